@@ -1,0 +1,1 @@
+"""Presets as TOML files, installed with the package."""

@@ -1,0 +1,1 @@
+"""The rendered HDR scene that ships with the package, as data files."""

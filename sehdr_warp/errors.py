@@ -1,0 +1,21 @@
+"""The errors a user can act on."""
+
+from pathlib import Path
+
+
+class SehdrError(Exception):
+    """One line that says what is wrong (file, field, value) and what to do about it.
+
+    The command line prints the message and exits with status 1; every other exception is a defect of the program.
+    """
+
+
+class InputError(SehdrError):
+    """A file or a value that was handed in cannot be used.
+
+    The message reads `<path>: <problem>; <remedy>`, on one line.
+    """
+
+    def __init__(self, path: Path | str, problem: str, remedy: str):
+        self.path = str(path)
+        super().__init__(" ".join(f"{path}: {problem}; {remedy}".split()))

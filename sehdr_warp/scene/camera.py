@@ -1,0 +1,96 @@
+"""The pinhole camera that every part of the package shares."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Camera:
+    """An undistorted pinhole camera in COLMAP's (OpenCV's) convention: +x right, +y down, +z into the scene.
+
+    A world point X lands at pixel (fx x/z + cx, fy y/z + cy) with (x, y, z) = (world_to_camera @ [X, 1])[:3];
+    the centre of the top left pixel is at (0.5, 0.5).
+
+    width, height: image size in pixels, at least 1.
+    fx, fy, cx, cy: focal lengths and principal point in pixels; focal lengths are positive.
+    world_to_camera: [4, 4] float64, rigid.
+
+    Raises ValueError if a size or focal length is not positive, a value is not finite or the pose is not rigid.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_to_camera: np.ndarray
+
+    def __post_init__(self):
+        pose = np.array(self.world_to_camera, dtype=np.float64)
+        pose.setflags(write=False)
+        object.__setattr__(self, "world_to_camera", pose)
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"image size {self.width} x {self.height} is not positive")
+        for field in ("fx", "fy", "cx", "cy"):
+            value = getattr(self, field)
+            if not np.isfinite(value):
+                raise ValueError(f"camera {field} = {value} is not finite")
+        if self.fx <= 0 or self.fy <= 0:
+            raise ValueError(f"focal lengths ({self.fx}, {self.fy}) are not positive")
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise ValueError("world_to_camera is not a finite 4 x 4 matrix")
+        rotation = pose[:3, :3]
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
+            raise ValueError("the rotation of world_to_camera is not a proper rotation")
+        if not np.allclose(pose[3], (0, 0, 0, 1)):
+            raise ValueError("the last row of world_to_camera is not (0, 0, 0, 1)")
+
+    @property
+    def camera_to_world(self) -> np.ndarray:
+        """[4, 4] float64, the inverse of world_to_camera."""
+        inverse = np.eye(4)
+        inverse[:3, :3] = self.world_to_camera[:3, :3].T
+        inverse[:3, 3] = self.position
+        return inverse
+
+    @property
+    def position(self) -> np.ndarray:
+        """[3] float64, the camera's centre in world coordinates."""
+        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """[4] float64: fx, fy, cx, cy in pixels."""
+        return np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float64)
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same view at another size; the principal point and the focal lengths scale with each axis."""
+        sx, sy = width / self.width, height / self.height
+        return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.world_to_camera)
+
+    def to_dict(self) -> dict:
+        """Plain values for JSON; from_dict reads them back exactly."""
+        return {
+            "width": self.width,
+            "height": self.height,
+            "fx": self.fx,
+            "fy": self.fy,
+            "cx": self.cx,
+            "cy": self.cy,
+            "world_to_camera": self.world_to_camera.tolist(),
+        }
+
+    @staticmethod
+    def from_dict(values: dict) -> "Camera":
+        """The camera that to_dict described; raises KeyError for a missing field, ValueError for a bad value."""
+        return Camera(
+            int(values["width"]),
+            int(values["height"]),
+            float(values["fx"]),
+            float(values["fy"]),
+            float(values["cx"]),
+            float(values["cy"]),
+            np.array(values["world_to_camera"], dtype=np.float64),
+        )

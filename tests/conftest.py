@@ -1,0 +1,29 @@
+"""What every test may ask for: devices, and the optional folder of larger real data."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def available_devices() -> list[str]:
+    """The torch devices the tests run on: always the CPU, and the first GPU where there is one."""
+    import torch
+
+    return ["cpu", "cuda:0"] if torch.cuda.is_available() else ["cpu"]
+
+
+def pytest_generate_tests(metafunc):
+    if "device" in metafunc.fixturenames:
+        metafunc.parametrize("device", available_devices())
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """Larger real data (photos, rendered rooms, response curves), which the repository does not carry."""
+    folder = Path(os.environ.get("SEHDR_SHARED", ROOT.parent / "shared"))
+    if not folder.is_dir():
+        pytest.skip("larger real data is not here (set SEHDR_SHARED)")
+    return folder
