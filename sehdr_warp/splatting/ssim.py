@@ -1,0 +1,138 @@
+"""Structural similarity of two images as a differentiable torch operation (kernels/ssim.py)."""
+
+from functools import lru_cache
+
+import torch
+import warp as wp
+
+from ..kernels.ssim import RADIUS, ssim_kernels, window
+from . import threads
+from .bridge import _torch_stream
+
+# Numbers that one step of the CPU kernels takes: one AVX-512 register of float32.
+CPU_LANES = 16
+# Smallest share of such steps that is worth handing to another thread: about 0.1 ms of work.
+STEPS_PER_THREAD = 4096
+
+
+def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Mean structural similarity (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5, data range 1.
+
+    a, b: [H, W, C] float32 or float64 on one device, any size from 1 x 1 x 1. Beyond the border both images count as
+    zero and every pixel is averaged, as in 3DGS's loss.
+
+    Returns a scalar of the same type, at most 1, differentiable once with respect to both images. The result and the
+    gradient do not depend on the number of threads.
+
+    Raises ValueError if the shapes differ or are not [H, W, C], TypeError for another type or two devices.
+    """
+    return _Similarity.apply(a, b, True)
+
+
+def ssim_map(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """The [H, W, C] values whose mean is ssim(a, b); same arguments, same errors, differentiable as well."""
+    return _Similarity.apply(a, b, False)
+
+
+class _Similarity(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, a, b, mean):
+        _check(a, b)
+        a, b = a.detach().contiguous(), b.detach().contiguous()
+        similarity, derivatives = _compare(a, b)
+        ctx.save_for_backward(a, b, derivatives)
+        ctx.mean = mean
+        # Sums within rows first: each is one thread's work, so the order of the additions is fixed.
+        return similarity.flatten(1).sum(1).sum() / similarity.numel() if mean else similarity
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, upstream):
+        a, b, derivatives = ctx.saved_tensors
+
+        def gradient(x, y, derivatives):
+            if ctx.mean:
+                return _gradient(x, y, derivatives, upstream / x.numel())
+            return _gradient(x, y, derivatives * upstream.reshape(derivatives.shape[1:]), upstream.new_ones(()))
+
+        for_a = gradient(a, b, derivatives) if ctx.needs_input_grad[0] else None
+        # Similarity is symmetric: b's derivatives are those of the exchanged comparison.
+        for_b = gradient(b, a, _compare(b, a)[1]) if ctx.needs_input_grad[1] else None
+        return for_a, for_b, None
+
+
+def _check(a: torch.Tensor, b: torch.Tensor) -> None:
+    if a.shape != b.shape or a.ndim != 3 or a.numel() == 0:
+        raise ValueError(f"ssim takes two images of one shape [H, W, C], not {list(a.shape)} and {list(b.shape)}")
+    if a.dtype != b.dtype or a.dtype not in (torch.float32, torch.float64) or a.device != b.device:
+        raise TypeError(
+            f"ssim takes float32 or float64 images on one device, not {a.dtype} on {a.device} and {b.dtype} on {b.device}"
+        )
+
+
+def _compare(a: torch.Tensor, b: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The similarity [H, W, C] and its derivatives [3, H, W C] by the windowed moments."""
+    runs = _Runs(a)
+    similarity = torch.empty_like(a)
+    derivatives = a.new_empty(3, runs.rows, runs.length)
+    moments = runs.padded(4)
+    runs.launch("blur_columns", [a, b], [moments])
+    runs.launch("compare", [moments], [similarity, derivatives])
+    return similarity, derivatives
+
+
+def _gradient(a: torch.Tensor, b: torch.Tensor, derivatives: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+    """scale times the gradient of the sum of the similarity by `a`, [H, W, C]."""
+    runs = _Runs(a)
+    result = torch.empty_like(a)
+    blurred = runs.padded(3)
+    runs.launch("blur_derivatives", [derivatives], [blurred])
+    runs.launch("gradient", [blurred, a, b], [wp.from_torch(scale.reshape(1), requires_grad=False), result])
+    return result
+
+
+class _Runs:
+    """One image size's launches: rows of W C numbers, taken `lanes` at a time."""
+
+    def __init__(self, image: torch.Tensor):
+        wp.init()
+        self.rows, width, self.channels = image.shape
+        self.length = width * self.channels
+        self.like = image
+        self.lanes = CPU_LANES if image.device.type == "cpu" and self.length >= CPU_LANES else 1
+        self.kernels = ssim_kernels(wp.dtype_from_torch(image.dtype), self.lanes)
+        self.weights = wp.from_torch(_weights(image.dtype, image.device), requires_grad=False)
+
+    def padded(self, count: int) -> torch.Tensor:
+        """[count, rows, ...] uninitialised rows with the zeros that the horizontal blur finds beyond the border."""
+        margin = RADIUS * self.channels
+        buffer = self.like.new_empty(count, self.rows, self.length + 2 * margin)
+        buffer[..., :margin] = 0
+        buffer[..., -margin:] = 0
+        return buffer
+
+    def launch(self, name: str, images, results) -> None:
+        """Launch a kernel over the whole image; tensors are passed as overlapping runs, arrays as they are."""
+        arguments = [self._view(image) for image in images]
+        arguments += [self.weights, self.length, self.channels]
+        arguments += [self._view(result) if isinstance(result, torch.Tensor) else result for result in results]
+        kernel = getattr(self.kernels, name)
+        count = self.rows * -(-self.length // self.lanes)
+        device = wp.device_from_torch(self.like.device)
+        with _torch_stream(self.like.device):
+            if device.is_cpu:
+                threads.launch_ranges(kernel, threads.even_ranges(count, STEPS_PER_THREAD), arguments, device)
+            else:
+                wp.launch(kernel, dim=count, inputs=[0, *arguments], device=device)
+
+    def _view(self, tensor: torch.Tensor) -> wp.array:
+        if tensor.shape == self.like.shape:
+            tensor = tensor.reshape(self.rows, self.length)
+        shape = (*tensor.shape[:-1], tensor.shape[-1] - self.lanes + 1, self.lanes)
+        runs = tensor.as_strided(shape, (*tensor.stride(), 1))
+        return wp.from_torch(runs, dtype=self.kernels.run, requires_grad=False)
+
+
+@lru_cache(maxsize=None)
+def _weights(dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    return torch.tensor(window(), dtype=dtype, device=device)

@@ -1,0 +1,174 @@
+"""The SSIM kernels against a float64 convolution, finite differences and an independent scipy version."""
+
+import numpy as np
+import pytest
+import scipy.ndimage
+import torch
+import torch.nn.functional as F
+
+from sehdr_warp.splatting import ssim as module
+from sehdr_warp.splatting.ssim import ssim, ssim_map
+
+SHAPES = [(32, 48, 3), (37, 29, 3), (5, 4, 3), (1, 1, 1), (1, 40, 2), (40, 1, 3), (11, 11, 1), (16, 9, 27), (3, 2, 9)]
+
+
+def conv_ssim(a, b):
+    """The usual quotient by 2D convolutions, [H, W, C] -> [H, W, C]."""
+    axis = torch.arange(11, dtype=a.dtype, device=a.device) - 5
+    g = torch.exp(-(axis**2) / (2 * 1.5**2))
+    g = g / g.sum()
+    channels = a.shape[2]
+    kernel = torch.outer(g, g).expand(channels, 1, 11, 11).contiguous()
+    x, y = a.permute(2, 0, 1)[None], b.permute(2, 0, 1)[None]
+
+    def blur(image):
+        return F.conv2d(image, kernel, padding=5, groups=channels)
+
+    mx, my = blur(x), blur(y)
+    vx, vy, vxy = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
+    c1, c2 = 0.01**2, 0.03**2
+    result = ((2 * mx * my + c1) * (2 * vxy + c2)) / ((mx * mx + my * my + c1) * (vx + vy + c2))
+    return result[0].permute(1, 2, 0)
+
+
+def images(shape, device="cpu", dtype=torch.float64, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    a = torch.rand(shape, generator=generator, dtype=torch.float64)
+    b = (a + 0.3 * torch.randn(shape, generator=generator, dtype=torch.float64)).clamp(0, 1)
+    return a.to(device, dtype), b.to(device, dtype)
+
+
+def relative_error(value, truth):
+    return float((value.double() - truth).norm() / truth.norm())
+
+
+@pytest.fixture(params=["runs", "single"])
+def lanes(request, monkeypatch):
+    """Both kernel widths on the CPU: runs of 16, and the one-number steps that a GPU takes."""
+    if request.param == "single":
+        monkeypatch.setattr(module, "CPU_LANES", 1)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-5), (torch.float64, 1e-12)])
+def test_values_and_gradients_equal_the_convolution(shape, dtype, tolerance, device, lanes):
+    a, b = images(shape, device)
+    a.requires_grad_(), b.requires_grad_()
+    expected_map = conv_ssim(a, b)
+    expected = torch.autograd.grad(expected_map.mean(), (a, b))
+    x, y = a.detach().to(dtype).requires_grad_(), b.detach().to(dtype).requires_grad_()
+    value = ssim(x, y)
+    value.backward()
+    assert value.dtype == dtype and value.shape == ()
+    assert abs(value.item() - expected_map.mean().item()) < tolerance
+    assert (ssim_map(x, y).double() - expected_map).abs().max() < 20 * tolerance
+    assert relative_error(x.grad, expected[0]) < 10 * tolerance
+    assert relative_error(y.grad, expected[1]) < 10 * tolerance
+
+
+def test_gradient_equals_finite_differences(device, lanes):
+    a, b = images((9, 13, 3), device)
+    x = a.clone().requires_grad_()
+    ssim(x, b).backward()
+    step, numeric = 1e-5, torch.zeros_like(a)
+    for index in np.ndindex(*a.shape):
+        shifted = a.clone()
+        shifted[index] += step
+        above = ssim(shifted, b)
+        shifted[index] -= 2 * step
+        numeric[index] = (above - ssim(shifted, b)) / (2 * step)
+    assert relative_error(x.grad, numeric) < 1e-8
+
+
+def test_map_gradient_takes_a_weight_per_pixel(device):
+    a, b = images((17, 12, 3), device)
+    weights = torch.linspace(-1, 2, a.numel(), dtype=a.dtype, device=device).reshape(a.shape)
+    a.requires_grad_()
+    (expected,) = torch.autograd.grad((conv_ssim(a, b) * weights).sum(), a)
+    (gradient,) = torch.autograd.grad((ssim_map(a, b) * weights).sum(), a)
+    assert relative_error(gradient, expected) < 1e-11
+
+
+def test_value_equals_scipys_filters():
+    a, b = images((30, 41, 3), dtype=torch.float32)
+
+    def blur(image):
+        return scipy.ndimage.gaussian_filter(image, (1.5, 1.5, 0), mode="constant", radius=(5, 5, 0))
+
+    x, y = a.double().numpy(), b.double().numpy()
+    mx, my = blur(x), blur(y)
+    vx, vy, vxy = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
+    quotient = (2 * mx * my + 1e-4) * (2 * vxy + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
+    np.testing.assert_allclose(ssim_map(a, b).numpy(), quotient, atol=2e-5)
+
+
+@pytest.mark.parametrize("level", [0.0, 0.5, 1.0, 100.0, 1e4])
+def test_constant_images(level, device):
+    a = torch.full((20, 30, 3), level, device=device, requires_grad=True)
+    same = ssim(a, a.detach().clone())
+    same.backward()
+    assert same.item() == pytest.approx(1.0, abs=1e-6)
+    assert torch.isfinite(a.grad).all() and a.grad.abs().max() < 1e-6
+    other = torch.full((20, 30, 3), level + 0.25, device=device, requires_grad=True)
+    expected = conv_ssim(other.detach().double(), a.detach().double()).mean().item()
+    value = ssim(other, a.detach())
+    value.backward()
+    assert value.item() == pytest.approx(expected, abs=1e-4)
+    assert torch.isfinite(other.grad).all()
+
+
+def test_bright_images_keep_their_digits(device):
+    """At 1e4 the moments are of order 1e8; the gradient in float32 must still match float64."""
+    a, b = (image * 1e4 for image in images((40, 50, 3), device))
+    a.requires_grad_()
+    (expected,) = torch.autograd.grad(conv_ssim(a, b).mean(), a)
+    x = a.detach().float().requires_grad_()
+    value = ssim(x, b.float())
+    value.backward()
+    assert value.item() == pytest.approx(conv_ssim(a, b).mean().item(), abs=1e-5)
+    assert relative_error(x.grad, expected) < 1e-4
+
+
+def test_nearly_equal_bright_images_are_nearly_one(device):
+    """The usual quotient in float32 returns noise here, since its variances cancel."""
+    a = torch.full((32, 32, 3), 5000.0, device=device)
+    b = a + 1e-2 * torch.rand(a.shape, generator=torch.Generator().manual_seed(1)).to(device)
+    expected = conv_ssim(a.double(), b.double()).mean().item()
+    assert ssim(a, b).item() == pytest.approx(expected, abs=0.02)
+    assert ssim(a, b).item() <= 1.0
+
+
+def test_the_number_of_threads_changes_nothing(monkeypatch):
+    a, b = images((300, 310, 3), dtype=torch.float32)
+    results = []
+    for threads in ("1", "3"):
+        monkeypatch.setenv("SEHDR_THREADS", threads)
+        x = a.clone().requires_grad_()
+        value = ssim(x, b)
+        value.backward()
+        results.append((value.item(), x.grad))
+    assert results[0][0] == results[1][0]
+    assert torch.equal(results[0][1], results[1][1])
+
+
+def test_views_and_slices_are_read_right(device):
+    a, b = images((20, 24, 3), device)
+    whole = torch.zeros(40, 48, 3, dtype=a.dtype, device=device)
+    whole[5:25, 7:31] = a
+    planes = b.permute(2, 0, 1).contiguous()
+    assert ssim(whole[5:25, 7:31], planes.permute(1, 2, 0)).item() == pytest.approx(ssim(a, b).item(), abs=1e-14)
+
+
+@pytest.mark.parametrize("shape", [(4, 4), (0, 5, 3), (1, 4, 4, 3)])
+def test_other_shapes_are_refused(shape):
+    with pytest.raises(ValueError, match="H, W, C"):
+        ssim(torch.zeros(shape), torch.zeros(shape))
+
+
+def test_unequal_images_are_refused():
+    with pytest.raises(ValueError, match="one shape"):
+        ssim(torch.zeros(4, 4, 3), torch.zeros(4, 5, 3))
+    with pytest.raises(TypeError, match="float32 or float64"):
+        ssim(torch.zeros(4, 4, 3), torch.zeros(4, 4, 3, dtype=torch.float64))
+    with pytest.raises(TypeError, match="float32 or float64"):
+        ssim(torch.zeros(4, 4, 3, dtype=torch.int32), torch.zeros(4, 4, 3, dtype=torch.int32))
