@@ -1,0 +1,181 @@
+"""From base radiance to HDR radiance: neural exposure fusion (SeHDR, section 3.3), and the scaling it stands for.
+
+Every bracket is the base scaled by a known ratio, so for a fixed response and fixed exposures the fused value is a
+function of one number: the log radiance of the base, for each channel by itself. NeuralExposureFusion can therefore
+evaluate its equations on a table over that number and interpolate, at a cost that does not grow with the Gaussians'
+number; gradients reach the MLPs, the sigmas and the radiances through the table.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import nn
+from torch.utils.checkpoint import checkpoint
+
+from ..errors import SehdrError
+from .exposure import bracket_log_radiance, exposure_times
+from .response_curve import Response
+
+# The table spans these octaves of exposure below and above white at every bracket: 2^-24 of white is 8 stops below
+# an 8-bit code of a gamma curve; 6 stops above it only the extension of the response is left, a line in log radiance.
+OCTAVES_BELOW_WHITE, OCTAVES_ABOVE_WHITE = 24.0, 6.0
+# Gaussians evaluated together by the exact form: bounds its memory to some 100 MB at width 128 and 5 brackets.
+EXACT_CHUNK = 16384
+# Limits inside which exp(-z^2 / 2) and its gradient are finite in float32, for any sigma.
+MAX_LOG_SIGMA, MAX_DEVIATION = 30.0, 30.0
+
+
+class ExposureScaling(nn.Module):
+    """c^h = c^{l_1} / dt_1: what the paper defines as the HDR radiance, with nothing to learn.
+
+    Any weighted mean of the linear brackets, each divided by its own time, is this too: sum_p w_p c^{l_p} / dt_p
+    = sum_p w_p c^{l_1} / dt_1 = c^{l_1} / dt_1, since the weights add up to 1.
+
+    base_time: dt_1 in seconds.
+    """
+
+    def __init__(self, base_time: float):
+        super().__init__()
+        (self.base_time,) = exposure_times(base_time, ("base",))
+
+    def forward(self, log_base: torch.Tensor) -> torch.Tensor:
+        """[N, 3] scene-linear radiance from [N, 3] log c^{l_1}."""
+        return (log_base - math.log(self.base_time)).exp()
+
+
+class NeuralExposureFusion(nn.Module):
+    """NeEF: c^h = radiance_scale * sum_p w_p f(c^{l_p}), w = softmax over p of MLP_c(gamma_p, f(c^{l_p})) gamma_p.
+
+    gamma = exp(-(f(c^{l_p}) - 0.5)^2 / (2 sigma_c^2)), sigma_c learnable for each channel, and one MLP a channel:
+    2 -> width -> ... -> 1 with ReLU between and no function at the end.
+
+    response: f. Used with its extension beyond the clip point, so that f, and with it the result, may pass 1 there.
+    times: n exposure times in seconds; base_time: dt_1.
+    width, hidden_layers: of each MLP. 128 and 1 are those of HDR-GS's tone mapper.
+    sigma: initial standard deviation, > 0.
+    evaluation: "exact" applies the equations to every Gaussian; "tabulated" to `nodes` values of the log radiance, with
+        cubic (Catmull-Rom) interpolation between them.
+    radiance_scale: what the fused value, which is at most 1, is multiplied by; "white" is response.white / base_time,
+        the radiance that the photo shows as white.
+    seed: of the MLPs' initial weights.
+
+    Parameters: log_sigma [3]; weights and biases, one stack over the three channels for each layer. All state is in
+    state_dict(). Raises SehdrError for a parameter out of range.
+    """
+
+    def __init__(
+        self,
+        response: Response,
+        times: Sequence[float],
+        base_time: float,
+        *,
+        width: int = 128,
+        hidden_layers: int = 1,
+        sigma: float = 0.2,
+        evaluation: str = "tabulated",
+        nodes: int = 1024,
+        radiance_scale: float | str = 1.0,
+        seed: int = 0,
+    ):
+        super().__init__()
+        for field, value, least in (("width", width, 1), ("hidden_layers", hidden_layers, 1), ("nodes", nodes, 16)):
+            if value < least:
+                raise SehdrError(f"fusion: {field} = {value} is less than {least}; raise it")
+        if not (math.isfinite(sigma) and sigma > 0):
+            raise SehdrError(f"fusion: sigma = {sigma} is not positive; the paper starts at 0.2")
+        if evaluation not in ("exact", "tabulated"):
+            raise SehdrError(f"fusion: evaluation = {evaluation!r} is neither 'exact' nor 'tabulated'")
+        self.response = response
+        self.times = exposure_times(base_time, [f"{float(time)!r}s" for time in times])
+        (self.base_time,) = exposure_times(base_time, ("base",))
+        self.evaluation, self.nodes = evaluation, nodes
+        self.radiance_scale = _radiance_scale(radiance_scale, response, self.base_time)
+        self.log_sigma = nn.Parameter(torch.full((3,), math.log(sigma)))
+        self.weights, self.biases = _channel_layers([2, *[width] * hidden_layers, 1], seed)
+        brackets = [math.log(time / self.base_time) for time in self.times]
+        white = math.log(response.white)
+        self._low = white - OCTAVES_BELOW_WHITE * math.log(2) - max(brackets)
+        self._high = white + OCTAVES_ABOVE_WHITE * math.log(2) - min(brackets)
+
+    def forward(self, log_base: torch.Tensor) -> torch.Tensor:
+        """[N, 3] scene-linear radiance c^h from [N, 3] log c^{l_1}, the log of the radiance at the input exposure."""
+        if self.evaluation == "tabulated":
+            return self._interpolate(log_base)
+        if not torch.is_grad_enabled() or len(log_base) <= EXACT_CHUNK:
+            return torch.cat([self._fuse(part) for part in log_base.split(EXACT_CHUNK)])
+        return torch.cat([checkpoint(self._fuse, part, use_reentrant=False) for part in log_base.split(EXACT_CHUNK)])
+
+    def fusion_weights(self, log_base: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The weights w and the encoded brackets f(c^{l_p}) behind the sum, each [n, N, 3], for [N, 3] log c^{l_1}."""
+        encoded = self.response.encode_extended(bracket_log_radiance(log_base, self.times, self.base_time).exp())
+        sigma = self.log_sigma.clamp(-MAX_LOG_SIGMA, MAX_LOG_SIGMA).exp()
+        deviation = ((encoded - 0.5) / sigma).clamp(-MAX_DEVIATION, MAX_DEVIATION)
+        exposedness = (-0.5 * deviation.square()).exp()
+        logits = self._channel_mlps(torch.stack([exposedness, encoded], dim=-1)) * exposedness
+        return logits.softmax(dim=0), encoded
+
+    def _fuse(self, log_base):
+        weights, encoded = self.fusion_weights(log_base)
+        return self.radiance_scale * (weights * encoded).sum(dim=0)
+
+    def _channel_mlps(self, features):
+        """[n, N, 3] outputs of the three MLPs for features [n, N, 3, 2]."""
+        count, points = features.shape[:2]
+        values = features.permute(2, 0, 1, 3).reshape(3, count * points, 2)
+        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            values = torch.baddbmm(bias, values.relu() if layer else values, weight)
+        return values.reshape(3, count, points).permute(1, 2, 0)
+
+    def _interpolate(self, log_base):
+        """Catmull-Rom between the table's nodes; constant below them, a straight line in log radiance above."""
+        step = (self._high - self._low) / (self.nodes - 1)
+        # One node more at either end gives every cell its four.
+        grid = torch.arange(-1, self.nodes + 1, dtype=log_base.dtype, device=log_base.device) * step + self._low
+        table = self._fuse(grid[:, None].expand(-1, 3))
+        position = ((log_base - self._low) / step).clamp_min(0.0)
+        cell = position.detach().nan_to_num(0.0).clamp_max(self.nodes - 2).long()
+        part = position - cell
+        before, left, right, after = (table.gather(0, cell + offset) for offset in range(4))
+        slope_left, slope_right = 0.5 * (right - before), 0.5 * (after - left)
+        inside = part.clamp_max(1.0)
+        rise = right - left
+        cubic = slope_left + slope_right - 2.0 * rise
+        square = 3.0 * rise - 2.0 * slope_left - slope_right
+        value = left + inside * (slope_left + inside * (square + inside * cubic))
+        return value + (part - inside) * slope_right
+
+
+def build_fusion(kind: str, response: Response, times: Sequence[float], base_time: float, **options) -> nn.Module:
+    """The module from [N, 3] log c^{l_1} to [N, 3] scene-linear c^h: "neural" or "scaling".
+
+    options: those of NeuralExposureFusion; "scaling" has none and ignores times and response.
+    """
+    if kind == "neural":
+        return NeuralExposureFusion(response, times, base_time, **options)
+    if kind == "scaling":
+        if options:
+            raise SehdrError(f"fusion: kind 'scaling' has no {', '.join(options)}; leave out, or take 'neural'")
+        return ExposureScaling(base_time)
+    raise SehdrError(f"fusion: kind = {kind!r} is neither 'neural' nor 'scaling'")
+
+
+def _radiance_scale(scale: float | str, response: Response, base_time: float) -> float:
+    if scale == "white":
+        return response.white / base_time
+    if isinstance(scale, str) or not (math.isfinite(scale) and scale > 0):
+        raise SehdrError(f"fusion: radiance_scale = {scale!r} is neither positive nor 'white'")
+    return float(scale)
+
+
+def _channel_layers(sizes: list[int], seed: int) -> tuple[nn.ParameterList, nn.ParameterList]:
+    """Weights [3, in, out] and biases [3, 1, out], uniform within 1 / sqrt(in) as torch.nn.Linear starts."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape, bound):
+        return nn.Parameter((2.0 * torch.rand(*shape, generator=generator) - 1.0) * bound)
+
+    pairs = list(zip(sizes[:-1], sizes[1:], strict=True))
+    weights = nn.ParameterList([uniform(3, a, b, bound=a**-0.5) for a, b in pairs])
+    biases = nn.ParameterList([uniform(3, 1, b, bound=a**-0.5) for a, b in pairs])
+    return weights, biases

@@ -1,0 +1,160 @@
+"""What a camera response is: the interface and the differentiation that every curve shares."""
+
+import math
+from abc import ABC, abstractmethod
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from ..errors import SehdrError
+
+# Half of one 8-bit code value: an encoded value nearer to white than this is stored as 255.
+HALF_CODE = 0.5 / 255
+# Rise of encode_extended beyond the clip point for each factor of e in exposure. A tenth of what a gamma curve rises
+# just below white: enough for a gradient, too little for a clipped highlight to cost much where no hinge is used.
+EXTENSION_SLOPE = 0.05
+
+
+class Response(ABC):
+    """A camera response function f: exposure x = E dt >= 0 to encoded value in [0, 1], increasing and immutable.
+
+    Sources: SeHDR, Eq. 1 (Z = f(E dt)); Grossberg and Nayar 2004 for the normalisation of tabulated curves.
+
+    name: what response_by_name takes, or the curve's source.
+    black: f(0), in [0, 1).
+    peak: the largest value that the curve takes or approaches, at most 1.
+    clip_exposure: the smallest exposure with f = peak; infinity for a curve that only approaches it.
+    notes: one line each on what was repaired when the curve was read.
+
+    encode, encode_extended and decode take a torch tensor (float32 or float64, any shape, any device; differentiable
+    once) and return one like it, or a NumPy array or number and return a NumPy array. NaN stays NaN.
+    """
+
+    name: str
+    black: float
+    peak: float
+    clip_exposure: float
+    notes: tuple[str, ...] = ()
+    _kinds: dict[str, type["Response"]] = {}
+
+    def __init_subclass__(cls, *, kind: str | None = None, **options):
+        super().__init_subclass__(**options)
+        if kind is not None:
+            Response._kinds[kind] = cls
+
+    @abstractmethod
+    def _evaluate(self, exposure: torch.Tensor, with_slope: bool) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Value and df/dx for exposures within [0, clip_exposure]; called without autograd."""
+
+    @abstractmethod
+    def _invert(self, value: torch.Tensor) -> torch.Tensor:
+        """The exposure for values within [black, peak); called without autograd."""
+
+    @abstractmethod
+    def to_dict(self) -> dict:
+        """Plain values for JSON that Response.from_dict turns back into the same curve, with no file needed."""
+
+    @classmethod
+    @abstractmethod
+    def _from_dict(cls, values: dict) -> "Response":
+        """The curve that to_dict described."""
+
+    @staticmethod
+    def from_dict(values: dict) -> "Response":
+        """The curve that to_dict described; SehdrError if the description is not one."""
+        kind = values.get("kind") if isinstance(values, dict) else None
+        if kind not in Response._kinds:
+            raise SehdrError(f"response: kind = {kind!r} is not one of {', '.join(sorted(Response._kinds))}")
+        try:
+            return Response._kinds[kind]._from_dict(values)
+        except (KeyError, TypeError, ValueError) as error:
+            raise SehdrError(f"response: the stored {kind} curve is damaged ({type(error).__name__}: {error})") from error
+
+    @property
+    def clips(self) -> bool:
+        """True if every exposure beyond some finite one gives the same value."""
+        return math.isfinite(self.clip_exposure)
+
+    @cached_property
+    def white(self) -> float:
+        """The smallest exposure that is stored as the brightest 8-bit code: f(white) = peak - 0.5/255."""
+        return float(self._invert(torch.tensor(self.peak - HALF_CODE, dtype=torch.float64)))
+
+    def encode(self, exposure):
+        """f(x), in [black, peak]. Exposures below 0 count as 0; the gradient is 0 there and beyond the clip point."""
+        return self._apply(_Encode, exposure, None)
+
+    def encode_extended(self, exposure, *, slope: float = EXTENSION_SLOPE):
+        """f(x) up to the clip point; beyond it f(clip) + slope log(x / clip), so that a gradient is left there.
+
+        Continuous; the derivative jumps at the clip point and is at most slope / clip beyond it. A loss can compare
+        the surplus over 1 with a clipped target through a hinge. Equals encode for a curve that never clips.
+        """
+        return self._apply(_Encode, exposure, slope)
+
+    def decode(self, value):
+        """The exposure whose encoded value this is: decode(encode(x)) = x for 0 <= x <= clip_exposure.
+
+        Values are first limited to [black, peak]. A curve that only approaches its peak is inverted up to `white`,
+        since the brightest code says no more than "at least this" and the exact inverse of 1 would be infinite.
+        """
+        return self._apply(_Decode, value, None)
+
+    def _apply(self, function, argument, slope):
+        if isinstance(argument, torch.Tensor):
+            if argument.dtype not in (torch.float32, torch.float64):
+                raise TypeError(f"a response takes float32 or float64 tensors, not {argument.dtype}")
+            return function.apply(argument, self, slope)
+        array = np.asarray(argument)
+        if array.dtype not in (np.float32, np.float64):
+            array = array.astype(np.float32 if array.dtype == np.float16 else np.float64)
+        # A negative stride or a read-only array is no tensor; both are common among loaded images.
+        tensor = torch.from_numpy(np.array(array, order="C"))
+        return function.apply(tensor, self, slope).numpy()
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.name!r})"
+
+
+class _Encode(torch.autograd.Function):
+    """The curve with the derivative it states itself: one saved tensor, and no NaN from an unused branch."""
+
+    @staticmethod
+    def forward(ctx, exposure, response, extension_slope):
+        differentiate = ctx.needs_input_grad[0]
+        clip = response.clip_exposure
+        inside = exposure.clamp(0.0, clip if response.clips else None)
+        value, slope = response._evaluate(inside, differentiate)
+        if response.clips and extension_slope is not None:
+            value = value + extension_slope * (exposure.clamp_min(clip) / clip).log()
+        if differentiate:
+            slope = torch.where(exposure < 0, 0.0, slope)
+            if response.clips:
+                beyond = 0.0 if extension_slope is None else extension_slope / exposure
+                slope = torch.where(exposure > clip, beyond, slope)
+            ctx.save_for_backward(slope)
+        return value
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient):
+        (slope,) = ctx.saved_tensors
+        return gradient * slope, None, None
+
+
+class _Decode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, value, response, _):
+        limit = response.peak if response.clips else response.peak - HALF_CODE
+        exposure = response._invert(value.clamp(response.black, limit))
+        if ctx.needs_input_grad[0]:
+            _, slope = response._evaluate(exposure, True)
+            ctx.save_for_backward(torch.where((value < response.black) | (value > limit), 0.0, 1.0 / slope))
+        return exposure
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient):
+        (slope,) = ctx.saved_tensors
+        return gradient * slope, None, None

@@ -1,0 +1,214 @@
+"""Responses that are read: EMoR and DoRF files, a curve of one's own, and the camera encodings of colour-science."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError, SehdrError
+from .response_curve import Response
+from .response_table import TabulatedResponse
+
+# The largest file read here (all of DoRF as text has 5 MB).
+MAX_BYTES = 64 * 2**20
+
+
+def response_from_file(path: Path, selector: str | None = None) -> Response:
+    """The curve in a file. `selector` is what follows the last colon of `FILE:SELECTOR`.
+
+    201_CRF_data.mat and dorfCurves.txt (DoRF; exposures and values normalised to [0, 1]): an index from 0, or a
+    curve's name where the file holds names. emor.txt (f = f0 + sum c_i h_i) and invemor.txt (the same for the inverse):
+    coefficients c_1,c_2,... separated by commas, none for the mean curve. CSV or text: two columns, exposure and value,
+    an optional line of headings, `#` comments. JSON: {"exposures": [...], "values": [...]} or Response.to_dict's.
+
+    Raises InputError for a file that is missing, too large, of another content, or whose curve cannot be used.
+    """
+    text = None if path.suffix.lower() == ".mat" else _read_text(path)
+    if text is not None and text.lstrip()[:2] in ("E ", "E=", "B ", "B=") and "(1)" in text:
+        return _emor(path, text, selector)
+    if text is None or _is_dorf(text):
+        return _select(path, responses_in_file(path), selector)
+    if selector is not None:
+        raise InputError(path, f"holds one curve, and {selector!r} asks for one of several", "leave out the colon and what follows")
+    return _json_curve(path, text) if path.suffix.lower() == ".json" else _text_curve(path, text)
+
+
+def responses_in_file(path: Path | str) -> list[Response]:
+    """Every curve of a DoRF file (.mat with B and I of [curves, samples], or dorfCurves.txt); InputError otherwise."""
+    path = Path(path)
+    if path.suffix.lower() == ".mat":
+        return _dorf_mat(path)
+    text = _read_text(path)
+    if not _is_dorf(text):
+        raise InputError(path, "is not a DoRF file", "give 201_CRF_data.mat or dorfCurves.txt")
+    return _dorf_text(path, text)
+
+
+def colour_response(encoding: str) -> Response:
+    """A camera or display encoding of colour-science by name (`S-Log3`; case, blanks and hyphens do not matter).
+
+    The exposure axis is scene reflectance as that encoding defines it (0.18 is middle grey); values are limited to
+    [0, 1]. Sampled once at 32 points an octave, 24 octaves below white. Raises SehdrError for an unknown name or an
+    encoding that is not a camera's (undefined values, or white beyond 2^20).
+    """
+    import colour
+
+    wanted = _key(encoding)
+    matches = [name for name in colour.CCTF_ENCODINGS if _key(name) == wanted]
+    if not matches:
+        known = ", ".join(colour.CCTF_ENCODINGS)
+        raise SehdrError(f"response 'colour:{encoding}': colour-science has no such encoding; it has {known}")
+    name = matches[0]
+
+    def encode(exposure):
+        with np.errstate(all="ignore"), colour.utilities.suppress_warnings(colour_warnings=True):
+            return np.asarray(colour.CCTF_ENCODINGS[name](np.asarray(exposure, np.float64)), np.float64)
+
+    bright = np.exp2(np.linspace(-10, 20, 30 * 32 + 1))
+    reached = np.flatnonzero(encode(bright) >= 1.0)
+    if not len(reached) or reached[0] == 0:
+        raise SehdrError(f"response 'colour:{encoding}': the encoding does not pass 1 between 2^-10 and 2^20; take another")
+    low, high = bright[reached[0] - 1], bright[reached[0]]
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if encode(middle) >= 1.0 else (middle, high)
+    exposures = np.concatenate([[0.0], high * np.exp2(np.arange(-24 * 32, 1) / 32)])
+    # At exactly 0 a pure logarithm gives -infinity: black.
+    values = np.nan_to_num(encode(exposures), neginf=0.0, nan=np.nan).clip(0.0, 1.0)
+    values[-1] = 1.0
+    return TabulatedResponse(f"colour:{name}", exposures, values)
+
+
+def _key(name: str) -> str:
+    return "".join(letter for letter in name.lower() if letter.isalnum())
+
+
+def _read_text(path: Path) -> str:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(path, f"{path.stat().st_size} bytes are too many for a response", f"give a file under {MAX_BYTES} bytes")
+        return path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", "give the path of a response file") from error
+
+
+def _numbers(path: Path, text: str) -> np.ndarray:
+    try:
+        return np.array(text.split(), dtype=np.float64)
+    except ValueError as error:
+        raise InputError(path, f"holds something that is not a number ({error})", "give the file as published") from error
+
+
+def _select(path: Path, curves: list[Response], selector: str | None) -> Response:
+    if selector is None:
+        raise InputError(path, f"holds {len(curves)} curves", f"say which, as {path.name}:INDEX or {path.name}:NAME")
+    named = [curve for curve in curves if curve.name.lower() == selector.strip().lower()]
+    if named:
+        return named[0]
+    if selector.strip().isdecimal() and int(selector) < len(curves):
+        return curves[int(selector)]
+    raise InputError(path, f"has no curve {selector!r}", f"give an index from 0 to {len(curves) - 1}, or a name where it holds names")
+
+
+def _dorf_mat(path: Path) -> list[Response]:
+    from scipy.io import loadmat
+
+    _read_size(path)
+    try:
+        stored = loadmat(path)
+        values, exposures = (np.asarray(stored[key], np.float64) for key in ("B", "I"))
+    except (OSError, KeyError, ValueError, TypeError, NotImplementedError) as error:
+        raise InputError(path, f"is not a DoRF file ({error})", "give a .mat with B and I of [curves, samples]") from error
+    if values.ndim != 2 or values.shape != exposures.shape:
+        raise InputError(path, f"B is {values.shape} and I is {exposures.shape}", "give both as [curves, samples]")
+    return [
+        TabulatedResponse(f"dorf:{index}", exposures[index], values[index], source=f"{path}:{index}")
+        for index in range(len(values))
+    ]
+
+
+def _read_size(path: Path):
+    if path.is_file() and path.stat().st_size > MAX_BYTES:
+        raise InputError(path, f"{path.stat().st_size} bytes are too many for a response", f"give a file under {MAX_BYTES} bytes")
+
+
+def _is_dorf(text: str) -> bool:
+    lines = text.split("\n", 6)
+    return len(lines) > 5 and lines[2].strip() == "I =" and lines[4].strip() == "B ="
+
+
+def _dorf_text(path: Path, text: str) -> list[Response]:
+    """Six lines a curve: name, kind, "I =", exposures, "B =", values."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    curves = []
+    for start in range(0, len(lines), 6):
+        block = lines[start : start + 6]
+        if len(block) < 6 or block[2].strip() != "I =" or block[4].strip() != "B =":
+            raise InputError(path, f"curve {start // 6} is not six lines with 'I =' and 'B ='", "give dorfCurves.txt as published")
+        exposures, values = _numbers(path, block[3]), _numbers(path, block[5])
+        curves.append(TabulatedResponse(block[0].strip(), exposures, values, source=f"{path}:{start // 6}"))
+    return curves
+
+
+def _emor(path: Path, text: str, selector: str | None) -> Response:
+    """Sections "E =", "f0 =", "h(1)=", ... of equal length; in the inverse file "B =", "g0 =", "hinv(1)=", ..."""
+    parts = [section.split("=", 1) for section in _sections(text)]
+    if any(len(part) != 2 for part in parts) or len(parts) < 3:
+        raise InputError(path, "is not EMoR's layout", "give emor.txt or invemor.txt as published")
+    rows = [_numbers(path, body) for _, body in parts]
+    if len({len(row) for row in rows}) != 1:
+        raise InputError(path, "its sections differ in length", "give emor.txt or invemor.txt as published")
+    coefficients = _numbers(path, (selector or "").replace(",", " "))
+    if len(coefficients) > len(rows) - 2 or not np.isfinite(coefficients).all():
+        raise InputError(path, f"{selector!r} is not up to {len(rows) - 2} finite numbers", "separate coefficients by commas")
+    curve = rows[1] + sum((c * row for c, row in zip(coefficients, rows[2:], strict=False)), np.zeros_like(rows[1]))
+    inverse = parts[0][0].strip() == "B"
+    name = ("invemor" if inverse else "emor") + (f":{selector}" if selector else "")
+    curve = curve.clip(0.0, 1.0)
+    if inverse:
+        return TabulatedResponse(name, np.maximum.accumulate(curve), rows[0], source=str(path))
+    return TabulatedResponse(name, rows[0], curve, source=str(path))
+
+
+def _sections(text: str) -> list[str]:
+    """The text cut before each line that holds an equals sign."""
+    sections: list[list[str]] = []
+    for line in text.splitlines():
+        if "=" in line:
+            sections.append([])
+        if sections:
+            sections[-1].append(line)
+    return ["\n".join(section) for section in sections]
+
+
+def _json_curve(path: Path, text: str) -> Response:
+    remedy = 'give {"exposures": [...], "values": [...]}'
+    try:
+        stored = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, f"is not JSON ({error})", remedy) from error
+    if isinstance(stored, dict) and "kind" in stored:
+        return Response.from_dict(stored)
+    try:
+        exposures, values = (np.array(stored[key], np.float64) for key in ("exposures", "values"))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(path, f"has no two lists of numbers ({error!r})", remedy) from error
+    return TabulatedResponse(str(stored.get("name", path.stem)), exposures, values, source=str(path))
+
+
+def _text_curve(path: Path, text: str) -> Response:
+    rows = []
+    for number, line in enumerate(text.splitlines(), 1):
+        cells = line.split("#", 1)[0].replace(",", " ").replace(";", " ").split()
+        if not cells:
+            continue
+        try:
+            rows.append([float(cell) for cell in cells])
+        except ValueError:
+            if rows or len(cells) != 2:
+                raise InputError(path, f"line {number} is not two numbers ({line.strip()[:40]!r})", "give exposure and value") from None
+            continue
+        if len(cells) != 2:
+            raise InputError(path, f"line {number} has {len(cells)} columns", "give two: exposure and value")
+    columns = np.array(rows).reshape(-1, 2)
+    return TabulatedResponse(path.stem, columns[:, 0], columns[:, 1], source=str(path))

@@ -1,0 +1,157 @@
+"""Responses without a formula: a monotone curve through measured samples."""
+
+import math
+
+import numpy as np
+import torch
+
+from ..errors import InputError
+from .response_curve import HALF_CODE, Response
+
+# Samples this dense and evenly spaced are joined by straight lines, exactly as stored (DoRF and EMoR have 1024).
+DENSE_SAMPLES = 256
+# Other curves are read off a grid even in log exposure; the straight pieces are then off by less than 1e-6 where the
+# curve is smooth.
+CELLS_PER_OCTAVE = 512
+# A curve's lowest straight piece ends this many octaves below its first sample, and the grid spans at most 40.
+TOE_OCTAVES, MAX_OCTAVES = 6, 40
+# A flat part is tilted by this much over its length (1/64 of an 8-bit code), so that the curve has an inverse there.
+FLAT_TILT = 2.0**-14
+
+
+class TabulatedResponse(Response, kind="table"):
+    """A response through samples (exposure, value), increasing, exact inverse included.
+
+    exposures: [K] >= 0, increasing, in the file's own unit; values: [K] in [0, 1]. At least 3 samples.
+    Sampled curves are given up to scale: `white` of a DoRF curve is 1 or less, and radiance is then relative to it.
+
+    What is repaired, with a note each: samples out of order are sorted, equal exposures averaged, a decrease is
+    replaced by the nearest monotone curve (least squares). What is always done: a curve that starts above exposure 0
+    is continued to (0, 0) by a line; a flat part within the curve is tilted about its centre by 2^-14, so that its
+    value decodes to the middle of the part (at black: rises from it); a flat part at the top is the clipped range.
+    Beyond the last sample the curve is flat.
+
+    Raises InputError(source, ...) for fewer than 3 samples, NaN or infinity, a negative exposure, a value outside
+    [0, 1], or a curve that does not rise.
+    """
+
+    def __init__(self, name: str, exposures, values, *, notes: tuple[str, ...] = (), source: str | None = None):
+        self.name = name
+        knots, levels, repairs = _monotone(np.asarray(exposures, np.float64), np.asarray(values, np.float64), source or name)
+        self.notes = (*notes, *repairs)
+        self._knots, self._levels = knots, levels
+        self.black, self.peak, self.clip_exposure = float(levels[0]), float(levels[-1]), float(knots[-1])
+        steps = np.diff(knots)
+        self._even = len(knots) >= DENSE_SAMPLES and np.allclose(steps, steps[0], rtol=1e-4)
+        self._nodes, self._node_values = (knots, levels) if self._even else self._log_grid()
+        self._tensors: dict = {}
+
+    def _log_grid(self):
+        """Nodes 0, then even in log exposure up to the clip point; values by monotone cubic interpolation."""
+        from scipy.interpolate import PchipInterpolator
+
+        top = self._knots[-1]
+        octaves = min(MAX_OCTAVES, math.ceil(math.log2(top / self._knots[1])) + TOE_OCTAVES)
+        nodes = np.concatenate([[0.0], top * np.exp2(np.arange(-octaves * CELLS_PER_OCTAVE, 1) / CELLS_PER_OCTAVE)])
+        values = PchipInterpolator(self._knots, self._levels)(nodes).clip(self.black, self.peak)
+        return nodes, np.maximum.accumulate(values)
+
+    def _table(self, like: torch.Tensor):
+        """Intercept and slope of each cell in `like`'s type and place, and float64 nodes for the inverse."""
+        key = (like.device, like.dtype)
+        if key not in self._tensors:
+            slope = np.diff(self._node_values) / np.diff(self._nodes)
+            intercept = self._node_values[:-1] - slope * self._nodes[:-1]
+            cells = [torch.as_tensor(part).to(like) for part in (intercept, slope)]
+            nodes = [torch.as_tensor(part).to(like.device) for part in (self._nodes, self._node_values)]
+            self._tensors[key] = (*cells, *nodes)
+        return self._tensors[key]
+
+    def _evaluate(self, exposure, with_slope):
+        intercept, slope, _, _ = self._table(exposure)
+        last = len(slope) - 1
+        if self._even:
+            position = exposure * (len(slope) / self.clip_exposure)
+        else:
+            # Cell 0 is the toe; a position rounded across a node evaluates the neighbour's line, equal there.
+            position = (exposure / self.clip_exposure).log2() * CELLS_PER_OCTAVE + (last + 1)
+        cell = position.nan_to_num(0.0).clamp(0, last).long()
+        slope = slope[cell]
+        value = torch.addcmul(intercept[cell], slope, exposure)
+        return value, slope if with_slope else None
+
+    def _invert(self, value):
+        _, _, nodes, levels = self._table(value)
+        wanted = value.double()
+        cell = (torch.searchsorted(levels, wanted.contiguous()) - 1).clamp(0, len(levels) - 2)
+        rise = levels[cell + 1] - levels[cell]
+        part = ((wanted - levels[cell]) / rise.clamp_min(1e-300)).clamp(0.0, 1.0)
+        return torch.lerp(nodes[cell], nodes[cell + 1], part).to(value.dtype)
+
+    def to_dict(self):
+        return {
+            "kind": "table",
+            "name": self.name,
+            "exposures": self._knots.tolist(),
+            "values": self._levels.tolist(),
+            "notes": list(self.notes),
+        }
+
+    @classmethod
+    def _from_dict(cls, values):
+        return cls(values["name"], values["exposures"], values["values"], notes=tuple(values["notes"]))
+
+
+def _monotone(exposures: np.ndarray, values: np.ndarray, source: str):
+    """Increasing samples from exposure 0 to the clip point, and what had to be repaired."""
+    _check(exposures, values, source)
+    notes = []
+    if (np.diff(exposures) <= 0).any():
+        notes.append(f"{source}: exposures were not increasing; sorted, and values of equal exposures averaged")
+        exposures, group = np.unique(exposures, return_inverse=True)
+        values = np.bincount(group, values) / np.bincount(group)
+    drop = np.diff(values).min(initial=0.0)
+    if drop < 0:
+        from scipy.optimize import isotonic_regression
+
+        count = int((np.diff(values) < 0).sum())
+        notes.append(f"{source}: {count} of {len(values)} values fall, by up to {-drop:.3g}; replaced by the nearest monotone curve")
+        values = np.maximum.accumulate(isotonic_regression(values).x)
+    if exposures[0] > 0:
+        exposures, values = np.concatenate([[0.0], exposures]), np.concatenate([[0.0], values])
+    if values[-1] - values[0] < 2 * HALF_CODE:
+        raise InputError(source, f"the curve rises by only {values[-1] - values[0]:.3g}", "give a curve that reaches from dark to bright")
+    clipped = np.searchsorted(values, values[-1])
+    return *_tilt_flat_parts(exposures[: clipped + 1], values[: clipped + 1]), notes
+
+
+def _check(exposures: np.ndarray, values: np.ndarray, source: str):
+    remedy = "give two columns of numbers, exposure and value in [0, 1]"
+    if exposures.ndim != 1 or exposures.shape != values.shape or len(exposures) < 3:
+        raise InputError(source, f"{exposures.shape} exposures and {values.shape} values are not 3 or more samples", remedy)
+    for what, column in (("exposure", exposures), ("value", values)):
+        bad = np.flatnonzero(~np.isfinite(column))
+        if len(bad):
+            raise InputError(source, f"{what} {bad[0] + 1} is {column[bad[0]]}", remedy)
+    if exposures.min() < 0:
+        raise InputError(source, f"exposure {exposures.min():.6g} is negative", remedy)
+    if values.min() < 0 or values.max() > 1:
+        worst = values.max() if values.max() > 1 else values.min()
+        raise InputError(source, f"value {worst:.6g} is outside [0, 1]", "divide codes by the largest one, 255 or 65535")
+
+
+def _tilt_flat_parts(exposures: np.ndarray, values: np.ndarray):
+    """Strictly increasing values: each run of equal ones becomes a line of FLAT_TILT, or less where neighbours are near."""
+    edges = np.flatnonzero(np.diff(values) != 0) + 1
+    starts, ends = np.concatenate([[0], edges]), np.concatenate([edges, [len(values)]]) - 1
+    tilted = values.copy()
+    for start, end in zip(starts, ends, strict=True):
+        if start == end:
+            continue
+        part = (exposures[start : end + 1] - exposures[start]) / (exposures[end] - exposures[start])
+        height = min(FLAT_TILT, 0.5 * (values[end + 1] - values[end]))
+        if start > 0:
+            height = min(height, 0.5 * (values[start] - values[start - 1]))
+            part = part - 0.5
+        tilted[start : end + 1] += height * part
+    return exposures, tilted
