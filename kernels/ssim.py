@@ -13,7 +13,7 @@ and one on the GPU. Arrays of runs are overlapping views: element [y, i] holds t
 Rows blurred vertically carry RADIUS pixels of zeros on both sides (zero padding, as in 3DGS).
 """
 
-from functools import lru_cache
+from functools import cache
 from math import exp
 from types import SimpleNamespace
 
@@ -32,7 +32,7 @@ def window() -> list[float]:
     return [weight / sum(weights) for weight in weights]
 
 
-@lru_cache(maxsize=None)
+@cache
 def ssim_kernels(dtype, lanes: int) -> SimpleNamespace:
     """The four passes for one scalar type (wp.float32 or wp.float64); images need W C >= lanes.
 

@@ -1,13 +1,13 @@
 """Structural similarity of two images as a differentiable torch operation (kernels/ssim.py)."""
 
-from functools import lru_cache
+from functools import cache
 
 import torch
 import warp as wp
 
 from ..kernels.ssim import RADIUS, ssim_kernels, window
 from . import threads
-from .bridge import _torch_stream
+from .bridge import torch_stream
 
 # Numbers that one step of the CPU kernels takes: one AVX-512 register of float32.
 CPU_LANES = 16
@@ -119,7 +119,7 @@ class _Runs:
         kernel = getattr(self.kernels, name)
         count = self.rows * -(-self.length // self.lanes)
         device = wp.device_from_torch(self.like.device)
-        with _torch_stream(self.like.device):
+        with torch_stream(self.like.device):
             if device.is_cpu:
                 threads.launch_ranges(kernel, threads.even_ranges(count, STEPS_PER_THREAD), arguments, device)
             else:
@@ -133,6 +133,6 @@ class _Runs:
         return wp.from_torch(runs, dtype=self.kernels.run, requires_grad=False)
 
 
-@lru_cache(maxsize=None)
+@cache
 def _weights(dtype: torch.dtype, device: torch.device) -> torch.Tensor:
     return torch.tensor(window(), dtype=dtype, device=device)

@@ -1,12 +1,13 @@
 """The SSIM kernels against a float64 convolution, finite differences and an independent scipy version."""
 
+from importlib import import_module
+
 import numpy as np
 import pytest
 import scipy.ndimage
 import torch
 import torch.nn.functional as F
 
-from sehdr_warp.splatting import ssim as module
 from sehdr_warp.splatting.ssim import ssim, ssim_map
 
 SHAPES = [(32, 48, 3), (37, 29, 3), (5, 4, 3), (1, 1, 1), (1, 40, 2), (40, 1, 3), (11, 11, 1), (16, 9, 27), (3, 2, 9)]
@@ -46,7 +47,7 @@ def relative_error(value, truth):
 def lanes(request, monkeypatch):
     """Both kernel widths on the CPU: runs of 16, and the one-number steps that a GPU takes."""
     if request.param == "single":
-        monkeypatch.setattr(module, "CPU_LANES", 1)
+        monkeypatch.setattr(import_module("sehdr_warp.splatting.ssim"), "CPU_LANES", 1)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
