@@ -1,0 +1,84 @@
+"""Quaternion, covariance and ellipse maths of the splat, written once for float32 and float64."""
+
+from functools import lru_cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from .constants import ALPHA_MAX
+
+
+def vector(length: int, dtype):
+    """The Warp vector type of `length` components of `dtype`."""
+    return wp.types.vector(length=length, dtype=dtype)
+
+
+def matrix(rows: int, columns: int, dtype):
+    """The Warp matrix type of `rows` x `columns` components of `dtype`."""
+    return wp.types.matrix(shape=(rows, columns), dtype=dtype)
+
+
+@lru_cache(maxsize=None)
+def geometry(dtype) -> SimpleNamespace:
+    """The functions below for one scalar type (wp.float32 or wp.float64)."""
+    real = dtype
+    vec3, vec4, mat33 = vector(3, dtype), vector(4, dtype), matrix(3, 3, dtype)
+
+    @wp.func
+    def rotation_from_quaternion(quaternion: vec4) -> mat33:
+        """Rotation matrix of a quaternion (w, x, y, z) of any length; zero gives the identity."""
+        largest = wp.max(wp.max(wp.abs(quaternion[0]), wp.abs(quaternion[1])), wp.max(wp.abs(quaternion[2]), wp.abs(quaternion[3])))
+        # A constant rescaling keeps the squared length inside the float range without entering the derivative.
+        rescale = wp.where(largest > real(1.0e10), real(1.0e-18), wp.where(largest < real(1.0e-10), real(1.0e18), real(1.0)))
+        q = quaternion * rescale
+        length_squared = wp.dot(q, q)
+        is_zero = length_squared < real(1.0e-30)
+        inverse_length = real(1.0) / wp.sqrt(wp.where(is_zero, real(1.0), length_squared))
+        w = wp.where(is_zero, real(1.0), q[0] * inverse_length)
+        x = q[1] * inverse_length
+        y = q[2] * inverse_length
+        z = q[3] * inverse_length
+        return mat33(
+            real(1.0) - real(2.0) * (y * y + z * z), real(2.0) * (x * y - w * z), real(2.0) * (x * z + w * y),
+            real(2.0) * (x * y + w * z), real(1.0) - real(2.0) * (x * x + z * z), real(2.0) * (y * z - w * x),
+            real(2.0) * (x * z - w * y), real(2.0) * (y * z + w * x), real(1.0) - real(2.0) * (x * x + y * y),
+        )
+
+    @wp.func
+    def ellipse_meets_rectangle(
+        x: real, y: real, a: real, b: real, c: real, level: real, left: real, top: real, width: real, height: real
+    ) -> bool:
+        """Does the ellipse a dx^2 + 2 b dx dy + c dy^2 <= level around (x, y) touch the rectangle?
+
+        The smallest value of the quadratic form over a rectangle lies on the edges nearest to the centre; both are
+        tried. The small allowance keeps rounding from dropping a pixel on the border.
+        """
+        x0 = left - x
+        x1 = x0 + width
+        y0 = top - y
+        y1 = y0 + height
+        nearest_x = wp.clamp(real(0.0), x0, x1)
+        nearest_y = wp.clamp(real(0.0), y0, y1)
+        best_y = wp.clamp(-b * nearest_x / c, y0, y1)
+        best_x = wp.clamp(-b * nearest_y / a, x0, x1)
+        along_vertical = a * nearest_x * nearest_x + real(2.0) * b * nearest_x * best_y + c * best_y * best_y
+        along_horizontal = a * best_x * best_x + real(2.0) * b * best_x * nearest_y + c * nearest_y * nearest_y
+        return wp.min(along_vertical, along_horizontal) <= level * real(1.0001) + real(1.0e-3)
+
+    @wp.func
+    def splat_exponent(a: real, b: real, c: real, dx: real, dy: real) -> real:
+        """The logarithm of a 2D Gaussian's value at offset (dx, dy); never positive, also when rounding says so."""
+        return wp.min(real(-0.5) * (a * dx * dx + c * dy * dy) - b * dx * dy, real(0.0))
+
+    return SimpleNamespace(
+        real=real,
+        vec2=vector(2, dtype),
+        vec3=vec3,
+        vec4=vec4,
+        mat33=mat33,
+        mat44=matrix(4, 4, dtype),
+        rotation_from_quaternion=rotation_from_quaternion,
+        ellipse_meets_rectangle=ellipse_meets_rectangle,
+        splat_exponent=splat_exponent,
+        alpha_max=ALPHA_MAX,
+    )

@@ -1,0 +1,138 @@
+"""Projection of 3D Gaussians to 2D Gaussians (EWA splatting, Zwicker et al. 2001, as in 3DGS, Kerbl et al. 2023).
+
+One thread takes one Gaussian to the camera, linearises the perspective at its centre and returns the centre in pixels,
+the inverse of the 2D covariance (the conic), the depth, the opacity and the half-extent of the region in which the
+Gaussian still counts. Everything but the extents is differentiable; Warp generates the adjoint.
+
+The covariance is formed as a Gram matrix, M M^T + low_pass I with M = J W R diag(scale), and its determinant as
+|m0 x m1|^2 + low_pass (|m0|^2 + |m1|^2) + low_pass^2 over M's rows (Cauchy-Binet): no term is ever subtracted, so a
+needle of any aspect ratio keeps a positive determinant.
+"""
+
+from functools import lru_cache
+
+import warp as wp
+
+from .constants import FRUSTUM_MARGIN, LOG_SCALE_MAX
+from .geometry import geometry, matrix
+
+
+@lru_cache(maxsize=None)
+def projection_kernel(dtype, antialiased: bool):
+    """The projection for one scalar type.
+
+    antialiased: the opacity is lowered by sqrt(det / det_blurred), so that the low pass keeps a Gaussian's energy
+    (Yu et al. 2024, Mip-Splatting); the factor counts as constant in the adjoint of the covariance.
+    """
+    g = geometry(dtype)
+    real, vec2, vec3, vec4, mat44 = g.real, g.vec2, g.vec3, g.vec4, g.mat44
+    mat23 = matrix(2, 3, dtype)
+
+    @wp.func
+    def compensation(determinant: real, blurred: real) -> real:
+        return wp.sqrt(wp.max(determinant / blurred, real(0.0)))
+
+    @wp.func_grad(compensation)
+    def _no_gradient(determinant: real, blurred: real, adj_ret: real):
+        pass
+
+    @wp.kernel(module="unique", module_options={"enable_backward": True})
+    def project(
+        first: int,
+        means: wp.array(dtype=vec3),
+        log_scales: wp.array(dtype=vec3),
+        quaternions: wp.array(dtype=vec4),
+        opacities: wp.array(dtype=real),
+        world_to_camera: wp.array(dtype=mat44),
+        intrinsics: wp.array(dtype=vec4),
+        width: int,
+        height: int,
+        near: real,
+        low_pass: real,
+        alpha_threshold: real,
+        means2d: wp.array(dtype=vec2),
+        conics: wp.array(dtype=vec3),
+        depths: wp.array(dtype=real),
+        opacities2d: wp.array(dtype=real),
+        extents: wp.array(dtype=vec2),
+    ):
+        i = first + wp.tid()
+        pose = world_to_camera[0]
+        lens = intrinsics[0]
+        fx = lens[0]
+        fy = lens[1]
+        rotation = g.mat33(
+            pose[0, 0], pose[0, 1], pose[0, 2],
+            pose[1, 0], pose[1, 1], pose[1, 2],
+            pose[2, 0], pose[2, 1], pose[2, 2],
+        )
+        centre = rotation * means[i] + vec3(pose[0, 3], pose[1, 3], pose[2, 3])
+        depth = centre[2]
+        in_front = depth > near
+        z = wp.where(in_front, depth, real(1.0))
+        inverse_z = real(1.0) / z
+        x_ratio = wp.where(in_front, centre[0], real(0.0)) * inverse_z
+        y_ratio = wp.where(in_front, centre[1], real(0.0)) * inverse_z
+        pixel = vec2(fx * x_ratio + lens[2], fy * y_ratio + lens[3])
+
+        # Far off the axis the linearisation explodes: hold its ray near the frustum.
+        w = real(width)
+        h = real(height)
+        margin = real(FRUSTUM_MARGIN)
+        jx = wp.clamp(x_ratio, -(lens[2] + margin * w * real(0.5)) / fx, (w - lens[2] + margin * w * real(0.5)) / fx)
+        jy = wp.clamp(y_ratio, -(lens[3] + margin * h * real(0.5)) / fy, (h - lens[3] + margin * h * real(0.5)) / fy)
+        jacobian = mat23(
+            fx * inverse_z, real(0.0), -fx * jx * inverse_z,
+            real(0.0), fy * inverse_z, -fy * jy * inverse_z,
+        )
+
+        limit = real(LOG_SCALE_MAX)
+        log_scale = log_scales[i]
+        scale_x = wp.exp(wp.clamp(log_scale[0], -limit, limit))
+        scale_y = wp.exp(wp.clamp(log_scale[1], -limit, limit))
+        scale_z = wp.exp(wp.clamp(log_scale[2], -limit, limit))
+        axes = rotation * g.rotation_from_quaternion(quaternions[i])
+        spread = jacobian * axes
+        m0 = vec3(spread[0, 0] * scale_x, spread[0, 1] * scale_y, spread[0, 2] * scale_z)
+        m1 = vec3(spread[1, 0] * scale_x, spread[1, 1] * scale_y, spread[1, 2] * scale_z)
+        variance_x = wp.dot(m0, m0) + low_pass
+        variance_y = wp.dot(m1, m1) + low_pass
+        covariance = wp.dot(m0, m1)
+        area = wp.cross(m0, m1)
+        determinant = wp.dot(area, area)
+        blurred = determinant + low_pass * (wp.dot(m0, m0) + wp.dot(m1, m1)) + low_pass * low_pass
+
+        opacity = opacities[i]
+        if wp.static(antialiased):
+            opacity = opacity * compensation(determinant, blurred)
+
+        usable = in_front and blurred > real(1.0e-12) and wp.isfinite(blurred) and opacity > alpha_threshold
+        extent_x = real(0.0)
+        extent_y = real(0.0)
+        if usable:
+            level = real(2.0) * wp.log(opacity / alpha_threshold)
+            extent_x = wp.sqrt(level * variance_x)
+            extent_y = wp.sqrt(level * variance_y)
+        # Keep only what reaches the centre of a pixel of this image.
+        usable = (
+            usable
+            and pixel[0] + extent_x > real(0.0)
+            and pixel[0] - extent_x < w
+            and pixel[1] + extent_y > real(0.0)
+            and pixel[1] - extent_y < h
+        )
+        if usable:
+            inverse = real(1.0) / blurred
+            means2d[i] = pixel
+            conics[i] = vec3(variance_y * inverse, -covariance * inverse, variance_x * inverse)
+            depths[i] = depth
+            opacities2d[i] = opacity
+            extents[i] = vec2(extent_x, extent_y)
+        else:
+            means2d[i] = vec2(real(0.0), real(0.0))
+            conics[i] = vec3(real(1.0), real(0.0), real(1.0))
+            depths[i] = real(0.0)
+            opacities2d[i] = real(0.0)
+            extents[i] = vec2(real(0.0), real(0.0))
+
+    return project

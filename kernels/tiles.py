@@ -1,0 +1,128 @@
+"""Which Gaussian touches which tile, front to back.
+
+Gaussians come in depth order. `count_tiles` counts the tiles that each one's ellipse really touches (not its bounding
+box), a prefix sum over the counts gives every Gaussian its range of entries, and `emit_entries` fills them. A stable
+sort of the entries by tile then leaves each tile's list in depth order, because the entries were emitted in it.
+`mark_ranges` finds where each tile's list begins and ends.
+"""
+
+from functools import lru_cache
+
+import warp as wp
+
+from .constants import TILE_SIZE
+from .geometry import geometry
+
+
+@lru_cache(maxsize=None)
+def tile_kernels(dtype):
+    """(pack_records, count_tiles, emit_entries) for one scalar type."""
+    g = geometry(dtype)
+    real, vec2, vec3, vec4 = g.real, g.vec2, g.vec3, g.vec4
+    size = float(TILE_SIZE)
+    options = {"enable_backward": False}
+
+    @wp.func
+    def tile_span(centre: real, extent: real, tiles: int) -> wp.vec2i:
+        first = wp.clamp(int(wp.floor((centre - extent) / real(size))), 0, tiles)
+        last = wp.clamp(int(wp.floor((centre + extent) / real(size))) + 1, 0, tiles)
+        return wp.vec2i(first, last)
+
+    @wp.func
+    def tile_is_touched(shape: vec4, conic: vec4, column: int, row: int) -> bool:
+        return g.ellipse_meets_rectangle(
+            shape[0], shape[1], conic[0], conic[1], conic[2], conic[3],
+            real(column) * real(size) + real(0.5), real(row) * real(size) + real(0.5),
+            real(wp.static(size - 1.0)), real(wp.static(size - 1.0)),
+        )
+
+    @wp.kernel(module="unique", module_options=options)
+    def pack_records(
+        means2d: wp.array(dtype=vec2),
+        conics: wp.array(dtype=vec3),
+        opacities: wp.array(dtype=real),
+        extents: wp.array(dtype=vec2),
+        alpha_threshold: real,
+        shapes: wp.array(dtype=vec4),
+        ellipses: wp.array(dtype=vec4),
+    ):
+        """shapes: (x, y, opacity, half-height); ellipses: (conic a, b, c, level at which alpha meets the threshold)."""
+        i = wp.tid()
+        mean = means2d[i]
+        conic = conics[i]
+        opacity = opacities[i]
+        extent = extents[i]
+        level = real(-1.0)
+        if extent[0] > real(0.0):
+            level = real(2.0) * wp.log(wp.max(opacity / alpha_threshold, real(1.0)))
+        shapes[i] = vec4(mean[0], mean[1], opacity, extent[1])
+        ellipses[i] = vec4(conic[0], conic[1], conic[2], level)
+
+    @wp.kernel(module="unique", module_options=options)
+    def count_tiles(
+        order: wp.array(dtype=wp.int32),
+        shapes: wp.array(dtype=vec4),
+        ellipses: wp.array(dtype=vec4),
+        extents: wp.array(dtype=vec2),
+        columns: int,
+        rows: int,
+        counts: wp.array(dtype=wp.int32),
+    ):
+        place = wp.tid()
+        i = order[place]
+        extent = extents[i]
+        touched = int(0)
+        if extent[0] > real(0.0):
+            shape = shapes[i]
+            ellipse = ellipses[i]
+            across = tile_span(shape[0], extent[0], columns)
+            down = tile_span(shape[1], extent[1], rows)
+            for row in range(down[0], down[1]):
+                for column in range(across[0], across[1]):
+                    if tile_is_touched(shape, ellipse, column, row):
+                        touched += 1
+        counts[place] = touched
+
+    @wp.kernel(module="unique", module_options=options)
+    def emit_entries(
+        order: wp.array(dtype=wp.int32),
+        shapes: wp.array(dtype=vec4),
+        ellipses: wp.array(dtype=vec4),
+        extents: wp.array(dtype=vec2),
+        columns: int,
+        rows: int,
+        ends: wp.array(dtype=wp.int32),
+        tiles: wp.array(dtype=wp.int32),
+        gaussians: wp.array(dtype=wp.int32),
+    ):
+        """ends: the running sum of the counts, so that Gaussian `place` fills the entries before ends[place]."""
+        place = wp.tid()
+        i = order[place]
+        extent = extents[i]
+        entry = int(0)
+        if place > 0:
+            entry = ends[place - 1]
+        if extent[0] > real(0.0) and ends[place] > entry:
+            shape = shapes[i]
+            ellipse = ellipses[i]
+            across = tile_span(shape[0], extent[0], columns)
+            down = tile_span(shape[1], extent[1], rows)
+            for row in range(down[0], down[1]):
+                for column in range(across[0], across[1]):
+                    if tile_is_touched(shape, ellipse, column, row):
+                        tiles[entry] = row * columns + column
+                        gaussians[entry] = i
+                        entry += 1
+
+    return pack_records, count_tiles, emit_entries
+
+
+@wp.kernel(module="unique", module_options={"enable_backward": False})
+def mark_ranges(tiles: wp.array(dtype=wp.int32), entry_count: int, ranges: wp.array(dtype=wp.vec2i)):
+    """ranges[t] = (first, one past the last) entry of tile t in the sorted list; untouched tiles keep what they had."""
+    entry = wp.tid()
+    tile = tiles[entry]
+    if entry == 0 or tiles[entry - 1] != tile:
+        ranges[tile][0] = entry
+    if entry == entry_count - 1 or tiles[entry + 1] != tile:
+        ranges[tile][1] = entry + 1

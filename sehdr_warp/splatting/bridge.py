@@ -1,0 +1,201 @@
+"""Warp programs as differentiable torch operations: the one place where tapes meet autograd.
+
+A *program* is a function that reads torch tensors as Warp arrays, launches kernels on a tape and returns the arrays
+it wrote. `@differentiable` turns it into a torch operation: data is shared, never copied; launches go to torch's
+current stream; the tape is replayed when torch asks for gradients, and not recorded when nobody will.
+
+    @wp.kernel
+    def scale(values: wp.array(dtype=wp.vec3), gain: float, scaled: wp.array(dtype=wp.vec3)):
+        i = wp.tid()
+        scaled[i] = gain * values[i]
+
+    @differentiable
+    def scaled(program, values, *, gain):
+        result = program.write(values.shape, wp.vec3)
+        program.launch(scale, len(values), [program.read(values, wp.vec3), gain], [result])
+        return result
+
+    loss = scaled(radiance, gain=2.0).sum()     # radiance: [N, 3] torch tensor
+    loss.backward()
+
+Positional arguments are tensors and take part in autograd; keyword arguments are passed on as they are.
+"""
+
+from contextlib import nullcontext
+from functools import wraps
+
+import torch
+import warp as wp
+
+from . import threads
+
+# The start-up banner, and the warning where there is no GPU, are not for a library to print.
+wp.config.log_level = wp.LOG_ERROR
+wp.init()
+wp.config.log_level = wp.LOG_WARNING
+
+
+class Program:
+    """What a program sees while it runs: arrays over torch memory, and a tape that takes its launches."""
+
+    def __init__(self, device: torch.device, recording: bool):
+        self.device = wp.device_from_torch(device)
+        self.torch_device = device
+        self.tape = wp.Tape() if recording else None
+        self.inputs: list[tuple[torch.Tensor, wp.array]] = []
+        self.outputs: dict[int, tuple[torch.Tensor, wp.array, bool]] = {}
+
+    @property
+    def is_cpu(self) -> bool:
+        return self.device.is_cpu
+
+    @property
+    def recording(self) -> bool:
+        return self.tape is not None
+
+    def read(self, tensor: torch.Tensor, dtype=None) -> wp.array:
+        """The tensor's memory as a Warp array; a vector or matrix dtype takes up the last one or two dimensions."""
+        array = _array(tensor, dtype)
+        self.inputs.append((tensor, array))
+        return array
+
+    def write(self, shape, dtype, *, zero: bool = False, differentiable: bool = True) -> wp.array:
+        """A new array over torch memory. `shape` is the tensor's, with the components of a vector dtype last."""
+        make = torch.zeros if zero else torch.empty
+        tensor = make(tuple(shape), dtype=_scalar(dtype), device=self.torch_device)
+        array = _array(tensor, dtype)
+        self.outputs[id(array)] = (tensor, array, differentiable)
+        return array
+
+    def tensor(self, array: wp.array) -> torch.Tensor:
+        """The torch tensor behind an array made by write()."""
+        return self.outputs[id(array)][0]
+
+    def launch(self, kernel, dim, inputs, outputs=(), *, block_dim: int = 256, recorded: bool = True) -> None:
+        """Launch a kernel; its generated adjoint runs in the backward pass unless recorded is False."""
+        with self.tape if recorded and self.tape is not None else nullcontext():
+            wp.launch(kernel, dim=dim, inputs=list(inputs), outputs=list(outputs), device=self.device, block_dim=block_dim)
+
+    def launch_ranges(self, kernel, count: int, inputs, outputs) -> None:
+        """Launch `kernel(first, *inputs, *outputs)` for `count` items; on the CPU spread over threads, adjoint too.
+
+        The kernel adds the argument `first` to its thread index and writes only what belongs to that item; an input
+        that several items share must not ask for a gradient here when threads run side by side, so the adjoint of
+        such a launch is left to one thread.
+        """
+        if not self.is_cpu:
+            self.launch(kernel, count, [0, *inputs], outputs)
+            return
+        arguments = [*inputs, *outputs]
+        threads.launch_ranges(kernel, threads.even_ranges(count), arguments, self.device)
+        if self.tape is None:
+            return
+
+        def adjoint():
+            gradients = [self.tape.get_adjoint(argument) for argument in arguments]
+            shared = any(
+                isinstance(argument, wp.array) and argument.grad is not None and argument.shape[0] != count
+                for argument in inputs
+            )
+            ranges = [(0, count)] if shared or count == 0 else threads.even_ranges(count)
+
+            def launch(bounds):
+                wp.launch(
+                    kernel,
+                    dim=bounds[1] - bounds[0],
+                    inputs=[bounds[0], *inputs],
+                    outputs=list(outputs),
+                    adj_inputs=[None, *gradients[: len(inputs)]],
+                    adj_outputs=gradients[len(inputs) :],
+                    adjoint=True,
+                    device=self.device,
+                    record_tape=False,
+                )
+
+            threads.run_parallel(launch, ranges)
+
+        self.tape.record_func(adjoint, arrays=[])
+
+    def record_adjoint(self, adjoint) -> None:
+        """Put a hand-written adjoint on the tape: it reads .grad of what was written, adds to .grad of what was read.
+
+        .grad of an array is None where no gradient is asked for.
+        """
+        if self.tape is not None:
+            self.tape.record_func(adjoint, arrays=[])
+
+
+def _scalar(dtype) -> torch.dtype:
+    return wp.dtype_to_torch(getattr(dtype, "_wp_scalar_type_", dtype))
+
+
+def _array(tensor: torch.Tensor, dtype=None) -> wp.array:
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+class _ProgramFunction(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, body, options, *tensors):
+        device = tensors[0].device
+        recording = any(ctx.needs_input_grad[2:])
+        program = Program(device, recording)
+        plain = tuple(tensor.detach() for tensor in tensors)
+        with torch_stream(device):
+            result = body(program, *plain, **options)
+        arrays = result if isinstance(result, tuple) else (result,)
+        outputs = tuple(program.outputs[id(array)][0] for array in arrays)
+        ctx.mark_non_differentiable(
+            *(tensor for tensor, array in zip(outputs, arrays) if not program.outputs[id(array)][2])
+        )
+        ctx.set_materialize_grads(False)
+        if recording:
+            # The tape holds the arrays, hence the memory, until torch frees this node.
+            ctx.program, ctx.arrays, ctx.plain = program, arrays, plain
+        return outputs if isinstance(result, tuple) else outputs[0]
+
+    @staticmethod
+    def backward(ctx, *gradients):
+        program = ctx.program
+        if program is None:
+            raise RuntimeError("this Warp operation was already differentiated once; run its forward pass again")
+        ctx.program = None
+        with torch_stream(program.torch_device):
+            for array, gradient in zip(ctx.arrays, gradients):
+                if not program.outputs[id(array)][2]:
+                    continue
+                tensor = program.outputs[id(array)][0]
+                gradient = torch.zeros_like(tensor) if gradient is None else gradient.contiguous()
+                array.grad = _array(gradient, array.dtype)
+                array.retain_grad = True  # the gradient is torch's: adjoint kernels must not clear it
+            results = [None] * len(ctx.plain)
+            by_memory = {}
+            for position, (tensor, needed) in enumerate(zip(ctx.plain, ctx.needs_input_grad[2:])):
+                if needed:
+                    results[position] = torch.zeros_like(tensor, memory_format=torch.contiguous_format)
+                    by_memory[id(tensor)] = results[position]
+            for tensor, array in program.inputs:
+                if id(tensor) in by_memory:
+                    array.grad = _array(by_memory[id(tensor)], array.dtype)
+            program.tape.backward()
+        return (None, None, *results)
+
+
+def torch_stream(device: torch.device):
+    """Warp launches on torch's current stream for as long as this context lasts."""
+    if device.type == "cpu":
+        return nullcontext()
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False, sync_exit=False)
+
+
+def differentiable(body):
+    """Make a torch operation of a program: body(program, *tensors, **options) -> Warp arrays made by program.write().
+
+    The operation takes the tensors positionally (on one device) and the options by keyword, returns the tensors
+    behind the arrays, and can be differentiated once with respect to every tensor that body passed to program.read().
+    """
+
+    @wraps(body)
+    def operation(*tensors, **options):
+        return _ProgramFunction.apply(body, options, *tensors)
+
+    return operation

@@ -1,0 +1,51 @@
+"""View-dependent values from spherical harmonics."""
+
+import torch
+
+from ..kernels.geometry import vector
+from ..kernels.harmonics import harmonics_kernel
+from .bridge import differentiable
+from .dtypes import warp_scalar
+
+MAX_DEGREE = 3
+
+
+def spherical_harmonics(degree: int, coefficients, means, camera_position):
+    """Evaluate spherical harmonics for the direction from the camera to each Gaussian (3DGS's basis and signs).
+
+    degree: 0 to 3, not above what the coefficients hold.
+    coefficients: [N, K, 3] with K >= (degree + 1)^2, or the pair ([N, 1, 3], [N, K - 1, 3]) of the constant term and
+        the rest, which saves joining them.
+    means: [N, 3] world coordinates; camera_position: [3].
+
+    Returns [N, 3]. Differentiable with respect to every tensor. Raises ValueError for a degree out of range.
+    """
+    constant, rest = (
+        (coefficients[:, :1], coefficients[:, 1:]) if isinstance(coefficients, torch.Tensor) else coefficients
+    )
+    if not 0 <= degree <= MAX_DEGREE:
+        raise ValueError(f"spherical harmonics degree {degree} is not in 0..{MAX_DEGREE}")
+    if rest.shape[1] < (degree + 1) ** 2 - 1:
+        raise ValueError(f"degree {degree} needs {(degree + 1) ** 2} coefficients, not {1 + rest.shape[1]}")
+    return _evaluate(
+        constant.contiguous(), rest.contiguous(), means.contiguous(), camera_position.contiguous(), degree=degree
+    )
+
+
+@differentiable
+def _evaluate(program, constant, rest, means, camera_position, *, degree):
+    scalar = warp_scalar(means.dtype)
+    vec3 = vector(3, scalar)
+    values = program.write(means.shape, vec3)
+    program.launch_ranges(
+        harmonics_kernel(scalar, degree),
+        means.shape[0],
+        [
+            program.read(constant, vec3),
+            program.read(rest, vec3),
+            program.read(means, vec3),
+            program.read(camera_position, vec3),
+        ],
+        [values],
+    )
+    return values

@@ -1,0 +1,63 @@
+"""Stage one of a render: 3D Gaussians to 2D Gaussians."""
+
+import warp as wp
+
+from ..kernels.geometry import matrix, vector
+from ..kernels.project import projection_kernel
+from .bridge import differentiable
+from .dtypes import warp_scalar
+
+
+@differentiable
+def project(
+    program,
+    means,
+    log_scales,
+    quaternions,
+    opacities,
+    world_to_camera,
+    intrinsics,
+    *,
+    width: int,
+    height: int,
+    near: float,
+    low_pass: float,
+    alpha_threshold: float,
+    antialiased: bool,
+):
+    """The 2D Gaussians of one camera.
+
+    means, log_scales [N, 3]; quaternions [N, 4] (w, x, y, z), any length; opacities [N] in [0, 1];
+    world_to_camera [4, 4]; intrinsics [4] (fx, fy, cx, cy) in pixels.
+
+    Returns means2d [N, 2] in pixels, conics [N, 3] (a, b, c of the inverse covariance), depths [N], opacities [N] and
+    extents [N, 2], the half-width and half-height in pixels within which alpha reaches alpha_threshold. A culled
+    Gaussian has extents 0. All but the extents are differentiable.
+    """
+    scalar = warp_scalar(means.dtype)
+    vec2, vec3, vec4 = vector(2, scalar), vector(3, scalar), vector(4, scalar)
+    count = means.shape[0]
+    means2d = program.write((count, 2), vec2)
+    conics = program.write((count, 3), vec3)
+    depths = program.write((count,), scalar)
+    opacities2d = program.write((count,), scalar)
+    extents = program.write((count, 2), vec2, differentiable=False)
+    program.launch_ranges(
+        projection_kernel(scalar, antialiased),
+        count,
+        [
+            program.read(means, vec3),
+            program.read(log_scales, vec3),
+            program.read(quaternions, vec4),
+            program.read(opacities, scalar),
+            program.read(world_to_camera, matrix(4, 4, scalar)),
+            program.read(intrinsics, vec4),
+            width,
+            height,
+            near,
+            low_pass,
+            alpha_threshold,
+        ],
+        [means2d, conics, depths, opacities2d, extents],
+    )
+    return means2d, conics, depths, opacities2d, extents

@@ -1,0 +1,120 @@
+"""Differentiable splatting of 3D Gaussians: project, order, bin, blend."""
+
+from dataclasses import dataclass
+
+import torch
+
+from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR
+from .blending import blend
+from .projection import project
+from .tile_lists import build_tile_lists
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """One rendered view of N Gaussians.
+
+    image: [H, W, C] blended features over zero; add (1 - alpha) * background for another background.
+    alpha: [H, W] in [0, 1], how much of each pixel the Gaussians cover.
+    means2d: [N, 2] centres in pixels; part of the graph, so means2d.retain_grad() gives densification its signal.
+    depths: [N] along the camera's axis, in scene units; 0 where culled.
+    radii: [N] the longer half-extent in pixels within which a Gaussian counts; 0 where culled.
+    entry_count: (Gaussian, tile) pairs that were blended.
+    """
+
+    image: torch.Tensor
+    alpha: torch.Tensor
+    means2d: torch.Tensor
+    depths: torch.Tensor
+    radii: torch.Tensor
+    entry_count: int
+
+    @property
+    def visible(self) -> torch.Tensor:
+        """[N] bool: not culled."""
+        return self.radii > 0
+
+
+def rasterize(
+    means: torch.Tensor,
+    log_scales: torch.Tensor,
+    quaternions: torch.Tensor,
+    opacities: torch.Tensor,
+    features: torch.Tensor,
+    world_to_camera: torch.Tensor,
+    intrinsics: torch.Tensor,
+    width: int,
+    height: int,
+    *,
+    near: float = NEAR,
+    low_pass: float = LOW_PASS,
+    alpha_threshold: float = ALPHA_THRESHOLD,
+    antialiased: bool = False,
+) -> Rendering:
+    """Splat Gaussians with any number of feature channels onto one camera's image plane (3DGS, Kerbl et al. 2023).
+
+    means: [N, 3] world coordinates.
+    log_scales: [N, 3] natural logarithm of the standard deviations along the local axes, in scene units.
+    quaternions: [N, 4] (w, x, y, z), of any length.
+    opacities: [N] in [0, 1].
+    features: [N, C], any C >= 1 and any finite range; several colour sets go side by side in one pass.
+    world_to_camera: [4, 4], OpenCV convention. intrinsics: [4] fx, fy, cx, cy in pixels. width, height: in pixels.
+    near: points nearer to the camera plane are culled. low_pass: variance in square pixels added to each splat.
+    alpha_threshold: contributions below it are left out, in (0, 1).
+    antialiased: keep a Gaussian's energy under the low pass by lowering its opacity.
+
+    All tensors share one device (CPU or CUDA) and one dtype (float32 or float64). Differentiable with respect to
+    every tensor, camera included. On the CPU results repeat bit for bit, whatever the number of threads.
+    Raises ValueError for shapes, dtypes, devices or values that do not fit.
+    """
+    _check(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics, width, height)
+    if not 0.0 < alpha_threshold < 1.0:
+        raise ValueError(f"alpha_threshold {alpha_threshold} is not between 0 and 1")
+    tensors = (means, log_scales, quaternions, opacities, world_to_camera, intrinsics)
+    means2d, conics, depths, opacities2d, extents = project(
+        *(tensor.contiguous() for tensor in tensors),
+        width=width,
+        height=height,
+        near=near,
+        low_pass=low_pass,
+        alpha_threshold=alpha_threshold,
+        antialiased=antialiased,
+    )
+    lists = build_tile_lists(
+        *(tensor.detach() for tensor in (means2d, conics, depths, opacities2d, extents)), width, height, alpha_threshold
+    )
+    image, alpha = blend(
+        means2d,
+        conics,
+        opacities2d,
+        features.contiguous(),
+        lists=lists,
+        width=width,
+        height=height,
+        alpha_threshold=alpha_threshold,
+    )
+    return Rendering(image, alpha, means2d, depths, extents.amax(dim=1), lists.entry_count)
+
+
+def _check(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics, width, height) -> None:
+    count = means.shape[0]
+    shapes = {
+        "means": (means, (count, 3)),
+        "log_scales": (log_scales, (count, 3)),
+        "quaternions": (quaternions, (count, 4)),
+        "opacities": (opacities, (count,)),
+        "world_to_camera": (world_to_camera, (4, 4)),
+        "intrinsics": (intrinsics, (4,)),
+    }
+    for name, (tensor, shape) in shapes.items():
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {shape}")
+    if features.ndim != 2 or features.shape[0] != count or features.shape[1] < 1:
+        raise ValueError(f"features has shape {tuple(features.shape)}, expected ({count}, C) with C >= 1")
+    for name, (tensor, _) in {**shapes, "features": (features, None)}.items():
+        if tensor.dtype != means.dtype or tensor.device != means.device:
+            raise ValueError(
+                f"{name} is {tensor.dtype} on {tensor.device}, but means is {means.dtype} on {means.device}"
+            )
+    if width < 1 or height < 1:
+        raise ValueError(f"image size {width} x {height} is not positive")

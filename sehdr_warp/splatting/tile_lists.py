@@ -1,0 +1,179 @@
+"""The middle stages of a render: depth order, and for each tile the list of Gaussians that touch it, front to back."""
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+
+from ..errors import SehdrError
+from ..kernels.constants import TILE_SIZE
+from ..kernels.geometry import vector
+from ..kernels.tiles import mark_ranges, tile_kernels
+from .bridge import torch_stream
+from .dtypes import warp_scalar
+
+_LARGEST_INT32 = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """Who is drawn where, in which order. All tensors on the render's device, all indices int32.
+
+    order: [N] Gaussians by depth, nearest first (ties by index; culled ones last).
+    ends: [N] running number of entries, by place in `order`.
+    ranges: [tiles, 2] first and one past the last entry of each tile.
+    gaussians: [M] the Gaussian of each entry, by tile and then front to back.
+    emission: [M] the entry's position before the sort by tile: entries of one Gaussian are neighbours there.
+    shapes: [N, 4] x, y, opacity, half-height; ellipses: [N, 4] conic a, b, c and the level where alpha meets the
+        threshold.
+    columns, rows: tiles across and down.
+    """
+
+    order: torch.Tensor
+    ends: torch.Tensor
+    ranges: torch.Tensor
+    gaussians: torch.Tensor
+    emission: torch.Tensor
+    shapes: torch.Tensor
+    ellipses: torch.Tensor
+    columns: int
+    rows: int
+
+    @property
+    def entry_count(self) -> int:
+        """How many (Gaussian, tile) pairs there are."""
+        return self.gaussians.shape[0]
+
+
+@torch.no_grad()
+def build_tile_lists(
+    means2d, conics, depths, opacities, extents, width: int, height: int, alpha_threshold: float
+) -> TileLists:
+    """Order the projected Gaussians by depth and list, for each tile, those whose ellipse touches it.
+
+    The arguments are project()'s results; nothing here is differentiable.
+    Raises SehdrError if the lists would need more than 2^31 - 1 entries.
+    """
+    columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
+    shapes, ellipses = pack_records(means2d, conics, opacities, extents, alpha_threshold)
+    order = depth_order(depths, extents)
+    ends, entry_count = count_entries(order, shapes, ellipses, extents, columns, rows)
+    tiles, gaussians = emit_entries(order, shapes, ellipses, extents, columns, rows, ends, entry_count)
+    tiles, emission = sort_by_tile(tiles, entry_count, columns * rows)
+    ranges = find_ranges(tiles, columns * rows)
+    gaussians = gaussians[emission] if entry_count else gaussians
+    return TileLists(order, ends, ranges, gaussians, emission, shapes, ellipses, columns, rows)
+
+
+def pack_records(means2d, conics, opacities, extents, alpha_threshold: float):
+    """[N] records of four numbers each: see TileLists.shapes and TileLists.ellipses."""
+    scalar = warp_scalar(means2d.dtype)
+    vec2, vec3, vec4 = (vector(n, scalar) for n in (2, 3, 4))
+    count = means2d.shape[0]
+    shapes, ellipses = means2d.new_empty(count, 4), means2d.new_empty(count, 4)
+    _launch(
+        tile_kernels(scalar)[0],
+        count,
+        [
+            _read(means2d, vec2),
+            _read(conics, vec3),
+            _read(opacities),
+            _read(extents, vec2),
+            alpha_threshold,
+            _read(shapes, vec4),
+            _read(ellipses, vec4),
+        ],
+        means2d.device,
+    )
+    return shapes, ellipses
+
+
+def depth_order(depths, extents):
+    """[N] int32: Gaussians nearest first, culled ones last; equal depths keep the order of their indices."""
+    count = depths.shape[0]
+    keys = depths.new_empty(2 * count)
+    keys[:count] = torch.where(extents[:, 0] > 0, depths, torch.inf)
+    return _sorted_places(keys, count)
+
+
+def count_entries(order, shapes, ellipses, extents, columns: int, rows: int):
+    """The running number of tiles touched, by place in `order`, [N] int32, and the total."""
+    counts = torch.empty_like(order)
+    vec2, vec4 = vector(2, warp_scalar(shapes.dtype)), vector(4, warp_scalar(shapes.dtype))
+    _launch(
+        tile_kernels(warp_scalar(shapes.dtype))[1],
+        order.shape[0],
+        [_read(order), _read(shapes, vec4), _read(ellipses, vec4), _read(extents, vec2), columns, rows, _read(counts)],
+        order.device,
+    )
+    total = int(counts.sum(dtype=torch.int64)) if order.shape[0] else 0
+    if total > _LARGEST_INT32:
+        raise SehdrError(
+            f"{order.shape[0]} Gaussians touch {total} tiles of a {columns} x {rows} tile image, more than 2^31 - 1; "
+            "render fewer Gaussians or a smaller image"
+        )
+    return counts.cumsum(0, dtype=torch.int32), total
+
+
+def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends, entry_count: int):
+    """One entry for each tile that each Gaussian touches, front to back: tiles [M] and Gaussians [M]."""
+    tiles = torch.empty(2 * entry_count, dtype=torch.int32, device=order.device)  # room for the sort
+    gaussians = torch.empty(entry_count, dtype=torch.int32, device=order.device)
+    vec2, vec4 = vector(2, warp_scalar(shapes.dtype)), vector(4, warp_scalar(shapes.dtype))
+    if entry_count:
+        _launch(
+            tile_kernels(warp_scalar(shapes.dtype))[2],
+            order.shape[0],
+            [
+                _read(order),
+                _read(shapes, vec4),
+                _read(ellipses, vec4),
+                _read(extents, vec2),
+                columns,
+                rows,
+                _read(ends),
+                _read(tiles),
+                _read(gaussians),
+            ],
+            order.device,
+        )
+    return tiles, gaussians
+
+
+def sort_by_tile(tiles, entry_count: int, tile_count: int):
+    """Stable sort of the entries by tile: sorted tiles [M], and where each entry stood before [M]."""
+    emission = _sorted_places(tiles, entry_count, bits=max(1, (tile_count - 1).bit_length()))
+    return tiles[:entry_count], emission
+
+
+def find_ranges(tiles, tile_count: int):
+    """[tiles, 2] int32: first and one past the last entry of each tile, (0, 0) for an untouched one."""
+    ranges = torch.zeros(tile_count, 2, dtype=torch.int32, device=tiles.device)
+    if tiles.shape[0]:
+        _launch(mark_ranges, tiles.shape[0], [_read(tiles), tiles.shape[0], _read(ranges, wp.vec2i)], tiles.device)
+    return ranges
+
+
+def _sorted_places(keys, count: int, bits: int | None = None):
+    """[count] int32 permutation that sorts keys[:count] (stable). keys has room for 2 count and is sorted in place."""
+    places = torch.empty(2 * count, dtype=torch.int32, device=keys.device)
+    torch.arange(count, dtype=torch.int32, device=keys.device, out=places[:count])
+    if count:
+        with torch_stream(keys.device):
+            wp.utils.radix_sort_pairs(_read(keys), _read(places), count, end_bit=bits)
+    return places[:count]
+
+
+def _read(tensor, dtype=None):
+    return wp.from_torch(tensor, dtype=dtype, requires_grad=False)
+
+
+def _launch(kernel, count: int, arguments, device) -> None:
+    with torch_stream(device):
+        wp.launch(kernel, dim=count, inputs=arguments, device=wp.device_from_torch(device), record_tape=False)
+
+
+
+
+
+
