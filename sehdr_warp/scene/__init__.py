@@ -1,6 +1,8 @@
 """What was photographed: cameras, views, scenes, and the readers that load them. Imports neither torch nor warp."""
 
 from .camera import Camera
+from .camera_path import load_cameras
+from .load import load_scene
 from .types import Scene, View
 
-__all__ = ["Camera", "Scene", "View"]
+__all__ = ["Camera", "Scene", "View", "load_cameras", "load_scene"]

@@ -36,7 +36,8 @@ class View:
 class Scene:
     """A set of posed views and the sparse points seen in them.
 
-    format: the layout that was read ("colmap", "transforms", "hdr-nerf", "hdr-nerf-real", "hdr-gs", "photos").
+    format: the layout that was read ("colmap", "transforms", "hdr-nerf", "hdr-nerf-real", "hdr-gs", "llff",
+        "photos").
     points: [P, 3] float64 world coordinates, P may be 0.
     point_colors: [P, 3] float32 in [0, 1], encoded like the images.
     exposure_times_known: False where no file stated them (then each view's is 1 second).

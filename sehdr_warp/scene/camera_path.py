@@ -1,0 +1,89 @@
+"""Cameras to render from, as JSON."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from sehdr_warp.errors import InputError
+
+from .camera import Camera
+from .capture import pose_from_camera_to_world
+from .names import natural_key
+from .paths import read_json
+from .read_transforms import frame_lens, frame_pose, frames_of
+
+_MAX_SIDE = 1 << 16
+
+
+def load_cameras(path: Path | str, *, size: tuple[int, int] | None = None) -> list[tuple[str, Camera]]:
+    """Named cameras from a JSON file, in its order, without distortion.
+
+    Accepted: {"cameras": [{"name": ..., **Camera.to_dict()}, ...]} (each entry may also keep its values under
+    "camera"), nerfstudio's camera_path.json, and transforms.json. size: (width, height) for files that state none.
+    Raises InputError where the file is damaged, a pose or size cannot be, or two cameras share a name.
+    """
+    path = Path(path)
+    values = read_json(path)
+    if isinstance(values.get("cameras"), list):
+        cameras = [_own(entry, i, path) for i, entry in enumerate(values["cameras"])]
+    elif isinstance(values.get("camera_path"), list):
+        cameras = [_nerfstudio(entry, i, values, path) for i, entry in enumerate(values["camera_path"])]
+    elif "frames" in values:
+        if size is not None:
+            values = {"w": size[0], "h": size[1], **values}
+        cameras = [
+            (Path(name).stem, frame_lens(values, frame, None, path).pinhole(frame_pose(frame, path, name)))
+            for name, frame in frames_of(values, path)
+        ]
+    else:
+        raise InputError(
+            path, "has none of cameras, camera_path and frames", "export cameras as described in the manual"
+        )
+    if not cameras:
+        raise InputError(path, "lists no cameras", "add at least one")
+    names = [name.lower() for name, _ in cameras]
+    if len(set(names)) < len(names):
+        twice = min((name for name in names if names.count(name) > 1), key=natural_key)
+        raise InputError(path, f"camera name {twice!r} is used twice", "give every camera its own name")
+    return cameras
+
+
+def _own(entry, index: int, path: Path) -> tuple[str, Camera]:
+    try:
+        name = str(entry.get("name", f"{index:04d}"))
+        camera = Camera.from_dict(entry.get("camera", entry))
+    except KeyError as error:
+        raise InputError(path, f"camera {index} has no {error.args[0]}", "add the field") from None
+    except (ValueError, TypeError, AttributeError, OverflowError) as error:
+        raise InputError(path, f"camera {index} cannot be used ({str(error)[:120]})", "correct the camera") from None
+    if not name or any(letter in name for letter in "/\\\0") or name in (".", "..") or len(name) > 200:
+        raise InputError(path, f"camera name {name!r:.60} cannot name a file", "use letters, digits, '_' and '-'")
+    _check_size(camera.width, camera.height, index, path)
+    return name, camera
+
+
+def _nerfstudio(entry, index: int, values: dict, path: Path) -> tuple[str, Camera]:
+    """An entry of camera_path.json: camera_to_world (OpenGL axes, 16 numbers by rows) and fov (vertical, degrees)."""
+    try:
+        width, height = int(values["render_width"]), int(values["render_height"])
+        matrix = np.array(entry["camera_to_world"], dtype=np.float64).reshape(4, 4)
+        fov = float(entry["fov"])
+    except KeyError as error:
+        raise InputError(path, f"camera {index}: {error.args[0]} is missing", "export the camera path again") from None
+    except (ValueError, TypeError, OverflowError) as error:
+        raise InputError(
+            path, f"camera {index} cannot be used ({str(error)[:120]})", "export the camera path again"
+        ) from None
+    if not 0 < fov < 180:
+        raise InputError(path, f"camera {index} has fov {fov}", "use degrees between 0 and 180")
+    _check_size(width, height, index, path)
+    matrix[:3, 1:3] *= -1
+    pose = pose_from_camera_to_world(matrix, path, f"camera {index}")
+    focal = 0.5 * height / math.tan(math.radians(fov) / 2)
+    return f"{index:04d}", Camera(width, height, focal, focal, width / 2, height / 2, pose)
+
+
+def _check_size(width: int, height: int, index: int, path: Path) -> None:
+    if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE):
+        raise InputError(path, f"camera {index} is {width} x {height} pixels", f"use sizes of 1 to {_MAX_SIDE}")

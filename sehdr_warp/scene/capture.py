@@ -1,0 +1,101 @@
+"""What a reader finds in a data folder, before any pixel is decoded."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from sehdr_warp.errors import InputError
+
+from .lens import Lens
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One photo of one view.
+
+    view: the key that photos of one view at several exposures share; becomes the view's name.
+    image: the LDR file.
+    lens, world_to_camera: the camera; [4, 4] float64, rigid.
+    exposure_key: the exposure's number where a view has several (the k of `<view>_<k>.png`); None otherwise.
+    exposure_time: seconds from the set's own files; None lets EXIF speak.
+    split: "train" or "test" where the set says so.
+    mask, hdr: files, where there are any.
+    oriented: the lens speaks of the pixels after EXIF orientation; None finds out from the sizes.
+    """
+
+    view: str
+    image: Path
+    lens: Lens
+    world_to_camera: np.ndarray
+    exposure_key: int | None = None
+    exposure_time: float | None = None
+    split: str | None = None
+    mask: Path | None = None
+    hdr: Path | None = None
+    oriented: bool | None = None
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A data folder as read.
+
+    format: as Scene.format.
+    alpha: what transparency means: "background" (nothing there: composite over black light) or "mask" (not observed).
+    holdout: the layout's own habit where no split is stated: every so many views is a test view, from offset on;
+        None takes the caller's.
+    points: [P, 3] float64; point_colors: [P, 3] float32 in [0, 1].
+    """
+
+    format: str
+    shots: tuple[Shot, ...]
+    alpha: str = "mask"
+    holdout: tuple[int, int] | None = None
+    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    point_colors: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    notes: tuple[str, ...] = ()
+
+
+def pose_from_quaternion(quaternion, translation, source: Path, name: str) -> np.ndarray:
+    """[4, 4] world_to_camera from COLMAP's (w, x, y, z) and t; InputError where not finite or zero."""
+    quaternion, translation = np.asarray(quaternion, np.float64), np.asarray(translation, np.float64)
+    if not (np.isfinite(quaternion).all() and np.isfinite(translation).all()):
+        raise InputError(source, f"pose of {name!r:.90} is not finite", "remove the image or export the model again")
+    length = np.linalg.norm(quaternion)
+    if not 1e-8 < length < 1e8:
+        raise InputError(source, f"quaternion of {name!r:.90} has length {length:g}", "export the model again")
+    w, x, y, z = quaternion / length
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    pose[:3, 3] = translation
+    return pose
+
+
+def pose_from_camera_to_world(matrix, source: Path, name: str) -> np.ndarray:
+    """[4, 4] world_to_camera from a 3 x 4 or 4 x 4 camera-to-world matrix in OpenCV axes.
+
+    The rotation is replaced by the nearest proper one where it is off by rounding (up to 1e-3); InputError for a
+    matrix of another shape, values that are not finite, scale, shear or reflection.
+    """
+    remedy = "export the poses again without scale"
+    try:
+        matrix = np.array(matrix, dtype=np.float64)
+    except (ValueError, TypeError):
+        raise InputError(source, f"pose of {name!r:.90} is not a matrix of numbers", remedy) from None
+    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
+        raise InputError(source, f"pose of {name!r:.90} is not a finite 4 x 4 matrix", remedy)
+    u, stretch, vt = np.linalg.svd(matrix[:3, :3])
+    rotation = u @ vt
+    if np.abs(stretch - 1).max() > 1e-3 or np.linalg.det(rotation) < 0:
+        raise InputError(source, f"pose of {name!r:.90} is not a rotation (its stretch is {np.round(stretch, 4).tolist()})",
+                         remedy)  # fmt: skip
+    if not np.abs(matrix[:3, 3]).max() < 1e12:
+        raise InputError(source, f"position of {name!r:.90} is {matrix[:3, 3].tolist()}", "check the units")
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.T
+    pose[:3, 3] = -rotation.T @ matrix[:3, 3]
+    return pose

@@ -1,0 +1,130 @@
+"""From shots to views: decode, orient, undistort and scale, every average taken over light."""
+
+from pathlib import Path
+
+import numpy as np
+
+from sehdr_warp.errors import InputError
+
+from .camera import Camera
+from .capture import Shot
+from .images import image_sizes, read_hdr, read_ldr, read_mask
+from .lens import Lens, Undistortion
+from .resample import Curve, area_average, light_table, limited_size, restore_clipping
+from .types import View
+
+
+class Developer:
+    """Makes views of shots under one choice of size and response.
+
+    max_size: longest side in pixels, None keeps each photo's.
+    decode, encode: encoded [0, 1] -> linear exposure, and back.
+    alpha: "background" (transparent pixels show black) or "mask" (they were not observed).
+    """
+
+    def __init__(self, max_size: int | None, decode: Curve, encode: Curve, alpha: str):
+        self.max_size, self.decode, self.encode, self.alpha = max_size, decode, encode, alpha
+        self._tables: dict[int, np.ndarray] = {}
+        self._last: tuple[Lens, Undistortion] | None = None
+
+    def view(self, shot: Shot, name: str) -> View:
+        """The shot's view; raises InputError where a file is damaged or its size disagrees with the camera's."""
+        lens, oriented = _fitted_lens(shot)
+        undistortion = None if lens.is_pinhole else self._undistortion(lens)
+        full = lens.pinhole(shot.world_to_camera) if undistortion is None else undistortion.camera(shot.world_to_camera)
+        camera = full.resized(*limited_size(full.width, full.height, self.max_size))
+
+        encoded = read_ldr(shot.image, oriented=oriented)
+        pixels, alpha = encoded.pixels, encoded.alpha
+        masks = (
+            []
+            if undistortion is None or undistortion.outside is None
+            else [self._shrink(~undistortion.outside, camera)]
+        )
+        if shot.mask is not None:
+            masks.append(self._geometry(_fitted_mask(shot.mask, lens, oriented), undistortion, camera))
+        if alpha is not None and self.alpha == "mask":
+            masks.append(self._geometry(alpha, undistortion, camera))
+            alpha = None
+        if undistortion is None and alpha is None and (camera.width, camera.height) == (lens.width, lens.height):
+            image = pixels.astype(np.float32) / np.float32(encoded.levels)
+        else:
+            image = self._resampled(pixels, encoded.levels, alpha, undistortion, camera)
+        mask = None
+        if masks:
+            mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32)
+            mask = None if mask.min() >= 1 - 1e-6 else mask
+        hdr = None if shot.hdr is None else self._truth(shot.hdr, lens, undistortion, camera)
+        return View(name, image, camera, shot.exposure_time, shot.split, mask, hdr, Path(shot.image))
+
+    def _undistortion(self, lens: Lens) -> Undistortion:
+        # Sets mostly share one lens; its map is as large as an image, so only the last one is kept.
+        if self._last is None or self._last[0] != lens:
+            self._last = lens, Undistortion(lens)
+        return self._last[1]
+
+    def _resampled(self, pixels, levels: int, alpha, undistortion, camera: Camera) -> np.ndarray:
+        if levels not in self._tables:
+            self._tables[levels] = light_table(levels, self.decode)
+        light = self._tables[levels][pixels]
+        clipped = (pixels == levels).astype(np.float32)
+        if alpha is not None:
+            light, clipped = light * alpha[:, :, None], clipped * alpha[:, :, None]
+        image = np.asarray(self.encode(self._geometry(light, undistortion, camera)), dtype=np.float32)
+        return restore_clipping(np.clip(image, 0.0, 1.0), self._geometry(clipped, undistortion, camera))
+
+    def _geometry(self, image: np.ndarray, undistortion: Undistortion | None, camera: Camera) -> np.ndarray:
+        image = image.astype(np.float32, copy=False)
+        return self._shrink(image if undistortion is None else undistortion.apply(image), camera)
+
+    def _shrink(self, image: np.ndarray, camera: Camera) -> np.ndarray:
+        return area_average(image.astype(np.float32, copy=False), camera.width, camera.height)
+
+    def _truth(self, path: Path, lens: Lens, undistortion: Undistortion | None, camera: Camera) -> np.ndarray:
+        width, height = image_sizes(path)[0]
+        same = (width, height) == (lens.width, lens.height)
+        # Truth may be rendered larger than the photos (HDR-NeRF's evaluation averages it down); never smaller.
+        larger = width >= camera.width and height >= camera.height and abs(width * lens.height - height * lens.width) <= max(
+            width, height
+        )  # fmt: skip
+        if not (same or (larger and undistortion is None)):
+            raise InputError(path, f"HDR truth is {width} x {height}, the photo {lens.width} x {lens.height}",
+                             "render the truth at the photo's size, or remove it")  # fmt: skip
+        return self._geometry(read_hdr(path), undistortion if same else None, camera)
+
+
+def _fitted_lens(shot: Shot) -> tuple[Lens, bool]:
+    """The lens at the file's size, and whether the pixels are to be turned as EXIF says.
+
+    COLMAP ignores the EXIF orientation, other tools follow it: the size that agrees with the camera's tells which,
+    and stored pixels win where both do. Whole-number reductions of the camera's size (images_2 ...) are taken.
+    """
+    lens = shot.lens
+    stored, turned = image_sizes(shot.image)
+    choices = {None: ((stored, False), (turned, True)), True: ((turned, True),), False: ((stored, False),)}[
+        shot.oriented
+    ]
+    for (width, height), oriented in choices:
+        if (width, height) == (lens.width, lens.height):
+            return lens, oriented
+    for (width, height), oriented in choices:
+        for factor in range(2, 17):
+            if abs(lens.width / factor - width) < 1 and abs(lens.height / factor - height) < 1:
+                return lens.resized(width, height), oriented
+    raise InputError(shot.image, f"image is {stored[0]} x {stored[1]}, its camera {lens.width} x {lens.height}",
+                     "use the images that the cameras were solved for")  # fmt: skip
+
+
+def _fitted_mask(path: Path, lens: Lens, oriented: bool) -> np.ndarray:
+    mask = read_mask(path, oriented=oriented)
+    height, width = mask.shape
+    if (width, height) == (lens.width, lens.height):
+        return mask
+    if (
+        width > lens.width
+        and height > lens.height
+        and abs(width * lens.height - height * lens.width) <= max(width, height)
+    ):
+        return area_average(mask, lens.width, lens.height)
+    raise InputError(path, f"mask is {width} x {height}, its image {lens.width} x {lens.height}",
+                     "make the mask at the image's size")  # fmt: skip

@@ -1,0 +1,160 @@
+"""Exposure times: from the set's own files, from EXIF, and the choice of one exposure where a view has several."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+from PIL import Image
+
+from sehdr_warp.errors import InputError
+
+from .capture import Shot
+from .paths import read_bytes
+
+_EXIF_IFD = 0x8769
+_EXPOSURE_TIME, _F_NUMBER, _SPEED, _SHUTTER_APEX = 33434, 33437, 34855, 37377
+_REMEDY = "correct it, or state every image's seconds in exposures.json"
+
+
+def choose_exposure(shots: tuple[Shot, ...], index: int | None, source: Path) -> tuple[list[Shot], list[str]]:
+    """One shot of each view, and notes.
+
+    index: the exposure's number in the file names; None takes the middle one (of an even count the longer).
+    Raises InputError where no view has the number.
+    """
+    keys = sorted({shot.exposure_key for shot in shots if shot.exposure_key is not None})
+    if not keys:
+        if index not in (None, 0):
+            raise InputError(source, f"exposure index {index} asked for, but each view has one exposure",
+                             "leave the exposure index out")  # fmt: skip
+        return list(shots), []
+    if index is None:
+        chosen = keys[len(keys) // 2]
+        notes = (
+            [f"each view has {len(keys)} exposures {keys}; took the middle one, index {chosen}"]
+            if len(keys) > 1
+            else []
+        )
+    elif index in keys:
+        chosen, notes = index, []
+    else:
+        raise InputError(source, f"exposure index {index} asked for, but the exposures are {keys}",
+                         f"choose one of {keys[0]} to {keys[-1]}")  # fmt: skip
+    taken = [shot for shot in shots if shot.exposure_key in (None, chosen)]
+    missing = sorted({shot.view for shot in shots} - {shot.view for shot in taken})
+    if missing:
+        notes.append(f"{len(missing)} views without exposure {chosen} were left out: {', '.join(missing[:5])}")
+    return taken, notes
+
+
+def with_exposure_times(shots: list[Shot], source: Path) -> tuple[list[Shot], bool, list[str]]:
+    """The shots with a time each, whether the times are known, and notes.
+
+    The set's own seconds come first, then `exposures.json` beside the images or in the data folder, then EXIF. An
+    EXIF time counts as t (ISO / ISO_0) (N_0 / N)^2 with the first photo's ISO_0 and f-number N_0, so that photos that
+    differ in sensitivity or aperture keep their ratio of recorded light. With none at all, each is 1 second.
+    Raises InputError for a time that is not positive and finite, and where only some photos state one.
+    """
+    stated = [shot.exposure_time for shot in shots]
+    notes = []
+    if any(time is None for time in stated):
+        listed = _listed_times(shots, source)
+        stated = [
+            time if time is not None else listed.get(shot.image.name) for time, shot in zip(stated, shots, strict=True)
+        ]
+    if all(time is None for time in stated):
+        stated, notes = _exif_times(shots)
+    for shot, time in zip(shots, stated, strict=True):
+        if time is not None and not (math.isfinite(time) and time > 0):
+            raise InputError(shot.image, f"exposure time {time} s is not positive and finite", _REMEDY)
+    if all(time is None for time in stated):
+        notes.append("no exposure times were found: each view counts as 1 s")
+        return [replace(shot, exposure_time=1.0) for shot in shots], False, notes
+    absent = [shot for shot, time in zip(shots, stated, strict=True) if time is None]
+    if absent:
+        raise InputError(absent[0].image, f"exposure time is absent here and in {len(absent) - 1} more of {len(shots)} images",
+                         "state every image's seconds in exposures.json, or strip them all")  # fmt: skip
+    shortest, longest = min(stated), max(stated)
+    if longest > shortest * 1.01:
+        stops = math.log2(longest / shortest)
+        notes.append(f"exposures differ: {shortest:g} to {longest:g} s ({stops:.1f} stops); each view keeps its own")
+    return [replace(shot, exposure_time=float(time)) for shot, time in zip(shots, stated, strict=True)], True, notes
+
+
+def parse_seconds(value, source: Path, field: str) -> float:
+    """A positive, finite number of seconds from JSON (a number, or a number as text); InputError otherwise."""
+    try:
+        seconds = float(value)
+    except (TypeError, ValueError, OverflowError):
+        seconds = math.nan
+    if not (math.isfinite(seconds) and seconds > 0):
+        raise InputError(source, f"exposure time of {field!r:.90} is {value!r:.40}", "state seconds above zero")
+    return seconds
+
+
+def _listed_times(shots: list[Shot], source: Path) -> dict[str, float]:
+    """exposures.json: {"file name": seconds} or a list of {"file": ..., "exposure_time": seconds}."""
+    import json
+
+    for folder in dict.fromkeys((shots[0].image.parent, source)):
+        path = folder / "exposures.json"
+        if path.is_file():
+            try:
+                values = json.loads(read_bytes(path, 1 << 24))
+                entries = (
+                    values.items() if isinstance(values, dict) else [(e["file"], e["exposure_time"]) for e in values]
+                )
+            except (ValueError, RecursionError, TypeError, KeyError) as error:
+                raise InputError(path, f"is not a table of exposure times ({error!r:.80})",
+                                 'write {"file name": seconds, ...}') from None  # fmt: skip
+            return {Path(str(name)).name: parse_seconds(value, path, str(name)) for name, value in entries}
+    return {}
+
+
+def _exif_times(shots: list[Shot]) -> tuple[list[float | None], list[str]]:
+    settings = [exif_exposure(shot.image) for shot in shots]
+    speeds = [iso for _, iso, _ in settings]
+    numbers = [aperture for _, _, aperture in settings]
+    notes, factors = [], [1.0] * len(shots)
+    for name, values, power in (("ISO", speeds, 1.0), ("f-number", numbers, -2.0)):
+        if len(set(values)) > 1:
+            if None in values:
+                notes.append(f"{name} is not stated for all photos and was not counted")
+                continue
+            factors = [f * (v / values[0]) ** power for f, v in zip(factors, values, strict=True)]
+            notes.append(
+                f"{name} differs ({min(values):g} to {max(values):g}); exposure times are relative to {values[0]:g}"
+            )
+    return [None if t is None else t * f for (t, _, _), f in zip(settings, factors, strict=True)], notes
+
+
+def exif_exposure(path: Path) -> tuple[float | None, float | None, float | None]:
+    """Exposure time in seconds, ISO speed and f-number as EXIF states them, None where it does not.
+
+    Raises InputError for an exposure time of zero or one that is not a number.
+    """
+    try:
+        with Image.open(path) as image:
+            table = image.getexif().get_ifd(_EXIF_IFD)
+            time, apex = _number(table.get(_EXPOSURE_TIME)), _number(table.get(_SHUTTER_APEX))
+            speed, aperture = _number(table.get(_SPEED)), _number(table.get(_F_NUMBER))
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError):
+        return None, None, None
+    if time is None and apex is not None and math.isfinite(apex) and abs(apex) < 64:
+        time = 2.0**-apex
+    if time is not None and not (math.isfinite(time) and time > 0):
+        raise InputError(path, f"EXIF exposure time is {time}", _REMEDY)
+    return time, speed if speed and 0 < speed < 1e9 else None, aperture if aperture and 0 < aperture < 1e4 else None
+
+
+def _number(value) -> float | None:
+    if isinstance(value, tuple):
+        value = value[0] if value else None
+    if value is None:
+        return None
+    try:
+        return float(value)
+    except ZeroDivisionError:
+        return math.nan
+    except (TypeError, ValueError):
+        return None

@@ -1,0 +1,136 @@
+"""COLMAP sets: `images/` with `sparse/0` (or `sparse`), and HDR-GS sets, which add `exr/` and several exposures."""
+
+import re
+from pathlib import Path
+
+from sehdr_warp.errors import InputError
+
+from .capture import Capture, Shot
+from .colmap_model import SparseModel, find_model, read_model
+from .exposure import parse_seconds
+from .images import HDR_SUFFIXES, LDR_SUFFIXES
+from .names import natural_key, sibling
+from .paths import contained, read_json
+
+# The images of reduced copies of a set lie in images_2 ... images_8; the full ones are taken where they are there.
+_IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
+# HDR-NeRF's synthetic exposures, which HDR-GS's folders do not state (its train_synthetic.py holds them as constants).
+_HDR_GS_SECONDS = (0.125, 0.5, 2.0, 8.0, 32.0)
+
+
+def image_folder(folder: Path) -> Path | None:
+    return next((folder / name for name in _IMAGE_FOLDERS if (folder / name).is_dir()), None)
+
+
+def read_colmap(folder: Path) -> Capture:
+    """One shot for each image of the model, in the natural order of the names."""
+    model, source, images = _model_and_images(folder)
+    shots, absent = [], []
+    for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
+        image = contained(images, entry.name, source)
+        hdr = None
+        if image.suffix.lower() in HDR_SUFFIXES:
+            hdr, image = image, sibling(image, LDR_SUFFIXES)
+            if image is None:
+                raise InputError(hdr, "is the view's only image, and no encoded (LDR) photo lies beside it",
+                                 "put the photo (PNG, JPEG or TIFF) of the same name beside it")  # fmt: skip
+        elif not image.is_file():
+            absent.append(entry.name)
+            continue
+        else:
+            hdr = next(
+                (file for name in ("hdr", "exr") if (file := sibling(folder / name / image.name, HDR_SUFFIXES))), None
+            )
+        shots.append(
+            Shot(image.stem, image, model.cameras[entry.camera_id], entry.world_to_camera,
+                 mask=_mask(folder, entry.name, source), hdr=hdr)
+        )  # fmt: skip
+    if not shots:
+        raise InputError(images, f"none of the model's {len(absent)} images is here (the first is {absent[0]!r:.90})",
+                         "copy the images that COLMAP used")  # fmt: skip
+    notes = (
+        (f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ...",) if absent else ()
+    )
+    return Capture("colmap", tuple(shots), points=model.points, point_colors=model.colors, notes=notes)
+
+
+def is_hdr_gs(folder: Path) -> bool:
+    return (folder / "exr").is_dir() and (folder / "images").is_dir() and find_model(folder) is not None and bool(
+        _exposures_by_view(folder / "images")
+    )  # fmt: skip
+
+
+def read_hdr_gs(folder: Path) -> Capture:
+    """HDR-GS's synthetic layout: `images/<v>_<e>.png`, `exr/<v>.exr`, and a model with one image (any e) of each view."""
+    model, source, images = _model_and_images(folder)
+    exposures = _exposures_by_view(images)
+    count = 1 + max(key for files in exposures.values() for key in files)
+    seconds, notes = _hdr_gs_seconds(folder, count)
+    shots, placed = [], set()
+    for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
+        view = re.sub(r"_\d+$", "", contained(images, entry.name, source).stem)
+        if view in placed or view not in exposures:
+            continue
+        placed.add(view)
+        hdr = sibling(folder / "exr" / f"{view}.exr", HDR_SUFFIXES)
+        shots += [
+            Shot(view, image, model.cameras[entry.camera_id], entry.world_to_camera, exposure_key=key,
+                 exposure_time=seconds[key] if seconds else None, hdr=hdr)
+            for key, image in sorted(exposures[view].items())
+        ]  # fmt: skip
+    if not shots:
+        raise InputError(source, "none of the model's images is in images/", "copy the images that COLMAP used")
+    return Capture("hdr-gs", tuple(shots), alpha="background", holdout=(2, 1), points=model.points,
+                   point_colors=model.colors, notes=notes)  # fmt: skip
+
+
+def poses_by_view(folder: Path) -> tuple[SparseModel, dict[str, tuple]]:
+    """The model and, for each view (names without `_<exposure>`), its lens and pose."""
+    model_folder = find_model(folder)
+    model = read_model(model_folder)
+    poses = {}
+    for entry in model.images:
+        view = re.sub(r"_\d+$", "", Path(entry.name).stem)
+        poses.setdefault(view, (model.cameras[entry.camera_id], entry.world_to_camera))
+    return model, poses
+
+
+def _model_and_images(folder: Path) -> tuple[SparseModel, Path, Path]:
+    model_folder = find_model(folder)
+    model = read_model(model_folder)
+    if not model.images:
+        raise InputError(model_folder, "the model has no registered views", "run structure from motion again")
+    images = image_folder(folder)
+    if images is None:
+        raise InputError(folder / "images", "folder not found", "put the photos that COLMAP used there")
+    return model, model_folder, images
+
+
+def _mask(folder: Path, name: str, source: Path) -> Path | None:
+    """`masks/<name>.png` (COLMAP's habit) or `masks/<stem>.png`."""
+    for candidate in (f"{name}.png", str(Path(name).with_suffix(".png"))):
+        if (path := contained(folder / "masks", candidate, source)).is_file():
+            return path
+    return None
+
+
+def _exposures_by_view(images: Path) -> dict[str, dict[int, Path]]:
+    found: dict[str, dict[int, Path]] = {}
+    for image in images.iterdir():
+        match = re.fullmatch(r"(.+)_(\d{1,3})", image.stem)
+        if match and image.suffix.lower() in LDR_SUFFIXES:
+            found.setdefault(match[1], {})[int(match[2])] = image
+    return found
+
+
+def _hdr_gs_seconds(folder: Path, count: int) -> tuple[list[float] | None, tuple[str, ...]]:
+    """Seconds by exposure number: `exposure_times.json` ([seconds, ...] under "exposure_times"), or HDR-GS's constants."""
+    path = folder / "exposure_times.json"
+    if path.is_file():
+        values = read_json(path).get("exposure_times")
+        if not isinstance(values, list) or len(values) < count:
+            raise InputError(path, f"exposure_times does not list {count} values", "list the seconds of every exposure")
+        return [parse_seconds(value, path, f"exposure {i}") for i, value in enumerate(values)], ()
+    if count == len(_HDR_GS_SECONDS):
+        return list(_HDR_GS_SECONDS), (f"the set states no exposure times; took HDR-NeRF's {list(_HDR_GS_SECONDS)} s",)
+    return None, ()

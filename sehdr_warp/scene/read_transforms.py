@@ -1,0 +1,233 @@
+"""transforms.json and its kin: nerfstudio, instant-ngp, Blender, and HDR-NeRF's synthetic sets."""
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+
+from sehdr_warp.errors import InputError
+
+from .capture import Capture, Shot, pose_from_camera_to_world
+from .colmap_model import find_model, read_ply_points, read_points
+from .exposure import parse_seconds
+from .images import HDR_SUFFIXES, LDR_SUFFIXES, image_sizes
+from .lens import Lens
+from .names import sibling
+from .paths import contained, read_json
+
+_REMEDY = "correct the file or export it again"
+
+
+def has_transforms(folder: Path) -> bool:
+    return (folder / "transforms.json").is_file() or (folder / "transforms_train.json").is_file()
+
+
+def is_hdr_nerf(folder: Path) -> bool:
+    return (folder / "transforms_train.json").is_file() and (folder / "exposure_train.json").is_file()
+
+
+def read_transforms(folder: Path) -> Capture:
+    """One shot for each frame of transforms.json, or of transforms_{train,test}.json (val where there is no test)."""
+    if (folder / "transforms.json").is_file():
+        files = [(folder / "transforms.json", None)]
+    else:
+        other = "test" if (folder / "transforms_test.json").is_file() else "val"
+        files = [(folder / f"transforms_{name}.json", split) for name, split in (("train", "train"), (other, "test"))]
+    shots, points, colors = [], np.zeros((0, 3)), np.zeros((0, 3), np.float32)
+    for path, split in files:
+        if split == "test" and not path.is_file():
+            continue
+        values = read_json(path)
+        named = _named_splits(values, path)
+        for name, frame in frames_of(values, path):
+            shots.append(_frame_shot(folder, path, values, frame, name, split or named.get(name)))
+        if not len(points):
+            points, colors = _points(folder, path, values)
+    notes = ()
+    if any(shot.split for shot in shots) and not all(shot.split for shot in shots):
+        kept = [shot for shot in shots if shot.split]
+        notes = (f"{len(shots) - len(kept)} frames belong to neither the train nor the test split and were left out",)
+        shots = kept
+    return Capture("transforms", tuple(shots), alpha="background", points=points, point_colors=colors, notes=notes)
+
+
+def read_hdr_nerf(folder: Path) -> Capture:
+    """HDR-NeRF's synthetic layout (xhuangcv/hdr-nerf, load_syn_llff.py).
+
+    `transforms_<split>.json` with camera_angle_x and frames whose file_path lacks the `_<k>.png` of the exposure;
+    `exposure_<split>.json` maps `<file_path>_<k>.png` to seconds; truth in `<split>_hdr/hdr_%03d.exr` by the frame's
+    place. Any number of exposures will do; points come from `sparse/0`, `sparse` or points3d.ply where they are there.
+    """
+    shots = []
+    for split in ("train", "test"):
+        path, times_path = folder / f"transforms_{split}.json", folder / f"exposure_{split}.json"
+        if split == "test" and not path.is_file():
+            continue
+        values, times = read_json(path), _exposures_of(read_json(times_path), times_path)
+        for place, (name, frame) in enumerate(frames_of(values, path)):
+            stated = times.get(_plain(name))
+            if not stated:
+                raise InputError(
+                    times_path, f"has no exposure time for {name!r:.90}", "list <file_path>_<k>.png: seconds"
+                )
+            hdr = sibling(folder / f"{split}_hdr" / f"hdr_{place:03d}.exr", HDR_SUFFIXES)
+            matrix = frame_pose(frame, path, name)
+            present = [(k, contained(folder, file, times_path), t) for k, (file, t) in sorted(stated.items())]
+            present = [entry for entry in present if entry[1].is_file()]
+            if not present:
+                raise InputError(
+                    folder / f"{_plain(name)}_{min(stated)}.png", "image file not found", "copy the whole set"
+                )
+            shots += [
+                Shot(Path(_plain(name)).name, image, frame_lens(values, frame, image, path), matrix, exposure_key=key,
+                     exposure_time=time, split=split, hdr=hdr)
+                for key, image, time in present
+            ]  # fmt: skip
+    points, colors = _sparse_points(folder)
+    return Capture("hdr-nerf", tuple(shots), alpha="background", points=points, point_colors=colors)
+
+
+def frames_of(values: dict, path: Path) -> list[tuple[str, dict]]:
+    frames = values.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise InputError(path, "has no frames", _REMEDY)
+    for i, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise InputError(path, f"frame {i} has no file_path", _REMEDY)
+    return [(frame["file_path"], frame) for frame in frames]
+
+
+def _named_splits(values: dict, path: Path) -> dict[str, str]:
+    """Each frame's split where the file says so: nerfstudio's <split>_filenames, or a frame's own "split"."""
+    named = {}
+    for name, frame in frames_of(values, path):
+        if frame.get("split") in ("train", "test", "val"):
+            named[name] = frame["split"]
+    for key, split in (("train_filenames", "train"), ("val_filenames", "val"), ("test_filenames", "test")):
+        listed = values.get(key)
+        if isinstance(listed, list):
+            named.update({name: split for name in listed if isinstance(name, str)})
+    held_out = "test" if "test" in named.values() else "val"
+    return {
+        name: "train" if split == "train" else "test" for name, split in named.items() if split in ("train", held_out)
+    }
+
+
+def _frame_shot(folder: Path, path: Path, values: dict, frame: dict, name: str, split: str | None) -> Shot:
+    image = contained(folder, name, path)
+    if image.suffix.lower() not in (*LDR_SUFFIXES, *HDR_SUFFIXES):
+        # Blender's file_path has no ending; a dot in the stem must not be taken for one.
+        found = sibling(image.with_name(image.name + ".png"), LDR_SUFFIXES)
+        if found is None:
+            raise InputError(image.with_name(image.name + ".png"), "image file not found", "copy the whole set")
+        image = found
+    hdr = None
+    if image.suffix.lower() in HDR_SUFFIXES:
+        hdr, image = image, sibling(image, LDR_SUFFIXES)
+        if image is None:
+            raise InputError(hdr, "is the frame's only image, and no encoded (LDR) photo lies beside it",
+                             "put the photo (PNG, JPEG or TIFF) of the same name beside it")  # fmt: skip
+    mask = frame.get("mask_path")
+    time = frame.get("exposure_time")
+    return Shot(
+        image.stem, image, frame_lens(values, frame, image, path), frame_pose(frame, path, name),
+        exposure_time=None if time is None else parse_seconds(time, path, name), split=split,
+        mask=None if mask is None else contained(folder, mask, path), hdr=hdr,
+    )  # fmt: skip
+
+
+def frame_pose(frame: dict, path: Path, name: str) -> np.ndarray:
+    try:
+        matrix = np.array(frame.get("transform_matrix"), dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
+    if matrix.shape in ((4, 4), (3, 4)):
+        # OpenGL's camera looks along -z with y up; OpenCV's along +z with y down.
+        matrix[:3, 1:3] *= -1
+    return pose_from_camera_to_world(matrix, path, name)
+
+
+def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Lens:
+    def number(*keys: str) -> float | None:
+        for key in keys:
+            value = frame.get(key, values.get(key))
+            if value is not None:
+                if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+                    raise InputError(path, f"{key} = {value!r:.40} is not a finite number", _REMEDY)
+                return float(value)
+        return None
+
+    width, height = number("w"), number("h")
+    if width is None or height is None:
+        if image is None:
+            raise InputError(path, "states no image size", "add w and h")
+        width, height = image_sizes(image)[0]
+    fx, fy = number("fl_x"), number("fl_y")
+    if fx is None and (angle := number("camera_angle_x")) is not None and 0 < angle < math.pi:
+        fx = 0.5 * width / math.tan(0.5 * angle)
+    if fy is None and (angle := number("camera_angle_y")) is not None and 0 < angle < math.pi:
+        fy = 0.5 * height / math.tan(0.5 * angle)
+    if fx is None and fy is None:
+        raise InputError(path, "states no focal length", "add camera_angle_x (radians, below pi) or fl_x (pixels)")
+    fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
+    cx, cy = number("cx"), number("cy")
+    pinhole = (fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
+    k1, k2, k3, k4, p1, p2 = (number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    model = frame.get("camera_model", values.get("camera_model", "OPENCV"))
+    if model == "OPENCV_FISHEYE" or frame.get("is_fisheye", values.get("is_fisheye")) is True:
+        model, params = "OPENCV_FISHEYE", (*pinhole, k1, k2, k3, k4)
+    elif model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL"):
+        raise InputError(path, f"camera_model {model!r:.40} is not supported", "use OPENCV, OPENCV_FISHEYE or PINHOLE")
+    elif k4:
+        raise InputError(path, f"k4 = {k4} of a perspective camera is not supported", "undistort the images first")
+    elif k3:
+        model, params = "FULL_OPENCV", (*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+    else:
+        model, params = "OPENCV", (*pinhole, k1, k2, p1, p2)
+    return Lens(model, int(width), int(height), params, path)
+
+
+def _points(folder: Path, path: Path, values: dict) -> tuple[np.ndarray, np.ndarray]:
+    """ply_file_path (in the frames' coordinates), or the COLMAP model that nerfstudio keeps, moved by applied_transform."""
+    name = values.get("ply_file_path")
+    if isinstance(name, str):
+        ply = contained(folder, name, path)
+        if ply.is_file():
+            return read_ply_points(ply)
+    points, colors = _sparse_points(folder)
+    applied = values.get("applied_transform")
+    if len(points) and applied is not None:
+        try:
+            matrix = np.array(applied, dtype=np.float64)
+        except (TypeError, ValueError):
+            matrix = np.zeros(0)
+        if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
+            raise InputError(path, "applied_transform is not a finite 3 x 4 matrix", _REMEDY)
+        points = points @ matrix[:3, :3].T + matrix[:3, 3]
+    return points, colors
+
+
+def _sparse_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    for place in (find_model(folder), folder / "sparse" / "0", folder / "sparse", folder):
+        if place is not None:
+            points, colors = read_points(place)
+            if len(points):
+                return points, colors
+    return np.zeros((0, 3)), np.zeros((0, 3), np.float32)
+
+
+def _plain(name: str) -> str:
+    """`./train/r_0` and `train/r_0` are the same."""
+    return re.sub(r"^(\./)+", "", name.replace("\\", "/"))
+
+
+def _exposures_of(values: dict, path: Path) -> dict[str, dict[int, tuple[str, float]]]:
+    """frame -> exposure number -> (file name, seconds)."""
+    found: dict[str, dict[int, tuple[str, float]]] = {}
+    for key, value in values.items():
+        match = re.fullmatch(r"(.+)_(\d{1,3})(\.[A-Za-z]+)?", _plain(key))
+        if match:
+            name = _plain(key) if match[3] else f"{_plain(key)}.png"
+            found.setdefault(match[1], {})[int(match[2])] = (name, parse_seconds(value, path, key))
+    return found
