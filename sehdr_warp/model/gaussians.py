@@ -1,0 +1,134 @@
+"""The 3D Gaussians of a scene: their parameters, their start values, and changes of their number during training."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from ..splatting.neighbours import nearest_neighbour_distances
+
+HARMONIC_0 = 0.28209479177387814
+"""The value of the spherical harmonic of degree 0, 1 / (2 sqrt(pi))."""
+
+PARAMETER_NAMES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics_dc", "harmonics_rest")
+
+
+class Gaussians(nn.Module):
+    """N anisotropic 3D Gaussians with a view-dependent colour.
+
+    means: [N, 3] world coordinates.
+    log_scales: [N, 3] natural logarithms of the standard deviations along the own axes, world units.
+    quaternions: [N, 4] (w, x, y, z), of any length but zero; normalised where they are used.
+    opacity_logits: [N]; the opacity is their sigmoid.
+    harmonics_dc, harmonics_rest: [N, 1, 3] and [N, K - 1, 3], real spherical harmonics of degree 0 and above,
+        K = (degree + 1)^2. What their sum over a direction means is the RadianceField's choice: with radiance "log"
+        the logarithm of the exposure at the field's base time.
+    """
+
+    def __init__(self, means, log_scales, quaternions, opacity_logits, harmonics_dc, harmonics_rest):
+        super().__init__()
+        given = (means, log_scales, quaternions, opacity_logits, harmonics_dc, harmonics_rest)
+        for name, value in zip(PARAMETER_NAMES, given, strict=True):
+            setattr(self, name, nn.Parameter(value.detach().contiguous()))
+        count, harmonics = means.shape[0], 1 + harmonics_rest.shape[1]
+        expected = ((count, 3), (count, 3), (count, 4), (count,), (count, 1, 3), (count, harmonics - 1, 3))
+        for name, value, shape in zip(PARAMETER_NAMES, given, expected, strict=True):
+            if tuple(value.shape) != shape:
+                raise ValueError(f"{name} has shape {tuple(value.shape)}, not {shape}")
+        if math.isqrt(harmonics) ** 2 != harmonics:
+            raise ValueError(f"{harmonics} harmonics are not a whole number of degrees")
+
+    @classmethod
+    def from_points(cls, points: Tensor, dc: Tensor, degree: int, *, opacity: float = 0.1, scale: float = 1.0) -> "Gaussians":
+        """Isotropic Gaussians at points, sized by their neighbours (3DGS, section 5.1).
+
+        points: [N, 3] float32, N >= 1; dc: [N, 3] values of the constant part of the colour (harmonic times
+        coefficient); opacity in (0, 1); scale multiplies the root mean square distance to three neighbours.
+        """
+        count = points.shape[0]
+        extent = max(float((points - points.mean(0)).norm(dim=1).max()), 1e-6)
+        if count > 3:
+            distance = nearest_neighbour_distances(points, 3).square().mean(1).sqrt()
+        else:
+            distance = points.new_full((count,), 0.1 * extent)
+        # Points that coincide, and lone outliers, would start as specks or as clouds over the whole scene.
+        log_scales = (scale * distance.clamp(1e-5 * extent, extent)).log()[:, None].expand(-1, 3)
+        quaternions = points.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(count, 4)
+        logits = points.new_full((count,), math.log(opacity / (1 - opacity)))
+        rest = points.new_zeros(count, (degree + 1) ** 2 - 1, 3)
+        return cls(points.clone(), log_scales, quaternions, logits, (dc / HARMONIC_0)[:, None, :], rest)
+
+    @property
+    def count(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def degree(self) -> int:
+        """The highest degree of the harmonics."""
+        return math.isqrt(1 + self.harmonics_rest.shape[1]) - 1
+
+    def opacities(self) -> Tensor:
+        """[N] in (0, 1)."""
+        return torch.sigmoid(self.opacity_logits)
+
+    def harmonics(self, degree: int | None = None) -> Tensor:
+        """[N, (degree + 1)^2, 3] coefficients up to a degree, by default all."""
+        degree = self.degree if degree is None else min(degree, self.degree)
+        if degree == 0:
+            return self.harmonics_dc
+        return torch.cat([self.harmonics_dc, self.harmonics_rest[:, : (degree + 1) ** 2 - 1]], dim=1)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Name to detached parameter, in the order of PARAMETER_NAMES."""
+        return {name: getattr(self, name).detach() for name in PARAMETER_NAMES}
+
+    def rows(self, index: Tensor) -> dict[str, Tensor]:
+        """Copies of the parameters at an index or mask [N]."""
+        return {name: value[index].clone() for name, value in self.tensors().items()}
+
+    def keep(self, index: Tensor, optimizer: torch.optim.Optimizer | None = None) -> None:
+        """Keeps only the Gaussians at an index or mask [N], with their optimizer state."""
+        for name in PARAMETER_NAMES:
+            self._exchange(name, getattr(self, name).detach()[index], optimizer, lambda state: state[index])
+
+    def append(self, rows: dict[str, Tensor], optimizer: torch.optim.Optimizer | None = None) -> None:
+        """Adds M Gaussians, given as by rows(); their optimizer state starts at zero."""
+        for name in PARAMETER_NAMES:
+            added = rows[name]
+            value = torch.cat([getattr(self, name).detach(), added])
+            self._exchange(name, value, optimizer, lambda state, added=added: torch.cat([state, torch.zeros_like(added)]))
+
+    def overwrite(
+        self, rows: dict[str, Tensor], index: Tensor | None = None, optimizer: torch.optim.Optimizer | None = None
+    ) -> None:
+        """Writes values of some parameters in place, at an index or mask [N] or everywhere, and zeroes the optimizer
+        state there."""
+        with torch.no_grad():
+            for name, values in rows.items():
+                where = slice(None) if index is None else index
+                parameter = getattr(self, name)
+                parameter[where] = values
+                self.forget(name, where, optimizer)
+
+    def forget(self, name: str, where, optimizer: torch.optim.Optimizer | None) -> None:
+        """Zeroes a parameter's optimizer state at an index, mask or slice."""
+        for key, state in _moments(optimizer, getattr(self, name)).items():
+            state[where] = 0
+
+    def _exchange(self, name: str, value: Tensor, optimizer, change_state) -> None:
+        old, new = getattr(self, name), nn.Parameter(value.contiguous())
+        setattr(self, name, new)
+        if optimizer is None:
+            return
+        for group in optimizer.param_groups:
+            group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
+        moments = _moments(optimizer, old)
+        state = optimizer.state.pop(old, None)
+        if state is not None:
+            optimizer.state[new] = state | {key: change_state(moment) for key, moment in moments.items()}
+
+
+def _moments(optimizer, parameter: nn.Parameter) -> dict[str, Tensor]:
+    """The optimizer's tensors that have one row a Gaussian: all but Adam's step counter."""
+    state = {} if optimizer is None else optimizer.state.get(parameter, {})
+    return {key: value for key, value in state.items() if torch.is_tensor(value) and value.shape == parameter.shape}

@@ -1,0 +1,194 @@
+"""Gaussians that know light: the colours of a view, from base exposure over brackets and fusion to encoded values.
+
+Every colour set that a step needs is a group of three channels of one rasterisation, so that geometry is projected,
+sorted and blended once.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from ..scene import Camera
+from ..splatting import Rendering, rasterize, spherical_harmonics
+from .fusion import NeuralExposureFusion
+from .gaussians import Gaussians
+from .response import Response
+
+EXPOSURE_FLOOR = 1e-6
+"""Least exposure of a Gaussian with radiance "linear": keeps logarithms finite, 100 times below 8-bit black in sRGB."""
+LOG_EXPOSURE_LIMIT = 40.0
+"""Log exposures are held within this: exp stays finite in float32, even squared and summed over a pixel."""
+
+
+@dataclass(frozen=True)
+class CameraTensors:
+    """A camera on a device. world_to_camera [4, 4], intrinsics [4] (fx, fy, cx, cy), position [3]; all float32."""
+
+    width: int
+    height: int
+    world_to_camera: Tensor
+    intrinsics: Tensor
+    position: Tensor
+
+    @staticmethod
+    def of(camera: Camera, device: torch.device | str) -> "CameraTensors":
+        pose, intrinsics, position = (
+            torch.tensor(value, dtype=torch.float32, device=device)
+            for value in (camera.world_to_camera, camera.intrinsics, camera.position)
+        )
+        return CameraTensors(camera.width, camera.height, pose, intrinsics, position)
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A differentiable simulated photo.
+
+    encoded: [H, W, 3] encoded values, extended beyond [0, 1] as by Response.encode_extended.
+    exposure: [H, W, 3] of the HDR colour at the base time (I^h dt_1 of the paper); None with radiance "display".
+    base: [H, W, 3] of the base colour at the base time (I^b); the same tensor as `exposure` without fusion.
+    rendering: what the rasteriser knows: alpha, projected means, radii.
+    """
+
+    encoded: Tensor
+    exposure: Tensor | None
+    base: Tensor | None
+    rendering: Rendering
+
+
+@dataclass(frozen=True)
+class RenderedView:
+    """What a trained scene looks like from a camera, composited over black.
+
+    hdr: [H, W, 3] float32 scene-linear radiance, >= 0, not multiplied by an exposure time.
+    alpha: [H, W] coverage in [0, 1].
+    depth: [H, W] mean distance along the camera's axis where alpha is above 0.001, else 0; world units.
+    """
+
+    hdr: Tensor
+    alpha: Tensor
+    depth: Tensor
+
+
+class RadianceField(nn.Module):
+    """A scene: Gaussians, the camera response that photographed them, and, where used, the fusion of brackets.
+
+    base_time: dt_1, seconds. Colours are exposures x = E dt_1 (the paper's c^{l_1}), so that their size, and with it
+        the learning rates, does not depend on the unit of time.
+    radiance: "log": x = exp(SH(d)); "linear": x = SH(d), kept positive; "display": encoded = max(SH(d) + 0.5, 0).
+    tone_map: "pixel": f(sum of weighted x); "gaussian": sum of weighted f(x), as the paper composites.
+    fusion: the paper's brackets and their fusion, at the same base time; without, the HDR colour is the base colour.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        response: Response,
+        *,
+        base_time: float,
+        radiance: str = "log",
+        tone_map: str = "pixel",
+        fusion: NeuralExposureFusion | None = None,
+        antialiased: bool = False,
+        low_pass: float = 0.3,
+    ):
+        super().__init__()
+        self.gaussians = gaussians
+        self.fusion = fusion
+        self.response = response
+        self.base_time = base_time
+        self.radiance = radiance
+        self.tone_map = tone_map
+        self.antialiased = antialiased
+        self.low_pass = low_pass
+
+    def photograph(
+        self, camera: CameraTensors, exposure_time: float, *, degree: int | None = None, linear: bool = False
+    ) -> Photograph:
+        """A photo of exposure_time seconds; harmonics up to `degree`; linear: also the exposures a linear loss needs."""
+        ratio = exposure_time / self.base_time
+        if self.radiance == "display":
+            rendering = self._rasterize(camera, self._harmonics(camera, degree).add(0.5).clamp_min(0))
+            return Photograph(self._reexpose(rendering.image, ratio), None, None, rendering)
+        base, fused = self._exposures(camera, degree)
+        sets = {"fused": fused}
+        if self.tone_map == "gaussian":
+            sets = {"encoded": self.response.encode_extended(fused * ratio)} | (sets if linear else {})
+        if linear and self.fusion is not None:
+            sets["base"] = base
+        rendering = self._rasterize(camera, torch.cat(list(sets.values()), dim=1) if len(sets) > 1 else next(iter(sets.values())))
+        images = dict(zip(sets, rendering.image.split(3, dim=2), strict=True))
+        encoded = images["encoded"] if self.tone_map == "gaussian" else self.response.encode_extended(images["fused"] * ratio)
+        exposure = images.get("fused")
+        return Photograph(encoded, exposure, images.get("base", exposure), rendering)
+
+    @torch.no_grad()
+    def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:
+        """The HDR view of a camera, by one rasterisation of radiance and depth."""
+        tensors = CameraTensors.of(camera, self.gaussians.means.device)
+        pose = tensors.world_to_camera
+        depth = self.gaussians.means @ pose[2, :3, None] + pose[2, 3]
+        rendering = self._rasterize(tensors, torch.cat([self._inference_colours(tensors, degree), depth], dim=1))
+        colours, depth = rendering.image[..., :3], rendering.image[..., 3]
+        if self.radiance == "display":
+            colours = self.response.decode(colours.clamp(0, 1))
+        alpha = rendering.alpha
+        depth = torch.where(alpha > 1e-3, depth / alpha.clamp_min(1e-3), torch.zeros_like(depth))
+        return RenderedView(colours / self.base_time, alpha, depth)
+
+    @torch.no_grad()
+    def render_ldr(self, camera: Camera, exposure_time: float | None = None, *, degree: int | None = None) -> Tensor:
+        """[H, W, 3] in [0, 1]: the simulated photo of exposure_time seconds, by default the base time."""
+        tensors = CameraTensors.of(camera, self.gaussians.means.device)
+        photo = self.photograph(tensors, exposure_time or self.base_time, degree=degree)
+        return photo.encoded.clamp(0, 1)
+
+    @torch.no_grad()
+    def radiance_from(self, position: Tensor, *, degree: int | None = None) -> Tensor:
+        """[N, 3] scene-linear radiance of each Gaussian seen from a position [3] (E, not times an exposure)."""
+        tensors = CameraTensors(0, 0, position, position, position)
+        colours = self._inference_colours(tensors, degree)
+        return (self.response.decode(colours.clamp(0, 1)) if self.radiance == "display" else colours) / self.base_time
+
+    def _inference_colours(self, camera: CameraTensors, degree: int | None) -> Tensor:
+        if self.radiance == "display":
+            return self._harmonics(camera, degree).add(0.5).clamp_min(0)
+        return self._exposures(camera, degree)[1]
+
+    def _harmonics(self, camera: CameraTensors, degree: int | None) -> Tensor:
+        coefficients = self.gaussians.harmonics(degree)
+        used = self.gaussians.degree if degree is None else min(degree, self.gaussians.degree)
+        return spherical_harmonics(used, coefficients, self.gaussians.means, camera.position)
+
+    def _exposures(self, camera: CameraTensors, degree: int | None) -> tuple[Tensor, Tensor]:
+        """Exposures at the base time of each Gaussian's base colour and of its HDR colour, [N, 3] each."""
+        value = self._harmonics(camera, degree)
+        if self.radiance == "linear":
+            base = value.clamp_min(EXPOSURE_FLOOR)
+            log_base = base.log() if self.fusion is not None else None
+        else:
+            log_base = value.clamp(-LOG_EXPOSURE_LIMIT, LOG_EXPOSURE_LIMIT)
+            base = log_base.exp()
+        return base, base if self.fusion is None else self.fusion(log_base) * self.base_time
+
+    def _reexpose(self, encoded: Tensor, ratio: float) -> Tensor:
+        """Encoded values at the base time as they would be at `ratio` times it."""
+        if ratio == 1.0:
+            return encoded
+        return self.response.encode_extended(self.response.decode(encoded.clamp(0, 1)) * ratio)
+
+    def _rasterize(self, camera: CameraTensors, features: Tensor) -> Rendering:
+        gaussians = self.gaussians
+        return rasterize(
+            gaussians.means,
+            gaussians.log_scales,
+            gaussians.quaternions,
+            gaussians.opacities(),
+            features,
+            camera.world_to_camera,
+            camera.intrinsics,
+            camera.width,
+            camera.height,
+            antialiased=self.antialiased,
+            low_pass=self.low_pass,
+        )

@@ -1,0 +1,219 @@
+"""Every choice of a training: one tree of frozen dataclasses, each field with its meaning, its range and its default.
+
+The defaults are the `default` preset. A TOML file states only what differs from the preset named by its key `base`
+(default: "default"). Iteration numbers other than `schedule.iterations` are stated for a training of
+`schedule.stated_for` iterations and scale with it, so a shorter training is the same training, compressed.
+"""
+
+import math
+from dataclasses import dataclass, field, fields, is_dataclass
+
+from ..errors import SehdrError
+
+
+class ConfigError(SehdrError):
+    """A field of a config has a value that cannot be used; names field, value and what is allowed."""
+
+
+def option(default, doc: str, *, low=None, high=None, above=None, choices=None, nonempty=False):
+    """A documented field: low <= value <= high, above < value, or one of choices; for tuples, of each item."""
+    limits = {"low": low, "high": high, "above": above, "choices": choices, "nonempty": nonempty}
+    return field(default=default, metadata={"doc": doc, "limits": limits})
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """What a Gaussian's colour means and how an image comes of it."""
+
+    radiance: str = option(
+        "log",
+        "log: log exposure is a harmonic series, so radiance is always positive; linear: exposure itself is (SeHDR); "
+        "display: encoded values are, with 3DGS's offset of 0.5",
+        choices=("log", "linear", "display"),
+    )
+    tone_map: str = option(
+        "pixel",
+        "pixel: composite radiance, then apply the response to each pixel; gaussian: apply it to each Gaussian (SeHDR)",
+        choices=("pixel", "gaussian"),
+    )
+    harmonics_degree: int = option(3, "highest degree of the spherical harmonics", low=0, high=3)
+    initial_count: int = option(50_000, "Gaussians to start from where the scene has no points", low=100, high=10_000_000)
+    initial_opacity: float = option(0.1, "opacity of every Gaussian at the start", above=0.0, high=0.99)
+    initial_scale: float = option(1.0, "start size, in mean distances to the three nearest neighbours", above=0.0, high=10.0)
+    antialiased: bool = option(False, "lower opacity where the low-pass filter widens a small Gaussian (Mip-Splatting)")
+    low_pass: float = option(0.3, "variance in square pixels added to every projected Gaussian", low=0.0, high=10.0)
+
+
+@dataclass(frozen=True)
+class ResponseConfig:
+    """The camera response f: exposure (radiance x seconds) to encoded values."""
+
+    name: str = option("srgb", "a response's name, a file, or auto: the paper's score on one random training photo", nonempty=True)
+    candidates: tuple[str, ...] = option((), "what auto chooses from: names and files; empty means every built-in response")
+
+
+@dataclass(frozen=True)
+class FusionConfig:
+    """Exposure brackets and their neural fusion (SeHDR, equations 6 to 9)."""
+
+    enabled: bool = option(False, "fuse exposure brackets into the HDR colour; off, the base colour is the HDR colour")
+    exposures: tuple[str, ...] = option(
+        ("1/8", "1/4", "1", "8", "16"),
+        "exposures of the brackets: multiples of the photos' own (1/8), stops from it (-3ev) or times (1/125s)",
+        nonempty=True,
+    )
+    radiance_scale: str = option(
+        "unit",
+        "the radiance of a fused value of 1; unit: 1, as printed in the paper; base: 1 / dt_1, an exposure of 1; "
+        "white: the radiance that the photos show as white",
+        choices=("unit", "base", "white"),
+    )
+    sigma: float = option(0.2, "start value of the well-exposedness widths", above=0.0, high=10.0)
+    width: int = option(128, "hidden units of each channel's perceptron", low=1, high=4096)
+    hidden_layers: int = option(1, "hidden layers of each channel's perceptron", low=1, high=8)
+    evaluation: str = option(
+        "tabulated",
+        "exact: the perceptrons run for every Gaussian; tabulated: for a table over radiance, which is interpolated",
+        choices=("exact", "tabulated"),
+    )
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """What the renders are compared with, and how."""
+
+    form: str = option("sum", "sum: L1 + w (1 - SSIM), SeHDR; blend: (1 - w) L1 + w (1 - SSIM), 3DGS", choices=("sum", "blend"))
+    ssim_weight: float = option(0.2, "w above", low=0.0, high=1.0)
+    clipping: bool = option(True, "a clipped pixel only says `at least`, a black one only `at most`; off: both are plain values")
+    linear_weight: float = option(0.0, "weight of the linear loss (SeHDR: 0.5)", low=0.0, high=100.0)
+    linear_detach: str = option(
+        "fused",
+        "the side of the self-supervised linear loss that gets no gradient: the fused or the base colour, or none",
+        choices=("fused", "base", "none"),
+    )
+    hdr_truth: bool = option(False, "compare the base colour with HDR truth in the linear loss, where a view has it")
+    opacity_weight: float = option(0.0, "weight of the mean opacity (3DGS-MCMC: 0.01)", low=0.0, high=10.0)
+    scale_weight: float = option(0.0, "weight of the mean size (3DGS-MCMC: 0.01)", low=0.0, high=10.0)
+
+
+@dataclass(frozen=True)
+class DensificationConfig:
+    """How Gaussians are added and taken away."""
+
+    strategy: str = option(
+        "gradient",
+        "gradient: clone and split where image gradients are large (3DGS); relocation: move the dead to where the "
+        "living are (3DGS-MCMC); none",
+        choices=("gradient", "relocation", "none"),
+    )
+    start: int = option(500, "first iteration after which the count may change", low=0)
+    stop: int = option(15_000, "last iteration at which it may", low=0)
+    every: int = option(100, "iterations between changes", low=1)
+    max_gaussians: int = option(3_000_000, "the count never exceeds this", low=1)
+    grow_gradient: float = option(0.0002, "gradient: mean gradient in normalised screen units that makes one grow", above=0.0)
+    grow_scale: float = option(0.01, "gradient: larger than this part of the scene is split, smaller is cloned", above=0.0)
+    prune_opacity: float = option(0.005, "fainter ones are taken away (relocation: are moved)", above=0.0, high=0.5)
+    prune_scale: float = option(0.1, "gradient: larger than this part of the scene is taken away after the first reset", above=0.0)
+    reset_every: int = option(3000, "gradient: iterations between resets of the opacities", low=1)
+    revised_opacity: bool = option(False, "gradient: a split keeps the opacity of the whole (Revising Densification)")
+    growth: float = option(0.05, "relocation: the count grows by this part at each change", low=0.0, high=1.0)
+    noise: float = option(5e5, "relocation: strength of the noise on the positions, in learning rates", low=0.0)
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """Adam's learning rates. Positions are in units of the scene's extent."""
+
+    means: float = option(1.6e-4, "positions, at the start", above=0.0, high=1.0)
+    means_final: float = option(1.6e-6, "positions, at the end; exponential in between", above=0.0, high=1.0)
+    log_scales: float = option(5e-3, "logarithms of the sizes", above=0.0, high=1.0)
+    quaternions: float = option(1e-3, "rotations", above=0.0, high=1.0)
+    opacity_logits: float = option(5e-2, "opacities before the sigmoid", above=0.0, high=1.0)
+    harmonics_dc: float = option(1e-2, "colours, degree 0", above=0.0, high=1.0)
+    harmonics_rest: float = option(5e-4, "colours, higher degrees", above=0.0, high=1.0)
+    fusion: float = option(1e-3, "perceptrons and widths of the fusion", above=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
+class ScheduleConfig:
+    """When things happen."""
+
+    iterations: int = option(30_000, "training steps; one photo each", low=1, high=10_000_000)
+    stated_for: int = option(30_000, "the number of iterations for which all other iteration numbers are stated", low=1)
+    harmonics_every: int = option(1000, "iterations between degrees of the harmonics; degree 0 first", low=1)
+    coarse_levels: int = option(0, "start with photos halved this often", low=0, high=4)
+    coarse_every: int = option(1000, "iterations at each coarse level", low=1)
+    evaluate_at: tuple[int, ...] = option((1000, 3000, 7000, 15_000, 30_000), "iterations that test the held-out views; the last always does", low=1)
+    checkpoint_every: int = option(5000, "iterations between checkpoints; one is always written at the end", low=1)
+    checkpoints_kept: int = option(1, "older checkpoints are deleted", low=1, high=1000)
+    nonfinite_limit: int = option(20, "steps with a loss or gradient that is not finite are skipped; more than this stop the training", low=0)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Every choice of a training; see the parts. Immutable: dataclasses.replace or load_config make another."""
+
+    model: ModelConfig = ModelConfig()
+    response: ResponseConfig = ResponseConfig()
+    fusion: FusionConfig = FusionConfig()
+    loss: LossConfig = LossConfig()
+    densification: DensificationConfig = DensificationConfig()
+    optimizer: OptimizerConfig = OptimizerConfig()
+    schedule: ScheduleConfig = ScheduleConfig()
+    seed: int = option(0, "of every random number in the training", low=0, high=2**62)
+
+    def __post_init__(self):
+        validate(self)
+
+    def scaled(self, iteration: int) -> int:
+        """An iteration number of the config as a number of this training's iterations, at least 1."""
+        return max(1, round(iteration * self.schedule.iterations / self.schedule.stated_for))
+
+
+def validate(config: Config) -> None:
+    """Raises ConfigError for the first field that is out of range, or for fields that contradict each other."""
+    for path, value, limits in _leaves(config, ""):
+        _check(path, value, limits)
+    _check_together(config)
+
+
+def _leaves(node, prefix: str):
+    for item in fields(node):
+        value = getattr(node, item.name)
+        if is_dataclass(value):
+            yield from _leaves(value, f"{prefix}{item.name}.")
+        else:
+            yield prefix + item.name, value, item.metadata["limits"]
+
+
+def _check(path: str, value, limits: dict) -> None:
+    for item in value if isinstance(value, tuple) else (value,):
+        shown = f"{path} = {item!r}"
+        if isinstance(item, float) and not math.isfinite(item):
+            raise ConfigError(f"{shown} is not finite")
+        if limits["choices"] is not None and item not in limits["choices"]:
+            raise ConfigError(f"{shown} is not one of {', '.join(limits['choices'])}")
+        if limits["low"] is not None and item < limits["low"]:
+            raise ConfigError(f"{shown} is less than {limits['low']}")
+        if limits["above"] is not None and item <= limits["above"]:
+            raise ConfigError(f"{shown} is not greater than {limits['above']}")
+        if limits["high"] is not None and item > limits["high"]:
+            raise ConfigError(f"{shown} is greater than {limits['high']}")
+        if limits["nonempty"] and not item:
+            raise ConfigError(f"{shown} is empty")
+
+
+def _check_together(config: Config) -> None:
+    model, fusion, loss = config.model, config.fusion, config.loss
+    if fusion.enabled and len(fusion.exposures) < 2:
+        raise ConfigError(f"fusion.exposures = {list(fusion.exposures)} is too few; a fusion needs two or more")
+    if model.radiance == "display" and fusion.enabled:
+        raise ConfigError('fusion.enabled = true needs radiance: model.radiance = "display" has none')
+    if model.radiance == "display" and loss.linear_weight > 0:
+        raise ConfigError(f'loss.linear_weight = {loss.linear_weight} needs radiance: model.radiance = "display" has none')
+    if loss.linear_weight > 0 and not (fusion.enabled or loss.hdr_truth):
+        raise ConfigError(
+            f"loss.linear_weight = {loss.linear_weight} has nothing to compare: needs fusion.enabled or loss.hdr_truth"
+        )
+    if config.optimizer.means_final > config.optimizer.means:
+        raise ConfigError(f"optimizer.means_final = {config.optimizer.means_final} is greater than optimizer.means")

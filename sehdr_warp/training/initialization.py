@@ -1,0 +1,190 @@
+"""The field a training starts from: the scene's points, or points drawn where several cameras look."""
+
+import numpy as np
+import torch
+
+from ..errors import InputError, SehdrError
+from ..model.exposure import exposure_times
+from ..model.fusion import NeuralExposureFusion
+from ..model.gaussians import Gaussians
+from ..model.radiance_field import EXPOSURE_FLOOR, RadianceField
+from ..model.response import Response, response_by_name, response_names
+from ..scene import Scene, View
+from .config import Config
+
+CODE_RANGE = (1 / 255, 250 / 255)
+"""Start colours are held within these encoded values: beyond them a photo tells a bound, not a colour."""
+CANDIDATES = 4
+"""Points drawn for each one kept, where a scene has none."""
+DEPTH_RANGE = (0.15, 4.0)
+"""Depths of drawn points in units of the distance to where the cameras look."""
+
+
+def base_exposure_time(scene: Scene) -> float:
+    """dt_1: the median exposure time of the training photos, seconds."""
+    return float(np.median([view.exposure_time for view in scene.train_views]))
+
+
+def scene_extent(scene: Scene) -> float:
+    """The radius of the training cameras around their mean, plus a tenth (3DGS); for cameras at one place, a tenth of
+    the distance to the points. World units, positive."""
+    positions = np.stack([view.camera.position for view in scene.train_views])
+    centre = positions.mean(0)
+    radius = 1.1 * float(np.linalg.norm(positions - centre, axis=1).max())
+    if radius > 1e-6:
+        return radius
+    if len(scene.points):
+        return max(0.1 * float(np.median(np.linalg.norm(scene.points - centre, axis=1))), 1e-6)
+    return 1.0
+
+
+def choose_response(scene: Scene, config: Config) -> Response:
+    """The response that the config names; for "auto" the paper's choice on one random training photo."""
+    if config.response.name != "auto":
+        return response_by_name(config.response.name)
+    from ..model.response_selection import select_response
+
+    view = scene.train_views[int(np.random.default_rng(config.seed).integers(len(scene.train_views)))]
+    names = config.response.candidates or response_names()
+    return select_response(view.image, [response_by_name(name) for name in names])
+
+
+def make_field(scene: Scene, config: Config, response: Response, device: torch.device | str) -> RadianceField:
+    """The field at iteration 0. Raises InputError for a scene that cannot be trained."""
+    check_scene(scene)
+    rng = np.random.default_rng(config.seed)
+    points, colours = (scene.points, scene.point_colors) if len(scene.points) else random_points(scene, config, rng)
+    budget = config.densification.max_gaussians
+    if len(points) > budget:
+        chosen = np.sort(rng.choice(len(points), budget, replace=False))
+        points, colours = points[chosen], colours[chosen]
+    dc = start_colours(colours, config.model.radiance, response)
+    gaussians = Gaussians.from_points(
+        torch.tensor(points, dtype=torch.float32),
+        torch.tensor(dc, dtype=torch.float32),
+        config.model.harmonics_degree,
+        opacity=config.model.initial_opacity,
+        scale=config.model.initial_scale,
+    )
+    return assemble_field(gaussians, config, response, base_exposure_time(scene)).to(device)
+
+
+def assemble_field(gaussians: Gaussians, config: Config, response: Response, base_time: float) -> RadianceField:
+    """Gaussians, response and a freshly seeded fusion as the config says."""
+    fusion, options = None, config.fusion
+    if options.enabled:
+        scales = {"unit": 1.0, "base": 1.0 / base_time, "white": "white"}
+        fusion = NeuralExposureFusion(
+            response,
+            exposure_times(base_time, options.exposures),
+            base_time,
+            width=options.width,
+            hidden_layers=options.hidden_layers,
+            sigma=options.sigma,
+            evaluation=options.evaluation,
+            radiance_scale=scales[options.radiance_scale],
+            seed=config.seed,
+        )
+    return RadianceField(
+        gaussians,
+        response,
+        base_time=base_time,
+        radiance=config.model.radiance,
+        tone_map=config.model.tone_map,
+        fusion=fusion,
+        antialiased=config.model.antialiased,
+        low_pass=config.model.low_pass,
+    )
+
+
+def check_scene(scene: Scene) -> None:
+    """Raises InputError for a scene without views enough, or whose photos say nothing about light."""
+    views = scene.train_views
+    if len(views) < 2:
+        raise InputError(scene.name, f"{len(views)} training view(s)", "a scene needs at least two photos from different places")
+    images = [view.image for view in views]
+    if max(float(image.max()) for image in images) <= 1 / 255:
+        raise InputError(scene.name, "every training photo is black", "use a longer exposure")
+    if min(float(image.min()) for image in images) >= 254 / 255:
+        raise InputError(scene.name, "every training photo is white", "use a shorter exposure")
+
+
+def start_colours(encoded: np.ndarray, radiance: str, response: Response) -> np.ndarray:
+    """[N, 3] start values of the constant part of the colour from encoded values [N, 3] in [0, 1]."""
+    encoded = np.clip(np.asarray(encoded, dtype=np.float64), *CODE_RANGE)
+    if radiance == "display":
+        return encoded - 0.5
+    exposure = np.maximum(response.decode(encoded), EXPOSURE_FLOOR)
+    return np.log(exposure) if radiance == "log" else exposure
+
+
+def random_points(scene: Scene, config: Config, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Points [N, 3] where at least two training cameras look, and their encoded colours [N, 3].
+
+    Drawn along the cameras' rays, uniform in inverse depth, then kept in the order of how well the photos that see a
+    point agree on its colour. Raises SehdrError if no two cameras share what they see.
+    """
+    views, count = scene.train_views, config.model.initial_count
+    distance = focus_distance(views)
+    found, wanted = [], CANDIDATES * count
+    for _ in range(8):
+        points = _points_on_rays(views, wanted, distance, rng)
+        seen, mean, spread = colour_agreement(points, views)
+        keep = seen >= 2
+        found.append((points[keep], mean[keep], spread[keep]))
+        if sum(len(points) for points, _, _ in found) >= count:
+            break
+    points, mean, spread = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    if len(points) < 4:
+        raise SehdrError(f"{scene.name}: no two training cameras look at the same place; check the poses")
+    best = np.argsort(spread, kind="stable")[:count]
+    return points[best], mean[best]
+
+
+def focus_distance(views: tuple[View, ...]) -> float:
+    """The median distance from the cameras to the point nearest to all their axes; where they do not look at a common
+    point, twice the spread of the cameras. World units, positive."""
+    origins = np.stack([view.camera.position for view in views])
+    axes = np.stack([view.camera.world_to_camera[2, :3] for view in views])
+    spread = float(np.linalg.norm(origins - origins.mean(0), axis=1).max())
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    focus = np.linalg.lstsq(across.sum(0), (across @ origins[:, :, None]).sum(0)[:, 0], rcond=1e-4)[0]
+    ahead = ((focus - origins) * axes).sum(1)
+    return float(np.median(ahead)) if np.median(ahead) > 0.2 * spread else max(2 * spread, 1e-3)
+
+
+def _points_on_rays(views, count: int, distance: float, rng: np.random.Generator) -> np.ndarray:
+    near, far = (factor * distance for factor in DEPTH_RANGE)
+    chosen = rng.integers(len(views), size=count)
+    across, depth = rng.random((count, 2)), 1 / rng.uniform(1 / far, 1 / near, count)
+    points = np.empty((count, 3))
+    for index, view in enumerate(views):
+        mine, camera = chosen == index, view.camera
+        x = (across[mine, 0] * camera.width - camera.cx) / camera.fx
+        y = (across[mine, 1] * camera.height - camera.cy) / camera.fy
+        local = np.stack([x, y, np.ones_like(x)], 1) * depth[mine, None]
+        points[mine] = local @ camera.world_to_camera[:3, :3] + camera.position
+    return points
+
+
+def colour_agreement(points: np.ndarray, views: tuple[View, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How many photos show each point [N], the mean of their encoded values there [N, 3], and the values' standard
+    deviation over photos and channels [N]; occlusion is not known and not considered."""
+    seen = np.zeros(len(points))
+    total, squares = np.zeros((len(points), 3)), np.zeros((len(points), 3))
+    for view in views:
+        camera = view.camera
+        local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        depth = np.where(local[:, 2] > 1e-9, local[:, 2], np.nan)
+        with np.errstate(invalid="ignore"):
+            column = np.floor(camera.fx * local[:, 0] / depth + camera.cx)
+            row = np.floor(camera.fy * local[:, 1] / depth + camera.cy)
+            inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        value = view.image[row[inside].astype(int), column[inside].astype(int)]
+        seen[inside] += 1
+        total[inside] += value
+        squares[inside] += value.astype(np.float64) ** 2
+    mean = total / np.maximum(seen, 1)[:, None]
+    variance = np.maximum(squares / np.maximum(seen, 1)[:, None] - mean**2, 0).mean(1)
+    # The deviation of few samples is too small by chance: two agreeing photos say less than ten.
+    return seen, mean, np.sqrt(variance * seen / np.maximum(seen - 1, 1))

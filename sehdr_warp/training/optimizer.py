@@ -1,0 +1,65 @@
+"""Adam over the Gaussians and the fusion, with 3DGS's learning rates."""
+
+import torch
+from torch import Tensor
+
+from ..model.gaussians import PARAMETER_NAMES
+from ..model.radiance_field import RadianceField
+from .config import Config
+
+EPSILON = 1e-15
+"""3DGS: gradients of a single Gaussian are tiny, and must not drown in Adam's usual 1e-8."""
+
+
+def make_optimizer(field: RadianceField, config: Config, extent: float) -> torch.optim.Adam:
+    """One parameter group, with its name, for each parameter of the Gaussians and one for the fusion."""
+    rates = {name: getattr(config.optimizer, name) for name in PARAMETER_NAMES}
+    rates["means"] *= extent
+    groups = [{"name": name, "params": [getattr(field.gaussians, name)], "lr": rate} for name, rate in rates.items()]
+    if field.fusion is not None:
+        groups.append({"name": "fusion", "params": list(field.fusion.parameters()), "lr": config.optimizer.fusion})
+    return torch.optim.Adam(groups, eps=EPSILON, fused=True)
+
+
+def means_rate(config: Config, extent: float, iteration: int) -> float:
+    """The learning rate of the positions at an iteration: exponential from `means` to `means_final`, times extent."""
+    rates = config.optimizer
+    part = min(iteration / config.schedule.iterations, 1.0)
+    return extent * rates.means * (rates.means_final / rates.means) ** part
+
+
+def guarded_step(optimizer: torch.optim.Adam, loss: Tensor) -> Tensor:
+    """One step of Adam, or none if the loss or a gradient is not finite; decided on the device, without waiting for it.
+
+    Returns a scalar float tensor: 1 if the step was skipped, else 0.
+    """
+    gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
+    norms = torch._foreach_norm(gradients)
+    bad = (~torch.isfinite(torch.stack([loss.detach(), *norms])).all()).float()
+    # The hook of torch's gradient scaler: the fused kernel leaves parameters, moments and step count where it is 1.
+    optimizer.found_inf = bad
+    optimizer.step()
+    return bad
+
+
+def optimizer_tensors(optimizer: torch.optim.Adam) -> dict[str, Tensor]:
+    """Adam's state as named tensors, `<group>.<index>.<key>`, for a checkpoint."""
+    tensors = {}
+    for group in optimizer.param_groups:
+        for index, parameter in enumerate(group["params"]):
+            for key, value in optimizer.state.get(parameter, {}).items():
+                tensors[f"{group['name']}.{index}.{key}"] = value
+    return tensors
+
+
+def load_optimizer_tensors(optimizer: torch.optim.Adam, tensors: dict[str, Tensor]) -> None:
+    """Takes up what optimizer_tensors gave."""
+    for group in optimizer.param_groups:
+        for index, parameter in enumerate(group["params"]):
+            prefix = f"{group['name']}.{index}."
+            state = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+            if state:
+                optimizer.state[parameter] = {
+                    key: value.to(parameter.device, copy=True).reshape(() if key == "step" else parameter.shape)
+                    for key, value in state.items()
+                }

@@ -1,0 +1,61 @@
+"""What a training tells while it runs: a bar on a terminal, plain lines elsewhere."""
+
+import sys
+import time
+
+PLAIN_EVERY = 10.0
+"""Seconds between plain lines."""
+
+
+class Progress:
+    """Reports on a training of `total` iterations to a stream, by default standard error.
+
+    enabled: False says nothing at all. Use as a context manager; update() is cheap enough for every report.
+    """
+
+    def __init__(self, total: int, *, enabled: bool = True, stream=None):
+        self.total = total
+        self.stream = stream or sys.stderr
+        self.enabled = enabled
+        self._bar = self._task = None
+        self._last_line = 0.0
+
+    def __enter__(self):
+        if self.enabled and self.stream.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+            self._bar = Progress(
+                TextColumn("train"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[figures]}"),
+                TextColumn("left"), TimeRemainingColumn(), console=Console(file=self.stream), transient=False,
+            )
+            self._task = self._bar.add_task("train", total=self.total, figures="")
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_):
+        if self._bar is not None:
+            self._bar.stop()
+
+    def is_due(self, iteration: int) -> bool:
+        """Whether an update would show; on a terminal about twice a second, else every PLAIN_EVERY seconds."""
+        if not self.enabled:
+            return False
+        interval = 0.5 if self._bar is not None else PLAIN_EVERY
+        return iteration == self.total or time.monotonic() - self._last_line >= interval
+
+    def update(self, iteration: int, *, loss: float, psnr: float, count: int, seconds_left: float) -> None:
+        """loss and PSNR (dB) of the last photo, Gaussians, and the expected seconds to the end."""
+        self._last_line = time.monotonic()
+        figures = f"loss {loss:.4f}  PSNR {psnr:.2f} dB  {count} Gaussians"
+        if self._bar is not None:
+            self._bar.update(self._task, completed=iteration, figures=figures)
+        elif self.enabled:
+            self.note(f"iteration {iteration}/{self.total}  {figures}  {seconds_left:.0f} s left")
+
+    def note(self, line: str) -> None:
+        """A line that stays."""
+        if self._bar is not None:
+            self._bar.console.print(line, highlight=False, markup=False)
+        elif self.enabled:
+            print(line, file=self.stream, flush=True)

@@ -1,0 +1,110 @@
+"""Densification as a Markov chain: 3D Gaussian Splatting as Markov Chain Monte Carlo (NeurIPS 2024).
+
+Dead Gaussians move to where living ones are, in a way that keeps the image; the count grows by a fixed part up to the
+budget; noise on the positions of the faint ones explores. No opacity resets, no gradient statistics.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from ..model.gaussians import Gaussians
+from .config import Config
+from .densification import Densification, rotate
+
+MOST_COPIES = 51
+"""A Gaussian is shared by at most this many at once, as in the authors' code: the binomial sums stay exact."""
+NOISE_SHARPNESS, NOISE_CENTRE = 100.0, 0.995
+"""Equation 8: noise is for Gaussians of opacity below 1 - 0.995."""
+
+
+class Relocation(Densification):
+    """Relocation, growth and noise; see the module."""
+
+    def __init__(self, config: Config, extent: float):
+        super().__init__(config, extent)
+        self._sums = _relocation_sums()
+
+    @torch.no_grad()
+    def change(self, iteration: int, gaussians: Gaussians, optimizer: torch.optim.Optimizer, generator) -> bool:
+        if not self._is_due(iteration):
+            return False
+        dead = gaussians.opacities() <= self.options.prune_opacity
+        moved = self._relocate(gaussians, dead, optimizer, generator)
+        count = gaussians.count
+        target = min(self.options.max_gaussians, int((1 + self.options.growth) * count))
+        if target > count:
+            self._add(gaussians, target - count, optimizer, generator)
+        return moved or target > count
+
+    @torch.no_grad()
+    def perturb(self, gaussians: Gaussians, means_rate: float, generator) -> None:
+        if self.options.noise == 0:
+            return
+        faintness = torch.sigmoid(NOISE_SHARPNESS * (1 - gaussians.opacities() - NOISE_CENTRE))
+        normal = torch.randn(gaussians.means.shape, generator=generator, device=gaussians.means.device)
+        step = normal * (faintness * (self.options.noise * means_rate))[:, None]
+        # Noise shaped by the covariance R S S R^T.
+        turned = rotate(gaussians.quaternions * _CONJUGATE.to(gaussians.quaternions), step)
+        gaussians.means += rotate(gaussians.quaternions, turned * (2 * gaussians.log_scales).exp())
+
+    def _relocate(self, gaussians: Gaussians, dead: Tensor, optimizer, generator) -> bool:
+        dead_index, alive = dead.nonzero()[:, 0], (~dead).nonzero()[:, 0]
+        if len(dead_index) == 0 or len(alive) == 0:
+            return False
+        chosen = alive[_draw(gaussians.opacities()[alive], len(dead_index), generator)]
+        self._share(gaussians, chosen, optimizer)
+        # In the authors' code the moved ones keep their Adam state, and only those that share lose it.
+        with torch.no_grad():
+            for name, values in gaussians.rows(chosen).items():
+                getattr(gaussians, name)[dead_index] = values
+        return True
+
+    def _add(self, gaussians: Gaussians, count: int, optimizer, generator) -> None:
+        chosen = _draw(gaussians.opacities(), count, generator)
+        self._share(gaussians, chosen, optimizer)
+        gaussians.append(gaussians.rows(chosen), optimizer)
+
+    def _share(self, gaussians: Gaussians, chosen: Tensor, optimizer) -> None:
+        """Makes each chosen Gaussian the n-th part of itself, n = 1 + how often it was chosen (equation 9)."""
+        copies = torch.bincount(chosen, minlength=gaussians.count)
+        index = copies.nonzero()[:, 0]
+        parts = (copies[index] + 1).clamp_max(MOST_COPIES)
+        opacity = gaussians.opacities()[index].clamp_max(1 - 1e-6)
+        part = 1 - (1 - opacity) ** (1 / parts)
+        powers = part[:, None].double() ** torch.arange(1, MOST_COPIES + 1, device=part.device)
+        total = (self._sums.to(part.device)[parts - 1] * powers).sum(1)
+        shrink = (opacity.double() / total).clamp(1e-3, 1.0).float()
+        part = part.clamp(self.options.prune_opacity, 1 - 1e-6)
+        gaussians.overwrite(
+            {
+                "opacity_logits": torch.logit(part),
+                "log_scales": gaussians.log_scales[index] + shrink.log()[:, None],
+            },
+            index,
+            optimizer,
+        )
+        for name in ("means", "quaternions", "harmonics_dc", "harmonics_rest"):
+            gaussians.forget(name, index, optimizer)
+
+
+_CONJUGATE = torch.tensor([1.0, -1.0, -1.0, -1.0])
+
+
+def _draw(weights: Tensor, count: int, generator) -> Tensor:
+    """[count] indices drawn in proportion to weights, with replacement; by bisection, for any number of weights."""
+    steps = weights.double().cumsum(0)
+    uniform = torch.rand(count, generator=generator, device=weights.device, dtype=torch.float64)
+    return torch.searchsorted(steps, uniform * steps[-1]).clamp_max(len(weights) - 1)
+
+
+def _relocation_sums() -> Tensor:
+    """[MOST_COPIES, MOST_COPIES] float64; row n - 1 dotted with (o, o^2, ...) is the denominator of equation 9 for n:
+    sum over i <= n and k < i of binomial(i - 1, k) (-1)^k o^(k + 1) / sqrt(k + 1)."""
+    rows = torch.zeros(MOST_COPIES, MOST_COPIES, dtype=torch.float64)
+    for n in range(1, MOST_COPIES + 1):
+        for k in range(n):
+            # The binomials of a column sum to one binomial (hockey stick).
+            rows[n - 1, k] = math.comb(n, k + 1) * (-1) ** k / math.sqrt(k + 1)
+    return rows

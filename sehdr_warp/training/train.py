@@ -1,0 +1,255 @@
+"""A whole training: folder, steps, reports, held-out tests, checkpoints, and a tidy end however it comes."""
+
+import signal
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+
+from ..errors import InputError, SehdrError
+from ..model.gaussians import Gaussians
+from ..output.files import write_json
+from ..scene import Scene
+from .checkpoint import newest_checkpoint, write_checkpoint
+from .config import Config
+from .config_files import config_to_dict, load_config, read_config_json
+from .heldout import evaluate_views
+from .initialization import choose_response, make_field
+from .progress import Progress
+from .run import (
+    CHECKPOINTS, CONFIG, SUMMARY, Run, append_metrics, check_same_scene, field_from_checkpoint, load_run,
+    prepare_folder, read_run_info, rewind_metrics, write_start,
+)
+from .trainer import Trainer
+
+
+def train(
+    scene: Scene,
+    out: Path | str,
+    config: Config | None = None,
+    *,
+    device: str | torch.device | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    quiet: bool = False,
+    tensorboard: bool = False,
+    data: dict | None = None,
+) -> Run:
+    """Trains a scene and returns the trained run, whose folder is `out`.
+
+    scene: of load_scene; its training views are trained on, its test views are the held-out ones.
+    config: by default the default preset, or, resuming, the run's own.
+    device: "cpu", "cuda:0", ...; by default the first GPU if there is one.
+    resume: continue the run in `out` from its newest complete checkpoint; with the same scene and config the result
+        is, on the CPU, bit for bit that of an uninterrupted training. A folder without a run starts one.
+    overwrite: replace the run in `out`.
+    quiet: no progress on standard error. tensorboard: event files in out/tensorboard (needs the extra `tensorboard`).
+    data: how load_scene made the scene ("path", "exposure_index", "max_size"), saved so that it can be loaded again.
+
+    Raises InputError for a scene, folder or config that cannot be used, SehdrError if the training diverges or the
+    disk is full, KeyboardInterrupt after an interrupt; a usable checkpoint is left then.
+    """
+    out, device = Path(out), pick_device(device)
+    if prepare_folder(out, resume=resume, overwrite=overwrite):
+        trainer, seconds = _continue(scene, out, config, device)
+    else:
+        config = config or load_config()
+        field = make_field(scene, config, choose_response(scene, config), device)
+        trainer, seconds = Trainer(scene, config, field), 0.0
+        write_start(out, scene, config, field, data or {})
+    loop = _Loop(scene, out, trainer, seconds, tensorboard)
+    with Progress(trainer.config.schedule.iterations, enabled=not quiet) as progress:
+        loop.run(progress)
+    return load_run(out, device=device)
+
+
+def pick_device(device: str | torch.device | None) -> torch.device:
+    """The device a user named, by default the first GPU or else the CPU; raises InputError if it is not there."""
+    if device is None:
+        return torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
+    try:
+        made = torch.device(device)
+        torch.empty(0, device=made)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"device {device}", f"cannot be used ({reason})", "use cpu, or cuda:N of a GPU that torch sees") from None
+    if made.type not in ("cpu", "cuda"):
+        raise InputError(f"device {device}", "is neither a CPU nor a CUDA GPU", "use cpu or cuda:N")
+    return torch.device("cuda", made.index or 0) if made.type == "cuda" else made
+
+
+def _continue(scene: Scene, out: Path, config: Config | None, device) -> tuple[Trainer, float]:
+    """Trainer and training seconds as the newest checkpoint has them; from the start where there is none yet."""
+    saved, info = read_config_json(out / CONFIG), read_run_info(out)
+    if config is not None and config != saved:
+        raise InputError(out / CONFIG, _first_difference(saved, config), "resume with the run's own config, or train anew")
+    check_same_scene(out, scene)
+    checkpoint = newest_checkpoint(out / CHECKPOINTS)
+    if checkpoint is None:
+        rewind_metrics(out, 0)
+        return Trainer(scene, saved, make_field(scene, saved, choose_response(scene, saved), device)), 0.0
+    trainer = Trainer(scene, saved, field_from_checkpoint(checkpoint, saved, info).to(device))
+    trainer.load_state(checkpoint.tensors, checkpoint.values)
+    rewind_metrics(out, trainer.iteration)
+    return trainer, checkpoint.values["seconds"]
+
+
+def _first_difference(saved: Config, given: Config) -> str:
+    old, new = config_to_dict(saved), config_to_dict(given)
+    for part, values in old.items():
+        if isinstance(values, dict):
+            for name, value in values.items():
+                if new[part][name] != value:
+                    return f"{part}.{name} = {value!r}, but {new[part][name]!r} was asked for"
+        elif new[part] != values:
+            return f"{part} = {values!r}, but {new[part]!r} was asked for"
+    return "the config differs"
+
+
+class _Loop:
+    """The steps of one process's part of a training."""
+
+    def __init__(self, scene: Scene, out: Path, trainer: Trainer, seconds: float, tensorboard: bool):
+        self.scene, self.out, self.trainer = scene, out, trainer
+        self.schedule = trainer.config.schedule
+        self.evaluate_at = {trainer.config.scaled(n) for n in self.schedule.evaluate_at} | {self.schedule.iterations}
+        self.checkpoint_every = trainer.config.scaled(self.schedule.checkpoint_every)
+        self.seconds = seconds
+        self.first_iteration, self.first_seconds = trainer.iteration, seconds
+        self.writer = _tensorboard_writer(out) if tensorboard else None
+
+    def run(self, progress: Progress) -> None:
+        trainer, total = self.trainer, self.schedule.iterations
+        with _interruptible() as interrupted:
+            started = time.perf_counter()
+            while trainer.iteration < total and not interrupted.is_set():
+                trainer.step()
+                iteration = trainer.iteration
+                if progress.is_due(iteration):
+                    self._report(progress, self.seconds + time.perf_counter() - started)
+                evaluate, save = iteration in self.evaluate_at, iteration % self.checkpoint_every == 0
+                if evaluate or save:
+                    self._stop_clock(started)
+                    if evaluate:
+                        self._evaluate(progress)
+                    if save and iteration < total:
+                        self._checkpoint()
+                    started = time.perf_counter()
+            self._stop_clock(started)
+            trainer.check()
+            self._checkpoint()
+            self._summarise()
+        if self.writer is not None:
+            self.writer.close()
+        if interrupted.is_set() and trainer.iteration < total:
+            progress.note(f"stopped at iteration {trainer.iteration}; continue with --resume")
+            raise KeyboardInterrupt
+
+    def _stop_clock(self, started: float) -> None:
+        """Adds the seconds since `started`, in which steps ran, to the training's; the device finishes first."""
+        if self.trainer.device.type == "cuda":
+            torch.cuda.synchronize(self.trainer.device)
+        self.seconds += time.perf_counter() - started
+
+    def _report(self, progress: Progress, seconds: float) -> None:
+        trainer, gaussians = self.trainer, self._gaussians()
+        per_step = (seconds - self.first_seconds) / max(1, trainer.iteration - self.first_iteration)
+        left = per_step * (self.schedule.iterations - trainer.iteration)
+        loss, psnr = trainer.loss, trainer.psnr
+        progress.update(trainer.iteration, loss=loss, psnr=psnr, count=gaussians.count, seconds_left=left)
+        self._log("train", trainer.iteration, {"loss": loss, "psnr": psnr, "gaussians": gaussians.count})
+
+    def _evaluate(self, progress: Progress) -> None:
+        trainer, views = self.trainer, self.scene.test_views
+        if not views:
+            return
+        scores = evaluate_views(trainer.field, views, trainer.degree)
+        line = {
+            "iteration": trainer.iteration,
+            "seconds": round(self.seconds, 3),
+            "split": "test",
+            **{name: round(value, 4) for name, value in scores.items()},
+            "gaussians": self._gaussians().count,
+        }
+        append_metrics(self.out, line)
+        self._log("test", trainer.iteration, scores)
+        figures = "  ".join(f"{name} {value:.2f} dB" for name, value in scores.items())
+        progress.note(f"iteration {trainer.iteration}  held-out {figures}  after {self.seconds:.1f} s")
+
+    def _checkpoint(self) -> None:
+        tensors, values = self.trainer.state()
+        values = values | {"seconds": self.seconds}
+        write_checkpoint(self.out / CHECKPOINTS, tensors, values, kept=self.schedule.checkpoints_kept)
+
+    def _summarise(self) -> None:
+        trainer = self.trainer
+        write_json(
+            self.out / SUMMARY,
+            {
+                "iteration": trainer.iteration,
+                "finished": trainer.iteration >= self.schedule.iterations,
+                "train_seconds": round(self.seconds, 3),
+                "gaussians": self._gaussians().count,
+                "skipped_steps": trainer.skipped_steps,
+                "device": device_name(trainer.device),
+                **peak_memory(trainer.device),
+            },
+            overwrite=True,
+        )
+
+    def _log(self, split: str, iteration: int, figures: dict[str, float]) -> None:
+        if self.writer is not None:
+            for name, value in figures.items():
+                self.writer.add_scalar(f"{split}/{name}", value, iteration)
+
+    def _gaussians(self) -> Gaussians:
+        return self.trainer.field.gaussians
+
+
+def device_name(device: torch.device) -> str:
+    """What runs the training, for a report."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu ({torch.get_num_threads()} threads)"
+
+
+def peak_memory(device: torch.device) -> dict[str, int]:
+    """Largest memory so far, bytes: of this process, and on a GPU of torch's tensors there."""
+    peaks = {}
+    if sys.platform != "win32":
+        import resource
+
+        unit = 1 if sys.platform == "darwin" else 1024
+        peaks["peak_memory_bytes"] = unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    if device.type == "cuda":
+        peaks["peak_gpu_memory_bytes"] = torch.cuda.max_memory_allocated(device)
+    return peaks
+
+
+@contextmanager
+def _interruptible():
+    """An event that the first interrupt sets, so that a step is never cut in two; a second interrupt stops at once."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    previous = signal.getsignal(signal.SIGINT)
+
+    def on_interrupt(*_):
+        event.set()
+        signal.signal(signal.SIGINT, previous)
+
+    signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def _tensorboard_writer(out: Path):
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        raise SehdrError("TensorBoard is not installed; run `pip install sehdr-warp[tensorboard]`") from None
+    return SummaryWriter(str(out / "tensorboard"))
