@@ -115,7 +115,6 @@ def forward_kernel(dtype, channels: int, halvings: int):
     @wp.kernel(module="unique", module_options=_options(dtype))
     def blend_forward(
         first: int,
-        tiles: wp.array(dtype=wp.int32),
         ranges: wp.array(dtype=wp.vec2i),
         entries: wp.array(dtype=wp.int32),
         shapes: wp.array(dtype=vec4),
@@ -132,7 +131,7 @@ def forward_kernel(dtype, channels: int, halvings: int):
         image: wp.array2d(dtype=real),
         alpha: wp.array(dtype=real),
     ):
-        tile = tiles[first + wp.tid()]
+        tile = first + wp.tid()
         bounds = ranges[tile]
         x0 = (tile % columns) * size
         y0 = (tile // columns) * size
@@ -206,7 +205,6 @@ def backward_kernel(dtype, channels: int, halvings: int):
     @wp.kernel(module="unique", module_options=_options(dtype))
     def blend_backward(
         first: int,
-        tiles: wp.array(dtype=wp.int32),
         ranges: wp.array(dtype=wp.vec2i),
         entries: wp.array(dtype=wp.int32),
         emission: wp.array(dtype=wp.int32),
@@ -228,7 +226,7 @@ def backward_kernel(dtype, channels: int, halvings: int):
         slopes: wp.array2d(dtype=row),
         entry_gradients: wp.array2d(dtype=real),
     ):
-        tile = tiles[first + wp.tid()]
+        tile = first + wp.tid()
         bounds = ranges[tile]
         x0 = (tile % columns) * size
         y0 = (tile // columns) * size

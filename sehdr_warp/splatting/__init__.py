@@ -2,6 +2,6 @@
 
 from .bridge import Program, differentiable
 from .harmonics import spherical_harmonics
-from .rasterize import Rendering, rasterize
+from .rasterization import Rendering, rasterize
 
 __all__ = ["Program", "Rendering", "differentiable", "rasterize", "spherical_harmonics"]

@@ -126,10 +126,11 @@ class Program:
 
 
 def _scalar(dtype) -> torch.dtype:
-    return wp.dtype_to_torch(getattr(dtype, "_wp_scalar_type_", dtype))
+    return dtype if isinstance(dtype, torch.dtype) else wp.dtype_to_torch(getattr(dtype, "_wp_scalar_type_", dtype))
 
 
 def _array(tensor: torch.Tensor, dtype=None) -> wp.array:
+    dtype = None if isinstance(dtype, torch.dtype) else dtype
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 

@@ -17,7 +17,7 @@ from ..kernels.constants import (
     TILE_SIZE,
     TRANSMITTANCE_MIN,
 )
-from .rasterize import Rendering
+from .rasterization import Rendering
 
 
 def project_reference(

@@ -1,0 +1,107 @@
+"""The blend on the CPU: tiles in balanced pieces, one piece to a thread at a time."""
+
+import math
+
+import torch
+import warp as wp
+
+from ..kernels import blend_cpu
+from ..kernels.constants import TILE_SIZE
+from ..kernels.geometry import vector
+from . import threads
+from .dtypes import warp_scalar
+from .tile_lists import TileLists
+
+
+def blend_on_cpu(device, features, lists: TileLists, image, alpha, width: int, height: int, alpha_threshold: float):
+    """Fill image [H, W, C] and alpha [H, W] (Warp arrays); return the backward pass as a function of their .grad."""
+    scalar = warp_scalar(features.dtype)
+    channels = features.shape[1]
+    halvings = exponent_halvings(alpha_threshold)
+    row, vec4 = vector(TILE_SIZE, scalar), vector(4, scalar)
+    tile_count = lists.columns * lists.rows
+
+    def rows(*shape):
+        return wp.from_torch(features.new_empty(tile_count, *shape, TILE_SIZE), dtype=row, requires_grad=False)
+
+    pieces = balanced_pieces(lists)
+    iota = wp.from_torch(torch.arange(TILE_SIZE, dtype=features.dtype).reshape(1, TILE_SIZE), dtype=row)
+    ranges, entries = wp.from_torch(lists.ranges, dtype=wp.vec2i), wp.from_torch(lists.gaussians)
+    records = [wp.from_torch(lists.shapes, dtype=vec4), wp.from_torch(lists.ellipses, dtype=vec4)]
+    colours = wp.from_torch(features, requires_grad=False)
+    view = [lists.columns, width, height, alpha_threshold, iota]
+    transmittance, last = rows(TILE_SIZE), rows(TILE_SIZE)
+    pixels = height * width
+    threads.launch_ranges(
+        blend_cpu.forward_kernel(scalar, channels, halvings),
+        pieces,
+        [
+            ranges,
+            entries,
+            *records,
+            colours,
+            *view,
+            transmittance,
+            rows(channels, TILE_SIZE),
+            last,
+            image.reshape((pixels, channels)),
+            alpha.flatten(),
+        ],
+        device,
+    )
+
+    def backward() -> torch.Tensor:
+        entry_gradients = features.new_empty(lists.entry_count, channels + 6)
+        threads.launch_ranges(
+            blend_cpu.backward_kernel(scalar, channels, halvings),
+            pieces,
+            [
+                ranges,
+                entries,
+                wp.from_torch(lists.emission),
+                *records,
+                colours,
+                *view,
+                transmittance,
+                last,
+                image.grad.reshape((pixels, channels)),
+                alpha.grad.flatten(),
+                rows(TILE_SIZE),
+                rows(channels, TILE_SIZE),
+                rows(TILE_SIZE),
+                rows(TILE_SIZE),
+                wp.from_torch(entry_gradients),
+            ],
+            device,
+        )
+        gathered = features.new_empty(features.shape[0], channels + 6)
+        threads.launch_ranges(
+            blend_cpu.gather_kernel(scalar),
+            threads.even_ranges(features.shape[0]),
+            [
+                wp.from_torch(lists.order),
+                wp.from_torch(lists.ends),
+                wp.from_torch(entry_gradients),
+                channels + 6,
+                wp.from_torch(gathered),
+            ],
+            device,
+        )
+        return gathered
+
+    return backward
+
+
+def exponent_halvings(alpha_threshold: float) -> int:
+    """How often the polynomial exponential halves its argument to reach down to log(alpha_threshold)."""
+    return max(1, math.ceil(math.log2(-math.log(alpha_threshold) / 0.7)))
+
+
+def balanced_pieces(lists: TileLists) -> list[tuple[int, int]]:
+    """Ranges of tiles that hold about the same number of entries each, a few for every thread."""
+    tile_count = lists.ranges.shape[0]
+    work = (lists.ranges[:, 1] - lists.ranges[:, 0]).add(16).cumsum(0).double()  # 16: a tile costs something in itself
+    pieces = min(threads.thread_count() * 8, tile_count)
+    goals = torch.arange(1, pieces, dtype=torch.float64) * (float(work[-1]) / pieces)
+    bounds = sorted({0, *torch.searchsorted(work, goals).tolist(), tile_count})
+    return list(zip(bounds, bounds[1:]))
