@@ -1,0 +1,78 @@
+"""The CUDA block kernels run on CPU fibers, so that a machine without a GPU tests their logic."""
+
+import pytest
+import torch
+import warp as wp
+
+from sehdr_warp.splatting.blending import blend
+from sehdr_warp.splatting.projection import project
+from sehdr_warp.splatting.reference import blend_reference
+from sehdr_warp.splatting.tile_lists import build_tile_lists
+
+from .scenes import random_like, random_scene, relative_error
+
+BOUNDS = {torch.float64: (1e-12, 1e-12), torch.float32: (1e-5, 1e-5)}
+
+
+def projected(scene, threshold):
+    tensors = [t for t in scene.tensors[:4]] + scene.tensors[5:]
+    return project(
+        *tensors,
+        width=scene.width,
+        height=scene.height,
+        near=0.01,
+        low_pass=0.3,
+        alpha_threshold=threshold,
+        antialiased=False,
+    )
+
+
+@pytest.fixture
+def fibers(monkeypatch):
+    """Switches block kernels on the CPU on; off again, because ordinary kernels must not run in blocks."""
+
+    def run(task):
+        monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+        try:
+            return task()
+        finally:
+            monkeypatch.setattr(wp.config, "enable_cpu_blocks", False)
+
+    return run
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
+@pytest.mark.parametrize("channels", [1, 3, 9])
+def test_block_kernels_match_the_reference(fibers, dtype, channels):
+    # Enough overlap that queues spill over 32 and pixels finish early; a cut tile at the right and the bottom.
+    scene = random_scene(count=600, channels=channels, width=44, height=26, spread=1.6, seed=2)
+    threshold = 1.0 / 255.0
+    with torch.no_grad():
+        geometry = projected(scene.to(dtype), threshold)
+        true_geometry = projected(scene.to(torch.float64), threshold)
+    inputs = [t.detach().requires_grad_() for t in (geometry[0], geometry[1], geometry[3])]
+    features = scene.tensors[4].to(dtype, copy=True).requires_grad_()
+    lists = build_tile_lists(*(t.detach() for t in geometry), scene.width, scene.height, threshold)
+    assert int((lists.ranges[:, 1] - lists.ranges[:, 0]).max()) > 64
+
+    def forward():
+        return blend(
+            *inputs, features, lists=lists, width=scene.width, height=scene.height, alpha_threshold=threshold,
+            block_kernels=True,
+        )
+
+    image, alpha = fibers(forward)
+    true_inputs = [t.detach().requires_grad_() for t in (true_geometry[0], true_geometry[1], true_geometry[3])]
+    true_features = scene.tensors[4].clone().requires_grad_()
+    true_image, true_alpha = blend_reference(
+        *true_inputs, true_features, true_geometry[2], true_geometry[4], scene.width, scene.height, threshold
+    )
+    assert (true_alpha > 0.999).any()
+    value_bound, gradient_bound = BOUNDS[dtype]
+    assert relative_error(image, true_image) < value_bound
+    assert relative_error(alpha, true_alpha) < value_bound
+    loss = (image * random_like(image, 1)).sum() + (alpha * random_like(alpha, 2)).sum()
+    fibers(loss.backward)
+    ((true_image * random_like(true_image, 1)).sum() + (true_alpha * random_like(true_alpha, 2)).sum()).backward()
+    for ours, truth in zip([*inputs, features], [*true_inputs, true_features]):
+        assert relative_error(ours.grad, truth.grad) < gradient_bound

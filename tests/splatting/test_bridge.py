@@ -1,0 +1,104 @@
+"""Any Warp kernel becomes a differentiable torch operation."""
+
+import pytest
+import torch
+import warp as wp
+
+from sehdr_warp.splatting import differentiable
+
+
+@wp.kernel
+def scale_kernel(values: wp.array(dtype=wp.vec3), gain: wp.array(dtype=wp.float32), scaled: wp.array(dtype=wp.vec3)):
+    i = wp.tid()
+    scaled[i] = gain[0] * values[i]
+
+
+@wp.kernel
+def square_kernel(values: wp.array(dtype=wp.vec3), squared: wp.array(dtype=wp.vec3)):
+    i = wp.tid()
+    squared[i] = wp.cw_mul(values[i], values[i])
+
+
+@differentiable
+def scale_and_square(program, values, gain):
+    scaled = program.write(values.shape, wp.vec3)
+    squared = program.write(values.shape, wp.vec3)
+    program.launch(scale_kernel, len(values), [program.read(values, wp.vec3), program.read(gain)], [scaled])
+    program.launch(square_kernel, len(values), [scaled], [squared])
+    return scaled, squared
+
+
+def leaves(device):
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randn(50, 3, generator=generator).to(device).requires_grad_()
+    return values, torch.tensor([1.7], device=device, requires_grad=True)
+
+
+def test_gradients_flow_through_the_tape(device):
+    values, gain = leaves(device)
+    scaled, squared = scale_and_square(values, gain)
+    (2.0 * scaled + squared).sum().backward()
+    torch.testing.assert_close(values.grad, 2.0 * gain + 2.0 * gain**2 * values)
+    torch.testing.assert_close(gain.grad, (2.0 * values + 2.0 * gain * values**2).sum().reshape(1))
+
+
+def test_only_one_output_used(device):
+    values, gain = leaves(device)
+    scaled, _ = scale_and_square(values, gain)
+    scaled.sum().backward()
+    torch.testing.assert_close(values.grad, gain.expand_as(values))
+
+
+def test_memory_is_shared_not_copied(device):
+    values, gain = leaves(device)
+    seen = []
+
+    @differentiable
+    def look(program, tensor):
+        array = program.read(tensor)
+        seen.append(array.ptr)
+        out = program.write(tensor.shape, wp.vec3)
+        return out
+
+    result = look(values)
+    assert seen == [values.data_ptr()]
+    assert result.device == values.device
+
+
+def test_the_gradient_that_torch_hands_in_is_left_alone(device):
+    values, gain = leaves(device)
+    scaled, squared = scale_and_square(values, gain)
+    scaled.retain_grad()
+    (3.0 * scaled).sum().backward()
+    torch.testing.assert_close(scaled.grad, torch.full_like(scaled, 3.0))
+
+
+def test_gradients_accumulate_like_any_torch_operation(device):
+    values, gain = leaves(device)
+    for _ in range(2):
+        scale_and_square(values, gain)[0].sum().backward()
+    torch.testing.assert_close(values.grad, 2.0 * gain.expand_as(values))
+
+
+def test_differentiating_twice_is_refused(device):
+    values, gain = leaves(device)
+    loss = scale_and_square(values, gain)[0].sum()
+    loss.backward(retain_graph=True)
+    with pytest.raises(RuntimeError, match="already differentiated"):
+        loss.backward()
+
+
+def test_runs_on_a_side_stream():
+    if not torch.cuda.is_available():
+        pytest.skip("streams are CUDA's")
+    values, gain = leaves("cuda:0")
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        busy = torch.randn(4000, 4000, device="cuda:0")
+        for _ in range(20):
+            busy = busy @ busy * 1e-3
+        moved = values * 2.0 + busy[0, 0] * 0.0
+        scaled, _ = scale_and_square(moved.nan_to_num(), gain)
+    torch.cuda.synchronize()
+    torch.testing.assert_close(scaled, 2.0 * gain * values)

@@ -1,0 +1,89 @@
+"""Spherical harmonics against SciPy's and against finite differences."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import sph_harm_y
+
+from sehdr_warp.splatting import spherical_harmonics
+
+from .scenes import finite_differences, relative_error
+
+GENERATOR_SEED = 7
+
+
+def inputs(count=20, terms=16):
+    generator = torch.Generator().manual_seed(GENERATOR_SEED)
+    coefficients = torch.randn(count, terms, 3, generator=generator, dtype=torch.float64)
+    means = torch.randn(count, 3, generator=generator, dtype=torch.float64) * 2.0
+    camera = torch.tensor([0.3, -0.2, 4.0], dtype=torch.float64)
+    return coefficients, means, camera
+
+
+def real_harmonics(direction: np.ndarray) -> np.ndarray:
+    """[N, 16] real spherical harmonics from SciPy's complex ones, with the signs that 3DGS gives them."""
+    x, y, z = direction.T
+    polar, azimuth = np.arccos(z), np.arctan2(y, x)
+    columns = []
+    for degree in range(4):
+        for order in range(-degree, degree + 1):
+            value = sph_harm_y(degree, abs(order), polar, azimuth)
+            # SciPy's value carries the Condon-Shortley phase (-1)^m, and so do 3DGS's constants.
+            if order == 0:
+                columns.append(value.real)
+            else:
+                columns.append(np.sqrt(2) * (value.real if order > 0 else value.imag))
+    return np.stack(columns, 1)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_basis_is_the_real_spherical_harmonics(device, degree):
+    coefficients, means, camera = inputs()
+    direction = torch.nn.functional.normalize(means - camera, dim=1).numpy()
+    terms = (degree + 1) ** 2
+    truth = torch.einsum("nk,nkc->nc", torch.from_numpy(real_harmonics(direction)[:, :terms]), coefficients[:, :terms])
+    for dtype, bound in ((torch.float64, 1e-12), (torch.float32, 1e-5)):
+        ours = spherical_harmonics(degree, *(t.to(device, dtype) for t in (coefficients, means, camera)))
+        assert relative_error(ours, truth) < bound
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("which", range(3), ids=["coefficients", "means", "camera_position"])
+def test_gradients_match_finite_differences(device, degree, which):
+    tensors = inputs(count=6)
+    weights = torch.randn(6, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+    def loss(*arguments, dtype=torch.float64):
+        values = spherical_harmonics(degree, *(t.to(device, dtype) for t in arguments))
+        return (values * weights.to(device, dtype)).sum()
+
+    numeric = finite_differences(loss, tensors, which, step=1e-3)
+    for dtype, bound in ((torch.float64, 1e-8), (torch.float32, 1e-4)):
+        leaves = [t.clone().requires_grad_() for t in tensors]
+        loss(*leaves, dtype=dtype).backward()
+        if degree == 0 and which > 0:
+            assert not leaves[which].grad.any()
+        else:
+            assert relative_error(leaves[which].grad, numeric) < bound
+
+
+def test_pair_of_coefficient_tensors_gives_the_same(device):
+    coefficients, means, camera = (t.to(device) for t in inputs())
+    pair = (coefficients[:, :1], coefficients[:, 1:])
+    assert torch.equal(
+        spherical_harmonics(2, pair, means, camera), spherical_harmonics(2, coefficients, means, camera)
+    )
+
+
+def test_a_gaussian_at_the_camera_has_its_constant_colour(device):
+    coefficients, means, camera = (t.to(device) for t in inputs())
+    means[0] = camera
+    values = spherical_harmonics(3, coefficients, means, camera)
+    assert torch.isfinite(values).all()
+
+
+@pytest.mark.parametrize(("degree", "message"), [(4, "not in 0..3"), (-1, "not in 0..3"), (3, "needs 16 coefficients")])
+def test_degrees_out_of_range_are_refused(degree, message):
+    coefficients, means, camera = inputs(terms=9)
+    with pytest.raises(ValueError, match=message):
+        spherical_harmonics(degree, coefficients, means, camera)

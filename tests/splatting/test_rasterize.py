@@ -1,0 +1,171 @@
+"""The whole splat against its plain torch reference and against finite differences, on every device."""
+
+import pytest
+import torch
+
+from sehdr_warp.splatting import rasterize
+from sehdr_warp.splatting.reference import rasterize_reference
+
+from .scenes import finite_differences, random_like, random_scene, relative_error
+
+NAMES = ("means", "log_scales", "quaternions", "opacities", "features", "world_to_camera", "intrinsics")
+# Largest relative error in norm: value, gradient.
+BOUNDS = {torch.float64: (1e-12, 1e-11), torch.float32: (1e-5, 1e-4)}
+
+
+def backward(rendering):
+    """A loss that weighs every pixel of image and alpha differently."""
+    loss = (rendering.image * random_like(rendering.image, 3)).sum()
+    loss = loss + (rendering.alpha * random_like(rendering.alpha, 4)).sum()
+    loss.backward()
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
+@pytest.mark.parametrize("channels", [1, 3, 9])
+@pytest.mark.parametrize("antialiased", [False, True], ids=["plain", "antialiased"])
+def test_matches_the_reference(device, dtype, channels, antialiased):
+    if antialiased and channels != 3:
+        pytest.skip("antialiasing does not look at the channels")
+    scene = random_scene(channels=channels)
+    ours, truth = scene.to(dtype, device), scene.to(torch.float64)
+    rendering = rasterize(*ours.arguments, antialiased=antialiased)
+    reference = rasterize_reference(*truth.arguments, antialiased=antialiased)
+    value_bound, gradient_bound = BOUNDS[dtype]
+    assert relative_error(rendering.image, reference.image) < value_bound
+    assert relative_error(rendering.alpha, reference.alpha) < value_bound
+    assert torch.equal(rendering.visible.cpu(), reference.visible)
+    backward(rendering)
+    backward(reference)
+    for name, tensor, true in zip(NAMES, ours.tensors, truth.tensors):
+        assert relative_error(tensor.grad, true.grad) < gradient_bound, name
+
+
+@pytest.mark.parametrize("which", range(len(NAMES)), ids=NAMES)
+def test_gradients_match_finite_differences(device, which):
+    # Few, wide Gaussians and a tiny threshold keep every pixel away from the cut-offs, where no derivative exists.
+    scene = random_scene(count=12, channels=2, width=18, height=17, spread=0.8, size=0.6, seed=1)
+    scene.tensors[0] = scene.tensors[0].clone()
+    scene.tensors[0][:, 2] = scene.tensors[0][:, 2].abs() * 0.3 + 2.0
+    scene.tensors[3] = scene.tensors[3] * 0.4
+
+    def loss(*tensors, dtype=torch.float64):
+        moved = [t.to(device=device, dtype=dtype) for t in tensors]
+        rendering = rasterize(*moved, scene.width, scene.height, alpha_threshold=1e-12)
+        return (rendering.image * random_like(rendering.image, 5)).sum() + rendering.alpha.square().sum()
+
+    numeric = finite_differences(loss, scene.tensors, which)
+    for dtype, bound in ((torch.float64, 1e-8), (torch.float32, 1e-4)):
+        tensors = [t.detach().clone().requires_grad_() for t in scene.tensors]
+        loss(*tensors, dtype=dtype).backward()
+        assert relative_error(tensors[which].grad, numeric) < bound
+
+
+def test_float32_images_agree_between_devices(device):
+    scene = random_scene(count=400, channels=5)
+    ours = rasterize(*scene.to(torch.float32, device).arguments)
+    cpu = rasterize(*scene.to(torch.float32, "cpu").arguments)
+    assert relative_error(ours.image, cpu.image) < 1e-5
+
+
+def test_cpu_results_do_not_depend_on_the_number_of_threads(monkeypatch):
+    results = []
+    for threads in ("1", "2", "5"):
+        monkeypatch.setenv("SEHDR_THREADS", threads)
+        scene = random_scene(count=300).to(torch.float32)
+        rendering = rasterize(*scene.arguments)
+        backward(rendering)
+        results.append([rendering.image, rendering.alpha, *(t.grad for t in scene.tensors)])
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+
+
+def test_means2d_carries_the_densification_signal(device):
+    scene = random_scene().to(torch.float32, device)
+    rendering = rasterize(*scene.arguments)
+    rendering.means2d.retain_grad()
+    backward(rendering)
+    gradient = rendering.means2d.grad
+    assert gradient.shape == (150, 2)
+    assert (gradient[rendering.visible].abs().sum(1) > 0).any()
+    assert (gradient[~rendering.visible] == 0).all()
+
+
+def test_tensors_that_need_no_gradient_get_none(device):
+    scene = random_scene().to(torch.float32, device)
+    for tensor in scene.tensors[:4] + scene.tensors[5:]:
+        tensor.requires_grad_(False)
+    rasterize(*scene.arguments).image.sum().backward()
+    assert scene.tensors[4].grad is not None
+    assert all(tensor.grad is None for tensor in scene.tensors[:4])
+
+
+def test_nothing_is_recorded_without_gradients(device):
+    with torch.no_grad():
+        rendering = rasterize(*random_scene().to(torch.float32, device).arguments)
+    assert not rendering.image.requires_grad
+
+
+@pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 33), (5, 200)])
+def test_any_image_size(device, size):
+    width, height = size
+    scene = random_scene(width=width, height=height)
+    ours = rasterize(*scene.to(torch.float32, device).arguments)
+    reference = rasterize_reference(*scene.arguments)
+    assert ours.image.shape == (height, width, 3)
+    assert relative_error(ours.image, reference.image) < 1e-5
+
+
+def test_no_gaussians_and_none_in_view_give_black(device):
+    empty = random_scene(count=0).to(torch.float32, device)
+    behind = random_scene().to(torch.float32, device)
+    with torch.no_grad():
+        behind.tensors[0][:, 2] -= 100.0
+    for scene in (empty, behind):
+        rendering = rasterize(*scene.arguments)
+        assert rendering.image.shape == (50, 70, 3)
+        assert not rendering.image.any() and not rendering.alpha.any()
+        assert not rendering.visible.any()
+        (rendering.image.sum() + rendering.alpha.sum()).backward()
+        assert all(torch.isfinite(t.grad).all() for t in scene.tensors)
+
+
+def test_one_gaussian_over_everything(device):
+    scene = random_scene(count=1).to(torch.float32, device)
+    with torch.no_grad():
+        scene.tensors[0][:] = torch.tensor([0.0, 0.0, 3.0])
+        scene.tensors[1][:] = 6.0  # a standard deviation of 400 units
+        scene.tensors[3][:] = 0.5
+    rendering = rasterize(*scene.arguments)
+    torch.testing.assert_close(rendering.alpha, torch.full_like(rendering.alpha, 0.5), atol=1e-3, rtol=0)
+    rendering.image.sum().backward()
+    assert all(torch.isfinite(t.grad).all() for t in scene.tensors)
+
+
+def test_a_bright_light_behind_dim_gaussians_keeps_their_gradients(device):
+    """Radiance over ten decades in one pixel: walking back to front loses nothing of the dim ones."""
+    scene = random_scene(count=40, channels=1, spread=1.0)
+    with torch.no_grad():
+        scene.tensors[3].mul_(0.5)
+        scene.tensors[4][:] = 1e-4
+        scene.tensors[4][scene.tensors[0][:, 2].argmax()] = 1e6
+    ours, truth = scene.to(torch.float32, device), scene.to(torch.float64)
+    rasterize(*ours.arguments).image.sum().backward()
+    rasterize_reference(*truth.arguments).image.sum().backward()
+    for name, tensor, true in zip(NAMES[:5], ours.tensors, truth.tensors):
+        assert relative_error(tensor.grad, true.grad) < 1e-4, name
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda a: a.__setitem__(1, a[1][:-1]), "log_scales has shape"),
+        (lambda a: a.__setitem__(4, a[4][:, :0]), "features has shape"),
+        (lambda a: a.__setitem__(3, a[3].float()), "opacities is torch.float32"),
+        (lambda a: a.__setitem__(7, 0), "image size 0 x 50"),
+    ],
+)
+def test_misfits_are_named(change, message):
+    arguments = list(random_scene(count=5).arguments)
+    change(arguments)
+    with pytest.raises(ValueError, match=message):
+        rasterize(*arguments)
