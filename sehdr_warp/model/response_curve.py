@@ -101,6 +101,10 @@ class Response(ABC):
         """
         return self._apply(_Decode, value, None)
 
+    def slope(self, exposure):
+        """df/dx of encode, shaped like the exposures; 0 beyond the clip point. Not differentiable itself."""
+        return self._apply(_Slope, exposure, None)
+
     def _apply(self, function, argument, slope):
         if isinstance(argument, torch.Tensor):
             if argument.dtype not in (torch.float32, torch.float64):
@@ -141,6 +145,17 @@ class _Encode(torch.autograd.Function):
     def backward(ctx, gradient):
         (slope,) = ctx.saved_tensors
         return gradient * slope, None, None
+
+
+class _Slope:
+    """The derivative, called as the two functions beside it are."""
+
+    @staticmethod
+    @torch.no_grad()
+    def apply(exposure, response, _):
+        clip = response.clip_exposure
+        _, slope = response._evaluate(exposure.clamp(0.0, clip if response.clips else None), True)
+        return torch.where((exposure < 0) | (exposure > clip), 0.0, slope)
 
 
 class _Decode(torch.autograd.Function):
