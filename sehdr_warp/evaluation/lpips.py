@@ -1,0 +1,136 @@
+"""LPIPS v0.1 (Zhang et al. 2018) on SqueezeNet 1.1 features, with weights from the user's folder.
+
+The package ships no weights. The folder, given by the caller or by the environment variable SEHDR_LPIPS, holds
+`squeeze.pth` (the v0.1 linear heads of the lpips package) and SqueezeNet 1.1 as `squeezenet1_1_features.pth` (features
+only) or under torchvision's own name `squeezenet1_1-*.pth`.
+"""
+
+import os
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from ..errors import InputError
+
+VARIABLE = "SEHDR_LPIPS"
+BACKBONE = "squeeze v0.1"
+# Below this many pixels along an edge the last pooling finds nothing.
+SMALLEST_EDGE = 17
+# Features after which the network is tapped.
+TAPS = (1, 4, 7, 9, 10, 11, 12)
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
+
+
+class _Fire(nn.Module):
+    """SqueezeNet's fire module (Iandola et al. 2016): 1 x 1 squeeze, then 1 x 1 and 3 x 3 expansions side by side."""
+
+    def __init__(self, channels: int, squeezed: int, expanded: int):
+        super().__init__()
+        self.squeeze = nn.Conv2d(channels, squeezed, 1)
+        self.expand1x1 = nn.Conv2d(squeezed, expanded, 1)
+        self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
+
+    def forward(self, x):
+        x = self.squeeze(x).relu()
+        return torch.cat([self.expand1x1(x).relu(), self.expand3x3(x).relu()], 1)
+
+
+def _squeezenet_features() -> nn.Sequential:
+    """SqueezeNet 1.1 up to its last fire module, layers numbered as in torchvision."""
+
+    def pool():
+        return nn.MaxPool2d(3, 2, ceil_mode=True)
+
+    return nn.Sequential(
+        nn.Conv2d(3, 64, 3, stride=2),
+        nn.ReLU(),
+        pool(),
+        _Fire(64, 16, 64),
+        _Fire(128, 16, 64),
+        pool(),
+        _Fire(128, 32, 128),
+        _Fire(256, 32, 128),
+        pool(),
+        _Fire(256, 48, 192),
+        _Fire(384, 48, 192),
+        _Fire(384, 64, 256),
+        _Fire(512, 64, 256),
+    )
+
+
+class Lpips:
+    """The distance itself: call it with two [H, W, 3] images in [0, 1]; 0 for equal images, larger for less alike."""
+
+    def __init__(self, features: nn.Sequential, heads: list[torch.Tensor], device: torch.device | str = "cpu"):
+        self.features = features.to(device).eval().requires_grad_(False)
+        self.heads = [head.to(device) for head in heads]
+        self.device = torch.device(device)
+
+    @torch.no_grad()
+    def __call__(self, prediction: torch.Tensor, truth: torch.Tensor) -> float:
+        """Raises ValueError for images of different sizes or with an edge below 17 pixels."""
+        if prediction.shape != truth.shape or min(prediction.shape[:2]) < SMALLEST_EDGE:
+            raise ValueError(f"LPIPS takes two images of one size from {SMALLEST_EDGE} pixels on")
+        pair = torch.stack([prediction, truth]).to(self.device, torch.float32).permute(0, 3, 1, 2)
+        shift, scale = pair.new_tensor(SHIFT)[:, None, None], pair.new_tensor(SCALE)[:, None, None]
+        x = (2 * pair - 1 - shift) / scale
+        distance = 0.0
+        for number, layer in enumerate(self.features):
+            x = layer(x)
+            if number in TAPS:
+                unit = x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10)
+                weighted = (unit[0] - unit[1]).square() * self.heads[TAPS.index(number)]
+                distance += float(weighted.sum(0).mean())
+        return distance
+
+
+def load_lpips(folder: Path | str | None = None, device: torch.device | str = "cpu") -> tuple[Lpips | None, str | None]:
+    """(metric, None), or (None, the reason) where no usable set of weights is there.
+
+    folder: where the weights lie; None takes the environment variable SEHDR_LPIPS.
+
+    Raises InputError for a folder that does not exist or a file that is not what its name says. Files are read as
+    plain tensors (torch.load with weights_only), so that they cannot run code.
+    """
+    folder = folder or os.environ.get(VARIABLE)
+    if not folder:
+        return None, f"no LPIPS weights: set {VARIABLE} or name a folder with squeeze.pth and SqueezeNet 1.1"
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(folder, "the folder of LPIPS weights does not exist", "name the folder that holds squeeze.pth")
+    backbones = [*sorted(folder.glob("squeezenet1_1_features.pth")), *sorted(folder.glob("squeezenet1_1-*.pth"))]
+    heads = folder / "squeeze.pth"
+    if not backbones or not heads.is_file():
+        missing = "squeeze.pth" if backbones else "a SqueezeNet 1.1 backbone (squeezenet1_1_features.pth)"
+        others = [name for name in ("alex", "vgg") if (folder / f"{name}.pth").is_file()]
+        beside = f"; the heads for {' and '.join(others)} have no backbone here" if others else ""
+        return None, f"{folder} lacks {missing}{beside}"
+    features = _squeezenet_features()
+    state = {name.removeprefix("features."): value for name, value in _tensors(backbones[0]).items()}
+    state = {name: value for name, value in state.items() if not name.startswith("classifier.")}
+    try:
+        features.load_state_dict(state)
+    except RuntimeError as error:
+        raise InputError(backbones[0], "is not SqueezeNet 1.1", "take torchvision's squeezenet1_1 weights") from error
+    return Lpips(features, _heads(heads), device), None
+
+
+def _heads(path: Path) -> list[torch.Tensor]:
+    state = _tensors(path)
+    widths = (64, 128, 256, 384, 384, 512, 512)
+    names = [f"lin{number}.model.1.weight" for number in range(len(widths))]
+    if any(name not in state or state[name].shape != (1, width, 1, 1) for name, width in zip(names, widths)):
+        raise InputError(path, "does not hold the seven linear heads of LPIPS-squeeze", "take v0.1's squeeze.pth")
+    return [state[name][0].float() for name in names]
+
+
+def _tensors(path: Path) -> dict[str, torch.Tensor]:
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch reports damaged archives, pickles and missing files in many ways
+        raise InputError(path, f"cannot be read as weights ({type(error).__name__})", "download it again") from error
+    if not isinstance(state, dict) or not all(isinstance(value, torch.Tensor) for value in state.values()):
+        raise InputError(path, "is not a table of tensors", "take the file of the lpips package or of torchvision")
+    return state

@@ -1,0 +1,145 @@
+"""Image metrics on torch tensors: mu-law, PSNR, SSIM, PU21, and the regions of a photo they are reported for.
+
+Images are [H, W, C]; a mask is [H, W] with weights in [0, 1], None for all ones. Metrics return Python floats: infinity
+for identical images under PSNR, NaN where a mask leaves nothing.
+"""
+
+import math
+
+import torch
+
+from ..splatting.ssim import ssim_map
+
+# A photo's pixel is clipped if any channel reaches this code of 255: JPEG blurs 255 by a few codes.
+CLIPPED_CODE = 250
+# It is dark if no channel exceeds this code: there one code is more than 6 % of the value, and of radiance twice that.
+DARK_CODE = 16
+REGIONS = ("clipped", "well-exposed", "dark")
+
+# Rec.709 luminance weights, as in the PU21 reference implementation.
+LUMINANCE = (0.212656, 0.715158, 0.072186)
+# PU21 "banding_glare", the variant its authors recommend (Mantiuk and Azimi 2021), and its range in cd/m^2.
+PU21 = (0.353487901, 0.3734658629, 8.277049286e-05, 0.9062562627, 0.09150303166, 0.9099517204, 596.3148142)
+PU21_RANGE = (0.005, 10000.0)
+# The peak that the reference implementation uses for PSNR and SSIM of PU21 values; 100 cd/m^2 encode to 256.
+PU21_PEAK = 256.0
+
+
+def mu_law(radiance: torch.Tensor, mu: float = 5000.0) -> torch.Tensor:
+    """log(1 + mu E) / log(1 + mu) (SeHDR, section 4.1; Kalantari and Ramamoorthi 2017).
+
+    radiance: normalised to [0, 1], any shape; values outside are limited to it first, as HDR-NeRF and HDR-GS do.
+    """
+    return torch.log1p(mu * radiance.clamp(0.0, 1.0)) / math.log1p(mu)
+
+
+def psnr(
+    prediction: torch.Tensor,
+    truth: torch.Tensor,
+    mask: torch.Tensor | None = None,
+    *,
+    peak: float = 1.0,
+    channels_apart: bool = False,
+) -> float:
+    """Peak signal-to-noise ratio in dB: 10 log10(peak^2 / MSE).
+
+    channels_apart: the mean of each channel's PSNR in place of the PSNR of the mean error.
+    """
+    error, weight = squared_error(prediction, truth, mask)
+    if channels_apart:
+        values = [decibels(float(channel) / weight if weight else math.nan, peak) for channel in error]
+        return sum(values) / len(values)
+    return decibels(float(error.sum()) / (weight * len(error)) if weight else math.nan, peak)
+
+
+def squared_error(
+    prediction: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor | None = None
+) -> tuple[torch.Tensor, float]:
+    """The sum of weighted squared errors for each channel [C] (float64), and the sum of the weights."""
+    squared = (prediction.double() - truth.double()) ** 2
+    if mask is None:
+        return squared.sum((0, 1)), float(squared.shape[0] * squared.shape[1])
+    return (squared * mask.double()[..., None]).sum((0, 1)), float(mask.double().sum())
+
+
+def decibels(mean_squared_error: float, peak: float = 1.0) -> float:
+    """10 log10(peak^2 / mean_squared_error); infinity for 0, NaN for NaN."""
+    if mean_squared_error == 0:
+        return math.inf
+    return 10 * math.log10(peak**2 / mean_squared_error)
+
+
+def ssim(
+    prediction: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor | None = None, *, peak: float = 1.0
+) -> float:
+    """Structural similarity (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5, averaged over pixels and channels.
+
+    Beyond the border both images count as zero and border pixels are averaged too, as in the code of 3DGS and HDR-GS;
+    HDR-NeRF's script uses a uniform 7 x 7 window without the border instead. A mask weights the average only.
+    """
+    values = ssim_map((prediction / peak).float(), (truth / peak).float()).double().mean(2)
+    if mask is None:
+        return float(values.mean())
+    weight = float(mask.double().sum())
+    return float((values * mask.double()).sum()) / weight if weight else math.nan
+
+
+def pu21_encode(luminance: torch.Tensor) -> torch.Tensor:
+    """PU21 values of absolute luminance or colour in cd/m^2: 0 at 0.005, 256 at 100, 595 at 10000.
+
+    Values outside [0.005, 10000] cd/m^2 are limited to it. Source: Mantiuk and Azimi, PU21, PCS 2021 (banding_glare).
+    """
+    p = PU21
+    power = luminance.double().clamp(*PU21_RANGE) ** p[3]
+    return p[6] * (((p[0] + p[1] * power) / (1 + p[2] * power)) ** p[4] - p[5])
+
+
+def pu21_metrics(
+    prediction: torch.Tensor,
+    truth: torch.Tensor,
+    mask: torch.Tensor | None = None,
+    *,
+    peak_luminance: float = 1000.0,
+    white_percentile: float = 100.0,
+) -> dict[str, float]:
+    """PSNR of PU21-encoded colour and SSIM of PU21-encoded luminance.
+
+    prediction, truth: [H, W, 3] relative radiance in one unit, Rec.709 primaries. PU21 needs absolute values: the
+    white_percentile-th percentile of the truth's largest channel (100: its maximum) is shown at peak_luminance
+    cd/m^2, and the prediction by the same factor. Returns {"psnr": dB, "ssim": ...}, both with peak 256.
+    """
+    brightest = truth.double().amax(2)
+    brightest = brightest if mask is None else brightest[mask > 0]
+    if brightest.numel() == 0:
+        return {"psnr": math.nan, "ssim": math.nan}
+    white = float(percentile(brightest, white_percentile))
+    factor = peak_luminance / white if white > 0 else 1.0
+    shown, reference = prediction.double() * factor, truth.double() * factor
+    weights = shown.new_tensor(LUMINANCE)
+    return {
+        "psnr": psnr(pu21_encode(shown), pu21_encode(reference), mask, peak=PU21_PEAK),
+        "ssim": ssim(
+            pu21_encode((shown @ weights)[..., None]),
+            pu21_encode((reference @ weights)[..., None]),
+            mask,
+            peak=PU21_PEAK,
+        ),
+    }
+
+
+def percentile(values: torch.Tensor, percent: float) -> torch.Tensor:
+    """The value below which `percent` of the values lie (nearest rank); any number of values."""
+    rank = math.ceil(percent / 100 * values.numel())
+    return values.flatten().kthvalue(min(max(rank, 1), values.numel())).values
+
+
+def region_masks(photo: torch.Tensor) -> dict[str, torch.Tensor]:
+    """{region: [H, W] bool} for REGIONS, which part the pixels among them, by the photo's own code values.
+
+    photo: [H, W, 3] encoded values in [0, 1]. Clipped: some channel reaches code 250 of 255, so that the photo only
+    bounds the radiance from below. Dark: no channel exceeds code 16. Well-exposed: the rest.
+    """
+    codes = photo * 255
+    clipped = (codes >= CLIPPED_CODE - 0.5).any(2)
+    dark = (codes <= DARK_CODE + 0.5).all(2)
+    return {"clipped": clipped, "well-exposed": ~(clipped | dark), "dark": dark}

@@ -1,0 +1,184 @@
+"""Evaluation of a run whose renders are known, so that every figure can be predicted."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.evaluation import evaluate, format_table
+from sehdr_warp.model.response import response_by_name
+from sehdr_warp.scene import Camera, Scene, View
+
+RESPONSE = response_by_name("hdr-nerf")
+
+
+def radiance(index, height=24, width=30):
+    rng = np.random.default_rng(index)
+    return (10 ** rng.uniform(-2.5, 1.5, (height, width, 3))).astype(np.float32)
+
+
+def view(index, split, *, truth=True, mask=None, exposure_time=2.0, photo=None):
+    hdr = radiance(index)
+    pose = np.eye(4)
+    pose[0, 3] = index  # the camera tells the fake run which view it is
+    camera = Camera(30, 24, 25.0, 25.0, 15.0, 12.0, pose)
+    image = RESPONSE.encode(hdr * exposure_time) if photo is None else photo
+    return View(f"r_{index}", image, camera, exposure_time, split, mask, hdr if truth else None)
+
+
+def scene(views):
+    return Scene("box", "transforms", tuple(views), np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+
+
+def run(change=lambda hdr: hdr):
+    """A run that renders change(true radiance)."""
+
+    def render(camera):
+        hdr = torch.tensor(radiance(int(camera.world_to_camera[0, 3])))
+        return SimpleNamespace(hdr=change(hdr))
+
+    return SimpleNamespace(
+        render=render, response=RESPONSE, device="cpu", train_seconds=12.5, gaussian_count=4321, iterations=700
+    )
+
+
+@pytest.fixture(autouse=True)
+def no_weights(monkeypatch):
+    monkeypatch.delenv("SEHDR_LPIPS", raising=False)
+
+
+VIEWS = [view(0, "train"), view(1, "train"), view(2, "test"), view(3, "test")]
+
+
+def test_a_render_that_is_too_dark():
+    lines = []
+    result = evaluate(run(lambda hdr: hdr / 2.1), scene(VIEWS), progress=lines.append)
+    protocol = result["protocol"]
+    # Near 20 log10(log(5001) / log 2.1) = 21.2 dB; the many dark pixels of these views pay less.
+    assert 21.2 < protocol["gt-max"]["psnr_mu"] < 26
+    assert protocol["aligned"]["scale"] == pytest.approx(2.1) and protocol["aligned"]["psnr_mu"] > 100
+    assert 50 < protocol["self-max"]["psnr_mu"] < 65  # only the truth's 8 bits are left
+    assert protocol["gt-max"]["views"] == 2 and result["split"] == "test"
+    photos = [(RESPONSE.encode(radiance(i) * 2 / np.float32(2.1)), RESPONSE.encode(radiance(i) * 2)) for i in (2, 3)]
+    expected = [-10 * np.log10(np.mean((a.astype(float) - b) ** 2)) for a, b in photos]
+    assert result["ldr"]["psnr"] == pytest.approx(np.mean(expected), abs=1e-4)
+    assert [row["name"] for row in result["views"]] == ["r_2", "r_3"]
+    assert result["views"][0]["ldr"]["psnr"] == pytest.approx(expected[0], abs=1e-4)
+    assert (result["train_seconds"], result["gaussians"], result["iterations"]) == (12.5, 4321, 700)
+    assert len(lines) == 3 and "r_3" in lines[-1]
+    assert result["ldr"]["lpips"] is None and "SEHDR_LPIPS" in result["ldr"]["lpips_reason"]
+    assert protocol["gt-max"]["lpips_mu"] is None and "SEHDR_LPIPS" in protocol["gt-max"]["lpips_reason"]
+    assert result["pu21"]["gt-max"]["psnr"] < result["pu21"]["aligned"]["psnr"]
+    assert result["pu21"]["peak_luminance"] == 1000.0
+
+
+def test_a_perfect_render_is_strict_json():
+    result = evaluate(run(), scene(VIEWS))
+    assert result["protocol"]["gt-max"]["psnr_mu"] is None and "infinite" in result["protocol"]["gt-max"]["reason"]
+    assert result["regions"]["clipped"]["psnr_ldr"] is None and "infinite" in result["regions"]["clipped"]["reason"]
+    assert result["protocol"]["gt-max"]["ssim_mu"] == pytest.approx(1.0)
+    assert json.loads(json.dumps(result, allow_nan=False)) == result
+    assert "box" in format_table(result)
+
+
+def test_a_scene_without_truth_keeps_its_ldr_figures():
+    result = evaluate(run(lambda hdr: hdr * 1.1), scene([view(0, "train", truth=False), view(1, "test", truth=False)]))
+    assert result["ldr"]["psnr"] > 20 and result["ldr"]["ssim"] > 0.9
+    for name in ("gt-max", "self-max", "aligned"):
+        assert result["protocol"][name]["psnr_mu"] is None and "no HDR truth" in result["protocol"][name]["reason"]
+        assert result["pu21"][name]["psnr"] is None
+    region = result["regions"]["well-exposed"]
+    assert region["psnr_ldr"] > 20 and region["psnr_mu"]["gt-max"] is None and "no HDR truth" in region["reason"]
+    json.dumps(result, allow_nan=False)
+    assert "no HDR truth" in format_table(result)
+
+
+def test_truth_of_the_test_views_alone_leaves_out_the_aligned_figures():
+    result = evaluate(run(lambda hdr: hdr * 1.1), scene([view(0, "train", truth=False), view(1, "test")]))
+    assert result["protocol"]["gt-max"]["psnr_mu"] > 20
+    assert result["protocol"]["aligned"]["psnr_mu"] is None
+    assert "training view" in result["protocol"]["aligned"]["reason"]
+
+
+def test_without_test_views_the_training_views_are_named():
+    result = evaluate(run(lambda hdr: hdr * 1.1), scene(VIEWS[:2]))
+    assert result["split"] == "train" and len(result["views"]) == 2
+    assert "no test views" in format_table(result)
+
+
+def test_regions_pool_their_errors():
+    photo = np.full((24, 30, 3), 0.5, np.float32)
+    photo[:6], photo[6:12] = 1.0, 0.02
+    views = [view(0, "train"), view(1, "test", photo=photo), view(2, "test")]
+
+    def clipped_wrong(hdr):
+        hdr = hdr.clone()
+        hdr[:6] *= 3
+        return hdr
+
+    result = evaluate(run(clipped_wrong), scene([views[0], views[1]]), protocols=["gt-max"])
+    regions = result["regions"]
+    assert [regions[r]["fraction"] for r in ("clipped", "well-exposed", "dark")] == pytest.approx([0.25, 0.5, 0.25])
+    assert regions["clipped"]["psnr_mu"]["gt-max"] < 25
+    assert regions["dark"]["psnr_mu"]["gt-max"] is None and "infinite" in regions["dark"]["reason"]
+    assert list(result["protocol"]) == ["gt-max"] and list(regions["dark"]["psnr_mu"]) == ["gt-max"]
+    encoded = RESPONSE.encode(radiance(1)[6:12] * 2)
+    assert regions["dark"]["psnr_ldr"] == pytest.approx(-10 * np.log10(np.mean((encoded - 0.02) ** 2)), abs=1e-3)
+
+
+def test_a_region_without_pixels_says_so():
+    flat = np.full((24, 30, 3), 0.5, np.float32)
+    result = evaluate(run(), scene([view(0, "train"), view(1, "test", photo=flat)]))
+    assert result["regions"]["clipped"]["psnr_ldr"] is None and "no pixel" in result["regions"]["clipped"]["reason"]
+    json.dumps(result, allow_nan=False)
+
+
+def test_masked_pixels_cost_nothing():
+    mask = np.ones((24, 30), np.float32)
+    mask[:, 20:] = 0
+
+    def spoil(hdr):
+        hdr = hdr * 1.05
+        hdr[:, 20:] = 1e5
+        return hdr
+
+    views = [view(0, "train", mask=mask), view(1, "test", mask=mask)]
+    spoilt, clean = evaluate(run(spoil), scene(views)), evaluate(run(lambda hdr: hdr * 1.05), scene(views))
+    assert spoilt == clean
+    unmasked = evaluate(run(spoil), scene([view(0, "train"), view(1, "test")]))
+    assert unmasked["ldr"]["psnr"] < clean["ldr"]["psnr"] - 10
+
+
+def test_lpips_with_the_real_weights(shared):
+    result = evaluate(run(lambda hdr: hdr * 1.3), scene(VIEWS), lpips_weights=shared / "lpips")
+    assert result["lpips_backbone"] == "squeeze v0.1"
+    assert 0 < result["ldr"]["lpips"] < 0.2 and "lpips_reason" not in result["ldr"]
+    assert 0 <= result["protocol"]["aligned"]["lpips_mu"] < result["protocol"]["gt-max"]["lpips_mu"]
+
+
+def test_each_views_own_exposure_is_used():
+    views = [view(0, "train"), view(1, "test", exposure_time=0.1), view(2, "test", exposure_time=8.0)]
+    assert evaluate(run(), scene(views))["ldr"]["ssim"] == pytest.approx(1.0)
+
+
+def test_what_cannot_be_evaluated_is_said():
+    with pytest.raises(SehdrError, match="no views"):
+        evaluate(run(), scene([]))
+    with pytest.raises(SehdrError, match="'own-max'"):
+        evaluate(run(), scene(VIEWS), protocols=["own-max"])
+    with pytest.raises(SehdrError, match="r_1.*30 x 23"):
+        evaluate(run(), scene([view(1, "test", photo=np.zeros((23, 30, 3), np.float32))]))
+    with pytest.raises(SehdrError, match="not finite"):
+        evaluate(run(lambda hdr: hdr * float("nan")), scene(VIEWS))
+
+
+def test_the_table_holds_every_figure():
+    result = evaluate(run(lambda hdr: hdr / 2), scene(VIEWS))
+    text = format_table(result)
+    for value in (result["ldr"]["psnr"], result["protocol"]["gt-max"]["psnr_mu"], result["pu21"]["gt-max"]["psnr"]):
+        assert f"{value:.2f}" in text
+    assert "4,321 Gaussians" in text and "12.5 s" in text and "1000 cd/m^2" in text and "times 2" in text
+    assert max(map(len, text.splitlines())) <= 120
