@@ -30,8 +30,9 @@ def evaluate(
 ) -> dict:
     """Render the scene's test views with a trained run and compare them with the photos and the HDR truth.
 
-    run: `render(camera)` gives an object with `.hdr` [H, W, 3], scene-linear radiance on the run's `device`; `response`
-        turns exposure into encoded values; `train_seconds`, `gaussian_count` and `iterations` are reported as they are.
+    run: a sehdr_warp.training.Run, or anything with its `render(camera)` (an object with `.hdr`, [H, W, 3] scene-linear
+        radiance on `device`), `render_ldr(camera, seconds)` ([H, W, 3] in [0, 1]), and the numbers `train_seconds`,
+        `gaussian_count` and `iterations`.
     scene: the views, at the exposure that was trained on. Without test views the training views are taken, and
         "split" says so.
     lpips_weights: folder, see load_lpips; protocols: names out of PROTOCOLS.
@@ -41,7 +42,7 @@ def evaluate(
     Returns plain values, ready for strict JSON (null in place of NaN and infinity):
         "protocol": {name: {"psnr_mu", "ssim_mu", "lpips_mu", "views"}}; "aligned" also holds its "scale"
         "pu21": {name: {"psnr", "ssim"}, "peak_luminance", "white_percentile"}
-        "ldr": {"psnr", "ssim", "lpips"} of f(E dt), unquantised, against the photo
+        "ldr": {"psnr", "ssim", "lpips"} of the simulated photo at the view's exposure time, unquantised, against the photo
         "regions": {region: {"fraction", "psnr_ldr", "psnr_mu": {name: dB}}}, errors pooled over all views
         "views": the same for each view; and "split", "lpips_backbone", "train_seconds", "gaussians", "iterations"
     Means are over views. What cannot be computed is null with "reason" (or "lpips_reason") beside it. A view's mask
@@ -138,7 +139,8 @@ class _Evaluation:
     def _view(self, view: View, scale: float | None) -> dict:
         hdr, truth = self._render(view)
         photo, mask = self._tensor(view.image), self._tensor(view.mask)
-        encoded = _inside(self.run.response.encode(hdr * view.exposure_time), photo, mask)
+        encoded = self.run.render_ldr(view.camera, view.exposure_time).detach().float()
+        encoded = _inside(encoded, photo, mask)
         row = {"name": view.name, "ldr": self._ldr(encoded, photo, mask), "protocol": {}, "pu21": {}}
         regions = metrics.region_masks(photo)
         weights = {name: region if mask is None else region * mask for name, region in regions.items()}

@@ -40,9 +40,11 @@ def run(change=lambda hdr: hdr):
         hdr = torch.tensor(radiance(int(camera.world_to_camera[0, 3])))
         return SimpleNamespace(hdr=change(hdr))
 
-    return SimpleNamespace(
-        render=render, response=RESPONSE, device="cpu", train_seconds=12.5, gaussian_count=4321, iterations=700
-    )
+    def render_ldr(camera, seconds):
+        return RESPONSE.encode(render(camera).hdr * seconds)
+
+    numbers = {"train_seconds": 12.5, "gaussian_count": 4321, "iterations": 700}
+    return SimpleNamespace(render=render, render_ldr=render_ldr, device="cpu", **numbers)
 
 
 @pytest.fixture(autouse=True)
