@@ -69,7 +69,7 @@ def read_model(folder: Path) -> SparseModel:
 
 
 def read_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """[P, 3] float64 places and [P, 3] float32 colours in [0, 1] of points3D.bin, .txt or .ply; none where all are absent."""
+    """[P, 3] float64 places and [P, 3] float32 colours in [0, 1] of points3D.bin, .txt or .ply; else none."""
     if (path := folder / "points3D.bin").is_file():
         return _points_binary(path)
     if (path := folder / "points3D.txt").is_file():

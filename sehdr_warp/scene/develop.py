@@ -84,9 +84,7 @@ class Developer:
         width, height = image_sizes(path)[0]
         same = (width, height) == (lens.width, lens.height)
         # Truth may be rendered larger than the photos (HDR-NeRF's evaluation averages it down); never smaller.
-        larger = width >= camera.width and height >= camera.height and abs(width * lens.height - height * lens.width) <= max(
-            width, height
-        )  # fmt: skip
+        larger = width >= camera.width and height >= camera.height and _same_aspect((width, height), lens)
         if not (same or (larger and undistortion is None)):
             raise InputError(path, f"HDR truth is {width} x {height}, the photo {lens.width} x {lens.height}",
                              "render the truth at the photo's size, or remove it")  # fmt: skip
@@ -128,3 +126,8 @@ def _fitted_mask(path: Path, lens: Lens, oriented: bool) -> np.ndarray:
         return area_average(mask, lens.width, lens.height)
     raise InputError(path, f"mask is {width} x {height}, its image {lens.width} x {lens.height}",
                      "make the mask at the image's size")  # fmt: skip
+
+
+def _same_aspect(size: tuple[int, int], lens: Lens) -> bool:
+    """True where the two sizes have one shape, to a pixel."""
+    return abs(size[0] * lens.height - size[1] * lens.width) <= max(size)

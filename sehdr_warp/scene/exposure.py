@@ -72,7 +72,7 @@ def with_exposure_times(shots: list[Shot], source: Path) -> tuple[list[Shot], bo
         return [replace(shot, exposure_time=1.0) for shot in shots], False, notes
     absent = [shot for shot, time in zip(shots, stated, strict=True) if time is None]
     if absent:
-        raise InputError(absent[0].image, f"exposure time is absent here and in {len(absent) - 1} more of {len(shots)} images",
+        raise InputError(absent[0].image, f"exposure time is absent in {len(absent)} of {len(shots)} images",
                          "state every image's seconds in exposures.json, or strip them all")  # fmt: skip
     shortest, longest = min(stated), max(stated)
     if longest > shortest * 1.01:

@@ -76,7 +76,7 @@ def read_ldr(path: Path, *, oriented: bool = False) -> EncodedImage:
 
 
 def read_mask(path: Path, *, oriented: bool = False) -> np.ndarray:
-    """[H, W] float32 in [0, 1] from a grey, colour (its mean) or transparent (its alpha) image; 1 where pixels count."""
+    """[H, W] float32 in [0, 1] from grey, colour (its mean) or transparent (its alpha); 1 counts."""
     image = read_ldr(path, oriented=oriented)
     if image.alpha is not None:
         return image.alpha
@@ -107,7 +107,7 @@ def read_hdr(path: Path) -> np.ndarray:
         value = pixels[row, column, channel]
         raise InputError(
             path,
-            f"{int(bad.any(axis=2).sum())} pixels are not finite, the first {'RGB'[channel]} = {value} at x={column}, y={row}",
+            f"{int(bad.any(axis=2).sum())} pixels not finite, one {'RGB'[channel]} = {value} at x={column}, y={row}",
             "render or export the image again",
         )
     return np.maximum(pixels, 0.0)

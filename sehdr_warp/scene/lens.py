@@ -118,7 +118,8 @@ class Undistortion:
         try:
             target = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), distorted)
             width, height = int(target.width), int(target.height)
-            fx, fy, cx, cy = target.focal_length_x, target.focal_length_y, *target.principal_point()
+            fx, fy = target.focal_length_x, target.focal_length_y
+            cx, cy = target.principal_point_x, target.principal_point_y
             if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE and np.isfinite([fx, fy, cx, cy]).all()):
                 raise ValueError(f"size {width} x {height}, focal length {fx}")
             columns, rows = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy

@@ -152,8 +152,8 @@ def _require_content(views: list[View], folder: Path) -> None:
     if shown < total * 1e-3 or total == 0:
         mean = sum(float(image.sum()) for image in samples) / max(total, 1)
         state = "masked out" if total == 0 else f"black or white in {100 - 100 * shown / total:.1f} % (mean {mean:.3f})"
-        raise InputError(folder, f"the training photos are {state}", "expose them so that the scene shows, or choose another "
-                         "exposure index")  # fmt: skip
+        raise InputError(folder, f"the training photos are {state}", "expose them so that the scene shows, "
+                         "or choose another exposure index")  # fmt: skip
 
 
 def _with_points(

@@ -61,7 +61,7 @@ def is_hdr_gs(folder: Path) -> bool:
 
 
 def read_hdr_gs(folder: Path) -> Capture:
-    """HDR-GS's synthetic layout: `images/<v>_<e>.png`, `exr/<v>.exr`, and a model with one image (any e) of each view."""
+    """HDR-GS's synthetic layout: `images/<v>_<e>.png`, `exr/<v>.exr`, and a model with one image of each view."""
     model, source, images = _model_and_images(folder)
     exposures = _exposures_by_view(images)
     count = 1 + max(key for files in exposures.values() for key in files)
@@ -124,7 +124,7 @@ def _exposures_by_view(images: Path) -> dict[str, dict[int, Path]]:
 
 
 def _hdr_gs_seconds(folder: Path, count: int) -> tuple[list[float] | None, tuple[str, ...]]:
-    """Seconds by exposure number: `exposure_times.json` ([seconds, ...] under "exposure_times"), or HDR-GS's constants."""
+    """Seconds by exposure number: "exposure_times" in `exposure_times.json`, or HDR-GS's constants."""
     path = folder / "exposure_times.json"
     if path.is_file():
         values = read_json(path).get("exposure_times")

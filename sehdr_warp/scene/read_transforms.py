@@ -125,6 +125,8 @@ def _frame_shot(folder: Path, path: Path, values: dict, frame: dict, name: str, 
     hdr = None
     if image.suffix.lower() in HDR_SUFFIXES:
         hdr, image = image, sibling(image, LDR_SUFFIXES)
+        if image is None and not hdr.is_file():
+            raise InputError(hdr, "image file not found", "copy the whole set")
         if image is None:
             raise InputError(hdr, "is the frame's only image, and no encoded (LDR) photo lies beside it",
                              "put the photo (PNG, JPEG or TIFF) of the same name beside it")  # fmt: skip
@@ -189,7 +191,7 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
 
 
 def _points(folder: Path, path: Path, values: dict) -> tuple[np.ndarray, np.ndarray]:
-    """ply_file_path (in the frames' coordinates), or the COLMAP model that nerfstudio keeps, moved by applied_transform."""
+    """ply_file_path (in the frames' coordinates), or nerfstudio's COLMAP model moved by applied_transform."""
     name = values.get("ply_file_path")
     if isinstance(name, str):
         ply = contained(folder, name, path)

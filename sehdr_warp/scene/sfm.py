@@ -125,8 +125,8 @@ def _cached(cache: Path | None, name: str, solve: Callable[[Path, Path], None], 
                 if not (cache / name).is_dir():
                     raise
     except OSError as error:
-        raise SehdrError(f"{cache or tempfile.gettempdir()}: structure from motion cannot write its files "
-                         f"({error.strerror or error}); free some space or name another cache folder") from None  # fmt: skip
+        raise SehdrError(f"{cache or tempfile.gettempdir()}: structure from motion cannot write "
+                         f"({error.strerror or error}); free some space or choose another cache") from None  # fmt: skip
     yield cache / name
 
 
@@ -242,7 +242,7 @@ def _seed(options) -> None:
 
 
 def _map(database: Path, work: Path, count: int, source: Path, progress: Progress):
-    """The largest reconstruction; a second, more patient try (smaller baselines, fewer inliers) where photos are left."""
+    """The largest reconstruction; where photos are left, after a second try with weaker conditions."""
     import pycolmap
 
     best = None
@@ -274,7 +274,7 @@ def _map(database: Path, work: Path, count: int, source: Path, progress: Progres
             return best
     if best is None or best.num_reg_images() < 2:
         raise InputError(source, f"none of the {count} photos could be placed by structure from motion",
-                         "take sharp photos that overlap by two thirds, or bring poses (COLMAP, transforms.json)")  # fmt: skip
+                         "take sharp photos that overlap by two thirds, or bring poses")  # fmt: skip
     return best
 
 

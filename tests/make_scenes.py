@@ -1,0 +1,123 @@
+"""Small real scenes for tests, written with the formats' own libraries."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from sehdr_warp.scene import Camera
+from sehdr_warp.scene.hdr_nerf_layout import RadianceView, centred_exposures, reinhard_gamma, write_hdr_nerf_scene
+from sehdr_warp.scene.images import read_hdr
+from sehdr_warp.scene.resample import area_average
+
+
+def look_at(position, target=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """[4, 4] world_to_camera (OpenCV axes) of a camera at `position` that looks at `target`, world z up."""
+    forward = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ position
+    return pose
+
+
+def arc_poses(count: int) -> list[np.ndarray]:
+    """Cameras on an arc around the origin, 4 units away."""
+    angles = np.linspace(-0.6, 0.6, count)
+    return [look_at((4 * np.sin(a), -4 * np.cos(a), 0.5)) for a in angles]
+
+
+def pattern(width: int, height: int, seed: int = 0) -> np.ndarray:
+    """[H, W, 3] uint8: smooth noise that uses the full range."""
+    noise = np.random.default_rng(seed).random((height // 4 + 2, width // 4 + 2, 3))
+    picture = Image.fromarray((noise * 255).astype(np.uint8)).resize((width, height), Image.Resampling.BICUBIC)
+    return np.asarray(picture)
+
+
+def write_colmap(
+    folder: Path,
+    count: int = 6,
+    *,
+    binary: bool = False,
+    model: str = "PINHOLE",
+    params=(50.0, 52.0, 30.0, 25.0),
+    size=(64, 48),
+    name="{:03d}.png",
+    exif: dict[int, dict] | None = None,
+) -> None:
+    """images/ and sparse/0 written by pycolmap: `count` views, 5 points, observations in every image."""
+    import pycolmap
+
+    reconstruction = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params), camera_id=1)
+    reconstruction.add_camera_with_trivial_rig(camera)
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    for i, pose in enumerate(arc_poses(count)):
+        keypoints = [pycolmap.Point2D(np.array([x, 5.0])) for x in (3.0, 9.0)]
+        image = pycolmap.Image(name.format(i), pycolmap.Point2DList(keypoints), camera_id=1, image_id=i + 1)
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+        photo = Image.fromarray(pattern(*size, seed=i))
+        tags = Image.Exif()
+        for tag, value in (exif or {}).get(i, {}).items():
+            tags.get_ifd(0x8769)[tag] = value
+        path = folder / "images" / name.format(i)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        photo.save(path, exif=tags)
+    for i in range(5):
+        track = pycolmap.Track([pycolmap.TrackElement(1, i % 2)]) if i < 2 else pycolmap.Track()
+        reconstruction.add_point3D(np.array([i, -i / 3, 0.25]), track, np.array([10 * i, 255, 0], np.uint8))
+    (folder / "sparse" / "0").mkdir(parents=True, exist_ok=True)
+    (reconstruction.write_binary if binary else reconstruction.write_text)(folder / "sparse" / "0")
+
+
+def write_blender(folder: Path, count: int = 6, *, rgba: bool = False, size=(40, 30), **fields) -> None:
+    """transforms.json with OpenGL poses and file names without ending, and its PNG files; more fields as given."""
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    frames = []
+    for i, pose in enumerate(arc_poses(count)):
+        photo = pattern(*size, seed=i)
+        if rgba:
+            alpha = np.full((*photo.shape[:2], 1), 255, np.uint8)
+            alpha[:, : size[0] // 2] = 0
+            photo = np.concatenate([photo, alpha], axis=2)
+        Image.fromarray(photo).save(folder / "images" / f"r_{i}.png")
+        matrix = np.linalg.inv(pose)
+        matrix[:3, 1:3] *= -1
+        frames.append({"file_path": f"./images/r_{i}", "transform_matrix": matrix.tolist()})
+    values = {"camera_angle_x": 0.8, "frames": frames, **fields}
+    (folder / "transforms.json").write_text(json.dumps(values))
+
+
+def room_views(
+    shared: Path, *, room: str = "room", weights=(1.0, 1.0, 1.0), size: int = 200, count: int | None = None
+) -> list[RadianceView]:
+    """The rendered room's views as radiance: weighted sums of its light groups (window, spot, lamps)."""
+    folder = shared / "data" / room
+    values = json.loads((folder / "transforms.json").read_text())
+    views = []
+    for i, frame in enumerate(values["frames"][:count]):
+        stem = Path(frame["file_path"]).stem
+        groups = [read_hdr(folder / "groups" / f"{stem}_{group}.exr") for group in ("window", "spot", "lamps")]
+        radiance = sum(weight * group for weight, group in zip(weights, groups, strict=True))
+        camera = Camera(
+            values["w"], values["h"], values["fl_x"], values["fl_y"], values["cx"], values["cy"], frame["w2c_opencv"]
+        ).resized(size, size)
+        views.append(RadianceView(f"r_{i}", camera, area_average(radiance, size, size), frame["split"]))
+    return views
+
+
+def write_room(folder: Path, shared: Path, *, points: bool = True, exposures=None, **options) -> list[float]:
+    """An HDR-NeRF synthetic set of the rendered room in `folder`; returns its five exposure times.
+
+    options: as room_views takes them. points: with the room's own sparse points.
+    """
+    views = room_views(shared, **options)
+    times = centred_exposures([view.radiance for view in views])
+    cloud = None
+    if points:
+        with np.load(shared / "data" / options.get("room", "room") / "points_hdr.npz") as stored:
+            cloud = stored["xyz"], reinhard_gamma(stored["radiance"] * times[2])
+    write_hdr_nerf_scene(folder, views, times, exposures=exposures, points=cloud)
+    return times

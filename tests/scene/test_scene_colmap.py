@@ -1,0 +1,230 @@
+"""COLMAP sets against pycolmap, and what a damaged or hostile model gets."""
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.scene import load_scene
+from sehdr_warp.scene.colmap_model import read_model
+from sehdr_warp.scene.lens import CAMERA_MODELS
+from tests.make_scenes import arc_poses, pattern, write_colmap
+
+pycolmap = pytest.importorskip("pycolmap")
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_model_is_what_pycolmap_wrote(tmp_path, binary):
+    write_colmap(tmp_path, binary=binary)
+    oracle = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
+    scene = load_scene(tmp_path)
+    assert scene.format == "colmap" and [view.name for view in scene.views] == [f"{i:03d}" for i in range(6)]
+    by_name = {image.name: image for image in oracle.images.values()}
+    for view in scene.views:
+        expected = np.eye(4)
+        expected[:3] = by_name[f"{view.name}.png"].cam_from_world().matrix()
+        np.testing.assert_allclose(view.camera.world_to_camera, expected, atol=1e-12)
+        np.testing.assert_array_equal(view.camera.intrinsics, (50, 52, 30, 25))
+        np.testing.assert_array_equal(view.image, pattern(64, 48, int(view.name)).astype(np.float32) / np.float32(255))
+    cloud = {tuple(point.xyz): tuple(point.color) for point in oracle.points3D.values()}
+    assert {tuple(p): tuple(np.round(c * 255)) for p, c in zip(scene.points, scene.point_colors, strict=True)} == cloud
+
+
+def test_every_camera_model_has_pycolmaps_id_and_parameters():
+    for number, (name, count) in CAMERA_MODELS.items():
+        camera = pycolmap.Camera.create_from_model_name(1, name, 500.0, 64, 48)
+        assert int(camera.model) == number and len(camera.params) == count
+
+
+@pytest.mark.parametrize(
+    "model, params",
+    [
+        ("OPENCV", (50, 52, 30, 25, -0.1, 0.02, 1e-3, -2e-3)),
+        ("SIMPLE_RADIAL", (50, 32, 24, -0.15)),
+        ("OPENCV_FISHEYE", (40, 40, 32, 24, 0.01, 0, 0, 0)),
+        ("FOV", (50, 50, 32, 24, 0.4)),
+    ],
+)
+def test_distortion_is_undone_where_pycolmap_projects(tmp_path, model, params):
+    """A photo that shows its own pixel places must, undistorted, show where pycolmap projects the pinhole's rays."""
+    write_colmap(tmp_path, model=model, params=params)
+    x, y = np.meshgrid(np.arange(64), np.arange(48))
+    for i in range(6):
+        Image.fromarray(np.stack([x, y, 0 * x], 2).astype(np.uint8)).save(tmp_path / "images" / f"{i:03d}.png")
+    view = load_scene(tmp_path, decode=lambda v: v, encode=lambda v: v).views[2]
+    camera, lens = view.camera, pycolmap.Camera(model=model, width=64, height=48, params=list(params))
+    rows, columns = np.mgrid[2 : camera.height - 2 : 5, 2 : camera.width - 2 : 5].reshape(2, -1)
+    rays = np.stack([(columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy, 0 * rows + 1.0], 1)
+    np.testing.assert_allclose(view.image[rows, columns, :2] * 255 + 0.5, lens.img_from_cam(rays), atol=0.02)
+
+
+def test_stored_pixels_or_turned_ones_as_the_camera_size_says(tmp_path):
+    for name, size in (("stored", (64, 48)), ("turned", (48, 64))):
+        write_colmap(tmp_path / name, size=size)
+        for i in range(6):
+            exif = Image.Exif()
+            exif[0x0112] = 6
+            Image.fromarray(pattern(64, 48, i)).save(tmp_path / name / "images" / f"{i:03d}.png", exif=exif)
+    stored, turned = (load_scene(tmp_path / name).views[1].image for name in ("stored", "turned"))
+    np.testing.assert_array_equal(np.rot90(stored, -1), turned)
+
+
+def test_reduced_images_scale_the_camera_and_others_are_refused(tmp_path):
+    write_colmap(tmp_path)
+    for i in range(6):
+        Image.fromarray(pattern(32, 24, i)).save(tmp_path / "images" / f"{i:03d}.png")
+    view = load_scene(tmp_path).views[0]
+    assert (view.camera.width, view.camera.fx, view.camera.cy) == (32, 25.0, 12.5)
+    Image.fromarray(pattern(60, 48)).save(tmp_path / "images" / "003.png")
+    with pytest.raises(InputError, match=r"003.png: image is 60 x 48, its camera 64 x 48"):
+        load_scene(tmp_path)
+
+
+def test_mask_and_alpha_keep_pixels_out(tmp_path):
+    write_colmap(tmp_path)
+    (tmp_path / "masks").mkdir()
+    mask = np.full((48, 64), 255, np.uint8)
+    mask[:, :16] = 0
+    Image.fromarray(mask).save(tmp_path / "masks" / "000.png.png")
+    alpha = np.full((48, 64, 1), 255, np.uint8)
+    alpha[:12] = 0
+    Image.fromarray(np.concatenate([pattern(64, 48, 1), alpha], 2)).save(tmp_path / "images" / "001.png")
+    scene = load_scene(tmp_path)
+    assert scene.views[0].mask[:, :16].max() == 0 and scene.views[0].mask[:, 16:].min() == 1
+    assert scene.views[1].mask[:12].max() == 0 and scene.views[1].mask[12:].min() == 1
+    np.testing.assert_array_equal(scene.views[1].image, pattern(64, 48, 1).astype(np.float32) / np.float32(255))
+    assert scene.views[2].mask is None
+
+
+@pytest.mark.parametrize("name", ["../../../etc/passwd", "/etc/passwd", "C:\\x.png", "a/../../b.png"])
+def test_names_that_leave_the_folder_are_refused(tmp_path, name):
+    write_colmap(tmp_path)
+    images = tmp_path / "sparse" / "0" / "images.txt"
+    images.write_text(images.read_text().replace("000.png", name))
+    with pytest.raises(InputError, match="absolute|'..'"):
+        load_scene(tmp_path)
+
+
+def test_link_out_of_the_folder_is_refused(tmp_path):
+    write_colmap(tmp_path / "set")
+    secret = tmp_path / "secret.png"
+    (tmp_path / "set" / "images" / "000.png").rename(secret)
+    (tmp_path / "set" / "images" / "000.png").symlink_to(secret)
+    with pytest.raises(InputError, match="leads outside"):
+        load_scene(tmp_path / "set")
+
+
+def _first_image(tmp_path) -> tuple:
+    write_colmap(tmp_path, binary=True)
+    path = tmp_path / "sparse" / "0" / "images.bin"
+    return path, bytearray(path.read_bytes())
+
+
+def test_hostile_binary_images(tmp_path):
+    path, good = _first_image(tmp_path)
+    nan, zero, unterminated, many = (bytearray(good) for _ in range(4))
+    nan[12:20] = struct.pack("<d", float("nan"))
+    zero[12:44] = bytes(32)
+    name = good.index(b"000.png")
+    unterminated = good[:name] + b"x" * 5000
+    many[0:8] = struct.pack("<Q", 2**62)
+    observations = good[: name + 8] + struct.pack("<Q", 2**61) + good[name + 16 :]
+    for data, message in (
+        (nan, "not finite"),
+        (zero, "quaternion"),
+        (unterminated, "has no end within 4096"),
+        (many, "count 4611686018427387904 needs"),
+        (observations, "count 2305843009213693952 needs"),
+        (b"", "empty"),
+        (struct.pack("<Q", 0), "no registered views"),
+    ):
+        path.write_bytes(bytes(data))
+        with pytest.raises(InputError, match=message):
+            load_scene(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def binary_model(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("model")
+    write_colmap(folder, binary=True, count=3)
+    return folder / "sparse" / "0"
+
+
+@settings(max_examples=150, deadline=2000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_damaged_binary_files_raise_only_input_errors(binary_model, tmp_path_factory, data):
+    """Truncation anywhere and up to four changed bytes: read as another model, or refused in one line."""
+    folder = tmp_path_factory.mktemp("damaged")
+    for source in ("cameras.bin", "images.bin", "points3D.bin"):
+        (folder / source).write_bytes((binary_model / source).read_bytes())
+    path = folder / data.draw(st.sampled_from(["cameras.bin", "images.bin", "points3D.bin"]))
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(0, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(bytes(content[: data.draw(st.integers(0, len(content)))]))
+    try:
+        model = read_model(folder)
+    except InputError as error:
+        assert "\n" not in str(error) and str(folder) in str(error)
+    else:
+        assert np.isfinite(model.points).all()
+        assert all(np.isfinite(image.world_to_camera).all() for image in model.images)
+
+
+@settings(max_examples=100, deadline=2000)
+@given(content=st.binary(max_size=300), name=st.sampled_from(["cameras", "images", "points3D"]))
+def test_random_text_and_bytes_raise_only_input_errors(binary_model, tmp_path_factory, content, name):
+    folder = tmp_path_factory.mktemp("random")
+    suffix = ".txt" if len(content) % 2 else ".bin"
+    for source in ("cameras", "images", "points3D"):
+        (folder / f"{source}.bin").write_bytes((binary_model / f"{source}.bin").read_bytes())
+    if suffix == ".txt":
+        pycolmap.Reconstruction(binary_model).write_text(folder)
+        for source in ("cameras", "images", "points3D"):
+            (folder / f"{source}.bin").unlink()
+    (folder / f"{name}{suffix}").write_bytes(content)
+    try:
+        read_model(folder)
+    except InputError as error:
+        assert "\n" not in str(error)
+
+
+def test_fern_is_read_as_pycolmap_reads_it(shared):
+    folder = shared / "data" / "fern"
+    oracle = pycolmap.Reconstruction(folder / "sparse" / "0")
+    scene = load_scene(folder, max_size=100)
+    assert [view.name for view in scene.test_views] == ["000", "008", "016"] and len(scene.views) == 20
+    assert not scene.exposure_times_known and any("1 s" in note for note in scene.notes)
+    assert scene.points.shape == (oracle.num_points3D(), 3)
+    poses = {image.name: image.cam_from_world().matrix() for image in oracle.images.values()}
+    for view in scene.views:
+        np.testing.assert_allclose(view.camera.world_to_camera[:3], poses[view.source.name], atol=1e-12)
+        assert view.image.shape == (75, 100, 3)
+
+
+def test_hdr_gs_layout(tmp_path):
+    write_colmap(tmp_path, name="{}_1.png")
+    from sehdr_warp.scene.hdr_nerf_layout import reinhard_gamma
+
+    (tmp_path / "exr").mkdir()
+    import OpenEXR
+
+    truth = {}
+    for i in range(6):
+        truth[i] = np.random.default_rng(i).random((48, 64, 3)).astype(np.float32) + 0.1
+        with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"RGB": truth[i]}) as file:
+            file.write(str(tmp_path / "exr" / f"{i}.exr"))
+        for k, seconds in enumerate((0.125, 0.5, 2, 8, 32)):
+            code = (reinhard_gamma(truth[i] * seconds) * 255 + 0.5).astype(np.uint8)
+            Image.fromarray(code).save(tmp_path / "images" / f"{i}_{k}.png")
+    scene = load_scene(tmp_path, exposure_index=3)
+    assert scene.format == "hdr-gs" and [view.name for view in scene.test_views] == ["1", "3", "5"]
+    assert {view.exposure_time for view in scene.views} == {8.0}
+    for i, view in enumerate(scene.views):
+        np.testing.assert_array_equal(view.hdr, truth[i])
+        np.testing.assert_allclose(view.image, reinhard_gamma(truth[i] * 8), atol=0.5 / 255 + 1e-6)
+        np.testing.assert_allclose(view.camera.world_to_camera, arc_poses(6)[i], atol=1e-12)

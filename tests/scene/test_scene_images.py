@@ -1,0 +1,175 @@
+"""Pixels: every format against another library's reading, damage, limits, and exact averages."""
+
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.scene.images import image_sizes, read_hdr, read_ldr
+from sehdr_warp.scene.resample import (
+    area_average,
+    light_table,
+    limited_size,
+    restore_clipping,
+    srgb_decode,
+    srgb_encode,
+)
+
+RNG = np.random.default_rng(1)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif", "a.jpg", "a.webp", "a.bmp"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_eight_bits(tmp_path, name, channels):
+    pixels = RNG.integers(0, 256, (20, 30, channels), dtype=np.uint8)
+    Image.fromarray(pixels.squeeze()).save(tmp_path / name, quality=100, lossless=True)
+    read = read_ldr(tmp_path / name)
+    assert read.levels == 255 and read.alpha is None and image_sizes(tmp_path / name) == ((30, 20), (30, 20))
+    np.testing.assert_array_equal(read.pixels, np.asarray(Image.open(tmp_path / name).convert("RGB")))
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif", "raw.tif"])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_sixteen_bits_keep_every_bit(tmp_path, name, channels):
+    pixels = RNG.integers(0, 65536, (20, 30, channels), dtype=np.uint16)
+    cv2.imwrite(str(tmp_path / name), pixels, [cv2.IMWRITE_TIFF_COMPRESSION, 1] if name == "raw.tif" else [])
+    read = read_ldr(tmp_path / name)
+    assert read.levels == 65535
+    expected = pixels[..., [0, 0, 0]] if channels == 1 else pixels[..., 2::-1]
+    np.testing.assert_array_equal(read.pixels, expected)
+    if channels == 4:
+        np.testing.assert_allclose(read.alpha, pixels[..., 3] / 65535, atol=1e-6)
+
+
+def test_palette_with_transparency(tmp_path):
+    image = Image.new("P", (4, 2))
+    image.putpalette([10, 20, 30, 200, 100, 50])
+    image.putdata([0, 1, 0, 1, 1, 1, 0, 0])
+    image.save(tmp_path / "p.png", transparency=0)
+    read = read_ldr(tmp_path / "p.png")
+    assert read.pixels[0, 1].tolist() == [200, 100, 50] and read.alpha[0].tolist() == [0, 1, 0, 1]
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_orientation_is_pillows(tmp_path, orientation):
+    from PIL import ImageOps
+
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(RNG.integers(0, 256, (5, 7, 3), dtype=np.uint8)).save(tmp_path / "o.png", exif=exif)
+    expected = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / "o.png")))
+    np.testing.assert_array_equal(read_ldr(tmp_path / "o.png", oriented=True).pixels, expected)
+    assert image_sizes(tmp_path / "o.png")[1] == expected.shape[1::-1]
+
+
+@pytest.mark.parametrize("width", [5, 40])
+def test_radiance_pictures(tmp_path, width):
+    """Width 40 is run-length coded, width 5 flat; the format's own precision is one part in 256 of the brightest."""
+    pixels = np.exp(RNG.normal(0, 3, (6, width, 3))).astype(np.float32)
+    pixels[2] = pixels[2, 0]
+    cv2.imwrite(str(tmp_path / "a.hdr"), pixels[..., ::-1])
+    read = read_hdr(tmp_path / "a.hdr")
+    assert np.all(np.abs(read - pixels) <= pixels.max(axis=2, keepdims=True) / 128)
+    data = (tmp_path / "a.hdr").read_bytes()
+    for end in (0, 5, 30, len(data) // 2, len(data) - 1):
+        (tmp_path / "b.hdr").write_bytes(data[:end])
+        with pytest.raises(InputError):
+            read_hdr(tmp_path / "b.hdr")
+
+
+def _exr(path, pixels, header=None):
+    import OpenEXR
+
+    with OpenEXR.File({"type": OpenEXR.scanlineimage, **(header or {})}, {"RGB": pixels}) as file:
+        file.write(str(path))
+
+
+def test_exr_negative_and_not_finite_values(tmp_path):
+    pixels = RNG.normal(0, 1, (6, 8, 3)).astype(np.float32)
+    _exr(tmp_path / "a.exr", pixels)
+    np.testing.assert_array_equal(read_hdr(tmp_path / "a.exr"), np.maximum(pixels, 0))
+    pixels[4, 5, 1] = np.nan
+    _exr(tmp_path / "a.exr", pixels)
+    with pytest.raises(InputError, match=r"G = nan at x=5, y=4"):
+        read_hdr(tmp_path / "a.exr")
+
+
+def test_exr_data_window_inside_the_display_window(tmp_path):
+    import OpenEXR
+
+    pixels = np.ones((3, 4, 3), np.float32)
+    corners = {"dataWindow": (np.array([2, 1], np.int32), np.array([5, 3], np.int32)),
+               "displayWindow": (np.array([0, 0], np.int32), np.array([9, 7], np.int32))}  # fmt: skip
+    _exr(tmp_path / "a.exr", pixels, corners)
+    with OpenEXR.File(str(tmp_path / "a.exr")) as file:
+        assert file.header()["dataWindow"][0].tolist() == [2, 1]
+    read = read_hdr(tmp_path / "a.exr")
+    assert read.shape == (8, 10, 3) and read[1:4, 2:6].min() == 1 and read.sum() == 36
+
+
+def test_damaged_files_raise_input_errors(tmp_path):
+    pixels = RNG.integers(0, 256, (40, 40, 3), dtype=np.uint8)
+    _exr(tmp_path / "a.exr", pixels.astype(np.float32))
+    for name in ("a.png", "a.jpg", "a.tif"):
+        Image.fromarray(pixels).save(tmp_path / name)
+    for name in ("a.png", "a.jpg", "a.tif", "a.exr"):
+        data = (tmp_path / name).read_bytes()
+        bad = tmp_path / f"bad_{name}"
+        for content in (b"", b"not an image", data[: len(data) // 3], data[: len(data) - len(data) // 8]):
+            bad.write_bytes(content)
+            with pytest.raises(InputError) as caught:
+                (read_hdr if name == "a.exr" else read_ldr)(bad)
+            assert str(bad) in str(caught.value) and "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="not found"):
+        read_ldr(tmp_path / "none.png")
+
+
+def test_too_many_pixels_are_refused_before_decoding(tmp_path):
+    header = struct.pack(">II5B", 60000, 60000, 8, 2, 0, 0, 0)
+    chunk = b"IHDR" + header
+    png = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    (tmp_path / "a.png").write_bytes(png + struct.pack(">I", 0) + b"IDAT" + struct.pack(">I", zlib.crc32(b"IDAT")))
+    (tmp_path / "a.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 60000 +X 60000\n")
+    for read, name in ((read_ldr, "a.png"), (image_sizes, "a.png"), (read_hdr, "a.hdr"), (image_sizes, "a.hdr")):
+        with pytest.raises(InputError, match="60000 x 60000"):
+            read(tmp_path / name)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 40), st.data())
+def test_area_average_is_exact(width, height, data):
+    small = data.draw(st.integers(1, width)), data.draw(st.integers(1, height))
+    image = np.random.default_rng(0).random((height, width, 2))
+    # Repeating every pixel makes the exact fractional areas whole numbers of samples.
+    fine = image.repeat(small[1], axis=0).repeat(small[0], axis=1)
+    expected = fine.reshape(small[1], height, small[0], width, 2).mean(axis=(1, 3))
+    np.testing.assert_allclose(area_average(image, *small), expected, atol=1e-5)
+
+
+def test_light_of_a_curve_that_ends_at_infinity():
+    with np.errstate(divide="ignore"):
+        table = light_table(255, lambda v: v / (1 - v))
+    assert np.isfinite(table).all() and (np.diff(table) > 0).all() and table[-1] == pytest.approx(509, rel=1e-3)
+
+
+def test_clipping_survives_where_it_covers_half():
+    share = np.array([0.0, 0.49, 0.5, 1.0])
+    np.testing.assert_array_equal(restore_clipping(np.full(4, 0.7, np.float32), share), np.float32([0.7, 0.7, 1, 1]))
+
+
+def test_srgb_is_the_standard():
+    colour = pytest.importorskip("colour")
+    value = np.linspace(0, 1, 999)
+    np.testing.assert_allclose(srgb_decode(value), colour.models.eotf_sRGB(value), atol=1e-12)
+    np.testing.assert_allclose(srgb_encode(srgb_decode(value)), value, atol=1e-6)
+
+
+def test_limited_size():
+    assert limited_size(2832, 2128, 400) == (400, 301) and limited_size(30, 20, 400) == (30, 20)
+    assert limited_size(5000, 2, 100) == (100, 1) and limited_size(30, 20, None) == (30, 20)

@@ -1,0 +1,243 @@
+"""transforms.json in its dialects, HDR-NeRF's two layouts, LLFF, and cameras to render from."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.scene import load_cameras, load_scene
+from sehdr_warp.scene.hdr_nerf_layout import reinhard_gamma, reinhard_gamma_inverse
+from tests.make_scenes import arc_poses, pattern, room_views, write_blender, write_colmap, write_room
+
+
+def _edit(folder, **fields):
+    path = folder / "transforms.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | fields))
+
+
+def test_blender_poses_become_opencv(tmp_path):
+    write_blender(tmp_path, 9, ply_file_path="cloud.ply")
+    (tmp_path / "cloud.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+        "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n0 0 0 255 0 0\n1 2 3 0 0 51\n"
+    )
+    scene = load_scene(tmp_path)
+    assert [view.name for view in scene.test_views] == ["r_0", "r_8"] and scene.format == "transforms"
+    for view, pose in zip(scene.views, arc_poses(9), strict=True):
+        np.testing.assert_allclose(view.camera.world_to_camera, pose, atol=1e-12)
+        assert view.camera.fx == view.camera.fy == pytest.approx(20 / np.tan(0.4)) and view.camera.cx == 20
+    np.testing.assert_array_equal(scene.points, [[0, 0, 0], [1, 2, 3]])
+    np.testing.assert_allclose(scene.point_colors, [[1, 0, 0], [0, 0, 0.2]], atol=1e-6)
+
+
+def test_transparent_pixels_show_black_light(tmp_path):
+    write_blender(tmp_path, rgba=True, camera_angle_x=0.7)
+    view = load_scene(tmp_path, cache=tmp_path / "cache").views[0]
+    assert view.image[:, :20].max() == 0 and view.mask is None
+    np.testing.assert_allclose(view.image[:, 20:], pattern(40, 30, 0)[:, 20:] / 255, atol=1e-6)
+
+
+def test_frame_values_win_over_the_files(tmp_path):
+    write_blender(tmp_path, fl_x=50.0, cx=18.0, camera_model="OPENCV", k1=0.0)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    values["frames"][1] |= {"fl_x": 60.0, "fl_y": 61.0, "exposure_time": 0.5, "split": "test", "mask_path": "mask.png"}
+    for i in (0, 2, 3, 4, 5):
+        values["frames"][i] |= {"exposure_time": 0.25, "split": "train"}
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    Image.fromarray(np.eye(30, 40, dtype=np.uint8) * 255).save(tmp_path / "mask.png")
+    scene = load_scene(tmp_path)
+    first, second = scene.views[:2]
+    assert tuple(first.camera.intrinsics) == (50, 50, 18, 15) and tuple(second.camera.intrinsics) == (60, 61, 18, 15)
+    assert (first.exposure_time, second.exposure_time) == (0.25, 0.5) and scene.exposure_times_known
+    assert scene.test_views == (second,) and any("exposures differ" in note for note in scene.notes)
+    np.testing.assert_array_equal(second.mask, np.eye(30, 40))
+
+
+def test_nerfstudio_points_move_with_the_poses(tmp_path):
+    write_blender(tmp_path, applied_transform=[[0, 1, 0, 5], [1, 0, 0, 0], [0, 0, -1, 0]])
+    write_colmap(tmp_path / "colmap")
+    points = load_scene(tmp_path).points
+    assert {tuple(p) for p in points} == {(-i / 3 + 5, i, -0.25) for i in range(5)}
+
+
+@pytest.mark.parametrize(
+    "fields, message",
+    [
+        ({"frames": []}, "has no frames"),
+        ({"frames": [{"file_path": "../up.png"}]}, r"contains '\.\.'"),
+        ({"camera_angle_x": "wide"}, "camera_angle_x = 'wide'"),
+        ({"camera_angle_x": 4.0}, "no focal length"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"),
+        ({"fl_x": -5.0}, "not positive"),
+        ({"w": 30, "h": 40}, "image is 40 x 30, its camera 30 x 40"),
+    ],
+)
+def test_bad_transforms_are_refused(tmp_path, fields, message):
+    write_blender(tmp_path)
+    _edit(tmp_path, **fields)
+    with pytest.raises(InputError, match=message):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda m: m.__setitem__((0, 3), np.nan), "not a finite"),
+        (lambda m: np.multiply(m, 2, out=m), "no rotation"),
+        (lambda m: m.__setitem__((slice(0, 3), 0), -m[:3, 0]), "no rotation"),
+    ],
+)
+def test_bad_poses_are_refused(tmp_path, change, message):
+    write_blender(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    matrix = np.array(values["frames"][3]["transform_matrix"])
+    change(matrix)
+    values["frames"][3]["transform_matrix"] = matrix.tolist()
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    with pytest.raises(InputError, match=message):
+        load_scene(tmp_path)
+
+
+def test_exr_alone_is_refused_and_beside_a_photo_is_truth(tmp_path):
+    import OpenEXR
+
+    write_blender(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    for i, frame in enumerate(values["frames"]):
+        frame["file_path"] = f"images/r_{i}.exr"
+        with OpenEXR.File({}, {"RGB": np.full((30, 40, 3), i + 1, np.float32)}) as file:
+            file.write(str(tmp_path / frame["file_path"]))
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    scene = load_scene(tmp_path, cache=tmp_path / "cache")
+    assert [view.hdr.max() for view in scene.views] == [1, 2, 3, 4, 5, 6]
+    (tmp_path / "images" / "r_2.png").unlink()
+    with pytest.raises(InputError, match=r"r_2.exr: is the frame's only image"):
+        load_scene(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory, shared):
+    folder = tmp_path_factory.mktemp("room")
+    return folder, write_room(folder, shared, size=100, count=12)
+
+
+def test_hdr_nerf_round_trip(room, shared):
+    folder, times = room
+    views = room_views(shared, size=100, count=12)
+    for index, expected in ((None, 2), (0, 0), (4, 4)):
+        scene = load_scene(folder, exposure_index=index)
+        assert scene.format == "hdr-nerf" and len(scene.train_views) == len(scene.test_views) == 6
+        assert {view.exposure_time for view in scene.views} == {times[expected]}
+        read = {view.name: view for view in scene.views}
+        for view in views:
+            np.testing.assert_allclose(read[view.name].hdr, view.radiance, rtol=6e-4, atol=1e-7)
+            exact = reinhard_gamma(view.radiance * times[expected])
+            assert np.abs(read[view.name].image - exact).max() <= 0.5 / 255 + 1e-6
+            np.testing.assert_allclose(read[view.name].camera.world_to_camera, view.camera.world_to_camera, atol=1e-9)
+            np.testing.assert_allclose(read[view.name].camera.intrinsics, view.camera.intrinsics, rtol=1e-12)
+    assert len(scene.points) == 21600
+    with pytest.raises(InputError, match=r"index 7 asked for, but the exposures are \[0, 1, 2, 3, 4\]"):
+        load_scene(folder, exposure_index=7)
+
+
+def test_photos_are_averaged_as_light(room):
+    """Half-size photos must agree with the half-size radiance that was photographed, not with averaged code values."""
+    folder, _ = room
+    small = load_scene(folder, max_size=25, decode=reinhard_gamma_inverse, encode=reinhard_gamma)
+    for view in small.views:
+        exact = reinhard_gamma(view.hdr * view.exposure_time)
+        assert np.percentile(np.abs(view.image - exact), 99) < 1 / 255
+        assert (view.camera.width, view.camera.cx) == (25, 12.5)
+
+
+def test_points_are_triangulated_and_cached(tmp_path, shared):
+    from scipy.spatial import cKDTree
+
+    write_room(tmp_path, shared, points=False, exposures=[2])
+    messages = []
+    scene = load_scene(tmp_path, cache=tmp_path / "cache", progress=messages.append)
+    truth = np.load(shared / "data" / "room" / "points_hdr.npz")["xyz"]
+    assert len(scene.points) > 200 and np.median(cKDTree(truth).query(scene.points)[0]) < 0.1
+    assert any("triangulated" in note for note in scene.notes)
+    again = load_scene(tmp_path, cache=tmp_path / "cache", progress=messages.append)
+    np.testing.assert_array_equal(again.points, scene.points)
+    assert "cached" in messages[-1]
+
+
+@pytest.mark.parametrize("value, message", [(0, "0"), (-1, "-1"), ("NaN", "NaN"), (None, "None")])
+def test_impossible_exposures_are_refused(room, tmp_path, value, message):
+    folder = tmp_path / "set"
+    folder.mkdir()
+    for name in ("transforms_train.json", "transforms_test.json", "exposure_test.json", "train", "train_hdr", "test"):
+        (folder / name).symlink_to(room[0] / name)
+    times = json.loads((room[0] / "exposure_train.json").read_text())
+    times[next(iter(times))] = value
+    (folder / "exposure_train.json").write_text(json.dumps(times))
+    with pytest.raises(InputError, match=f"exposure time of .* is {message}|'{message}'"):
+        load_scene(folder)
+
+
+def test_hdr_nerf_real_layout(tmp_path):
+    (tmp_path / "input_images").mkdir()
+    rows = []
+    for i, pose in enumerate(arc_poses(6)):
+        for k, seconds in enumerate((0.1, 0.4, 1.6)):
+            Image.fromarray(pattern(40, 30, i)).save(tmp_path / "input_images" / f"{i:03d}_{k}.jpg", quality=95)
+            right, down, forward, position = np.linalg.inv(pose)[:3].T
+            matrix = np.stack([down, right, -forward, position, [120, 160, 200]], axis=1)
+            rows.append([*matrix.ravel(), 1.0, 9.0, seconds])
+    np.save(tmp_path / "poses_bounds_exps.npy", np.array(rows))
+    scene = load_scene(tmp_path, exposure_index=1, cache=tmp_path / "cache")
+    assert scene.format == "hdr-nerf-real" and [view.name for view in scene.test_views] == ["001", "003", "005"]
+    for view, pose in zip(scene.views, arc_poses(6), strict=True):
+        np.testing.assert_allclose(view.camera.world_to_camera, pose, atol=1e-9)
+        assert view.exposure_time == 0.4 and (view.camera.fx, view.camera.cx) == (50, 20)
+    np.save(tmp_path / "poses_bounds_exps.npy", np.array(rows)[:, :17])
+    with pytest.raises(InputError, match=r"not an \[n, 18\] array"):
+        load_scene(tmp_path)
+    with (tmp_path / "poses_bounds_exps.npy").open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (1 << 40, 18)})
+    with pytest.raises(InputError, match=r"not an \[n, 18\] array"):
+        load_scene(tmp_path)
+
+
+def test_cameras_from_every_kind_of_file(tmp_path):
+    write_blender(tmp_path, w=40, h=30)
+    scene = load_scene(tmp_path, cache=tmp_path / "cache")
+    expected = scene.views[2].camera
+    own = tmp_path / "cameras.json"
+    own.write_text(
+        json.dumps({"cameras": [{"name": "a", **expected.to_dict()}, {"name": "b", "camera": expected.to_dict()}]})
+    )
+    matrix = expected.camera_to_world.copy()
+    matrix[:3, 1:3] *= -1
+    path = tmp_path / "camera_path.json"
+    fov = float(np.degrees(2 * np.arctan(15 / expected.fy)))
+    entry = {"camera_to_world": matrix.ravel().tolist(), "fov": fov, "aspect": 1}
+    path.write_text(json.dumps({"render_width": 40, "render_height": 30, "camera_path": [entry]}))
+    for file, index, name in ((own, 1, "b"), (path, 0, "0000"), (tmp_path / "transforms.json", 2, "r_2")):
+        read_name, camera = load_cameras(file)[index]
+        assert read_name == name
+        np.testing.assert_allclose(camera.world_to_camera, expected.world_to_camera, atol=1e-12)
+        np.testing.assert_allclose(camera.intrinsics, expected.intrinsics, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        ("[]", "JSON list"),
+        ("{", "not valid JSON"),
+        ("[" * 100000, "not valid JSON"),
+        ("{}", "none of cameras"),
+        ('{"cameras": []}', "no cameras"),
+        ('{"cameras": [{"width": 4}]}', "has no height"),
+        ('{"cameras": [5]}', "cannot be used"),
+        ('{"camera_path": [{}], "render_width": 4, "render_height": 4}', "camera_to_world is missing"),
+    ],
+)
+def test_bad_camera_files_are_refused(tmp_path, content, message):
+    (tmp_path / "c.json").write_text(content)
+    with pytest.raises(InputError, match=message):
+        load_cameras(tmp_path / "c.json")
