@@ -46,7 +46,8 @@ def evaluate(
         "regions": {region: {"fraction", "psnr_ldr", "psnr_mu": {name: dB}}}, errors pooled over all views
         "views": the same for each view; and "split", "lpips_backbone", "train_seconds", "gaussians", "iterations"
     Means are over views. What cannot be computed is null with "reason" (or "lpips_reason") beside it. A view's mask
-    applies to everything: outside it the prediction is taken to be right, and nothing there is averaged.
+    applies to everything: outside it the prediction is taken to be right, and nothing there is averaged; a view whose
+    mask is empty is left out.
 
     Raises SehdrError for a scene without views, images that disagree with their camera, a render that is not finite
     or an unknown protocol; InputError for LPIPS weights that cannot be read.
@@ -62,9 +63,9 @@ class _Evaluation:
         self.run, self.scene, self.names = run, scene, tuple(names)
         self.pu21_mapping = {"peak_luminance": peak_luminance, "white_percentile": white_percentile}
         self.split = "test" if scene.test_views else "train"
-        self.views = scene.test_views or scene.train_views
+        self.views = [view for view in scene.test_views or scene.train_views if view.mask is None or view.mask.any()]
         if not self.views:
-            raise SehdrError(f"scene {scene.name!r} has no views to evaluate; check its splits")
+            raise SehdrError(f"scene {scene.name!r} has no views to evaluate; check its splits and masks")
         self.device = torch.device(run.device)
         self.lpips, self.lpips_reason = load_lpips(lpips_weights, self.device)
         self.regions = {region: _RegionErrors(self.names) for region in metrics.REGIONS}
@@ -76,7 +77,7 @@ class _Evaluation:
             rows.append(self._view(view, scale))
             if progress:
                 progress(_line(number, len(self.views), rows[-1]))
-        truths = [row for row in rows if row["protocol"]]
+        truths = [row for row, view in zip(rows, self.views) if view.hdr is not None]
         missing = None if truths else f"the {self.split} views hold no HDR truth"
         hdr, pu21 = {}, {}
         for name in self.names:
@@ -144,11 +145,11 @@ class _Evaluation:
         row = {"name": view.name, "ldr": self._ldr(encoded, photo, mask), "protocol": {}, "pu21": {}}
         regions = metrics.region_masks(photo)
         weights = {name: region if mask is None else region * mask for name, region in regions.items()}
+        counted = float(photo.shape[0] * photo.shape[1] if mask is None else mask.sum())
         for region, weight in weights.items():
-            self.regions[region].add_ldr(encoded, photo, weight)
+            self.regions[region].add_ldr(encoded, photo, weight, counted)
         if truth is None:
             return row
-        hdr = _inside(hdr, truth, mask)
         for name in self.names:
             if name == "aligned" and scale is None:
                 continue
@@ -193,9 +194,9 @@ class _RegionErrors:
         self.pixels = self.weight = self.ldr = 0.0
         self.hdr = dict.fromkeys(names, (0.0, 0.0))
 
-    def add_ldr(self, prediction, truth, weight) -> None:
+    def add_ldr(self, prediction, truth, weight, counted: float) -> None:
         error, total = metrics.squared_error(prediction, truth, weight)
-        self.pixels += weight.numel()
+        self.pixels += counted
         self.weight += total
         self.ldr += float(error.mean())
 

@@ -103,6 +103,8 @@ def test_truth_of_the_test_views_alone_leaves_out_the_aligned_figures():
     assert result["protocol"]["gt-max"]["psnr_mu"] > 20
     assert result["protocol"]["aligned"]["psnr_mu"] is None
     assert "training view" in result["protocol"]["aligned"]["reason"]
+    alone = evaluate(run(), scene([view(0, "train", truth=False), view(1, "test")]), protocols=["aligned"])
+    assert "training view" in alone["protocol"]["aligned"]["reason"]
 
 
 def test_without_test_views_the_training_views_are_named():
@@ -150,6 +152,9 @@ def test_masked_pixels_cost_nothing():
     views = [view(0, "train", mask=mask), view(1, "test", mask=mask)]
     spoilt, clean = evaluate(run(spoil), scene(views)), evaluate(run(lambda hdr: hdr * 1.05), scene(views))
     assert spoilt == clean
+    assert sum(region["fraction"] for region in clean["regions"].values()) == pytest.approx(1.0)
+    hidden = view(2, "test", mask=np.zeros((24, 30), np.float32))
+    assert evaluate(run(spoil), scene([*views, hidden]))["ldr"] == clean["ldr"]
     unmasked = evaluate(run(spoil), scene([view(0, "train"), view(1, "test")]))
     assert unmasked["ldr"]["psnr"] < clean["ldr"]["psnr"] - 10
 
