@@ -1,0 +1,281 @@
+"""Exposure brackets of HDR views: scene-linear EXR files whose ratios are exact, and simulated photos of them."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.scene import Camera
+
+from .colorspace import color_space, from_rec709
+from .exr import Part, exr_header, stored_pixel_type, write_exr, write_multipart_exr
+from .files import atomic_folder, atomic_path, write_json
+from .images import exposure_exif, quantize, write_jpeg, write_png
+from .names import safe_names
+
+LDR_FORMATS = ("jpeg", "png", "png16")
+MANIFEST_FORMAT = 1
+
+# EXIF rationals and 32-bit expTime hold these; real shutters lie far inside.
+_SHORTEST, _LONGEST = 1e-6, 1e6
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One exposure of a bracket. time: seconds. ev: stops above the base exposure, log2(time / base)."""
+
+    time: float
+    ev: float
+
+    @property
+    def label(self) -> str:
+        """`ev-4.0`, with one decimal and always a sign."""
+        # Adding zero turns -0.0 into 0.0.
+        return f"ev{round(self.ev, 1) + 0.0:+.1f}"
+
+
+@dataclass(frozen=True)
+class BracketOptions:
+    """How brackets are written.
+
+    exposures: ascending, as from bracket_exposures. base_time: seconds at 0 EV.
+    colorspace: of the EXR files. pixel: "half" (float where half would overflow) or "float".
+    multipart: one EXR file with all exposures of a view. ldr: one of LDR_FORMATS adds simulated photos, through
+    response.encode; None leaves them out. provenance: text by key, for the EXR attributes `sehdr:<key>`.
+    """
+
+    exposures: tuple[Exposure, ...]
+    base_time: float
+    colorspace: str = "rec709"
+    pixel: str = "half"
+    multipart: bool = False
+    ldr: str | None = None
+    response: object | None = None
+    captured: datetime | None = None
+    provenance: Mapping[str, str] | None = None
+
+    def __post_init__(self):
+        color_space(self.colorspace)
+        stored_pixel_type((), self.pixel)
+        if self.ldr is not None and self.ldr not in LDR_FORMATS:
+            raise SehdrError(f"LDR brackets {self.ldr!r} are not one of {', '.join(LDR_FORMATS)}")
+        if self.ldr is not None and self.response is None:
+            raise SehdrError("LDR brackets need a camera response")
+
+
+def bracket_exposures(
+    base_time: float, *, evs: Sequence[float] | None = None, exposures: Sequence[float] | None = None
+) -> tuple[Exposure, ...]:
+    """The exposures of a bracket, ascending.
+
+    evs: stops, time = base_time 2^ev; or exposures: seconds. Exactly one of them.
+    Raises SehdrError naming the value where both or none are given, a value is zero, negative (a time), not finite,
+    outside 1e-6 to 1e6 seconds, or comes twice.
+    """
+    if (evs is None) == (exposures is None):
+        raise SehdrError(
+            f"brackets need evs or exposures, {'not both' if evs is not None else 'and neither was given'}"
+        )
+    if not (math.isfinite(base_time) and base_time > 0):
+        raise SehdrError(f"base exposure time {base_time} is not a positive number of seconds")
+    given, field = (evs, "evs") if evs is not None else (exposures, "exposures")
+    if not len(given):
+        raise SehdrError(f"{field} is empty; give at least one value")
+    made = []
+    for value in map(float, given):
+        if not math.isfinite(value):
+            raise SehdrError(f"{field}: {value} is not finite")
+        if field == "exposures" and value <= 0:
+            raise SehdrError(f"exposures: {value:g} is not a positive number of seconds")
+        # Scaling by whole stops is exact; absurd stops would overflow before the range refuses them.
+        time = base_time * 2.0**value if field == "evs" and abs(value) < 64 else value
+        if field == "evs" and abs(value) >= 64 or not _SHORTEST <= time <= _LONGEST:
+            raise SehdrError(f"{field}: {value:g} is outside {_SHORTEST:g} to {_LONGEST:g} seconds")
+        made.append(Exposure(time, value if field == "evs" else math.log2(value / base_time)))
+    made.sort(key=lambda exposure: exposure.time)
+    for first, second in zip(made, made[1:], strict=False):
+        if first.time == second.time:
+            raise SehdrError(f"{field}: {first.ev if field == 'evs' else first.time:g} is given twice")
+    return tuple(made)
+
+
+def write_brackets(
+    out: Path | str,
+    views: Mapping[str, np.ndarray] | Iterable[tuple[str, np.ndarray]],
+    base_time: float,
+    *,
+    evs: Sequence[float] | None = None,
+    exposures: Sequence[float] | None = None,
+    cameras: Mapping[str, Camera] | None = None,
+    colorspace: str = "rec709",
+    pixel: str = "half",
+    multipart: bool = False,
+    ldr: str | None = None,
+    response=None,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Writes exposure brackets of HDR views; returns the EXR files.
+
+    views: name -> [H, W, 3] scene-linear Rec.709 radiance E, >= 0, not multiplied by an exposure time.
+    base_time: seconds at 0 EV. evs or exposures: as bracket_exposures takes them.
+    cameras: name -> camera, for the EXR attributes, where known. Other parameters: see BracketOptions.
+
+    Every pixel is E dt, computed in float64 and rounded once. Files: `out/brackets/<view>/<view>_b<i>_ev<+x.x>.exr`
+    with i ascending by exposure, or `out/brackets/<view>.exr`; `out/brackets_ldr/<view>/...` where ldr is given; and
+    `out/brackets.json`. All appear together when the last one is written.
+
+    Raises SehdrError for unusable exposures or options, InputError where something would be replaced (unless
+    overwrite) or a pixel is not finite.
+    """
+    options = BracketOptions(
+        bracket_exposures(base_time, evs=evs, exposures=exposures),
+        base_time,
+        colorspace,
+        pixel,
+        multipart,
+        ldr,
+        response,
+    )
+    pairs = list(views.items() if isinstance(views, Mapping) else views)
+    with BracketFolder(out, options, overwrite=overwrite) as folder:
+        for safe, (name, radiance) in zip(safe_names([name for name, _ in pairs]), pairs, strict=True):
+            folder.add(safe, radiance, (cameras or {}).get(name))
+    return folder.files
+
+
+class BracketFolder:
+    """A set of brackets under construction: add views one at a time; leaving the `with` block makes them appear.
+
+    files: the EXR files, at their final places.
+    """
+
+    def __init__(self, out: Path | str, options: BracketOptions, *, overwrite: bool = False):
+        self.out = Path(out)
+        self.options = options
+        self.files: list[Path] = []
+        self._overwrite = overwrite
+        self._views: list[dict] = []
+
+    def __enter__(self) -> "BracketFolder":
+        with ExitStack() as stack:
+            self._manifest = stack.enter_context(atomic_path(self.out / "brackets.json", self._overwrite))
+            self._folder = stack.enter_context(atomic_folder(self.out / "brackets", self._overwrite))
+            if self.options.ldr:
+                self._ldr_folder = stack.enter_context(atomic_folder(self.out / "brackets_ldr", self._overwrite))
+            stack.push(self._finish)  # Pushed last, it runs first: the list must be there before anything appears.
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *error) -> bool | None:
+        return self._stack.__exit__(*error)
+
+    def _finish(self, kind, error, trace) -> None:
+        if kind is None:
+            write_json(self._manifest, self._describe())
+
+    def add(self, name: str, radiance: np.ndarray, camera: Camera | None = None) -> str:
+        """Writes the bracket of one view under a name that is safe for files; returns the pixel type of its files."""
+        options = self.options
+        radiance = _checked(self.out / "brackets" / name, radiance)
+        linear = from_rec709(radiance, options.colorspace)
+        pixels = [linear * exposure.time for exposure in options.exposures]
+        # One type for all exposures of a view, so that their ratios keep one precision.
+        pixel = stored_pixel_type(pixels, options.pixel)
+        parts = [
+            Part(
+                dict(zip("RGB", np.moveaxis(image, 2, 0), strict=True)),
+                exr_header(
+                    colorspace=options.colorspace,
+                    exposure_time=exposure.time,
+                    camera=camera,
+                    captured=options.captured,
+                    provenance={
+                        **(options.provenance or {}),
+                        "view": name,
+                        "ev": repr(exposure.ev),
+                        "baseExposureTime": repr(options.base_time),
+                    },
+                ),
+                f"b{index}_{exposure.label}",
+            )
+            for index, (image, exposure) in enumerate(zip(pixels, options.exposures, strict=True))
+        ]
+        if options.multipart:
+            stored = [f"{name}.exr"] * len(parts)
+            write_multipart_exr(self._folder / stored[0], parts, pixel=pixel)
+        else:
+            stored = [f"{name}/{name}_{part.name}.exr" for part in parts]
+            for file, part in zip(stored, parts, strict=True):
+                write_exr(self._folder / file, part.channels, pixel=pixel, header=part.header)
+        self.files += [self.out / "brackets" / file for file in dict.fromkeys(stored)]
+        photos = self._write_photos(name, radiance)
+        self._views.append(
+            {
+                "view": name,
+                "pixel": pixel,
+                "exposures": [
+                    {
+                        "index": index,
+                        "exposure_time": exposure.time,
+                        "ev": exposure.ev,
+                        "file": f"brackets/{file}",
+                        **({"part": index} if options.multipart else {}),
+                        **({"ldr_file": photos[index]} if photos else {}),
+                    }
+                    for index, (exposure, file) in enumerate(zip(options.exposures, stored, strict=True))
+                ],
+            }
+        )
+        return pixel
+
+    def _write_photos(self, name: str, radiance: np.ndarray) -> list[str]:
+        options, files = self.options, []
+        if not options.ldr:
+            return files
+        captured = options.captured.strftime("%Y:%m:%d %H:%M:%S") if options.captured else None
+        for index, exposure in enumerate(options.exposures):
+            encoded = options.response.encode(radiance * exposure.time)
+            exif = exposure_exif(exposure.time, bias=exposure.ev, captured=captured)
+            file = f"{name}/{name}_b{index}_{exposure.label}.{'jpg' if options.ldr == 'jpeg' else 'png'}"
+            if options.ldr == "jpeg":
+                write_jpeg(self._ldr_folder / file, quantize(encoded), exif=exif)
+            else:
+                write_png(self._ldr_folder / file, quantize(encoded, 16 if options.ldr == "png16" else 8), exif=exif)
+            files.append(f"brackets_ldr/{file}")
+        return files
+
+    def _describe(self) -> dict:
+        options = self.options
+        return {
+            "format": MANIFEST_FORMAT,
+            "software": "sehdr-warp",
+            "units": "relative scene-linear radiance times exposure_time (seconds)",
+            "color_space": options.colorspace,
+            "base_exposure_time": options.base_time,
+            "multipart": options.multipart,
+            "response": getattr(options.response, "name", None),
+            "ldr": options.ldr,
+            "provenance": dict(options.provenance or {}),
+            "views": self._views,
+        }
+
+
+def _checked(path: Path, radiance: np.ndarray) -> np.ndarray:
+    radiance = np.asarray(radiance, np.float64)
+    if radiance.ndim != 3 or radiance.shape[2] != 3:
+        raise ValueError(f"radiance has shape {radiance.shape}, not [H, W, 3]")
+    bad = ~np.isfinite(radiance)
+    if bad.any():
+        row, column, channel = (int(i) for i in np.argwhere(bad)[0])
+        raise InputError(
+            path,
+            f"{int(bad.sum())} radiances are not finite, the first {'RGB'[channel]} = {radiance[row, column, channel]}"
+            f" at x={column}, y={row}",
+            "such views are not written; train again from an earlier checkpoint or with another seed",
+        )
+    return radiance

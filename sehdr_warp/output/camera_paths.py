@@ -1,0 +1,135 @@
+"""Camera paths for films: an orbit about what the photos look at, and a smooth way through the photos' places."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.scene import Camera
+
+# A gap in azimuth smaller than this means that the photos go round the scene.
+_ROUND_GAP = np.radians(120)
+# Mean squared sine between optical axes below which they are parallel in effect and meet nowhere (1 degree).
+_PARALLEL = np.sin(np.radians(1)) ** 2
+
+
+def common_focus(cameras: Sequence[Camera]) -> np.ndarray | None:
+    """[3] the point nearest to all optical axes (least squares); None where they are parallel or it lies behind."""
+    positions, forward = _positions(cameras), _axes(cameras, 2)
+    off_axis = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    matrix = off_axis.mean(axis=0)
+    if np.linalg.eigvalsh(matrix)[0] < _PARALLEL:
+        return None
+    focus = np.linalg.solve(matrix, (off_axis @ positions[:, :, None]).mean(axis=0)[:, 0])
+    return focus if np.median(np.sum((focus - positions) * forward, axis=1)) > 0 else None
+
+
+def orbit(cameras: Sequence[Camera], count: int, *, focus_distance: float) -> list[Camera]:
+    """A closed path of `count` cameras about the common focus of the given ones, upright, all looking at it.
+
+    Where the given cameras go round the focus, the path is a circle of their mean radius and height. Else it is an
+    oval within their spread (azimuth and elevation about the focus, at the mean distance), so that it shows nothing
+    that no photo saw. Size and intrinsics are those of the camera nearest to the middle.
+
+    focus_distance: how far ahead the focus is taken to lie where the optical axes are parallel; world units, positive.
+    Raises SehdrError without cameras or for a count below 1.
+    """
+    _check(cameras, count)
+    positions = _positions(cameras)
+    focus = common_focus(cameras)
+    middle = cameras[int(np.argmin(np.linalg.norm(positions - positions.mean(axis=0), axis=1)))]
+    if focus is None:
+        focus = middle.position + focus_distance * middle.world_to_camera[2, :3]
+    up = _unit(-_axes(cameras, 1).mean(axis=0), fallback=-middle.world_to_camera[1, :3])
+    back = _unit(np.mean(positions, axis=0) - focus, fallback=-middle.world_to_camera[2, :3])
+    back = _unit(back - up * (back @ up), fallback=np.linalg.svd(up[None])[2][1])
+    right = np.cross(up, back)
+
+    offsets = positions - focus
+    horizontal = np.hypot(offsets @ back, offsets @ right)
+    azimuths = np.arctan2(offsets @ right, offsets @ back)
+    turn = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    if _largest_gap(azimuths) < _ROUND_GAP:
+        azimuth = turn
+        ring, height = np.full(count, horizontal.mean()), np.full(count, (offsets @ up).mean())
+    else:
+        elevations = np.arctan2(offsets @ up, horizontal)
+        # An ellipse whose points have the photos' spread: a cosine's variance is a half.
+        azimuth = azimuths.mean() + np.sqrt(2) * azimuths.std() * np.sin(turn)
+        elevation = elevations.mean() + np.sqrt(2) * elevations.std() * np.cos(turn)
+        distance = np.linalg.norm(offsets, axis=1).mean()
+        ring, height = distance * np.cos(elevation), distance * np.sin(elevation)
+    directions = np.cos(azimuth)[:, None] * back + np.sin(azimuth)[:, None] * right
+    return [_moved(middle, _look_at(p, focus, up)) for p in focus + ring[:, None] * directions + height[:, None] * up]
+
+
+def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
+    """`count` cameras along a smooth path through the given ones, in their order, evenly spaced in time.
+
+    Positions follow a cubic spline and rotations a spherical one (scipy's RotationSpline), both over chord length, so
+    that speed stays even. Size and intrinsics are those of the first camera.
+    Raises SehdrError without cameras or for a count below 1.
+    """
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    _check(cameras, count)
+    positions = _positions(cameras)
+    rotations = Rotation.from_matrix(np.stack([camera.camera_to_world[:3, :3] for camera in cameras]))
+    size = max(float(np.ptp(positions, axis=0).max()), 1e-9)
+    steps = [
+        np.linalg.norm(b - a) / size + (p.inv() * q).magnitude()
+        for a, b, p, q in zip(positions, positions[1:], rotations, list(rotations)[1:], strict=False)
+    ]
+    keep = np.concatenate([[True], np.array(steps) > 1e-6]) if steps else np.array([True])
+    times = np.concatenate([[0.0], np.cumsum(np.array(steps))])[keep]
+    if len(times) == 1:
+        return [_moved(cameras[0], cameras[0].camera_to_world)] * count
+    at = np.linspace(0, times[-1], count)
+    places = CubicSpline(times, positions[keep])(at)
+    turns = RotationSpline(times, rotations[keep])(at).as_matrix()
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = turns, places
+    return [_moved(cameras[0], pose) for pose in poses]
+
+
+def _check(cameras: Sequence[Camera], count: int) -> None:
+    if not cameras:
+        raise SehdrError("a camera path needs at least one camera of the run")
+    if count < 1:
+        raise SehdrError(f"a camera path of {count} views is empty; ask for at least 1")
+
+
+def _positions(cameras: Sequence[Camera]) -> np.ndarray:
+    return np.stack([camera.position for camera in cameras])
+
+
+def _axes(cameras: Sequence[Camera], axis: int) -> np.ndarray:
+    """[n, 3] the cameras' x, y or z axes in world coordinates."""
+    return np.stack([camera.world_to_camera[axis, :3] for camera in cameras])
+
+
+def _unit(vector: np.ndarray, *, fallback: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vector)
+    return vector / length if length > 1e-6 else fallback / np.linalg.norm(fallback)
+
+
+def _largest_gap(angles: np.ndarray) -> float:
+    ordered = np.sort(angles)
+    return float(np.max(np.diff(ordered, append=ordered[0] + 2 * np.pi)))
+
+
+def _look_at(position: np.ndarray, focus: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """[4, 4] camera to world, OpenCV axes."""
+    forward = _unit(focus - position, fallback=np.array([0.0, 0, 1]))
+    right = _unit(np.cross(forward, up), fallback=np.linalg.svd(forward[None])[2][1])
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(forward, right), forward, position], axis=1)
+    return pose
+
+
+def _moved(camera: Camera, camera_to_world: np.ndarray) -> Camera:
+    rotation = camera_to_world[:3, :3].T
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ camera_to_world[:3, 3]
+    return Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, pose)

@@ -1,0 +1,215 @@
+"""Scene-linear OpenEXR files, single and multi-part, with the metadata that HDR tools read.
+
+In every file that this package writes, a colour pixel is radiance times `expTime` (1 second for a radiance picture).
+docs/formats.md lists the attributes and the conventions of the matrices.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.scene import Camera
+from sehdr_warp.scene.images import MAX_PIXELS, read_exr_channels
+
+from .colorspace import chromaticities, color_space
+from .files import atomic_path
+
+HALF_MAX = 65504.0
+"""The largest value of a 16-bit float (IEEE 754 binary16)."""
+
+PIXEL_TYPES = ("half", "float")
+
+# OpenCV axes (+y down, +z forward) to the axes of worldToCamera (+y up, -z forward).
+_FLIP_Y_Z = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Part:
+    """One picture of a file.
+
+    channels: name -> [H, W] numbers, all of one shape and finite: R, G, B, A, Z, and any other.
+    header: OpenEXR attributes besides the pixels' own, such as exr_header() makes.
+    name: the part's name; needed where a file has several, and then unique.
+    """
+
+    channels: Mapping[str, np.ndarray]
+    header: Mapping[str, Any] = field(default_factory=dict)
+    name: str = ""
+
+
+def exr_header(
+    *,
+    colorspace: str = "rec709",
+    exposure_time: float | None = None,
+    camera: Camera | None = None,
+    captured: datetime | None = None,
+    provenance: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """OpenEXR attributes for a picture.
+
+    exposure_time: seconds, `expTime`: what radiance was multiplied by.
+    camera: gives `worldToCamera`, `worldToNDC`, `screenWindowCenter`, `screenWindowWidth` and `pixelAspectRatio`.
+    captured: local time, `capDate`.
+    provenance: text by key; stored as `sehdr:<key>`.
+    """
+    space = color_space(colorspace)
+    header: dict[str, Any] = {"chromaticities": chromaticities(space.name), "sehdr:colorSpace": space.name}
+    if space.interop_id:
+        header["colorInteropID"] = space.interop_id
+    if exposure_time is not None:
+        header["expTime"] = float(exposure_time)
+        header["sehdr:exposureTime"] = repr(float(exposure_time))  # expTime holds only 24 bits of it.
+    if camera is not None:
+        header.update(_camera_attributes(camera))
+    if captured is not None:
+        header["capDate"] = captured.strftime("%Y:%m:%d %H:%M:%S")
+    for key, value in (provenance or {}).items():
+        header[f"sehdr:{key}"] = str(value)
+    return header
+
+
+def write_exr(
+    path: Path | str,
+    channels: Mapping[str, np.ndarray],
+    *,
+    pixel: str = "half",
+    header: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
+) -> str:
+    """Writes a single-part file with ZIP compression; returns the pixel type of its colours, "half" or "float".
+
+    Parameters and errors as write_multipart_exr, for one part.
+    """
+    return _write(Path(path), [Part(channels, header or {})], pixel, overwrite)
+
+
+def write_multipart_exr(
+    path: Path | str, parts: Sequence[Part], *, pixel: str = "half", overwrite: bool = False
+) -> str:
+    """Writes a file of several named parts with ZIP compression; returns the pixel type of the colours.
+
+    pixel: "half" or "float". Numbers are rounded once, to the nearest. Where half cannot hold a value (above 65504 in
+    size), all channels of the file are float instead, and each part's `sehdr:pixelType` says so: nothing is clipped.
+    Depth (`Z`, or a layer's `.Z`) is always float: half's 11 bits are too few for it.
+
+    Raises InputError where a value is NaN or infinite (with channel and place) or `path` exists (unless overwrite);
+    SehdrError where the file cannot be written; ValueError for an unknown pixel type, unequal shapes or names.
+    """
+    if not parts or any(not part.name for part in parts) or len({part.name for part in parts}) < len(parts):
+        raise ValueError("parts need one name each, all different")
+    return _write(Path(path), parts, pixel, overwrite)
+
+
+def read_exr(path: Path | str, *, max_pixels: int = MAX_PIXELS) -> tuple[np.ndarray, tuple[str, ...], dict[str, Any]]:
+    """The first part of a file: pixels [H, W, C] float32, channel names (R, G, B, A first) and the header.
+
+    Values are as stored: NaN and infinity pass.
+    Raises InputError where the file is missing, damaged, truncated, empty or larger than max_pixels.
+    """
+    channels, header = read_exr_channels(Path(path), max_pixels=max_pixels)
+    if not channels:
+        raise InputError(path, "has no channels", "export it with colour channels")
+    names = tuple(sorted(channels, key=lambda name: ("RGBA".find(name) if name in ("R", "G", "B", "A") else 4, name)))
+    return np.stack([channels[name] for name in names], axis=2), names, header
+
+
+def stored_pixel_type(arrays: Sequence[np.ndarray], pixel: str = "half") -> str:
+    """The type that holds all values unclipped: `pixel`, or "float" where half would overflow."""
+    if pixel not in PIXEL_TYPES:
+        raise ValueError(f"pixel type {pixel!r} is not one of {PIXEL_TYPES}")
+    return "float" if pixel == "float" or any(_largest(array) > HALF_MAX for array in arrays) else "half"
+
+
+def _write(path: Path, parts: Sequence[Part], pixel: str, overwrite: bool) -> str:
+    import OpenEXR
+
+    for part in parts:
+        _check(path, part)
+    colours = [array for part in parts for name, array in part.channels.items() if not _is_depth(name)]
+    stored = stored_pixel_type(colours, pixel)
+    said = stored if stored == pixel else "float, since half would overflow 65504"
+    with atomic_path(path, overwrite) as temporary:
+        try:
+            written = [_openexr_part(part, stored, said) for part in parts]
+            with OpenEXR.File(written) as file:
+                file.write(str(temporary))
+        except (RuntimeError, ValueError, TypeError) as error:
+            reason = " ".join(str(error).replace(str(temporary), path.name).split())
+            raise SehdrError(f"{path}: cannot be written as OpenEXR ({reason}); check the disk's free space") from error
+    return stored
+
+
+def _openexr_part(part: Part, stored: str, said: str):
+    import OpenEXR
+
+    release = version("sehdr-warp")
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "software": f"sehdr-warp {release}",
+        "sehdr:version": release,
+        "sehdr:pixelType": said,
+        **part.header,
+    }
+    dtype = {"half": np.float16, "float": np.float32}
+    channels = {
+        name: np.ascontiguousarray(np.asarray(array).astype(dtype["float" if _is_depth(name) else stored]))
+        for name, array in part.channels.items()
+    }
+    return OpenEXR.Part(header, channels, part.name) if part.name else OpenEXR.Part(header, channels)
+
+
+def _check(path: Path, part: Part) -> None:
+    shapes = {np.shape(array) for array in part.channels.values()}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 2 or 0 in next(iter(shapes)):
+        raise ValueError(f"channels have the shapes {sorted(shapes)}, not one [H, W]")
+    for name, array in part.channels.items():
+        bad = ~np.isfinite(array)
+        if bad.any():
+            row, column = (int(i) for i in np.argwhere(bad)[0])
+            where = f"part {part.name}, channel {name}" if part.name else f"channel {name}"
+            raise InputError(
+                path,
+                f"{where}: {int(bad.sum())} values are not finite, the first {array[row, column]} at x={column}, y={row}",
+                "such pictures are not written; train again from an earlier checkpoint or with another seed",
+            )
+        if _largest(array) > float(np.finfo(np.float32).max):
+            raise InputError(
+                path, f"channel {name} reaches {_largest(array):.3g}, past 32-bit floats", "scale the radiance down"
+            )
+
+
+def _largest(array: np.ndarray) -> float:
+    return float(np.max(np.abs(array)))
+
+
+def _is_depth(name: str) -> bool:
+    return name == "Z" or name.endswith(".Z")
+
+
+def _camera_attributes(camera: Camera) -> dict[str, Any]:
+    """Matrices act on row vectors (p M), as all of OpenEXR's do."""
+    view = _FLIP_Y_Z @ camera.world_to_camera
+    x, y = camera.cx / camera.width, camera.cy / camera.height
+    # x and y run over [0, 1] from the top left corner; z is the distance along the axis; w divides.
+    to_ndc = np.array(
+        [[camera.fx / camera.width, 0, x, 0], [0, camera.fy / camera.height, y, 0], [0, 0, 1, 0], [0, 0, 1, 0]],
+        np.float64,
+    )
+    # The screen window lies at distance 1; its axes point to the camera's left and up.
+    center = ((camera.cx - camera.width / 2) / camera.fx, (camera.cy - camera.height / 2) / camera.fy)
+    return {
+        "worldToCamera": np.ascontiguousarray(view.T, np.float32),
+        "worldToNDC": np.ascontiguousarray((to_ndc @ camera.world_to_camera).T, np.float32),
+        "screenWindowCenter": np.array(center, np.float32),
+        "screenWindowWidth": camera.width / camera.fx,
+        "pixelAspectRatio": camera.fy / camera.fx,
+        "sehdr:camera": json.dumps(camera.to_dict()),
+    }

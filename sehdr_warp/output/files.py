@@ -1,0 +1,181 @@
+"""Files that appear whole or not at all: written beside their place, flushed to the disk, then renamed."""
+
+import errno
+import json
+import math
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from sehdr_warp.errors import InputError, SehdrError
+
+_REPLACE = "choose another place, or ask for it to be replaced (--overwrite)"
+_WRITE_ERRORS = frozenset(
+    getattr(errno, name)
+    for name in "ENOSPC EDQUOT EFBIG EROFS EACCES EPERM EIO ENAMETOOLONG ENOTDIR EISDIR EMFILE".split()
+    if hasattr(errno, name)
+)
+
+
+@contextmanager
+def atomic_path(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
+    """Yields a temporary path in the folder of `path`; what is written there becomes `path` when the block ends.
+
+    The temporary name keeps the suffix, for writers that choose a format by it. Missing parent folders are made.
+    If the block raises, the temporary file and the folders made are removed, and an existing `path` stays as it was.
+
+    Raises InputError where `path` exists (unless overwrite, and never for a folder), SehdrError where the disk is
+    full or the folder is not writable.
+    """
+    path = Path(path)
+    check_absent(path, overwrite)
+    with _in_place(path) as made:
+        temporary = _beside(path)
+        try:
+            yield temporary
+            _sync(temporary)
+            check_absent(path, overwrite)
+            os.replace(temporary, path)
+            _sync(path.parent)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            _remove_empty(made)
+            raise
+
+
+@contextmanager
+def atomic_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
+    """Yields a temporary folder beside `path`; it becomes `path` when the block ends.
+
+    An empty folder at `path` counts as absent. With overwrite an existing folder is set aside, and removed only once
+    the new one stands in its place. If the block raises, nothing new is left and the existing folder is untouched.
+
+    Raises InputError where `path` exists (unless overwrite, and never for a file), SehdrError where the disk is full
+    or the parent is not writable.
+    """
+    path = Path(path)
+    check_absent_folder(path, overwrite)
+    with _in_place(path) as made:
+        temporary = _beside(path)
+        try:
+            temporary.mkdir()
+            yield temporary
+            for folder, _, names in os.walk(temporary):
+                for name in names:
+                    _sync(Path(folder, name))
+                _sync(Path(folder))
+            check_absent_folder(path, overwrite)
+            _swap_in(temporary, path)
+        except BaseException:
+            shutil.rmtree(temporary, ignore_errors=True)
+            _remove_empty(made)
+            raise
+
+
+def write_json(path: Path | str, value: Any, overwrite: bool = False) -> None:
+    """Writes plain values as indented UTF-8 JSON, atomically; NaN and infinity become null, as JSON has neither.
+
+    Raises InputError and SehdrError as atomic_path does, TypeError for a value that is not plain.
+    """
+    text = json.dumps(_finite(value), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    with atomic_path(path, overwrite) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def check_absent(path: Path | str, overwrite: bool = False) -> None:
+    """Raises InputError where a file at `path` would have to be replaced without leave, or a folder is in the way."""
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(path, "is a folder, not a file", "choose another name")
+    if not overwrite and (path.exists() or path.is_symlink()):
+        raise InputError(path, "exists already", _REPLACE)
+
+
+def check_absent_folder(path: Path | str, overwrite: bool = False) -> None:
+    """Raises InputError where a folder at `path` would have to be replaced without leave, or a file is in the way."""
+    path = Path(path)
+    if path.is_dir():
+        if not overwrite and any(path.iterdir()):
+            raise InputError(path, "exists already", _REPLACE)
+    elif path.exists() or path.is_symlink():
+        raise InputError(path, "is a file, not a folder", "choose another name")
+
+
+@contextmanager
+def _in_place(path: Path) -> Iterator[list[Path]]:
+    """Makes the parents of `path`, yields those made, and turns the operating system's refusals into one line."""
+    try:
+        yield _make_parents(path)
+    except OSError as error:
+        if error.errno not in _WRITE_ERRORS and not isinstance(error, FileExistsError):
+            raise
+        reason = os.strerror(error.errno)
+        raise SehdrError(f"{path}: cannot be written ({reason}); free space or choose another folder") from error
+
+
+def _beside(path: Path) -> Path:
+    # Short stems keep the temporary name within the 255 bytes that file systems allow.
+    return path.with_name(f".{path.stem[:40]}.{secrets.token_hex(4)}.tmp{path.suffix[:20]}")
+
+
+def _make_parents(path: Path) -> list[Path]:
+    missing = []
+    for parent in path.absolute().parents:
+        if parent.exists():
+            break
+        missing.append(parent)
+    for parent in reversed(missing):
+        parent.mkdir(exist_ok=True)
+    return missing
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    for folder in folders:
+        try:
+            folder.rmdir()
+        except OSError:  # Someone else has put a file there in the meantime.
+            return
+
+
+def _swap_in(temporary: Path, path: Path) -> None:
+    old = _beside(path)
+    replaced = path.exists()
+    if replaced:
+        os.rename(path, old)
+    try:
+        os.rename(temporary, path)
+    except OSError:
+        if replaced:
+            os.rename(old, path)
+        raise
+    _sync(path.parent)
+    if replaced:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _sync(path: Path) -> None:
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except PermissionError:  # Windows opens no folders.
+        return
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.EBADF, errno.ENOTSUP):  # Some file systems cannot flush folders.
+            raise
+    finally:
+        os.close(handle)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

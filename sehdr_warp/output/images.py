@@ -1,0 +1,114 @@
+"""Encoded pictures: PNG with 8 or 16 bits and JPEG, with EXIF exposure times. Reading is in scene/images.py."""
+
+import struct
+import zlib
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from .files import atomic_path
+
+# EXIF 2.32, table 8: rationals are two unsigned 32-bit integers.
+_RATIONAL_LIMIT = 2**32 - 1
+_EXIF_IFD, _EXPOSURE_TIME, _EXPOSURE_BIAS, _SOFTWARE, _DATE = 0x8769, 0x829A, 0x9204, 0x0131, 0x9003
+
+
+def quantize(values: np.ndarray, bits: int = 8) -> np.ndarray:
+    """Encoded values in [0, 1] to code values, rounded to nearest: uint8 or uint16. Values outside are limited.
+
+    Raises ValueError for NaN or another number of bits.
+    """
+    if bits not in (8, 16):
+        raise ValueError(f"{bits} bits: PNG has 8 or 16")
+    if np.isnan(values).any():
+        raise ValueError("the picture holds NaN")
+    white = 2**bits - 1
+    return np.rint(np.clip(values, 0, 1) * np.float64(white)).astype(np.uint8 if bits == 8 else np.uint16)
+
+
+def exposure_exif(exposure_time: float, *, bias: float | None = None, captured: str | None = None) -> Image.Exif:
+    """EXIF with ExposureTime as a rational.
+
+    exposure_time: seconds; the simplest fraction within a billionth of it, 1/8 as 1/8.
+    bias: ExposureBiasValue in stops. captured: DateTimeOriginal, `YYYY:MM:DD hh:mm:ss`.
+    """
+    exif = Image.Exif()
+    exif[_SOFTWARE] = "sehdr-warp"
+    details = exif.get_ifd(_EXIF_IFD)
+    details[_EXPOSURE_TIME] = _rational(exposure_time)
+    if bias is not None:
+        details[_EXPOSURE_BIAS] = _rational(bias)
+    if captured is not None:
+        details[_DATE] = captured
+    return exif
+
+
+def write_png(path: Path | str, codes: np.ndarray, *, exif: Image.Exif | None = None, overwrite: bool = False) -> None:
+    """Writes [H, W] grey or [H, W, 3] RGB code values, uint8 or uint16.
+
+    Raises InputError and SehdrError as atomic_path does, ValueError for another shape or type.
+    """
+    _check(codes, (np.uint8, np.uint16))
+    with atomic_path(path, overwrite) as temporary:
+        if codes.dtype == np.uint8:
+            Image.fromarray(codes).save(temporary, format="PNG", exif=exif)
+        else:
+            temporary.write_bytes(_png16(codes, exif))
+
+
+def write_jpeg(
+    path: Path | str, codes: np.ndarray, *, quality: int = 98, exif: Image.Exif | None = None, overwrite: bool = False
+) -> None:
+    """Writes [H, W] grey or [H, W, 3] RGB uint8 code values, without chroma subsampling.
+
+    Raises InputError and SehdrError as atomic_path does, ValueError for another shape or type.
+    """
+    _check(codes, (np.uint8,))
+    with atomic_path(path, overwrite) as temporary:
+        options = {} if exif is None else {"exif": exif}
+        Image.fromarray(codes).save(temporary, format="JPEG", quality=quality, subsampling=0, **options)
+
+
+def _check(codes: np.ndarray, dtypes: tuple) -> None:
+    if (
+        codes.dtype not in dtypes
+        or not (codes.ndim == 2 or (codes.ndim == 3 and codes.shape[2] == 3))
+        or 0 in codes.shape
+    ):
+        raise ValueError(f"code values are {codes.dtype} {codes.shape}, not [H, W] or [H, W, 3] of {dtypes}")
+
+
+def _rational(value: float):
+    from PIL.TiffImagePlugin import IFDRational
+
+    exact = Fraction(value)
+    limit = 1
+    while limit < _RATIONAL_LIMIT:
+        nearest = exact.limit_denominator(limit)
+        if abs(nearest - exact) <= abs(exact) * Fraction(1, 10**9):
+            break
+        limit *= 2
+    if max(abs(nearest.numerator), nearest.denominator) > _RATIONAL_LIMIT:
+        raise ValueError(f"{value} does not fit an EXIF rational")
+    return IFDRational(nearest.numerator, nearest.denominator)
+
+
+def _png16(codes: np.ndarray, exif: Image.Exif | None) -> bytes:
+    """A 16-bit PNG, which Pillow cannot write in colour (PNG specification, 3rd edition: sections 5, 9 and 11.3.3)."""
+    height, width = codes.shape[:2]
+    rows = codes.astype(">u2").reshape(height, -1).view(np.uint8).reshape(height, -1)
+    filtered = np.empty((height, 1 + rows.shape[1]), np.uint8)
+    filtered[:, 0] = 2  # "Up": each byte less the one above it.
+    filtered[:, 1:] = rows
+    filtered[1:, 1:] -= rows[:-1]
+    header = struct.pack(">IIBBBBB", width, height, 16, 2 if codes.ndim == 3 else 0, 0, 0, 0)
+    chunks = [(b"IHDR", header)]
+    if exif is not None:
+        chunks.append((b"eXIf", exif.tobytes().removeprefix(b"Exif\0\0")))
+    chunks += [(b"IDAT", zlib.compress(filtered.tobytes(), 6)), (b"IEND", b"")]
+    parts = [
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    ]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)

@@ -1,0 +1,31 @@
+"""Names of views as names of files."""
+
+import re
+from collections.abc import Sequence
+
+# Separators, what Windows forbids, and control characters.
+_FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')
+_LONGEST = 120
+
+
+def safe_names(names: Sequence[str]) -> list[str]:
+    """File names for views, all different, also where upper and lower case are one.
+
+    Separators and characters that some system forbids become `_`, leading dots go, and length is limited to 120 bytes.
+    Of names that come more than once, the later ones get a number.
+    """
+    cleaned = [_clean(name) for name in names]
+    wanted, taken, result = {name.casefold() for name in cleaned}, set(), []
+    for name in cleaned:
+        candidate, number = name, 2
+        while candidate.casefold() in taken or (number > 2 and candidate.casefold() in wanted):
+            candidate, number = f"{name}_{number}", number + 1
+        taken.add(candidate.casefold())
+        result.append(candidate)
+    return result
+
+
+def _clean(name: str) -> str:
+    name = _FORBIDDEN.sub("_", name).strip().lstrip(".").rstrip(". ")
+    # The file system's limit counts bytes, and prefixes and suffixes still come.
+    return name.encode("utf-8")[:_LONGEST].decode("utf-8", "ignore") or "view"

@@ -1,0 +1,185 @@
+"""Pictures of a trained scene: HDR files, previews and exposure brackets, for any set of cameras."""
+
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from datetime import datetime
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.scene import Camera, load_cameras
+
+from .brackets import BracketFolder, BracketOptions, bracket_exposures
+from .camera_paths import interpolate, orbit
+from .colorspace import from_rec709
+from .exr import exr_header, write_exr
+from .files import atomic_folder
+from .images import quantize, write_png
+from .names import safe_names
+from .tonemap import ToneMap, fit_tone_map
+
+SPLITS = ("train", "test", "all")
+PATHS = ("orbit", "interpolate")
+
+# The tone map is fitted to a few small pictures, so that all previews of a set share it.
+_FIT_VIEWS, _FIT_SIZE = 4, 160
+
+
+class RenderableRun(Protocol):
+    """What is needed of a trained run. cameras: entries with name, split, camera; exposure_time: base, seconds."""
+
+    cameras: Sequence
+    response: object
+    exposure_time: float
+
+    def render(self, camera: Camera):
+        """hdr [H, W, 3] scene-linear radiance, alpha [H, W], depth [H, W]."""
+
+
+def render_views(
+    run: RenderableRun,
+    out: Path | str,
+    *,
+    cameras: str | Path = "test",
+    count: int = 60,
+    evs: Sequence[float] | None = None,
+    exposures: Sequence[float] | None = None,
+    multipart: bool = False,
+    colorspace: str = "rec709",
+    pixel: str = "half",
+    overwrite: bool = False,
+    ldr_brackets: str | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> list[Path]:
+    """Renders views of a run into `out`; returns the files written.
+
+    Always: `hdr/<view>.exr` (R, G, B scene-linear radiance; A coverage; Z distance along the axis, 0 where empty) and
+    `preview/<view>.png` (tone-mapped, sRGB). With evs or exposures: brackets, see output/brackets.py; ldr_brackets
+    ("jpeg", "png" or "png16") adds simulated photos through the run's response.
+
+    cameras: "train", "test", "all", "orbit", "interpolate", or a JSON file. count: views of an orbit or interpolation.
+    overwrite: replaces the folders hdr, preview and brackets of an earlier render; other files in `out` stay.
+    progress: takes one line for each view, and what the user should know.
+
+    Everything appears when the last view is done; if a view fails, nothing new is left.
+    Raises SehdrError for unusable options or an empty set of cameras, InputError where something would be replaced or
+    a pixel is not finite.
+    """
+    out, say = Path(out), progress or (lambda line: None)
+    wanted = evs is not None or exposures is not None
+    if (multipart or ldr_brackets) and not wanted:
+        raise SehdrError("brackets were asked for without exposures; give evs (--evs=-2,0,2) or exposures")
+    options = BracketOptions(
+        bracket_exposures(run.exposure_time, evs=evs, exposures=exposures) if wanted else (),
+        run.exposure_time,
+        colorspace,
+        pixel,
+        multipart,
+        ldr_brackets,
+        run.response,
+        datetime.now().replace(microsecond=0),
+        _provenance(run),
+    )
+    views = select_cameras(run, cameras, count=count)
+    with (
+        atomic_folder(out / "hdr", overwrite) as hdr_folder,
+        atomic_folder(out / "preview", overwrite) as preview_folder,
+        BracketFolder(out, options, overwrite=overwrite) if wanted else nullcontext() as brackets,
+    ):
+        tone_map = fit_run_tone_map(run, [camera for _, camera in views])
+        for index, (name, camera) in enumerate(views, start=1):
+            rendered = run.render(camera)
+            hdr, alpha, depth = _array(rendered.hdr), _array(rendered.alpha), _array(rendered.depth)
+            stored = {_write_hdr(hdr_folder / f"{name}.exr", hdr, alpha, depth, camera, options)}
+            write_png(preview_folder / f"{name}.png", quantize(tone_map(hdr)))
+            if brackets is not None:
+                stored.add(brackets.add(name, hdr, camera))
+            say(f"{name} ({index} of {len(views)})")
+            if stored != {pixel}:
+                say(f"{name}: holds values above 65504, which half cannot; written as float")
+    files = [
+        out / folder / f"{name}.{suffix}"
+        for folder, suffix in (("hdr", "exr"), ("preview", "png"))
+        for name, _ in views
+    ]
+    return files if brackets is None else files + brackets.files + [out / "brackets.json"]
+
+
+def select_cameras(run: RenderableRun, cameras: str | Path, *, count: int = 60) -> list[tuple[str, Camera]]:
+    """Named cameras: "train", "test", "all", "orbit", "interpolate" (see render_views) or a JSON file.
+
+    Names are safe for files and all different.
+    Raises SehdrError where the set is empty or the name is neither known nor a file.
+    """
+    text = str(cameras)
+    if text in SPLITS:
+        entries = [entry for entry in run.cameras if text in (entry.split, "all")]
+        if not entries:
+            raise SehdrError(
+                f"the run has no {text} views; choose other cameras (train, test, all, orbit or a JSON file)"
+            )
+        names = safe_names([entry.name for entry in entries])
+        return list(zip(names, [entry.camera for entry in entries], strict=True))
+    if text in PATHS:
+        seen = [entry.camera for entry in run.cameras if entry.split == "train"]
+        path = (
+            interpolate(seen, count)
+            if text == "interpolate"
+            else orbit(seen, count, focus_distance=_focus_distance(run, seen))
+        )
+        digits = max(3, len(str(count - 1)))
+        return [(f"{text}_{index:0{digits}d}", camera) for index, camera in enumerate(path)]
+    if not Path(cameras).is_file():
+        raise SehdrError(f"cameras {text!r} are neither a file nor one of {', '.join(SPLITS + PATHS)}")
+    named = load_cameras(Path(cameras))
+    return list(zip(safe_names([name for name, _ in named]), [camera for _, camera in named], strict=True))
+
+
+def fit_run_tone_map(run: RenderableRun, cameras: Sequence[Camera]) -> ToneMap:
+    """One tone map for a set of views, from small renders of up to four of them, evenly chosen."""
+    chosen = [cameras[i] for i in sorted({round(i) for i in np.linspace(0, len(cameras) - 1, _FIT_VIEWS)})]
+    return fit_tone_map([_array(run.render(_small(camera)).hdr) for camera in chosen])
+
+
+def _write_hdr(path: Path, hdr, alpha, depth, camera: Camera, options: BracketOptions) -> str:
+    linear = from_rec709(hdr, options.colorspace)
+    header = exr_header(
+        colorspace=options.colorspace,
+        exposure_time=1.0,
+        camera=camera,
+        captured=options.captured,
+        provenance={**options.provenance, "view": path.stem, "baseExposureTime": repr(options.base_time)},
+    )
+    channels = dict(zip("RGB", np.moveaxis(linear, 2, 0), strict=True)) | {"A": alpha, "Z": depth}
+    return write_exr(path, channels, pixel=options.pixel, header=header)
+
+
+def _array(value) -> np.ndarray:
+    """A torch tensor on any device, or an array, as an array."""
+    return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
+
+
+def _provenance(run: RenderableRun) -> dict[str, str]:
+    """Text for the EXR attributes `sehdr:<key>`: what the picture was made from, as far as the run knows."""
+    known = {
+        "scene": getattr(run, "scene_name", None),
+        "iteration": getattr(run, "iteration", None),
+        "response": getattr(run.response, "name", None),
+    }
+    return {key: str(value) for key, value in known.items() if value is not None} | {"units": "relative radiance"}
+
+
+def _small(camera: Camera) -> Camera:
+    factor = min(1.0, _FIT_SIZE / max(camera.width, camera.height))
+    return camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+
+
+def _focus_distance(run: RenderableRun, cameras: Sequence[Camera]) -> float:
+    """The median depth in a small render of the middle camera; 1 where nothing is seen."""
+    if not cameras:
+        return 1.0
+    depth = _array(run.render(_small(cameras[len(cameras) // 2])).depth)
+    depth = depth[depth > 0]
+    return float(np.median(depth)) if depth.size else 1.0

@@ -1,0 +1,82 @@
+"""Display pictures of scene-linear radiance: a tone map for eyes, and plain exposure stops.
+
+The tone map is Reinhard's extended global operator (Reinhard et al. 2002, Eq. 4) on luminance, with the key and the
+white point found from the scene (Reinhard 2003, "Parameter estimation for photographic tone reproduction"). Scaling
+colours by luminance alone would leave bright saturated colours outside the display's gamut, and mapping each channel
+alone would bleach them; the two are mixed by the display luminance itself, so that colours hold in the shadows and run
+into white in the highlights.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+# ITU-R BT.709 luminance weights.
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+# Below this part of the brightest per cent, a pixel says nothing about the scene's key: empty background and noise.
+_FLOOR = 1e-6
+# Reinhard 2003 uses the extremes; percentiles keep a lamp's filament from deciding the picture.
+_LOW, _HIGH, _WHITE = 1.0, 99.0, 99.8
+
+
+@dataclass(frozen=True)
+class ToneMap:
+    """A fixed tone map, so that the pictures of one scene compare.
+
+    scale: multiplies radiance, so that the scene's log-average comes to its key.
+    white: the smallest scaled luminance that is shown as white.
+    """
+
+    scale: float
+    white: float
+
+    def __call__(self, radiance: np.ndarray) -> np.ndarray:
+        """[..., 3] linear Rec.709 radiance to [..., 3] sRGB-encoded float32 in [0, 1]. Negative radiance counts as 0."""
+        scaled = np.maximum(np.asarray(radiance, np.float32), 0) * np.float32(self.scale)
+        luminance = scaled @ _LUMINANCE.astype(np.float32)
+        shown = self._curve(luminance)[..., None]
+        by_luminance = scaled * (shown / np.maximum(luminance[..., None], 1e-12))
+        by_channel = self._curve(scaled)
+        weight = np.minimum(shown, 1)
+        return encode_srgb(by_luminance * (1 - weight) + by_channel * weight)
+
+    def _curve(self, value: np.ndarray) -> np.ndarray:
+        return value * (1 + value / np.float32(self.white**2)) / (1 + value)
+
+
+def fit_tone_map(pictures: Iterable[np.ndarray]) -> ToneMap:
+    """The tone map for a scene seen in one or several pictures, each [H, W, 3] linear Rec.709 radiance.
+
+    Black scenes get the identity scale. Raises ValueError without pictures.
+    """
+    # float64 before the logarithm: radiance may be small in its units.
+    values = np.concatenate([(np.maximum(np.asarray(p, np.float64), 0) @ _LUMINANCE).ravel() for p in pictures])
+    values = values[np.isfinite(values) & (values > 0)]  # Writers refuse what is not finite, and say where.
+    if not values.size:
+        return ToneMap(1.0, 1.0)
+    values = values[values > np.percentile(values, _HIGH) * _FLOOR]
+    logs = np.log2(values)
+    low, high = np.percentile(logs, (_LOW, _HIGH))
+    average = logs.mean()
+    # Between 0.09 for a mostly dark scene with highlights and 0.36 for a bright one.
+    key = 0.18 * 2.0 ** np.clip((2 * average - low - high) / max(high - low, 1e-6), -1, 1)
+    scale = key / 2.0**average
+    # A white below 1 would make the curve convex, and brighten everything.
+    return ToneMap(float(scale), float(max(np.percentile(values, _WHITE) * scale, 1.0)))
+
+
+def expose(radiance: np.ndarray, stops: float, *, scale: float = 1.0) -> np.ndarray:
+    """[..., 3] radiance as a display shows it at an exposure: radiance scale 2^stops, clipped to [0, 1], sRGB-encoded.
+
+    scale: what brings the picture to its normal exposure; the base exposure time, or ToneMap.scale.
+    """
+    return encode_srgb(np.asarray(radiance, np.float32) * np.float32(scale * 2.0**stops))
+
+
+def encode_srgb(linear: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1 encoding of display-linear values, limited to [0, 1]; float32."""
+    linear = np.clip(np.asarray(linear, np.float32), 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** np.float32(1 / 2.4) - 0.055).astype(
+        np.float32
+    )

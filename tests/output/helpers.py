@@ -1,0 +1,82 @@
+"""Pictures and cameras that the output tests share."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sehdr_warp.scene import Camera
+
+
+def radiance(height=24, width=32, seed=0):
+    """[H, W, 3] float32 over five decades."""
+    random = np.random.default_rng(seed)
+    return (10.0 ** random.uniform(-3, 2, (height, width, 3))).astype(np.float32)
+
+
+def camera(width=32, height=24, position=(0.0, 0.0, -3.0), target=(0.0, 0.0, 0.0)):
+    """A camera that looks at a target, y down."""
+    position, forward = np.array(position, float), np.array(target, float) - np.array(position, float)
+    forward /= np.linalg.norm(forward)
+    right = np.cross([0.0, 1, 0], forward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ position
+    return Camera(width, height, 40.0, 44.0, width / 2 + 1, height / 2 - 2, pose)
+
+
+@dataclass
+class Entry:
+    name: str
+    split: str
+    camera: Camera
+    exposure_time: float = 0.5
+
+
+@dataclass
+class Rendered:
+    hdr: np.ndarray
+    alpha: np.ndarray
+    depth: np.ndarray
+
+
+class GammaResponse:
+    """Clips at 1, gamma 2.2; no torch needed."""
+
+    name = "gamma-2.2"
+
+    def encode(self, exposure):
+        return np.clip(exposure, 0, 1) ** (1 / 2.2)
+
+    def decode(self, value):
+        return np.clip(value, 0, 1) ** 2.2
+
+
+class AnalyticRun:
+    """Stands for a trained run: a sky whose radiance depends on the viewing direction, six decades of it."""
+
+    response = GammaResponse()
+    exposure_time = 0.5
+    scene_name = "sky"
+    iteration = 7
+
+    def __init__(self, names=(("r_0", "train"), ("r_1", "train"), ("r_2", "train"), ("t_0", "test"), ("t_1", "test"))):
+        self.cameras = [
+            Entry(name, split, camera(position=(0.3 * i - 0.6, 0.1 * (i % 2), -3)))
+            for i, (name, split) in enumerate(names)
+        ]
+        self.gain = 1.0
+        self.rendered = 0
+
+    def render(self, view):
+        self.rendered += 1
+        y, x = np.mgrid[: view.height, : view.width] + 0.5
+        rays = (
+            np.stack([(x - view.cx) / view.fx, (y - view.cy) / view.fy, np.ones_like(x)], 2)
+            @ view.world_to_camera[:3, :3]
+        )
+        rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+        hdr = self.gain * np.exp(6 * rays - 2 * rays[..., :1]) * 0.1
+        return Rendered(
+            hdr.astype(np.float32), np.full(x.shape, 0.75, np.float32), (2 + x * 0 + y * 1e-4).astype(np.float32)
+        )

@@ -1,0 +1,216 @@
+import json
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.output.brackets import bracket_exposures, write_brackets
+from sehdr_warp.output.exr import read_exr
+from sehdr_warp.output.images import exposure_exif
+from sehdr_warp.scene.images import read_ldr
+
+from .helpers import GammaResponse, camera, radiance
+from .test_exr import read_openimageio
+
+EXIF_IFD, EXPOSURE_TIME, EXPOSURE_BIAS = 0x8769, 0x829A, 0x9204
+
+
+def test_evs_are_stops_above_the_base_and_ascend():
+    made = bracket_exposures(0.5, evs=[2, -4, 0])
+    assert [(e.time, e.ev, e.label) for e in made] == [(1 / 32, -4, "ev-4.0"), (0.5, 0, "ev+0.0"), (2, 2, "ev+2.0")]
+
+
+def test_exposures_are_seconds():
+    made = bracket_exposures(0.5, exposures=[8, 0.125])
+    assert [(e.time, e.ev) for e in made] == [(0.125, -2), (8, 4)]
+    assert bracket_exposures(1.0, evs=[-0.01])[0].label == "ev+0.0"
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        ({"evs": [0], "exposures": [1]}, "not both"),
+        ({}, "neither was given"),
+        ({"evs": []}, "evs is empty"),
+        ({"evs": [0, float("nan")]}, "evs: nan is not finite"),
+        ({"exposures": [1, float("inf")]}, "exposures: inf is not finite"),
+        ({"exposures": [0.5, 0]}, "exposures: 0 is not a positive"),
+        ({"exposures": [-2]}, "exposures: -2 is not a positive"),
+        ({"exposures": [2, 1, 2]}, "exposures: 2 is given twice"),
+        ({"evs": [1, 1.0]}, "evs: 1 is given twice"),
+        ({"evs": [1e9]}, "evs: 1e[+]09 is outside"),
+        ({"exposures": [1e-30]}, "exposures: 1e-30 is outside"),
+    ],
+)
+def test_unusable_exposures_name_the_value(given, message):
+    with pytest.raises(SehdrError, match=message):
+        bracket_exposures(0.5, **given)
+    with pytest.raises(SehdrError, match="base exposure time -1"):
+        bracket_exposures(-1, evs=[0])
+
+
+@pytest.mark.parametrize("pixel, dtype", [("half", np.float16), ("float", np.float32)])
+def test_exposures_differ_by_exactly_the_ratio_of_their_times(tmp_path, pixel, dtype):
+    image = radiance()
+    times = [0.125, 0.3, 2.0, 1 / 3]
+    files = write_brackets(tmp_path, {"r_0": image}, 0.5, exposures=times, pixel=pixel)
+    assert [file.name for file in files] == [
+        "r_0_b0_ev-2.0.exr",
+        "r_0_b1_ev-0.7.exr",
+        "r_0_b2_ev-0.6.exr",
+        "r_0_b3_ev+2.0.exr",
+    ]
+    read = [read_exr(file)[0].astype(np.float64) for file in files]
+    for time, pixels in zip(sorted(times), read, strict=True):
+        np.testing.assert_array_equal(pixels, (image.astype(np.float64) * time).astype(dtype))
+    # Whole stops differ by a power of two to the last bit, except in half's denormals.
+    exact = read[0] >= 2.0**-14
+    assert exact.mean() > 0.5
+    np.testing.assert_array_equal((read[3] / 16)[exact], read[0][exact])
+    ratio = read[2] / read[1]
+    bound = 2.0 * np.finfo(dtype).eps
+    np.testing.assert_allclose(ratio[exact], (1 / 3) / 0.3, rtol=bound)
+
+
+def test_manifest_lists_what_was_written(tmp_path):
+    views = {"r_0": radiance(), "../a/b": radiance(seed=1), "R_0": radiance(seed=2)}
+    files = write_brackets(tmp_path, views, 0.5, evs=[-2, 0, 2], cameras={"r_0": camera()}, colorspace="rec2020")
+    manifest = json.loads((tmp_path / "brackets.json").read_text())
+    assert manifest["base_exposure_time"] == 0.5 and manifest["color_space"] == "rec2020"
+    assert [view["view"] for view in manifest["views"]] == ["r_0", "_a_b", "R_0_2"]
+    listed = [tmp_path / exposure["file"] for view in manifest["views"] for exposure in view["exposures"]]
+    assert listed == files == sorted((tmp_path / "brackets").rglob("*.exr"), key=files.index)
+    assert [e["exposure_time"] for e in manifest["views"][0]["exposures"]] == [0.125, 0.5, 2.0]
+    for view in manifest["views"]:
+        for exposure in view["exposures"]:
+            _, spec = read_openimageio(tmp_path / exposure["file"])
+            assert spec.get_float_attribute("ExposureTime") == exposure["exposure_time"]
+            assert float(spec.get_string_attribute("sehdr:ev")) == exposure["ev"]
+
+
+def test_names_sort_by_exposure(tmp_path):
+    files = write_brackets(tmp_path, {"v": radiance()}, 0.5, evs=[4, -4, 0, 2, -2])
+    times = [read_exr(file)[2]["expTime"] for file in sorted(files)]
+    assert times == sorted(times)
+
+
+def test_multipart_holds_all_exposures_of_a_view(tmp_path):
+    image = radiance()
+    files = write_brackets(tmp_path, {"r_0": image, "r_1": image}, 0.5, evs=[-1, 0, 1], multipart=True)
+    assert files == [tmp_path / "brackets" / "r_0.exr", tmp_path / "brackets" / "r_1.exr"]
+    manifest = json.loads((tmp_path / "brackets.json").read_text())
+    for exposure in manifest["views"][1]["exposures"]:
+        pixels, spec = read_openimageio(tmp_path / exposure["file"], exposure["part"])
+        np.testing.assert_array_equal(pixels, (image * exposure["exposure_time"]).astype(np.float16))
+        assert spec.get_float_attribute("ExposureTime") == exposure["exposure_time"]
+
+
+def test_one_exposure_past_half_makes_the_whole_bracket_float(tmp_path):
+    files = write_brackets(tmp_path, {"v": radiance() * 100}, 0.5, evs=[-2, 8])
+    assert json.loads((tmp_path / "brackets.json").read_text())["views"][0]["pixel"] == "float"
+    for file in files:
+        assert read_exr(file)[2]["sehdr:pixelType"] == "float"
+    assert read_exr(files[1])[0].max() > 65504
+
+
+def test_nothing_is_replaced_or_left_half_done(tmp_path):
+    write_brackets(tmp_path, {"v": radiance()}, 0.5, evs=[0])
+    (tmp_path / "mine.txt").write_text("keep")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match="exists already"):
+        write_brackets(tmp_path, {"v": radiance()}, 0.5, evs=[1])
+    broken = radiance()
+    broken[1, 2, 0] = np.nan
+    with pytest.raises(InputError, match="R = nan at x=2, y=1"):
+        write_brackets(tmp_path, {"v": radiance(), "w": broken}, 0.5, evs=[1], overwrite=True)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    write_brackets(tmp_path, {"w": radiance()}, 0.5, evs=[1], overwrite=True)
+    assert [path.name for path in (tmp_path / "brackets").iterdir()] == ["w"]
+    assert (tmp_path / "mine.txt").exists()
+    with pytest.raises(InputError):
+        write_brackets(tmp_path / "new", {"w": broken}, 0.5, evs=[1])
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("kind, suffix", [("jpeg", "jpg"), ("png", "png"), ("png16", "png")])
+def test_photos_carry_their_exposure_times(tmp_path, kind, suffix):
+    image = radiance()
+    write_brackets(tmp_path, {"v": image}, 0.5, evs=[-2, 1 / 3], ldr=kind, response=GammaResponse())
+    manifest = json.loads((tmp_path / "brackets.json").read_text())
+    assert manifest["response"] == "gamma-2.2"
+    for exposure in manifest["views"][0]["exposures"]:
+        file = tmp_path / exposure["ldr_file"]
+        assert file.suffix == f".{suffix}"
+        details = Image.open(file).getexif().get_ifd(EXIF_IFD)
+        assert float(details[EXPOSURE_TIME]) == pytest.approx(exposure["exposure_time"], rel=1e-9)
+        assert float(details[EXPOSURE_BIAS]) == pytest.approx(exposure["ev"], rel=1e-8)
+        encoded = GammaResponse().encode(image.astype(np.float64) * exposure["exposure_time"])
+        stored = read_ldr(file)
+        tolerance = 0.5 / stored.levels if kind != "jpeg" else 0.2
+        assert stored.levels == (65535 if kind == "png16" else 255)
+        assert np.abs(stored.pixels / stored.levels - encoded).max() <= tolerance * 1.0001
+    first = manifest["views"][0]["exposures"][0]["ldr_file"]
+    assert Fraction(Image.open(tmp_path / first).getexif().get_ifd(EXIF_IFD)[EXPOSURE_TIME]) == Fraction(1, 8)
+
+
+def test_exif_times_are_simple_fractions():
+    for time, expected in ((1 / 400, (1, 400)), (0.1, (1, 10)), (32.0, (32, 1)), (1 / 3, (1, 3)), (1e-6, (1, 10**6))):
+        value = exposure_exif(time).get_ifd(EXIF_IFD)[EXPOSURE_TIME]
+        assert (value.numerator, value.denominator) == expected
+
+
+def test_unusable_options():
+    with pytest.raises(SehdrError, match="'gif' are not one of"):
+        write_brackets("x", {}, 1, evs=[0], ldr="gif", response=GammaResponse())
+    with pytest.raises(SehdrError, match="need a camera response"):
+        write_brackets("x", {}, 1, evs=[0], ldr="png")
+    with pytest.raises(SehdrError, match="colour space"):
+        write_brackets("x", {}, 1, evs=[0], colorspace="cmyk")
+
+
+def smooth_radiance():
+    """Smooth, five decades, for merging: neighbours share a code value."""
+    y, x = np.mgrid[:96, :128] / 96
+    return np.stack([10 ** (4 * x / 1.33 - 2 + 0.2 * c * np.sin(5 * y)) for c in (0.5, 1, 1.5)], axis=2)
+
+
+def well_exposed(photos):
+    return np.any([(photo > 32) & (photo < 224) for photo in photos], axis=0)
+
+
+def test_debevec_merge_through_the_response_gives_back_the_radiance(tmp_path):
+    """Debevec and Malik 1997, Eq. 6, with the known response and the times that EXIF states."""
+    image = smooth_radiance()
+    write_brackets(tmp_path, {"v": image}, 0.5, evs=range(-6, 7, 2), ldr="png", response=GammaResponse())
+    photos, times = [], []
+    for file in sorted((tmp_path / "brackets_ldr" / "v").iterdir()):
+        photos.append(read_ldr(file).pixels.astype(np.float64))
+        times.append(float(Image.open(file).getexif().get_ifd(EXIF_IFD)[EXPOSURE_TIME]))
+    weights = [np.minimum(photo, 255 - photo) for photo in photos]
+    logs = [
+        np.log(np.maximum(GammaResponse().decode(p / 255), 1e-12)) - np.log(t)
+        for p, t in zip(photos, times, strict=True)
+    ]
+    merged = np.exp(np.sum(np.multiply(weights, logs), axis=0) / np.maximum(np.sum(weights, axis=0), 1e-9))
+    seen = well_exposed(photos)
+    assert seen.mean() > 0.9
+    ratio = merged[seen] / image[seen]
+    assert np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.005
+    assert np.median(ratio) == pytest.approx(1, abs=0.005)
+
+
+def test_opencv_debevec_merge_agrees(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    image = smooth_radiance()
+    write_brackets(tmp_path, {"v": image}, 0.5, evs=range(-6, 7, 2), ldr="png", response=GammaResponse())
+    files = sorted((tmp_path / "brackets_ldr" / "v").iterdir())
+    photos = [read_ldr(file).pixels for file in files]
+    times = [float(Image.open(file).getexif().get_ifd(EXIF_IFD)[EXPOSURE_TIME]) for file in files]
+    curve = np.maximum(GammaResponse().decode(np.arange(256) / 255), 1e-6).astype(np.float32)
+    curve = np.repeat(curve[:, None, None], 3, axis=2)
+    merged = cv2.createMergeDebevec().process(photos, np.array(times, np.float32), curve)
+    seen = well_exposed(photos)
+    ratio = merged[seen] / image[seen]
+    assert np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.005

@@ -1,0 +1,179 @@
+import json
+from datetime import datetime
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.output.colorspace import color_space, color_space_names, from_rec709, matrix_from_rec709
+from sehdr_warp.output.exr import Part, exr_header, read_exr, stored_pixel_type, write_exr, write_multipart_exr
+
+from .helpers import camera, radiance
+from .test_files import full_disk  # noqa: F401
+
+
+def rgb(image):
+    return dict(zip("RGB", np.moveaxis(image, 2, 0), strict=True))
+
+
+def read_openimageio(path, subimage=0):
+    OpenImageIO = pytest.importorskip("OpenImageIO")
+    buffer = OpenImageIO.ImageBuf(str(path), subimage, 0)
+    assert not buffer.has_error, buffer.geterror()
+    return buffer.get_pixels(OpenImageIO.FLOAT), buffer.spec()
+
+
+@pytest.mark.parametrize("pixel, dtype", [("half", np.float16), ("float", np.float32)])
+def test_both_readers_give_back_the_rounded_pixels(tmp_path, pixel, dtype):
+    image = radiance()
+    alpha, depth = np.full(image.shape[:2], 0.3), image[..., 0] * 1.0001
+    channels = rgb(image) | {"A": alpha, "Z": depth, "confidence": alpha / 2}
+    assert write_exr(tmp_path / "a.exr", channels, pixel=pixel) == pixel
+
+    pixels, names, header = read_exr(tmp_path / "a.exr")
+    assert names == ("R", "G", "B", "A", "Z", "confidence")
+    np.testing.assert_array_equal(pixels[..., :3], image.astype(dtype))
+    np.testing.assert_array_equal(pixels[..., 3], alpha.astype(dtype))
+    np.testing.assert_array_equal(pixels[..., 4], depth.astype(np.float32))
+    assert header["compression"] == OpenEXR.ZIP_COMPRESSION
+
+    other, spec = read_openimageio(tmp_path / "a.exr")
+    np.testing.assert_array_equal(other, pixels)
+    assert [str(kind) for kind in spec.channelformats or ["float"] * 6] == [pixel] * 4 + ["float"] + [pixel]
+
+
+def test_metadata_reaches_both_readers(tmp_path):
+    view = camera()
+    header = exr_header(
+        colorspace="acescg",
+        exposure_time=0.1,
+        camera=view,
+        captured=datetime(2025, 1, 2, 3, 4, 5),
+        provenance={"scene": "room", "iteration": "7"},
+    )
+    write_exr(tmp_path / "a.exr", rgb(radiance()), header=header)
+    _, _, found = read_exr(tmp_path / "a.exr")
+    assert found["expTime"] == np.float32(0.1) and float(found["sehdr:exposureTime"]) == 0.1
+    assert found["capDate"] == "2025:01:02 03:04:05"
+    assert found["sehdr:scene"] == "room" and found["sehdr:pixelType"] == "half"
+    assert found["colorInteropID"] == "lin_ap1_scene"
+    np.testing.assert_allclose(found["chromaticities"][:2], (0.713, 0.293), atol=1e-6)
+    np.testing.assert_allclose(found["pixelAspectRatio"], view.fy / view.fx, rtol=1e-6)
+    assert json.loads(found["sehdr:camera"]) == view.to_dict()
+
+    _, spec = read_openimageio(tmp_path / "a.exr")
+    assert spec.get_float_attribute("ExposureTime") == np.float32(0.1)
+    assert spec.get_string_attribute("DateTime") == "2025:01:02 03:04:05"
+    np.testing.assert_allclose(np.reshape(spec.getattribute("worldToCamera"), (4, 4)), found["worldToCamera"])
+
+
+def test_camera_matrices_follow_their_conventions():
+    view = camera(position=(1.0, 0.5, -3.0), target=(0.2, 0.1, 0.3))
+    header = exr_header(camera=view)
+    point = np.array([0.3, -0.2, 0.4, 1.0])
+    x, y, z, _ = view.world_to_camera @ point
+    np.testing.assert_allclose((point @ header["worldToCamera"])[:3], (x, -y, -z), rtol=1e-5)
+    ndc = point @ header["worldToNDC"]
+    pixel = (view.fx * x / z + view.cx, view.fy * y / z + view.cy)
+    np.testing.assert_allclose(ndc[:2] / ndc[3] * (view.width, view.height), pixel, rtol=1e-5)
+    # The screen window: left edge at pixel 0, right edge at the width; its x axis points left.
+    left = header["screenWindowCenter"][0] + header["screenWindowWidth"] / 2
+    np.testing.assert_allclose(-left * view.fx + view.cx, 0, atol=1e-5)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_values_that_are_not_finite_are_refused_with_their_place(tmp_path, value):
+    image = radiance()
+    image[5, 7, 1] = value
+    with pytest.raises(InputError, match=rf"a.exr: channel G: 1 values are not finite, the first {value} at x=7, y=5"):
+        write_exr(tmp_path / "a.exr", rgb(image))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_half_overflow_becomes_float_and_says_so(tmp_path):
+    image = radiance()
+    image[2, 3, 0] = 70000.0
+    assert write_exr(tmp_path / "a.exr", rgb(image)) == "float"
+    pixels, _, header = read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(pixels, image)
+    assert header["sehdr:pixelType"] == "float, since half would overflow 65504"
+    # The largest half itself is held by half.
+    image[2, 3, 0] = 65504.0
+    assert write_exr(tmp_path / "b.exr", rgb(image)) == "half"
+    assert stored_pixel_type([np.array([-65505.0])]) == "float"
+    with pytest.raises(InputError, match="past 32-bit floats"):
+        write_exr(tmp_path / "c.exr", rgb(image.astype(np.float64) * 1e38))
+
+
+def test_existing_file_is_kept(tmp_path):
+    write_exr(tmp_path / "a.exr", rgb(radiance()))
+    before = (tmp_path / "a.exr").read_bytes()
+    with pytest.raises(InputError, match="exists already"):
+        write_exr(tmp_path / "a.exr", rgb(radiance(seed=1)))
+    assert (tmp_path / "a.exr").read_bytes() == before
+    write_exr(tmp_path / "a.exr", rgb(radiance(seed=1)), overwrite=True)
+    assert (tmp_path / "a.exr").read_bytes() != before
+
+
+def test_full_disk_is_one_line_and_leaves_nothing(tmp_path, full_disk):  # noqa: F811
+    with pytest.raises(SehdrError, match="a.exr: cannot be written") as caught:
+        write_exr(tmp_path / "a.exr", rgb(radiance(200, 200)))
+    assert "\n" not in str(caught.value) and ".tmp" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_multipart_keeps_pixels_and_headers_apart(tmp_path):
+    images = [radiance(seed=seed) for seed in range(3)]
+    parts = [Part(rgb(image), exr_header(exposure_time=2.0**i), f"b{i}") for i, image in enumerate(images)]
+    write_multipart_exr(tmp_path / "m.exr", parts)
+    for index, image in enumerate(images):
+        pixels, spec = read_openimageio(tmp_path / "m.exr", index)
+        np.testing.assert_array_equal(pixels, image.astype(np.float16))
+        assert spec.get_float_attribute("ExposureTime") == 2.0**index
+    with OpenEXR.File(str(tmp_path / "m.exr")) as file:
+        assert [part.header["name"] for part in file.parts] == ["b0", "b1", "b2"]
+    with pytest.raises(ValueError, match="names? each"):
+        write_multipart_exr(tmp_path / "n.exr", [parts[0], parts[0]])
+
+
+def test_shapes_must_agree(tmp_path):
+    with pytest.raises(ValueError, match="shapes"):
+        write_exr(tmp_path / "a.exr", {"R": np.zeros((2, 3)), "G": np.zeros((3, 2))})
+    with pytest.raises(ValueError, match="pixel type"):
+        write_exr(tmp_path / "a.exr", {"R": np.zeros((2, 3))}, pixel="double")
+
+
+def test_reader_refuses_what_is_too_large_or_damaged(tmp_path):
+    write_exr(tmp_path / "a.exr", rgb(radiance()))
+    with pytest.raises(InputError, match="32 x 24"):
+        read_exr(tmp_path / "a.exr", max_pixels=100)
+    data = (tmp_path / "a.exr").read_bytes()
+    for keep in (3, 100, len(data) // 2):
+        (tmp_path / "cut.exr").write_bytes(data[:keep])
+        with pytest.raises(InputError, match="cut.exr"):
+            read_exr(tmp_path / "cut.exr")
+
+
+def test_acescg_matrix_is_the_published_one():
+    # ACEScg from linear sRGB as in the OpenColorIO ACES configurations.
+    published = [[0.613097, 0.339523, 0.047379], [0.070194, 0.916354, 0.013452], [0.020616, 0.109570, 0.869815]]
+    np.testing.assert_allclose(matrix_from_rec709("acescg"), published, atol=2e-6)
+
+
+@pytest.mark.parametrize("name", color_space_names())
+def test_white_stays_white_and_the_gamut_holds(name):
+    np.testing.assert_allclose(from_rec709(np.ones(3), name), 1, atol=2e-4)
+    assert from_rec709(np.eye(3), name).min() > -1e-9
+
+
+@pytest.mark.parametrize("name", [n for n in color_space_names() if color_space(n).interop_id])
+def test_chromaticities_are_those_of_the_interop_id(name):
+    header = exr_header(colorspace=name)
+    assert OpenEXR.chromaticitiesToColorInteropID(header["chromaticities"]) == header["colorInteropID"]
+
+
+def test_unknown_color_space_lists_the_known():
+    with pytest.raises(SehdrError, match="'foo' is not known; choose one of rec709, acescg"):
+        color_space("foo")
+    assert color_space("AP0").name == "aces2065-1"

@@ -1,0 +1,129 @@
+import json
+import os
+import resource
+
+import pytest
+
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.output.files import atomic_folder, atomic_path, write_json
+
+
+def listing(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def test_file_appears_when_the_block_ends(tmp_path):
+    target = tmp_path / "new" / "deep" / "a.txt"
+    with atomic_path(target) as temporary:
+        assert temporary.parent == target.parent and temporary.suffix == ".txt"
+        temporary.write_text("whole")
+        assert not target.exists()
+    assert target.read_text() == "whole"
+    assert listing(tmp_path) == ["new", "new/deep", "new/deep/a.txt"]
+
+
+def test_existing_file_is_kept_unless_asked(tmp_path):
+    target = tmp_path / "a.txt"
+    target.write_text("old")
+    with pytest.raises(InputError, match="a.txt: exists already;") as caught, atomic_path(target):
+        pytest.fail("the block must not run")
+    assert "\n" not in str(caught.value)
+    with atomic_path(target, overwrite=True) as temporary:
+        temporary.write_text("new")
+    assert target.read_text() == "new"
+
+
+def test_file_that_appears_meanwhile_is_kept(tmp_path):
+    target = tmp_path / "a.txt"
+    with pytest.raises(InputError), atomic_path(target) as temporary:
+        temporary.write_text("mine")
+        target.write_text("theirs")
+    assert target.read_text() == "theirs"
+    assert listing(tmp_path) == ["a.txt"]
+
+
+def test_a_folder_is_never_replaced_by_a_file(tmp_path):
+    (tmp_path / "a").mkdir()
+    with pytest.raises(InputError, match="is a folder"), atomic_path(tmp_path / "a", overwrite=True):
+        pass
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
+def test_failure_leaves_nothing_new_and_keeps_the_old(tmp_path, error):
+    (tmp_path / "old.txt").write_text("old")
+    with pytest.raises(error), atomic_path(tmp_path / "old.txt", overwrite=True) as temporary:
+        temporary.write_text("half")
+        raise error
+    with pytest.raises(error), atomic_path(tmp_path / "x" / "y" / "new.txt") as temporary:
+        temporary.write_text("half")
+        raise error
+    assert listing(tmp_path) == ["old.txt"]
+    assert (tmp_path / "old.txt").read_text() == "old"
+
+
+@pytest.fixture
+def full_disk():
+    """Writing past 4 KiB of a file fails, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_full_disk_is_one_line(tmp_path, full_disk):
+    with pytest.raises(SehdrError, match=r"big.bin: cannot be written \(.*\); free space") as caught:
+        with atomic_path(tmp_path / "big.bin") as temporary:
+            temporary.write_bytes(bytes(1 << 20))
+    assert "\n" not in str(caught.value)
+    assert listing(tmp_path) == []
+
+
+def test_parent_that_is_a_file_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SehdrError, match="cannot be written"), atomic_path(tmp_path / "file" / "a.txt"):
+        pass
+
+
+def test_long_names_fit_the_file_system(tmp_path):
+    name = "n" * 250 + ".txt"
+    with atomic_path(tmp_path / name) as temporary:
+        temporary.write_text("x")
+    assert (tmp_path / name).exists()
+
+
+def test_folder_appears_whole(tmp_path):
+    with atomic_folder(tmp_path / "set") as folder:
+        (folder / "sub").mkdir()
+        (folder / "sub" / "a").write_text("1")
+        assert not (tmp_path / "set").exists()
+    assert listing(tmp_path) == ["set", "set/sub", "set/sub/a"]
+
+
+def test_folder_replaces_whole_or_not_at_all(tmp_path):
+    target = tmp_path / "set"
+    target.mkdir()
+    (target / "old").write_text("old")
+    with pytest.raises(InputError, match="exists already"), atomic_folder(target):
+        pass
+    with pytest.raises(RuntimeError), atomic_folder(target, overwrite=True) as folder:
+        (folder / "new").write_text("new")
+        raise RuntimeError
+    assert listing(tmp_path) == ["set", "set/old"]
+    with atomic_folder(target, overwrite=True) as folder:
+        (folder / "new").write_text("new")
+    assert listing(tmp_path) == ["set", "set/new"]
+
+
+def test_empty_folder_counts_as_absent(tmp_path):
+    (tmp_path / "set").mkdir()
+    with atomic_folder(tmp_path / "set") as folder:
+        (folder / "a").write_text("1")
+    assert os.listdir(tmp_path / "set") == ["a"]
+
+
+def test_json_has_no_nan(tmp_path):
+    write_json(tmp_path / "a.json", {"a": float("nan"), "b": [1.5, float("inf")], "c": "ä"})
+    assert json.loads((tmp_path / "a.json").read_text(encoding="utf-8")) == {"a": None, "b": [1.5, None], "c": "ä"}
+    with pytest.raises(TypeError):
+        write_json(tmp_path / "b.json", {"a": object()})
+    assert listing(tmp_path) == ["a.json"]

@@ -1,0 +1,170 @@
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.output.camera_paths import common_focus, interpolate, orbit
+from sehdr_warp.output.exr import read_exr
+from sehdr_warp.output.names import safe_names
+from sehdr_warp.output.render_views import render_views, select_cameras
+
+from .helpers import AnalyticRun, Entry, camera
+
+
+def tree(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def test_layout_on_disk(tmp_path):
+    said = []
+    files = render_views(AnalyticRun(), tmp_path / "out", evs=[-2, 0, 2], progress=said.append)
+    expected = ["hdr/t_0.exr", "hdr/t_1.exr", "preview/t_0.png", "preview/t_1.png", "brackets.json"]
+    expected += [
+        f"brackets/{v}/{v}_b{i}_ev{ev}.exr" for v in ("t_0", "t_1") for i, ev in enumerate(("-2.0", "+0.0", "+2.0"))
+    ]
+    assert tree(tmp_path / "out") == sorted(expected) == sorted(str(f.relative_to(tmp_path / "out")) for f in files)
+    assert said == ["t_0 (1 of 2)", "t_1 (2 of 2)"]
+
+
+def test_hdr_file_holds_what_was_rendered(tmp_path):
+    run = AnalyticRun()
+    render_views(run, tmp_path, pixel="float")
+    entry = run.cameras[3]
+    pixels, names, header = read_exr(tmp_path / "hdr" / "t_0.exr")
+    rendered = run.render(entry.camera)
+    assert names == ("R", "G", "B", "A", "Z")
+    np.testing.assert_array_equal(pixels[..., :3], rendered.hdr)
+    np.testing.assert_array_equal(pixels[..., 3], rendered.alpha)
+    np.testing.assert_array_equal(pixels[..., 4], rendered.depth)
+    assert header["expTime"] == 1 and header["sehdr:baseExposureTime"] == "0.5"
+    assert header["sehdr:scene"] == "sky" and header["sehdr:view"] == "t_0"
+    assert json.loads(header["sehdr:camera"]) == entry.camera.to_dict()
+    assert Image.open(tmp_path / "preview" / "t_0.png").size == (entry.camera.width, entry.camera.height)
+
+
+def test_brackets_are_the_hdr_file_times_the_exposure(tmp_path):
+    render_views(AnalyticRun(), tmp_path, exposures=[0.125, 8], pixel="float", colorspace="acescg", multipart=False)
+    hdr = read_exr(tmp_path / "hdr" / "t_1.exr")[0][..., :3].astype(np.float64)
+    for name, time in (("t_1_b0_ev-2.0", 0.125), ("t_1_b1_ev+4.0", 8)):
+        np.testing.assert_array_equal(
+            read_exr(tmp_path / "brackets" / "t_1" / f"{name}.exr")[0], (hdr * time).astype(np.float32)
+        )
+
+
+def test_nothing_is_replaced_unless_asked_and_rendering_does_not_start(tmp_path):
+    run = AnalyticRun()
+    render_views(run, tmp_path, evs=[0])
+    (tmp_path / "note.txt").write_text("mine")
+    run.rendered = 0
+    with pytest.raises(InputError, match="exists already"):
+        render_views(run, tmp_path)
+    assert run.rendered == 0
+    render_views(run, tmp_path, cameras="train", evs=[1], overwrite=True)
+    assert [path.name for path in sorted((tmp_path / "hdr").iterdir())] == ["r_0.exr", "r_1.exr", "r_2.exr"]
+    assert (tmp_path / "note.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("multipart", [False, True])
+def test_a_bad_pixel_leaves_nothing_new(tmp_path, multipart):
+    run = AnalyticRun()
+    run.gain = np.inf
+    with pytest.raises(InputError, match="not finite"):
+        render_views(run, tmp_path / "deep" / "out", evs=[0], multipart=multipart)
+    assert not (tmp_path / "deep").exists()
+
+
+def test_values_past_half_are_said(tmp_path):
+    run, said = AnalyticRun(), []
+    run.gain = 1e5
+    render_views(run, tmp_path, progress=said.append)
+    assert "t_0: holds values above 65504, which half cannot; written as float" in said
+
+
+def test_options_that_do_nothing_are_refused(tmp_path):
+    with pytest.raises(SehdrError, match="without exposures"):
+        render_views(AnalyticRun(), tmp_path / "out", multipart=True)
+    with pytest.raises(SehdrError, match="no test views"):
+        render_views(AnalyticRun([("a", "train")]), tmp_path / "out")
+    with pytest.raises(SehdrError, match="'tset' are neither a file nor one of train, test, all, orbit, interpolate"):
+        render_views(AnalyticRun(), tmp_path / "out", cameras="tset")
+    assert not (tmp_path / "out").exists()
+
+
+def test_cameras_from_a_file(tmp_path):
+    entries = [{"name": name, **camera(position=(i, 0, -3)).to_dict()} for i, name in enumerate(("a", "b"))]
+    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": entries}))
+    render_views(AnalyticRun(), tmp_path / "out", cameras=tmp_path / "cameras.json")
+    assert tree(tmp_path / "out" / "hdr") == ["a.exr", "b.exr"]
+
+
+def test_names_are_safe_and_different():
+    names = ["a/b", "..", "A_B", "a_b", "x" * 300, "con?", "a_b_2", ""]
+    safe = safe_names(names)
+    assert safe == ["a_b", "view", "A_B_3", "a_b_4", "x" * 120, "con_", "a_b_2", "view_2"]
+    assert len({name.casefold() for name in safe}) == len(safe)
+
+
+def arc(count, degrees, radius=3.0, height=-0.5):
+    angles = np.radians(np.linspace(-degrees / 2, degrees / 2, count, endpoint=degrees < 360))
+    return [camera(position=(radius * np.sin(a), height, -radius * np.cos(a))) for a in angles]
+
+
+def test_common_focus_is_where_the_axes_meet():
+    np.testing.assert_allclose(common_focus(arc(5, 60)), 0, atol=1e-9)
+    parallel = [camera(position=(x, 0, -3), target=(x, 0, 0)) for x in (0, 0.1, 0.2)]
+    assert common_focus(parallel) is None
+    away = [camera(position=(x, 0, -3), target=(3 * x, 0, -9)) for x in (-1.0, -0.5, 0.5, 1.0)]
+    assert common_focus(away) is None
+
+
+def sees(view, point):
+    x, y, z, _ = view.world_to_camera @ np.append(point, 1)
+    return view.fx * x / z + view.cx, view.fy * y / z + view.cy
+
+
+@pytest.mark.parametrize("degrees", [60, 360])
+def test_orbit_looks_at_the_focus_smoothly(degrees):
+    given = arc(12, degrees)
+    path = orbit(given, 48, focus_distance=1)
+    positions = np.stack([view.position for view in path])
+    for view in path:
+        np.testing.assert_allclose(sees(view, np.zeros(3)), (view.cx, view.cy), atol=1e-6)
+        assert view.world_to_camera[1, :3] @ [0, 1, 0] > 0.9
+        np.testing.assert_allclose(np.linalg.norm(view.position), np.linalg.norm(given[0].position), rtol=1e-6)
+    steps = np.linalg.norm(np.diff(positions, axis=0, append=positions[:1]), axis=1)
+    assert steps.max() < 4 / len(path) * np.ptp(positions, axis=0).max()
+    azimuth = np.degrees(np.arctan2(positions[:, 0], -positions[:, 2]))
+    assert np.ptp(azimuth) > 300 if degrees == 360 else np.abs(azimuth).max() < 30
+
+
+def test_orbit_of_parallel_cameras_uses_the_depth_seen():
+    run = AnalyticRun()
+    run.cameras = [
+        Entry(str(i), "train", camera(position=(x, 0, -3), target=(x, 0, 0))) for i, x in enumerate((0, 0.2, 0.4))
+    ]
+    views = select_cameras(run, "orbit", count=8)
+    assert [name for name, _ in views] == [f"orbit_{i:03d}" for i in range(8)]
+    for _, view in views:  # AnalyticRun's depth is 2 everywhere: the focus lies at z = -1.
+        np.testing.assert_allclose(sees(view, (0.2, 0, -1)), (view.cx, view.cy), atol=0.1)
+
+
+def test_interpolation_passes_through_its_cameras():
+    given = arc(5, 90)
+    path = interpolate(given, 41)
+    assert len(path) == 41
+    for i, view in enumerate(given):
+        np.testing.assert_allclose(path[10 * i].world_to_camera, view.world_to_camera, atol=1e-6)
+    turns = [np.linalg.norm(a.world_to_camera - b.world_to_camera) for a, b in zip(path, path[1:], strict=False)]
+    assert max(turns) < 1.5 * min(turns)
+    repeated = interpolate([given[0], given[0], given[1]], 3)
+    np.testing.assert_allclose(repeated[2].world_to_camera, given[1].world_to_camera, atol=1e-9)
+    assert len(interpolate(given[:1], 4)) == 4
+
+
+def test_paths_need_cameras():
+    with pytest.raises(SehdrError, match="at least one camera"):
+        interpolate([], 3)
+    with pytest.raises(SehdrError, match="path of 0 views"):
+        orbit(arc(3, 30), 0, focus_distance=1)
