@@ -32,13 +32,12 @@ def load_config(preset: str | Path = "default", overrides: dict | None = None) -
     value out of range.
     """
     source, values = _read(preset)
-    for path, value in (overrides or {}).items():
-        *parents, leaf = path.split(".")
-        table = values
-        for parent in parents:
-            table = table.setdefault(parent, {})
-        table[leaf] = value
-    return _build(source, values)
+    return _override(source, values, overrides or {})
+
+
+def override_config(config: Config, overrides: dict, source: Path | str = "config") -> Config:
+    """A config with some fields replaced, given as for load_config; `source` names it in errors. Raises InputError."""
+    return _override(source, config_to_dict(config), overrides)
 
 
 def config_to_dict(config: Config) -> dict:
@@ -119,6 +118,16 @@ def _text(path: Path) -> str:
         raise InputError(path, f"cannot be read ({error.strerror})", "check the path") from None
     except UnicodeDecodeError:
         raise InputError(path, "not UTF-8 text", "this is not a config file") from None
+
+
+def _override(source: Path | str, values: dict, overrides: dict) -> Config:
+    for path, value in overrides.items():
+        *parents, leaf = path.split(".")
+        table = values
+        for parent in parents:
+            table = table.setdefault(parent, {})
+        table[leaf] = value
+    return _build(source, values)
 
 
 def _merge(into: dict, values: dict) -> None:

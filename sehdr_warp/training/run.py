@@ -50,7 +50,7 @@ class Run:
 
     path: its folder. config: the choices it was trained with. model: the RadianceField, on `device`.
     cameras: the views of the scene, in its order. response: the camera's curve. exposure_time: the base one, seconds.
-    iteration, train_seconds: how far the training was. data: where the photos were, for load_scene; may be empty.
+    iterations, train_seconds: how far the training was. data: where the photos were, for load_scene; may be empty.
     """
 
     def __init__(self, path: Path, config: Config, model: RadianceField, cameras: tuple[CameraEntry, ...], info: dict, values: dict):
@@ -58,7 +58,7 @@ class Run:
         self.config = config
         self.model = model
         self.cameras = cameras
-        self.iteration: int = values["iteration"]
+        self.iterations: int = values["iteration"]
         self.train_seconds: float = values["seconds"]
         self.data: dict = info["data"]
         self.scene_name: str = info["scene"]
@@ -75,11 +75,15 @@ class Run:
     def device(self) -> torch.device:
         return self.model.gaussians.means.device
 
+    @property
+    def gaussian_count(self) -> int:
+        return self.model.gaussians.count
+
     @cached_property
     def degree(self) -> int:
         """The degree of the harmonics that the training had reached."""
         every = self.config.scaled(self.config.schedule.harmonics_every)
-        return min(self.config.model.harmonics_degree, self.iteration // every)
+        return min(self.config.model.harmonics_degree, self.iterations // every)
 
     def render(self, camera: Camera) -> RenderedView:
         """HDR radiance [H, W, 3], alpha [H, W] and depth [H, W] from a camera."""
@@ -129,26 +133,30 @@ def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) ->
     return field
 
 
-def prepare_folder(path: Path, *, resume: bool, overwrite: bool) -> bool:
-    """Makes the folder ready for a training; True if there is a run to continue.
+def check_folder(path: Path, *, resume: bool, overwrite: bool) -> bool:
+    """Whether a folder holds a run to continue. Changes nothing.
 
     Raises InputError if something is there and neither was asked for, or if what is there is no run.
     """
-    if path.is_file():
+    if path.exists() and not path.is_dir():
         raise InputError(path, "is a file", "choose another folder for the run")
     if not path.exists() or not any(path.iterdir()):
-        path.mkdir(parents=True, exist_ok=True)
         return False
-    if resume:
-        require_run(path)
-        return True
-    if not overwrite:
+    if not resume and not overwrite:
         raise InputError(path, "exists and is not empty", "choose another folder, or use --resume or --overwrite")
     require_run(path)
+    return resume
+
+
+def clear_folder(path: Path) -> None:
+    """Makes the folder, or removes the run in it. Raises InputError if the folder cannot be made."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(path, f"cannot be made ({error.strerror})", "choose another folder for the run") from None
     for name in (SUMMARY, METRICS, SCENE, RUN, CONFIG):
         (path / name).unlink(missing_ok=True)
     shutil.rmtree(path / CHECKPOINTS, ignore_errors=True)
-    return False
 
 
 def require_run(path: Path) -> None:

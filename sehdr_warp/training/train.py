@@ -20,8 +20,8 @@ from .heldout import evaluate_views
 from .initialization import choose_response, make_field
 from .progress import Progress
 from .run import (
-    CHECKPOINTS, CONFIG, SUMMARY, Run, append_metrics, check_same_scene, field_from_checkpoint, load_run,
-    prepare_folder, read_run_info, rewind_metrics, write_start,
+    CHECKPOINTS, CONFIG, SUMMARY, Run, append_metrics, check_folder, check_same_scene, clear_folder,
+    field_from_checkpoint, load_run, read_run_info, rewind_metrics, write_start,
 )
 from .trainer import Trainer
 
@@ -53,12 +53,14 @@ def train(
     disk is full, KeyboardInterrupt after an interrupt; a usable checkpoint is left then.
     """
     out, device = Path(out), pick_device(device)
-    if prepare_folder(out, resume=resume, overwrite=overwrite):
+    if check_folder(out, resume=resume, overwrite=overwrite):
         trainer, seconds = _continue(scene, out, config, device)
     else:
         config = config or load_config()
         field = make_field(scene, config, choose_response(scene, config), device)
         trainer, seconds = Trainer(scene, config, field), 0.0
+        # Nothing is made or removed before the scene is known to be good.
+        clear_folder(out)
         write_start(out, scene, config, field, data or {})
     loop = _Loop(scene, out, trainer, seconds, tensorboard)
     with Progress(trainer.config.schedule.iterations, enabled=not quiet) as progress:

@@ -1,0 +1,237 @@
+"""Adaptive density control and MCMC relocation: who grows, who goes, and what stays the same."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from sehdr_warp.model.gaussians import PARAMETER_NAMES, Gaussians
+from sehdr_warp.splatting import rasterize
+from sehdr_warp.training.config_files import load_config
+from sehdr_warp.training.densification import GradientDensification, make_densification, rotate
+from sehdr_warp.training.relocation import Relocation, _draw, _relocation_sums
+
+EXTENT = 2.0
+
+
+def cloud(count=6):
+    generator = torch.Generator().manual_seed(5)
+    return Gaussians.from_points(torch.rand(count, 3, generator=generator), torch.rand(count, 3, generator=generator), 1)
+
+
+def adam(gaussians):
+    parameters = [getattr(gaussians, name) for name in PARAMETER_NAMES]
+    groups = [{"name": n, "params": [p], "lr": 0.01} for n, p in zip(PARAMETER_NAMES, parameters, strict=True)]
+    optimizer = torch.optim.Adam(groups)
+    for parameter in parameters:
+        parameter.grad = torch.ones_like(parameter)
+    optimizer.step()
+    optimizer.zero_grad(set_to_none=True)
+    return optimizer
+
+
+def rendering_with(gradient, visible):
+    means2d = torch.zeros_like(gradient)
+    means2d.grad = gradient
+    return SimpleNamespace(means2d=means2d, visible=visible)
+
+
+def gradient_strategy(**options):
+    values = {f"densification.{name}": value for name, value in options.items()}
+    return GradientDensification(load_config("default", values), EXTENT)
+
+
+def observe(strategy, gradients):
+    """Screen gradients along x, in normalised units for an image 200 wide."""
+    gradient = torch.tensor(gradients)[:, None] * torch.tensor([[1 / 100.0, 0.0]])
+    strategy.observe(rendering_with(gradient, torch.ones(len(gradients), dtype=bool)), 200, 100, torch.tensor(1.0))
+
+
+def test_statistics_are_means_over_the_photos_that_show_it():
+    strategy = gradient_strategy()
+    gradient = torch.tensor([[3.0, 0.0], [0.0, 4.0]])
+    strategy.observe(rendering_with(gradient, torch.tensor([True, True])), 200, 100, torch.tensor(1.0))
+    strategy.observe(rendering_with(gradient * float("nan"), torch.tensor([True, True])), 200, 100, torch.tensor(0.0))
+    strategy.observe(rendering_with(gradient, torch.tensor([True, False])), 200, 100, torch.tensor(1.0))
+    assert strategy.gradient_sum.tolist() == [600.0, 200.0] and strategy.seen.tolist() == [2.0, 1.0]
+
+
+def test_small_are_cloned_and_large_are_split():
+    gaussians = cloud(3)
+    small, large = 0.001, 0.5
+    gaussians.overwrite({"log_scales": torch.tensor([small, large, small]).log()[:, None].expand(3, 3)})
+    optimizer = adam(gaussians)
+    before = gaussians.rows(torch.arange(3))
+    strategy = gradient_strategy()
+    observe(strategy, [1.0, 1.0, 0.0])
+    assert strategy.change(600, gaussians, optimizer, torch.Generator().manual_seed(0))
+    # Kept: 0 and 2; added: a clone of 0, and two halves of 1.
+    assert gaussians.count == 5
+    torch.testing.assert_close(gaussians.means[:3].detach(), before["means"][[0, 2, 0]])
+    halves = gaussians.log_scales[3:].detach()
+    torch.testing.assert_close(halves, (before["log_scales"][1] - math.log(1.6)).expand(2, 3))
+    assert not torch.equal(gaussians.means[3], gaussians.means[4])
+    for name in PARAMETER_NAMES:
+        parameter = getattr(gaussians, name)
+        moments = optimizer.state[parameter]["exp_avg"]
+        assert moments.shape == parameter.shape and (moments[:2] != 0).all() and (moments[2:] == 0).all()
+        assert any(parameter is p for group in optimizer.param_groups for p in group["params"])
+
+
+def test_split_points_are_drawn_from_the_parent():
+    strategy, gaussians = gradient_strategy(), cloud(4)
+    scales = torch.tensor([0.5, 0.01, 0.2])
+    quaternion = torch.tensor([0.3, -0.5, 0.7, 0.2])
+    gaussians.overwrite({"log_scales": scales.log().expand(4, 3), "quaternions": quaternion.expand(4, 4)})
+    parents = torch.zeros(20_000, dtype=torch.long)
+    rows = strategy._half(gaussians, parents, torch.Generator().manual_seed(1))
+    offsets = rows["means"] - gaussians.means[0].detach()
+    rotation = rotate(quaternion.expand(3, 4), torch.eye(3)).T
+    expected = rotation @ torch.diag(scales**2) @ rotation.T
+    torch.testing.assert_close(torch.cov(offsets.T), expected, atol=0.01, rtol=0.05)
+
+
+def test_rotation_is_the_quaternions():
+    half = math.sqrt(0.5)
+    turned = rotate(torch.tensor([[2 * half, 0.0, 0.0, 2 * half]]), torch.tensor([[1.0, 0.0, 0.0]]))
+    torch.testing.assert_close(turned, torch.tensor([[0.0, 1.0, 0.0]]))
+
+
+def test_revised_opacity_keeps_the_whole():
+    strategy, gaussians = gradient_strategy(revised_opacity=True), cloud(4)
+    rows = strategy._half(gaussians, torch.tensor([0]), torch.Generator().manual_seed(1))
+    half = torch.sigmoid(rows["opacity_logits"])
+    torch.testing.assert_close(1 - (1 - half) ** 2, gaussians.opacities()[:1].detach())
+
+
+def test_the_budget_goes_to_the_largest_gradients():
+    gaussians = cloud(6)
+    optimizer = adam(gaussians)
+    # Neither faint nor huge, so that nothing is pruned.
+    gaussians.overwrite({"log_scales": torch.full((6, 3), math.log(0.001)), "opacity_logits": torch.zeros(6)})
+    strategy = gradient_strategy(max_gaussians=8)
+    observe(strategy, [0.1, 0.6, 0.2, 0.5, 0.3, 0.4])
+    strategy.change(600, gaussians, optimizer, torch.Generator())
+    assert gaussians.count == 8
+    torch.testing.assert_close(gaussians.means[6:].detach(), gaussians.means[[1, 3]].detach())
+
+
+def test_faint_and_oversized_are_pruned():
+    gaussians = cloud(5)
+    optimizer = adam(gaussians)
+    logits = torch.logit(torch.tensor([0.5, 0.004, 0.5, 0.5, 0.5]))
+    scales = torch.tensor([0.01, 0.01, 0.3, 0.01, 0.01]).log()[:, None].expand(5, 3)
+    gaussians.overwrite({"opacity_logits": logits, "log_scales": scales})
+    strategy = gradient_strategy()
+    observe(strategy, [0.0] * 5)
+    strategy.change(2900, gaussians, optimizer, torch.Generator())
+    assert gaussians.count == 4, "only the faint one before the first reset"
+    observe(strategy, [0.0] * 4)
+    strategy.change(3100, gaussians, optimizer, torch.Generator())
+    assert gaussians.count == 3, "0.3 is more than a tenth of the extent 2.0"
+
+
+def test_opacity_reset():
+    gaussians = cloud(3)
+    optimizer = adam(gaussians)
+    gaussians.overwrite({"opacity_logits": torch.logit(torch.tensor([0.9, 0.5, 0.006]))})
+    strategy = gradient_strategy()
+    strategy.change(3000, gaussians, optimizer, torch.Generator())
+    torch.testing.assert_close(gaussians.opacities().detach(), torch.tensor([0.01, 0.01, 0.006]))
+    assert (optimizer.state[gaussians.opacity_logits]["exp_avg"] == 0).all()
+    assert (optimizer.state[gaussians.means]["exp_avg"] != 0).all()
+
+
+@pytest.mark.parametrize("iteration", [500, 550, 15_100])
+def test_nothing_changes_outside_the_schedule(iteration):
+    gaussians, strategy = cloud(4), gradient_strategy()
+    observe(strategy, [1.0] * 4)
+    assert not strategy.change(iteration, gaussians, None, torch.Generator()) and gaussians.count == 4
+
+
+def test_none_changes_nothing():
+    strategy = make_densification(load_config("default", {"densification.strategy": "none"}), EXTENT)
+    gaussians = cloud(4)
+    before = gaussians.means.detach().clone()
+    strategy.perturb(gaussians, 1.0, torch.Generator())
+    assert not strategy.needs_gradients(600) and not strategy.change(600, gaussians, None, None)
+    assert torch.equal(before, gaussians.means)
+
+
+def relocation(**options):
+    values = {"densification.strategy": "relocation"} | {f"densification.{k}": v for k, v in options.items()}
+    return make_densification(load_config("default", values), EXTENT)
+
+
+def test_relocation_sums_are_equation_9():
+    sums, opacity = _relocation_sums(), 0.3
+    for n in (1, 2, 5, 20):
+        direct = sum(
+            math.comb(i - 1, k) * (-1) ** k * opacity ** (k + 1) / math.sqrt(k + 1) for i in range(1, n + 1) for k in range(i)
+        )
+        powers = opacity ** torch.arange(1, sums.shape[1] + 1, dtype=torch.float64)
+        assert float(sums[n - 1] @ powers) == pytest.approx(direct, rel=1e-9)
+
+
+def test_relocation_moves_the_dead_and_keeps_the_image():
+    generator = torch.Generator().manual_seed(0)
+    gaussians = cloud(8)
+    gaussians.overwrite({"means": gaussians.means.detach() + torch.tensor([-0.5, -0.5, 4.0]), "log_scales": torch.full((8, 3), -2.0)})
+    logits = torch.logit(torch.tensor([0.004] * 3 + [0.5] * 5))
+    gaussians.overwrite({"opacity_logits": logits})
+    optimizer = adam(gaussians)
+    gaussians.overwrite({"opacity_logits": logits})
+
+    def image():
+        features = gaussians.harmonics_dc[:, 0].detach()
+        pose, intrinsics = torch.eye(4), torch.tensor([40.0, 40.0, 16.0, 16.0])
+        with torch.no_grad():
+            return rasterize(
+                gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacities(), features,
+                pose, intrinsics, 32, 32,
+            ).image
+
+    before = image()
+    assert relocation(growth=0.0).change(600, gaussians, optimizer, generator)
+    after = image()
+    assert gaussians.count == 8 and (gaussians.opacities() > 0.005).all()
+    positions = {tuple(row) for row in gaussians.means.detach().tolist()}
+    assert len(positions) == 5, "the three dead ones are where living ones are"
+    # Plain copies would brighten the image by a quarter.
+    assert (after - before).abs().mean() < 0.05 * before.abs().mean()
+
+
+def test_relocation_grows_to_the_budget():
+    gaussians = cloud(100)
+    optimizer = adam(gaussians)
+    gaussians.overwrite({"opacity_logits": torch.zeros(100)})
+    strategy = relocation(max_gaussians=104)
+    strategy.change(600, gaussians, optimizer, torch.Generator().manual_seed(0))
+    assert gaussians.count == 104
+    strategy.change(700, gaussians, optimizer, torch.Generator().manual_seed(0))
+    assert gaussians.count == 104
+
+
+def test_noise_moves_the_faint_along_their_shape():
+    gaussians = cloud(2000)
+    opacities = torch.cat([torch.full((1000,), 0.001), torch.full((1000,), 0.5)])
+    scales = torch.tensor([0.3, 0.003, 0.003]).log().expand(2000, 3)
+    gaussians.overwrite({"opacity_logits": torch.logit(opacities), "log_scales": scales})
+    before = gaussians.means.detach().clone()
+    relocation(noise=1.0).perturb(gaussians, 1.0, torch.Generator().manual_seed(0))
+    moved = (gaussians.means.detach() - before).std(0)
+    faint = (gaussians.means.detach() - before)[:1000].std(0)
+    assert (gaussians.means.detach() - before)[1000:].abs().max() < 1e-6
+    assert faint[0] > 1000 * faint[1] and moved[0] > 0
+
+
+def test_draws_follow_the_weights():
+    drawn = _draw(torch.tensor([1.0, 0.0, 3.0]), 40_000, torch.Generator().manual_seed(0))
+    counts = torch.bincount(drawn, minlength=3) / 40_000
+    torch.testing.assert_close(counts, torch.tensor([0.25, 0.0, 0.75]), atol=0.01, rtol=0)
+
+
+def test_strategies_by_name():
+    assert isinstance(relocation(), Relocation)
+    assert isinstance(make_densification(load_config(), EXTENT), GradientDensification)

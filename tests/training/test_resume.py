@@ -1,0 +1,93 @@
+"""N steps equal N/2, kill -9, resume, N/2: bit for bit on the CPU."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from sehdr_warp.training.checkpoint import newest_checkpoint
+from sehdr_warp.training.config_files import load_config
+from sehdr_warp.training.train import train
+
+from .test_train import QUICK
+
+TRAIN = """
+import sys, time
+sys.path.insert(0, sys.argv[1])
+from tests.training.test_resume import configuration
+from tests.training.toy import toy_scene
+from sehdr_warp.training import trainer
+from sehdr_warp.training.train import train
+
+step = trainer.Trainer.step
+def slow(self):
+    # Past the checkpoint each step takes a while, so that the kill lands before the end.
+    step(self)
+    time.sleep(0.5 if self.iteration > 60 else 0)
+trainer.Trainer.step = slow
+train(toy_scene(), sys.argv[2], configuration(sys.argv[3]), device="cpu", quiet=True)
+"""
+
+
+def configuration(strategy):
+    preset = "paper" if strategy == "paper" else "default"
+    strategies = {"densification.strategy": "relocation"} if strategy == "relocation" else {}
+    fixed = {"schedule.iterations": 120, "schedule.stated_for": 120, "densification.every": 25, "response.name": "srgb"}
+    return load_config(preset, QUICK | fixed | strategies)
+
+
+def kill_after_checkpoint(out, strategy):
+    root = Path(__file__).resolve().parents[2]
+    process = subprocess.Popen([sys.executable, "-c", TRAIN, str(root), str(out), strategy], env=os.environ | {"PYTHONPATH": str(root)})
+    deadline = time.monotonic() + 120
+    while not list((out / "checkpoints").glob("iteration_*")):
+        assert process.poll() is None and time.monotonic() < deadline, "the training ended before its checkpoint"
+        time.sleep(0.05)
+    time.sleep(1.2)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+
+
+@pytest.mark.parametrize("strategy", ["gradient", "relocation", "paper"])
+def test_resume_is_exact(scene, tmp_path, strategy):
+    config = configuration(strategy)
+    train(scene, tmp_path / "whole", config, device="cpu", quiet=True)
+    kill_after_checkpoint(tmp_path / "killed", strategy)
+    assert newest_checkpoint(tmp_path / "killed" / "checkpoints").values["iteration"] == 60
+    # The statistics of a densification interval that the kill cut in two (50 to 75) are part of the state.
+    run = train(scene, tmp_path / "killed", device="cpu", quiet=True, resume=True)
+    whole = newest_checkpoint(tmp_path / "whole" / "checkpoints")
+    resumed = newest_checkpoint(tmp_path / "killed" / "checkpoints")
+    assert run.config == config and resumed.values["iteration"] == 120
+    assert whole.tensors.keys() == resumed.tensors.keys()
+    for name, value in whole.tensors.items():
+        assert torch.equal(value, resumed.tensors[name]), name
+    assert {k: whole.values[k] for k in ("order", "skipped_steps")} == {k: resumed.values[k] for k in ("order", "skipped_steps")}
+    lines = [line["iteration"] for line in run.metrics()]
+    assert lines == [10, 120], "each evaluation once"
+
+
+def test_resume_before_the_first_checkpoint_starts_over(scene, tmp_path):
+    config = configuration("gradient")
+    whole = train(scene, tmp_path / "whole", config, device="cpu", quiet=True)
+    train(scene, tmp_path / "cut", config, device="cpu", quiet=True)
+    for folder in (tmp_path / "cut" / "checkpoints").iterdir():
+        for file in folder.iterdir():
+            file.unlink()
+        folder.rmdir()
+    again = train(scene, tmp_path / "cut", device="cpu", quiet=True, resume=True)
+    assert torch.equal(whole.model.gaussians.means, again.model.gaussians.means)
+    assert len(again.metrics()) == len(whole.metrics())
+
+
+def test_resume_of_a_finished_run_changes_nothing(scene, tmp_path):
+    config = configuration("gradient")
+    first = train(scene, tmp_path / "run", config, device="cpu", quiet=True)
+    again = train(scene, tmp_path / "run", config, device="cpu", quiet=True, resume=True)
+    assert torch.equal(first.model.gaussians.means, again.model.gaussians.means)
+    assert first.metrics() == again.metrics()

@@ -1,0 +1,221 @@
+"""Whole trainings of seconds: they learn, they report, they stop tidily, and they refuse what cannot work."""
+
+import dataclasses
+import json
+import signal
+import threading
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.training.config_files import load_config
+from sehdr_warp.training.initialization import choose_response, make_field
+from sehdr_warp.training.run import load_run
+from sehdr_warp.training.train import train
+from sehdr_warp.training.trainer import Trainer
+
+from .toy import EXPOSURE_TIME, toy_scene
+
+QUICK = {
+    "schedule.iterations": 150,
+    "schedule.stated_for": 150,
+    "schedule.harmonics_every": 60,
+    "schedule.evaluate_at": [10, 150],
+    "schedule.checkpoint_every": 60,
+    "densification.start": 20,
+    "densification.stop": 100,
+    "densification.every": 20,
+    "densification.max_gaussians": 400,
+    "model.harmonics_degree": 1,
+    "optimizer.means": 1e-3,
+    "model.initial_count": 300,
+    "fusion.width": 16,
+}
+
+
+def quick(preset="default", **options):
+    return load_config(preset, QUICK | options)
+
+
+VARIANTS = {
+    "default": quick(),
+    "relocation": quick(**{"densification.strategy": "relocation", "loss.opacity_weight": 0.01, "loss.scale_weight": 0.01}),
+    "coarse": quick(**{"schedule.coarse_levels": 1, "schedule.coarse_every": 50}),
+    "3dgs": quick("3dgs", **{"optimizer.harmonics_dc": 0.01}),
+    "paper": quick("paper", **{"response.name": "srgb", "fusion.radiance_scale": "base", "optimizer.harmonics_dc": 0.02}),
+    "paper, pixel": quick("paper", **{"response.name": "srgb", "fusion.radiance_scale": "base", "model.tone_map": "pixel"}),
+    "truth": quick(**{"loss.linear_weight": 0.5, "loss.hdr_truth": True}),
+    "gaussian tone map": quick(**{"model.tone_map": "gaussian"}),
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_every_variant_learns(scene, tmp_path, variant):
+    run = train(scene, tmp_path / "run", VARIANTS[variant], device="cpu", quiet=True)
+    first, last = run.metrics()
+    assert first["iteration"] == 10 and last["iteration"] == 150 and last["split"] == "test"
+    assert last["psnr_ldr"] > first["psnr_ldr"] + 1.5
+    assert last["seconds"] > first["seconds"] > 0
+    assert run.summary()["finished"] and run.summary()["skipped_steps"] == 0
+    assert np.isfinite(run.render(run.cameras[0].camera).hdr.numpy()).all()
+
+
+def test_the_default_gets_radiance_right(scene, tmp_path):
+    run = train(scene, tmp_path / "run", quick(), device="cpu", quiet=True)
+    last = run.metrics()[-1]
+    assert last["psnr_ldr"] > 22 and last["psnr_mu"] > 22
+    assert run.exposure_time == EXPOSURE_TIME and run.gaussian_count == last["gaussians"]
+
+
+def test_a_scene_without_points_starts_from_drawn_ones(tmp_path):
+    scene = toy_scene(with_points=False)
+    run = train(scene, tmp_path / "run", quick(), device="cpu", quiet=True)
+    assert run.metrics()[-1]["psnr_ldr"] > 20
+
+
+def test_run_folder_is_complete_and_loads_without_photos(scene, tmp_path):
+    out = tmp_path / "run"
+    run = train(scene, out, quick(), device="cpu", quiet=True, data={"path": "somewhere"})
+    names = {path.name for path in out.iterdir()}
+    assert names == {"config.json", "scene.json", "run.json", "metrics.jsonl", "summary.json", "checkpoints"}
+    again = load_run(out)
+    assert again.config == run.config == quick() and again.data == {"path": "somewhere"}
+    assert [entry.name for entry in again.cameras] == [view.name for view in scene.views]
+    assert [entry.split for entry in again.cameras] == [view.split for view in scene.views]
+    view = run.render(scene.test_views[0].camera)
+    assert torch.equal(view.hdr, again.render(scene.test_views[0].camera).hdr)
+    size = scene.views[0].camera.height
+    assert view.hdr.shape == (size, size, 3) and view.alpha.shape == view.depth.shape == (size, size)
+    solid = view.alpha > 0.9
+    assert solid.any() and (view.depth[solid] > 2).all() and (view.depth[solid] < 6).all()
+    assert json.loads((out / "summary.json").read_text())["peak_memory_bytes"] > 1e7
+
+
+def test_views_of_differing_exposure_agree(tmp_path):
+    """The same scene photographed at twice the time: one radiance explains both."""
+    base = toy_scene()
+    from sehdr_warp.model.response import response_by_name
+
+    srgb, views = response_by_name("srgb"), []
+    for index, view in enumerate(base.views):
+        time = EXPOSURE_TIME * (2 if index % 2 else 1)
+        photo = np.round(srgb.encode(view.hdr * time) * 255).astype(np.float32) / 255
+        views.append(dataclasses.replace(view, image=photo, exposure_time=time))
+    run = train(dataclasses.replace(base, views=tuple(views)), tmp_path / "run", quick(), device="cpu", quiet=True)
+    assert run.metrics()[-1]["psnr_mu"] > 21
+
+
+def test_clipped_highlights_are_not_pulled_down(scene, tmp_path):
+    """Photos of twice what the sensor holds: with one-sided losses the render is white there, without being held to it."""
+    views = tuple(dataclasses.replace(view, image=np.ones_like(view.image)) for view in scene.views)
+    field = make_field(scene, quick(), choose_response(scene, quick()), "cpu")
+    trainer = Trainer(dataclasses.replace(scene, views=views), quick(**{"loss.ssim_weight": 0.0}), field)
+    with torch.no_grad():
+        field.gaussians.harmonics_dc.fill_(8.0)
+        field.gaussians.opacity_logits.fill_(20.0)
+    before = field.gaussians.harmonics_dc.detach().clone()
+    for _ in range(5):
+        trainer.step()
+    # Only edges, where coverage is partial, may ask for more; nothing asks for less.
+    assert (field.gaussians.harmonics_dc.detach() - before).min() > -1e-6
+
+
+def test_existing_folders_are_safe(scene, tmp_path):
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "notes.txt").write_text("mine")
+    for options in ({}, {"overwrite": True}, {"resume": True}):
+        with pytest.raises(InputError):
+            train(scene, out, quick(), device="cpu", quiet=True, **options)
+    assert [path.name for path in out.iterdir()] == ["notes.txt"]
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match="is a file"):
+        train(scene, tmp_path / "file", quick(), device="cpu", quiet=True)
+
+
+def test_overwrite_starts_anew(scene, tmp_path):
+    short = quick(**{"schedule.iterations": 5})
+    train(scene, tmp_path / "run", short, device="cpu", quiet=True)
+    with pytest.raises(InputError, match="--resume or --overwrite"):
+        train(scene, tmp_path / "run", short, device="cpu", quiet=True)
+    run = train(scene, tmp_path / "run", quick(**{"schedule.iterations": 3}), device="cpu", quiet=True, overwrite=True)
+    assert run.iterations == 3 and [line["iteration"] for line in run.metrics()][-1] == 3
+
+
+def test_resume_refuses_another_config_or_scene(scene, tmp_path):
+    short = quick(**{"schedule.iterations": 5})
+    train(scene, tmp_path / "run", short, device="cpu", quiet=True)
+    with pytest.raises(InputError, match="seed = 0, but 1"):
+        train(scene, tmp_path / "run", dataclasses.replace(short, seed=1), device="cpu", quiet=True, resume=True)
+    with pytest.raises(InputError, match="views differ"):
+        train(toy_scene(view_count=6), tmp_path / "run", short, device="cpu", quiet=True, resume=True)
+
+
+def test_seeds_decide_and_global_state_does_not(scene, tmp_path):
+    config = quick(**{"schedule.iterations": 40})
+    results = []
+    for index, seed in enumerate((0, 0, 1)):
+        torch.manual_seed(index)
+        run = train(scene, tmp_path / str(index), dataclasses.replace(config, seed=seed), device="cpu", quiet=True)
+        results.append(run.model.gaussians.means)
+    assert torch.equal(results[0], results[1])
+    assert results[2].shape != results[0].shape or not torch.equal(results[0], results[2])
+
+
+def test_non_finite_steps_are_skipped_and_then_stop(scene):
+    config = quick(**{"schedule.nonfinite_limit": 20})
+    field = make_field(scene, config, choose_response(scene, config), "cpu")
+    trainer = Trainer(scene, config, field)
+    trainer.step()
+    before = field.gaussians.means.detach().clone()
+    hook = field.gaussians.harmonics_dc.register_hook(lambda gradient: gradient * float("nan"))
+    trainer.step()
+    assert trainer.skipped_steps == 1 and torch.equal(before, field.gaussians.means)
+    hook.remove()
+    trainer.step()
+    assert trainer.skipped_steps == 1 and not torch.equal(before, field.gaussians.means)
+    field.gaussians.harmonics_dc.register_hook(lambda gradient: gradient * float("inf"))
+    with pytest.raises(SehdrError, match="iteration 40: .* nonfinite_limit = 20"):
+        for _ in range(60):
+            trainer.step()
+    assert torch.isfinite(field.gaussians.means).all()
+
+
+def test_an_interrupt_leaves_a_usable_checkpoint(scene, tmp_path):
+    config = quick(**{"schedule.iterations": 100_000, "schedule.evaluate_at": [100_000]})
+    threading.Timer(2.0, lambda: signal.raise_signal(signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        train(scene, tmp_path / "run", config, device="cpu", quiet=True)
+    run = load_run(tmp_path / "run")
+    assert 0 < run.iterations < 100_000 and not run.summary()["finished"]
+
+
+@pytest.mark.parametrize("value,words", [(0.0, "black"), (1.0, "white")])
+def test_photos_without_light_or_shadow_are_refused(scene, tmp_path, value, words):
+    views = tuple(dataclasses.replace(view, image=np.full_like(view.image, value)) for view in scene.views)
+    with pytest.raises(InputError, match=words):
+        train(dataclasses.replace(scene, views=views), tmp_path / "run", quick(), device="cpu", quiet=True)
+
+
+def test_one_view_is_refused_and_leaves_no_run(scene, tmp_path):
+    with pytest.raises(InputError, match="1 training view"):
+        train(dataclasses.replace(scene, views=scene.views[:1]), tmp_path / "run", quick(), device="cpu", quiet=True)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_failed_overwrite_keeps_the_old_run(scene, tmp_path):
+    train(scene, tmp_path / "run", quick(**{"schedule.iterations": 2}), device="cpu", quiet=True)
+    with pytest.raises(InputError):
+        train(
+            dataclasses.replace(scene, views=scene.views[:1]), tmp_path / "run", quick(), device="cpu", quiet=True, overwrite=True
+        )
+    assert load_run(tmp_path / "run").iterations == 2
+
+
+def test_unknown_device_is_refused(scene, tmp_path):
+    for device in ("cuda:99", "tpu", "meta"):
+        with pytest.raises(InputError, match=device):
+            train(scene, tmp_path / "run", quick(), device=device, quiet=True)
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,48 @@
+"""A scene of a few small views of a coloured cloud, with HDR truth, made by the package's own renderer."""
+
+import numpy as np
+import torch
+
+from sehdr_warp.model.gaussians import Gaussians
+from sehdr_warp.model.radiance_field import RadianceField
+from sehdr_warp.model.response import response_by_name
+from sehdr_warp.scene import Camera, Scene, View
+
+EXPOSURE_TIME = 0.25
+
+
+def orbit_camera(angle: float, size: int = 32, radius: float = 4.0) -> Camera:
+    """A camera on a circle in the plane z = 0.8, looking at the origin."""
+    position = np.array([radius * np.cos(angle), radius * np.sin(angle), 0.8])
+    forward = -position / np.linalg.norm(position)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
+    return Camera(size, size, 1.2 * size, 1.2 * size, size / 2, size / 2, pose)
+
+
+def toy_field(count: int = 60, seed: int = 3) -> RadianceField:
+    """A cloud of coloured blobs whose radiance spans some four stops around a mid exposure."""
+    rng = np.random.default_rng(seed)
+    points = torch.tensor(rng.uniform(-1, 1, (count, 3)), dtype=torch.float32)
+    log_exposure = torch.tensor(rng.uniform(-3.0, 0.3, (count, 3)), dtype=torch.float32)
+    gaussians = Gaussians.from_points(points, log_exposure, 0, opacity=0.9, scale=0.6)
+    return RadianceField(gaussians, response_by_name("srgb"), base_time=EXPOSURE_TIME)
+
+
+def toy_scene(view_count: int = 8, size: int = 32, with_points: bool = True) -> Scene:
+    """8-bit photos of toy_field(); every fourth view is held out."""
+    field = toy_field()
+    views = []
+    for index in range(view_count):
+        camera = orbit_camera(2 * np.pi * index / view_count, size)
+        photo = np.round(field.render_ldr(camera).numpy() * 255) / 255
+        truth = field.render(camera).hdr.numpy()
+        split = "test" if index % 4 == 3 else "train"
+        views.append(View(f"v_{index}", photo.astype(np.float32), camera, EXPOSURE_TIME, split, hdr=truth))
+    points = field.gaussians.means.detach().numpy().astype(np.float64)
+    colors = np.full((len(points), 3), 0.5, dtype=np.float32)
+    chosen = slice(None) if with_points else slice(0)
+    return Scene("toy", "transforms", tuple(views), points[chosen], colors[chosen])
