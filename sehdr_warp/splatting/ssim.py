@@ -75,9 +75,11 @@ def _compare(a: torch.Tensor, b: torch.Tensor) -> tuple[torch.Tensor, torch.Tens
     runs = _Runs(a)
     similarity = torch.empty_like(a)
     derivatives = a.new_empty(3, runs.rows, runs.length)
-    moments = runs.padded(4)
-    runs.launch("blur_columns", [a, b], [moments])
-    runs.launch("compare", [moments], [similarity, derivatives])
+    buffer = runs.padded(4)
+    moments = runs.view(buffer)
+    with torch_stream(a.device):
+        runs.launch("blur_columns", [runs.view(a), runs.view(b)], [moments])
+        runs.launch("compare", [moments], [runs.view(similarity), runs.view(derivatives)])
     return similarity, derivatives
 
 
@@ -85,14 +87,21 @@ def _gradient(a: torch.Tensor, b: torch.Tensor, derivatives: torch.Tensor, scale
     """scale times the gradient of the sum of the similarity by `a`, [H, W, C]."""
     runs = _Runs(a)
     result = torch.empty_like(a)
-    blurred = runs.padded(3)
-    runs.launch("blur_derivatives", [derivatives], [blurred])
-    runs.launch("gradient", [blurred, a, b], [wp.from_torch(scale.reshape(1), requires_grad=False), result])
+    buffer = runs.padded(3)
+    blurred = runs.view(buffer)
+    scale = scale.reshape(1)
+    with torch_stream(a.device):
+        runs.launch("blur_derivatives", [runs.view(derivatives)], [blurred])
+        runs.launch("gradient", [blurred, runs.view(a), runs.view(b)], [_descriptor(scale), runs.view(result)])
     return result
 
 
 class _Runs:
-    """One image size's launches: rows of W C numbers, taken `lanes` at a time."""
+    """One image size's launches: rows of W C numbers, taken `lanes` at a time.
+
+    Kernels get bare descriptors of torch's memory, which cost the host a tenth of a wp.array; the tensors behind them
+    must live until the launches are made.
+    """
 
     def __init__(self, image: torch.Tensor):
         wp.init()
@@ -101,7 +110,8 @@ class _Runs:
         self.like = image
         self.lanes = CPU_LANES if image.device.type == "cpu" and self.length >= CPU_LANES else 1
         self.kernels = ssim_kernels(wp.dtype_from_torch(image.dtype), self.lanes)
-        self.weights = wp.from_torch(_weights(image.dtype, image.device), requires_grad=False)
+        self.weights = _descriptor(_weights(image.dtype, image.device))
+        self.device = wp.device_from_torch(image.device)
 
     def padded(self, count: int) -> torch.Tensor:
         """[count, rows, ...] uninitialised rows with the zeros that the horizontal blur finds beyond the border."""
@@ -111,26 +121,27 @@ class _Runs:
         buffer[..., -margin:] = 0
         return buffer
 
-    def launch(self, name: str, images, results) -> None:
-        """Launch a kernel over the whole image; tensors are passed as overlapping runs, arrays as they are."""
-        arguments = [self._view(image) for image in images]
-        arguments += [self.weights, self.length, self.channels]
-        arguments += [self._view(result) if isinstance(result, torch.Tensor) else result for result in results]
+    def view(self, tensor: torch.Tensor):
+        """A contiguous image [H, W, C] or stack of rows [..., H, n] as overlapping runs."""
+        rows = tensor.shape[:1] if tensor.shape == self.like.shape else tensor.shape[:-1]
+        length = tensor.numel() // rows.numel()
+        strides = (length,) if len(rows) == 1 else (rows[1] * length, length)
+        runs = tensor.as_strided((*rows, length - self.lanes + 1, self.lanes), (*strides, 1, 1))
+        return _descriptor(runs, self.kernels.run)
+
+    def launch(self, name: str, inputs, results) -> None:
+        """Launch a kernel over the whole image."""
+        arguments = [*inputs, self.weights, self.length, self.channels, *results]
         kernel = getattr(self.kernels, name)
         count = self.rows * -(-self.length // self.lanes)
-        device = wp.device_from_torch(self.like.device)
-        with torch_stream(self.like.device):
-            if device.is_cpu:
-                threads.launch_ranges(kernel, threads.even_ranges(count, STEPS_PER_THREAD), arguments, device)
-            else:
-                wp.launch(kernel, dim=count, inputs=[0, *arguments], device=device)
+        if self.device.is_cpu:
+            threads.launch_ranges(kernel, threads.even_ranges(count, STEPS_PER_THREAD), arguments, self.device)
+        else:
+            wp.launch(kernel, dim=count, inputs=[0, *arguments], device=self.device)
 
-    def _view(self, tensor: torch.Tensor) -> wp.array:
-        if tensor.shape == self.like.shape:
-            tensor = tensor.reshape(self.rows, self.length)
-        shape = (*tensor.shape[:-1], tensor.shape[-1] - self.lanes + 1, self.lanes)
-        runs = tensor.as_strided(shape, (*tensor.stride(), 1))
-        return wp.from_torch(runs, dtype=self.kernels.run, requires_grad=False)
+
+def _descriptor(tensor: torch.Tensor, dtype=None):
+    return wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
 
 
 @cache
