@@ -30,31 +30,28 @@ class Developer:
     def view(self, shot: Shot, name: str) -> View:
         """The shot's view; raises InputError where a file is damaged or its size disagrees with the camera's."""
         lens, oriented = _fitted_lens(shot)
-        undistortion = None if lens.is_pinhole else self._undistortion(lens)
+        working = lens if lens.is_pinhole else _working_lens(lens, self.max_size)
+        undistortion = None if lens.is_pinhole else self._undistortion(working)
         full = lens.pinhole(shot.world_to_camera) if undistortion is None else undistortion.camera(shot.world_to_camera)
         camera = full.resized(*limited_size(full.width, full.height, self.max_size))
 
         encoded = read_ldr(shot.image, oriented=oriented)
         pixels, alpha = encoded.pixels, encoded.alpha
-        masks = (
-            []
-            if undistortion is None or undistortion.outside is None
-            else [self._shrink(~undistortion.outside, camera)]
-        )
+        masks = [] if undistortion is None or undistortion.outside is None else [_shrunk(~undistortion.outside, camera)]
         if shot.mask is not None:
-            masks.append(self._geometry(_fitted_mask(shot.mask, lens, oriented), undistortion, camera))
+            masks.append(_warped(_fitted_mask(shot.mask, lens, oriented), working, undistortion, camera))
         if alpha is not None and self.alpha == "mask":
-            masks.append(self._geometry(alpha, undistortion, camera))
+            masks.append(_warped(alpha, working, undistortion, camera))
             alpha = None
         if undistortion is None and alpha is None and (camera.width, camera.height) == (lens.width, lens.height):
             image = pixels.astype(np.float32) / np.float32(encoded.levels)
         else:
-            image = self._resampled(pixels, encoded.levels, alpha, undistortion, camera)
+            image = self._resampled(pixels, encoded.levels, alpha, working, undistortion, camera)
         mask = None
         if masks:
             mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32)
             mask = None if mask.min() >= 1 - 1e-6 else mask
-        hdr = None if shot.hdr is None else self._truth(shot.hdr, lens, undistortion, camera)
+        hdr = None if shot.hdr is None else _truth(shot.hdr, lens, working, undistortion, camera)
         return View(name, image, camera, shot.exposure_time, shot.split, mask, hdr, Path(shot.image))
 
     def _undistortion(self, lens: Lens) -> Undistortion:
@@ -63,32 +60,47 @@ class Developer:
             self._last = lens, Undistortion(lens)
         return self._last[1]
 
-    def _resampled(self, pixels, levels: int, alpha, undistortion, camera: Camera) -> np.ndarray:
+    def _resampled(self, pixels, levels: int, alpha, working: Lens, undistortion, camera: Camera) -> np.ndarray:
         if levels not in self._tables:
             self._tables[levels] = light_table(levels, self.decode)
         light = self._tables[levels][pixels]
         clipped = (pixels == levels).astype(np.float32)
         if alpha is not None:
             light, clipped = light * alpha[:, :, None], clipped * alpha[:, :, None]
-        image = np.asarray(self.encode(self._geometry(light, undistortion, camera)), dtype=np.float32)
-        return restore_clipping(np.clip(image, 0.0, 1.0), self._geometry(clipped, undistortion, camera))
+        image = np.asarray(self.encode(_warped(light, working, undistortion, camera)), dtype=np.float32)
+        return restore_clipping(np.clip(image, 0.0, 1.0), _warped(clipped, working, undistortion, camera))
 
-    def _geometry(self, image: np.ndarray, undistortion: Undistortion | None, camera: Camera) -> np.ndarray:
-        image = image.astype(np.float32, copy=False)
-        return self._shrink(image if undistortion is None else undistortion.apply(image), camera)
 
-    def _shrink(self, image: np.ndarray, camera: Camera) -> np.ndarray:
-        return area_average(image.astype(np.float32, copy=False), camera.width, camera.height)
+def _working_lens(lens: Lens, max_size: int | None) -> Lens:
+    """The lens at the size at which its distortion is undone: twice the final size at least, to spare time above.
 
-    def _truth(self, path: Path, lens: Lens, undistortion: Undistortion | None, camera: Camera) -> np.ndarray:
-        width, height = image_sizes(path)[0]
-        same = (width, height) == (lens.width, lens.height)
-        # Truth may be rendered larger than the photos (HDR-NeRF's evaluation averages it down); never smaller.
-        larger = width >= camera.width and height >= camera.height and _same_aspect((width, height), lens)
-        if not (same or (larger and undistortion is None)):
-            raise InputError(path, f"HDR truth is {width} x {height}, the photo {lens.width} x {lens.height}",
-                             "render the truth at the photo's size, or remove it")  # fmt: skip
-        return self._geometry(read_hdr(path), undistortion if same else None, camera)
+    Averaging first and bending then at twice the final resolution moves nothing by more than a fraction of a final
+    pixel, since distortion is smooth.
+    """
+    factor = 1 if max_size is None else max(lens.width, lens.height) // (2 * max_size)
+    return lens if factor < 2 else lens.resized(round(lens.width / factor), round(lens.height / factor))
+
+
+def _warped(image: np.ndarray, working: Lens, undistortion: Undistortion | None, camera: Camera) -> np.ndarray:
+    """[H, W] or [H, W, C] at the photo's size -> float32 at the camera's, undistorted."""
+    if undistortion is None:
+        return _shrunk(image, camera)
+    return _shrunk(undistortion.apply(_shrunk(image, working)), camera)
+
+
+def _shrunk(image: np.ndarray, to: Lens | Camera) -> np.ndarray:
+    return area_average(image.astype(np.float32, copy=False), to.width, to.height)
+
+
+def _truth(path: Path, lens: Lens, working: Lens, undistortion: Undistortion | None, camera: Camera) -> np.ndarray:
+    width, height = image_sizes(path)[0]
+    same = (width, height) == (lens.width, lens.height)
+    # Truth may be rendered larger than the photos (HDR-NeRF's evaluation averages it down); never smaller.
+    larger = width >= camera.width and height >= camera.height and _same_aspect((width, height), lens)
+    if not (same or (larger and undistortion is None)):
+        raise InputError(path, f"HDR truth is {width} x {height}, the photo {lens.width} x {lens.height}",
+                         "render the truth at the photo's size, or remove it")  # fmt: skip
+    return _warped(read_hdr(path), working, undistortion, camera)
 
 
 def _fitted_lens(shot: Shot) -> tuple[Lens, bool]:

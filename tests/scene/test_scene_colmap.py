@@ -62,6 +62,21 @@ def test_distortion_is_undone_where_pycolmap_projects(tmp_path, model, params):
     np.testing.assert_allclose(view.image[rows, columns, :2] * 255 + 0.5, lens.img_from_cam(rays), atol=0.02)
 
 
+def test_distorted_photos_scaled_down_show_the_same_places(tmp_path):
+    """As above at an eighth of the size, where the photo is averaged before it is bent: within a quarter pixel."""
+    params = (500.0, 320.0, 240.0, -0.15)
+    write_colmap(tmp_path, model="SIMPLE_RADIAL", params=params, size=(640, 480))
+    places = np.stack(np.meshgrid(np.arange(640), np.arange(480)) + [np.zeros((480, 640))], axis=2)
+    for i in range(6):
+        Image.fromarray((places * 255 / 640 + 0.5).astype(np.uint8)).save(tmp_path / "images" / f"{i:03d}.png")
+    view = load_scene(tmp_path, max_size=80, decode=lambda v: v, encode=lambda v: v).views[0]
+    camera, lens = view.camera, pycolmap.Camera(model="SIMPLE_RADIAL", width=640, height=480, params=list(params))
+    assert camera.width == 80
+    rows, columns = np.mgrid[2 : camera.height - 2 : 3, 2:78:3].reshape(2, -1)
+    rays = np.stack([(columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy, 0 * rows + 1.0], 1)
+    np.testing.assert_allclose(view.image[rows, columns, :2] * 640 + 0.5, lens.img_from_cam(rays), atol=2)
+
+
 def test_stored_pixels_or_turned_ones_as_the_camera_size_says(tmp_path):
     for name, size in (("stored", (64, 48)), ("turned", (48, 64))):
         write_colmap(tmp_path / name, size=size)

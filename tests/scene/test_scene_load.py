@@ -160,6 +160,23 @@ def test_bare_photos_are_placed_undistorted_and_cached(tmp_path, shared):
     assert not [entry for entry in (tmp_path / "cache").iterdir() if entry.name.startswith("sehdr-sfm-")]
 
 
+def test_turned_photos_are_placed_upright(tmp_path, shared):
+    """Photos stored on their side with an EXIF orientation give the scene of the upright ones."""
+    for photo in sorted((shared / "data" / "castle").glob("*.JPG"))[4:8]:
+        with Image.open(photo) as image:
+            upright = image.reduce(4)
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        for folder, picture, tags in (("up", upright, Image.Exif()), ("side", upright.rotate(90, expand=True), exif)):
+            (tmp_path / folder).mkdir(exist_ok=True)
+            picture.save(tmp_path / folder / f"{photo.stem}.png", exif=tags)
+    up, side = (load_scene(tmp_path / folder, max_size=100) for folder in ("up", "side"))
+    assert len(up.views) == len(side.views) == 4
+    for a, b in zip(up.views, side.views, strict=True):
+        assert a.image.shape == b.image.shape
+        assert np.abs(a.image - b.image).mean() < 0.01
+
+
 def test_photos_of_several_cameras_get_their_own_lenses(tmp_path, shared):
     photos = sorted((shared / "data" / "castle").glob("*.JPG"))[4:8]
     for i, photo in enumerate(photos):
