@@ -51,7 +51,7 @@ def color_space_names() -> list[str]:
 
 
 def color_space(name: str) -> ColorSpace:
-    """The space of a name or alias (`ap0`, `ap1`, `bt709`, `bt2020`, ...), upper or lower case; SehdrError if unknown."""
+    """The space of a name or alias (`ap0`, `ap1`, `bt709`, `bt2020`, ...), in any case; SehdrError if unknown."""
     key = name.strip().lower()
     key = _ALIASES.get(key, key)
     if key not in _SPACES:

@@ -177,7 +177,8 @@ def _check(path: Path, part: Part) -> None:
             where = f"part {part.name}, channel {name}" if part.name else f"channel {name}"
             raise InputError(
                 path,
-                f"{where}: {int(bad.sum())} values are not finite, the first {array[row, column]} at x={column}, y={row}",
+                f"{where}: {int(bad.sum())} values are not finite, the first {array[row, column]}"
+                f" at x={column}, y={row}",
                 "such pictures are not written; train again from an earlier checkpoint or with another seed",
             )
         if _largest(array) > float(np.finfo(np.float32).max):

@@ -165,7 +165,7 @@ def _provenance(run: RenderableRun) -> dict[str, str]:
     """Text for the EXR attributes `sehdr:<key>`: what the picture was made from, as far as the run knows."""
     known = {
         "scene": getattr(run, "scene_name", None),
-        "iteration": getattr(run, "iteration", None),
+        "iterations": getattr(run, "iterations", None),
         "response": getattr(run.response, "name", None),
     }
     return {key: str(value) for key, value in known.items() if value is not None} | {"units": "relative radiance"}

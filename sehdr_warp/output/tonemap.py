@@ -32,7 +32,7 @@ class ToneMap:
     white: float
 
     def __call__(self, radiance: np.ndarray) -> np.ndarray:
-        """[..., 3] linear Rec.709 radiance to [..., 3] sRGB-encoded float32 in [0, 1]. Negative radiance counts as 0."""
+        """[..., 3] linear Rec.709 radiance to sRGB-encoded float32 in [0, 1]; negative radiance counts as 0."""
         scaled = np.maximum(np.asarray(radiance, np.float32), 0) * np.float32(self.scale)
         luminance = scaled @ _LUMINANCE.astype(np.float32)
         shown = self._curve(luminance)[..., None]

@@ -58,7 +58,7 @@ class AnalyticRun:
     response = GammaResponse()
     exposure_time = 0.5
     scene_name = "sky"
-    iteration = 7
+    iterations = 7
 
     def __init__(self, names=(("r_0", "train"), ("r_1", "train"), ("r_2", "train"), ("t_0", "test"), ("t_1", "test"))):
         self.cameras = [

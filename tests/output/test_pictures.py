@@ -60,7 +60,8 @@ def test_tone_map_does_not_depend_on_the_unit_of_radiance():
 def test_tone_map_uses_the_display():
     image = radiance(64, 64)
     shown = fit_tone_map([image])(image)
-    assert shown.min() >= 0 and 0.999 < shown.max() <= 1 and 0.3 < np.median(shown) < 0.7
+    assert shown.min() >= 0 and 0.999 < shown.max() <= 1
+    assert 0.25 < shown.mean() < 0.6
     # Greys keep their order and stay grey; highlights run into white.
     grey = np.repeat(np.geomspace(1e-3, 1e2, 100)[:, None], 3, axis=1).astype(np.float32)
     tones = ToneMap(0.2, 4.0)(grey)

@@ -1,0 +1,109 @@
+"""A trained scene as PLY: scene-linear for HDR tools, or baked to display colours for the viewers of 3DGS."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from sehdr_warp.errors import SehdrError
+
+from .bake import bake
+from .files import check_absent
+from .gaussian_file import GaussianArrays, write_gaussians
+
+KINDS = ("hdr", "ldr")
+
+_HARMONIC_0 = 0.5 / np.sqrt(np.pi)
+# Radiance below this is written as this: its logarithm must be finite.
+_DARKEST = 1e-12
+
+Colors = Callable[[np.ndarray], np.ndarray]
+
+
+def write_ply(
+    path: Path | str, run, *, kind: str = "hdr", exposure_time: float | None = None, overwrite: bool = False
+) -> Path:
+    """Writes the Gaussians of a trained run; returns the path.
+
+    kind: "hdr": scene-linear radiance, see hdr_gaussians; "ldr": display colours, see ldr_gaussians.
+    exposure_time: of "ldr", seconds; by default the one the scene was photographed at.
+
+    Raises SehdrError for another kind or an exposure time that is not positive, InputError where the file exists
+    (unless overwrite) or a value is not finite.
+    """
+    if kind not in KINDS:
+        raise SehdrError(f"PLY kind {kind!r} is not one of {', '.join(KINDS)}")
+    if exposure_time is not None and kind == "hdr":
+        raise SehdrError("an HDR PLY has no exposure time; leave it out, or write kind ldr")
+    check_absent(path, overwrite)  # Before minutes of fitting.
+    write_gaussians(
+        path, hdr_gaussians(run) if kind == "hdr" else ldr_gaussians(run, exposure_time), overwrite=overwrite
+    )
+    return Path(path)
+
+
+def hdr_gaussians(run) -> GaussianArrays:
+    """The scene-linear Gaussians of a run.
+
+    Exact for models whose harmonics are exposures or their logarithms. With fused brackets, or harmonics of encoded
+    values, harmonics are fitted to the logarithm of the radiance (output/bake.py).
+    """
+    stored, to_radiance = _stored(run)
+    if to_radiance is not None:
+        seen_from = _train_positions(run)
+        return bake(stored, lambda c: np.log(np.maximum(to_radiance(c), _DARKEST)), "log", camera_positions=seen_from)
+    harmonics = stored.harmonics.astype(np.float64)
+    if stored.color_model == "linear":
+        return stored.with_colors(harmonics / run.exposure_time, "linear")
+    harmonics[:, 0] -= np.log(run.exposure_time) / _HARMONIC_0
+    return stored.with_colors(harmonics, "log")
+
+
+def ldr_gaussians(run, exposure_time: float | None = None) -> GaussianArrays:
+    """Display colours of a run at an exposure time in seconds: what its response makes of each Gaussian's radiance.
+
+    The encoded values are shown as sRGB, as the photos were. Viewers blend these, not radiance, so half-covered edges
+    of very bright things come out darker than in a rendered photo. Degree and geometry are kept.
+    """
+    time = run.exposure_time if exposure_time is None else float(exposure_time)
+    if not (np.isfinite(time) and time > 0):
+        raise SehdrError(f"exposure time {time:g} is not a positive number of seconds")
+    stored, to_radiance = _stored(run)
+    if stored.color_model == "display" and time == run.exposure_time:
+        return stored
+    radiance = to_radiance or (lambda exposure: exposure / run.exposure_time)
+    return bake(
+        stored, lambda c: run.response.encode(radiance(c) * time), "display", camera_positions=_train_positions(run)
+    )
+
+
+def _stored(run) -> tuple[GaussianArrays, Colors | None]:
+    """The run's Gaussians in the colours of its model (exposures at the base time, or encoded values), and how these
+    become radiance; None where radiance is the exposure over the base time."""
+    tensors = {name: value.cpu().numpy() for name, value in run.model.gaussians.tensors().items()}
+    gaussians = GaussianArrays(
+        tensors["means"],
+        tensors["log_scales"],
+        tensors["quaternions"],
+        tensors["opacity_logits"],
+        np.concatenate([tensors["harmonics_dc"], tensors["harmonics_rest"]], axis=1),
+        run.model.radiance,
+        run.exposure_time,
+    )
+    if run.model.radiance == "display":
+        return gaussians, lambda encoded: run.response.decode(np.clip(encoded, 0, 1)) / run.exposure_time
+    return gaussians, None if run.model.fusion is None else lambda exposure: _fuse(run, exposure)
+
+
+def _fuse(run, exposure: np.ndarray) -> np.ndarray:
+    """[N, D, 3] radiance of the fused brackets from [N, D, 3] exposures at the base time."""
+    import torch
+
+    logs = torch.from_numpy(np.log(np.maximum(exposure, _DARKEST)).reshape(-1, 3).astype(np.float32))
+    with torch.no_grad():
+        fused = run.model.fusion(logs.to(run.model.gaussians.means.device))
+    return fused.cpu().numpy().reshape(exposure.shape).astype(np.float64)
+
+
+def _train_positions(run) -> np.ndarray:
+    return np.array([entry.camera.position for entry in run.cameras if entry.split == "train"])

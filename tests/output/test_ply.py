@@ -1,0 +1,246 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.output import bake as bake_module
+from sehdr_warp.output.bake import bake, evaluate_colors, harmonic_basis, sphere_directions
+from sehdr_warp.output.gaussian_file import GaussianArrays, read_gaussians, write_gaussians
+from sehdr_warp.output.ply import hdr_gaussians, ldr_gaussians, write_ply
+
+from .helpers import Entry, GammaResponse, camera
+
+
+def gaussians(count=50, degree=3, color_model="log", seed=0):
+    random = np.random.default_rng(seed)
+    harmonics = 0.3 * random.normal(size=(count, (degree + 1) ** 2, 3))
+    harmonics[:, 0] -= 2
+    shapes = ((count, 3), (count, 3), (count, 4), (count,))
+    return GaussianArrays(
+        *(random.normal(size=shape).astype(np.float32) for shape in shapes),
+        harmonics.astype(np.float32),
+        color_model,
+        0.5,
+    )
+
+
+ARRAYS = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics")
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("color_model", ["log", "linear", "display"])
+def test_round_trip_is_exact(tmp_path, degree, color_model):
+    written = gaussians(degree=degree, color_model=color_model)
+    write_gaussians(tmp_path / "a.ply", written)
+    read = read_gaussians(tmp_path / "a.ply")
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(read, name), getattr(written, name))
+    assert (read.color_model, read.base_exposure_time, read.degree) == (color_model, 0.5, degree)
+
+
+def test_names_and_order_are_those_of_the_reference_release(tmp_path):
+    written = gaussians()
+    write_gaussians(tmp_path / "a.ply", written)
+    vertex = PlyData.read(tmp_path / "a.ply")["vertex"]
+    names = ["x", "y", "z", "nx", "ny", "nz"] + [f"f_dc_{i}" for i in range(3)] + [f"f_rest_{i}" for i in range(45)]
+    names += ["opacity"] + [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
+    assert [p.name for p in vertex.properties] == names
+    # All of red's higher coefficients, then green's, then blue's.
+    np.testing.assert_array_equal(vertex["f_rest_16"], written.harmonics[:, 2, 1])
+    np.testing.assert_array_equal(vertex["rot_0"], written.quaternions[:, 0])
+
+
+def test_ascii_and_unmarked_files_are_read_as_display(tmp_path):
+    write_gaussians(tmp_path / "a.ply", gaussians(5, 1))
+    ply = PlyData.read(tmp_path / "a.ply")
+    ply.text, ply.comments = True, []
+    ply.write(tmp_path / "b.ply")
+    read = read_gaussians(tmp_path / "b.ply")
+    assert read.color_model == "display" and read.base_exposure_time is None
+    np.testing.assert_allclose(read.means, gaussians(5, 1).means, rtol=1e-6)
+
+
+def test_nothing_is_replaced_and_nan_is_refused(tmp_path):
+    write_gaussians(tmp_path / "a.ply", gaussians())
+    with pytest.raises(InputError, match="exists already"):
+        write_gaussians(tmp_path / "a.ply", gaussians())
+    broken = gaussians()
+    broken.harmonics[7, 3, 1] = np.nan
+    with pytest.raises(InputError, match="f_rest_17 of 1 Gaussians is not finite, the first nan at 7"):
+        write_gaussians(tmp_path / "b.ply", broken)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+
+def header(count, properties, form="binary_little_endian"):
+    lines = [
+        "ply",
+        f"format {form} 1.0",
+        f"element vertex {count}",
+        *(f"property {p}" for p in properties),
+        "end_header",
+        "",
+    ]
+    return "\n".join(lines).encode()
+
+
+FLOATS = [f"float {name}" for name in ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity")]
+
+
+@pytest.mark.parametrize(
+    "data, message",
+    [
+        (b"", "is not a PLY file"),
+        (b"ply\nformat binary_little_endian 1.0\n" + b"x" * 100, "header does not end"),
+        (b"\x89PNG\r\n", "is not a PLY file"),
+        (header(10**15, FLOATS), "states 10+ Gaussians, more than"),
+        (header(40_000_000, FLOATS) + b"\0" * 100, "but the file has only"),
+        (header(-1, FLOATS), "malformed element line"),
+        (header(4, FLOATS) + b"\0" * 30, "cannot be read as PLY"),
+        (header(1, FLOATS) + b"\0" * 28, "lacks the property rot_0"),
+        (header(0, FLOATS), "holds no Gaussians"),
+        (header(1, ["list uchar float x"]) + b"\0", "vertices hold lists"),
+        (header(1, FLOATS, "text") + b"1 2 3", "cannot be read as PLY"),
+        (header(1, FLOATS, "ascii") + b"1 2 x y z 1 2\n", "cannot be read as PLY"),
+        (b"ply\nformat ascii 1.0\nelement face 1\nproperty float x\nend_header\n1\n", "cannot be read as PLY"),
+    ],
+)
+def test_hostile_files_are_one_line(tmp_path, data, message):
+    (tmp_path / "bad.ply").write_bytes(data)
+    with pytest.raises(InputError, match=f"bad.ply: .*{message}") as caught:
+        read_gaussians(tmp_path / "bad.ply")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="no such file"):
+        read_gaussians(tmp_path / "absent.ply")
+
+
+@pytest.mark.parametrize(
+    "field, value, message",
+    [
+        ("means", np.nan, "x of Gaussian 3 is nan"),
+        ("quaternions", 0.0, "rotation of Gaussian 3 is zero"),
+        ("opacity_logits", np.inf, "opacity of Gaussian 3 is inf"),
+    ],
+)
+def test_unusable_values_name_their_place(tmp_path, field, value, message):
+    write_gaussians(tmp_path / "a.ply", gaussians())
+    ply = PlyData.read(tmp_path / "a.ply")
+    names = {"means": ["x"], "quaternions": [f"rot_{i}" for i in range(4)], "opacity_logits": ["opacity"]}[field]
+    for name in names:
+        ply["vertex"][name][3] = value
+    ply.write(tmp_path / "b.ply")
+    with pytest.raises(InputError, match=message):
+        read_gaussians(tmp_path / "b.ply")
+
+
+def test_basis_is_that_of_the_renderer():
+    torch = pytest.importorskip("torch")
+    from sehdr_warp.splatting import spherical_harmonics
+
+    directions = sphere_directions(40)
+    coefficients = gaussians(40).harmonics
+    rendered = spherical_harmonics(
+        3, torch.from_numpy(coefficients), torch.from_numpy(directions).float(), torch.zeros(3)
+    )
+    np.testing.assert_allclose(
+        np.einsum("nk,nkc->nc", harmonic_basis(directions, 3), coefficients), rendered, atol=2e-5
+    )
+
+
+def test_basis_is_orthonormal():
+    directions = sphere_directions(20000)
+    basis = harmonic_basis(directions, 3)
+    np.testing.assert_allclose(basis.T @ basis * 4 * np.pi / len(basis), np.eye(16), atol=1e-3)
+
+
+def test_bake_gives_back_what_harmonics_can_hold(monkeypatch):
+    monkeypatch.setattr(bake_module, "_CHUNK", 16)
+    start = gaussians(color_model="linear")
+    start.harmonics[:, 0] += 20  # Positive in all directions: nothing is cut off.
+    baked = bake(start, lambda radiance: 2 * radiance + 0.5, "display", camera_positions=np.ones((3, 3)))
+    np.testing.assert_allclose(baked.harmonics, 2 * start.harmonics, atol=1e-4)
+
+
+def test_bake_follows_the_cameras_where_harmonics_cannot_hold_all():
+    start = gaussians(200, color_model="log")
+    positions = np.array([[x, y, -8.0] for x in (-1, 0, 1) for y in (-1, 0, 1)])
+    encode = GammaResponse().encode
+    wanted = lambda radiance: encode(radiance * 4)  # noqa: E731
+    seen = start.means[:, None] - positions
+    seen /= np.linalg.norm(seen, axis=2, keepdims=True)
+    target = wanted(evaluate_colors(start, seen))
+    errors = {}
+    for name, given in (("cameras", positions), ("sphere", None)):
+        baked = bake(start, wanted, "display", camera_positions=given)
+        assert baked.degree == 3 and baked.color_model == "display"
+        errors[name] = np.abs(evaluate_colors(baked, seen) - target).mean()
+    assert errors["cameras"] < 0.01
+    assert errors["cameras"] < 0.5 * errors["sphere"]
+
+
+class StoredRun:
+    """A run as write_ply sees it, with tensors."""
+
+    response = GammaResponse()
+    exposure_time = 0.25
+
+    def __init__(self, radiance="log", fusion=None):
+        torch = pytest.importorskip("torch")
+        self.arrays = gaussians(color_model=radiance)
+        tensors = {name: torch.from_numpy(getattr(self.arrays, name)) for name in ARRAYS[:4]}
+        harmonics = torch.from_numpy(self.arrays.harmonics)
+        tensors |= {"harmonics_dc": harmonics[:, :1], "harmonics_rest": harmonics[:, 1:]}
+        stored = SimpleNamespace(tensors=lambda: tensors, means=tensors["means"])
+        self.model = SimpleNamespace(gaussians=stored, radiance=radiance, fusion=fusion)
+        self.cameras = [Entry(str(i), "train", camera(position=(i, 0, -6))) for i in range(3)]
+
+    def exposures(self, directions):
+        return evaluate_colors(self.arrays, directions)
+
+
+@pytest.mark.parametrize("radiance", ["log", "linear"])
+def test_hdr_ply_is_the_radiance_exactly(tmp_path, radiance):
+    run = StoredRun(radiance)
+    assert write_ply(tmp_path / "hdr.ply", run) == tmp_path / "hdr.ply"
+    read = read_gaussians(tmp_path / "hdr.ply")
+    assert read.color_model == radiance and read.base_exposure_time == 0.25
+    directions = sphere_directions(20)
+    np.testing.assert_allclose(
+        evaluate_colors(read, directions), run.exposures(directions) / 0.25, rtol=1e-5, atol=1e-7
+    )
+
+
+def test_hdr_ply_of_fused_brackets_is_fitted_in_log_radiance():
+    run = StoredRun(fusion=lambda logs: (0.8 * logs).exp() * 3)
+    directions = sphere_directions(20)
+    expected = 3 * run.exposures(directions) ** 0.8
+    np.testing.assert_allclose(evaluate_colors(hdr_gaussians(run), directions), expected, rtol=1e-4)
+
+
+def test_ldr_ply_shows_the_photo(tmp_path):
+    run = StoredRun()
+    write_ply(tmp_path / "ldr.ply", run, kind="ldr", exposure_time=1.0)
+    read = read_gaussians(tmp_path / "ldr.ply")
+    assert read.color_model == "display" and read.degree == 3
+    seen = run.arrays.means[:, None] - np.array([[1.0, 0, -6]])
+    seen /= np.linalg.norm(seen, axis=2, keepdims=True)
+    expected = GammaResponse().encode(run.exposures(seen) * 4)
+    assert np.abs(evaluate_colors(read, seen) - expected).mean() < 0.01
+
+
+def test_display_model_is_kept_as_it_is_at_its_own_exposure():
+    run = StoredRun("display")
+    np.testing.assert_array_equal(ldr_gaussians(run).harmonics, run.arrays.harmonics)
+    assert hdr_gaussians(run).color_model == "log"
+
+
+def test_unusable_requests(tmp_path):
+    run = StoredRun()
+    with pytest.raises(SehdrError, match="'sdr' is not one of hdr, ldr"):
+        write_ply(tmp_path / "a.ply", run, kind="sdr")
+    with pytest.raises(SehdrError, match="exposure time 0 is not"):
+        write_ply(tmp_path / "a.ply", run, kind="ldr", exposure_time=0)
+    with pytest.raises(SehdrError, match="has no exposure time"):
+        write_ply(tmp_path / "a.ply", run, exposure_time=1)
+    assert list(tmp_path.iterdir()) == []
