@@ -1,14 +1,15 @@
 """Exposure times: from the set's own files, from EXIF, and the choice of one exposure where a view has several."""
 
+import json
 import math
+import struct
 from dataclasses import replace
 from pathlib import Path
-
-from PIL import Image
 
 from sehdr_warp.errors import InputError
 
 from .capture import Shot
+from .images import open_image
 from .paths import read_bytes
 
 _EXIF_IFD = 0x8769
@@ -94,8 +95,6 @@ def parse_seconds(value, source: Path, field: str) -> float:
 
 def _listed_times(shots: list[Shot], source: Path) -> dict[str, float]:
     """exposures.json: {"file name": seconds} or a list of {"file": ..., "exposure_time": seconds}."""
-    import json
-
     for folder in dict.fromkeys((shots[0].image.parent, source)):
         path = folder / "exposures.json"
         if path.is_file():
@@ -131,14 +130,14 @@ def _exif_times(shots: list[Shot]) -> tuple[list[float | None], list[str]]:
 def exif_exposure(path: Path) -> tuple[float | None, float | None, float | None]:
     """Exposure time in seconds, ISO speed and f-number as EXIF states them, None where it does not.
 
-    Raises InputError for an exposure time of zero or one that is not a number.
+    Raises InputError for an exposure time of zero or one that is not a number, and where the file is no image.
     """
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             table = image.getexif().get_ifd(_EXIF_IFD)
             time, apex = _number(table.get(_EXPOSURE_TIME)), _number(table.get(_SHUTTER_APEX))
             speed, aperture = _number(table.get(_SPEED)), _number(table.get(_F_NUMBER))
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError):
+    except (OSError, SyntaxError, ValueError, KeyError, TypeError, EOFError, struct.error):
         return None, None, None
     if time is None and apex is not None and math.isfinite(apex) and abs(apex) < 64:
         time = 2.0**-apex

@@ -1,5 +1,6 @@
 """Pixels from files: PNG (8 and 16 bits), JPEG, TIFF, WebP, OpenEXR and Radiance, with sizes known before decoding."""
 
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,8 +52,8 @@ def image_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
         size = radiance_size(path)
         _check_size(path, *size)
         return size, size
-    with _open(path) as image:
-        turned = image.getexif().get(_ORIENTATION_TAG, 1) in (5, 6, 7, 8)
+    with open_image(path) as image:
+        turned = _orientation(image) in (5, 6, 7, 8)
         return image.size, image.size[::-1] if turned else image.size
 
 
@@ -62,7 +63,7 @@ def read_ldr(path: Path, *, oriented: bool = False) -> EncodedImage:
     oriented: turn the pixels as the EXIF orientation says.
     Raises InputError where the file is missing, damaged, truncated, of another kind, or larger than MAX_PIXELS.
     """
-    with _open(path) as image:
+    with open_image(path) as image:
         try:
             pixels, alpha = _decode(image, path)
             turn = _turn(image) if oriented else None
@@ -179,7 +180,8 @@ def _check_size(path: Path, width: int, height: int, max_pixels: int = MAX_PIXEL
         )
 
 
-def _open(path: Path) -> Image.Image:
+def open_image(path: Path) -> Image.Image:
+    """The image with its header read and its pixels not; InputError as image_sizes raises it."""
     _require_file(path)
     # Pillow's own limit is global and lower for its warning; ours is checked below, before any pixel is decoded.
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
@@ -256,4 +258,12 @@ def _turn(image: Image.Image):
         7: lambda a: a.swapaxes(0, 1)[::-1, ::-1],
         8: lambda a: a.swapaxes(0, 1)[::-1],
     }
-    return turns.get(image.getexif().get(_ORIENTATION_TAG, 1))
+    return turns.get(_orientation(image))
+
+
+def _orientation(image: Image.Image) -> int:
+    """EXIF's orientation, 1 (as stored) where there is none or EXIF is damaged: the pixels may still be good."""
+    try:
+        return image.getexif().get(_ORIENTATION_TAG, 1)
+    except (OSError, SyntaxError, ValueError, KeyError, TypeError, EOFError, struct.error):
+        return 1

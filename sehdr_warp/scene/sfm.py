@@ -9,6 +9,7 @@ import hashlib
 import json
 import math
 import os
+import struct
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,7 +20,7 @@ from PIL import Image
 from sehdr_warp.errors import InputError, SehdrError
 
 from .colmap_model import SparseModel, read_model
-from .images import read_ldr
+from .images import open_image, read_ldr
 from .types import View
 
 Progress = Callable[[str], None]
@@ -183,21 +184,27 @@ def _same_camera(photos, sizes) -> list[list[int]]:
     """Indices of photos that one set of intrinsics describes: same size, device and focal length by EXIF."""
     groups: dict[tuple, list[int]] = {}
     for i, photo in enumerate(photos):
-        with Image.open(photo) as image:
-            exif = image.getexif()
-            lens = exif.get_ifd(0x8769)
-        device = (str(exif.get(0x010F)), str(exif.get(0x0110)), str(lens.get(0x920A)), str(lens.get(0xA405)))
-        groups.setdefault((tuple(sizes[i]), device), []).append(i)
+        groups.setdefault((tuple(sizes[i]), *map(str, _device(photo))), []).append(i)
     return list(groups.values())
 
 
 def _focal_prior(photo: Path, size: tuple[int, int]) -> float:
     """Pixels: from EXIF's 35 mm equivalent (whose diagonal is 43.27 mm), or COLMAP's guess of 1.2 longest sides."""
-    with Image.open(photo) as image:
-        equivalent = image.getexif().get_ifd(0x8769).get(0xA405)
+    equivalent = _device(photo)[-1]
     if isinstance(equivalent, int | float) and 4 <= equivalent <= 2000:
         return float(equivalent) / 43.27 * math.hypot(*size)
     return 1.2 * max(size)
+
+
+def _device(photo: Path) -> tuple:
+    """EXIF's maker, model, focal length and its 35 mm equivalent; None where EXIF does not say or is damaged."""
+    with open_image(photo) as image:
+        try:
+            exif = image.getexif()
+            lens = exif.get_ifd(0x8769)
+        except (OSError, SyntaxError, ValueError, KeyError, TypeError, EOFError, struct.error):
+            return None, None, None, None
+    return exif.get(0x010F), exif.get(0x0110), lens.get(0x920A), lens.get(0xA405)
 
 
 def _extract(database: Path, images: Path, names: list[str], model: str, params, progress: Progress) -> None:

@@ -66,7 +66,7 @@ def test_distorted_photos_scaled_down_show_the_same_places(tmp_path):
     """As above at an eighth of the size, where the photo is averaged before it is bent: within a quarter pixel."""
     params = (500.0, 320.0, 240.0, -0.15)
     write_colmap(tmp_path, model="SIMPLE_RADIAL", params=params, size=(640, 480))
-    places = np.stack(np.meshgrid(np.arange(640), np.arange(480)) + [np.zeros((480, 640))], axis=2)
+    places = np.stack([*np.meshgrid(np.arange(640), np.arange(480)), np.zeros((480, 640))], axis=2)
     for i in range(6):
         Image.fromarray((places * 255 / 640 + 0.5).astype(np.uint8)).save(tmp_path / "images" / f"{i:03d}.png")
     view = load_scene(tmp_path, max_size=80, decode=lambda v: v, encode=lambda v: v).views[0]

@@ -164,7 +164,7 @@ def test_turned_photos_are_placed_upright(tmp_path, shared):
     """Photos stored on their side with an EXIF orientation give the scene of the upright ones."""
     for photo in sorted((shared / "data" / "castle").glob("*.JPG"))[4:8]:
         with Image.open(photo) as image:
-            upright = image.reduce(4)
+            upright = image.reduce(6)
         exif = Image.Exif()
         exif[0x0112] = 6
         for folder, picture, tags in (("up", upright, Image.Exif()), ("side", upright.rotate(90, expand=True), exif)):
