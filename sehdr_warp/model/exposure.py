@@ -27,8 +27,8 @@ def exposure_times(base_time: float, spec: str | Sequence[str | float] = PAPER_B
     """The exposure times in seconds of a bracket, ascending, from a description.
 
     base_time: dt_1 of the photos, seconds, positive.
-    spec: items, or one string of them separated by commas. A number or fraction is a multiple of base_time (`1/8`, `16`);
-        with `ev` it is in stops from it (`-2ev`); with `s` it is a time (`1/125s`); `base` is base_time itself.
+    spec: items, or one string of them separated by commas. A number or fraction is a multiple of base_time (`1/8`,
+        `16`); with `ev` it is in stops from it (`-2ev`); with `s` it is a time (`1/125s`); `base` is base_time itself.
 
     Raises SehdrError, with the item, for one that is not a number, not positive or not finite, and for a time that
     occurs twice (its weight would count double).
@@ -55,7 +55,9 @@ def _bracket_time(base_time: float, item: str | float) -> float:
     except (ValueError, ZeroDivisionError, OverflowError):
         time = math.nan
     if not (math.isfinite(time) and time > 0):
-        raise SehdrError(f"exposures: {item!r} is not a positive time; write a multiple (1/8), stops (-3ev), seconds (1/125s) or base")
+        raise SehdrError(
+            f"exposures: {item!r} is no time above 0; write a multiple (1/8), stops (-3ev), seconds (1/125s) or base"
+        )
     return time
 
 

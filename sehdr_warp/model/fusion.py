@@ -1,4 +1,4 @@
-"""From base radiance to HDR radiance: neural exposure fusion (SeHDR, section 3.3), and the scaling it stands for.
+"""From base radiance to HDR radiance: neural exposure fusion (SeHDR, section 3.3).
 
 Every bracket is the base scaled by a known ratio, so for a fixed response and fixed exposures the fused value is a
 function of one number: the log radiance of the base, for each channel by itself. NeuralExposureFusion can therefore
@@ -17,31 +17,13 @@ from ..errors import SehdrError
 from .exposure import bracket_log_radiance, exposure_times
 from .response_curve import Response
 
-# The table spans these octaves of exposure below and above white at every bracket: 2^-24 of white is 8 stops below
-# an 8-bit code of a gamma curve; 6 stops above it only the extension of the response is left, a line in log radiance.
-OCTAVES_BELOW_WHITE, OCTAVES_ABOVE_WHITE = 24.0, 6.0
+# The table spans, for every bracket, exposures from where the encoded value is this far above black (a four-hundredth
+# of an 8-bit code) to this many octaves above white, where only the response's extension is left: a line in the log.
+DARKEST_VALUE, OCTAVES_ABOVE_WHITE = 1e-5, 6.0
 # Gaussians evaluated together by the exact form: bounds its memory to some 100 MB at width 128 and 5 brackets.
 EXACT_CHUNK = 16384
 # Limits inside which exp(-z^2 / 2) and its gradient are finite in float32, for any sigma.
 MAX_LOG_SIGMA, MAX_DEVIATION = 30.0, 30.0
-
-
-class ExposureScaling(nn.Module):
-    """c^h = c^{l_1} / dt_1: what the paper defines as the HDR radiance, with nothing to learn.
-
-    Any weighted mean of the linear brackets, each divided by its own time, is this too: sum_p w_p c^{l_p} / dt_p
-    = sum_p w_p c^{l_1} / dt_1 = c^{l_1} / dt_1, since the weights add up to 1.
-
-    base_time: dt_1 in seconds.
-    """
-
-    def __init__(self, base_time: float):
-        super().__init__()
-        (self.base_time,) = exposure_times(base_time, ("base",))
-
-    def forward(self, log_base: torch.Tensor) -> torch.Tensor:
-        """[N, 3] scene-linear radiance from [N, 3] log c^{l_1}."""
-        return (log_base - math.log(self.base_time)).exp()
 
 
 class NeuralExposureFusion(nn.Module):
@@ -94,9 +76,8 @@ class NeuralExposureFusion(nn.Module):
         self.log_sigma = nn.Parameter(torch.full((3,), math.log(sigma)))
         self.weights, self.biases = _channel_layers([2, *[width] * hidden_layers, 1], seed)
         brackets = [math.log(time / self.base_time) for time in self.times]
-        white = math.log(response.white)
-        self._low = white - OCTAVES_BELOW_WHITE * math.log(2) - max(brackets)
-        self._high = white + OCTAVES_ABOVE_WHITE * math.log(2) - min(brackets)
+        self._low = math.log(response.decode(response.black + DARKEST_VALUE)) - max(brackets)
+        self._high = math.log(response.white) + OCTAVES_ABOVE_WHITE * math.log(2) - min(brackets)
 
     def forward(self, log_base: torch.Tensor) -> torch.Tensor:
         """[N, 3] scene-linear radiance c^h from [N, 3] log c^{l_1}, the log of the radiance at the input exposure."""
@@ -144,20 +125,6 @@ class NeuralExposureFusion(nn.Module):
         square = 3.0 * rise - 2.0 * slope_left - slope_right
         value = left + inside * (slope_left + inside * (square + inside * cubic))
         return value + (part - inside) * slope_right
-
-
-def build_fusion(kind: str, response: Response, times: Sequence[float], base_time: float, **options) -> nn.Module:
-    """The module from [N, 3] log c^{l_1} to [N, 3] scene-linear c^h: "neural" or "scaling".
-
-    options: those of NeuralExposureFusion; "scaling" has none and ignores times and response.
-    """
-    if kind == "neural":
-        return NeuralExposureFusion(response, times, base_time, **options)
-    if kind == "scaling":
-        if options:
-            raise SehdrError(f"fusion: kind 'scaling' has no {', '.join(options)}; leave out, or take 'neural'")
-        return ExposureScaling(base_time)
-    raise SehdrError(f"fusion: kind = {kind!r} is neither 'neural' nor 'scaling'")
 
 
 def _radiance_scale(scale: float | str, response: Response, base_time: float) -> float:

@@ -52,6 +52,7 @@ class PowerLaw(AnalyticResponse):
         power = ((value + self._offset) / (1.0 + self._offset)).pow(self._exponent)
         return torch.where(value < self._toe_slope * self._toe_end, value / self._toe_slope, power)
 
+
 class Reinhard:
     """y = x / (1 + x), which approaches 1 and never reaches it (Reinhard et al. 2002)."""
 
@@ -106,6 +107,7 @@ class ToneMapped(AnalyticResponse):
 
     def _invert(self, value):
         return self._tone.invert(self._display._invert(value))
+
 
 def _gamma(name: str, exponent: float) -> PowerLaw:
     toe_end = HALF_CODE**exponent

@@ -29,7 +29,7 @@ def response_from_file(path: Path, selector: str | None = None) -> Response:
     if text is None or _is_dorf(text):
         return _select(path, responses_in_file(path), selector)
     if selector is not None:
-        raise InputError(path, f"holds one curve, and {selector!r} asks for one of several", "leave out the colon and what follows")
+        raise InputError(path, f"holds one curve, and {selector!r} asks for one of several", "leave out the selector")
     return _json_curve(path, text) if path.suffix.lower() == ".json" else _text_curve(path, text)
 
 
@@ -67,7 +67,7 @@ def colour_response(encoding: str) -> Response:
     bright = np.exp2(np.linspace(-10, 20, 30 * 32 + 1))
     reached = np.flatnonzero(encode(bright) >= 1.0)
     if not len(reached) or reached[0] == 0:
-        raise SehdrError(f"response 'colour:{encoding}': the encoding does not pass 1 between 2^-10 and 2^20; take another")
+        raise SehdrError(f"response 'colour:{encoding}': the encoding does not pass 1 below 2^20; take another")
     low, high = bright[reached[0] - 1], bright[reached[0]]
     for _ in range(60):
         middle = 0.5 * (low + high)
@@ -83,10 +83,18 @@ def _key(name: str) -> str:
     return "".join(letter for letter in name.lower() if letter.isalnum())
 
 
-def _read_text(path: Path) -> str:
+def _check_size(path: Path):
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(path, f"{path.stat().st_size} bytes are too many for a response", f"give a file under {MAX_BYTES} bytes")
+        size = path.stat().st_size
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", "give the path of a response file") from error
+    if size > MAX_BYTES:
+        raise InputError(path, f"{size} bytes are too many for a response", f"give a file under {MAX_BYTES} bytes")
+
+
+def _read_text(path: Path) -> str:
+    _check_size(path)
+    try:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})", "give the path of a response file") from error
@@ -96,7 +104,7 @@ def _numbers(path: Path, text: str) -> np.ndarray:
     try:
         return np.array(text.split(), dtype=np.float64)
     except ValueError as error:
-        raise InputError(path, f"holds something that is not a number ({error})", "give the file as published") from error
+        raise InputError(path, f"holds no plain numbers ({error})", "give the file as published") from error
 
 
 def _select(path: Path, curves: list[Response], selector: str | None) -> Response:
@@ -107,29 +115,25 @@ def _select(path: Path, curves: list[Response], selector: str | None) -> Respons
         return named[0]
     if selector.strip().isdecimal() and int(selector) < len(curves):
         return curves[int(selector)]
-    raise InputError(path, f"has no curve {selector!r}", f"give an index from 0 to {len(curves) - 1}, or a name where it holds names")
+    raise InputError(path, f"has no curve {selector!r}", f"give an index from 0 to {len(curves) - 1}, or a name")
 
 
 def _dorf_mat(path: Path) -> list[Response]:
     from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
 
-    _read_size(path)
+    _check_size(path)
     try:
-        stored = loadmat(path)
+        stored = loadmat(path, variable_names=("B", "I"))
         values, exposures = (np.asarray(stored[key], np.float64) for key in ("B", "I"))
-    except (OSError, KeyError, ValueError, TypeError, NotImplementedError) as error:
-        raise InputError(path, f"is not a DoRF file ({error})", "give a .mat with B and I of [curves, samples]") from error
+    except (OSError, KeyError, ValueError, TypeError, NotImplementedError, MatReadError) as error:
+        raise InputError(path, f"is not a DoRF file ({error})", "give B and I of [curves, samples]") from error
     if values.ndim != 2 or values.shape != exposures.shape:
         raise InputError(path, f"B is {values.shape} and I is {exposures.shape}", "give both as [curves, samples]")
     return [
         TabulatedResponse(f"dorf:{index}", exposures[index], values[index], source=f"{path}:{index}")
         for index in range(len(values))
     ]
-
-
-def _read_size(path: Path):
-    if path.is_file() and path.stat().st_size > MAX_BYTES:
-        raise InputError(path, f"{path.stat().st_size} bytes are too many for a response", f"give a file under {MAX_BYTES} bytes")
 
 
 def _is_dorf(text: str) -> bool:
@@ -144,7 +148,9 @@ def _dorf_text(path: Path, text: str) -> list[Response]:
     for start in range(0, len(lines), 6):
         block = lines[start : start + 6]
         if len(block) < 6 or block[2].strip() != "I =" or block[4].strip() != "B =":
-            raise InputError(path, f"curve {start // 6} is not six lines with 'I =' and 'B ='", "give dorfCurves.txt as published")
+            raise InputError(
+                path, f"curve {start // 6} lacks its 'I =' or 'B =' line", "give dorfCurves.txt as published"
+            )
         exposures, values = _numbers(path, block[3]), _numbers(path, block[5])
         curves.append(TabulatedResponse(block[0].strip(), exposures, values, source=f"{path}:{start // 6}"))
     return curves
@@ -160,7 +166,7 @@ def _emor(path: Path, text: str, selector: str | None) -> Response:
         raise InputError(path, "its sections differ in length", "give emor.txt or invemor.txt as published")
     coefficients = _numbers(path, (selector or "").replace(",", " "))
     if len(coefficients) > len(rows) - 2 or not np.isfinite(coefficients).all():
-        raise InputError(path, f"{selector!r} is not up to {len(rows) - 2} finite numbers", "separate coefficients by commas")
+        raise InputError(path, f"{selector!r} is not up to {len(rows) - 2} finite numbers", "separate them by commas")
     curve = rows[1] + sum((c * row for c, row in zip(coefficients, rows[2:], strict=False)), np.zeros_like(rows[1]))
     inverse = parts[0][0].strip() == "B"
     name = ("invemor" if inverse else "emor") + (f":{selector}" if selector else "")
@@ -206,7 +212,7 @@ def _text_curve(path: Path, text: str) -> Response:
             rows.append([float(cell) for cell in cells])
         except ValueError:
             if rows or len(cells) != 2:
-                raise InputError(path, f"line {number} is not two numbers ({line.strip()[:40]!r})", "give exposure and value") from None
+                raise InputError(path, f"line {number} is {line.strip()[:40]!r}", "give two numbers") from None
             continue
         if len(cells) != 2:
             raise InputError(path, f"line {number} has {len(cells)} columns", "give two: exposure and value")

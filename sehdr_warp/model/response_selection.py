@@ -65,7 +65,7 @@ def select_response(
     seed: of the sample of edges where there are more than 5000.
 
     Both find a curve only up to the exposure's scale, and neither is calibration: docs/method.md has measured errors.
-    Raises SehdrError for an unknown method, no candidates, an image of another shape, NaN, or images with under 100 pixels
+    Raises SehdrError for an unknown method, no candidates, an image of another shape or with NaN, or under 100 pixels
     that are neither black nor clipped.
     """
     if method not in ("paper", "edges"):
@@ -83,7 +83,8 @@ def select_response(
         edges = edges[np.random.default_rng(seed).choice(len(edges), MAX_EDGES, replace=False)]
     fullest = int(np.argmax([mask.sum() for mask in clear]))
     statistics = [
-        (*_range_and_roughness(images[fullest], clear[fullest], each), _edge_deviation(edges, each)) for each in candidates
+        (*_range_and_roughness(images[fullest], clear[fullest], each), _edge_deviation(edges, each))
+        for each in candidates
     ]
     ranges, roughnesses, deviations = np.array(statistics).T
     paper = _relative(ranges) - _relative(roughnesses)

@@ -37,7 +37,9 @@ class TabulatedResponse(Response, kind="table"):
 
     def __init__(self, name: str, exposures, values, *, notes: tuple[str, ...] = (), source: str | None = None):
         self.name = name
-        knots, levels, repairs = _monotone(np.asarray(exposures, np.float64), np.asarray(values, np.float64), source or name)
+        knots, levels, repairs = _monotone(
+            np.asarray(exposures, np.float64), np.asarray(values, np.float64), source or name
+        )
         self.notes = (*notes, *repairs)
         self._knots, self._levels = knots, levels
         self.black, self.peak, self.clip_exposure = float(levels[0]), float(levels[-1]), float(knots[-1])
@@ -53,7 +55,8 @@ class TabulatedResponse(Response, kind="table"):
         top = self._knots[-1]
         octaves = min(MAX_OCTAVES, math.ceil(math.log2(top / self._knots[1])) + TOE_OCTAVES)
         nodes = np.concatenate([[0.0], top * np.exp2(np.arange(-octaves * CELLS_PER_OCTAVE, 1) / CELLS_PER_OCTAVE)])
-        values = PchipInterpolator(self._knots, self._levels)(nodes).clip(self.black, self.peak)
+        with np.errstate(over="ignore"):  # Harmonic means of slopes next to a nearly flat piece; the limit is right.
+            values = PchipInterpolator(self._knots, self._levels)(nodes).clip(self.black, self.peak)
         return nodes, np.maximum.accumulate(values)
 
     def _table(self, like: torch.Tensor):
@@ -115,12 +118,16 @@ def _monotone(exposures: np.ndarray, values: np.ndarray, source: str):
         from scipy.optimize import isotonic_regression
 
         count = int((np.diff(values) < 0).sum())
-        notes.append(f"{source}: {count} of {len(values)} values fall, by up to {-drop:.3g}; replaced by the nearest monotone curve")
+        notes.append(f"{source}: {count} of {len(values)} values fall, by up to {-drop:.3g}; made monotone")
         values = np.maximum.accumulate(isotonic_regression(values).x)
     if exposures[0] > 0:
         exposures, values = np.concatenate([[0.0], exposures]), np.concatenate([[0.0], values])
     if values[-1] - values[0] < 2 * HALF_CODE:
-        raise InputError(source, f"the curve rises by only {values[-1] - values[0]:.3g}", "give a curve that reaches from dark to bright")
+        raise InputError(
+            source,
+            f"the curve rises by only {values[-1] - values[0]:.3g}",
+            "give a curve from dark to bright",
+        )
     clipped = np.searchsorted(values, values[-1])
     return *_tilt_flat_parts(exposures[: clipped + 1], values[: clipped + 1]), notes
 
@@ -128,7 +135,9 @@ def _monotone(exposures: np.ndarray, values: np.ndarray, source: str):
 def _check(exposures: np.ndarray, values: np.ndarray, source: str):
     remedy = "give two columns of numbers, exposure and value in [0, 1]"
     if exposures.ndim != 1 or exposures.shape != values.shape or len(exposures) < 3:
-        raise InputError(source, f"{exposures.shape} exposures and {values.shape} values are not 3 or more samples", remedy)
+        raise InputError(
+            source, f"{exposures.shape} exposures and {values.shape} values are not 3 samples or more", remedy
+        )
     for what, column in (("exposure", exposures), ("value", values)):
         bad = np.flatnonzero(~np.isfinite(column))
         if len(bad):
@@ -137,11 +146,11 @@ def _check(exposures: np.ndarray, values: np.ndarray, source: str):
         raise InputError(source, f"exposure {exposures.min():.6g} is negative", remedy)
     if values.min() < 0 or values.max() > 1:
         worst = values.max() if values.max() > 1 else values.min()
-        raise InputError(source, f"value {worst:.6g} is outside [0, 1]", "divide codes by the largest one, 255 or 65535")
+        raise InputError(source, f"value {worst:.6g} is outside [0, 1]", "divide codes by the largest, 255 or 65535")
 
 
 def _tilt_flat_parts(exposures: np.ndarray, values: np.ndarray):
-    """Strictly increasing values: each run of equal ones becomes a line of FLAT_TILT, or less where neighbours are near."""
+    """Strictly increasing values: a run of equal ones becomes a line of FLAT_TILT, less where neighbours are near."""
     edges = np.flatnonzero(np.diff(values) != 0) + 1
     starts, ends = np.concatenate([[0], edges]), np.concatenate([edges, [len(values)]]) - 1
     tilted = values.copy()

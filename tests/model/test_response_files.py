@@ -1,0 +1,187 @@
+"""Curves from files: published layouts, one's own tables, repairs and refusals."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.model.response import response_by_name, responses_in_file
+from sehdr_warp.model.response_table import FLAT_TILT, TabulatedResponse
+
+
+def dorf_text(curves: dict[str, np.ndarray]) -> str:
+    blocks = []
+    for name, values in curves.items():
+        exposures = np.linspace(0, 1, len(values))
+        blocks += [
+            name,
+            f"{name} graph",
+            "I =",
+            " ".join(f"{x:.6e}" for x in exposures),
+            "B =",
+            " ".join(map(str, values)),
+        ]
+    return "\n".join(blocks) + "\n"
+
+
+def test_dorf_matlab_file(shared):
+    from scipy.io import loadmat
+
+    path = shared / "crf" / "201_CRF_data.mat"
+    stored = loadmat(path)
+    curves = responses_in_file(path)
+    assert len(curves) == 201
+    for index, curve in enumerate(curves):
+        exposures, values = stored["I"][index].astype(float), stored["B"][index].astype(float)
+        assert abs(curve.encode(exposures) - values).max() <= FLAT_TILT + 1e-12
+        exposures = np.linspace(1e-3, curve.clip_exposure, 3001)
+        np.testing.assert_allclose(curve.decode(curve.encode(exposures)), exposures, rtol=1e-6)
+    assert response_by_name(f"{path}:17").name == "dorf:17"
+    for wrong in (str(path), f"{path}:201", f"{path}:agfa", f"{path}:-1"):
+        with pytest.raises(InputError, match="201_CRF_data"):
+            response_by_name(wrong)
+
+
+def test_emor(shared):
+    path = shared / "crf" / "emor.txt"
+    text = path.read_text()
+    numbers = [line for line in text.splitlines() if line and "=" not in line]
+    rows = np.array(" ".join(numbers).split(), float).reshape(-1, 1024)
+    assert len(rows) == 27
+    mean, bent = response_by_name(path), response_by_name(f"{path}:0.3,-0.1")
+    np.testing.assert_allclose(mean.encode(rows[0]), rows[1], atol=FLAT_TILT + 1e-12)
+    np.testing.assert_allclose(bent.encode(rows[0]), rows[1] + 0.3 * rows[2] - 0.1 * rows[3], atol=FLAT_TILT + 1e-12)
+    inverse = response_by_name(shared / "crf" / "invemor.txt")
+    stored = (shared / "crf" / "invemor.txt").read_text().splitlines()
+    values, exposures = np.array(" ".join(x for x in stored if x and "=" not in x).split(), float).reshape(-1, 1024)[:2]
+    np.testing.assert_allclose(inverse.encode(exposures), values, atol=5e-4)
+    for wrong in ("1e", "nan", ",".join("0" * 26)):
+        with pytest.raises(InputError, match="emor.txt"):
+            response_by_name(f"{path}:{wrong}")
+
+
+def test_dorf_text_file(tmp_path):
+    ramp = np.linspace(0, 1, 1024)
+    path = tmp_path / "dorfCurves.txt"
+    path.write_text(dorf_text({"film-Red": ramp**0.5, "film-Green": ramp**0.4}))
+    assert [curve.name for curve in responses_in_file(path)] == ["film-Red", "film-Green"]
+    np.testing.assert_allclose(response_by_name(f"{path}:film-green").encode(ramp), ramp**0.4, atol=1e-6)
+    np.testing.assert_allclose(response_by_name(f"{path}:0").encode(ramp), ramp**0.5, atol=1e-6)
+    path.write_text(dorf_text({"film-Red": ramp})[:-30] + "\nextra")
+    with pytest.raises(InputError):
+        responses_in_file(path)
+
+
+@pytest.mark.parametrize("separator", [",", ";", " ", "\t"])
+def test_table_file(tmp_path, separator):
+    path = tmp_path / "camera.csv"
+    rows = [("exposure", "value"), (0, 0), (0.25, 0.5), (1, 1), (1.5, 1)]
+    path.write_text("# measured\n" + "".join(f"{x}{separator}{value}\n" for x, value in rows))
+    curve = response_by_name(path)
+    assert curve.name == "camera" and curve.clip_exposure == pytest.approx(1.0)
+    np.testing.assert_allclose(curve.encode([0, 0.25, 1]), [0, 0.5, 1], atol=1e-4)
+
+
+def test_json_file(tmp_path):
+    path = tmp_path / "curve.json"
+    path.write_text(json.dumps({"exposures": [0, 1, 2], "values": [0, 0.6, 1], "name": "mine"}))
+    curve = response_by_name(path)
+    assert curve.name == "mine" and curve.encode(1.0) == pytest.approx(0.6, abs=1e-4)
+    path.write_text(json.dumps(curve.to_dict()))
+    np.testing.assert_array_equal(response_by_name(path).encode([0.3, 1.7]), curve.encode([0.3, 1.7]))
+
+
+BAD_TABLES = {
+    "empty": "",
+    "one column": "1\n2\n3\n",
+    "three columns": "0 0 0\n1 1 1\n2 2 2\n",
+    "nan": "0 0\n0.5 nan\n1 1\n",
+    "infinite": "0 0\ninf 0.5\n1 1\n",
+    "words later": "0 0\nhalf way\n1 1\n",
+    "codes": "0 0\n0.5 128\n1 255\n",
+    "negative value": "0 -0.1\n0.5 0.5\n1 1\n",
+    "negative exposure": "-1 0\n0.5 0.5\n1 1\n",
+    "constant": "0 0.5\n0.5 0.5\n1 0.5\n",
+    "falling": "0 1\n0.5 0.5\n1 0\n",
+    "binary": "\x00\x01\x02\n",
+}
+
+
+@pytest.mark.parametrize("case", BAD_TABLES)
+def test_bad_tables_are_refused_in_one_line(tmp_path, case):
+    path = tmp_path / "bad.csv"
+    path.write_text(BAD_TABLES[case])
+    with pytest.raises(InputError) as error:
+        response_by_name(path)
+    assert str(path) in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["{", "[1, 2]", '{"exposures": [0, 1]}', '{"exposures": "abc", "values": [1]}', '{"kind": "table"}', "[" * 100000],
+)
+def test_bad_json_is_refused(tmp_path, text):
+    path = tmp_path / "bad.json"
+    path.write_text(text)
+    with pytest.raises(Exception) as error:
+        response_by_name(path)
+    assert "SehdrError" in [each.__name__ for each in type(error.value).__mro__]
+
+
+def test_truncated_matlab_file(tmp_path):
+    path = tmp_path / "bad.mat"
+    for content in (b"", b"MATLAB 5.0 MAT-file" + b" " * 105 + b"\x00\x01IM\x0e\x00\x00\x00", b"\xff" * 300):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match="bad.mat"):
+            response_by_name(f"{path}:0")
+
+
+def test_noise_is_made_monotone_and_noted():
+    exposures = np.linspace(0, 1, 500)
+    noisy = (exposures**0.5 + np.random.default_rng(0).normal(0, 0.01, 500)).clip(0, 1)
+    curve = TabulatedResponse("noisy", exposures, noisy)
+    assert "fall" in curve.notes[0]
+    encoded = curve.encode(exposures)
+    assert (np.diff(encoded[exposures < curve.clip_exposure]) > 0).all()
+    assert abs(encoded - exposures**0.5).max() < 0.04
+    assert TabulatedResponse("clean", exposures, exposures).notes == ()
+
+
+def test_flat_parts():
+    exposures = np.linspace(0, 1, 1001)
+    values = np.interp(exposures, [0, 0.1, 0.4, 0.5, 0.8, 0.9, 1], [0.05, 0.05, 0.5, 0.5, 0.9, 1, 1])
+    curve = TabulatedResponse("flat", exposures, values)
+    assert curve.decode(0.5) == pytest.approx(0.45, abs=1e-3)  # Within: the middle.
+    assert curve.decode(1.0) == pytest.approx(0.9, abs=1e-9)  # At the top: where clipping begins.
+    assert curve.decode(0.05) == 0.0 and curve.slope(0.05) > 0  # At black: from 0, and not without a gradient.
+    assert abs(curve.encode(exposures) - values).max() <= FLAT_TILT + 1e-12
+    assert curve.notes == ()
+
+
+def test_order_and_repeats_are_repaired():
+    curve = TabulatedResponse("shuffled", [1.0, 0.0, 0.5, 0.5], [1.0, 0.0, 0.6, 0.8])
+    assert "sorted" in curve.notes[0] and curve.encode(0.5) == pytest.approx(0.7, abs=1e-4)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.lists(
+        st.tuples(st.floats(0, 1e6, width=32), st.floats(0, 1)), min_size=3, max_size=300, unique_by=lambda row: row[0]
+    )
+)
+def test_any_table_becomes_an_invertible_curve_or_an_input_error(rows):
+    exposures, values = np.array(rows).T
+    try:
+        curve = TabulatedResponse("any", exposures, values)
+    except InputError as error:
+        assert "rises by only" in str(error)
+        return
+    wanted = np.linspace(curve.black, curve.peak, 200)
+    decoded = curve.decode(wanted)
+    assert (np.diff(decoded) >= 0).all() and decoded[0] >= 0 and decoded[-1] == pytest.approx(curve.clip_exposure)
+    encoded = curve.encode(np.linspace(0, curve.clip_exposure * 1.5, 500))
+    assert (np.diff(encoded) >= -1e-12).all() and encoded.min() >= 0 and encoded.max() <= 1
+    np.testing.assert_allclose(curve.encode(decoded), wanted, atol=1e-6)

@@ -1,0 +1,73 @@
+"""Choosing a response from photos that were made with a known one."""
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.model.response import response_by_name, response_names
+from sehdr_warp.model.response_selection import select_response
+
+
+def mosaic(seed=0, size=96, tile=12) -> np.ndarray:
+    """Coloured tiles, anti-aliased in linear light: each boundary pixel is a mixture. [size, size, 3] in (0, 1)."""
+    rng = np.random.default_rng(seed)
+    colours = rng.uniform(0.02, 0.9, (size // tile, size // tile, 3))
+    fine = colours.repeat(tile * 4, 0).repeat(tile * 4, 1)
+    fine = np.roll(fine, (2, 1), (0, 1))
+    return fine.reshape(size, 4, size, 4, 3).mean((1, 3))
+
+
+@pytest.mark.parametrize("name", ["linear", "gamma-2.2", "rec709", "reinhard-gamma", "filmic"])
+def test_edges_find_the_response_of_a_clean_picture(name):
+    response = response_by_name(name)
+    peak = min(response.clip_exposure, 3.0)
+    photos = [np.round(response.encode(peak * mosaic(seed)) * 255) / 255 for seed in range(4)]
+    selection = select_response(photos)
+    assert selection.response.name == name and selection.method == "edges" and selection.edge_count > 200
+    assert [score.edge_deviation for score in selection.scores] == sorted(s.edge_deviation for s in selection.scores)
+    assert {score.response.name for score in selection.scores} == set(response_names())
+
+
+def test_papers_score_orders_by_range_and_smoothness():
+    photo = np.round(response_by_name("srgb").encode(mosaic()) * 255) / 255
+    selection = select_response(photo, method="paper")
+    scores = selection.scores
+    assert [score.paper_score for score in scores] == sorted((s.paper_score for s in scores), reverse=True)
+    middle_range, middle_bend = (np.median([getattr(s, f) for s in scores]) for f in ("dynamic_range", "roughness"))
+    for score in scores:
+        assert score.paper_score == pytest.approx(score.dynamic_range / middle_range - score.roughness / middle_bend)
+    linear = next(s for s in scores if s.response.name == "linear")
+    clear = photo[((photo > 1.5 / 255) & (photo < 1 - 4.5 / 255)).all(2)]
+    assert linear.dynamic_range == pytest.approx(
+        np.log2(np.percentile(clear, 99.9) / np.percentile(clear, 0.1)), rel=1e-3
+    )
+
+
+def test_tensor_array_and_candidates():
+    photo = response_by_name("srgb").encode(mosaic())
+    few = [response_by_name("linear"), response_by_name("srgb")]
+    by_array, by_tensor = select_response(photo, few), select_response(torch.tensor(photo), few)
+    assert by_array.scores == by_tensor.scores and by_array.response in few
+
+
+def test_no_edges_falls_back_to_the_papers_score():
+    ramp = np.linspace(0.1, 0.9, 64)[None, :, None] * np.ones((64, 1, 3))
+    selection = select_response(ramp)
+    assert selection.method == "paper" and np.isnan(selection.scores[0].edge_deviation)
+
+
+@pytest.mark.parametrize(
+    "image", [np.ones((8, 8, 3)), np.zeros((32, 32, 3)), np.full((32, 32, 3), np.nan), np.ones((32, 32))]
+)
+def test_useless_photos_are_refused(image):
+    with pytest.raises(SehdrError, match="select_response"):
+        select_response(image)
+
+
+def test_bad_arguments():
+    photo = np.full((32, 32, 3), 0.5)
+    with pytest.raises(SehdrError, match="'guess'"):
+        select_response(photo, method="guess")
+    with pytest.raises(SehdrError, match="no candidates"):
+        select_response(photo, [])

@@ -1,0 +1,211 @@
+"""Every response: its inverse, its derivative, its limits; formulae against independent ones."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.model.response import Response, response_by_name, response_names
+from sehdr_warp.model.response_curve import EXTENSION_SLOPE, HALF_CODE
+from sehdr_warp.model.response_table import TabulatedResponse
+
+EXTREMES = [0.0, 1e-12, 1e-6, 1e-3, 0.18, 0.999, 1.0, 1.001, 11.2, 1e3, 1e9]
+
+
+def sampled_gamma() -> Response:
+    """1024 even samples, the layout of DoRF."""
+    exposures = np.linspace(0.0, 1.0, 1024)
+    return TabulatedResponse("even", exposures, exposures**0.6)
+
+
+def sparse_curve() -> Response:
+    return TabulatedResponse("sparse", [0.0, 0.01, 0.1, 0.5, 2.0, 4.0], [0.02, 0.1, 0.35, 0.7, 0.95, 1.0])
+
+
+CURVES = {
+    name: (lambda name=name: response_by_name(name)) for name in (*response_names(), "gamma-1.8", "colour:S-Log3")
+}
+CURVES |= {"even table": sampled_gamma, "sparse table": sparse_curve}
+
+
+@pytest.fixture(params=CURVES, scope="module")
+def response(request) -> Response:
+    return CURVES[request.param]()
+
+
+def domain(response: Response, count: int = 4001) -> np.ndarray:
+    """Exposures over 40 octaves up to the clip point, or to white for a curve that has none."""
+    top = response.clip_exposure if response.clips else response.white
+    return top * np.exp2(np.linspace(-40, 0, count))
+
+
+FORMULAE = {
+    "linear": lambda x: x,
+    "gamma-2.2": lambda x: x ** (1 / 2.2),
+    "srgb": lambda x: x * 12.92 if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055,
+    "rec709": lambda x: 4.5 * x if x < 0.018 else 1.099 * x**0.45 - 0.099,
+    "reinhard-gamma": lambda x: (x / (1 + x)) ** (1 / 2.2),
+    "hdr-nerf": lambda x: (x / (1 + x)) ** (1 / 2.2),
+    "filmic": lambda x: srgb(hable(x) / hable(11.2)),
+    "aces": lambda x: srgb(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14)),
+}
+
+
+def srgb(y: float) -> float:
+    return FORMULAE["srgb"](min(y, 1.0))
+
+
+def hable(x: float) -> float:
+    a, b, c, d, e, f = 0.15, 0.5, 0.1, 0.2, 0.02, 0.3
+    return (x * (a * x + c * b) + d * e) / (x * (a * x + b) + d * f) - e / f
+
+
+@pytest.mark.parametrize("name", FORMULAE)
+def test_published_formula(name):
+    exposures = np.geomspace(1e-5, 1.0, 300)
+    expected = [FORMULAE[name](float(x)) for x in exposures]
+    # Rec.709 as published, with three digits, is off by 3e-4 at its own break; ours is continuous.
+    np.testing.assert_allclose(
+        response_by_name(name).encode(exposures), expected, atol=4e-4 if name == "rec709" else 1e-7
+    )
+
+
+def test_colour_encoding_is_colour_science():
+    import colour
+
+    exposures = np.geomspace(1e-4, 30, 500)
+    encoded = response_by_name("colour:slog3").encode(exposures)
+    # The encoding's two branches meet in a kink, which the samples round off by a hundredth of an 8-bit code.
+    np.testing.assert_allclose(encoded, colour.models.log_encoding_SLog3(exposures), atol=5e-5)
+
+
+def test_decode_inverts_encode(response):
+    exposures = domain(response)
+    ulp = np.spacing(response.encode(exposures)) / response.slope(exposures)  # What the value's own rounding hides.
+    np.testing.assert_array_less(
+        abs(response.decode(response.encode(exposures)) - exposures), 1e-9 * exposures + 8 * ulp
+    )
+
+
+def test_encode_inverts_decode_on_every_16_bit_code(response):
+    codes = np.arange(65536) / 65535
+    codes = codes[(codes >= response.black) & (codes <= response.peak - (0 if response.clips else HALF_CODE))]
+    np.testing.assert_allclose(response.encode(response.decode(codes)), codes, atol=1e-9)
+    single = codes.astype(np.float32)
+    np.testing.assert_allclose(response.encode(response.decode(single)), single, atol=5e-7)
+
+
+def test_encode_rises(response):
+    encoded = response.encode(domain(response))
+    assert (np.diff(encoded) > 0).all() if response.black == 0 else (np.diff(encoded) >= 0).all()
+    assert encoded[0] >= 0 and encoded[-1] <= 1
+    single = response.encode(domain(response).astype(np.float32))
+    assert single.dtype == np.float32 and (np.diff(single) > -2e-7).all()
+
+
+def test_white_and_clip(response):
+    assert response.encode(response.white) == pytest.approx(response.peak - HALF_CODE, abs=1e-9)
+    assert round(float(response.encode(response.white * 1.0001)) * 255) == 255
+    assert response.clips == math.isfinite(response.clip_exposure)
+    if response.clips:
+        assert response.encode(10 * response.clip_exposure) == pytest.approx(response.peak, abs=1e-12)
+    assert response.decode(1.0) == pytest.approx(response.clip_exposure if response.clips else response.white)
+
+
+def test_gradient_is_the_difference_quotient(response):
+    top = response.clip_exposure if response.clips else response.white
+    generator = torch.Generator().manual_seed(0)
+    # Kept from nodes and breaks by chance; a step far smaller than a cell of any table.
+    exposures = (top * torch.rand(200, generator=generator, dtype=torch.float64) ** 3).requires_grad_()
+    step = 1e-7 * exposures.detach()
+    quotient = (response.encode(exposures + step) - response.encode(exposures - step)).detach() / (2 * step)
+    (gradient,) = torch.autograd.grad(response.encode(exposures).sum(), exposures)
+    assert (gradient - quotient).norm() < 1e-5 * quotient.norm()
+    (extended,) = torch.autograd.grad(response.encode_extended(exposures).sum(), exposures)
+    assert torch.equal(gradient, extended)
+    assert torch.equal(gradient, response.slope(exposures.detach()))
+    values = response.encode(exposures.detach()).requires_grad_()
+    (inverse,) = torch.autograd.grad(response.decode(values).sum(), values)
+    assert (inverse * gradient - 1).abs().max() < 1e-3  # Tables: a value rounded across a node takes the next slope.
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_extremes_stay_finite(response, device, dtype):
+    exposures = torch.tensor(EXTREMES, dtype=dtype, device=device, requires_grad=True)
+    for encode in (response.encode, response.encode_extended):
+        value = encode(exposures)
+        (gradient,) = torch.autograd.grad(value.sum(), exposures)
+        assert value.dtype == dtype and value.device == exposures.device
+        assert value.isfinite().all() and gradient.isfinite().all() and (gradient >= 0).all()
+        assert (value.diff() >= 0).all()
+        assert gradient[0] > 0, "black must be able to become brighter"
+    assert response.encode(exposures).max() <= 1
+    value = response.encode(exposures).detach()
+    assert response.decode(value).isfinite().all()
+
+
+def test_extension_continues_in_log_exposure(response):
+    exposures = domain(response)
+    np.testing.assert_array_equal(response.encode_extended(exposures), response.encode(exposures))
+    if not response.clips:
+        np.testing.assert_array_equal(response.encode_extended(1e6), response.encode(1e6))
+        return
+    clip = response.clip_exposure
+    beyond = torch.tensor([clip * 1.0000001, clip * math.e, clip * 1e6], dtype=torch.float64, requires_grad=True)
+    value = response.encode_extended(beyond)
+    expected = response.peak + EXTENSION_SLOPE * torch.log(beyond / clip)
+    torch.testing.assert_close(value, expected, atol=1e-9, rtol=0)
+    value.sum().backward()
+    torch.testing.assert_close(beyond.grad, EXTENSION_SLOPE / beyond.detach())
+    assert response.encode_extended(clip * math.e, slope=0.3) == pytest.approx(response.peak + 0.3)
+
+
+def test_outside_the_domain(response):
+    exposures = torch.tensor([-1.0, float("nan")], requires_grad=True)
+    value = response.encode(exposures)
+    assert value[0].item() == pytest.approx(response.black) and value[1].isnan()
+    value[0].backward()
+    assert exposures.grad[0] == 0
+    top = response.clip_exposure if response.clips else response.white
+    np.testing.assert_allclose(response.decode([-0.5, 1.5]), [0.0, top], rtol=1e-9)
+
+
+def test_json_round_trip_is_exact(response):
+    again = Response.from_dict(json.loads(json.dumps(response.to_dict())))
+    exposures = domain(response, 997)
+    np.testing.assert_array_equal(again.encode(exposures), response.encode(exposures))
+    assert (again.name, again.white, again.clips) == (response.name, response.white, response.clips)
+
+
+def test_numpy_in_numpy_out(response):
+    image = np.random.default_rng(0).random((5, 4, 3), dtype=np.float32)[::-1]
+    image.setflags(write=False)
+    encoded = response.encode(image)
+    assert isinstance(encoded, np.ndarray) and encoded.dtype == np.float32 and encoded.shape == image.shape
+    np.testing.assert_array_equal(encoded, response.encode(torch.tensor(image.copy())).numpy())
+    assert response.encode(0.25).dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    "name", ["gamma-0.5", "gamma-nan", "sRGB-ish", "", "no/such/file.csv", "colour:S-Log9", "colour:DICOM GSDF"]
+)
+def test_unknown_names_are_refused(name):
+    with pytest.raises(SehdrError) as error:
+        response_by_name(name)
+    assert "\n" not in str(error.value) and name.split(":")[-1] in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "damage", [{}, {"kind": "x"}, {"kind": "table"}, {"kind": "analytic", "name": 3}, None, {"kind": "analytic"}]
+)
+def test_damaged_descriptions_are_refused(damage):
+    with pytest.raises(SehdrError):
+        Response.from_dict(damage)
+
+
+def test_integer_tensors_are_refused():
+    with pytest.raises(TypeError, match="float32"):
+        response_by_name("srgb").encode(torch.tensor([128], dtype=torch.uint8))
