@@ -1,0 +1,243 @@
+"""Pictures that show what a training achieved: photo, HDR and truth side by side, exposure stops, error against time."""
+
+import json
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.scene import Scene, View
+
+from .files import atomic_path, check_absent
+from .tonemap import expose, fit_tone_map
+
+STOPS = (-4, -2, 0, 2, 4)
+"""Stops from the photos' exposure in the strip."""
+
+_DPI = 160
+_INK, _QUIET, _RULE = "#1f2328", "#6a737d", "#e1e4e8"
+# Two hues that the colour-blind tell apart (Okabe and Ito's blue and vermilion).
+_SERIES = (("psnr_ldr", "LDR", "#0072b2"), ("psnr_mu", "HDR (mu-law)", "#d55e00"))
+_STYLE = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["Inter", "Helvetica Neue", "Arial", "DejaVu Sans"],
+    "font.size": 9,
+    "text.color": _INK,
+    "axes.labelcolor": _QUIET,
+    "xtick.color": _QUIET,
+    "ytick.color": _QUIET,
+    "axes.edgecolor": _RULE,
+}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One view of the report.
+
+    name: of the view. photo: [H, W, 3] encoded, in [0, 1]. from_photo: [H, W, 3] the radiance that the photo alone
+    gives, its response undone. hdr: [H, W, 3] rendered radiance. truth: [H, W, 3] true radiance; None without.
+    """
+
+    name: str
+    photo: np.ndarray
+    from_photo: np.ndarray
+    hdr: np.ndarray
+    truth: np.ndarray | None = None
+
+
+def write_report(run, scene: Scene, out: Path | str, *, view_count: int = 3, overwrite: bool = False) -> list[Path]:
+    """Renders some held-out views and writes the report's pictures; returns their paths.
+
+    `comparison.png`: held-out photo, tone-mapped HDR and truth (where the scene has it), one row a view.
+    `stops.png`: one view from -4 to +4 stops: the photo alone, the HDR scene, the truth.
+    `training.png`: held-out error against training time, from `RUN/metrics.jsonl`; left out where that has no lines.
+
+    run: a trained run (render, response, exposure_time, path). view_count: rows of the comparison, evenly chosen.
+    Without test views the training views are shown, and captions say so.
+    Raises InputError where a picture exists (unless overwrite), SehdrError for a scene without views.
+    """
+    out = Path(out)
+    metrics = read_metrics(Path(run.path) / "metrics.jsonl")
+    names = ["comparison.png", "stops.png"] + ["training.png"] * bool(metrics)
+    for name in names:
+        check_absent(out / name, overwrite)
+    held_out = bool(scene.test_views)
+    views = _chosen(scene.test_views or scene.train_views, view_count)
+    comparisons = [_compare(run, view) for view in views]
+    figures = [
+        comparison_figure(comparisons, _caption(run, views, metrics, held_out), held_out=held_out),
+        stops_figure(comparisons[len(comparisons) // 2], run.exposure_time),
+    ] + ([training_figure(metrics)] if metrics else [])
+    with ExitStack() as stack:
+        for name, figure in zip(names, figures, strict=True):
+            temporary = stack.enter_context(atomic_path(out / name, overwrite))
+            figure.savefig(temporary, dpi=_DPI, facecolor="white", format="png")
+    return [out / name for name in names]
+
+
+def read_metrics(path: Path | str) -> list[dict]:
+    """The lines of a metrics.jsonl with "seconds" and a figure; empty without the file. Damaged lines are left out."""
+    path, lines = Path(path), []
+    for text in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
+        try:
+            line = json.loads(text)
+        except ValueError:  # A killed process leaves half a line behind.
+            continue
+        if isinstance(line, dict) and "seconds" in line and any(line.get(key) is not None for key, _, _ in _SERIES):
+            lines.append(line)
+    return lines
+
+
+def comparison_figure(comparisons: Sequence[Comparison], caption: str, *, held_out: bool = True):
+    """A matplotlib Figure: one row a view; photo, tone-mapped HDR, and truth where every view has it.
+
+    HDR and truth share one tone map, fitted to the truth where there is one: a wrong scale shows.
+    """
+    with_truth = all(c.truth is not None for c in comparisons)
+    tone_map = fit_tone_map([c.truth if with_truth else c.hdr for c in comparisons])
+    titles = ["Held-out photo" if held_out else "Training photo", "HDR scene, tone-mapped"]
+    titles += ["Truth, tone-mapped"] if with_truth else []
+    rows = [[c.photo, tone_map(c.hdr)] + ([tone_map(c.truth)] if with_truth else []) for c in comparisons]
+    return _grid(rows, titles, [c.name for c in comparisons], caption, cell=2.9)
+
+
+def stops_figure(comparison: Comparison, exposure_time: float, stops: Sequence[float] = STOPS):
+    """A matplotlib Figure: one view at several exposures, as radiance on a plain sRGB display.
+
+    The first row re-exposes the photo alone: what it clipped stays white or black. exposure_time: seconds at 0 EV.
+    """
+    sources = {"Photo alone": comparison.from_photo, "HDR scene": comparison.hdr, "Truth": comparison.truth}
+    sources = {name: radiance for name, radiance in sources.items() if radiance is not None}
+    rows = [[expose(radiance, stop, scale=exposure_time) for stop in stops] for radiance in sources.values()]
+    titles = [f"{stop:+g} EV".replace("-", "\N{MINUS SIGN}") if stop else "0 EV" for stop in stops]
+    caption = (
+        f"View {comparison.name}, re-exposed from {_seconds(exposure_time)} (0 EV) and shown on a plain sRGB display. "
+        "What the photo clipped stays flat."
+    )
+    return _grid(rows, titles, list(sources), caption, cell=1.9)
+
+
+def training_figure(metrics: Sequence[dict]):
+    """A matplotlib Figure: held-out PSNR against training seconds; the right axis says it as an error."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(7.2, 4.2), layout="constrained")
+        figure.get_layout_engine().set(w_pad=0.12, h_pad=0.12)
+        axes = figure.add_subplot()
+        drawn = [series for series in _SERIES if any(line.get(series[0]) is not None for line in metrics)]
+        ends = []
+        for key, label, color in drawn:
+            points = np.array([(line["seconds"], line[key]) for line in metrics if line.get(key) is not None], float)
+            axes.plot(*points.T, color=color, linewidth=1.8, marker="o", markersize=4, clip_on=False)
+            ends.append((points[-1], label, color))
+        _label_ends(axes, ends)
+        axes.set_title("Held-out error against training time", loc="left", fontsize=11, fontweight="bold", pad=12)
+        axes.set_xlabel("training time, seconds")
+        axes.set_ylabel("PSNR, dB (higher is better)")
+        axes.set_xlim(left=0)
+        axes.margins(y=0.15)
+        axes.grid(axis="y", color=_RULE, linewidth=0.8)
+        axes.set_axisbelow(True)
+        axes.tick_params(length=0)
+        axes.spines[["top", "right", "left"]].set_visible(False)
+        error = axes.secondary_yaxis("right", functions=(_psnr_to_percent, _percent_to_psnr))
+        _percent_ticks(error, axes.get_ylim())
+        return figure
+
+
+def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, cell: float):
+    """Pictures [H, W, 3] in rows and columns with column titles, row names at the left, and a caption below."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    gap, left, top, bottom, edge = 0.06, 0.3, 0.36, 0.46, 0.12
+    heights = [cell * row[0].shape[0] / row[0].shape[1] for row in rows]
+    width = left + len(titles) * (cell + gap) - gap + edge
+    height = top + sum(heights) + gap * (len(rows) - 1) + bottom
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(width, height))
+        y = height - top
+        for row, (pictures, name, row_height) in enumerate(zip(rows, names, heights, strict=True)):
+            y -= row_height
+            for column, picture in enumerate(pictures):
+                x = left + column * (cell + gap)
+                axes = figure.add_axes((x / width, y / height, cell / width, row_height / height))
+                axes.imshow(np.clip(picture, 0, 1), aspect="auto", interpolation="lanczos")
+                axes.set_axis_off()
+                if row == 0:
+                    where = ((x + cell / 2) / width, (height - top + 0.1) / height)
+                    figure.text(*where, titles[column], ha="center", va="bottom", fontsize=9.5, fontweight="bold")
+            where = ((left - 0.1) / width, (y + row_height / 2) / height)
+            figure.text(*where, name, rotation=90, ha="right", va="center", color=_QUIET, fontsize=8.5)
+            y -= gap
+        figure.text(left / width, 0.16 / height, _wrap(caption, width - left), color=_QUIET, fontsize=8, va="bottom")
+        return figure
+
+
+def _wrap(text: str, inches: float) -> str:
+    import textwrap
+
+    return "\n".join(textwrap.wrap(text, max(30, int(inches * 17))))
+
+
+def _label_ends(axes, ends) -> None:
+    """Names and last values at the ends of the lines, in their colours: the upper one above, the lower one below."""
+    top = max(y for (_, y), _, _ in ends)
+    for (x, y), label, color in ends:
+        where = (2, 12 if y == top else -13)
+        text = f"{label}  {y:.1f} dB"
+        axes.annotate(
+            text, (x, y), where, textcoords="offset points", ha="right", va="center", color=color, fontweight="bold"
+        )
+
+
+def _psnr_to_percent(psnr):
+    return 100 * 10.0 ** (-np.asarray(psnr, float) / 20)
+
+
+def _percent_to_psnr(percent):
+    return -20 * np.log10(np.maximum(np.asarray(percent, float), 1e-9) / 100)
+
+
+def _percent_ticks(axis, limits: tuple[float, float]) -> None:
+    low, high = sorted(_psnr_to_percent(np.array(limits)))
+    steps = [digit * 10.0**power for power in range(-4, 3) for digit in (1, 1.5, 2, 3, 5, 7)]
+    ticks = [step for step in steps if low <= step <= high]
+    axis.set_yticks(ticks, [f"{tick:g} %" for tick in ticks])
+    axis.set_ylabel("root mean square error, of white")
+    axis.tick_params(length=0, which="both")
+    axis.spines["right"].set_visible(False)
+    axis.minorticks_off()
+
+
+def _chosen(views: Sequence[View], count: int) -> list[View]:
+    if not views:
+        raise SehdrError("the scene has no views to report on")
+    return [views[i] for i in sorted({round(i) for i in np.linspace(0, len(views) - 1, max(count, 1))})]
+
+
+def _compare(run, view: View) -> Comparison:
+    hdr = run.render(view.camera).hdr
+    hdr = np.asarray(hdr.detach().cpu() if hasattr(hdr, "detach") else hdr)
+    from_photo = np.asarray(run.response.decode(view.image)) / view.exposure_time
+    return Comparison(view.name, view.image, from_photo, hdr, view.hdr)
+
+
+def _caption(run, views: Sequence[View], metrics: Sequence[dict], held_out: bool) -> str:
+    times = sorted({view.exposure_time for view in views})
+    text = f"Photos at {' and '.join(map(_seconds, times)) if len(times) < 3 else 'several exposures'}"
+    text += ", none of them trained on." if held_out else ", all of them trained on: the scene has no test views."
+    if metrics and held_out:
+        last = metrics[-1]
+        figures = [f"{label} {last[key]:.1f} dB" for key, label, _ in _SERIES if last.get(key) is not None]
+        text += f" All held-out views after {last['seconds']:.0f} s of training: PSNR {', '.join(figures)}."
+    return text
+
+
+def _seconds(time: float) -> str:
+    return f"1/{1 / time:.0f} s" if time < 0.3 else f"{time:g} s"

@@ -1,0 +1,110 @@
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.output.report import Comparison, read_metrics, stops_figure, training_figure, write_report
+from sehdr_warp.scene import Scene, View
+
+from .helpers import AnalyticRun
+
+METRICS = [
+    {"iteration": 100, "seconds": 1.5, "split": "test", "psnr_ldr": 20.0, "psnr_mu": 18.0},
+    {"iteration": 200, "seconds": 3.0, "split": "test", "psnr_ldr": 26.0, "psnr_mu": 25.5},
+]
+
+
+def make(folder, *, truth=True, splits=("train", "test", "test"), metrics=METRICS):
+    run = AnalyticRun([(f"v_{i}", split) for i, split in enumerate(splits)])
+    run.path = folder / "run"
+    run.path.mkdir(exist_ok=True)
+    if metrics:
+        (run.path / "metrics.jsonl").write_text(
+            "".join(json.dumps(line) + "\n" for line in metrics) + '{"iteration": 3'
+        )
+    views = []
+    for entry in run.cameras:
+        hdr = run.render(entry.camera).hdr
+        image = run.response.encode(hdr * entry.exposure_time).astype(np.float32)
+        views.append(
+            View(entry.name, image, entry.camera, entry.exposure_time, entry.split, hdr=hdr if truth else None)
+        )
+    return run, Scene("sky", "photos", tuple(views), np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+
+
+def columns_of_pictures(path):
+    """How many pictures stand side by side: runs of columns that are not white from top to bottom, past the margin."""
+    pixels = np.asarray(Image.open(path).convert("L"))
+    middle = pixels[pixels.shape[0] // 4 : pixels.shape[0] // 3, 60:]
+    dark = (middle < 250).mean(axis=0) > 0.5
+    return int(np.sum(dark[1:] & ~dark[:-1]) + dark[0])
+
+
+@pytest.mark.parametrize("truth, columns", [(True, 3), (False, 2)])
+def test_pictures_hold_what_they_say(tmp_path, truth, columns):
+    run, scene = make(tmp_path, truth=truth)
+    files = write_report(run, scene, tmp_path / "report")
+    assert [file.name for file in files] == ["comparison.png", "stops.png", "training.png"]
+    assert columns_of_pictures(files[0]) == columns
+    assert sorted(file.name for file in (tmp_path / "report").iterdir()) == sorted(file.name for file in files)
+
+
+def test_without_test_views_and_metrics(tmp_path):
+    run, scene = make(tmp_path, splits=("train", "train"), metrics=None)
+    files = write_report(run, scene, tmp_path / "report", view_count=1)
+    assert [file.name for file in files] == ["comparison.png", "stops.png"]
+
+
+def test_nothing_is_replaced_unless_asked(tmp_path):
+    run, scene = make(tmp_path)
+    write_report(run, scene, tmp_path)
+    run.rendered = 0
+    with pytest.raises(InputError, match="comparison.png: exists already"):
+        write_report(run, scene, tmp_path)
+    assert run.rendered == 0
+    write_report(run, scene, tmp_path, overwrite=True)
+
+
+def test_empty_scene_is_one_line(tmp_path):
+    run, _ = make(tmp_path)
+    empty = Scene("none", "photos", (), np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+    with pytest.raises(SehdrError, match="no views"):
+        write_report(run, empty, tmp_path / "report")
+
+
+def test_metrics_pass_over_damaged_lines(tmp_path):
+    run, _ = make(tmp_path)
+    assert read_metrics(run.path / "metrics.jsonl") == METRICS
+    (tmp_path / "other.jsonl").write_text('[1]\n{"seconds": 1}\n{"seconds": 2, "psnr_mu": null, "psnr_ldr": 3}\n')
+    assert [line["seconds"] for line in read_metrics(tmp_path / "other.jsonl")] == [2]
+    assert read_metrics(tmp_path / "absent.jsonl") == []
+
+
+def test_training_plot_draws_the_figures():
+    figure = training_figure(METRICS)
+    axes = figure.axes[0]
+    drawn = [line.get_xydata().tolist() for line in axes.get_lines()]
+    assert drawn == [[[1.5, 20.0], [3.0, 26.0]], [[1.5, 18.0], [3.0, 25.5]]]
+    assert [text.get_text() for text in axes.texts] == ["LDR  26.0 dB", "HDR (mu-law)  25.5 dB"]
+    right = axes.child_axes[0]
+    low, high = sorted(100 * 10 ** (-np.array(axes.get_ylim()) / 20))
+    ticks = [float(label.get_text().removesuffix(" %")) for label in right.get_yticklabels()]
+    assert ticks and all(low <= tick <= high for tick in ticks)
+    only = [{"seconds": 1.0, "psnr_ldr": 20.0}]
+    assert len(training_figure(only).axes[0].get_lines()) == 1
+
+
+def test_stops_show_what_the_photo_lost(tmp_path):
+    run, scene = make(tmp_path)
+    view = scene.views[1]
+    from_photo = run.response.decode(view.image) / view.exposure_time
+    comparison = Comparison(view.name, view.image, from_photo, run.render(view.camera).hdr, view.hdr)
+    figure = stops_figure(comparison, 0.5)
+    pictures = [axes.get_images()[0].get_array() for axes in figure.axes]
+    photo, hdr, truth = pictures[:5], pictures[5:10], pictures[10:]
+    clipped = comparison.photo == 1
+    assert clipped.any()
+    assert np.ptp(photo[0][clipped]) < 1e-6 < 0.01 < np.ptp(hdr[0][clipped])
+    np.testing.assert_array_equal(hdr, truth)
