@@ -58,14 +58,18 @@ class Render:
     """Folder for the images."""
     cameras: str = "test"
     """test, train, all, orbit, interpolate, or a JSON file of cameras."""
+    count: int = 60
+    """Views of an orbit or interpolation."""
     evs: str | None = None
     """Exposure brackets in stops from the photos' exposure, such as --evs=-4,-2,0,2,4."""
     exposures: str | None = None
     """Exposure brackets in seconds, such as 0.125,0.5,2,8,32."""
     multipart: bool = False
     """One multi-part EXR file for all exposures of a view."""
-    colorspace: Literal["rec709", "acescg", "aces2065-1", "rec2020"] = "rec709"
-    """Primaries of the EXR files; always scene-linear."""
+    ldr_brackets: Literal["jpeg", "png", "png16"] | None = None
+    """Also write the brackets as simulated photos, through the camera response."""
+    colorspace: str = "rec709"
+    """Primaries of the EXR files, always scene-linear: rec709, acescg, aces2065-1, rec2020, display-p3 or dci-p3."""
     pixel: Literal["half", "float"] = "half"
     """Pixel type of the EXR files."""
     device: str | None = None
@@ -222,11 +226,13 @@ def _render(command: Render) -> None:
         _load_run(command.run, command.device),
         command.out,
         cameras=command.cameras,
+        count=command.count,
         evs=_numbers("--evs", command.evs),
         exposures=_numbers("--exposures", command.exposures),
         multipart=command.multipart,
         colorspace=command.colorspace,
         pixel=command.pixel,
+        ldr_brackets=command.ldr_brackets,
         overwrite=command.overwrite,
         progress=_say,
     )

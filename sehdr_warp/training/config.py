@@ -48,8 +48,16 @@ class ModelConfig:
 class ResponseConfig:
     """The camera response f: exposure (radiance x seconds) to encoded values."""
 
-    name: str = option("srgb", "a response's name, a file, or auto: the paper's score on one random training photo", nonempty=True)
-    candidates: tuple[str, ...] = option((), "what auto chooses from: names and files; empty means every built-in response")
+    name: str = option("srgb", "a response's name, a file, or auto: the one that fits the photos best", nonempty=True)
+    method: str = option(
+        "edges",
+        "how auto chooses; edges: colours across edges mix linearly (Lin et al. 2004), over all training photos; "
+        "paper: dynamic range and smoothness on one random training photo",
+        choices=("edges", "paper"),
+    )
+    candidates: tuple[str, ...] = option(
+        (), "what auto chooses from: names, and files of one curve or many; empty means every built-in response", nonempty=True
+    )
 
 
 @dataclass(frozen=True)

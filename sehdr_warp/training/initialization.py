@@ -1,5 +1,7 @@
 """The field a training starts from: the scene's points, or points drawn where several cameras look."""
 
+from pathlib import Path
+
 import numpy as np
 import torch
 
@@ -8,7 +10,8 @@ from ..model.exposure import exposure_times
 from ..model.fusion import NeuralExposureFusion
 from ..model.gaussians import Gaussians
 from ..model.radiance_field import EXPOSURE_FLOOR, RadianceField
-from ..model.response import Response, response_by_name, response_names
+from ..model.response import Response, response_by_name, response_names, responses_in_file
+from ..model.response_selection import select_response
 from ..scene import Scene, View
 from .config import Config
 
@@ -39,14 +42,20 @@ def scene_extent(scene: Scene) -> float:
 
 
 def choose_response(scene: Scene, config: Config) -> Response:
-    """The response that the config names; for "auto" the paper's choice on one random training photo."""
-    if config.response.name != "auto":
-        return response_by_name(config.response.name)
-    from ..model.response_selection import select_response
+    """The response that the config names; for "auto" the candidate that fits the training photos best."""
+    options = config.response
+    if options.name != "auto":
+        return response_by_name(options.name)
+    candidates = [response for name in options.candidates or response_names() for response in _responses(name)]
+    images = [view.image for view in scene.train_views]
+    if options.method == "paper":
+        images = [images[int(np.random.default_rng(config.seed).integers(len(images)))]]
+    return select_response(images, candidates, method=options.method, seed=config.seed).response
 
-    view = scene.train_views[int(np.random.default_rng(config.seed).integers(len(scene.train_views)))]
-    names = config.response.candidates or response_names()
-    return select_response(view.image, [response_by_name(name) for name in names])
+
+def _responses(name: str) -> list[Response]:
+    """Every curve of a file that holds many, or the one that a name stands for."""
+    return responses_in_file(name) if Path(name).is_file() else [response_by_name(name)]
 
 
 def make_field(scene: Scene, config: Config, response: Response, device: torch.device | str) -> RadianceField:

@@ -64,6 +64,7 @@ def train(
         write_start(out, scene, config, field, data or {})
     loop = _Loop(scene, out, trainer, seconds, tensorboard)
     with Progress(trainer.config.schedule.iterations, enabled=not quiet) as progress:
+        progress.note(f"response {trainer.field.response.name}, {trainer.field.gaussians.count} Gaussians on {device}")
         loop.run(progress)
     return load_run(out, device=device)
 

@@ -1,0 +1,80 @@
+"""docs/architecture.md, held: which room may import which, and how large a file may be."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / "sehdr_warp"
+
+# What each room may import of the others. Imports go down the line scene -> model -> splatting -> kernels; training
+# drives all four, and takes two leaves of the rooms that read a trained model.
+ALLOWED = {
+    "kernels": set(),
+    "errors": set(),
+    "scene": {"errors", "embedded"},
+    "splatting": {"errors", "kernels"},
+    "model": {"errors", "scene", "splatting"},
+    "training": {"errors", "scene", "model", "splatting", "configs", "output.files", "evaluation.metrics", "evaluation.protocols"},
+    "output": {"errors", "scene", "model", "evaluation.metrics"},
+    "evaluation": {"errors", "scene", "model", "splatting", "output.files"},
+}
+# Packages that only some rooms may import.
+ONLY_IN = {"torch": {"model", "splatting", "training", "output", "evaluation"}, "warp": {"kernels", "splatting"}}
+LARGEST_FILE = 480
+
+
+def sources():
+    for folder in (PACKAGE, ROOT / "kernels"):
+        for path in sorted(folder.rglob("*.py")):
+            room = "kernels" if folder.name == "kernels" else path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+            yield pytest.param(path, room, id=str(path.relative_to(ROOT)))
+
+
+def imports(path):
+    """Dotted names that a file imports; those of the package start with `sehdr_warp.`."""
+    parts = ("sehdr_warp", *path.relative_to(PACKAGE).parts) if PACKAGE in path.parents else ("sehdr_warp", "kernels", path.name)
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = [*parts[: len(parts) - node.level]] if node.level else []
+            stem = ".".join([*base, *([node.module] if node.module else [])])
+            yield from (f"{stem}.{alias.name}" for alias in node.names)
+
+
+@pytest.mark.parametrize("path,room", list(sources()))
+def test_imports_go_down_the_line(path, room):
+    for name in imports(path):
+        top, *rest = name.split(".")
+        if top == "sehdr_warp" and room in ALLOWED and rest and rest[0] != room:
+            fits = any(".".join(rest).startswith(allowed) for allowed in ALLOWED[room]) or rest[0] == "__version__"
+            assert fits, f"{room} may not import {name}"
+        if top in ONLY_IN and room in ALLOWED:
+            assert room in ONLY_IN[top], f"{room} may not import {name}"
+
+
+def test_kernels_import_warp_only():
+    allowed = {"warp", "sehdr_warp.kernels"} | set(sys.stdlib_module_names)
+    for path in sorted((ROOT / "kernels").glob("*.py")):
+        for name in imports(path):
+            assert any(name == top or name.startswith(top + ".") for top in allowed), f"{path.name} imports {name}"
+
+
+@pytest.mark.parametrize("path,room", list(sources()))
+def test_files_are_one_room_each(path, room):
+    assert len(path.read_text().splitlines()) <= LARGEST_FILE
+
+
+def test_every_file_says_what_it_is():
+    for path in [*PACKAGE.rglob("*.py"), *(ROOT / "kernels").glob("*.py")]:
+        assert ast.get_docstring(ast.parse(path.read_text())), f"{path} has no docstring"
+
+
+@pytest.mark.parametrize("module", ["sehdr_warp", "sehdr_warp.cli", "sehdr_warp.scene", "sehdr_warp.training.config_files"])
+def test_light_modules_leave_torch_and_warp_alone(module):
+    code = f"import sys, {module}; print([name for name in ('torch', 'warp') if name in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
