@@ -2,6 +2,17 @@
 
 from .bridge import Program, differentiable
 from .harmonics import spherical_harmonics
+from .neighbours import nearest_neighbour_distances
 from .rasterization import Rendering, rasterize
+from .ssim import ssim, ssim_map
 
-__all__ = ["Program", "Rendering", "differentiable", "rasterize", "spherical_harmonics"]
+__all__ = [
+    "Program",
+    "Rendering",
+    "differentiable",
+    "nearest_neighbour_distances",
+    "rasterize",
+    "spherical_harmonics",
+    "ssim",
+    "ssim_map",
+]

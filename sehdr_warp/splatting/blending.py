@@ -40,11 +40,11 @@ def blend(
     alpha = program.write((height, width), features.dtype)
     on_blocks = not program.is_cpu if block_kernels is None else block_kernels
     backend = blend_on_cuda if on_blocks else blend_on_cpu
-    backward = backend(program.device, features, lists, image, alpha, width, height, alpha_threshold)
+    backward = backend(program.device, features, lists, program.tensor(image), program.tensor(alpha), alpha_threshold)
 
     def adjoint():
         """backward() gives [N, C + 6]: by feature, conic a b c, x, y, opacity."""
-        gathered = backward()
+        gathered = backward(wp.to_torch(image.grad, requires_grad=False), wp.to_torch(alpha.grad, requires_grad=False))
         channels = features.shape[1]
         columns = {
             "features": gathered[:, :channels],

@@ -9,29 +9,31 @@ from ..kernels import blend_cpu
 from ..kernels.constants import TILE_SIZE
 from ..kernels.geometry import vector
 from . import threads
-from .dtypes import warp_scalar
+from .arrays import view, warp_scalar
 from .tile_lists import TileLists
 
 
-def blend_on_cpu(device, features, lists: TileLists, image, alpha, width: int, height: int, alpha_threshold: float):
-    """Fill image [H, W, C] and alpha [H, W] (Warp arrays); return the backward pass as a function of their .grad."""
+def blend_on_cpu(device, features, lists: TileLists, image, alpha, alpha_threshold: float):
+    """Fill image [H, W, C] and alpha [H, W]; return the backward pass.
+
+    It takes the gradients of image and alpha and gives [N, C + 6]: by feature, conic a b c, x, y, opacity.
+    """
     scalar = warp_scalar(features.dtype)
-    channels = features.shape[1]
+    height, width, channels = image.shape
     halvings = exponent_halvings(alpha_threshold)
     row, vec4 = vector(TILE_SIZE, scalar), vector(4, scalar)
     tile_count = lists.columns * lists.rows
 
     def rows(*shape):
-        return wp.from_torch(features.new_empty(tile_count, *shape, TILE_SIZE), dtype=row, requires_grad=False)
+        return view(features.new_empty(tile_count, *shape, TILE_SIZE), dtype=row)
 
     pieces = balanced_pieces(lists)
-    iota = wp.from_torch(torch.arange(TILE_SIZE, dtype=features.dtype).reshape(1, TILE_SIZE), dtype=row)
-    ranges, entries = wp.from_torch(lists.ranges, dtype=wp.vec2i), wp.from_torch(lists.gaussians)
-    records = [wp.from_torch(lists.shapes, dtype=vec4), wp.from_torch(lists.ellipses, dtype=vec4)]
-    colours = wp.from_torch(features, requires_grad=False)
-    view = [lists.columns, width, height, alpha_threshold, iota]
+    iota = view(torch.arange(TILE_SIZE, dtype=features.dtype).reshape(1, TILE_SIZE), dtype=row)
+    ranges, entries = view(lists.ranges, dtype=wp.vec2i), view(lists.gaussians)
+    records = [view(lists.shapes, dtype=vec4), view(lists.ellipses, dtype=vec4)]
+    colours = view(features)
+    frame = [lists.columns, width, height, alpha_threshold, iota]
     transmittance, last = rows(TILE_SIZE), rows(TILE_SIZE)
-    pixels = height * width
     threads.launch_ranges(
         blend_cpu.forward_kernel(scalar, channels, halvings),
         pieces,
@@ -40,17 +42,17 @@ def blend_on_cpu(device, features, lists: TileLists, image, alpha, width: int, h
             entries,
             *records,
             colours,
-            *view,
+            *frame,
             transmittance,
             rows(channels, TILE_SIZE),
             last,
-            image.reshape((pixels, channels)),
-            alpha.flatten(),
+            view(image.view(-1, channels)),
+            view(alpha.view(-1)),
         ],
         device,
     )
 
-    def backward() -> torch.Tensor:
+    def backward(image_gradient: torch.Tensor, alpha_gradient: torch.Tensor) -> torch.Tensor:
         entry_gradients = features.new_empty(lists.entry_count, channels + 6)
         threads.launch_ranges(
             blend_cpu.backward_kernel(scalar, channels, halvings),
@@ -58,19 +60,19 @@ def blend_on_cpu(device, features, lists: TileLists, image, alpha, width: int, h
             [
                 ranges,
                 entries,
-                wp.from_torch(lists.emission),
+                view(lists.emission),
                 *records,
                 colours,
-                *view,
+                *frame,
                 transmittance,
                 last,
-                image.grad.reshape((pixels, channels)),
-                alpha.grad.flatten(),
+                view(image_gradient.view(-1, channels)),
+                view(alpha_gradient.view(-1)),
                 rows(TILE_SIZE),
                 rows(channels, TILE_SIZE),
                 rows(TILE_SIZE),
                 rows(TILE_SIZE),
-                wp.from_torch(entry_gradients),
+                view(entry_gradients),
             ],
             device,
         )
@@ -79,11 +81,11 @@ def blend_on_cpu(device, features, lists: TileLists, image, alpha, width: int, h
             blend_cpu.gather_kernel(scalar),
             threads.even_ranges(features.shape[0]),
             [
-                wp.from_torch(lists.order),
-                wp.from_torch(lists.ends),
-                wp.from_torch(entry_gradients),
+                view(lists.order),
+                view(lists.ends),
+                view(entry_gradients),
                 channels + 6,
-                wp.from_torch(gathered),
+                view(gathered),
             ],
             device,
         )

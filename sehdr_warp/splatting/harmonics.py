@@ -5,7 +5,7 @@ import torch
 from ..kernels.geometry import vector
 from ..kernels.harmonics import harmonics_kernel
 from .bridge import differentiable
-from .dtypes import warp_scalar
+from .arrays import warp_scalar
 
 MAX_DEGREE = 3
 

@@ -5,7 +5,7 @@ import warp as wp
 from ..kernels.geometry import matrix, vector
 from ..kernels.project import projection_kernel
 from .bridge import differentiable
-from .dtypes import warp_scalar
+from .arrays import warp_scalar
 
 
 @differentiable

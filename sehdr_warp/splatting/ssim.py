@@ -7,6 +7,7 @@ import warp as wp
 
 from ..kernels.ssim import RADIUS, ssim_kernels, window
 from . import threads
+from .arrays import view
 from .bridge import torch_stream
 
 # Numbers that one step of the CPU kernels takes: one AVX-512 register of float32.
@@ -92,7 +93,7 @@ def _gradient(a: torch.Tensor, b: torch.Tensor, derivatives: torch.Tensor, scale
     scale = scale.reshape(1)
     with torch_stream(a.device):
         runs.launch("blur_derivatives", [runs.view(derivatives)], [blurred])
-        runs.launch("gradient", [blurred, runs.view(a), runs.view(b)], [_descriptor(scale), runs.view(result)])
+        runs.launch("gradient", [blurred, runs.view(a), runs.view(b)], [view(scale), runs.view(result)])
     return result
 
 
@@ -110,7 +111,7 @@ class _Runs:
         self.like = image
         self.lanes = CPU_LANES if image.device.type == "cpu" and self.length >= CPU_LANES else 1
         self.kernels = ssim_kernels(wp.dtype_from_torch(image.dtype), self.lanes)
-        self.weights = _descriptor(_weights(image.dtype, image.device))
+        self.weights = view(_weights(image.dtype, image.device))
         self.device = wp.device_from_torch(image.device)
 
     def padded(self, count: int) -> torch.Tensor:
@@ -127,7 +128,7 @@ class _Runs:
         length = tensor.numel() // rows.numel()
         strides = (length,) if len(rows) == 1 else (rows[1] * length, length)
         runs = tensor.as_strided((*rows, length - self.lanes + 1, self.lanes), (*strides, 1, 1))
-        return _descriptor(runs, self.kernels.run)
+        return view(runs, self.kernels.run)
 
     def launch(self, name: str, inputs, results) -> None:
         """Launch a kernel over the whole image."""
@@ -138,10 +139,6 @@ class _Runs:
             threads.launch_ranges(kernel, threads.even_ranges(count, STEPS_PER_THREAD), arguments, self.device)
         else:
             wp.launch(kernel, dim=count, inputs=[0, *arguments], device=self.device)
-
-
-def _descriptor(tensor: torch.Tensor, dtype=None):
-    return wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
 
 
 @cache

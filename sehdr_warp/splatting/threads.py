@@ -24,19 +24,30 @@ def thread_count() -> int:
 
 
 def run_parallel(task, items) -> None:
-    """Call task(item) for every item, on the pool; the first exception is raised here."""
+    """Call task(item) for every item, on this thread and the pool's; the first exception is raised here."""
     global _pool, _pool_size
     items = list(items)
-    threads = thread_count()
-    if threads == 1 or len(items) < 2:
-        for item in items:
+    helpers = min(thread_count(), len(items)) - 1
+    pending = iter(items)  # advancing a list's iterator is atomic under the interpreter's lock
+
+    def work():
+        for item in pending:
             task(item)
+
+    if helpers < 1:
+        work()
         return
-    if _pool is None or _pool_size != threads:
-        _pool = ThreadPoolExecutor(threads, thread_name_prefix="sehdr-warp")
-        _pool_size = threads
-    for _ in _pool.map(task, items):
-        pass
+    if _pool is None or _pool_size < helpers:
+        _pool = ThreadPoolExecutor(helpers, thread_name_prefix="sehdr-warp")
+        _pool_size = helpers
+    futures = [_pool.submit(work) for _ in range(helpers)]
+    try:
+        work()
+    finally:
+        for future in futures:
+            future.exception()  # no thread may still be at work when the caller goes on
+    for future in futures:
+        future.result()
 
 
 def even_ranges(count: int, smallest: int = 1024) -> list[tuple[int, int]]:

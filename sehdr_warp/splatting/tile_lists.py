@@ -10,7 +10,7 @@ from ..kernels.constants import TILE_SIZE
 from ..kernels.geometry import vector
 from ..kernels.tiles import mark_ranges, tile_kernels
 from .bridge import torch_stream
-from .dtypes import warp_scalar
+from .arrays import view, warp_scalar
 
 _LARGEST_INT32 = 2**31 - 1
 
@@ -75,13 +75,13 @@ def pack_records(means2d, conics, opacities, extents, alpha_threshold: float):
         tile_kernels(scalar)[0],
         count,
         [
-            _read(means2d, vec2),
-            _read(conics, vec3),
-            _read(opacities),
-            _read(extents, vec2),
+            view(means2d, vec2),
+            view(conics, vec3),
+            view(opacities),
+            view(extents, vec2),
             alpha_threshold,
-            _read(shapes, vec4),
-            _read(ellipses, vec4),
+            view(shapes, vec4),
+            view(ellipses, vec4),
         ],
         means2d.device,
     )
@@ -103,7 +103,7 @@ def count_entries(order, shapes, ellipses, extents, columns: int, rows: int):
     _launch(
         tile_kernels(warp_scalar(shapes.dtype))[1],
         order.shape[0],
-        [_read(order), _read(shapes, vec4), _read(ellipses, vec4), _read(extents, vec2), columns, rows, _read(counts)],
+        [view(order), view(shapes, vec4), view(ellipses, vec4), view(extents, vec2), columns, rows, view(counts)],
         order.device,
     )
     total = int(counts.sum(dtype=torch.int64)) if order.shape[0] else 0
@@ -125,15 +125,15 @@ def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends
             tile_kernels(warp_scalar(shapes.dtype))[2],
             order.shape[0],
             [
-                _read(order),
-                _read(shapes, vec4),
-                _read(ellipses, vec4),
-                _read(extents, vec2),
+                view(order),
+                view(shapes, vec4),
+                view(ellipses, vec4),
+                view(extents, vec2),
                 columns,
                 rows,
-                _read(ends),
-                _read(tiles),
-                _read(gaussians),
+                view(ends),
+                view(tiles),
+                view(gaussians),
             ],
             order.device,
         )
@@ -150,7 +150,7 @@ def find_ranges(tiles, tile_count: int):
     """[tiles, 2] int32: first and one past the last entry of each tile, (0, 0) for an untouched one."""
     ranges = torch.zeros(tile_count, 2, dtype=torch.int32, device=tiles.device)
     if tiles.shape[0]:
-        _launch(mark_ranges, tiles.shape[0], [_read(tiles), tiles.shape[0], _read(ranges, wp.vec2i)], tiles.device)
+        _launch(mark_ranges, tiles.shape[0], [view(tiles), tiles.shape[0], view(ranges, wp.vec2i)], tiles.device)
     return ranges
 
 
@@ -160,12 +160,9 @@ def _sorted_places(keys, count: int, bits: int | None = None):
     torch.arange(count, dtype=torch.int32, device=keys.device, out=places[:count])
     if count:
         with torch_stream(keys.device):
-            wp.utils.radix_sort_pairs(_read(keys), _read(places), count, end_bit=bits)
+            wp.utils.radix_sort_pairs(wp.from_torch(keys), wp.from_torch(places), count, end_bit=bits)
     return places[:count]
 
-
-def _read(tensor, dtype=None):
-    return wp.from_torch(tensor, dtype=dtype, requires_grad=False)
 
 
 def _launch(kernel, count: int, arguments, device) -> None:
