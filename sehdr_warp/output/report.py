@@ -1,4 +1,4 @@
-"""Pictures that show what a training achieved: photo, HDR and truth side by side, exposure stops, error against time."""
+"""Pictures of what a training achieved: photo, HDR and truth side by side, exposure stops, error against time."""
 
 import json
 from collections.abc import Sequence
