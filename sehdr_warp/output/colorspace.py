@@ -10,6 +10,9 @@ from sehdr_warp.errors import SehdrError
 # The adaptation of the ACES transforms (and of OpenColorIO's built-in ones), where white points differ.
 CHROMATIC_ADAPTATION = "Bradford"
 
+# ITU-R BT.709-6, items 1.3 and 1.4. Importing colour-science takes a second, which the default need not.
+_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+
 
 @dataclass(frozen=True)
 class ColorSpace:
@@ -62,6 +65,8 @@ def color_space(name: str) -> ColorSpace:
 @cache
 def chromaticities(name: str) -> tuple[float, ...]:
     """CIE xy of red, green, blue and white: eight numbers in the order of OpenEXR's `chromaticities`."""
+    if color_space(name).name == "rec709":
+        return _REC709
     space = _colourspace(name)
     return tuple(float(value) for value in (*space.primaries.ravel(), *space.whitepoint))
 
@@ -69,11 +74,11 @@ def chromaticities(name: str) -> tuple[float, ...]:
 @cache
 def matrix_from_rec709(name: str) -> np.ndarray:
     """[3, 3] float64: linear Rec.709 column vectors to the named space, white to white (Bradford adaptation)."""
-    import colour
-
     if color_space(name).name == "rec709":
         matrix = np.eye(3)
     else:
+        import colour
+
         matrix = colour.matrix_RGB_to_RGB(_colourspace("rec709"), _colourspace(name), CHROMATIC_ADAPTATION)
     matrix.setflags(write=False)
     return matrix

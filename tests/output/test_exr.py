@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 from datetime import datetime
 
 import numpy as np
@@ -6,7 +8,7 @@ import OpenEXR
 import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.output.colorspace import color_space, color_space_names, from_rec709, matrix_from_rec709
+from sehdr_warp.output.colorspace import chromaticities, color_space, color_space_names, from_rec709, matrix_from_rec709
 from sehdr_warp.output.exr import Part, exr_header, read_exr, stored_pixel_type, write_exr, write_multipart_exr
 
 from .helpers import camera, radiance
@@ -171,6 +173,15 @@ def test_white_stays_white_and_the_gamut_holds(name):
 def test_chromaticities_are_those_of_the_interop_id(name):
     header = exr_header(colorspace=name)
     assert OpenEXR.chromaticitiesToColorInteropID(header["chromaticities"]) == header["colorInteropID"]
+
+
+def test_default_space_is_that_of_colour_science_and_does_without_it():
+    import colour
+
+    space = colour.RGB_COLOURSPACES["ITU-R BT.709"]
+    np.testing.assert_array_equal(chromaticities("rec709"), [*space.primaries.ravel(), *space.whitepoint])
+    code = "import sys; from sehdr_warp.output.exr import exr_header; exr_header(); assert 'colour' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_unknown_color_space_lists_the_known():
