@@ -137,8 +137,8 @@ class OptimizerConfig:
     log_scales: float = option(5e-3, "logarithms of the sizes", above=0.0, high=1.0)
     quaternions: float = option(1e-3, "rotations", above=0.0, high=1.0)
     opacity_logits: float = option(5e-2, "opacities before the sigmoid", above=0.0, high=1.0)
-    harmonics_dc: float = option(1e-2, "colours, degree 0", above=0.0, high=1.0)
-    harmonics_rest: float = option(5e-4, "colours, higher degrees", above=0.0, high=1.0)
+    harmonics_dc: float = option(2e-2, "colours, degree 0", above=0.0, high=1.0)
+    harmonics_rest: float = option(1e-3, "colours, higher degrees", above=0.0, high=1.0)
     fusion: float = option(1e-3, "perceptrons and widths of the fusion", above=0.0, high=1.0)
 
 

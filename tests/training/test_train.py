@@ -44,8 +44,8 @@ VARIANTS = {
     "relocation": quick(**{"densification.strategy": "relocation", "loss.opacity_weight": 0.01, "loss.scale_weight": 0.01}),
     "coarse": quick(**{"schedule.coarse_levels": 1, "schedule.coarse_every": 50}),
     "3dgs": quick("3dgs", **{"optimizer.harmonics_dc": 0.01}),
-    "paper": quick("paper", **{"response.name": "srgb", "fusion.radiance_scale": "base", "optimizer.harmonics_dc": 0.02}),
-    "paper, pixel": quick("paper", **{"response.name": "srgb", "fusion.radiance_scale": "base", "model.tone_map": "pixel"}),
+    "paper": quick("paper", **{"response.name": "srgb", "optimizer.harmonics_dc": 0.05, "optimizer.fusion": 0.01}),
+    "paper, pixel": quick("paper", **{"response.name": "srgb", "optimizer.harmonics_dc": 0.05, "optimizer.fusion": 0.01, "model.tone_map": "pixel"}),
     "truth": quick(**{"loss.linear_weight": 0.5, "loss.hdr_truth": True}),
     "gaussian tone map": quick(**{"model.tone_map": "gaussian"}),
 }
@@ -56,7 +56,9 @@ def test_every_variant_learns(scene, tmp_path, variant):
     run = train(scene, tmp_path / "run", VARIANTS[variant], device="cpu", quiet=True)
     first, last = run.metrics()
     assert first["iteration"] == 10 and last["iteration"] == 150 and last["split"] == "test"
-    assert last["psnr_ldr"] > first["psnr_ldr"] + 1.5
+    # The perceptrons of the fusion take longer than this to find their weights.
+    gain = 0.8 if run.config.fusion.enabled else 3.0
+    assert last["psnr_ldr"] > first["psnr_ldr"] + gain
     assert last["seconds"] > first["seconds"] > 0
     assert run.summary()["finished"] and run.summary()["skipped_steps"] == 0
     assert np.isfinite(run.render(run.cameras[0].camera).hdr.numpy()).all()
@@ -65,7 +67,7 @@ def test_every_variant_learns(scene, tmp_path, variant):
 def test_the_default_gets_radiance_right(scene, tmp_path):
     run = train(scene, tmp_path / "run", quick(), device="cpu", quiet=True)
     last = run.metrics()[-1]
-    assert last["psnr_ldr"] > 22 and last["psnr_mu"] > 22
+    assert last["psnr_ldr"] > 20 and last["psnr_mu"] > 20
     assert run.exposure_time == EXPOSURE_TIME and run.gaussian_count == last["gaussians"]
 
 
@@ -177,7 +179,7 @@ def test_non_finite_steps_are_skipped_and_then_stop(scene):
     trainer.step()
     assert trainer.skipped_steps == 1 and not torch.equal(before, field.gaussians.means)
     field.gaussians.harmonics_dc.register_hook(lambda gradient: gradient * float("inf"))
-    with pytest.raises(SehdrError, match="iteration 40: .* nonfinite_limit = 20"):
+    with pytest.raises(SehdrError, match="iteration 40: .*schedule.nonfinite_limit = 20"):
         for _ in range(60):
             trainer.step()
     assert torch.isfinite(field.gaussians.means).all()
