@@ -1,4 +1,4 @@
-"""The command `sehdr-warp`: parses, calls, prints. Modules that need torch are imported by the commands that need them."""
+"""The command `sehdr-warp`: parses, calls, prints. What needs torch is imported by the commands that need it."""
 
 import json
 import sys
@@ -20,8 +20,8 @@ class Train:
     """Train a scene from photos of one exposure."""
 
     data: Positional[str]
-    """Folder of photos: COLMAP, transforms.json, HDR-NeRF, HDR-GS, LLFF or bare photos; `embedded` is the scene that comes
-    with the package."""
+    """Folder of photos: COLMAP, transforms.json, HDR-NeRF, HDR-GS, LLFF or bare photos; `embedded` is the scene that
+    comes with the package."""
     out: Path
     """Folder for the run."""
     preset: str | None = None
@@ -100,7 +100,7 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Export:
-    """Write the Gaussians as PLY: `hdr` with scene-linear colours, `ldr` with display colours that 3DGS viewers read."""
+    """Write the Gaussians as PLY: `hdr` with scene-linear colours, `ldr` with the display colours of 3DGS viewers."""
 
     run: Positional[Path]
     """Folder of a run."""

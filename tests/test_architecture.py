@@ -18,7 +18,16 @@ ALLOWED = {
     "scene": {"errors", "embedded"},
     "splatting": {"errors", "kernels"},
     "model": {"errors", "scene", "splatting"},
-    "training": {"errors", "scene", "model", "splatting", "configs", "output.files", "evaluation.metrics", "evaluation.protocols"},
+    "training": {
+        "errors",
+        "scene",
+        "model",
+        "splatting",
+        "configs",
+        "output.files",
+        "evaluation.metrics",
+        "evaluation.protocols",
+    },
     "output": {"errors", "scene", "model", "evaluation.metrics"},
     "evaluation": {"errors", "scene", "model", "splatting", "output.files"},
 }
@@ -36,7 +45,11 @@ def sources():
 
 def imports(path):
     """Dotted names that a file imports; those of the package start with `sehdr_warp.`."""
-    parts = ("sehdr_warp", *path.relative_to(PACKAGE).parts) if PACKAGE in path.parents else ("sehdr_warp", "kernels", path.name)
+    parts = (
+        ("sehdr_warp", *path.relative_to(PACKAGE).parts)
+        if PACKAGE in path.parents
+        else ("sehdr_warp", "kernels", path.name)
+    )
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -74,7 +87,11 @@ def test_every_file_says_what_it_is():
         assert ast.get_docstring(ast.parse(path.read_text())), f"{path} has no docstring"
 
 
-@pytest.mark.parametrize("module", ["sehdr_warp", "sehdr_warp.cli", "sehdr_warp.scene", "sehdr_warp.training.config_files"])
+@pytest.mark.parametrize(
+    "module", ["sehdr_warp", "sehdr_warp.cli", "sehdr_warp.scene", "sehdr_warp.training.config_files"]
+)
 def test_light_modules_leave_torch_and_warp_alone(module):
     code = f"import sys, {module}; print([name for name in ('torch', 'warp') if name in sys.modules])"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+    )

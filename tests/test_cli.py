@@ -10,7 +10,7 @@ import pytest
 from sehdr_warp import __version__, cli
 
 
-def call(*arguments, capsys=None):
+def call(*arguments):
     """Exit status of a command line in this process."""
     with pytest.raises(SystemExit) as caught:
         cli.main([str(argument) for argument in arguments])
@@ -38,8 +38,25 @@ def test_version_and_help(capsys):
 @pytest.mark.parametrize(
     "command,flags",
     [
-        ("train", ["--out", "--preset", "--device", "--exposure-index", "--response", "--iterations", "--max-size", "--seed", "--resume", "--json"]),
-        ("render", ["--out", "--cameras", "--evs", "--exposures", "--multipart", "--colorspace", "--pixel", "--overwrite"]),
+        (
+            "train",
+            [
+                "--out",
+                "--preset",
+                "--device",
+                "--exposure-index",
+                "--response",
+                "--iterations",
+                "--max-size",
+                "--seed",
+                "--resume",
+                "--json",
+            ],
+        ),
+        (
+            "render",
+            ["--out", "--cameras", "--evs", "--exposures", "--multipart", "--colorspace", "--pixel", "--overwrite"],
+        ),
         ("eval", ["--json"]),
     ],
 )
@@ -50,7 +67,8 @@ def test_documented_flags_exist(command, flags, capsys):
 
 
 def test_help_is_quick_and_needs_no_torch():
-    code = "import sys; from sehdr_warp import cli\ntry: cli.main(['train', '--help'])\nexcept SystemExit: print('torch' in sys.modules)"
+    call = "try: cli.main(['train', '--help'])\nexcept SystemExit: print('torch' in sys.modules)"
+    code = f"import sys; from sehdr_warp import cli\n{call}"
     times = []
     for _ in range(3):
         started = time.perf_counter()
@@ -60,11 +78,23 @@ def test_help_is_quick_and_needs_no_torch():
 
 
 def test_module_is_the_command():
-    out = subprocess.run([sys.executable, "-m", "sehdr_warp", "--version"], capture_output=True, text=True, check=True).stdout
+    out = subprocess.run(
+        [sys.executable, "-m", "sehdr_warp", "--version"], capture_output=True, text=True, check=True
+    ).stdout
     assert out == f"sehdr-warp {__version__}\n"
 
 
-@pytest.mark.parametrize("arguments", [[], ["train"], ["train", "x"], ["fly"], ["train", "x", "--out", "y", "--seed", "one"], ["render", "x", "--out", "y", "--pixel", "byte"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["train"],
+        ["train", "x"],
+        ["fly"],
+        ["train", "x", "--out", "y", "--seed", "one"],
+        ["render", "x", "--out", "y", "--pixel", "byte"],
+    ],
+)
 def test_wrong_usage_is_2(arguments, capsys):
     assert call(*arguments) == 2
 
@@ -72,7 +102,11 @@ def test_wrong_usage_is_2(arguments, capsys):
 def test_training_leaves_a_run_that_says_how_it_was_made(run):
     config = json.loads((run / "config.json").read_text())
     assert (config["seed"], config["schedule"]["iterations"], config["response"]["name"]) == (3, 30, "hdr-nerf")
-    assert json.loads((run / "run.json").read_text())["data"] == {"path": "embedded", "exposure_index": None, "max_size": 48}
+    assert json.loads((run / "run.json").read_text())["data"] == {
+        "path": "embedded",
+        "exposure_index": None,
+        "max_size": 48,
+    }
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert lines[-1]["iteration"] == 30 and {"seconds", "psnr_ldr", "psnr_mu", "gaussians", "split"} <= lines[-1].keys()
 
@@ -146,7 +180,10 @@ def test_render_writes_hdr_previews_and_brackets(run, tmp_path, capsys):
     assert call("render", run, "--out", out, "--device", "cpu") == 1, "nothing is replaced without --overwrite"
 
 
-@pytest.mark.parametrize("flags,words", [(["--evs=1,x"], "--evs"), (["--evs=0", "--exposures", "1"], "not both"), (["--colorspace", "cmyk"], "cmyk")])
+@pytest.mark.parametrize(
+    "flags,words",
+    [(["--evs=1,x"], "--evs"), (["--evs=0", "--exposures", "1"], "not both"), (["--colorspace", "cmyk"], "cmyk")],
+)
 def test_render_refuses_what_it_cannot_use(run, tmp_path, flags, words, capsys):
     assert call("render", run, "--out", tmp_path / "r", "--device", "cpu", *flags) == 1
     assert words in capsys.readouterr().err

@@ -39,7 +39,9 @@ class Gaussians(nn.Module):
             raise ValueError(f"{harmonics} harmonics are not a whole number of degrees")
 
     @classmethod
-    def from_points(cls, points: Tensor, dc: Tensor, degree: int, *, opacity: float = 0.1, scale: float = 1.0) -> "Gaussians":
+    def from_points(
+        cls, points: Tensor, dc: Tensor, degree: int, *, opacity: float = 0.1, scale: float = 1.0
+    ) -> "Gaussians":
         """Isotropic Gaussians at points, sized by their neighbours (3DGS, section 5.1).
 
         points: [N, 3] float32, N >= 1; dc: [N, 3] values of the constant part of the colour (harmonic times
@@ -96,7 +98,9 @@ class Gaussians(nn.Module):
         for name in PARAMETER_NAMES:
             added = rows[name]
             value = torch.cat([getattr(self, name).detach(), added])
-            self._exchange(name, value, optimizer, lambda state, added=added: torch.cat([state, torch.zeros_like(added)]))
+            self._exchange(
+                name, value, optimizer, lambda state, added=added: torch.cat([state, torch.zeros_like(added)])
+            )
 
     def overwrite(
         self, rows: dict[str, Tensor], index: Tensor | None = None, optimizer: torch.optim.Optimizer | None = None
@@ -112,7 +116,7 @@ class Gaussians(nn.Module):
 
     def forget(self, name: str, where, optimizer: torch.optim.Optimizer | None) -> None:
         """Zeroes a parameter's optimizer state at an index, mask or slice."""
-        for key, state in _moments(optimizer, getattr(self, name)).items():
+        for state in _moments(optimizer, getattr(self, name)).values():
             state[where] = 0
 
     def _exchange(self, name: str, value: Tensor, optimizer, change_state) -> None:

@@ -105,7 +105,7 @@ class RadianceField(nn.Module):
     def photograph(
         self, camera: CameraTensors, exposure_time: float, *, degree: int | None = None, linear: bool = False
     ) -> Photograph:
-        """A photo of exposure_time seconds; harmonics up to `degree`; linear: also the exposures a linear loss needs."""
+        """A photo of exposure_time seconds, harmonics up to `degree`; linear: also what a linear loss needs."""
         ratio = exposure_time / self.base_time
         if self.radiance == "display":
             rendering = self._rasterize(camera, self._harmonics(camera, degree).add(0.5).clamp_min(0))
@@ -116,9 +116,13 @@ class RadianceField(nn.Module):
             sets = {"encoded": self.response.encode_extended(fused * ratio)} | (sets if linear else {})
         if linear and self.fusion is not None:
             sets["base"] = base
-        rendering = self._rasterize(camera, torch.cat(list(sets.values()), dim=1) if len(sets) > 1 else next(iter(sets.values())))
+        rendering = self._rasterize(
+            camera, torch.cat(list(sets.values()), dim=1) if len(sets) > 1 else next(iter(sets.values()))
+        )
         images = dict(zip(sets, rendering.image.split(3, dim=2), strict=True))
-        encoded = images["encoded"] if self.tone_map == "gaussian" else self.response.encode_extended(images["fused"] * ratio)
+        encoded = (
+            images["encoded"] if self.tone_map == "gaussian" else self.response.encode_extended(images["fused"] * ratio)
+        )
         exposure = images.get("fused")
         return Photograph(encoded, exposure, images.get("base", exposure), rendering)
 

@@ -37,9 +37,13 @@ class ModelConfig:
         choices=("pixel", "gaussian"),
     )
     harmonics_degree: int = option(3, "highest degree of the spherical harmonics", low=0, high=3)
-    initial_count: int = option(50_000, "Gaussians to start from where the scene has no points", low=100, high=10_000_000)
+    initial_count: int = option(
+        50_000, "Gaussians to start from where the scene has no points", low=100, high=10_000_000
+    )
     initial_opacity: float = option(0.1, "opacity of every Gaussian at the start", above=0.0, high=0.99)
-    initial_scale: float = option(1.0, "start size, in mean distances to the three nearest neighbours", above=0.0, high=10.0)
+    initial_scale: float = option(
+        1.0, "start size, in mean distances to the three nearest neighbours", above=0.0, high=10.0
+    )
     antialiased: bool = option(False, "lower opacity where the low-pass filter widens a small Gaussian (Mip-Splatting)")
     low_pass: float = option(0.3, "variance in square pixels added to every projected Gaussian", low=0.0, high=10.0)
 
@@ -56,7 +60,9 @@ class ResponseConfig:
         choices=("edges", "paper"),
     )
     candidates: tuple[str, ...] = option(
-        (), "what auto chooses from: names, and files of one curve or many; empty means every built-in response", nonempty=True
+        (),
+        "what auto chooses from: names, and files of one curve or many; empty means every built-in response",
+        nonempty=True,
     )
 
 
@@ -90,9 +96,13 @@ class FusionConfig:
 class LossConfig:
     """What the renders are compared with, and how."""
 
-    form: str = option("sum", "sum: L1 + w (1 - SSIM), SeHDR; blend: (1 - w) L1 + w (1 - SSIM), 3DGS", choices=("sum", "blend"))
+    form: str = option(
+        "sum", "sum: L1 + w (1 - SSIM), SeHDR; blend: (1 - w) L1 + w (1 - SSIM), 3DGS", choices=("sum", "blend")
+    )
     ssim_weight: float = option(0.2, "w above", low=0.0, high=1.0)
-    clipping: bool = option(True, "a clipped pixel only says `at least`, a black one only `at most`; off: both are plain values")
+    clipping: bool = option(
+        True, "a clipped pixel only says `at least`, a black one only `at most`; off: both are plain values"
+    )
     linear_weight: float = option(0.0, "weight of the linear loss (SeHDR: 0.5)", low=0.0, high=100.0)
     linear_detach: str = option(
         "fused",
@@ -118,10 +128,16 @@ class DensificationConfig:
     stop: int = option(15_000, "last iteration at which it may", low=0)
     every: int = option(100, "iterations between changes", low=1)
     max_gaussians: int = option(3_000_000, "the count never exceeds this", low=1)
-    grow_gradient: float = option(0.0002, "gradient: mean gradient in normalised screen units that makes one grow", above=0.0)
-    grow_scale: float = option(0.01, "gradient: larger than this part of the scene is split, smaller is cloned", above=0.0)
+    grow_gradient: float = option(
+        0.0002, "gradient: mean gradient in normalised screen units that makes one grow", above=0.0
+    )
+    grow_scale: float = option(
+        0.01, "gradient: larger than this part of the scene is split, smaller is cloned", above=0.0
+    )
     prune_opacity: float = option(0.005, "fainter ones are taken away (relocation: are moved)", above=0.0, high=0.5)
-    prune_scale: float = option(0.1, "gradient: larger than this part of the scene is taken away after the first reset", above=0.0)
+    prune_scale: float = option(
+        0.1, "gradient: larger than this part of the scene is taken away after the first reset", above=0.0
+    )
     reset_every: int = option(3000, "gradient: iterations between resets of the opacities", low=1)
     revised_opacity: bool = option(False, "gradient: a split keeps the opacity of the whole (Revising Densification)")
     growth: float = option(0.05, "relocation: the count grows by this part at each change", low=0.0, high=1.0)
@@ -151,10 +167,14 @@ class ScheduleConfig:
     harmonics_every: int = option(1000, "iterations between degrees of the harmonics; degree 0 first", low=1)
     coarse_levels: int = option(0, "start with photos halved this often", low=0, high=4)
     coarse_every: int = option(1000, "iterations at each coarse level", low=1)
-    evaluate_at: tuple[int, ...] = option((1000, 3000, 7000, 15_000, 30_000), "iterations that test the held-out views; the last always does", low=1)
+    evaluate_at: tuple[int, ...] = option(
+        (1000, 3000, 7000, 15_000, 30_000), "iterations that test the held-out views; the last always does", low=1
+    )
     checkpoint_every: int = option(5000, "iterations between checkpoints; one is always written at the end", low=1)
     checkpoints_kept: int = option(1, "older checkpoints are deleted", low=1, high=1000)
-    nonfinite_limit: int = option(20, "steps with a loss or gradient that is not finite are skipped; more than this stop the training", low=0)
+    nonfinite_limit: int = option(
+        20, "steps with a loss or gradient that is not finite are skipped; more than this stop the training", low=0
+    )
 
 
 @dataclass(frozen=True)
@@ -218,7 +238,9 @@ def _check_together(config: Config) -> None:
     if model.radiance == "display" and fusion.enabled:
         raise ConfigError('fusion.enabled = true needs radiance: model.radiance = "display" has none')
     if model.radiance == "display" and loss.linear_weight > 0:
-        raise ConfigError(f'loss.linear_weight = {loss.linear_weight} needs radiance: model.radiance = "display" has none')
+        raise ConfigError(
+            f'loss.linear_weight = {loss.linear_weight} needs radiance: model.radiance = "display" has none'
+        )
     if loss.linear_weight > 0 and not (fusion.enabled or loss.hdr_truth):
         raise ConfigError(
             f"loss.linear_weight = {loss.linear_weight} has nothing to compare: needs fusion.enabled or loss.hdr_truth"

@@ -92,7 +92,9 @@ def _read(preset: str | Path) -> tuple[Path, dict]:
         if base is None:
             break
         if not isinstance(base, str):
-            raise InputError(path, f"base = {base!r} is not a name", f"use one of {', '.join(preset_names())}, or a file")
+            raise InputError(
+                path, f"base = {base!r} is not a name", f"use one of {', '.join(preset_names())}, or a file"
+            )
         path = _locate(base, beside=path.parent)
     merged: dict = {}
     for values in reversed(chain):
@@ -142,7 +144,9 @@ def _build(source: Path | str, values: dict) -> Config:
     try:
         return _table(Config, values, "")
     except ConfigError as error:
-        raise InputError(source, str(error), "correct the value; configs/default.toml says what each field means") from None
+        raise InputError(
+            source, str(error), "correct the value; configs/default.toml says what each field means"
+        ) from None
 
 
 def _table(kind: type, values, prefix: str):

@@ -110,7 +110,9 @@ def check_scene(scene: Scene) -> None:
     """Raises InputError for a scene without views enough, or whose photos say nothing about light."""
     views = scene.train_views
     if len(views) < 2:
-        raise InputError(scene.name, f"{len(views)} training view(s)", "a scene needs at least two photos from different places")
+        raise InputError(
+            scene.name, f"{len(views)} training view(s)", "a scene needs at least two photos from different places"
+        )
     images = [view.image for view in views]
     if max(float(image.max()) for image in images) <= 1 / 255:
         raise InputError(scene.name, "every training photo is black", "use a longer exposure")

@@ -1,11 +1,11 @@
 """The folder of a training: what it holds, how it begins, and how a trained scene is loaded from it.
 
-    config.json         the Config
-    scene.json          cameras of all views, splits, exposure times, names: enough to render without the photos
-    run.json            response, base exposure time, version, where the photos were
-    metrics.jsonl       one line for each evaluation
-    checkpoints/        see checkpoint.py
-    summary.json        times, memory and counts, when the training ended
+config.json         the Config
+scene.json          cameras of all views, splits, exposure times, names: enough to render without the photos
+run.json            response, base exposure time, version, where the photos were
+metrics.jsonl       one line for each evaluation
+checkpoints/        see checkpoint.py
+summary.json        times, memory and counts, when the training ended
 """
 
 import json
@@ -29,7 +29,12 @@ from .config_files import config_to_dict, read_config_json
 from .initialization import assemble_field
 
 CONFIG, SCENE, RUN, METRICS, SUMMARY, CHECKPOINTS = (
-    "config.json", "scene.json", "run.json", "metrics.jsonl", "summary.json", "checkpoints",
+    "config.json",
+    "scene.json",
+    "run.json",
+    "metrics.jsonl",
+    "summary.json",
+    "checkpoints",
 )
 FORMAT = 1
 _REMEDY = "the run is damaged: train again"
@@ -53,7 +58,15 @@ class Run:
     iterations, train_seconds: how far the training was. data: where the photos were, for load_scene; may be empty.
     """
 
-    def __init__(self, path: Path, config: Config, model: RadianceField, cameras: tuple[CameraEntry, ...], info: dict, values: dict):
+    def __init__(
+        self,
+        path: Path,
+        config: Config,
+        model: RadianceField,
+        cameras: tuple[CameraEntry, ...],
+        info: dict,
+        values: dict,
+    ):
         self.path = path
         self.config = config
         self.model = model
@@ -220,7 +233,9 @@ def read_cameras(path: Path) -> tuple[CameraEntry, ...]:
     values = _read_json(path / SCENE)
     try:
         return tuple(
-            CameraEntry(str(view["name"]), str(view["split"]), Camera.from_dict(view["camera"]), float(view["exposure_time"]))
+            CameraEntry(
+                str(view["name"]), str(view["split"]), Camera.from_dict(view["camera"]), float(view["exposure_time"])
+            )
             for view in values["views"]
         )
     except (KeyError, TypeError, ValueError) as error:
@@ -232,7 +247,11 @@ def check_same_scene(path: Path, scene: Scene) -> None:
     saved, given = _read_json(path / SCENE), json.loads(json.dumps(describe_scene(scene)))
     for name in ("layout", "views"):
         if saved.get(name) != given[name]:
-            raise InputError(path / SCENE, f"its {name} differ from those of {scene.name}", "resume with the same data and --max-size")
+            raise InputError(
+                path / SCENE,
+                f"its {name} differ from those of {scene.name}",
+                "resume with the same data and --max-size",
+            )
 
 
 def append_metrics(path: Path, line: dict) -> None:

@@ -20,8 +20,19 @@ from .heldout import evaluate_views
 from .initialization import choose_response, make_field
 from .progress import Progress
 from .run import (
-    CHECKPOINTS, CONFIG, SUMMARY, Run, append_metrics, check_folder, check_same_scene, clear_folder,
-    field_from_checkpoint, load_run, read_run_info, rewind_metrics, write_start,
+    CHECKPOINTS,
+    CONFIG,
+    SUMMARY,
+    Run,
+    append_metrics,
+    check_folder,
+    check_same_scene,
+    clear_folder,
+    field_from_checkpoint,
+    load_run,
+    read_run_info,
+    rewind_metrics,
+    write_start,
 )
 from .trainer import Trainer
 
@@ -78,7 +89,9 @@ def pick_device(device: str | torch.device | None) -> torch.device:
         torch.empty(0, device=made)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
-        raise InputError(f"device {device}", f"cannot be used ({reason})", "use cpu, or cuda:N of a GPU that torch sees") from None
+        raise InputError(
+            f"device {device}", f"cannot be used ({reason})", "use cpu, or cuda:N of a GPU that torch sees"
+        ) from None
     if made.type not in ("cpu", "cuda"):
         raise InputError(f"device {device}", "is neither a CPU nor a CUDA GPU", "use cpu or cuda:N")
     return torch.device("cuda", made.index or 0) if made.type == "cuda" else made
@@ -88,7 +101,9 @@ def _continue(scene: Scene, out: Path, config: Config | None, device) -> tuple[T
     """Trainer and training seconds as the newest checkpoint has them; from the start where there is none yet."""
     saved, info = read_config_json(out / CONFIG), read_run_info(out)
     if config is not None and config != saved:
-        raise InputError(out / CONFIG, _first_difference(saved, config), "resume with the run's own config, or train anew")
+        raise InputError(
+            out / CONFIG, _first_difference(saved, config), "resume with the run's own config, or train anew"
+        )
     check_same_scene(out, scene)
     checkpoint = newest_checkpoint(out / CHECKPOINTS)
     if checkpoint is None:

@@ -99,12 +99,12 @@ class Trainer:
             self.check()
 
     def check(self) -> None:
-        """Raises SehdrError if too many steps were skipped or no Gaussian is left."""
+        """Raises SehdrError if more than schedule.nonfinite_limit steps were skipped."""
         limit = self.config.schedule.nonfinite_limit
         if self.skipped_steps > limit:
             raise SehdrError(
-                f"iteration {self.iteration}: {self.skipped_steps} steps had a loss or gradient that is not finite, more "
-                f"than schedule.nonfinite_limit = {limit}; lower the learning rates or check the photos and cameras"
+                f"iteration {self.iteration}: {self.skipped_steps} steps had a loss or gradient that is not finite, "
+                f"more than schedule.nonfinite_limit = {limit}; lower the learning rates or check photos and cameras"
             )
 
     def state(self) -> tuple[dict[str, Tensor], dict]:

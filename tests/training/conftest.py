@@ -1,6 +1,7 @@
 """Scenes small enough to train on in seconds."""
 
 import pytest
+
 from .toy import toy_scene
 
 

@@ -10,7 +10,11 @@ from sehdr_warp.training.checkpoint import newest_checkpoint, read_checkpoint, w
 
 
 def state(iteration):
-    tensors = {"a.b": torch.arange(6.0).reshape(2, 3) + iteration, "step": torch.tensor(3.0), "rng": torch.arange(4, dtype=torch.uint8)}
+    tensors = {
+        "a.b": torch.arange(6.0).reshape(2, 3) + iteration,
+        "step": torch.tensor(3.0),
+        "rng": torch.arange(4, dtype=torch.uint8),
+    }
     return tensors, {"iteration": iteration, "order": [2, 0], "seconds": 1.25}
 
 
@@ -18,7 +22,9 @@ def test_round_trip(tmp_path):
     tensors, values = state(7)
     path = write_checkpoint(tmp_path / "c", tensors, values, kept=1)
     read = read_checkpoint(path)
-    assert {name: value.dtype for name, value in read.tensors.items()} == {name: value.dtype for name, value in tensors.items()}
+    assert {name: value.dtype for name, value in read.tensors.items()} == {
+        name: value.dtype for name, value in tensors.items()
+    }
     assert all(torch.equal(read.tensors[name], value) for name, value in tensors.items())
     assert {name: read.values[name] for name in values} == values
     assert sorted(p.name for p in path.iterdir()) == ["checkpoint.json", "state.safetensors"]

@@ -10,7 +10,12 @@ import sehdr_warp
 from sehdr_warp.errors import InputError
 from sehdr_warp.training.config import Config, ConfigError, FusionConfig, LossConfig, ModelConfig
 from sehdr_warp.training.config_files import (
-    config_from_dict, config_to_dict, config_to_toml, load_config, override_config, preset_names,
+    config_from_dict,
+    config_to_dict,
+    config_to_toml,
+    load_config,
+    override_config,
+    preset_names,
 )
 
 PACKAGE = Path(sehdr_warp.__file__).parent
@@ -57,7 +62,11 @@ def test_every_field_is_documented_and_read(path, item):
     if path.startswith("optimizer."):
         names.append("getattr(config.optimizer, name)")
     # In config.py only what follows the declarations counts as reading.
-    sources = [p.read_text().split("    def scaled")[-1] for room in ("training", "model") for p in (PACKAGE / room).glob("*.py")]
+    sources = [
+        p.read_text().split("    def scaled")[-1]
+        for room in ("training", "model")
+        for p in (PACKAGE / room).glob("*.py")
+    ]
     assert any(name in source for source in sources for name in names), f"{path} is never read"
 
 

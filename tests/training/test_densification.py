@@ -17,7 +17,9 @@ EXTENT = 2.0
 
 def cloud(count=6):
     generator = torch.Generator().manual_seed(5)
-    return Gaussians.from_points(torch.rand(count, 3, generator=generator), torch.rand(count, 3, generator=generator), 1)
+    return Gaussians.from_points(
+        torch.rand(count, 3, generator=generator), torch.rand(count, 3, generator=generator), 1
+    )
 
 
 def adam(gaussians):
@@ -168,7 +170,9 @@ def test_relocation_sums_are_equation_9():
     sums, opacity = _relocation_sums(), 0.3
     for n in (1, 2, 5, 20):
         direct = sum(
-            math.comb(i - 1, k) * (-1) ** k * opacity ** (k + 1) / math.sqrt(k + 1) for i in range(1, n + 1) for k in range(i)
+            math.comb(i - 1, k) * (-1) ** k * opacity ** (k + 1) / math.sqrt(k + 1)
+            for i in range(1, n + 1)
+            for k in range(i)
         )
         powers = opacity ** torch.arange(1, sums.shape[1] + 1, dtype=torch.float64)
         assert float(sums[n - 1] @ powers) == pytest.approx(direct, rel=1e-9)
@@ -177,7 +181,9 @@ def test_relocation_sums_are_equation_9():
 def test_relocation_moves_the_dead_and_keeps_the_image():
     generator = torch.Generator().manual_seed(0)
     gaussians = cloud(8)
-    gaussians.overwrite({"means": gaussians.means.detach() + torch.tensor([-0.5, -0.5, 4.0]), "log_scales": torch.full((8, 3), -2.0)})
+    gaussians.overwrite(
+        {"means": gaussians.means.detach() + torch.tensor([-0.5, -0.5, 4.0]), "log_scales": torch.full((8, 3), -2.0)}
+    )
     logits = torch.logit(torch.tensor([0.004] * 3 + [0.5] * 5))
     gaussians.overwrite({"opacity_logits": logits})
     optimizer = adam(gaussians)
@@ -188,8 +194,15 @@ def test_relocation_moves_the_dead_and_keeps_the_image():
         pose, intrinsics = torch.eye(4), torch.tensor([40.0, 40.0, 16.0, 16.0])
         with torch.no_grad():
             return rasterize(
-                gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacities(), features,
-                pose, intrinsics, 32, 32,
+                gaussians.means,
+                gaussians.log_scales,
+                gaussians.quaternions,
+                gaussians.opacities(),
+                features,
+                pose,
+                intrinsics,
+                32,
+                32,
             ).image
 
     before = image()

@@ -38,7 +38,9 @@ def test_clipped_pixels_push_up_and_never_down():
 
 def test_without_clipping_an_overshoot_costs():
     encoded, predicted = torch.ones(2, 2, 3), torch.full((2, 2, 3), 1.3, requires_grad=True)
-    loss = ldr_loss(Photograph(predicted, None, None, None), target_of(encoded), LossConfig(ssim_weight=0.0, clipping=False))
+    loss = ldr_loss(
+        Photograph(predicted, None, None, None), target_of(encoded), LossConfig(ssim_weight=0.0, clipping=False)
+    )
     assert loss.item() == pytest.approx(0.3, rel=1e-5)
 
 

@@ -43,7 +43,9 @@ def configuration(strategy):
 
 def kill_after_checkpoint(out, strategy):
     root = Path(__file__).resolve().parents[2]
-    process = subprocess.Popen([sys.executable, "-c", TRAIN, str(root), str(out), strategy], env=os.environ | {"PYTHONPATH": str(root)})
+    process = subprocess.Popen(
+        [sys.executable, "-c", TRAIN, str(root), str(out), strategy], env=os.environ | {"PYTHONPATH": str(root)}
+    )
     deadline = time.monotonic() + 120
     while not list((out / "checkpoints").glob("iteration_*")):
         assert process.poll() is None and time.monotonic() < deadline, "the training ended before its checkpoint"
@@ -67,7 +69,9 @@ def test_resume_is_exact(scene, tmp_path, strategy):
     assert whole.tensors.keys() == resumed.tensors.keys()
     for name, value in whole.tensors.items():
         assert torch.equal(value, resumed.tensors[name]), name
-    assert {k: whole.values[k] for k in ("order", "skipped_steps")} == {k: resumed.values[k] for k in ("order", "skipped_steps")}
+    assert {k: whole.values[k] for k in ("order", "skipped_steps")} == {
+        k: resumed.values[k] for k in ("order", "skipped_steps")
+    }
     lines = [line["iteration"] for line in run.metrics()]
     assert lines == [10, 120], "each evaluation once"
 
