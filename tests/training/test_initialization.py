@@ -1,0 +1,103 @@
+"""Where a training starts: extents, focus, drawn points, colours, and the choice of a response."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.model.response import response_by_name
+from sehdr_warp.training.config_files import load_config
+from sehdr_warp.training.initialization import (
+    base_exposure_time,
+    choose_response,
+    colours_in_views,
+    focus_distance,
+    random_points,
+    scene_extent,
+    start_colours,
+)
+
+from .toy import orbit_camera, toy_scene
+
+RADIUS = np.hypot(4.0, 0.8)
+
+
+def test_extent_and_focus_of_an_orbit(scene):
+    centre = np.mean([view.camera.position for view in scene.train_views], axis=0)
+    farthest = max(np.linalg.norm(view.camera.position - centre) for view in scene.train_views)
+    assert scene_extent(scene) == pytest.approx(1.1 * farthest)
+    assert focus_distance(scene.train_views) == pytest.approx(RADIUS, rel=1e-3)
+
+
+def test_cameras_at_one_place_have_an_extent(scene):
+    still = tuple(dataclasses.replace(view, camera=scene.views[0].camera) for view in scene.views)
+    assert scene_extent(dataclasses.replace(scene, views=still)) > 0
+    assert scene_extent(dataclasses.replace(scene, views=still, points=np.zeros((0, 3)))) == 1.0
+    assert focus_distance(still) > 0
+
+
+def test_drawn_points_are_seen_and_repeat(scene):
+    config = load_config("default", {"model.initial_count": 500})
+    points, colours = random_points(scene, config, np.random.default_rng(0))
+    again, _ = random_points(scene, config, np.random.default_rng(0))
+    seen, mean = colours_in_views(points, scene.train_views)
+    assert len(points) == len(colours) == 500 and (seen >= 2).all() and np.array_equal(points, again)
+    np.testing.assert_allclose(mean, colours)
+
+
+def test_colours_are_those_at_the_projections(scene):
+    view = scene.views[0]
+    camera = orbit_camera(0.0)
+    point = camera.camera_to_world @ [0.5 / camera.fx * 4, 0.5 / camera.fy * 4, 4.0, 1.0]
+    behind = camera.camera_to_world @ [0.0, 0.0, -4.0, 1.0]
+    seen, mean = colours_in_views(np.stack([point[:3], behind[:3]]), (view,))
+    assert seen.tolist() == [1, 0]
+    np.testing.assert_allclose(mean[0], view.image[16, 16], rtol=1e-6)
+
+
+def test_cameras_back_to_back_share_nothing():
+    scene = toy_scene(with_points=False)
+    away = []
+    for view in scene.views:
+        pose = view.camera.world_to_camera.copy()
+        pose[[0, 2]] *= -1  # turned by half a circle about its own vertical axis
+        away.append(dataclasses.replace(view, camera=dataclasses.replace(view.camera, world_to_camera=pose)))
+    two = tuple(view for view in away if view.name in ("v_0", "v_4"))
+    with pytest.raises(SehdrError, match="no two training cameras"):
+        random_points(dataclasses.replace(scene, views=two), load_config(), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("radiance", ["log", "linear", "display"])
+def test_start_colours_invert_the_colour_model(radiance):
+    srgb, encoded = response_by_name("srgb"), np.array([[0.2, 0.5, 0.9]])
+    value = start_colours(encoded, radiance, srgb)
+    shown = {
+        "log": lambda: srgb.encode(np.exp(value)),
+        "linear": lambda: srgb.encode(value),
+        "display": lambda: value + 0.5,
+    }
+    np.testing.assert_allclose(shown[radiance](), encoded, atol=1e-6)
+    # Black and white say a bound only; their start values are finite and inside it.
+    for extreme in (0.0, 1.0):
+        assert np.isfinite(start_colours(np.full((1, 3), extreme), radiance, response_by_name("hdr-nerf"))).all()
+
+
+def test_base_time_is_the_median_of_training(scene):
+    times = [0.1, 0.2, 0.4, 8.0]
+    views = tuple(dataclasses.replace(v, exposure_time=t) for v, t in zip(scene.train_views, times, strict=False))
+    assert base_exposure_time(dataclasses.replace(scene, views=views)) == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("method", ["edges", "paper"])
+def test_auto_chooses_from_the_candidates(method, tmp_path):
+    scene = toy_scene(view_count=4, size=64)
+    (tmp_path / "mine.csv").write_text("".join(f"{x / 20},{(x / 20) ** 0.4}\n" for x in range(21)))
+    candidates = ["gamma-2.2", str(tmp_path / "mine.csv")]
+    options = {"response.name": "auto", "response.method": method, "response.candidates": candidates}
+    assert choose_response(scene, load_config("default", options)).name in (
+        "gamma-2.2",
+        "mine",
+        str(tmp_path / "mine.csv"),
+    )
+    assert choose_response(scene, load_config("default", {"response.name": "rec709"})).name == "rec709"
