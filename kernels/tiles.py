@@ -92,10 +92,14 @@ def tile_kernels(dtype):
         columns: int,
         rows: int,
         ends: wp.array(dtype=wp.int32),
+        capacity: int,
         tiles: wp.array(dtype=wp.int32),
         gaussians: wp.array(dtype=wp.int32),
     ):
-        """ends: the running sum of the counts, so that Gaussian `place` fills the entries before ends[place]."""
+        """ends: the running sum of the counts, so that Gaussian `place` fills the entries before ends[place].
+
+        Entries from `capacity` on are left out.
+        """
         place = wp.tid()
         i = order[place]
         extent = extents[i]
@@ -109,7 +113,7 @@ def tile_kernels(dtype):
             down = tile_span(shape[1], extent[1], rows)
             for row in range(down[0], down[1]):
                 for column in range(across[0], across[1]):
-                    if tile_is_touched(shape, ellipse, column, row):
+                    if entry < capacity and tile_is_touched(shape, ellipse, column, row):
                         tiles[entry] = row * columns + column
                         gaussians[entry] = i
                         entry += 1
@@ -118,10 +122,15 @@ def tile_kernels(dtype):
 
 
 @wp.kernel(module="unique", module_options={"enable_backward": False})
-def mark_ranges(tiles: wp.array(dtype=wp.int32), entry_count: int, ranges: wp.array(dtype=wp.vec2i)):
-    """ranges[t] = (first, one past the last) entry of tile t in the sorted list; untouched tiles keep what they had."""
+def mark_ranges(tiles: wp.array(dtype=wp.int32), entry_count: int, tile_count: int, ranges: wp.array(dtype=wp.vec2i)):
+    """ranges[t] = (first, one past the last) entry of tile t in the sorted list; untouched tiles keep what they had.
+
+    Unused entries carry the tile number tile_count, and belong to no list.
+    """
     entry = wp.tid()
     tile = tiles[entry]
+    if tile == tile_count:
+        return
     if entry == 0 or tiles[entry - 1] != tile:
         ranges[tile][0] = entry
     if entry == entry_count - 1 or tiles[entry + 1] != tile:

@@ -160,9 +160,10 @@ class RadianceField(nn.Module):
         return self._exposures(camera, degree)[1]
 
     def _harmonics(self, camera: CameraTensors, degree: int | None) -> Tensor:
-        coefficients = self.gaussians.harmonics(degree)
-        used = self.gaussians.degree if degree is None else min(degree, self.gaussians.degree)
-        return spherical_harmonics(used, coefficients, self.gaussians.means, camera.position)
+        gaussians = self.gaussians
+        used = gaussians.degree if degree is None else min(degree, gaussians.degree)
+        coefficients = gaussians.harmonics_dc, gaussians.harmonics_rest
+        return spherical_harmonics(used, coefficients, gaussians.means, camera.position)
 
     def _exposures(self, camera: CameraTensors, degree: int | None) -> tuple[Tensor, Tensor]:
         """Exposures at the base time of each Gaussian's base colour and of its HDR colour, [N, 3] each."""

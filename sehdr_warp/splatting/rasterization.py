@@ -19,7 +19,8 @@ class Rendering:
     means2d: [N, 2] centres in pixels; part of the graph, so means2d.retain_grad() gives densification its signal.
     depths: [N] along the camera's axis, in scene units; 0 where culled.
     radii: [N] the longer half-extent in pixels within which a Gaussian counts; 0 where culled.
-    entry_count: (Gaussian, tile) pairs that were blended.
+    entry_count: (Gaussian, tile) pairs that there was room for.
+    overflow: scalar bool tensor, whether the given capacity left some of them out; None without a capacity.
     """
 
     image: torch.Tensor
@@ -28,6 +29,7 @@ class Rendering:
     depths: torch.Tensor
     radii: torch.Tensor
     entry_count: int
+    overflow: torch.Tensor | None = None
 
     @property
     def visible(self) -> torch.Tensor:
@@ -50,6 +52,7 @@ def rasterize(
     low_pass: float = LOW_PASS,
     alpha_threshold: float = ALPHA_THRESHOLD,
     antialiased: bool = False,
+    capacity: int | None = None,
 ) -> Rendering:
     """Splat Gaussians with any number of feature channels onto one camera's image plane (3DGS, Kerbl et al. 2023).
 
@@ -62,6 +65,8 @@ def rasterize(
     near: points nearer to the camera plane are culled. low_pass: variance in square pixels added to each splat.
     alpha_threshold: contributions below it are left out, in (0, 1).
     antialiased: keep a Gaussian's energy under the low pass by lowering its opacity.
+    capacity: room for this many (Gaussian, tile) pairs. On a GPU nothing then waits for the device, so that the call can
+        be part of a CUDA graph; Rendering.overflow says whether the room was enough.
 
     All tensors share one device (CPU or CUDA) and one dtype (float32 or float64). Differentiable with respect to
     every tensor, camera included. On the CPU results repeat bit for bit, whatever the number of threads.
@@ -81,7 +86,8 @@ def rasterize(
         antialiased=antialiased,
     )
     lists = build_tile_lists(
-        *(tensor.detach() for tensor in (means2d, conics, depths, opacities2d, extents)), width, height, alpha_threshold
+        *(tensor.detach() for tensor in (means2d, conics, depths, opacities2d, extents)), width, height, alpha_threshold,
+        capacity,
     )
     image, alpha = blend(
         means2d,
@@ -93,7 +99,7 @@ def rasterize(
         height=height,
         alpha_threshold=alpha_threshold,
     )
-    return Rendering(image, alpha, means2d, depths, extents.amax(dim=1), lists.entry_count)
+    return Rendering(image, alpha, means2d, depths, extents.amax(dim=1), lists.entry_count, lists.overflow)
 
 
 def _check(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics, width, height) -> None:

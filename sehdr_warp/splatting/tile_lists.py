@@ -27,6 +27,7 @@ class TileLists:
     shapes: [N, 4] x, y, opacity, half-height; ellipses: [N, 4] conic a, b, c and the level where alpha meets the
         threshold.
     columns, rows: tiles across and down.
+    overflow: scalar bool, whether a given capacity was too small for all entries; None without a capacity.
     """
 
     order: torch.Tensor
@@ -38,31 +39,56 @@ class TileLists:
     ellipses: torch.Tensor
     columns: int
     rows: int
+    overflow: torch.Tensor | None
 
     @property
     def entry_count(self) -> int:
-        """How many (Gaussian, tile) pairs there are."""
+        """How many (Gaussian, tile) pairs there is room for: all there are, or the capacity."""
         return self.gaussians.shape[0]
 
 
 @torch.no_grad()
 def build_tile_lists(
-    means2d, conics, depths, opacities, extents, width: int, height: int, alpha_threshold: float
+    means2d,
+    conics,
+    depths,
+    opacities,
+    extents,
+    width: int,
+    height: int,
+    alpha_threshold: float,
+    capacity: int | None = None,
 ) -> TileLists:
     """Order the projected Gaussians by depth and list, for each tile, those whose ellipse touches it.
 
     The arguments are project()'s results; nothing here is differentiable.
+    capacity: room for this many entries. The host then never waits for the device to learn how many there are; entries
+    beyond it are left out, and TileLists.overflow says so.
     Raises SehdrError if the lists would need more than 2^31 - 1 entries.
     """
     columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
+    tile_count = columns * rows
     shapes, ellipses = pack_records(means2d, conics, opacities, extents, alpha_threshold)
     order = depth_order(depths, extents)
-    ends, entry_count = count_entries(order, shapes, ellipses, extents, columns, rows)
-    tiles, gaussians = emit_entries(order, shapes, ellipses, extents, columns, rows, ends, entry_count)
-    tiles, emission = sort_by_tile(tiles, entry_count, columns * rows)
-    ranges = find_ranges(tiles, columns * rows)
-    gaussians = gaussians[emission] if entry_count else gaussians
-    return TileLists(order, ends, ranges, gaussians, emission, shapes, ellipses, columns, rows)
+    counts = count_entries(order, shapes, ellipses, extents, columns, rows)
+    total = counts.sum(dtype=torch.int64)
+    overflow = None if capacity is None else total > capacity
+    room = _exact_room(int(total), order.shape[0], columns, rows) if capacity is None else capacity
+    ends = counts.cumsum(0, dtype=torch.int32)
+    tiles, gaussians = emit_entries(order, shapes, ellipses, extents, columns, rows, ends, room, capacity is not None)
+    tiles, emission = sort_by_tile(tiles, room, tile_count)
+    ranges = find_ranges(tiles, tile_count)
+    gaussians = gaussians[emission] if room else gaussians
+    return TileLists(order, ends, ranges, gaussians, emission, shapes, ellipses, columns, rows, overflow)
+
+
+def _exact_room(total: int, gaussian_count: int, columns: int, rows: int) -> int:
+    if total > _LARGEST_INT32:
+        raise SehdrError(
+            f"{gaussian_count} Gaussians touch {total} tiles of a {columns} x {rows} tile image, more than 2^31 - 1; "
+            "render fewer Gaussians or a smaller image"
+        )
+    return total
 
 
 def pack_records(means2d, conics, opacities, extents, alpha_threshold: float):
@@ -97,7 +123,7 @@ def depth_order(depths, extents):
 
 
 def count_entries(order, shapes, ellipses, extents, columns: int, rows: int):
-    """The running number of tiles touched, by place in `order`, [N] int32, and the total."""
+    """[N] int32: how many tiles each Gaussian touches, by place in `order`."""
     counts = torch.empty_like(order)
     vec2, vec4 = vector(2, warp_scalar(shapes.dtype)), vector(4, warp_scalar(shapes.dtype))
     _launch(
@@ -106,21 +132,22 @@ def count_entries(order, shapes, ellipses, extents, columns: int, rows: int):
         [view(order), view(shapes, vec4), view(ellipses, vec4), view(extents, vec2), columns, rows, view(counts)],
         order.device,
     )
-    total = int(counts.sum(dtype=torch.int64)) if order.shape[0] else 0
-    if total > _LARGEST_INT32:
-        raise SehdrError(
-            f"{order.shape[0]} Gaussians touch {total} tiles of a {columns} x {rows} tile image, more than 2^31 - 1; "
-            "render fewer Gaussians or a smaller image"
-        )
-    return counts.cumsum(0, dtype=torch.int32), total
+    return counts
 
 
-def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends, entry_count: int):
-    """One entry for each tile that each Gaussian touches, front to back: tiles [M] and Gaussians [M]."""
-    tiles = torch.empty(2 * entry_count, dtype=torch.int32, device=order.device)  # room for the sort
-    gaussians = torch.empty(entry_count, dtype=torch.int32, device=order.device)
+def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends, room: int, padded: bool):
+    """One entry for each tile that each Gaussian touches, front to back: tiles [2 room] and Gaussians [room].
+
+    Only the first half of tiles is filled; the sort needs the rest. padded: there may be fewer entries than room, and
+    the unused ones belong to tile columns * rows.
+    """
+    tiles = torch.empty(2 * room, dtype=torch.int32, device=order.device)
+    gaussians = torch.empty(room, dtype=torch.int32, device=order.device)
+    if padded:
+        tiles[:room] = columns * rows
+        gaussians.zero_()
     vec2, vec4 = vector(2, warp_scalar(shapes.dtype)), vector(4, warp_scalar(shapes.dtype))
-    if entry_count:
+    if room:
         _launch(
             tile_kernels(warp_scalar(shapes.dtype))[2],
             order.shape[0],
@@ -132,6 +159,7 @@ def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends
                 columns,
                 rows,
                 view(ends),
+                room,
                 view(tiles),
                 view(gaussians),
             ],
@@ -142,7 +170,7 @@ def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends
 
 def sort_by_tile(tiles, entry_count: int, tile_count: int):
     """Stable sort of the entries by tile: sorted tiles [M], and where each entry stood before [M]."""
-    emission = _sorted_places(tiles, entry_count, bits=max(1, (tile_count - 1).bit_length()))
+    emission = _sorted_places(tiles, entry_count, bits=tile_count.bit_length())
     return tiles[:entry_count], emission
 
 
@@ -150,7 +178,7 @@ def find_ranges(tiles, tile_count: int):
     """[tiles, 2] int32: first and one past the last entry of each tile, (0, 0) for an untouched one."""
     ranges = torch.zeros(tile_count, 2, dtype=torch.int32, device=tiles.device)
     if tiles.shape[0]:
-        _launch(mark_ranges, tiles.shape[0], [view(tiles), tiles.shape[0], view(ranges, wp.vec2i)], tiles.device)
+        _launch(mark_ranges, tiles.shape[0], [view(tiles), tiles.shape[0], tile_count, view(ranges, wp.vec2i)], tiles.device)
     return ranges
 
 

@@ -169,3 +169,16 @@ def test_misfits_are_named(change, message):
     change(arguments)
     with pytest.raises(ValueError, match=message):
         rasterize(*arguments)
+
+
+def test_a_capacity_changes_nothing_when_it_is_enough_and_says_so_when_not(device):
+    scene = random_scene().to(torch.float32, device)
+    exact = rasterize(*scene.arguments)
+    roomy = rasterize(*scene.arguments, capacity=exact.entry_count + 100)
+    assert exact.overflow is None and not roomy.overflow
+    assert torch.equal(exact.image, roomy.image)
+    cramped = rasterize(*scene.arguments, capacity=exact.entry_count - 1)
+    assert cramped.overflow
+    for rendering in (roomy, cramped):
+        rendering.image.sum().backward()
+        assert all(torch.isfinite(t.grad).all() for t in scene.tensors)
