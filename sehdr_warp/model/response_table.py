@@ -80,7 +80,8 @@ class TabulatedResponse(Response, kind="table"):
             position = (exposure / self.clip_exposure).log2() * CELLS_PER_OCTAVE + (last + 1)
         cell = position.nan_to_num(0.0).clamp(0, last).long()
         slope = slope[cell]
-        value = torch.addcmul(intercept[cell], slope, exposure)
+        # Rounding may leave [black, peak] by a last digit.
+        value = torch.addcmul(intercept[cell], slope, exposure).clamp_(self.black, self.peak)
         return value, slope if with_slope else None
 
     def _invert(self, value):

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sehdr_warp.errors import InputError
@@ -167,6 +167,7 @@ def test_order_and_repeats_are_repaired():
 
 
 @settings(deadline=None, max_examples=60)
+@example([(0.0, 0.0), (5941.0, 0.0), (159959.0, 1.0)])
 @given(
     st.lists(
         st.tuples(st.floats(0, 1e6, width=32), st.floats(0, 1)), min_size=3, max_size=300, unique_by=lambda row: row[0]
