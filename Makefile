@@ -13,7 +13,7 @@ RESPONSE ?= hdr-nerf
 EVS ?= -4,-2,0,2,4
 PYTEST ?= -q
 
-PIP = $(VENV)/bin/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
+PIP = $(VENV)/bin/python -m pip --disable-pip-version-check install -qq --constraint constraints.txt
 SEHDR = $(VENV)/bin/sehdr-warp
 
 # torch's CPU build, a tenth of the size of the CUDA build that PyPI has for Linux: from wherever pip is set up to
