@@ -30,9 +30,13 @@ ALLOWED = {
     },
     "output": {"errors", "scene", "model", "evaluation.metrics"},
     "evaluation": {"errors", "scene", "model", "splatting", "output.files"},
+    "bench": {"errors", "kernels", "scene", "splatting", "model", "training", "output", "evaluation"},
 }
 # Packages that only some rooms may import.
-ONLY_IN = {"torch": {"model", "splatting", "training", "output", "evaluation"}, "warp": {"kernels", "splatting"}}
+ONLY_IN = {
+    "torch": {"model", "splatting", "training", "output", "evaluation", "bench"},
+    "warp": {"kernels", "splatting"},
+}
 LARGEST_FILE = 480
 
 

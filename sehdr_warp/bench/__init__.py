@@ -1,0 +1,1 @@
+"""Measuring: splats, training steps and whole trainings, against peers, with their correctness checked in the run."""

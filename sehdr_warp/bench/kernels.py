@@ -1,0 +1,263 @@
+"""`bench kernels`: the whole differentiable splat (project, order, bin, blend; colours given), and the CPU's blend."""
+
+import os
+from collections.abc import Callable
+from contextlib import contextmanager
+
+import torch
+
+from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR, TILE_SIZE
+from ..splatting.blending import blend
+from ..splatting.projection import project
+from ..splatting.rasterization import rasterize
+from ..splatting.tile_lists import TileLists, build_tile_lists
+from . import checks
+from .machine import package_version
+from .peers import Peer, differs, find_peers
+from .report import new_report
+from .splats import Size, SplatScene, make_splat_scene
+from .timing import Variant, peak_memory, time_variants
+
+OURS = "sehdr-warp"
+OURS_CAPACITY = "sehdr-warp, capacity"
+"""rasterize() with a given capacity, a quarter more than there are entries, so that the host waits for nothing."""
+PLAIN_TORCH = "plain torch"
+PLAIN_TORCH_BYTES = 4 << 30
+"""The plain torch rasterizer keeps about 16 numbers for each pixel-Gaussian pair; beyond this it is left out."""
+BLEND_THREADS = (1, 2)
+
+
+def bench_kernels(
+    sizes: list[Size],
+    channels: list[int],
+    device: torch.device,
+    *,
+    peers: bool = True,
+    repetitions: int = 30,
+    budget: float = 20.0,
+    progress: Callable[[str], None] = lambda line: None,
+) -> dict:
+    """Time and check; returns the report, docs/benchmarks.md says what is in it.
+
+    sizes, channels: every combination is measured. peers: compare with the peers that import.
+    repetitions, budget: see time_variants.
+    """
+    settings = {"device": str(device), "repetitions": repetitions, "cpu_seconds_per_variant": budget}
+    report = new_report("kernels", device, settings)
+    found, notes = find_peers(device) if peers else ([], ["peers not compared: not asked for (--peers)"])
+    report["notes"] += notes
+    for size in sizes:
+        for count in channels:
+            scene = make_splat_scene(size, count).to(device)
+            usable = [peer for peer in found if peer.supports(count)]
+            report["checks"] += [check.to_dict() for check in _checks(scene, usable)]
+            report["rows"] += _splat_rows(scene, usable, repetitions, budget, report["notes"])
+            if device.type == "cpu":
+                report["rows"] += _blend_rows(scene, repetitions, budget)
+            best = next(
+                row for row in report["rows"][::-1] if row["implementation"] == OURS and row["stage"] == "splat"
+            )
+            progress(f"{size}, {count} channels: {best['pass']} {best['median_ms']:.3f} ms")
+    report["notes"] = list(dict.fromkeys(report["notes"]))
+    return report
+
+
+def _render(scene: SplatScene) -> torch.Tensor:
+    return rasterize(*scene.arguments).image
+
+
+def _render_with_capacity(scene: SplatScene) -> torch.Tensor:
+    return _renderer_with_capacity(scene)()
+
+
+def _renderer_with_capacity(scene: SplatScene) -> Callable[[], torch.Tensor]:
+    with torch.no_grad():
+        capacity = rasterize(*scene.arguments).entry_count * 5 // 4
+    return lambda: rasterize(*scene.arguments, capacity=capacity).image
+
+
+def _checks(scene: SplatScene, peers: list[Peer]) -> list[checks.Check]:
+    """Every variant that is timed: on a scene small enough for the reference, on CUDA also on the timed one."""
+    small = make_splat_scene(scene.size.reduced(checks.REFERENCE_GAUSSIANS), scene.channels).to(scene.device)
+    made = []
+    if scene.device.type == "cuda":
+        cpu = checks.image_and_gradients(_render, scene.to("cpu"))
+        for name, render in ((OURS, _render), (OURS_CAPACITY, _render_with_capacity)):
+            made += checks.check_against_reference(name, render, small)
+            ours = checks.image_and_gradients(render, scene)
+            made += checks.compare(name, "CPU kernels", scene, ours, cpu)
+    else:
+        made += checks.check_against_reference(PLAIN_TORCH, checks.render_reference, small)
+        for threads in BLEND_THREADS:
+            with using_threads(threads):
+                made += checks.check_against_reference(f"{OURS} on {threads} threads", _render, small)
+    if peers:
+        with torch.no_grad():
+            image = _render(scene)
+            for peer in peers:
+                difference = differs(peer.renderer(scene)(), image)
+                what = f"{peer.name}: image"
+                made.append(checks.Check(what, OURS, str(scene.size), scene.channels, difference, peer.bound))
+    return made
+
+
+def _splat_rows(scene: SplatScene, peers: list[Peer], repetitions: int, budget: float, notes: list[str]) -> list[dict]:
+    """Rows of the whole splat, forward, and forward and backward, of us and of everyone we compare with."""
+    with torch.no_grad():
+        entries = rasterize(*scene.arguments).entry_count
+    renderers = {OURS: lambda: _render(scene)} | {peer.name: peer.renderer(scene) for peer in peers}
+    versions = {OURS: package_version(OURS)} | {peer.name: peer.version for peer in peers}
+    if scene.device.type == "cuda":
+        renderers[OURS_CAPACITY] = _renderer_with_capacity(scene)
+        versions[OURS_CAPACITY] = versions[OURS]
+    else:
+        if entries * TILE_SIZE**2 * 16 * 4 <= PLAIN_TORCH_BYTES:
+            renderers[PLAIN_TORCH] = lambda: checks.render_reference(scene)
+            versions[PLAIN_TORCH] = package_version("torch")
+        else:
+            notes.append(f"{PLAIN_TORCH} not compared at {scene.size}: it would need more than 4 GiB")
+    cotangent = scene.cotangent()
+    rows = []
+    for name, make in (("forward", _forward), ("forward + backward", _forward_backward)):
+        variants = {key: make(render, scene, cotangent) for key, render in renderers.items()}
+        timings = time_variants(variants, scene.device, repetitions=repetitions, budget=budget)
+        for key, timing in timings.items():
+            row = _row(scene, "splat", key, name) | {"version": versions[key], "entries": entries} | timing.to_dict()
+            row["peak_memory_bytes"] = peak_memory(variants[key], scene.device)
+            row["ours_over_this"] = None if key == OURS else timings[OURS].median / timing.median
+            rows.append(row)
+    return rows
+
+
+def _forward(render, scene, cotangent) -> Variant:
+    def run(_):
+        with torch.no_grad():
+            render()
+
+    return Variant(run)
+
+
+def _forward_backward(render, scene, cotangent) -> Variant:
+    return Variant(lambda _: render().backward(cotangent), prepare=scene.clear)
+
+
+def _row(scene: SplatScene, stage: str, implementation: str, passes: str) -> dict:
+    size = scene.size
+    return {
+        "stage": stage,
+        "gaussians": size.gaussians,
+        "width": size.width,
+        "height": size.height,
+        "channels": scene.channels,
+        "implementation": implementation,
+        "pass": passes,
+    }
+
+
+def _blend_rows(scene: SplatScene, repetitions: int, budget: float) -> list[dict]:
+    """Rows of the CPU's blend alone: nanoseconds for each pixel of each list entry, on one thread and on two."""
+    lists, inputs, options = _blend_arguments(scene)
+    pairs, counted = listed_pairs(lists, scene.size), counted_pairs(lists, scene.size)
+    cotangent = scene.cotangent()
+    variants = {}
+    for threads in BLEND_THREADS:
+        variants["forward", threads] = _blend_forward(inputs, options, threads)
+        variants["backward", threads] = _blend_backward(inputs, options, cotangent, threads)
+    timings = time_variants(variants, scene.device, repetitions=repetitions, budget=budget)
+    rows = []
+    for (name, threads), timing in timings.items():
+        row = _row(scene, "blend", OURS, name) | {"threads": threads, "entries": lists.entry_count, "pairs": pairs}
+        row |= {"counted_pairs": counted, "ns_per_pair": timing.median * 1e6 / max(1, pairs)}
+        row |= {"ns_per_counted_pair": timing.median * 1e6 / max(1, counted)} | timing.to_dict()
+        row["speedup_over_one_thread"] = timings[name, 1].median / timing.median
+        rows.append(row)
+    return rows
+
+
+def _blend_arguments(scene: SplatScene):
+    """Tile lists, the tensors that blend() differentiates (as leaves) and its options, as rasterize() makes them."""
+    size, (*geometry, features) = scene.size, scene.leaves
+    with torch.no_grad():
+        *projected, extents = project(
+            *geometry,
+            scene.world_to_camera,
+            scene.intrinsics,
+            width=size.width,
+            height=size.height,
+            near=NEAR,
+            low_pass=LOW_PASS,
+            alpha_threshold=ALPHA_THRESHOLD,
+            antialiased=False,
+        )
+        lists = build_tile_lists(*projected, extents, size.width, size.height, ALPHA_THRESHOLD)
+    means2d, conics, _, opacities = projected
+    inputs = tuple(tensor.detach().clone().requires_grad_() for tensor in (means2d, conics, opacities, features))
+    return (
+        lists,
+        inputs,
+        {"lists": lists, "width": size.width, "height": size.height, "alpha_threshold": ALPHA_THRESHOLD},
+    )
+
+
+def listed_pairs(lists: TileLists, size: Size) -> int:
+    """Pixel-Gaussian pairs: for each tile, the entries of its list times its pixels within the image."""
+    entries = (lists.ranges[:, 1] - lists.ranges[:, 0]).long().cpu().reshape(lists.rows, lists.columns)
+    across = torch.full((lists.columns,), TILE_SIZE)
+    across[-1] = size.width - (lists.columns - 1) * TILE_SIZE
+    down = torch.full((lists.rows,), TILE_SIZE)
+    down[-1] = size.height - (lists.rows - 1) * TILE_SIZE
+    return int((entries * down[:, None] * across[None, :]).sum())
+
+
+def counted_pairs(lists: TileLists, size: Size) -> int:
+    """Of listed_pairs(), those where alpha reaches the threshold: what no algorithm may leave out (but behind pixels
+    that are finished)."""
+    tiles = torch.repeat_interleave(
+        torch.arange(lists.ranges.shape[0]), (lists.ranges[:, 1] - lists.ranges[:, 0]).long()
+    )
+    offsets = torch.arange(TILE_SIZE) + 0.5
+    total = 0
+    for tile, gaussian in zip(tiles.split(20_000), lists.gaussians.long().split(20_000)):
+        x = (tile % lists.columns * TILE_SIZE)[:, None, None] + offsets[None, None, :]
+        y = (tile // lists.columns * TILE_SIZE)[:, None, None] + offsets[None, :, None]
+        shape, ellipse = lists.shapes[gaussian].T[:, :, None, None], lists.ellipses[gaussian].T[:, :, None, None]
+        dx, dy = shape[0] - x, shape[1] - y
+        exponent = -0.5 * (ellipse[0] * dx * dx + ellipse[2] * dy * dy) - ellipse[1] * dx * dy
+        reached = shape[2] * exponent.clamp(max=0.0).exp() >= ALPHA_THRESHOLD
+        total += int((reached & (x < size.width) & (y < size.height)).sum())
+    return total
+
+
+def _blend_forward(inputs, options, threads: int) -> Variant:
+    def run(_):
+        with torch.no_grad(), using_threads(threads):
+            blend(*inputs, **options)
+
+    return Variant(run)
+
+
+def _blend_backward(inputs, options, cotangent, threads: int) -> Variant:
+    def run(image):
+        with using_threads(threads):
+            image.backward(cotangent)
+
+    def prepare():
+        for tensor in inputs:
+            tensor.grad = None
+        return blend(*inputs, **options)[0]
+
+    return Variant(run, prepare)
+
+
+@contextmanager
+def using_threads(count: int):
+    """The CPU's kernels run on so many threads (SEHDR_THREADS) within this block."""
+    before = os.environ.get("SEHDR_THREADS")
+    os.environ["SEHDR_THREADS"] = str(count)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["SEHDR_THREADS"]
+        else:
+            os.environ["SEHDR_THREADS"] = before

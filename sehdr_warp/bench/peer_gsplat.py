@@ -1,0 +1,154 @@
+"""The plain 3DGS training done by gsplat 1.5 (Ye et al. 2025), for a comparison on equal terms.
+
+Same photos, split, start points, start colours, losses and iteration count as the preset `3dgs`; gsplat's rasterization
+and DefaultStrategy at 3DGS's settings. gsplat needs CUDA and is not a dependency.
+"""
+
+import time
+
+import torch
+
+from ..errors import SehdrError
+from ..evaluation.metrics import psnr
+from ..model.gaussians import Gaussians
+from ..scene import Scene
+from ..training.config import Config
+from ..training.heldout import BEST
+from ..training.initialization import scene_extent, start_colours
+from ..training.losses import image_loss
+
+
+def train_with_gsplat(
+    scene: Scene,
+    config: Config,
+    device: str | torch.device = "cuda:0",
+    *,
+    resets: bool = True,
+    steps: int | None = None,
+) -> dict:
+    """Train on a scene's training views as a config of the preset `3dgs` says and measure the held-out ones.
+
+    config: iterations, thresholds, losses and learning rates are taken from it; iteration numbers are read as they
+        stand, so schedule.stated_for must equal schedule.iterations.
+    resets: reset the opacities every densification.reset_every iterations, as 3DGS does. gsplat 1.5.3 as released
+        never does: its condition is `step % reset_every == 0 & step > 0`, and & binds before the comparisons.
+    steps: stop after so many iterations, to warm up.
+
+    Returns {"psnr_ldr" dB over the test views, "train_seconds", "gaussians", "iterations", "peak_gpu_memory_bytes"}.
+    Raises SehdrError where gsplat is not installed or the scene has no points to start from.
+    """
+    try:
+        from gsplat import DefaultStrategy, rasterization
+        from gsplat.strategy.ops import reset_opa
+    except ImportError as error:
+        raise SehdrError(
+            f"gsplat is not installed ({error}); pip install gsplat==1.5.3 on a machine with CUDA"
+        ) from None
+    if not len(scene.points):
+        raise SehdrError(f"{scene.name} has no points; the comparison starts both sides from the same ones")
+    torch.cuda.reset_peak_memory_stats(device)
+    torch.manual_seed(config.seed)
+    densification, rates, schedule = config.densification, config.optimizer, config.schedule
+    extent = scene_extent(scene)
+    start = Gaussians.from_points(
+        torch.tensor(scene.points, dtype=torch.float32),
+        torch.tensor(start_colours(scene.point_colors, "display", None), dtype=torch.float32),
+        config.model.harmonics_degree,
+        opacity=config.model.initial_opacity,
+        scale=config.model.initial_scale,
+    )
+    values = {
+        "means": (start.means, rates.means * extent),
+        "scales": (start.log_scales, rates.log_scales),
+        "quats": (start.quaternions, rates.quaternions),
+        "opacities": (start.opacity_logits, rates.opacity_logits),
+        "sh0": (start.harmonics_dc, rates.harmonics_dc),
+        "shN": (start.harmonics_rest, rates.harmonics_rest),
+    }
+    params = torch.nn.ParameterDict(
+        {name: torch.nn.Parameter(value.detach().to(device)) for name, (value, _) in values.items()}
+    )
+    optimizers = {
+        name: torch.optim.Adam([{"params": params[name], "lr": rate, "name": name}], eps=1e-15, fused=True)
+        for name, (_, rate) in values.items()
+    }
+    gamma = (rates.means_final / rates.means) ** (1.0 / schedule.iterations)
+    decay = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], gamma=gamma)
+    strategy = DefaultStrategy(
+        prune_opa=densification.prune_opacity,
+        grow_grad2d=densification.grow_gradient,
+        grow_scale3d=densification.grow_scale,
+        prune_scale3d=densification.prune_scale,
+        refine_start_iter=densification.start,
+        refine_stop_iter=densification.stop + 1,
+        refine_every=densification.every,
+        reset_every=densification.reset_every,
+        verbose=False,
+    )
+    strategy.check_sanity(params, optimizers)
+    state = strategy.initialize_state(scene_scale=extent)
+    views = [_upload(view, device) for view in scene.train_views]
+
+    def render(pose, intrinsics, width, height, degree):
+        image, _, info = rasterization(
+            params["means"],
+            params["quats"],
+            params["scales"].exp(),
+            params["opacities"].sigmoid(),
+            torch.cat([params["sh0"], params["shN"]], 1),
+            pose[None],
+            intrinsics[None],
+            width,
+            height,
+            sh_degree=degree,
+            packed=False,
+            rasterize_mode="antialiased" if config.model.antialiased else "classic",
+            eps2d=config.model.low_pass,
+        )
+        return image[0], info
+
+    order, generator = [], torch.Generator().manual_seed(config.seed)
+    iterations = steps or schedule.iterations
+    torch.cuda.synchronize(device)
+    started = time.perf_counter()
+    for step in range(iterations):
+        order = order or torch.randperm(len(views), generator=generator).tolist()
+        pose, intrinsics, photo, mask = views[order.pop()]
+        degree = min(step // schedule.harmonics_every, config.model.harmonics_degree)
+        image, info = render(pose, intrinsics, photo.shape[1], photo.shape[0], degree)
+        strategy.step_pre_backward(params, optimizers, state, step, info)
+        loss = image_loss(image, photo, mask, config.loss.form, config.loss.ssim_weight)
+        loss.backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        decay.step()
+        strategy.step_post_backward(params, optimizers, state, step, info, packed=False)
+        if resets and 0 < step <= densification.stop and step % densification.reset_every == 0:
+            reset_opa(params, optimizers, state, value=2 * densification.prune_opacity)
+    torch.cuda.synchronize(device)
+    seconds = time.perf_counter() - started
+    scores = []
+    with torch.no_grad():
+        for view in scene.test_views:
+            pose, intrinsics, photo, mask = _upload(view, device)
+            image, _ = render(pose, intrinsics, photo.shape[1], photo.shape[0], degree)
+            scores.append(min(psnr(image.clamp(0, 1), photo, None if mask is None else mask[..., 0]), BEST))
+    return {
+        "psnr_ldr": sum(scores) / len(scores) if scores else None,
+        "train_seconds": seconds,
+        "gaussians": params["means"].shape[0],
+        "iterations": iterations,
+        "peak_gpu_memory_bytes": torch.cuda.max_memory_allocated(device),
+    }
+
+
+def _upload(view, device):
+    """Pose [4, 4], intrinsics [3, 3], photo [H, W, 3] and mask [H, W, 1] or None of a view."""
+    camera = view.camera
+    intrinsics = torch.tensor(
+        [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float32, device=device
+    )
+    pose = torch.tensor(camera.world_to_camera, dtype=torch.float32, device=device)
+    mask = None if view.mask is None else torch.tensor(view.mask, dtype=torch.float32, device=device)[..., None]
+    return pose, intrinsics, torch.tensor(view.image, device=device), mask

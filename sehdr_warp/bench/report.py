@@ -1,0 +1,194 @@
+"""A benchmark's result as JSON, as a table for terminals and Markdown, and as a picture."""
+
+from pathlib import Path
+
+import torch
+
+from ..output.files import atomic_path, check_absent, write_json
+from .machine import command_line, describe_machine, now
+
+SCHEMA = 1
+
+# Column title, field, format.
+COLUMNS = {
+    "kernels": {
+        "splat": (
+            ("Gaussians", "gaussians", ",d"),
+            ("width", "width", "d"),
+            ("height", "height", "d"),
+            ("C", "channels", "d"),
+            ("pass", "pass", "s"),
+            ("implementation", "implementation", "s"),
+            ("median ms", "median_ms", ".3f"),
+            ("p90 ms", "p90_ms", ".3f"),
+            ("n", "repetitions", "d"),
+            ("peak MiB", "peak_memory_bytes", "MiB"),
+            ("ours / this", "ours_over_this", ".3f"),
+        ),
+        "blend": (
+            ("Gaussians", "gaussians", ",d"),
+            ("width", "width", "d"),
+            ("height", "height", "d"),
+            ("C", "channels", "d"),
+            ("pass", "pass", "s"),
+            ("threads", "threads", "d"),
+            ("median ms", "median_ms", ".3f"),
+            ("n", "repetitions", "d"),
+            ("Mpairs", "pairs", "M"),
+            ("ns / pair", "ns_per_pair", ".2f"),
+            ("counted Mpairs", "counted_pairs", "M"),
+            ("ns / counted pair", "ns_per_counted_pair", ".2f"),
+            ("x one thread", "speedup_over_one_thread", ".2f"),
+        ),
+    },
+    "step": {
+        "step": (
+            ("rasterizer", "implementation", "s"),
+            ("Gaussians", "gaussians", ",d"),
+            ("width", "width", "d"),
+            ("height", "height", "d"),
+            ("median ms", "median_ms", ".3f"),
+            ("mean ms", "mean_ms", ".3f"),
+            ("with densification", "amortised_ms", ".3f"),
+            ("host ms", "host_ms", ".3f"),
+            ("device ms", "device_ms", ".3f"),
+            ("n", "repetitions", "d"),
+            ("peak MiB", "peak_memory_bytes", "MiB"),
+            ("ours / this", "ours_over_this", ".4f"),
+        ),
+    },
+    "training": {
+        "training": (
+            ("trained by", "implementation", "s"),
+            ("iterations", "iterations", ",d"),
+            ("PSNR dB", "psnr_ldr", ".2f"),
+            ("seconds", "train_seconds", ".1f"),
+            ("Gaussians", "gaussians", ",d"),
+            ("peak GPU MiB", "peak_gpu_memory_bytes", "MiB"),
+        ),
+    },
+}
+
+
+def new_report(benchmark: str, device: torch.device, settings: dict) -> dict:
+    """A report without results: benchmark, command, date, machine, settings; rows, checks and notes are to be filled."""
+    return {
+        "schema": SCHEMA,
+        "benchmark": benchmark,
+        "command": command_line(),
+        "date": now(),
+        "machine": describe_machine(device),
+        "settings": settings,
+        "rows": [],
+        "checks": [],
+        "notes": [],
+    }
+
+
+def format_report(report: dict) -> str:
+    """The machine in a line, a table for each stage, the checks in a line, the notes."""
+    parts = [_heading(report)]
+    for stage, columns in COLUMNS[report["benchmark"]].items():
+        rows = [row for row in report["rows"] if row["stage"] == stage]
+        if rows:
+            shown = [column for column in columns if any(row.get(column[1]) is not None for row in rows)]
+            parts.append(_table([title for title, _, _ in shown], [[_cell(row, c) for c in shown] for row in rows]))
+    checks = report["checks"]
+    if checks:
+        failed = [check for check in checks if not check["passed"]]
+        largest = max(checks, key=lambda check: check["difference"] / check["bound"])
+        line = f"correctness: {len(checks) - len(failed)} of {len(checks)} checks passed; nearest to its bound: "
+        line += f"{largest['what']} against {largest['against']}, {largest['difference']:.1e} of {largest['bound']:.0e}"
+        parts.append(line)
+    parts += report["notes"]
+    return "\n\n".join(parts)
+
+
+def write_report(report: dict, *, json: Path | None = None, out: Path | None = None, overwrite: bool = False) -> None:
+    """Writes the JSON file, and in the folder `out` <benchmark>.json, .md and, for kernels, .png."""
+    if json is not None:
+        write_json(json, report, overwrite)
+    if out is None:
+        return
+    name = report["benchmark"]
+    write_json(out / f"{name}.json", report, overwrite)
+    with atomic_path(out / f"{name}.md", overwrite) as path:
+        path.write_text(format_report(report) + "\n", encoding="utf-8")
+    if name == "kernels":
+        with atomic_path(out / f"{name}.png", overwrite) as path:
+            _plot_kernels(report, path)
+
+
+def check_writable(benchmark: str, json: Path | None, out: Path | None, overwrite: bool) -> None:
+    """Raises InputError for a file that is in the way, before minutes are spent on what could not be written."""
+    paths = [] if json is None else [json]
+    if out is not None:
+        endings = ("json", "md", "png") if benchmark == "kernels" else ("json", "md")
+        paths += [out / f"{benchmark}.{ending}" for ending in endings]
+    for path in paths:
+        check_absent(path, overwrite)
+
+
+def _heading(report: dict) -> str:
+    machine, versions = report["machine"], report["machine"]["versions"]
+    place = f"{machine['cpu']}, {machine['usable_cores']} of {machine['cores']} cores"
+    if machine["gpu"]:
+        place = f"{machine['gpu']['name']} (driver {machine['gpu']['driver']}), {place}"
+    packages = ", ".join(f"{name} {version}" for name, version in versions.items() if version)
+    return f"`{report['command']}`, {report['date']}\n{place}; {packages}"
+
+
+def _cell(row: dict, column: tuple[str, str, str]) -> str:
+    _, key, form = column
+    value = row.get(key)
+    if value is None:
+        return "-"
+    if form == "MiB":
+        return f"{value / 2**20:.1f}"
+    if form == "M":
+        return f"{value / 1e6:.1f}"
+    return f"{value:{form}}"
+
+
+def _table(titles: list[str], rows: list[list[str]]) -> str:
+    """Aligned Markdown: text columns to the left, numbers to the right."""
+    widths = [max(len(line[k]) for line in [titles, *rows]) for k in range(len(titles))]
+    text = [all(row[k][:1].isalpha() for row in rows) for k in range(len(titles))]
+
+    def line(cells):
+        return "| " + " | ".join(c.ljust(w) if t else c.rjust(w) for c, w, t in zip(cells, widths, text)) + " |"
+
+    rule = "| " + " | ".join("-" * w if t else "-" * (w - 1) + ":" for w, t in zip(widths, text)) + " |"
+    return "\n".join([line(titles), rule, *map(line, rows)])
+
+
+def _plot_kernels(report: dict, path: Path) -> None:
+    """Median times of the splat over the channels, one panel for each pass and size, one line for each
+    implementation."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    rows = [row for row in report["rows"] if row["stage"] == "splat"]
+    sizes = list(dict.fromkeys((row["gaussians"], row["width"], row["height"]) for row in rows))
+    passes = list(dict.fromkeys(row["pass"] for row in rows))
+    names = list(dict.fromkeys(row["implementation"] for row in rows))
+    figure = Figure(figsize=(4 * len(sizes), 3.2 * len(passes)), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(len(passes), len(sizes), squeeze=False)
+    for panel_row, passing in zip(panels, passes):
+        for axes, size in zip(panel_row, sizes):
+            for name in names:
+                chosen = [
+                    (row["channels"], row["median_ms"])
+                    for row in rows
+                    if (row["gaussians"], row["width"], row["height"]) == size
+                    and row["pass"] == passing
+                    and row["implementation"] == name
+                ]
+                if chosen:
+                    axes.plot(*zip(*sorted(chosen)), marker="o", label=name)
+            axes.set(title=f"{size[0]:,} at {size[1]} x {size[2]}, {passing}", xlabel="channels", ylabel="median, ms")
+            axes.set_yscale("log")
+            axes.grid(True, which="both", alpha=0.3)
+            axes.legend(fontsize="small")
+    figure.savefig(path, dpi=120)

@@ -1,0 +1,114 @@
+"""Times and memory of a call, fair to all that are compared: variants take turns, so that a machine's moods hit all."""
+
+import math
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import accumulate
+
+import torch
+from torch.profiler import ProfilerActivity, profile
+
+LEAST_REPETITIONS = 3
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One thing to time. prepare() is not timed and runs before every run(); run() takes what it returned."""
+
+    run: Callable[[object], object]
+    prepare: Callable[[], object] = lambda: None
+
+    def once(self) -> None:
+        self.run(self.prepare())
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Milliseconds of each repetition, in their order."""
+
+    samples: tuple[float, ...]
+
+    @property
+    def median(self) -> float:
+        return statistics.median(self.samples)
+
+    def to_dict(self) -> dict:
+        """median, mean, least and 90th percentile in ms, and the number of repetitions."""
+        ordered = sorted(self.samples)
+        return {
+            "median_ms": self.median,
+            "mean_ms": statistics.fmean(ordered),
+            "min_ms": ordered[0],
+            "p90_ms": ordered[min(len(ordered) - 1, math.ceil(0.9 * len(ordered)) - 1)],
+            "repetitions": len(ordered),
+        }
+
+
+def time_variants(
+    variants: dict[str, Variant],
+    device: torch.device,
+    *,
+    repetitions: int = 30,
+    warm_up: int | None = None,
+    budget: float = 20.0,
+) -> dict[str, Timing]:
+    """Time variants in turns.
+
+    warm_up: untimed runs of each before, by default 8 on CUDA and 2 on the CPU.
+    budget: on the CPU, seconds that one variant may take; a slow one is repeated less often, but at least 3 times.
+    CUDA: events around each run, with the device idle before, so that the host's time counts where it is the limit.
+    """
+    warm_up = (8 if device.type == "cuda" else 2) if warm_up is None else warm_up
+    samples: dict[str, list[float]] = {name: [] for name in variants}
+    wanted = {}
+    for name, variant in variants.items():
+        for _ in range(warm_up):
+            variant.once()
+        wanted[name] = repetitions
+        if device.type == "cpu":
+            # The trial counts as one more warm run: the first one may have compiled kernels.
+            trial = _milliseconds(variant, device) / 1e3
+            wanted[name] = max(min(LEAST_REPETITIONS, repetitions), min(repetitions, int(budget / max(trial, 1e-9))))
+    rounds = max(wanted.values())
+    for turn in range(rounds):
+        for name, variant in variants.items():
+            # A variant with fewer repetitions sits out turns evenly.
+            if (turn + 1) * wanted[name] // rounds > turn * wanted[name] // rounds:
+                samples[name].append(_milliseconds(variant, device))
+    return {name: Timing(tuple(values)) for name, values in samples.items()}
+
+
+def _milliseconds(variant: Variant, device: torch.device) -> float:
+    prepared = variant.prepare()
+    if device.type == "cpu":
+        started = time.perf_counter()
+        variant.run(prepared)
+        return (time.perf_counter() - started) * 1e3
+    first, last = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    torch.cuda.synchronize(device)
+    first.record(torch.cuda.current_stream(device))
+    variant.run(prepared)
+    last.record(torch.cuda.current_stream(device))
+    last.synchronize()
+    return first.elapsed_time(last)
+
+
+def peak_memory(variant: Variant, device: torch.device) -> int:
+    """Largest memory of torch's allocator during one run above what was in use before it, bytes."""
+    prepared = variant.prepare()
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+        before = torch.cuda.memory_allocated(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        variant.run(prepared)
+        torch.cuda.synchronize(device)
+        return torch.cuda.max_memory_allocated(device) - before
+    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
+        variant.run(prepared)
+    # In the order of time; events() of the profiler leaves out what is freed within the operation that allocated it.
+    events = recorded.profiler.kineto_results.events()
+    changes = [(event.start_ns(), event.nbytes()) for event in events if event.name() == "[memory]"]
+    held = accumulate(nbytes for _, nbytes in sorted(changes))
+    return max(held, default=0)
