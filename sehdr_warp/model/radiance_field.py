@@ -103,12 +103,19 @@ class RadianceField(nn.Module):
         self.low_pass = low_pass
 
     def photograph(
-        self, camera: CameraTensors, exposure_time: float, *, degree: int | None = None, linear: bool = False
+        self,
+        camera: CameraTensors,
+        exposure_time: float | Tensor,
+        *,
+        degree: int | None = None,
+        linear: bool = False,
+        capacity: int | None = None,
     ) -> Photograph:
-        """A photo of exposure_time seconds, harmonics up to `degree`; linear: also what a linear loss needs."""
+        """A photo of exposure_time seconds, harmonics up to `degree`; linear: also what a linear loss needs; capacity:
+        as rasterize() takes it."""
         ratio = exposure_time / self.base_time
         if self.radiance == "display":
-            rendering = self._rasterize(camera, self._harmonics(camera, degree).add(0.5).clamp_min(0))
+            rendering = self._rasterize(camera, self._harmonics(camera, degree).add(0.5).clamp_min(0), capacity)
             return Photograph(self._reexpose(rendering.image, ratio), None, None, rendering)
         base, fused = self._exposures(camera, degree)
         sets = {"fused": fused}
@@ -117,7 +124,7 @@ class RadianceField(nn.Module):
         if linear and self.fusion is not None:
             sets["base"] = base
         rendering = self._rasterize(
-            camera, torch.cat(list(sets.values()), dim=1) if len(sets) > 1 else next(iter(sets.values()))
+            camera, torch.cat(list(sets.values()), dim=1) if len(sets) > 1 else next(iter(sets.values())), capacity
         )
         images = dict(zip(sets, rendering.image.split(3, dim=2), strict=True))
         encoded = (
@@ -182,7 +189,7 @@ class RadianceField(nn.Module):
             return encoded
         return self.response.encode_extended(self.response.decode(encoded.clamp(0, 1)) * ratio)
 
-    def _rasterize(self, camera: CameraTensors, features: Tensor) -> Rendering:
+    def _rasterize(self, camera: CameraTensors, features: Tensor, capacity: int | None = None) -> Rendering:
         gaussians = self.gaussians
         return rasterize(
             gaussians.means,
@@ -196,4 +203,5 @@ class RadianceField(nn.Module):
             camera.height,
             antialiased=self.antialiased,
             low_pass=self.low_pass,
+            capacity=capacity,
         )

@@ -4,9 +4,11 @@ from .bridge import Program, differentiable
 from .harmonics import spherical_harmonics
 from .neighbours import nearest_neighbour_distances
 from .rasterization import Rendering, rasterize
+from .recording import GraphRecorder
 from .ssim import ssim, ssim_map
 
 __all__ = [
+    "GraphRecorder",
     "Program",
     "Rendering",
     "differentiable",

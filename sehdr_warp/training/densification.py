@@ -39,11 +39,14 @@ class Densification:
         """Whether observe() wants the gradients of the projected means at this iteration."""
         return False
 
+    def prepare(self, count: int, device: torch.device | str) -> None:
+        """Makes room for what observe() adds to."""
+
     def observe(self, rendering: Rendering, width: int, height: int, usable: Tensor) -> None:
         """Takes note of a step's image gradients. usable: scalar tensor, 0 where the step is to be ignored."""
 
     def change(self, iteration: int, gaussians: Gaussians, optimizer: torch.optim.Optimizer, generator) -> bool:
-        """Changes the Gaussians where this iteration is one for it; True if their number or order changed."""
+        """Changes the Gaussians where this iteration is one for it; True if any tensor was replaced by another."""
         return False
 
     def perturb(self, gaussians: Gaussians, means_rate: float, generator) -> None:
@@ -72,13 +75,15 @@ class GradientDensification(Densification):
     def needs_gradients(self, iteration: int) -> bool:
         return iteration <= self.stop
 
+    def prepare(self, count: int, device: torch.device | str) -> None:
+        if self.gradient_sum is None:
+            self.gradient_sum, self.seen = torch.zeros(count, device=device), torch.zeros(count, device=device)
+
     @torch.no_grad()
     def observe(self, rendering: Rendering, width: int, height: int, usable: Tensor) -> None:
         # In normalised screen units: the screen is 2 wide, so a pixel's gradient counts width / 2 times.
         gradient = rendering.means2d.grad
         norm = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2))
-        if self.gradient_sum is None:
-            self.gradient_sum, self.seen = torch.zeros_like(norm), torch.zeros_like(norm)
         counted = rendering.visible & usable.bool()
         self.gradient_sum += torch.where(counted, norm, 0.0)
         self.seen += counted
@@ -86,36 +91,34 @@ class GradientDensification(Densification):
     def change(self, iteration: int, gaussians: Gaussians, optimizer: torch.optim.Optimizer, generator) -> bool:
         changed = False
         if self._is_due(iteration) and self.gradient_sum is not None:
-            before = gaussians.count
             gradient = self.gradient_sum / self.seen.clamp_min(1)
-            grown = self._grow(gaussians, gradient, optimizer, generator)
-            pruned = self._prune(gaussians, optimizer, oversized=iteration > self.reset_every)
+            self._grow(gaussians, gradient, optimizer, generator)
+            self._prune(gaussians, optimizer, oversized=iteration > self.reset_every)
             self.gradient_sum = self.seen = None
-            changed = grown or pruned or gaussians.count != before
+            changed = True
         if iteration <= self.stop and iteration % self.reset_every == 0 and self.reset_every >= SHORTEST_RESET:
             self._reset_opacities(gaussians, optimizer)
         return changed
 
     @torch.no_grad()
-    def _grow(self, gaussians: Gaussians, gradient: Tensor, optimizer, generator) -> bool:
+    def _grow(self, gaussians: Gaussians, gradient: Tensor, optimizer, generator) -> None:
         wanted = gradient > self.options.grow_gradient
         room = self.options.max_gaussians - gaussians.count
         if int(wanted.sum()) > room:
             if room <= 0:
-                return False
+                return
             # Short of room, those that the image pulls at hardest go first.
             wanted = torch.zeros_like(wanted).index_fill_(0, gradient.topk(room).indices, True) & wanted
         small = gaussians.log_scales.amax(1) <= math.log(self.options.grow_scale * self.extent)
         clones, parents = (wanted & small).nonzero()[:, 0], (wanted & ~small).nonzero()[:, 0]
         if len(clones) + len(parents) == 0:
-            return False
+            return
         added = [gaussians.rows(clones)]
         added += [self._half(gaussians, parents, generator) for _ in range(2)]
         kept = torch.ones_like(wanted).index_fill_(0, parents, False)
         if len(parents):
             gaussians.keep(kept, optimizer)
         gaussians.append({name: torch.cat([rows[name] for rows in added]) for name in added[0]}, optimizer)
-        return True
 
     def _half(self, gaussians: Gaussians, parents: Tensor, generator) -> dict[str, Tensor]:
         """One smaller Gaussian for each parent, at a point drawn from it."""
@@ -130,15 +133,12 @@ class GradientDensification(Densification):
         return rows
 
     @torch.no_grad()
-    def _prune(self, gaussians: Gaussians, optimizer, oversized: bool) -> bool:
+    def _prune(self, gaussians: Gaussians, optimizer, oversized: bool) -> None:
         unwanted = gaussians.opacities() < self.options.prune_opacity
         if oversized:
             unwanted |= gaussians.log_scales.amax(1) > math.log(self.options.prune_scale * self.extent)
-        count = int(unwanted.sum())
-        if count == 0 or count == gaussians.count:
-            return False
-        gaussians.keep(~unwanted, optimizer)
-        return True
+        if 0 < int(unwanted.sum()) < gaussians.count:
+            gaussians.keep(~unwanted, optimizer)
 
     @torch.no_grad()
     def _reset_opacities(self, gaussians: Gaussians, optimizer) -> None:

@@ -12,13 +12,19 @@ EPSILON = 1e-15
 
 
 def make_optimizer(field: RadianceField, config: Config, extent: float) -> torch.optim.Adam:
-    """One parameter group, with its name, for each parameter of the Gaussians and one for the fusion."""
+    """One parameter group, with its name, for each parameter of the Gaussians and one for the fusion.
+
+    On a GPU its steps can be recorded in a CUDA graph: counters and the rate of the positions live on the device.
+    """
+    device = field.gaussians.means.device
     rates = {name: getattr(config.optimizer, name) for name in PARAMETER_NAMES}
     rates["means"] *= extent
     groups = [{"name": name, "params": [getattr(field.gaussians, name)], "lr": rate} for name, rate in rates.items()]
     if field.fusion is not None:
         groups.append({"name": "fusion", "params": list(field.fusion.parameters()), "lr": config.optimizer.fusion})
-    return torch.optim.Adam(groups, eps=EPSILON, fused=True)
+    if device.type == "cuda":
+        groups[0]["lr"] = torch.tensor(groups[0]["lr"], device=device)
+    return torch.optim.Adam(groups, eps=EPSILON, fused=True, capturable=device.type == "cuda")
 
 
 def means_rate(config: Config, extent: float, iteration: int) -> float:
@@ -28,18 +34,29 @@ def means_rate(config: Config, extent: float, iteration: int) -> float:
     return extent * rates.means * (rates.means_final / rates.means) ** part
 
 
-def guarded_step(optimizer: torch.optim.Adam, loss: Tensor) -> Tensor:
-    """One step of Adam, or none if the loss or a gradient is not finite; decided on the device, without waiting for it.
+def set_means_rate(optimizer: torch.optim.Adam, rate: float) -> None:
+    """Sets the learning rate of the positions for the next step."""
+    group = optimizer.param_groups[PARAMETER_NAMES.index("means")]
+    if isinstance(group["lr"], Tensor):
+        group["lr"].fill_(rate)
+    else:
+        group["lr"] = rate
 
-    Returns a scalar float tensor: 1 if the step was skipped, else 0.
+
+def guarded_step(optimizer: torch.optim.Adam, loss: Tensor, incomplete: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """One step of Adam, or none if the loss or a gradient is not finite or the rendering was incomplete; decided on the
+    device, without waiting for it.
+
+    Returns two scalar float tensors: 1 if something was not finite, and 1 if the step was skipped for either reason.
     """
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
     norms = torch._foreach_norm(gradients)
-    bad = (~torch.isfinite(torch.stack([loss.detach(), *norms])).all()).float()
+    nonfinite = (~torch.isfinite(torch.stack([loss.detach(), *norms])).all()).float()
+    skipped = nonfinite if incomplete is None else torch.maximum(nonfinite, incomplete.float())
     # The hook of torch's gradient scaler: the fused kernel leaves parameters, moments and step count where it is 1.
-    optimizer.found_inf = bad
+    optimizer.found_inf = skipped
     optimizer.step()
-    return bad
+    return nonfinite, skipped
 
 
 def optimizer_tensors(optimizer: torch.optim.Adam) -> dict[str, Tensor]:

@@ -18,8 +18,73 @@ class TrainingView:
     """A photo to train on: camera, exposure time in seconds, and the target at the camera's size."""
 
     camera: CameraTensors
-    exposure_time: float
+    exposure_time: float | Tensor
     target: Target
+
+
+@dataclass(frozen=True)
+class ViewStack:
+    """V training views of one size in shared memory: [i] is view i; at() takes the view whose number is on the device.
+
+    cameras: poses [V, 4, 4], intrinsics [V, 4], positions [V, 3]; times: exposure times in seconds [V], float32, or
+    one float where all are equal; the images as in Target, each [V, H, W, ...] or None.
+    """
+
+    width: int
+    height: int
+    poses: Tensor
+    intrinsics: Tensor
+    positions: Tensor
+    times: Tensor | float
+    images: dict[str, Tensor | None]
+
+    @staticmethod
+    def of(views: list[TrainingView]) -> "ViewStack | None":
+        """The views stacked; None where their sizes differ or only some have HDR truth."""
+        sizes = {(view.camera.width, view.camera.height) for view in views}
+        truths = {view.target.exposure_truth is None for view in views}
+        if len(sizes) > 1 or len(truths) > 1:
+            return None
+        images = {}
+        for name in ("encoded", "clipped", "black", "mask", "exposure_truth"):
+            values = [getattr(view.target, name) for view in views]
+            given = next((value for value in values if value is not None), None)
+            if given is not None:
+                # A view without clipped or black pixels has none of them; one without a mask counts everywhere.
+                empty = torch.ones_like(given) if name == "mask" else torch.zeros_like(given)
+                given = torch.stack([empty if value is None else value for value in values])
+            images[name] = given
+        times = [view.exposure_time for view in views]
+        cameras = [view.camera for view in views]
+        return ViewStack(
+            *sizes.pop(),
+            torch.stack([camera.world_to_camera for camera in cameras]),
+            torch.stack([camera.intrinsics for camera in cameras]),
+            torch.stack([camera.position for camera in cameras]),
+            times[0] if len(set(times)) == 1 else torch.tensor(times, device=cameras[0].position.device),
+            images,
+        )
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def __getitem__(self, index: int) -> TrainingView:
+        time = self.times if isinstance(self.times, float) else float(self.times[index])
+        return self._view(lambda values: values[index], time)
+
+    def at(self, index: Tensor) -> TrainingView:
+        """The view whose number is in index [1], int64, on the views' device; its exposure time may be a tensor."""
+
+        def take(values: Tensor) -> Tensor:
+            return values.index_select(0, index)[0]
+
+        return self._view(take, self.times if isinstance(self.times, float) else take(self.times))
+
+    def _view(self, take, time) -> TrainingView:
+        camera = CameraTensors(
+            self.width, self.height, take(self.poses), take(self.intrinsics), take(self.positions)
+        )
+        return TrainingView(camera, time, Target(**{k: None if v is None else take(v) for k, v in self.images.items()}))
 
 
 def training_views(

@@ -4,18 +4,28 @@ import torch
 from torch import Tensor
 
 from ..errors import SehdrError
-from ..model.gaussians import PARAMETER_NAMES
 from ..model.radiance_field import RadianceField
 from ..scene import Scene
+from ..splatting import GraphRecorder
 from .config import Config
 from .densification import make_densification
 from .initialization import scene_extent
 from .losses import total_loss
-from .optimizer import guarded_step, load_optimizer_tensors, make_optimizer, means_rate, optimizer_tensors
-from .targets import TrainingView, training_views
+from .optimizer import (
+    guarded_step,
+    load_optimizer_tensors,
+    make_optimizer,
+    means_rate,
+    optimizer_tensors,
+    set_means_rate,
+)
+from .targets import TrainingView, ViewStack, training_views
 
 CHECK_EVERY = 20
 """Iterations between looks at the count of skipped steps, each of which waits for the device."""
+ROOM_TO_GROW = 2.0
+"""A recorded step has room for this many times the (Gaussian, tile) pairs of the step before it: photos differ."""
+LEAST_ROOM = 1 << 14
 
 
 class Trainer:
@@ -36,11 +46,16 @@ class Trainer:
         self.optimizer = make_optimizer(field, config, self.extent)
         self.densification = make_densification(config, self.extent)
         self._views = scene.train_views
-        self._levels: dict[int, list[TrainingView]] = {}
+        self._levels: dict[int, ViewStack | list[TrainingView]] = {}
         self._order: list[int] = []
         self._order_generator = torch.Generator().manual_seed(config.seed)
         self._generator = torch.Generator(device=self.device).manual_seed(config.seed)
         self._skipped = torch.zeros((), device=self.device)
+        self._incomplete = torch.zeros((), device=self.device)
+        self._index = torch.zeros(1, dtype=torch.int64, device=self.device)
+        self._recorder = GraphRecorder(self.device) if self.device.type == "cuda" else None
+        self._launched: set = set()
+        self._pairs = 0
         self._last: tuple[Tensor, Tensor, Tensor] | None = None
 
     @property
@@ -75,28 +90,73 @@ class Trainer:
     def step(self) -> None:
         """One photo, one step. Raises SehdrError if more than schedule.nonfinite_limit steps had to be skipped."""
         self.iteration += 1
-        view = self._next_view()
-        photo = self.field.photograph(
-            view.camera, view.exposure_time, degree=self.degree, linear=self.config.loss.linear_weight > 0
-        )
+        views = self._training_views()
+        index = self._next_index(len(views))
+        gaussians = self.field.gaussians
         watched = self.densification.needs_gradients(self.iteration)
+        if watched:
+            self.densification.prepare(gaussians.count, self.device)
+        rate = means_rate(self.config, self.extent, self.iteration)
+        set_means_rate(self.optimizer, rate)
+        if self._can_record(views, (self.degree, self.level, watched)):
+            self._last = self._replay(views, index, watched)
+        else:
+            self._last = self._optimise(views[index], watched)
+        self.densification.perturb(gaussians, rate, self._generator)
+        if self.densification.change(self.iteration, gaussians, self.optimizer, self._generator):
+            self._forget_recording()
+        if self.iteration % CHECK_EVERY == 0:
+            self.check()
+
+    def _optimise(
+        self, view: TrainingView, watched: bool, capacity: int | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Photograph, compare, differentiate, step. Returns the loss, the simulated photo and the photo.
+
+        With a capacity all of it works on fixed memory and nothing waits for the device.
+        """
+        linear = self.config.loss.linear_weight > 0
+        photo = self.field.photograph(
+            view.camera, view.exposure_time, degree=self.degree, linear=linear, capacity=capacity
+        )
         if watched:
             photo.rendering.means2d.retain_grad()
         loss = total_loss(self.field, photo, view.target, self.config.loss)
         loss.backward()
-        rate = means_rate(self.config, self.extent, self.iteration)
-        self.optimizer.param_groups[PARAMETER_NAMES.index("means")]["lr"] = rate
-        bad = guarded_step(self.optimizer, loss)
+        nonfinite, skipped = guarded_step(self.optimizer, loss, photo.rendering.overflow)
         if watched:
-            self.densification.observe(photo.rendering, view.camera.width, view.camera.height, 1 - bad)
+            self.densification.observe(photo.rendering, view.camera.width, view.camera.height, 1 - skipped)
         self.optimizer.zero_grad(set_to_none=True)
-        gaussians = self.field.gaussians
-        self.densification.perturb(gaussians, rate, self._generator)
-        self.densification.change(self.iteration, gaussians, self.optimizer, self._generator)
-        self._skipped += bad
-        self._last = (loss.detach(), photo.encoded.detach(), view.target.encoded)
-        if self.iteration % CHECK_EVERY == 0:
-            self.check()
+        self._skipped += nonfinite
+        if capacity is None:
+            self._pairs = max(self._pairs, photo.rendering.entry_count)
+        else:
+            self._incomplete += photo.rendering.overflow
+        return loss.detach(), photo.encoded.detach(), view.target.encoded
+
+    def _can_record(self, views, kind) -> bool:
+        """Whether this step can be a recorded one: on a GPU, with photos of one size, after one like it was launched."""
+        if self._recorder is None or not isinstance(views, ViewStack):
+            return False
+        if self.field.radiance == "display" and not isinstance(views.times, float):
+            return False
+        ready = kind in self._launched and self._pairs > 0
+        self._launched.add(kind)
+        return ready
+
+    def _replay(self, views: ViewStack, index: int, watched: bool) -> tuple[Tensor, Tensor, Tensor]:
+        capacity = max(LEAST_ROOM, int(ROOM_TO_GROW * self._pairs))
+        self._index.fill_(index)
+        return self._recorder.run(
+            (self.degree, self.level, watched),
+            lambda: self._optimise(views.at(self._index), watched, capacity),
+        )
+
+    def _forget_recording(self) -> None:
+        """The Gaussians are others: launch the next step, which also tells how much room it needs."""
+        if self._recorder is not None:
+            self._recorder.invalidate()
+            self._pairs = 0
 
     def check(self) -> None:
         """Raises SehdrError if more than schedule.nonfinite_limit steps were skipped."""
@@ -106,6 +166,11 @@ class Trainer:
                 f"iteration {self.iteration}: {self.skipped_steps} steps had a loss or gradient that is not finite, "
                 f"more than schedule.nonfinite_limit = {limit}; lower the learning rates or check photos and cameras"
             )
+        if self._recorder is not None and self._incomplete:
+            # Steps without room for all pairs changed nothing; record again with room for any photo.
+            self._incomplete.zero_()
+            self._recorder.invalidate()
+            self._pairs *= 2
 
     def state(self) -> tuple[dict[str, Tensor], dict]:
         """Named tensors and plain values that together are the whole state."""
@@ -133,16 +198,19 @@ class Trainer:
         self._order = list(values["order"])
         self._skipped.fill_(values["skipped_steps"])
 
-    def _next_view(self) -> TrainingView:
-        """Every photo once in random order, then again in another."""
+    def _training_views(self) -> ViewStack | list[TrainingView]:
         level = self.level
         if level not in self._levels:
             # One resolution at a time: the coarser ones are not needed again.
-            self._levels = {level: self._upload(level)}
-        views = self._levels[level]
+            views = self._upload(level)
+            self._levels = {level: ViewStack.of(views) or views}
+        return self._levels[level]
+
+    def _next_index(self, count: int) -> int:
+        """Every photo once in random order, then again in another."""
         if not self._order:
-            self._order = torch.randperm(len(views), generator=self._order_generator).tolist()
-        return views[self._order.pop()]
+            self._order = torch.randperm(count, generator=self._order_generator).tolist()
+        return self._order.pop()
 
     def _upload(self, level: int) -> list[TrainingView]:
         loss, field = self.config.loss, self.field

@@ -47,12 +47,14 @@ def gradient_strategy(**options):
 def observe(strategy, gradients):
     """Screen gradients along x, in normalised units for an image 200 wide."""
     gradient = torch.tensor(gradients)[:, None] * torch.tensor([[1 / 100.0, 0.0]])
+    strategy.prepare(len(gradients), "cpu")
     strategy.observe(rendering_with(gradient, torch.ones(len(gradients), dtype=bool)), 200, 100, torch.tensor(1.0))
 
 
 def test_statistics_are_means_over_the_photos_that_show_it():
     strategy = gradient_strategy()
     gradient = torch.tensor([[3.0, 0.0], [0.0, 4.0]])
+    strategy.prepare(2, "cpu")
     strategy.observe(rendering_with(gradient, torch.tensor([True, True])), 200, 100, torch.tensor(1.0))
     strategy.observe(rendering_with(gradient * float("nan"), torch.tensor([True, True])), 200, 100, torch.tensor(0.0))
     strategy.observe(rendering_with(gradient, torch.tensor([True, False])), 200, 100, torch.tensor(1.0))

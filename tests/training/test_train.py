@@ -11,6 +11,7 @@ import torch
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.training.config_files import load_config
+from sehdr_warp.training.heldout import evaluate_views
 from sehdr_warp.training.initialization import choose_response, make_field
 from sehdr_warp.training.run import load_run
 from sehdr_warp.training.train import train
@@ -236,3 +237,22 @@ def test_unknown_device_is_refused(scene, tmp_path):
         with pytest.raises(InputError, match=device):
             train(scene, tmp_path / "run", quick(), device=device, quiet=True)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
+def test_recorded_steps_train_like_launched_ones():
+    scene, config = toy_scene(), quick()
+    scores = []
+    for recorded in (True, False):
+        field = make_field(scene, config, choose_response(scene, config), "cuda:0")
+        trainer = Trainer(scene, config, field)
+        if not recorded:
+            trainer._recorder = None
+        replays = 0
+        for _ in range(config.schedule.iterations):
+            trainer.step()
+            replays += recorded and trainer._recorder._key is not None
+        assert replays > 100 or not recorded
+        assert trainer.skipped_steps == 0
+        scores.append(evaluate_views(field, scene.test_views, trainer.degree)["psnr_ldr"])
+    assert abs(scores[0] - scores[1]) < 1.5

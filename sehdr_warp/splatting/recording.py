@@ -1,0 +1,68 @@
+"""Torch and Warp work recorded as one CUDA graph.
+
+A training step is some sixty kernels of a few microseconds each: launched one by one, the host takes several times as
+long as the GPU. Recorded once and replayed, the GPU sets the pace.
+"""
+
+from collections.abc import Callable
+
+import torch
+import warp as wp
+
+from .bridge import torch_stream
+
+
+class GraphRecorder:
+    """Records a function of no arguments, its torch operations and Warp launches alike, and replays it.
+
+    The function works on fixed memory: what differs between replays it must read from tensors that are filled before.
+    It must neither wait for the device nor copy from the host, and every kernel in it must have run once before. Its
+    result must be tensors (or tuples of them), which the next replay overwrites.
+    """
+
+    def __init__(self, device: torch.device):
+        self.device = torch.device(device)
+        self._key = None
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._result = None
+        self._stream = torch.cuda.Stream(self.device)
+        self._pool = torch.cuda.graph_pool_handle()
+        # Keeps the pool's memory between recordings: freed with the last graph of the pool, it would be allocated anew.
+        self._anchor = self._record(lambda: torch.zeros(1, device=self.device))
+
+    def invalidate(self) -> None:
+        """Forget the recording: something that it holds fixed has changed."""
+        self._key = self._result = None
+        if self._graph is not None:
+            self._graph.reset()
+            self._graph = None
+
+    def run(self, key, function: Callable):
+        """Replay the recording made under `key`, after recording `function` if there is none; returns its result.
+
+        Raises RuntimeError if the function cannot be recorded.
+        """
+        if key != self._key:
+            self.invalidate()
+            self._graph, self._result = self._record(function)
+            self._key = key
+        self._graph.replay()
+        return self._result
+
+    def _record(self, function: Callable):
+        graph = torch.cuda.CUDAGraph()
+        current = torch.cuda.current_stream(self.device)
+        self._stream.wait_stream(current)
+        with torch.cuda.stream(self._stream), torch_stream(self.device):
+            stream = wp.get_stream(wp.device_from_torch(self.device))
+            graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
+            try:
+                wp.capture_begin(stream=stream, external=True)
+                try:
+                    result = function()
+                finally:
+                    wp.capture_end(stream=stream)
+            finally:
+                graph.capture_end()
+        current.wait_stream(self._stream)
+        return graph, result
