@@ -21,7 +21,7 @@ SEHDR = $(VENV)/bin/sehdr-warp
 TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
-.PHONY: demo test
+.PHONY: demo test pictures
 
 demo: $(VENV)/installed
 	$(SEHDR) train $(DATA) --out $(DEMO)/run --preset demo --response $(RESPONSE) --device cpu --overwrite
@@ -31,6 +31,10 @@ demo: $(VENV)/installed
 
 test: $(VENV)/installed-test
 	$(VENV)/bin/python -m pytest $(PYTEST)
+
+# The README's pictures, from the demo's report.
+pictures: $(VENV)/installed
+	$(VENV)/bin/python docs/pictures.py $(DEMO)/report
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
