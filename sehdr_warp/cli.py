@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from . import __version__
+from .bench.commands import Bench, run_bench
 from .errors import SehdrError
 
 Positional = tyro.conf.Positional
@@ -134,6 +135,7 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Report, tyro.conf.subcommand("report")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 
 
@@ -271,7 +273,14 @@ def _report(command: Report) -> None:
         print(path)
 
 
-_COMMANDS = {Train: _train, Render: _render, Evaluate: _evaluate, Export: _export, Report: _report}
+_COMMANDS = {
+    Train: _train,
+    Render: _render,
+    Evaluate: _evaluate,
+    Export: _export,
+    Report: _report,
+    Bench: run_bench,
+}
 
 
 def _load_run(path: Path, device: str | None):

@@ -34,7 +34,8 @@ def train_with_gsplat(
         never does: its condition is `step % reset_every == 0 & step > 0`, and & binds before the comparisons.
     steps: stop after so many iterations, to warm up.
 
-    Returns {"psnr_ldr" dB over the test views, "train_seconds", "gaussians", "iterations", "peak_gpu_memory_bytes"}.
+    Returns {"psnr_ldr" dB over the test views, "train_seconds", "gaussians", "iterations", "peak_gpu_memory_bytes"
+    since torch's last reset}.
     Raises SehdrError where gsplat is not installed or the scene has no points to start from.
     """
     try:
@@ -46,7 +47,6 @@ def train_with_gsplat(
         ) from None
     if not len(scene.points):
         raise SehdrError(f"{scene.name} has no points; the comparison starts both sides from the same ones")
-    torch.cuda.reset_peak_memory_stats(device)
     torch.manual_seed(config.seed)
     densification, rates, schedule = config.densification, config.optimizer, config.schedule
     extent = scene_extent(scene)

@@ -1,6 +1,7 @@
 """Times and memory of a call, fair to all that are compared: variants take turns, so that a machine's moods hit all."""
 
 import math
+import os
 import statistics
 import time
 from collections.abc import Callable
@@ -11,6 +12,8 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 LEAST_REPETITIONS = 3
+TURNS = 3
+"""Each variant's repetitions come in so many turns, between the others'."""
 
 
 @dataclass(frozen=True)
@@ -71,11 +74,11 @@ def time_variants(
             # The trial counts as one more warm run: the first one may have compiled kernels.
             trial = _milliseconds(variant, device) / 1e3
             wanted[name] = max(min(LEAST_REPETITIONS, repetitions), min(repetitions, int(budget / max(trial, 1e-9))))
-    rounds = max(wanted.values())
-    for turn in range(rounds):
+    for turn in range(TURNS):
         for name, variant in variants.items():
-            # A variant with fewer repetitions sits out turns evenly.
-            if (turn + 1) * wanted[name] // rounds > turn * wanted[name] // rounds:
+            # The first run of a turn finds caches full of another variant's data, and is not timed.
+            variant.once()
+            for _ in range(wanted[name] * (turn + 1) // TURNS - wanted[name] * turn // TURNS):
                 samples[name].append(_milliseconds(variant, device))
     return {name: Timing(tuple(values)) for name, values in samples.items()}
 
@@ -105,6 +108,7 @@ def peak_memory(variant: Variant, device: torch.device) -> int:
         variant.run(prepared)
         torch.cuda.synchronize(device)
         return torch.cuda.max_memory_allocated(device) - before
+    os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # the profiler's own messages are not the user's
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
         variant.run(prepared)
     # In the order of time; events() of the profiler leaves out what is freed within the operation that allocated it.

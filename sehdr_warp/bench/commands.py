@@ -1,0 +1,170 @@
+"""The command line of `sehdr-warp bench`: what may be asked for, and the call. Light: torch is imported when it runs."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ..errors import SehdrError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Output:
+    """Where the figures go."""
+
+    json: Path | None = None
+    """Write the result to this file."""
+    out: Path | None = None
+    """Folder for the result as JSON and table, and for pictures."""
+    overwrite: bool = False
+    """Replace files that exist."""
+    device: str | None = None
+    """cpu or cuda:N; by default the first GPU if there is one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kernels(Output):
+    """Time the whole differentiable splat, forward and backward, against peers and the plain torch reference."""
+
+    channels: str = "3,9,15"
+    """Feature channels, separated by commas."""
+    sizes: str | None = None
+    """small, medium, large or Gaussians@WIDTHxHEIGHT such as 20k@200x200, separated by commas."""
+    peers: bool = False
+    """Also time gsplat and gswarp, where they are installed and there is a GPU."""
+    repetitions: int = 30
+    """Timed runs of each variant; slow ones have fewer on the CPU."""
+    budget: float = 20.0
+    """Seconds that one variant may take on the CPU."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step(Output):
+    """Time a whole training step of a preset on a synthetic scene."""
+
+    preset: str = "default"
+    """default, paper, fast, demo, 3dgs, or a TOML file."""
+    size: str | None = None
+    """Gaussians@WIDTHxHEIGHT; by default 100k@400x400 on a GPU and 20k@200x200 on the CPU."""
+    repetitions: int = 30
+    """Timed steps."""
+    budget: float = 20.0
+    """Seconds that one variant may take on the CPU."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training(Output):
+    """Train plain 3DGS on our kernels and with gsplat on equal terms, and compare."""
+
+    data: tyro.conf.Positional[str]
+    """Photos, as for train."""
+    iterations: int = 30_000
+    """Training steps of both."""
+    max_size: int | None = None
+    """Longest side of the photos, in pixels; larger ones are reduced."""
+    exposure_index: int | None = None
+    """Which exposure to train on where a view has several; by default the middle one."""
+    seed: int = 0
+    """Seed of every random number."""
+    released: bool = False
+    """Also train gsplat as version 1.5.3 is released: without resets of the opacities."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Measure speed: splats, training steps, trainings."""
+
+    benchmark: (
+        Annotated[Kernels, tyro.conf.subcommand("kernels")]
+        | Annotated[Step, tyro.conf.subcommand("step")]
+        | Annotated[Training, tyro.conf.subcommand("training")]
+    )
+
+
+def run_bench(command: Bench) -> None:
+    """Measures, prints the tables and writes what was asked for; raises SehdrError if a correctness check failed, after
+    everything was written."""
+    from ..training.train import pick_device
+    from .checks import require
+    from .report import check_writable, format_report, write_report
+
+    asked = command.benchmark
+    check_writable(type(asked).__name__.lower(), asked.json, asked.out, asked.overwrite)
+    report = _MEASURES[type(asked)](asked, pick_device(asked.device))
+    print(format_report(report))
+    write_report(report, json=asked.json, out=asked.out, overwrite=asked.overwrite)
+    require(report["checks"])
+
+
+def _kernels(asked: Kernels, device) -> dict:
+    from .kernels import bench_kernels
+    from .splats import parse_sizes
+
+    return bench_kernels(
+        parse_sizes(asked.sizes, device.type),
+        _channels(asked.channels),
+        device,
+        peers=asked.peers,
+        repetitions=_positive("--repetitions", asked.repetitions),
+        budget=_positive("--budget", asked.budget),
+        progress=_say,
+    )
+
+
+def _step(asked: Step, device) -> dict:
+    from .splats import Size, parse_size
+    from .step import bench_step
+
+    default = {"cuda": Size(100_000, 400, 400), "cpu": Size(20_000, 200, 200)}[device.type]
+    return bench_step(
+        default if asked.size is None else parse_size(asked.size, device.type),
+        device,
+        preset=asked.preset,
+        repetitions=_positive("--repetitions", asked.repetitions),
+        budget=_positive("--budget", asked.budget),
+        progress=_say,
+    )
+
+
+def _training(asked: Training, device) -> dict:
+    from ..scene import load_scene
+    from .training import bench_training
+
+    cache = None if asked.out is None else asked.out / "cache"
+    scene = load_scene(
+        asked.data, exposure_index=asked.exposure_index, max_size=asked.max_size, cache=cache, progress=_say
+    )
+    return bench_training(
+        scene,
+        device,
+        iterations=_positive("--iterations", asked.iterations),
+        seed=asked.seed,
+        released=asked.released,
+        out=asked.out,
+        overwrite=asked.overwrite,
+        progress=_say,
+    )
+
+
+_MEASURES = {Kernels: _kernels, Step: _step, Training: _training}
+
+
+def _channels(text: str) -> list[int]:
+    items = text.split(",")
+    if not all(item.strip().isdecimal() and int(item) > 0 for item in items):
+        raise SehdrError(
+            f"--channels {text}: not positive numbers separated by commas; write for example --channels 3,9"
+        )
+    return [int(item) for item in items]
+
+
+def _positive(flag: str, value):
+    if value <= 0:
+        raise SehdrError(f"{flag} {value}: must be positive")
+    return value
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
