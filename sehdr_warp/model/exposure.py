@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from fractions import Fraction
+from functools import lru_cache
 
 import torch
 
@@ -76,4 +77,11 @@ def bracket_log_radiance(log_base: torch.Tensor, times: Sequence[float], base_ti
     Returns [n, ...]: exp of it is the linear radiance at each exposure. SehdrError for a time that is not positive.
     """
     shifts = [math.log(_positive(time, "times")) - math.log(_positive(base_time, "base_time")) for time in times]
-    return log_base + log_base.new_tensor(shifts).reshape(-1, *[1] * log_base.dim())
+    offsets = _on_device(tuple(shifts), log_base.dtype, log_base.device)
+    return log_base + offsets.reshape(-1, *[1] * log_base.dim())
+
+
+@lru_cache(maxsize=64)
+def _on_device(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    """Copied once: a copy from the host cannot be part of a recorded training step."""
+    return torch.tensor(values, dtype=dtype, device=device)

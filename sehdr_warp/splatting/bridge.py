@@ -181,11 +181,18 @@ class _ProgramFunction(torch.autograd.Function):
         return (None, None, *results)
 
 
+_streams: dict[int, wp.Stream] = {}
+
+
 def torch_stream(device: torch.device):
     """Warp launches on torch's current stream for as long as this context lasts."""
     if device.type == "cpu":
         return nullcontext()
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False, sync_exit=False)
+    current = torch.cuda.current_stream(device)
+    # One Warp object a stream, for good: when a second one dies, Warp forgets the stream, in mid-capture too.
+    if current.cuda_stream not in _streams:
+        _streams[current.cuda_stream] = wp.Stream(wp.device_from_torch(device), cuda_stream=current.cuda_stream)
+    return wp.ScopedStream(_streams[current.cuda_stream], sync_enter=False, sync_exit=False)
 
 
 def differentiable(body):

@@ -5,6 +5,7 @@ long as the GPU. Recorded once and replayed, the GPU sets the pace.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 
 import torch
 import warp as wp
@@ -56,13 +57,17 @@ class GraphRecorder:
         with torch.cuda.stream(self._stream), torch_stream(self.device):
             stream = wp.get_stream(wp.device_from_torch(self.device))
             graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
+            wp.capture_begin(stream=stream, external=True)
             try:
-                wp.capture_begin(stream=stream, external=True)
-                try:
-                    result = function()
-                finally:
+                result = function()
+            except BaseException:
+                # Leave both recordings; that they are spoilt is no news.
+                with suppress(RuntimeError):
                     wp.capture_end(stream=stream)
-            finally:
-                graph.capture_end()
+                with suppress(RuntimeError):
+                    graph.capture_end()
+                raise
+            wp.capture_end(stream=stream)
+            graph.capture_end()
         current.wait_stream(self._stream)
         return graph, result

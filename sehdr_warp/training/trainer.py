@@ -1,5 +1,7 @@
 """The training loop's state and its single step. What happens around steps is train.py's business."""
 
+import warnings
+
 import torch
 from torch import Tensor
 
@@ -147,10 +149,17 @@ class Trainer:
     def _replay(self, views: ViewStack, index: int, watched: bool) -> tuple[Tensor, Tensor, Tensor]:
         capacity = max(LEAST_ROOM, int(ROOM_TO_GROW * self._pairs))
         self._index.fill_(index)
-        return self._recorder.run(
-            (self.degree, self.level, watched),
-            lambda: self._optimise(views.at(self._index), watched, capacity),
-        )
+        try:
+            return self._recorder.run(
+                (self.degree, self.level, watched),
+                lambda: self._optimise(views.at(self._index), watched, capacity),
+            )
+        except RuntimeError as error:
+            # Nothing of the step was done yet. Launching every step is slower, and right.
+            self._recorder = None
+            self.optimizer.zero_grad(set_to_none=True)
+            warnings.warn(f"training steps are launched one by one: {str(error).splitlines()[0]}", stacklevel=2)
+            return self._optimise(views[index], watched)
 
     def _forget_recording(self) -> None:
         """The Gaussians are others: launch the next step, which also tells how much room it needs."""
