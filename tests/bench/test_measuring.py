@@ -125,7 +125,9 @@ def test_gswarp_is_given_the_same_scene(monkeypatch):
             s = self.settings
             clip = torch.cat([means3D, torch.ones(len(means3D), 1)], 1) @ s.projmatrix
             centres = (clip[:, :2] / clip[:, 3:] + 1) * torch.tensor([s.image_width, s.image_height]) / 2
-            torch.testing.assert_close(centres, rasterize(*scene.arguments).means2d, rtol=1e-4, atol=1e-3)
+            ours = rasterize(*scene.arguments)
+            assert ours.visible.sum() > 250
+            torch.testing.assert_close(centres[ours.visible], ours.means2d[ours.visible], rtol=1e-4, atol=1e-3)
             assert ((clip[:, 2] > 0) & (clip[:, 2] < clip[:, 3])).all()
             focal = [s.image_width / (2 * s.tanfovx), s.image_height / (2 * s.tanfovy)]
             camera = torch.tensor([*focal, s.image_width / 2, s.image_height / 2])
