@@ -11,7 +11,7 @@ import tyro
 
 from . import __version__
 from .bench.commands import Bench, run_bench
-from .errors import SehdrError
+from .errors import InputError, SehdrError
 
 Positional = tyro.conf.Positional
 
@@ -294,10 +294,13 @@ def _scene_of(run, data: str | None):
     """The scene a run was trained on, read again in the same way."""
     from .scene import load_scene
 
-    if data is None and "path" not in run.data:
+    place = data or run.data.get("path")
+    if place is None:
         raise SehdrError(f"{run.path}: does not say where its photos are; give --data")
+    if data is None and place != "embedded" and not Path(place).is_dir():
+        raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
     return load_scene(
-        data or run.data["path"],
+        place,
         exposure_index=run.data.get("exposure_index"),
         max_size=run.data.get("max_size"),
         cache=_cache_beside(run.path),

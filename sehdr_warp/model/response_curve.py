@@ -64,8 +64,8 @@ class Response(ABC):
     def from_dict(values: dict) -> "Response":
         """The curve that to_dict described; SehdrError if the description is not one."""
         kind = values.get("kind") if isinstance(values, dict) else None
-        if kind not in Response._kinds:
-            raise SehdrError(f"response: kind = {kind!r} is not one of {', '.join(sorted(Response._kinds))}")
+        if not isinstance(kind, str) or kind not in Response._kinds:
+            raise SehdrError(f"response: kind = {kind!r:.60} is not one of {', '.join(sorted(Response._kinds))}")
         try:
             return Response._kinds[kind]._from_dict(values)
         except (KeyError, TypeError, ValueError, AttributeError) as error:

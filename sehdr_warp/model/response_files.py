@@ -1,5 +1,6 @@
 """Responses that are read: EMoR and DoRF files, a curve of one's own, and the camera encodings of colour-science."""
 
+import difflib
 import json
 from pathlib import Path
 
@@ -56,8 +57,9 @@ def colour_response(encoding: str) -> Response:
     wanted = _key(encoding)
     matches = [name for name in colour.CCTF_ENCODINGS if _key(name) == wanted]
     if not matches:
-        known = ", ".join(colour.CCTF_ENCODINGS)
-        raise SehdrError(f"response 'colour:{encoding}': colour-science has no such encoding; it has {known}")
+        near = difflib.get_close_matches(encoding, colour.CCTF_ENCODINGS, n=5, cutoff=0.3)
+        hint = f"did you mean {', '.join(near)}?" if near else "colour.CCTF_ENCODINGS lists them"
+        raise SehdrError(f"response 'colour:{encoding:.60}': colour-science has no such encoding; {hint}")
     name = matches[0]
 
     def encode(exposure):
@@ -120,14 +122,13 @@ def _select(path: Path, curves: list[Response], selector: str | None) -> Respons
 
 def _dorf_mat(path: Path) -> list[Response]:
     from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
 
     _check_size(path)
     try:
         stored = loadmat(path, variable_names=("B", "I"))
         values, exposures = (np.asarray(stored[key], np.float64) for key in ("B", "I"))
-    except (OSError, KeyError, ValueError, TypeError, NotImplementedError, MatReadError) as error:
-        raise InputError(path, f"is not a DoRF file ({error})", "give B and I of [curves, samples]") from error
+    except Exception as error:  # noqa: BLE001 - scipy raises many kinds on damaged files, all of one meaning
+        raise InputError(path, f"is not a DoRF file ({error!r:.120})", "give B and I of [curves, samples]") from error
     if values.ndim != 2 or values.shape != exposures.shape:
         raise InputError(path, f"B is {values.shape} and I is {exposures.shape}", "give both as [curves, samples]")
     return [
@@ -194,7 +195,10 @@ def _json_curve(path: Path, text: str) -> Response:
     except (ValueError, RecursionError) as error:
         raise InputError(path, f"is not JSON ({error})", remedy) from error
     if isinstance(stored, dict) and "kind" in stored:
-        return Response.from_dict(stored)
+        try:
+            return Response.from_dict(stored)
+        except SehdrError as error:
+            raise InputError(path, str(error), remedy) from error
     try:
         exposures, values = (np.array(stored[key], np.float64) for key in ("exposures", "values"))
     except (KeyError, TypeError, ValueError) as error:

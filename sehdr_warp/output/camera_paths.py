@@ -7,6 +7,8 @@ import numpy as np
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera
 
+# An hour of film at 24 views a second has 86 400; more is a slip of the hand.
+_LONGEST = 100_000
 # A gap in azimuth smaller than this means that the photos go round the scene.
 _ROUND_GAP = np.radians(120)
 # Mean squared sine between optical axes below which they are parallel in effect and meet nowhere (1 degree).
@@ -32,7 +34,7 @@ def orbit(cameras: Sequence[Camera], count: int, *, focus_distance: float) -> li
     that no photo saw. Size and intrinsics are those of the camera nearest to the middle.
 
     focus_distance: how far ahead the focus is taken to lie where the optical axes are parallel; world units, positive.
-    Raises SehdrError without cameras or for a count below 1.
+    Raises SehdrError without cameras or for a count outside 1 to 100 000.
     """
     _check(cameras, count)
     positions = _positions(cameras)
@@ -68,7 +70,7 @@ def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
 
     Positions follow a cubic spline and rotations a spherical one (scipy's RotationSpline), both over chord length, so
     that speed stays even. Size and intrinsics are those of the first camera.
-    Raises SehdrError without cameras or for a count below 1.
+    Raises SehdrError without cameras or for a count outside 1 to 100 000.
     """
     from scipy.interpolate import CubicSpline
     from scipy.spatial.transform import Rotation, RotationSpline
@@ -96,8 +98,8 @@ def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
 def _check(cameras: Sequence[Camera], count: int) -> None:
     if not cameras:
         raise SehdrError("a camera path needs at least one camera of the run")
-    if count < 1:
-        raise SehdrError(f"a camera path of {count} views is empty; ask for at least 1")
+    if not 1 <= count <= _LONGEST:
+        raise SehdrError(f"a camera path of {count} views cannot be; ask for a count of 1 to {_LONGEST}")
 
 
 def _positions(cameras: Sequence[Camera]) -> np.ndarray:

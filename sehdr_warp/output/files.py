@@ -22,6 +22,13 @@ _WRITE_ERRORS = frozenset(
 
 
 @contextmanager
+def _in_place(path: Path) -> Iterator[list[Path]]:
+    """Makes the parents of `path`, yields those made, and says in one line why a write is refused."""
+    with writing(path):
+        yield _make_parents(path)
+
+
+@contextmanager
 def atomic_path(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     """Yields a temporary path in the folder of `path`; what is written there becomes `path` when the block ends.
 
@@ -70,7 +77,10 @@ def atomic_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
                 _sync(Path(folder))
             check_absent_folder(path, overwrite)
             _swap_in(temporary, path)
-        except BaseException:
+        except BaseException as error:
+            # Whoever writes into the folder names files by its temporary name, which means nothing to the user.
+            if isinstance(error, SehdrError):
+                error.args = tuple(str(item).replace(str(temporary), str(path)) for item in error.args)
             shutil.rmtree(temporary, ignore_errors=True)
             _remove_empty(made)
             raise
@@ -106,10 +116,10 @@ def check_absent_folder(path: Path | str, overwrite: bool = False) -> None:
 
 
 @contextmanager
-def _in_place(path: Path) -> Iterator[list[Path]]:
-    """Makes the parents of `path`, yields those made, and turns the operating system's refusals into one line."""
+def writing(path: Path | str) -> Iterator[None]:
+    """Turns the operating system's refusals to write `path` (a full disk, no rights) into a SehdrError of one line."""
     try:
-        yield _make_parents(path)
+        yield
     except OSError as error:
         if error.errno not in _WRITE_ERRORS and not isinstance(error, FileExistsError):
             raise
@@ -126,6 +136,8 @@ def _make_parents(path: Path) -> list[Path]:
     missing = []
     for parent in path.absolute().parents:
         if parent.exists():
+            if not parent.is_dir():
+                raise InputError(parent, "is a file, not a folder", "choose another place")
             break
         missing.append(parent)
     for parent in reversed(missing):

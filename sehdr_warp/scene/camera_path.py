@@ -9,11 +9,11 @@ from sehdr_warp.errors import InputError
 
 from .camera import Camera
 from .capture import pose_from_camera_to_world
+from .images import MAX_PIXELS
 from .names import natural_key
 from .paths import read_json
 from .read_transforms import frame_lens, frame_pose, frames_of
 
-_MAX_SIDE = 1 << 16
 
 
 def load_cameras(path: Path | str, *, size: tuple[int, int] | None = None) -> list[tuple[str, Camera]]:
@@ -42,6 +42,8 @@ def load_cameras(path: Path | str, *, size: tuple[int, int] | None = None) -> li
         )
     if not cameras:
         raise InputError(path, "lists no cameras", "add at least one")
+    for i, (_, camera) in enumerate(cameras):
+        _check_size(camera.width, camera.height, i, path)
     names = [name.lower() for name, _ in cameras]
     if len(set(names)) < len(names):
         twice = min((name for name in names if names.count(name) > 1), key=natural_key)
@@ -59,7 +61,6 @@ def _own(entry, index: int, path: Path) -> tuple[str, Camera]:
         raise InputError(path, f"camera {index} cannot be used ({str(error)[:120]})", "correct the camera") from None
     if not name or any(letter in name for letter in "/\\\0") or name in (".", "..") or len(name) > 200:
         raise InputError(path, f"camera name {name!r:.60} cannot name a file", "use letters, digits, '_' and '-'")
-    _check_size(camera.width, camera.height, index, path)
     return name, camera
 
 
@@ -85,5 +86,5 @@ def _nerfstudio(entry, index: int, values: dict, path: Path) -> tuple[str, Camer
 
 
 def _check_size(width: int, height: int, index: int, path: Path) -> None:
-    if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE):
-        raise InputError(path, f"camera {index} is {width} x {height} pixels", f"use sizes of 1 to {_MAX_SIDE}")
+    if width < 1 or height < 1 or width * height > MAX_PIXELS:
+        raise InputError(path, f"camera {index} is {width} x {height}", f"use sizes of 1 to {MAX_PIXELS} pixels")

@@ -125,7 +125,12 @@ def _cached(cache: Path | None, name: str, solve: Callable[[Path, Path], None], 
                 # Another process finished the same work first; its result is as good.
                 if not (cache / name).is_dir():
                     raise
-    except OSError as error:
+    except BaseException as error:
+        if cache is not None:
+            with contextlib.suppress(OSError):  # Not empty, or never made.
+                cache.rmdir()
+        if not isinstance(error, OSError):
+            raise
         raise SehdrError(f"{cache or tempfile.gettempdir()}: structure from motion cannot write "
                          f"({error.strerror or error}); free some space or choose another cache") from None  # fmt: skip
     yield cache / name

@@ -6,6 +6,8 @@ tensors. A folder that a killed process left is therefore never mistaken for a c
 
 import hashlib
 import json
+import math
+import reprlib
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,11 +80,14 @@ def read_checkpoint(path: Path) -> Checkpoint:
         data = (path / TENSORS).read_bytes()
     except OSError as error:
         raise InputError(error.filename or path, f"cannot be read ({error.strerror})", remedy) from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(path / VALUES, f"not valid JSON ({error})", remedy) from None
     if not isinstance(values, dict) or values.get("format") != FORMAT:
         found = values.get("format") if isinstance(values, dict) else None
         raise InputError(path / VALUES, f"format = {found!r} is not {FORMAT}", remedy)
+    for name, kind in (("iteration", int), ("seconds", int | float)):
+        if not isinstance(values.get(name), kind) or not 0 <= values[name] < math.inf:
+            raise InputError(path / VALUES, f"{name} = {reprlib.repr(values.get(name))} is not a number from 0", remedy)
     if hashlib.sha256(data).hexdigest() != values.get("sha256"):
         raise InputError(path / TENSORS, f"its SHA-256 is not the {values.get('sha256')} of {VALUES}", remedy)
     try:

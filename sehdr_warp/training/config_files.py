@@ -1,6 +1,7 @@
 """Configs as files: TOML presets and overrides in, JSON beside the run out."""
 
 import json
+import reprlib
 import textwrap
 import tomllib
 import types
@@ -70,7 +71,7 @@ def read_config_json(path: Path) -> Config:
     """The config saved with a run; raises InputError."""
     try:
         values = json.loads(_text(path))
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(path, f"not valid JSON ({error})", "the run is damaged: train again") from None
     return _build(path, values)
 
@@ -85,7 +86,7 @@ def _read(preset: str | Path) -> tuple[Path, dict]:
         seen.add(path)
         try:
             values = tomllib.loads(_text(path))
-        except tomllib.TOMLDecodeError as error:
+        except (ValueError, RecursionError) as error:
             raise InputError(path, f"not valid TOML ({error})", _REMEDY) from None
         chain.append(values)
         base = values.pop("base", None)
@@ -128,6 +129,8 @@ def _override(source: Path | str, values: dict, overrides: dict) -> Config:
         table = values
         for parent in parents:
             table = table.setdefault(parent, {})
+            if not isinstance(table, dict):
+                raise InputError(source, f"{parent} = {_shown(table)} is not a table", _REMEDY)
         table[leaf] = value
     return _build(source, values)
 
@@ -151,11 +154,11 @@ def _build(source: Path | str, values: dict) -> Config:
 
 def _table(kind: type, values, prefix: str):
     if not isinstance(values, dict):
-        raise ConfigError(f"{prefix.rstrip('.') or 'the config'} = {values!r} is not a table")
+        raise ConfigError(f"{prefix.rstrip('.') or 'the config'} = {_shown(values)} is not a table")
     hints = typing.get_type_hints(kind)
     unknown = sorted(set(values) - set(hints))
     if unknown:
-        raise ConfigError(f"unknown field {prefix}{unknown[0]} = {values[unknown[0]]!r}")
+        raise ConfigError(f"unknown field {prefix}{unknown[0]} = {_shown(values[unknown[0]])}")
     made = {}
     for item in fields(kind):
         if item.name in values:
@@ -168,10 +171,15 @@ def _plain(hint, value, path: str):
     """A TOML or JSON value as the field's type; whole numbers are good for float fields, nothing else converts."""
     if isinstance(hint, types.GenericAlias):
         if not isinstance(value, list | tuple):
-            raise ConfigError(f"{path} = {value!r} is not a list")
+            raise ConfigError(f"{path} = {_shown(value)} is not a list")
         return tuple(_plain(typing.get_args(hint)[0], item, path) for item in value)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if type(value) is not hint:
-        raise ConfigError(f"{path} = {value!r} is not of type {hint.__name__}")
+        raise ConfigError(f"{path} = {_shown(value)} is not of type {hint.__name__}")
     return value
+
+
+def _shown(value) -> str:
+    """A value for an error's one line: short, whatever a file holds."""
+    return reprlib.repr(value)

@@ -9,6 +9,8 @@ summary.json        times, memory and counts, when the training ended
 """
 
 import json
+import math
+import reprlib
 import shutil
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,12 +19,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ..errors import InputError
+from ..errors import InputError, SehdrError
 from ..model.gaussians import PARAMETER_NAMES, Gaussians
 from ..model.radiance_field import RadianceField, RenderedView
 from ..model.response import Response
-from ..output.files import atomic_path, write_json
+from ..output.files import atomic_path, write_json, writing
 from ..scene import Camera, Scene
+from ..scene.images import MAX_PIXELS
 from .checkpoint import Checkpoint, newest_checkpoint
 from .config import Config
 from .config_files import config_to_dict, read_config_json
@@ -134,6 +137,9 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
 
 def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) -> RadianceField:
     """The RadianceField that a checkpoint holds, on the CPU; raises InputError if tensors are missing or do not fit."""
+    for name, tensor in checkpoint.tensors.items():
+        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+            raise InputError(checkpoint.path, f"{name} holds values that are not finite", _REMEDY)
     try:
         gaussians = Gaussians(*(checkpoint.tensors[f"gaussians.{name}"] for name in PARAMETER_NAMES))
         field = assemble_field(gaussians, config, Response.from_dict(info["response"]), info["base_exposure_time"])
@@ -222,9 +228,18 @@ def write_start(path: Path, scene: Scene, config: Config, field: RadianceField, 
 def read_run_info(path: Path) -> dict:
     """What run.json holds; raises InputError."""
     info = _read_json(path / RUN)
-    for name in ("scene", "data", "base_exposure_time", "response"):
+    for name, kind in (("scene", str), ("data", dict), ("base_exposure_time", int | float), ("response", dict)):
         if name not in info:
             raise InputError(path / RUN, f"lacks the field {name}", _REMEDY)
+        if not isinstance(info[name], kind):
+            raise InputError(path / RUN, f"{name} = {reprlib.repr(info[name])} is of the wrong type", _REMEDY)
+    time = info["base_exposure_time"]
+    if not (math.isfinite(time) and time > 0):
+        raise InputError(path / RUN, f"base_exposure_time = {time} is not a positive number of seconds", _REMEDY)
+    try:
+        Response.from_dict(info["response"])
+    except SehdrError as error:
+        raise InputError(path / RUN, str(error), _REMEDY) from None
     return info
 
 
@@ -232,14 +247,18 @@ def read_cameras(path: Path) -> tuple[CameraEntry, ...]:
     """The views in scene.json; raises InputError."""
     values = _read_json(path / SCENE)
     try:
-        return tuple(
-            CameraEntry(
-                str(view["name"]), str(view["split"]), Camera.from_dict(view["camera"]), float(view["exposure_time"])
-            )
-            for view in values["views"]
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(path / SCENE, f"a view is damaged ({error!r})", _REMEDY) from None
+        return tuple(_camera_entry(view) for view in values["views"])
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(path / SCENE, f"a view is damaged ({error!r:.200})", _REMEDY) from None
+
+
+def _camera_entry(view: dict) -> CameraEntry:
+    camera, time = Camera.from_dict(view["camera"]), float(view["exposure_time"])
+    if camera.width * camera.height > MAX_PIXELS:
+        raise ValueError(f"{camera.width} x {camera.height} is more than {MAX_PIXELS} pixels")
+    if not (math.isfinite(time) and time > 0):
+        raise ValueError(f"exposure_time = {time} is not a positive number of seconds")
+    return CameraEntry(str(view["name"]), str(view["split"]), camera, time)
 
 
 def check_same_scene(path: Path, scene: Scene) -> None:
@@ -255,8 +274,8 @@ def check_same_scene(path: Path, scene: Scene) -> None:
 
 
 def append_metrics(path: Path, line: dict) -> None:
-    """Adds a line to metrics.jsonl."""
-    with open(path / METRICS, "a", encoding="utf-8") as file:
+    """Adds a line to metrics.jsonl; raises SehdrError if the disk refuses."""
+    with writing(path / METRICS), open(path / METRICS, "a", encoding="utf-8") as file:
         file.write(json.dumps(line) + "\n")
 
 
@@ -283,7 +302,7 @@ def _read_json(path: Path) -> dict:
         values = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})", _REMEDY) from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(path, f"not valid JSON ({error})", _REMEDY) from None
     if not isinstance(values, dict):
         raise InputError(path, "is not a JSON object", _REMEDY)

@@ -80,7 +80,7 @@ def test_full_disk_is_one_line(tmp_path, full_disk):
 
 def test_parent_that_is_a_file_is_one_line(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(SehdrError, match="cannot be written"), atomic_path(tmp_path / "file" / "a.txt"):
+    with pytest.raises(SehdrError, match="is a file"), atomic_path(tmp_path / "file" / "a.txt"):
         pass
 
 
