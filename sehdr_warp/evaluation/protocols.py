@@ -76,8 +76,8 @@ def fit_scale(pairs: Iterable[tuple[torch.Tensor, torch.Tensor, torch.Tensor | N
     """The factor that takes predictions to the truth: exp of the median of log(truth / prediction).
 
     pairs: (prediction, truth, mask or None) of the training views; images [H, W, 3] scene-linear radiance. Every
-    channel of every pixel votes if both values are above 1e-4 of the view's truth maximum; a median stands up to
-    clipped, empty and wrong regions of up to half the votes.
+    channel of every pixel votes whose truth is above 1e-4 of the view's maximum and whose prediction is not black; a
+    median stands up to clipped, empty and wrong regions of up to half the votes.
 
     Returns None if nothing can vote (an empty prediction, or no view with truth).
     """
@@ -85,8 +85,8 @@ def fit_scale(pairs: Iterable[tuple[torch.Tensor, torch.Tensor, torch.Tensor | N
     for prediction, truth, mask in pairs:
         prediction, truth = prediction.double(), truth.double()
         valid = truth > VOTING_FLOOR * _maximum(truth, mask)
-        # The prediction's own floor: its scale is what is sought, so it cannot be held against the truth's.
-        valid &= prediction > VOTING_FLOOR * _maximum(prediction, mask)
+        # No floor for the prediction: its scale is what is sought, and one wild highlight would set its maximum.
+        valid &= prediction > 0
         if mask is not None:
             valid &= (mask > 0.5)[..., None]
         ratios = (truth[valid] / prediction[valid]).log()

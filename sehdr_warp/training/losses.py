@@ -29,10 +29,12 @@ class Target:
 
 
 def one_sided(prediction: Tensor, target: Target) -> Tensor:
-    """The prediction [H, W, 3] as far as the photo can tell: a clipped pixel says `at least white`, so what is brighter
-    equals it; a black pixel says `at most half a code`, so what is darker equals it."""
+    """The prediction [H, W, 3] as far as the photo can tell. A clipped pixel says `at least white less half a code`, so
+    what is brighter equals it: without the half code a response that never quite reaches white would be pulled up for
+    ever. A black pixel says `at most half a code`, so what is darker equals it."""
     if target.clipped is not None:
-        prediction = torch.where(target.clipped, torch.minimum(prediction, target.encoded), prediction)
+        reached = torch.minimum(prediction + CODE / 2, target.encoded)
+        prediction = torch.where(target.clipped, reached, prediction)
     if target.black is not None:
         prediction = torch.where(target.black, (prediction - CODE / 2).clamp_min(0), prediction)
     return prediction
