@@ -17,6 +17,8 @@ CELLS_PER_OCTAVE = 512
 TOE_OCTAVES, MAX_OCTAVES = 6, 40
 # A flat part is tilted by this much over its length (1/64 of an 8-bit code), so that the curve has an inverse there.
 FLAT_TILT = 2.0**-14
+# A rise from sample to sample below this is none: a 16-bit code is 1.5e-5.
+LEAST_STEP = 1e-9
 
 
 class TabulatedResponse(Response, kind="table"):
@@ -123,6 +125,7 @@ def _monotone(exposures: np.ndarray, values: np.ndarray, source: str):
         values = np.maximum.accumulate(isotonic_regression(values).x)
     if exposures[0] > 0:
         exposures, values = np.concatenate([[0.0], exposures]), np.concatenate([[0.0], values])
+    values = _without_traces(values)
     if values[-1] - values[0] < 2 * HALF_CODE:
         raise InputError(
             source,
@@ -148,6 +151,16 @@ def _check(exposures: np.ndarray, values: np.ndarray, source: str):
     if values.min() < 0 or values.max() > 1:
         worst = values.max() if values.max() > 1 else values.min()
         raise InputError(source, f"value {worst:.6g} is outside [0, 1]", "divide codes by the largest, 255 or 65535")
+
+
+def _without_traces(values: np.ndarray) -> np.ndarray:
+    """Increasing values whose steps are 0 or at least LEAST_STEP: smaller ones are what rounding left of a flat part,
+    and an inverse through them would be decided by the last digit."""
+    steps = np.diff(values) >= LEAST_STEP
+    first = np.concatenate([[0], np.flatnonzero(steps) + 1])
+    last = np.concatenate([first[1:], [len(values)]]) - 1
+    # The end of each group, so that the peak stays what it is.
+    return np.repeat(values[last], last - first + 1)
 
 
 def _tilt_flat_parts(exposures: np.ndarray, values: np.ndarray):

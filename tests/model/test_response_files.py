@@ -168,6 +168,8 @@ def test_order_and_repeats_are_repaired():
 
 @settings(deadline=None, max_examples=60)
 @example([(0.0, 0.0), (5941.0, 0.0), (159959.0, 1.0)])
+@example([(0.0, 0.0), (1.0, 0.9999999999999999), (2.0, 1.0)])
+@example([(0.0, 0.0), (1.0, 1e-16), (2.0, 0.5), (3.0, 0.5 + 1e-15), (4.0, 1.0)])
 @given(
     st.lists(
         st.tuples(st.floats(0, 1e6, width=32), st.floats(0, 1)), min_size=3, max_size=300, unique_by=lambda row: row[0]
