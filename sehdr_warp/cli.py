@@ -1,6 +1,7 @@
 """The command `sehdr-warp`: parses, calls, prints. What needs torch is imported by the commands that need it."""
 
 import json
+import os
 import sys
 import traceback
 from dataclasses import dataclass
@@ -141,6 +142,9 @@ Command = (
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs a command line and exits: 0 done, 1 an error the user can act on, 2 wrong usage, 130 interrupted."""
+    # torch's OpenMP threads spin while they wait, which on a processor shared with other programs costs a training on
+    # the CPU most of its time; read once, when torch is loaded.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if arguments[:1] == ["--version"]:
         print(f"sehdr-warp {__version__}")
