@@ -1,14 +1,12 @@
 """Bad input through the command line: one clear line, status 1, nothing written, nothing lost."""
 
 import json
-import os
 import re
 import shutil
 import signal
 import struct
 import subprocess
 import sys
-import time
 import zlib
 
 import numpy as np
@@ -17,6 +15,7 @@ from PIL import Image
 
 from sehdr_warp import cli, splatting
 
+from .full_disk import full_disk
 from .make_scenes import write_blender, write_colmap
 
 # Warp tells once per process, when splatting is imported, that there is no GPU.
@@ -156,7 +155,11 @@ COLMAP_BINARY = {
         "no end within",
     ),
     "name leaves": ("images.bin", lambda content: content.replace(b"000.png", b"../etc/p"), "'..'"),
-    "images are a pickle": ("images.bin", lambda content: b"\x80\x04\x95" + b"cos\nsystem\n(S'id'\ntR." * 9, "images.bin"),
+    "images are a pickle": (
+        "images.bin",
+        lambda content: b"\x80\x04\x95" + b"cos\nsystem\n(S'id'\ntR." * 9,
+        "images.bin",
+    ),
     "unknown camera model": (
         "cameras.bin",
         lambda content: content[:12] + struct.pack("<i", 77) + content[16:],
@@ -491,7 +494,9 @@ RUNS = {
     "tensor missing": (lambda run: resign(run, lambda tensors: tensors.pop("gaussians.means")), "gaussians.means"),
     "tensor NaN": (lambda run: resign(run, lambda tensors: tensors["gaussians.means"].fill_(float("nan"))), "finite"),
     "tensor of other shape": (
-        lambda run: resign(run, lambda tensors: tensors.update({"gaussians.means": tensors["gaussians.means"][:3].clone()})),
+        lambda run: resign(
+            run, lambda tensors: tensors.update({"gaussians.means": tensors["gaussians.means"][:3].clone()})
+        ),
         "checkpoint",
     ),
     "no config": (lambda run: (run / "config.json").unlink(), "config.json"),
@@ -645,3 +650,85 @@ def test_lpips_weights(trained, tmp_path, capfd, case):
             (folder / name).write_bytes(content)
     line = refused(capfd, "eval", trained, "--device", "cpu", "--lpips", folder)
     assert "weights" in line
+
+
+# --------------------------------------------------------------------------------------------- full disks and signals
+
+
+@pytest.mark.parametrize(
+    "command", [("render",), ("render", "--evs=-2,0,2", "--multipart"), ("export",), ("report",)], ids=" ".join
+)
+def test_full_disk(trained, tmp_path, capfd, command):
+    out = tmp_path / "out"
+    device = () if command[0] == "export" else ("--device", "cpu")
+    with full_disk():
+        line = refused(capfd, command[0], trained, "--out", out, *device, *command[1:])
+    assert "cannot be written" in line and ".tmp" not in line and list(tmp_path.iterdir()) == []
+
+
+def test_full_disk_while_training_keeps_the_last_checkpoint(trained, tmp_path, capfd):
+    out = tmp_path / "run"
+    shutil.copytree(trained, out)
+    values = json.loads((out / "config.json").read_text())
+    values["schedule"]["iterations"] = 8
+    (out / "config.json").write_text(json.dumps(values))
+    before = snapshot(out / "checkpoints")
+    flags = ("--max-size", "40", "--device", "cpu", "--resume")
+    with full_disk():
+        line = refused(capfd, "train", "embedded", "--out", out, *flags)
+    assert "cannot be written" in line and snapshot(out / "checkpoints") == before
+    assert call("train", "embedded", "--out", out, *flags) == 0, "and goes on once there is room"
+
+
+def test_read_only_place(trained, tmp_path, capfd):
+    """/proc takes no new files, not even root's."""
+    for command in ("render", "export", "report"):
+        line = refused(capfd, command, trained, "--out", "/proc/sehdr/out")
+        assert "/proc/sehdr" in line
+    assert "/proc/sehdr" in refused(capfd, "train", "embedded", "--out", "/proc/sehdr", "--max-size", "40")
+
+
+def start(*arguments) -> subprocess.Popen:
+    command = [sys.executable, "-m", "sehdr_warp", *(str(argument) for argument in arguments)]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+
+
+def wait_for(process: subprocess.Popen, words: str) -> None:
+    for line in process.stderr:
+        if words in line:
+            return
+    raise AssertionError(f"{words!r} was never said; status {process.wait()}")
+
+
+def test_interrupted_render_leaves_nothing(trained, tmp_path):
+    process = start("render", trained, "--out", tmp_path / "out", "--cameras", "orbit", "--count", "2000", "--evs=-2,0")
+    wait_for(process, "(3 of 2000)")
+    process.send_signal(signal.SIGINT)
+    assert "Traceback" not in process.communicate(timeout=60)[1] and process.returncode == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_interrupted_training_can_be_used(tmp_path, capfd):
+    out = tmp_path / "run"
+    process = start("train", "embedded", "--out", out, "--iterations", "100000", "--max-size", "40", "--device", "cpu")
+    wait_for(process, "iteration 1/")
+    process.send_signal(signal.SIGINT)
+    rest = process.communicate(timeout=60)[1]
+    assert process.returncode == 130 and "--resume" in rest and "Traceback" not in rest
+    assert call("render", out, "--out", tmp_path / "views", "--device", "cpu") == 0
+
+
+def test_kill_while_a_checkpoint_is_written(trained, tmp_path):
+    """What a killed process leaves beside a checkpoint is not taken for one, and is cleared by the next."""
+    out = tmp_path / "run"
+    shutil.copytree(trained, out)
+    whole = checkpoint_of(out)
+    half = whole.with_name(f".{whole.name[:-1]}9.0123abcd.tmp")
+    shutil.copytree(whole, half)
+    (half / "checkpoint.json").unlink()
+    torn = whole.with_name("iteration_00000009")
+    shutil.copytree(whole, torn)
+    (torn / "state.safetensors").write_bytes((whole / "state.safetensors").read_bytes()[:1000])
+    assert call("render", out, "--out", tmp_path / "views", "--device", "cpu") == 0
+    assert call("train", "embedded", "--out", out, "--max-size", "40", "--device", "cpu", "--resume") == 0
+    assert [path.name for path in sorted((out / "checkpoints").iterdir()) if path != half] == [whole.name]

@@ -5,9 +5,12 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
 from sehdr_warp import __version__, cli
+from sehdr_warp.model.response import response_by_name
+from sehdr_warp.scene.images import read_hdr, read_ldr
 
 
 def call(*arguments):
@@ -176,8 +179,35 @@ def test_render_writes_hdr_previews_and_brackets(run, tmp_path, capsys):
     for view in views:
         names = sorted(path.name for path in (out / "brackets" / view).iterdir())
         assert names == [f"{view}_b0_ev-2.0.exr", f"{view}_b1_ev+0.0.exr", f"{view}_b2_ev+2.0.exr"]
-    assert (out / "brackets" / "brackets.json").exists() or (out / "brackets.json").exists()
+    manifest = json.loads((out / "brackets.json").read_text())
+    assert [view["view"] for view in manifest["views"]] and all(
+        (out / exposure["file"]).is_file() for view in manifest["views"] for exposure in view["exposures"]
+    )
     assert call("render", run, "--out", out, "--device", "cpu") == 1, "nothing is replaced without --overwrite"
+
+
+@pytest.mark.parametrize("kind, tolerance", [("png", 0.005), ("png16", 1e-4)])
+def test_simulated_photos_merge_back_to_the_rendered_radiance(run, tmp_path, kind, tolerance, capsys):
+    """From a trained run to photos and, by Debevec and Malik 1997, Eq. 6, back to its HDR views: RMS error."""
+    out = tmp_path / "renders"
+    evs = ",".join(str(ev) for ev in range(-8, 9, 2))
+    flags = ("--device", "cpu", "--pixel", "float", "--ldr-brackets", kind)
+    assert call("render", run, "--out", out, f"--evs={evs}", *flags) == 0
+    manifest = json.loads((out / "brackets.json").read_text())
+    decode = response_by_name(manifest["response"]).decode
+    for view in manifest["views"]:
+        total = weights = 0.0
+        for exposure in view["exposures"]:
+            photo = read_ldr(out / exposure["ldr_file"])
+            value = photo.pixels / photo.levels
+            weight = np.where((value > 0.02) & (value < 0.98), np.minimum(value, 1 - value), 0)
+            total += weight * np.log(np.maximum(decode(value), 1e-12) / exposure["exposure_time"])
+            weights += weight
+        radiance = read_hdr(out / "hdr" / f"{view['view']}.exr")
+        seen = weights > 0
+        assert seen[radiance > 1e-3].mean() > 0.99
+        error = np.exp(total[seen] / weights[seen]) / radiance[seen] - 1
+        assert np.sqrt(np.mean(error**2)) < tolerance
 
 
 @pytest.mark.parametrize(
@@ -190,12 +220,15 @@ def test_render_refuses_what_it_cannot_use(run, tmp_path, flags, words, capsys):
     assert not (tmp_path / "r").exists()
 
 
-def test_eval_writes_json_and_prints_a_table(run, tmp_path, capsys):
+def test_eval_writes_json_and_prints_a_table(run, tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("SEHDR_LPIPS", raising=False)
     file = tmp_path / "figures.json"
     assert call("eval", run, "--json", file, "--device", "cpu") == 0
     result = json.loads(file.read_text())
     assert result["protocol"]["gt-max"]["psnr_mu"] > 10 and result["ldr"]["psnr"] > 10 and result["train_seconds"] > 0
     assert "gt-max" in capsys.readouterr().out
+    assert result["ldr"]["lpips"] is None and "SEHDR_LPIPS" in result["ldr"]["lpips_reason"]
+    assert result["protocol"]["gt-max"]["lpips_mu"] is None and "lpips_reason" in result["protocol"]["gt-max"]
     assert call("eval", run, "--json", file, "--device", "cpu") == 1
 
 

@@ -11,11 +11,12 @@ def format_table(result: dict) -> str:
         f"{'':<22}{'PSNR':>8}{'SSIM':>9}{'LPIPS':>9}",
         _row("LDR", result["ldr"], ("psnr", "ssim", "lpips")),
     ]
-    for name, figures in result["protocol"].items():
-        lines.append(_row(f"HDR mu-law {name}", figures, ("psnr_mu", "ssim_mu", "lpips_mu")))
-    for name in result["protocol"]:
+    # Sets without truth have no HDR figures: seven lines of dashes would say less than the reason below.
+    names = list(result["protocol"]) if any(figures["views"] for figures in result["protocol"].values()) else []
+    for name in names:
+        lines.append(_row(f"HDR mu-law {name}", result["protocol"][name], ("psnr_mu", "ssim_mu", "lpips_mu")))
+    for name in names:
         lines.append(_row(f"HDR PU21 {name}", result["pu21"][name], ("psnr", "ssim")))
-    names = list(result["protocol"])
     lines += ["", f"{'region of the photo':<22}{'share':>8}{'LDR':>9}" + "".join(f"{name:>10}" for name in names)]
     for region, figures in result["regions"].items():
         values = [figures["psnr_ldr"], *(figures["psnr_mu"][name] for name in names)]
@@ -37,7 +38,8 @@ def _number(value: float | None, width: int, digits: int) -> str:
 def _notes(result: dict) -> list[str]:
     pu21 = result["pu21"]
     white = "maximum" if pu21["white_percentile"] == 100 else f"{pu21['white_percentile']:g}th percentile"
-    notes = [f"PU21: the {white} of each view's truth is shown at {pu21['peak_luminance']:g} cd/m^2."]
+    has_truth = any(figures["views"] for figures in result["protocol"].values())
+    notes = [f"PU21: the {white} of each view's truth is shown at {pu21['peak_luminance']:g} cd/m^2."] * has_truth
     scale = result["protocol"].get("aligned", {}).get("scale")
     if scale is not None:
         notes.append(f"aligned: radiance times {scale:.4g}, fitted on the training views.")

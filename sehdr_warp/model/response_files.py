@@ -127,7 +127,7 @@ def _dorf_mat(path: Path) -> list[Response]:
     try:
         stored = loadmat(path, variable_names=("B", "I"))
         values, exposures = (np.asarray(stored[key], np.float64) for key in ("B", "I"))
-    except Exception as error:  # noqa: BLE001 - scipy raises many kinds on damaged files, all of one meaning
+    except Exception as error:
         raise InputError(path, f"is not a DoRF file ({error!r:.120})", "give B and I of [curves, samples]") from error
     if values.ndim != 2 or values.shape != exposures.shape:
         raise InputError(path, f"B is {values.shape} and I is {exposures.shape}", "give both as [curves, samples]")

@@ -8,7 +8,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -149,12 +148,11 @@ def _write(path: Path, parts: Sequence[Part], pixel: str, overwrite: bool) -> st
 def _openexr_part(part: Part, stored: str, said: str):
     import OpenEXR
 
-    release = version("sehdr-warp")
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
-        "software": f"sehdr-warp {release}",
-        "sehdr:version": release,
+        "software": f"sehdr-warp {__version__}",
+        "sehdr:version": __version__,
         "sehdr:pixelType": said,
         **part.header,
     }

@@ -141,7 +141,10 @@ def _make_parents(path: Path) -> list[Path]:
             break
         missing.append(parent)
     for parent in reversed(missing):
-        parent.mkdir(exist_ok=True)
+        try:
+            parent.mkdir(exist_ok=True)
+        except FileNotFoundError:  # A file system that makes none, such as /proc, or a folder just deleted.
+            raise SehdrError(f"{parent}: this folder cannot be made; choose another place") from None
     return missing
 
 

@@ -186,10 +186,13 @@ def _wrap(text: str, inches: float) -> str:
 
 
 def _label_ends(axes, ends) -> None:
-    """Names and last values at the ends of the lines, in their colours: the upper one above, the lower one below."""
+    """Names and last values at the ends of the lines, in their colours: the upper one above, the lower one below.
+
+    A rising line passes over what stands to the left below its end, so the lower one keeps more distance.
+    """
     top = max(y for (_, y), _, _ in ends)
     for (x, y), label, color in ends:
-        where = (2, 12 if y == top else -13)
+        where = (2, 12 if y == top else -26)
         text = f"{label}  {y:.1f} dB"
         axes.annotate(
             text, (x, y), where, textcoords="offset points", ha="right", va="center", color=color, fontweight="bold"
@@ -240,4 +243,4 @@ def _caption(run, views: Sequence[View], metrics: Sequence[dict], held_out: bool
 
 
 def _seconds(time: float) -> str:
-    return f"1/{1 / time:.0f} s" if time < 0.3 else f"{time:g} s"
+    return f"1/{1 / time:.0f} s" if time < 0.3 else f"{time:.3g} s"

@@ -15,7 +15,6 @@ from .paths import read_json
 from .read_transforms import frame_lens, frame_pose, frames_of
 
 
-
 def load_cameras(path: Path | str, *, size: tuple[int, int] | None = None) -> list[tuple[str, Camera]]:
     """Named cameras from a JSON file, in its order, without distortion.
 

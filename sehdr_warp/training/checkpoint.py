@@ -34,7 +34,7 @@ class Checkpoint:
 def write_checkpoint(folder: Path, tensors: dict[str, Tensor], values: dict, *, kept: int) -> Path:
     """Writes folder/iteration_<n> from a state with the value "iteration", then deletes all but the newest `kept`.
 
-    Where that checkpoint exists and is sound it is left alone. Raises SehdrError if the disk refuses; checkpoints that
+    Later checkpoints go too: a training that is at n was resumed from an earlier one because they are damaged. Where that checkpoint exists and is sound it is left alone. Raises SehdrError if the disk refuses; checkpoints that
     exist are untouched then.
     """
     from safetensors.torch import save
@@ -48,8 +48,10 @@ def write_checkpoint(folder: Path, tensors: dict[str, Tensor], values: dict, *, 
         with atomic_folder(final, overwrite=True) as beside:
             (beside / TENSORS).write_bytes(data)
             (beside / VALUES).write_text(json.dumps(stated, indent=1) + "\n", encoding="utf-8")
-    for old in _folders(folder)[kept:]:
-        shutil.rmtree(old, ignore_errors=True)
+    folders = _folders(folder)
+    place = folders.index(final)
+    for other in folders[:place] + folders[place + kept :]:
+        shutil.rmtree(other, ignore_errors=True)
     return final
 
 

@@ -11,8 +11,8 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.colorspace import chromaticities, color_space, color_space_names, from_rec709, matrix_from_rec709
 from sehdr_warp.output.exr import Part, exr_header, read_exr, stored_pixel_type, write_exr, write_multipart_exr
 
+from ..full_disk import full_disk
 from .helpers import camera, radiance
-from .test_files import full_disk  # noqa: F401
 
 
 def rgb(image):
@@ -118,8 +118,8 @@ def test_existing_file_is_kept(tmp_path):
     assert (tmp_path / "a.exr").read_bytes() != before
 
 
-def test_full_disk_is_one_line_and_leaves_nothing(tmp_path, full_disk):  # noqa: F811
-    with pytest.raises(SehdrError, match="a.exr: cannot be written") as caught:
+def test_full_disk_is_one_line_and_leaves_nothing(tmp_path):
+    with pytest.raises(SehdrError, match="a.exr: cannot be written") as caught, full_disk():
         write_exr(tmp_path / "a.exr", rgb(radiance(200, 200)))
     assert "\n" not in str(caught.value) and ".tmp" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
@@ -175,12 +175,34 @@ def test_chromaticities_are_those_of_the_interop_id(name):
     assert OpenEXR.chromaticitiesToColorInteropID(header["chromaticities"]) == header["colorInteropID"]
 
 
-def test_default_space_is_that_of_colour_science_and_does_without_it():
+TITLES = {
+    "rec709": "ITU-R BT.709",
+    "acescg": "ACEScg",
+    "aces2065-1": "ACES2065-1",
+    "rec2020": "ITU-R BT.2020",
+    "display-p3": "Display P3",
+    "dci-p3": "DCI-P3",
+}
+
+
+@pytest.mark.parametrize("name", color_space_names())
+def test_spaces_are_those_of_colour_science(name):
     import colour
 
-    space = colour.RGB_COLOURSPACES["ITU-R BT.709"]
-    np.testing.assert_array_equal(chromaticities("rec709"), [*space.primaries.ravel(), *space.whitepoint])
-    code = "import sys; from sehdr_warp.output.exr import exr_header; exr_header(); assert 'colour' not in sys.modules"
+    space, rec709 = (colour.RGB_COLOURSPACES[title].copy() for title in (TITLES[name], TITLES["rec709"]))
+    np.testing.assert_array_equal(chromaticities(name), [*space.primaries.ravel(), *space.whitepoint])
+    for each in (space, rec709):
+        each.use_derived_transformation_matrices(True)
+    expected = colour.matrix_RGB_to_RGB(rec709, space, "Bradford")
+    np.testing.assert_allclose(matrix_from_rec709(name), expected, rtol=1e-12, atol=1e-14)
+
+
+def test_spaces_do_without_colour_science():
+    """Its import takes a second, and leaves lines on the terminal where OpenImageIO is installed."""
+    code = (
+        "import sys; from sehdr_warp.output.exr import exr_header; from sehdr_warp.output.colorspace import *; "
+        "exr_header(colorspace='acescg'); matrix_from_rec709('acescg'); assert 'colour' not in sys.modules"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

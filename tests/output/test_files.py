@@ -1,11 +1,12 @@
 import json
 import os
-import resource
 
 import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.files import atomic_folder, atomic_path, write_json
+
+from ..full_disk import full_disk
 
 
 def listing(folder):
@@ -61,17 +62,8 @@ def test_failure_leaves_nothing_new_and_keeps_the_old(tmp_path, error):
     assert (tmp_path / "old.txt").read_text() == "old"
 
 
-@pytest.fixture
-def full_disk():
-    """Writing past 4 KiB of a file fails, as on a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-def test_full_disk_is_one_line(tmp_path, full_disk):
-    with pytest.raises(SehdrError, match=r"big.bin: cannot be written \(.*\); free space") as caught:
+def test_full_disk_is_one_line(tmp_path):
+    with pytest.raises(SehdrError, match=r"big.bin: cannot be written \(.*\); free space") as caught, full_disk():
         with atomic_path(tmp_path / "big.bin") as temporary:
             temporary.write_bytes(bytes(1 << 20))
     assert "\n" not in str(caught.value)
