@@ -80,7 +80,7 @@ def train_with_gsplat(
         grow_scale3d=densification.grow_scale,
         prune_scale3d=densification.prune_scale,
         refine_start_iter=densification.start,
-        refine_stop_iter=densification.stop + 1,
+        refine_stop_iter=densification.stop,
         refine_every=densification.every,
         reset_every=densification.reset_every,
         verbose=False,
@@ -124,7 +124,7 @@ def train_with_gsplat(
             optimizer.zero_grad(set_to_none=True)
         decay.step()
         strategy.step_post_backward(params, optimizers, state, step, info, packed=False)
-        if resets and 0 < step <= densification.stop and step % densification.reset_every == 0:
+        if resets and 0 < step < densification.stop and step % densification.reset_every == 0:
             reset_opa(params, optimizers, state, value=2 * densification.prune_opacity)
     torch.cuda.synchronize(device)
     seconds = time.perf_counter() - started

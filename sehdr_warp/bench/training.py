@@ -73,7 +73,7 @@ def plain_config(iterations: int, seed: int) -> Config:
             "schedule.evaluate_at": [iterations],
             "schedule.checkpoint_every": iterations,
             # 3DGS densifies while iteration < 15000: neither a change nor a reset falls on 15000 itself.
-            "densification.stop": 14_999,
+            "densification.stop": 15_000,
         },
     )
 

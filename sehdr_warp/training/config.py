@@ -125,7 +125,7 @@ class DensificationConfig:
         choices=("gradient", "relocation", "none"),
     )
     start: int = option(500, "first iteration after which the count may change", low=0)
-    stop: int = option(15_000, "last iteration at which it may", low=0)
+    stop: int = option(15_000, "the iteration from which it may no longer", low=0)
     every: int = option(100, "iterations between changes", low=1)
     max_gaussians: int = option(3_000_000, "the count never exceeds this", low=1)
     grow_gradient: float = option(

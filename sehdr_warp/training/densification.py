@@ -60,7 +60,7 @@ class Densification:
         """Takes up the statistics of state()."""
 
     def _is_due(self, iteration: int) -> bool:
-        return self.start < iteration <= self.stop and iteration % self.every == 0
+        return self.start < iteration < self.stop and iteration % self.every == 0
 
 
 class GradientDensification(Densification):
@@ -73,7 +73,7 @@ class GradientDensification(Densification):
         self.seen: Tensor | None = None
 
     def needs_gradients(self, iteration: int) -> bool:
-        return iteration <= self.stop
+        return iteration < self.stop
 
     def prepare(self, count: int, device: torch.device | str) -> None:
         if self.gradient_sum is None:
@@ -96,7 +96,7 @@ class GradientDensification(Densification):
             self._prune(gaussians, optimizer, oversized=iteration > self.reset_every)
             self.gradient_sum = self.seen = None
             changed = True
-        if iteration <= self.stop and iteration % self.reset_every == 0 and self.reset_every >= SHORTEST_RESET:
+        if iteration < self.stop and iteration % self.reset_every == 0 and self.reset_every >= SHORTEST_RESET:
             self._reset_opacities(gaussians, optimizer)
         return changed
 
