@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from sehdr_warp import __version__
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.images import MAX_PIXELS, read_exr_channels
