@@ -1,5 +1,6 @@
 """What the pages say, held: examples run, command lines parse, links lead somewhere, versions agree."""
 
+import os
 import re
 import runpy
 import shlex
@@ -134,7 +135,12 @@ def test_constraints_pin_what_the_package_needs():
 def test_make_calls_documented_commands(tmp_path):
     recipe = {
         goal: subprocess.run(
-            ["make", "-n", goal, f"VENV={tmp_path}/venv"], cwd=ROOT, capture_output=True, text=True, check=True
+            ["make", "-n", "--no-print-directory", goal, f"VENV={tmp_path}/venv"],
+            cwd=ROOT,
+            env={name: value for name, value in os.environ.items() if "MAKE" not in name},
+            capture_output=True,
+            text=True,
+            check=True,
         ).stdout.splitlines()
         for goal in ("demo", "test")
     }
