@@ -28,8 +28,8 @@ ALLOWED = {
         "evaluation.metrics",
         "evaluation.protocols",
     },
-    "output": {"errors", "scene", "model", "evaluation.metrics"},
-    "evaluation": {"errors", "scene", "model", "splatting", "output.files"},
+    "output": {"errors", "scene"},
+    "evaluation": {"errors", "scene", "splatting"},
     "bench": {"errors", "kernels", "scene", "splatting", "model", "training", "output", "evaluation"},
 }
 # Packages that only some rooms may import.
