@@ -15,8 +15,9 @@ PACKAGE = ROOT / "sehdr_warp"
 ALLOWED = {
     "kernels": set(),
     "errors": set(),
-    "scene": {"errors", "embedded"},
-    "splatting": {"errors", "kernels"},
+    "quiet": set(),
+    "scene": {"errors", "quiet", "embedded"},
+    "splatting": {"errors", "quiet", "kernels"},
     "model": {"errors", "scene", "splatting"},
     "training": {
         "errors",

@@ -1,16 +1,14 @@
 """Pixels from files: PNG (8 and 16 bits), JPEG, TIFF, WebP, OpenEXR and Radiance, with sizes known before decoding."""
 
-import os
 import struct
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from sehdr_warp.errors import InputError
+from ..errors import InputError
+from ..quiet import silent_stderr
 
 from .radiance import radiance_size, read_radiance
 
@@ -127,7 +125,7 @@ def read_exr_channels(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[dict
 
     (x0, y0), (width, height) = _exr_window(path, max_pixels)
     try:
-        with _silent_stderr(), OpenEXR.File(str(path), separate_channels=True) as file:
+        with silent_stderr(), OpenEXR.File(str(path), separate_channels=True) as file:
             # A file whose pixels end early leaves no part behind instead of raising.
             if not file.parts:
                 raise InputError(path, "pixel data is damaged or ends early", _DAMAGED)
@@ -156,7 +154,7 @@ def _exr_window(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[tuple[int, in
 
     _require_file(path)
     try:
-        with _silent_stderr(), OpenEXR.File(str(path), header_only=True) as file:
+        with silent_stderr(), OpenEXR.File(str(path), header_only=True) as file:
             header = file.header()
             windows = [
                 [tuple(int(v) for v in corner) for corner in header[key]] for key in ("displayWindow", "dataWindow")
@@ -169,21 +167,6 @@ def _exr_window(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[tuple[int, in
     return windows[0][0], sizes[0]
 
 
-@contextmanager
-def _silent_stderr() -> Iterator[None]:
-    """OpenEXR prints what is wrong with a file past Python, and then raises; the error says it once."""
-    try:
-        kept = os.dup(2)
-    except OSError:  # The program runs without a standard error: nothing to silence.
-        yield
-        return
-    with open(os.devnull, "wb") as nothing:
-        os.dup2(nothing.fileno(), 2)
-    try:
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
 
 
 def _require_file(path: Path) -> None:

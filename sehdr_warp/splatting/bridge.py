@@ -27,12 +27,13 @@ from functools import wraps
 import torch
 import warp as wp
 
+from ..quiet import silent_stderr
 from . import threads
 
 # The start-up banner, and the warning where there is no GPU, are not for a library to print.
-wp.config.log_level = wp.LOG_ERROR
-wp.init()
 wp.config.log_level = wp.LOG_WARNING
+with silent_stderr():
+    wp.init()
 
 
 class Program:

@@ -1,0 +1,22 @@
+"""Libraries that print past Python, kept silent where an exception or nothing at all says it better."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def silent_stderr() -> Iterator[None]:
+    """Whatever is written to file descriptor 2 meanwhile is lost; exceptions pass."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # The program runs without a standard error: nothing to silence.
+        yield
+        return
+    with open(os.devnull, "wb") as nothing:
+        os.dup2(nothing.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
