@@ -13,6 +13,7 @@ from ..errors import InputError, SehdrError
 from ..model.gaussians import Gaussians
 from ..output.files import write_json
 from ..scene import Scene
+from ..splatting.threads import thread_count
 from .checkpoint import newest_checkpoint, write_checkpoint
 from .config import Config
 from .config_files import config_to_dict, load_config, read_config_json
@@ -74,7 +75,7 @@ def train(
         clear_folder(out)
         write_start(out, scene, config, field, data or {})
     loop = _Loop(scene, out, trainer, seconds, tensorboard)
-    with Progress(trainer.config.schedule.iterations, enabled=not quiet) as progress:
+    with Progress(trainer.config.schedule.iterations, enabled=not quiet) as progress, _one_torch_thread():
         progress.note(f"response {trainer.field.response.name}, {trainer.field.gaussians.count} Gaussians on {device}")
         loop.run(progress)
     return load_run(out, device=device)
@@ -229,7 +230,7 @@ class _Loop:
 
 def device_name(device: torch.device) -> str:
     """What runs the training, for a report."""
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu ({torch.get_num_threads()} threads)"
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu ({thread_count()} threads)"
 
 
 def peak_memory(device: torch.device) -> dict[str, int]:
@@ -243,6 +244,20 @@ def peak_memory(device: torch.device) -> dict[str, int]:
     if device.type == "cuda":
         peaks["peak_gpu_memory_bytes"] = torch.cuda.max_memory_allocated(device)
     return peaks
+
+
+@contextmanager
+def _one_torch_thread():
+    """torch on one thread: its sums then do not depend on the machine's cores, and a CPU training repeats bit for bit.
+
+    It costs nothing: the work is in the kernels, which have threads of their own, and torch's would stand in their way.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @contextmanager
