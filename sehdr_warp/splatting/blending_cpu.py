@@ -1,6 +1,7 @@
 """The blend on the CPU: tiles in balanced pieces, one piece to a thread at a time."""
 
 import math
+from itertools import pairwise
 
 import torch
 import warp as wp
@@ -82,7 +83,7 @@ def blend_on_cpu(device, features, lists: TileLists, image, alpha, alpha_thresho
             threads.even_ranges(features.shape[0]),
             [
                 view(lists.order),
-                view(lists.ends),
+                view(lists.ends.clamp(0, lists.entry_count)),  # beyond a capacity there are no rows
                 view(entry_gradients),
                 channels + 6,
                 view(gathered),
@@ -106,4 +107,4 @@ def balanced_pieces(lists: TileLists) -> list[tuple[int, int]]:
     pieces = min(threads.thread_count() * 8, tile_count)
     goals = torch.arange(1, pieces, dtype=torch.float64) * (float(work[-1]) / pieces)
     bounds = sorted({0, *torch.searchsorted(work, goals).tolist(), tile_count})
-    return list(zip(bounds, bounds[1:]))
+    return list(pairwise(bounds))

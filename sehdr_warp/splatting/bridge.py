@@ -69,13 +69,13 @@ class Program:
         return array
 
     def tensor(self, array: wp.array) -> torch.Tensor:
-        """The torch tensor behind an array made by write()."""
-        return self.outputs[id(array)][0]
+        """A torch tensor of the memory behind an array made by write(). An adjoint may keep it."""
+        return self.outputs[id(array)][0].detach()
 
     def launch(self, kernel, dim, inputs, outputs=(), *, block_dim: int = 256, recorded: bool = True) -> None:
         """Launch a kernel; its generated adjoint runs in the backward pass unless recorded is False."""
         with self.tape if recorded and self.tape is not None else nullcontext():
-            wp.launch(kernel, dim=dim, inputs=list(inputs), outputs=list(outputs), device=self.device, block_dim=block_dim)
+            wp.launch(kernel, dim, list(inputs), list(outputs), device=self.device, block_dim=block_dim)
 
     def launch_ranges(self, kernel, count: int, inputs, outputs) -> None:
         """Launch `kernel(first, *inputs, *outputs)` for `count` items; on the CPU spread over threads, adjoint too.
@@ -91,9 +91,12 @@ class Program:
         threads.launch_ranges(kernel, threads.even_ranges(count), arguments, self.device)
         if self.tape is None:
             return
+        # The tape holds the adjoint. If that held the program or the tape, memory would wait for the garbage collector.
+        device = self.device
 
         def adjoint():
-            gradients = [self.tape.get_adjoint(argument) for argument in arguments]
+            tape = wp.Tape()
+            gradients = [tape.get_adjoint(argument) for argument in arguments]
             shared = any(
                 isinstance(argument, wp.array) and argument.grad is not None and argument.shape[0] != count
                 for argument in inputs
@@ -109,7 +112,7 @@ class Program:
                     adj_inputs=[None, *gradients[: len(inputs)]],
                     adj_outputs=gradients[len(inputs) :],
                     adjoint=True,
-                    device=self.device,
+                    device=device,
                     record_tape=False,
                 )
 
@@ -147,8 +150,10 @@ class _ProgramFunction(torch.autograd.Function):
         arrays = result if isinstance(result, tuple) else (result,)
         outputs = tuple(program.outputs[id(array)][0] for array in arrays)
         ctx.mark_non_differentiable(
-            *(tensor for tensor, array in zip(outputs, arrays) if not program.outputs[id(array)][2])
+            *(tensor for tensor, array in zip(outputs, arrays, strict=True) if not program.outputs[id(array)][2])
         )
+        # torch makes this node the outputs' origin: held here as well, neither would ever be freed.
+        program.outputs = {key: (tensor.detach(), *rest) for key, (tensor, *rest) in program.outputs.items()}
         ctx.set_materialize_grads(False)
         if recording:
             # The tape holds the arrays, hence the memory, until torch frees this node.
@@ -160,18 +165,19 @@ class _ProgramFunction(torch.autograd.Function):
         program = ctx.program
         if program is None:
             raise RuntimeError("this Warp operation was already differentiated once; run its forward pass again")
-        ctx.program = None
+        arrays, plain = ctx.arrays, ctx.plain
+        ctx.program = ctx.arrays = ctx.plain = None
         with torch_stream(program.torch_device):
-            for array, gradient in zip(ctx.arrays, gradients):
+            for array, gradient in zip(arrays, gradients, strict=True):
                 if not program.outputs[id(array)][2]:
                     continue
                 tensor = program.outputs[id(array)][0]
                 gradient = torch.zeros_like(tensor) if gradient is None else gradient.contiguous()
                 array.grad = _array(gradient, array.dtype)
                 array.retain_grad = True  # the gradient is torch's: adjoint kernels must not clear it
-            results = [None] * len(ctx.plain)
+            results = [None] * len(plain)
             by_memory = {}
-            for position, (tensor, needed) in enumerate(zip(ctx.plain, ctx.needs_input_grad[2:])):
+            for position, (tensor, needed) in enumerate(zip(plain, ctx.needs_input_grad[2:], strict=True)):
                 if needed:
                     results[position] = torch.zeros_like(tensor, memory_format=torch.contiguous_format)
                     by_memory[id(tensor)] = results[position]

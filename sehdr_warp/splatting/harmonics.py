@@ -4,8 +4,8 @@ import torch
 
 from ..kernels.geometry import vector
 from ..kernels.harmonics import harmonics_kernel
-from .bridge import differentiable
 from .arrays import warp_scalar
+from .bridge import differentiable
 
 MAX_DEGREE = 3
 

@@ -39,7 +39,6 @@ def nearest_neighbour_distances(points: torch.Tensor, k: int = 3) -> torch.Tenso
     distances = torch.full((count, k), torch.inf, dtype=torch.float64, device=points.device)
     if count < 2:
         return distances.to(points.dtype)
-    wp.init()
     # A power of two is an exact change of unit; in it no square overflows or vanishes.
     extent = float((points.amax(0).double() / 2 - points.amin(0).double() / 2).max())
     unit = 2.0 ** max(-1000, torch.tensor(extent, dtype=torch.float64).frexp().exponent.item()) if extent > 0 else 1.0

@@ -1,11 +1,9 @@
 """Stage one of a render: 3D Gaussians to 2D Gaussians."""
 
-import warp as wp
-
 from ..kernels.geometry import matrix, vector
 from ..kernels.project import projection_kernel
-from .bridge import differentiable
 from .arrays import warp_scalar
+from .bridge import differentiable
 
 
 @differentiable

@@ -1,5 +1,6 @@
 """Differentiable splatting of 3D Gaussians: project, order, bin, blend."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -7,7 +8,7 @@ import torch
 from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR
 from .blending import blend
 from .projection import project
-from .tile_lists import build_tile_lists
+from .tile_lists import LARGEST_CAPACITY, build_tile_lists
 
 
 @dataclass(frozen=True)
@@ -62,19 +63,20 @@ def rasterize(
     opacities: [N] in [0, 1].
     features: [N, C], any C >= 1 and any finite range; several colour sets go side by side in one pass.
     world_to_camera: [4, 4], OpenCV convention. intrinsics: [4] fx, fy, cx, cy in pixels. width, height: in pixels.
-    near: points nearer to the camera plane are culled. low_pass: variance in square pixels added to each splat.
+    near: points nearer to the camera plane are culled; > 0. low_pass: variance in square pixels added to each splat;
+        >= 0.
     alpha_threshold: contributions below it are left out, in (0, 1).
     antialiased: keep a Gaussian's energy under the low pass by lowering its opacity.
-    capacity: room for this many (Gaussian, tile) pairs. On a GPU nothing then waits for the device, so that the call can
-        be part of a CUDA graph; Rendering.overflow says whether the room was enough.
+    capacity: room for this many (Gaussian, tile) pairs, from 1. On a GPU nothing then waits for the device, so that the
+        call can be part of a CUDA graph; Rendering.overflow says whether the room was enough.
 
     All tensors share one device (CPU or CUDA) and one dtype (float32 or float64). Differentiable with respect to
     every tensor, camera included. On the CPU results repeat bit for bit, whatever the number of threads.
+    A Gaussian whose position or shape in the image is not finite is culled; a camera that is not finite culls them all.
     Raises ValueError for shapes, dtypes, devices or values that do not fit.
     """
-    _check(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics, width, height)
-    if not 0.0 < alpha_threshold < 1.0:
-        raise ValueError(f"alpha_threshold {alpha_threshold} is not between 0 and 1")
+    _check_tensors(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics)
+    _check_options(width, height, near, low_pass, alpha_threshold, capacity)
     tensors = (means, log_scales, quaternions, opacities, world_to_camera, intrinsics)
     means2d, conics, depths, opacities2d, extents = project(
         *(tensor.contiguous() for tensor in tensors),
@@ -86,7 +88,10 @@ def rasterize(
         antialiased=antialiased,
     )
     lists = build_tile_lists(
-        *(tensor.detach() for tensor in (means2d, conics, depths, opacities2d, extents)), width, height, alpha_threshold,
+        *(tensor.detach() for tensor in (means2d, conics, depths, opacities2d, extents)),
+        width,
+        height,
+        alpha_threshold,
         capacity,
     )
     image, alpha = blend(
@@ -102,8 +107,8 @@ def rasterize(
     return Rendering(image, alpha, means2d, depths, extents.amax(dim=1), lists.entry_count, lists.overflow)
 
 
-def _check(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics, width, height) -> None:
-    count = means.shape[0]
+def _check_tensors(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics) -> None:
+    count = means.shape[0] if means.ndim else 0
     shapes = {
         "means": (means, (count, 3)),
         "log_scales": (log_scales, (count, 3)),
@@ -122,5 +127,18 @@ def _check(means, log_scales, quaternions, opacities, features, world_to_camera,
             raise ValueError(
                 f"{name} is {tensor.dtype} on {tensor.device}, but means is {means.dtype} on {means.device}"
             )
+    if means.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"means is {means.dtype}, expected torch.float32 or torch.float64")
+
+
+def _check_options(width, height, near, low_pass, alpha_threshold, capacity) -> None:
     if width < 1 or height < 1:
         raise ValueError(f"image size {width} x {height} is not positive")
+    if not 0.0 < near < math.inf:
+        raise ValueError(f"near {near} is not a positive number")
+    if not 0.0 <= low_pass < math.inf:
+        raise ValueError(f"low_pass {low_pass} is not a number from 0")
+    if not 0.0 < alpha_threshold < 1.0:
+        raise ValueError(f"alpha_threshold {alpha_threshold} is not between 0 and 1")
+    if capacity is not None and not 1 <= capacity <= LARGEST_CAPACITY:
+        raise ValueError(f"capacity {capacity} is not in 1..{LARGEST_CAPACITY}")

@@ -34,8 +34,9 @@ def project_reference(
     y_ratio = torch.where(in_front, centre[:, 1], 0.0) / z
     means2d = torch.stack([fx * x_ratio + cx, fy * y_ratio + cy], 1)
 
-    jx = torch.maximum(torch.minimum(x_ratio, (width - cx + FRUSTUM_MARGIN * width / 2) / fx), -(cx + FRUSTUM_MARGIN * width / 2) / fx)
-    jy = torch.maximum(torch.minimum(y_ratio, (height - cy + FRUSTUM_MARGIN * height / 2) / fy), -(cy + FRUSTUM_MARGIN * height / 2) / fy)
+    beyond_x, beyond_y = FRUSTUM_MARGIN * width / 2, FRUSTUM_MARGIN * height / 2
+    jx = torch.maximum(torch.minimum(x_ratio, (width - cx + beyond_x) / fx), -(cx + beyond_x) / fx)
+    jy = torch.maximum(torch.minimum(y_ratio, (height - cy + beyond_y) / fy), -(cy + beyond_y) / fy)
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
         [torch.stack([fx / z, zero, -fx * jx / z], 1), torch.stack([zero, fy / z, -fy * jy / z], 1)], 1

@@ -67,7 +67,8 @@ def _check(a: torch.Tensor, b: torch.Tensor) -> None:
         raise ValueError(f"ssim takes two images of one shape [H, W, C], not {list(a.shape)} and {list(b.shape)}")
     if a.dtype != b.dtype or a.dtype not in (torch.float32, torch.float64) or a.device != b.device:
         raise TypeError(
-            f"ssim takes float32 or float64 images on one device, not {a.dtype} on {a.device} and {b.dtype} on {b.device}"
+            f"ssim takes float32 or float64 images on one device, not {a.dtype} on {a.device} and "
+            f"{b.dtype} on {b.device}"
         )
 
 
@@ -105,7 +106,6 @@ class _Runs:
     """
 
     def __init__(self, image: torch.Tensor):
-        wp.init()
         self.rows, width, self.channels = image.shape
         self.length = width * self.channels
         self.like = image

@@ -8,6 +8,7 @@ threads.
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import warp as wp
 
@@ -24,7 +25,11 @@ def thread_count() -> int:
 
 
 def run_parallel(task, items) -> None:
-    """Call task(item) for every item, on this thread and the pool's; the first exception is raised here."""
+    """Call task(item) for every item, on this thread and the pool's, and return when all are done.
+
+    An exception ends its thread's share; the others finish the rest, then one of the exceptions is raised here. A task
+    may itself call run_parallel.
+    """
     global _pool, _pool_size
     items = list(items)
     helpers = min(thread_count(), len(items)) - 1
@@ -44,20 +49,23 @@ def run_parallel(task, items) -> None:
     try:
         work()
     finally:
-        for future in futures:
-            future.exception()  # no thread may still be at work when the caller goes on
-    for future in futures:
+        # No thread may still be at work when the caller goes on. A helper that has not begun finds nothing left to do,
+        # and where this is itself a pool's thread, to wait for it could be to wait for oneself.
+        begun = [future for future in futures if not future.cancel()]
+        for future in begun:
+            future.exception()
+    for future in begun:
         future.result()
 
 
 def even_ranges(count: int, smallest: int = 1024) -> list[tuple[int, int]]:
-    """[first, last) ranges that cover `count` items, a few for each thread, none smaller than `smallest` but the last."""
+    """[first, last) ranges that cover `count` items, a few for each thread; of at least `smallest` items, unless alone."""
     pieces = max(1, min(thread_count() * 4, count // smallest))
     bounds = [count * k // pieces for k in range(pieces + 1)]
-    return [(a, b) for a, b in zip(bounds, bounds[1:]) if b > a]
+    return [(a, b) for a, b in pairwise(bounds) if b > a]
 
 
-def launch_ranges(kernel, ranges, arguments, device, block_dim: int = 256) -> None:
+def launch_ranges(kernel, ranges, arguments, device) -> None:
     """Launch `kernel(first, *arguments)` over each [first, last) range, side by side on the CPU."""
     if not ranges:
         return

@@ -9,10 +9,11 @@ from ..errors import SehdrError
 from ..kernels.constants import TILE_SIZE
 from ..kernels.geometry import vector
 from ..kernels.tiles import mark_ranges, tile_kernels
-from .bridge import torch_stream
 from .arrays import view, warp_scalar
+from .bridge import torch_stream
 
-_LARGEST_INT32 = 2**31 - 1
+LARGEST_CAPACITY = 2**31 - 1
+"""Entries are counted in int32."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ def build_tile_lists(
 
 
 def _exact_room(total: int, gaussian_count: int, columns: int, rows: int) -> int:
-    if total > _LARGEST_INT32:
+    if total > LARGEST_CAPACITY:
         raise SehdrError(
             f"{gaussian_count} Gaussians touch {total} tiles of a {columns} x {rows} tile image, more than 2^31 - 1; "
             "render fewer Gaussians or a smaller image"
@@ -178,7 +179,8 @@ def find_ranges(tiles, tile_count: int):
     """[tiles, 2] int32: first and one past the last entry of each tile, (0, 0) for an untouched one."""
     ranges = torch.zeros(tile_count, 2, dtype=torch.int32, device=tiles.device)
     if tiles.shape[0]:
-        _launch(mark_ranges, tiles.shape[0], [view(tiles), tiles.shape[0], tile_count, view(ranges, wp.vec2i)], tiles.device)
+        arguments = [view(tiles), tiles.shape[0], tile_count, view(ranges, wp.vec2i)]
+        _launch(mark_ranges, tiles.shape[0], arguments, tiles.device)
     return ranges
 
 
@@ -192,13 +194,6 @@ def _sorted_places(keys, count: int, bits: int | None = None):
     return places[:count]
 
 
-
 def _launch(kernel, count: int, arguments, device) -> None:
     with torch_stream(device):
         wp.launch(kernel, dim=count, inputs=arguments, device=wp.device_from_torch(device), record_tape=False)
-
-
-
-
-
-

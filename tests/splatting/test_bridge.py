@@ -1,5 +1,8 @@
 """Any Warp kernel becomes a differentiable torch operation."""
 
+import gc
+import weakref
+
 import pytest
 import torch
 import warp as wp
@@ -17,6 +20,18 @@ def scale_kernel(values: wp.array(dtype=wp.vec3), gain: wp.array(dtype=wp.float3
 def square_kernel(values: wp.array(dtype=wp.vec3), squared: wp.array(dtype=wp.vec3)):
     i = wp.tid()
     squared[i] = wp.cw_mul(values[i], values[i])
+
+
+@wp.kernel
+def ranged_scale_kernel(
+    first: int, values: wp.array(dtype=wp.vec3), gain: wp.array(dtype=wp.float32), scaled: wp.array(dtype=wp.vec3)
+):
+    i = first + wp.tid()
+    scaled[i] = gain[0] * values[i]
+
+
+ALIVE: list[weakref.ref] = []
+"""The programs that have run."""
 
 
 @differentiable
@@ -86,6 +101,34 @@ def test_differentiating_twice_is_refused(device):
     loss.backward(retain_graph=True)
     with pytest.raises(RuntimeError, match="already differentiated"):
         loss.backward()
+
+
+@differentiable
+def scale_in_ranges(program, values, gain):
+    scaled = program.write(values.shape, wp.vec3)
+    seen = program.tensor(scaled)
+    program.launch_ranges(
+        ranged_scale_kernel, len(values), [program.read(values, wp.vec3), program.read(gain)], [scaled]
+    )
+    program.record_adjoint(lambda: seen.sum())
+    ALIVE.append(weakref.ref(program))
+    return scaled
+
+
+@pytest.mark.parametrize("differentiated", [False, True], ids=["dropped", "differentiated"])
+def test_memory_goes_with_the_result_without_the_garbage_collector(device, differentiated):
+    values, gain = leaves(device)
+    ALIVE.clear()
+    gc.disable()
+    try:
+        for _ in range(3):
+            result = scale_in_ranges(values, gain)
+            if differentiated:
+                result.sum().backward()
+            del result
+        assert [program() for program in ALIVE] == [None] * 3
+    finally:
+        gc.enable()
 
 
 def test_runs_on_a_side_stream():

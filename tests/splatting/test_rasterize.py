@@ -162,6 +162,8 @@ def test_a_bright_light_behind_dim_gaussians_keeps_their_gradients(device):
         (lambda a: a.__setitem__(4, a[4][:, :0]), "features has shape"),
         (lambda a: a.__setitem__(3, a[3].float()), "opacities is torch.float32"),
         (lambda a: a.__setitem__(7, 0), "image size 0 x 50"),
+        (lambda a: a.__setitem__(0, a[0][0, 0]), "means has shape"),
+        (lambda a: a.__setitem__(slice(0, 7), [t.half() for t in a[:7]]), "means is torch.float16"),
     ],
 )
 def test_misfits_are_named(change, message):
@@ -169,6 +171,54 @@ def test_misfits_are_named(change, message):
     change(arguments)
     with pytest.raises(ValueError, match=message):
         rasterize(*arguments)
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"near": 0.0},
+        {"near": float("nan")},
+        {"low_pass": -0.1},
+        {"low_pass": float("inf")},
+        {"alpha_threshold": 0.0},
+        {"alpha_threshold": float("nan")},
+        {"capacity": 0},
+        {"capacity": 2**31},
+    ],
+)
+def test_options_out_of_range_are_named(option):
+    with pytest.raises(ValueError, match=next(iter(option))):
+        rasterize(*random_scene(count=5).arguments, **option)
+
+
+@pytest.mark.parametrize("which", range(4), ids=NAMES[:4])
+def test_gaussians_that_are_not_finite_are_culled(device, which):
+    scene = random_scene().to(torch.float32, device)
+    rest = random_scene().to(torch.float32, device)
+    with torch.no_grad():
+        scene.tensors[which][7] = float("nan")
+        rest.tensors[3][7] = 0.0
+    ours, without = rasterize(*scene.arguments), rasterize(*rest.arguments)
+    assert not ours.visible[7]
+    assert torch.equal(ours.image, without.image)
+
+
+@pytest.mark.parametrize("which", [5, 6], ids=NAMES[5:])
+def test_a_camera_that_is_not_finite_shows_nothing(device, which):
+    scene = random_scene().to(torch.float32, device)
+    with torch.no_grad():
+        scene.tensors[which][0] = float("nan")
+    rendering = rasterize(*scene.arguments)
+    assert not rendering.visible.any() and not rendering.image.any()
+
+
+def test_gaussians_that_a_capacity_leaves_out_get_no_gradient(device):
+    scene = random_scene().to(torch.float32, device)
+    rendering = rasterize(*scene.arguments, capacity=1)
+    backward(rendering)
+    assert rendering.overflow
+    assert int((scene.tensors[4].grad != 0).any(1).sum()) == 1
+    assert int((scene.tensors[0].grad != 0).any(1).sum()) == 1
 
 
 def test_a_capacity_changes_nothing_when_it_is_enough_and_says_so_when_not(device):
