@@ -168,7 +168,9 @@ class ScheduleConfig:
     coarse_levels: int = option(0, "start with photos halved this often", low=0, high=4)
     coarse_every: int = option(1000, "iterations at each coarse level", low=1)
     evaluate_at: tuple[int, ...] = option(
-        (1000, 3000, 7000, 15_000, 30_000), "iterations that test the held-out views; the last always does", low=1
+        (500, 1000, 2000, 4000, 7000, 10_000, 14_000, 20_000, 30_000),
+        "iterations that test the held-out views, not just after a reset of opacities; the last always does",
+        low=1,
     )
     checkpoint_every: int = option(5000, "iterations between checkpoints; one is always written at the end", low=1)
     checkpoints_kept: int = option(1, "older checkpoints are deleted", low=1, high=1000)
