@@ -1,13 +1,13 @@
 """N-channel front-to-back blend and its adjoint for the CPU: rows of 16 pixels, branch-free.
 
-One kernel index is one tile of 16 x 16 pixels. For each Gaussian of the tile's list the kernel walks the pixel rows that
-the Gaussian reaches; a row is one vector of 16, and every decision (is alpha high enough, is the pixel finished) is a
-factor of 0 or 1, so that LLVM turns a row into a handful of AVX-512 or AVX2 instructions. The exponential is a
+One kernel index is one tile of 16 x 16 pixels. For each Gaussian of the tile's list the kernel walks the pixel rows
+that the Gaussian reaches; a row is one vector of 16, and every decision (is alpha high enough, is the pixel finished)
+is a factor of 0 or 1, so that LLVM turns a row into a handful of AVX-512 or AVX2 instructions. The exponential is a
 polynomial for the same reason: a call of libm's expf would break the vectorisation.
 
 Forward, per pixel, with T the transmittance so far:
 
-    alpha = min(opacity exp(p), ALPHA_MAX),  counted if alpha >= threshold and T (1 - alpha) > TRANSMITTANCE_MIN
+    alpha = min(opacity exp(p), ALPHA_MAX),  counted if alpha > threshold and T (1 - alpha) > TRANSMITTANCE_MIN
     image += alpha T feature;  T *= 1 - alpha
 
 A finished pixel stays finished. Its T is stored negated meanwhile, which saves a separate flag.
@@ -24,7 +24,7 @@ Each tile writes the gradients of its list entries to rows of their own, and `ga
 a fixed order: results do not depend on the number of threads.
 """
 
-from functools import lru_cache
+from functools import cache
 
 import warp as wp
 
@@ -32,7 +32,9 @@ from .constants import ALPHA_MAX, TILE_SIZE, TRANSMITTANCE_MIN
 from .geometry import geometry, vector
 
 # Inlining everything and fusing multiply-adds is worth 1.3-1.6x here. The flags go to Warp's own LLVM.
-COMPILER_FLAGS = "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -ffp-contract=fast"
+COMPILER_FLAGS = (
+    "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -ffp-contract=fast"
+)
 
 # exp(x) on [-0.7, 0], least squares in relative error at Chebyshev points; 8.2e-8 relative.
 EXP_COEFFICIENTS = (
@@ -45,9 +47,9 @@ EXP_COEFFICIENTS = (
 )
 
 
-@lru_cache(maxsize=None)
+@cache
 def row_functions(dtype, halvings: int):
-    """exp, comparison and broadcast on rows of 16.
+    """The type of a row of 16, and on rows: broadcast, comparison with zero, exp.
 
     halvings: the polynomial is taken at p / 2^halvings and squared as often, so that p may go down to -0.7 2^halvings.
     float64 rows use the library's exponential: they are the reference, not the fast path.
@@ -99,11 +101,14 @@ def _options(dtype) -> dict:
     return options
 
 
-@lru_cache(maxsize=None)
+@cache
 def forward_kernel(dtype, channels: int, halvings: int):
-    """blend(first, ranges, entries, shapes, ellipses, features, ...): see the module's description.
+    """blend_forward over tiles, from `first` on: see the module's description.
 
-    shapes: [N] (x, y, opacity, half-height); ellipses: [N] (a, b, c, level); features: [N, C]
+    halvings: see row_functions
+    ranges: [tiles] first and one past the last entry; entries: [M] Gaussians
+    shapes: [N] (x, y, opacity, half-height); ellipses: [N] (conic a, b, c, level); features: [N, C]
+    columns: tiles across; width, height: of the image; iota: one row, 0 to 15
     transmittance, accumulated, last: scratch of [tiles, 16] rows, [tiles, C, 16] rows and [tiles, 16] rows
     image: [H W, C]; alpha: [H W]
     """
@@ -188,14 +193,15 @@ def forward_kernel(dtype, channels: int, halvings: int):
     return blend_forward
 
 
-@lru_cache(maxsize=None)
+@cache
 def backward_kernel(dtype, channels: int, halvings: int):
-    """The adjoint of forward_kernel.
+    """The adjoint of forward_kernel, whose arguments it shares.
 
-    transmittance, last: as the forward left them (transmittance is used up); image_gradient: [H W, C];
-    alpha_gradient: [H W]; behind: scratch of [tiles, 16] rows; incoming: scratch of [tiles, C, 16] rows;
-    weights, slopes, densities: scratch of [tiles, 16] rows
-    entry_gradients: [entries, C + 6], in the order of emission: features, conic a b c, x, y, opacity
+    emission: [M] each entry's row in entry_gradients
+    transmittance, last: as the forward left them (transmittance is used up)
+    image_gradient: [H W, C]; alpha_gradient: [H W]
+    behind, weights, slopes: scratch of [tiles, 16] rows; incoming: scratch of [tiles, C, 16] rows
+    entry_gradients: [M, C + 6], in the order of emission: features, conic a b c, x, y, opacity
     """
     row, spread, step, exponential = row_functions(dtype, halvings)
     g = geometry(dtype)
@@ -314,9 +320,13 @@ def backward_kernel(dtype, channels: int, halvings: int):
     return blend_backward
 
 
-@lru_cache(maxsize=None)
+@cache
 def gather_kernel(dtype):
-    """rows[order[place]] = the sum of entry_gradients over the entries of Gaussian `place`, in their order."""
+    """rows[order[place]] = the sum of entry_gradients over the entries of Gaussian `place`, in their order.
+
+    order: [N] Gaussians; ends: [N] one past the last entry of each place; entry_gradients: [M, columns];
+    rows: [N, columns]
+    """
     real = dtype
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})

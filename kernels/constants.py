@@ -4,7 +4,8 @@
 # against list count best in the blend measurements.
 TILE_SIZE = 16
 
-# Contributions below this opacity are left out. 1/255 is the step of an 8-bit display; for HDR output it can be lowered.
+# Contributions below this opacity are left out. 1/255 is the step of an 8-bit display; for HDR output it can be
+# lowered.
 ALPHA_THRESHOLD = 1.0 / 255.0
 
 # A single Gaussian never hides everything behind it: 1 / (1 - alpha) stays bounded in the adjoint.

@@ -1,11 +1,9 @@
 """Quaternion, covariance and ellipse maths of the splat, written once for float32 and float64."""
 
-from functools import lru_cache
+from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
-
-from .constants import ALPHA_MAX
 
 
 def vector(length: int, dtype):
@@ -18,18 +16,21 @@ def matrix(rows: int, columns: int, dtype):
     return wp.types.matrix(shape=(rows, columns), dtype=dtype)
 
 
-@lru_cache(maxsize=None)
+@cache
 def geometry(dtype) -> SimpleNamespace:
-    """The functions below for one scalar type (wp.float32 or wp.float64)."""
+    """Scalar, vector and matrix types and the functions below for one scalar type (wp.float32 or wp.float64)."""
     real = dtype
     vec3, vec4, mat33 = vector(3, dtype), vector(4, dtype), matrix(3, 3, dtype)
 
     @wp.func
     def rotation_from_quaternion(quaternion: vec4) -> mat33:
         """Rotation matrix of a quaternion (w, x, y, z) of any length; zero gives the identity."""
-        largest = wp.max(wp.max(wp.abs(quaternion[0]), wp.abs(quaternion[1])), wp.max(wp.abs(quaternion[2]), wp.abs(quaternion[3])))
+        largest = wp.max(
+            wp.max(wp.abs(quaternion[0]), wp.abs(quaternion[1])), wp.max(wp.abs(quaternion[2]), wp.abs(quaternion[3]))
+        )
         # A constant rescaling keeps the squared length inside the float range without entering the derivative.
-        rescale = wp.where(largest > real(1.0e10), real(1.0e-18), wp.where(largest < real(1.0e-10), real(1.0e18), real(1.0)))
+        enlarge = wp.where(largest < real(1.0e-10), real(1.0e18), real(1.0))
+        rescale = wp.where(largest > real(1.0e10), real(1.0e-18), enlarge)
         q = quaternion * rescale
         length_squared = wp.dot(q, q)
         is_zero = length_squared < real(1.0e-30)
@@ -80,5 +81,4 @@ def geometry(dtype) -> SimpleNamespace:
         rotation_from_quaternion=rotation_from_quaternion,
         ellipse_meets_rectangle=ellipse_meets_rectangle,
         splat_exponent=splat_exponent,
-        alpha_max=ALPHA_MAX,
     )

@@ -4,14 +4,14 @@ One thread evaluates the three channels of one Gaussian for the direction from t
 coefficients come in two arrays, the constant term and the rest, because optimisers treat them at different rates.
 """
 
-from functools import lru_cache
+from functools import cache
 
 import warp as wp
 
 from .geometry import geometry
 
 
-@lru_cache(maxsize=None)
+@cache
 def harmonics_kernel(dtype, degree: int):
     """values[i] = sum over l <= degree and m of coefficient[i, l, m] * Y_l^m(direction), three channels at once.
 
@@ -53,7 +53,9 @@ def harmonics_kernel(dtype, degree: int):
                     value += (real(-0.5900435899266435) * y * (real(3.0) * xx - yy)) * rest[i, 8]
                     value += (real(2.890611442640554) * x * y * z) * rest[i, 9]
                     value += (real(-0.4570457994644658) * y * (real(4.0) * zz - xx - yy)) * rest[i, 10]
-                    value += (real(0.3731763325901154) * z * (real(2.0) * zz - real(3.0) * xx - real(3.0) * yy)) * rest[i, 11]
+                    value += (
+                        real(0.3731763325901154) * z * (real(2.0) * zz - real(3.0) * xx - real(3.0) * yy)
+                    ) * rest[i, 11]
                     value += (real(-0.4570457994644658) * x * (real(4.0) * zz - xx - yy)) * rest[i, 12]
                     value += (real(1.445305721320277) * z * (xx - yy)) * rest[i, 13]
                     value += (real(-0.5900435899266435) * x * (xx - real(3.0) * yy)) * rest[i, 14]

@@ -9,7 +9,7 @@ The covariance is formed as a Gram matrix, M M^T + low_pass I with M = J W R dia
 needle of any aspect ratio keeps a positive determinant.
 """
 
-from functools import lru_cache
+from functools import cache
 
 import warp as wp
 
@@ -17,7 +17,7 @@ from .constants import FRUSTUM_MARGIN, LOG_SCALE_MAX
 from .geometry import geometry, matrix
 
 
-@lru_cache(maxsize=None)
+@cache
 def projection_kernel(dtype, antialiased: bool):
     """The projection for one scalar type.
 

@@ -6,7 +6,7 @@ sort of the entries by tile then leaves each tile's list in depth order, because
 `mark_ranges` finds where each tile's list begins and ends.
 """
 
-from functools import lru_cache
+from functools import cache
 
 import warp as wp
 
@@ -14,7 +14,7 @@ from .constants import TILE_SIZE
 from .geometry import geometry
 
 
-@lru_cache(maxsize=None)
+@cache
 def tile_kernels(dtype):
     """(pack_records, count_tiles, emit_entries) for one scalar type."""
     g = geometry(dtype)

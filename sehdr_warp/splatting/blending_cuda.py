@@ -3,7 +3,7 @@
 import torch
 import warp as wp
 
-from ..kernels import blend_cuda
+from ..kernels import blend_cuda, blend_cuda_adjoint
 from ..kernels.geometry import vector
 from .arrays import view, warp_scalar
 from .tile_lists import TileLists
@@ -49,21 +49,21 @@ def blend_on_cuda(device, features, lists: TileLists, image, alpha, alpha_thresh
 
     launch(
         blend_cuda.forward_kernel(scalar, channels),
-        blend_cuda.FORWARD_BLOCKS_PER_TILE,
+        blend_cuda.BLOCKS_PER_TILE,
         [pixels(image), view(alpha.view(-1)), view(transmittance), view(last)],
     )
 
     def backward(image_gradient: torch.Tensor, alpha_gradient: torch.Tensor) -> torch.Tensor:
         gathered = features.new_zeros(features.shape[0], channels + 6)
         launch(
-            blend_cuda.backward_kernel(scalar, channels),
-            blend_cuda.BACKWARD_BLOCKS_PER_TILE,
+            blend_cuda_adjoint.backward_kernel(scalar, channels),
+            blend_cuda_adjoint.BLOCKS_PER_TILE,
             [
                 view(transmittance),
                 view(last),
                 pixels(image_gradient),
                 view(alpha_gradient.view(-1)),
-                blend_cuda.BACKWARD_ROWS,
+                blend_cuda_adjoint.ROWS,
                 channels + 6,
                 view(gathered.view(-1)),
             ],

@@ -91,7 +91,7 @@ def blend_reference(means2d, conics, opacities, features, depths, extents, width
             a, b, c = (conics[here, k, None] for k in range(3))
             exponent = (-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy).clamp(max=0.0)
             value = (opacities[here, None] * exponent.exp()).clamp(max=ALPHA_MAX)
-            value = torch.where(value >= alpha_threshold, value, 0.0)
+            value = torch.where(value > alpha_threshold, value, 0.0)
             # A pixel stops before its transmittance would fall to the limit, so later Gaussians count nothing there.
             running = torch.cumprod(1 - value, 0)
             value = torch.where(running > TRANSMITTANCE_MIN, value, 0.0)
