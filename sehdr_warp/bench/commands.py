@@ -1,4 +1,4 @@
-"""The command line of `sehdr-warp bench`: what may be asked for, and the call. Light: torch is imported when it runs."""
+"""The command line of `sehdr-warp bench`: what may be asked for, and the call. torch is imported when it runs."""
 
 import sys
 from dataclasses import dataclass

@@ -71,7 +71,7 @@ COLUMNS = {
 
 
 def new_report(benchmark: str, device: torch.device, settings: dict) -> dict:
-    """A report without results: benchmark, command, date, machine, settings; rows, checks and notes are to be filled."""
+    """A report without results: benchmark, command, date, machine, settings; rows, checks and notes to be filled."""
     return {
         "schema": SCHEMA,
         "benchmark": benchmark,

@@ -245,7 +245,7 @@ def _amortised(trainer: Trainer, first: int) -> dict:
     for _ in range(steps):
         trainer.step()
         due = trainer.iteration % densification.every == 0
-        changes += due and densification.start < trainer.iteration <= densification.stop
+        changes += due and densification.start < trainer.iteration < densification.stop
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     mean = (time.perf_counter() - started) * 1e3 / steps

@@ -161,6 +161,7 @@ class _ProgramFunction(torch.autograd.Function):
         return outputs if isinstance(result, tuple) else outputs[0]
 
     @staticmethod
+    @torch.autograd.function.once_differentiable
     def backward(ctx, *gradients):
         program = ctx.program
         if program is None:

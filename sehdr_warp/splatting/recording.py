@@ -19,10 +19,14 @@ class GraphRecorder:
     The function works on fixed memory: what differs between replays it must read from tensors that are filled before.
     It must neither wait for the device nor copy from the host, and every kernel in it must have run once before. Its
     result must be tensors (or tuples of them), which the next replay overwrites.
+
+    device: a CUDA device; raises ValueError for another.
     """
 
     def __init__(self, device: torch.device):
         self.device = torch.device(device)
+        if self.device.type != "cuda":
+            raise ValueError(f"device {self.device} has no CUDA graphs; use a GPU, or call the function itself")
         self._key = None
         self._graph: torch.cuda.CUDAGraph | None = None
         self._result = None
@@ -43,7 +47,7 @@ class GraphRecorder:
 
         Raises RuntimeError if the function cannot be recorded.
         """
-        if key != self._key:
+        if self._graph is None or key != self._key:
             self.invalidate()
             self._graph, self._result = self._record(function)
             self._key = key

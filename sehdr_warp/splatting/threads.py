@@ -59,7 +59,7 @@ def run_parallel(task, items) -> None:
 
 
 def even_ranges(count: int, smallest: int = 1024) -> list[tuple[int, int]]:
-    """[first, last) ranges that cover `count` items, a few for each thread; of at least `smallest` items, unless alone."""
+    """[first, last) ranges that cover `count` items, a few for each thread; one, or each of at least `smallest`."""
     pieces = max(1, min(thread_count() * 4, count // smallest))
     bounds = [count * k // pieces for k in range(pieces + 1)]
     return [(a, b) for a, b in pairwise(bounds) if b > a]

@@ -34,7 +34,8 @@ class Checkpoint:
 def write_checkpoint(folder: Path, tensors: dict[str, Tensor], values: dict, *, kept: int) -> Path:
     """Writes folder/iteration_<n> from a state with the value "iteration", then deletes all but the newest `kept`.
 
-    Later checkpoints go too: a training that is at n was resumed from an earlier one because they are damaged. Where that checkpoint exists and is sound it is left alone. Raises SehdrError if the disk refuses; checkpoints that
+    Later checkpoints go too: a training that is at n was resumed from an earlier one because they are damaged. Where
+    the checkpoint of n exists and is sound it is left alone. Raises SehdrError if the disk refuses; checkpoints that
     exist are untouched then.
     """
     from safetensors.torch import save

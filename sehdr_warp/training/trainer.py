@@ -137,7 +137,7 @@ class Trainer:
         return loss.detach(), photo.encoded.detach(), view.target.encoded
 
     def _can_record(self, views, kind) -> bool:
-        """Whether this step can be a recorded one: on a GPU, with photos of one size, after one like it was launched."""
+        """Whether this step can be a recorded one: on a GPU, photos of one size, after a step like it was launched."""
         if self._recorder is None or not isinstance(views, ViewStack):
             return False
         if self.field.radiance == "display" and not isinstance(views.times, float):

@@ -103,6 +103,13 @@ def test_differentiating_twice_is_refused(device):
         loss.backward()
 
 
+def test_gradients_of_gradients_are_refused(device):
+    values, gain = leaves(device)
+    gradient = torch.autograd.grad(scale_and_square(values, gain)[0].square().sum(), values, create_graph=True)[0]
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        (gradient + values).square().sum().backward()
+
+
 @differentiable
 def scale_in_ranges(program, values, gain):
     scaled = program.write(values.shape, wp.vec3)

@@ -3,16 +3,20 @@
 import pytest
 import torch
 
-from sehdr_warp.splatting import rasterize
+from sehdr_warp.splatting import GraphRecorder, rasterize
 
 from .scenes import random_scene, relative_error
 
-pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
 
 
+def test_a_device_without_cuda_graphs_is_refused():
+    with pytest.raises(ValueError, match="device cpu has no CUDA graphs"):
+        GraphRecorder("cpu")
+
+
+@needs_gpu
 def test_a_recorded_render_and_its_gradients_follow_their_inputs():
-    from sehdr_warp.splatting import GraphRecorder
-
     scene = random_scene(count=300).to(torch.float32, "cuda:0")
     target = torch.rand(scene.height, scene.width, 3, device="cuda:0")
 
@@ -34,9 +38,8 @@ def test_a_recorded_render_and_its_gradients_follow_their_inputs():
             assert relative_error(ours, truth) < 1e-5
 
 
+@needs_gpu
 def test_an_invalidated_recording_is_made_again():
-    from sehdr_warp.splatting import GraphRecorder
-
     recorder, factor = GraphRecorder("cuda:0"), [2.0]
     values = torch.ones(4, device="cuda:0")
 
@@ -49,3 +52,5 @@ def test_an_invalidated_recording_is_made_again():
     recorder.invalidate()
     assert recorder.run("a", step).tolist() == [3.0] * 4
     assert recorder.run("b", step).tolist() == [3.0] * 4
+    recorder.invalidate()
+    assert recorder.run(None, step).tolist() == [3.0] * 4
