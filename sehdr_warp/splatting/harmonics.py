@@ -18,18 +18,37 @@ def spherical_harmonics(degree: int, coefficients, means, camera_position):
         the rest, which saves joining them.
     means: [N, 3] world coordinates; camera_position: [3].
 
-    Returns [N, 3]. Differentiable with respect to every tensor. Raises ValueError for a degree out of range.
+    Returns [N, 3]. Differentiable with respect to every tensor. Raises ValueError for a degree out of range, and for
+    shapes, dtypes or devices that do not fit.
     """
     constant, rest = (
         (coefficients[:, :1], coefficients[:, 1:]) if isinstance(coefficients, torch.Tensor) else coefficients
     )
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"spherical harmonics degree {degree} is not in 0..{MAX_DEGREE}")
+    _check(constant, rest, means, camera_position)
     if rest.shape[1] < (degree + 1) ** 2 - 1:
         raise ValueError(f"degree {degree} needs {(degree + 1) ** 2} coefficients, not {1 + rest.shape[1]}")
     return _evaluate(
         constant.contiguous(), rest.contiguous(), means.contiguous(), camera_position.contiguous(), degree=degree
     )
+
+
+def _check(constant, rest, means, camera_position) -> None:
+    count = means.shape[0] if means.ndim else 0
+    shapes = {
+        "means": (means, (count, 3)),
+        "the constant coefficients": (constant, (count, 1, 3)),
+        "the other coefficients": (rest, (count, rest.shape[1] if rest.ndim == 3 else 0, 3)),
+        "camera_position": (camera_position, (3,)),
+    }
+    for name, (tensor, shape) in shapes.items():
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"shape {tuple(tensor.shape)} of {name}, expected {shape}")
+        if tensor.dtype != means.dtype or tensor.device != means.device:
+            raise ValueError(
+                f"{name}: {tensor.dtype} on {tensor.device}, but means is {means.dtype} on {means.device}"
+            )
 
 
 @differentiable
