@@ -10,6 +10,7 @@ from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR, TILE_SIZE
 from ..splatting.blending import blend
 from ..splatting.projection import project
 from ..splatting.rasterization import rasterize
+from ..splatting.recording import GraphRecorder
 from ..splatting.tile_lists import TileLists, build_tile_lists
 from . import checks
 from .machine import package_version
@@ -21,6 +22,8 @@ from .timing import Variant, peak_memory, time_variants
 OURS = "sehdr-warp"
 OURS_CAPACITY = "sehdr-warp, capacity"
 """rasterize() with a given capacity, a quarter more than there are entries, so that the host waits for nothing."""
+OURS_RECORDED = "sehdr-warp, recorded"
+"""The call with a capacity, replayed as a CUDA graph: what it costs inside a recorded training step."""
 PLAIN_TORCH = "plain torch"
 PLAIN_TORCH_BYTES = 4 << 30
 """The plain torch rasterizer keeps about 16 numbers for each pixel-Gaussian pair; beyond this it is left out."""
@@ -76,6 +79,24 @@ def _renderer_with_capacity(scene: SplatScene) -> Callable[[], torch.Tensor]:
     return lambda: rasterize(*scene.arguments, capacity=capacity).image
 
 
+def _recorded(scene: SplatScene, cotangent: torch.Tensor | None) -> Callable[[], list[torch.Tensor]]:
+    """A replay of the render with a capacity: of [image], or with a cotangent of [image, gradients of the leaves]."""
+    render = _renderer_with_capacity(scene)
+
+    def forward():
+        with torch.no_grad():
+            return [render()]
+
+    def forward_backward():
+        image = render()
+        return [image.detach(), *torch.autograd.grad(image, scene.leaves, cotangent)]
+
+    function = forward if cotangent is None else forward_backward
+    function()  # loads the kernels, which a recording cannot
+    recorder = GraphRecorder(scene.device)
+    return lambda: recorder.run("render", function)
+
+
 def _checks(scene: SplatScene, peers: list[Peer]) -> list[checks.Check]:
     """Every variant that is timed: on a scene small enough for the reference, on CUDA also on the timed one."""
     small = make_splat_scene(scene.size.reduced(checks.REFERENCE_GAUSSIANS), scene.channels).to(scene.device)
@@ -86,6 +107,7 @@ def _checks(scene: SplatScene, peers: list[Peer]) -> list[checks.Check]:
             made += checks.check_against_reference(name, render, small)
             ours = checks.image_and_gradients(render, scene)
             made += checks.compare(name, "CPU kernels", scene, ours, cpu)
+        made += checks.compare(OURS_RECORDED, "CPU kernels", scene, _recorded(scene, scene.cotangent())(), cpu)
     else:
         made += checks.check_against_reference(PLAIN_TORCH, checks.render_reference, small)
         for threads in BLEND_THREADS:
@@ -120,6 +142,10 @@ def _splat_rows(scene: SplatScene, peers: list[Peer], repetitions: int, budget: 
     rows = []
     for name, make in (("forward", _forward), ("forward + backward", _forward_backward)):
         variants = {key: make(render, scene, cotangent) for key, render in renderers.items()}
+        if scene.device.type == "cuda":
+            replay = _recorded(scene, None if make is _forward else cotangent)
+            variants[OURS_RECORDED] = Variant(lambda _, replay=replay: replay())
+            versions[OURS_RECORDED] = versions[OURS]
         timings = time_variants(variants, scene.device, repetitions=repetitions, budget=budget)
         for key, timing in timings.items():
             row = _row(scene, "splat", key, name) | {"version": versions[key], "entries": entries} | timing.to_dict()
