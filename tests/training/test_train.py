@@ -117,7 +117,9 @@ def test_views_of_differing_exposure_agree(tmp_path):
         photo = np.round(srgb.encode(view.hdr * time) * 255).astype(np.float32) / 255
         views.append(dataclasses.replace(view, image=photo, exposure_time=time))
     run = train(dataclasses.replace(base, views=tuple(views)), tmp_path / "run", quick(), device="cpu", quiet=True)
-    assert run.metrics()[-1]["psnr_mu"] > 21
+    # Taken for equal, the times would leave the simulated photos a stop off: below 15 dB.
+    assert run.metrics()[-1]["psnr_ldr"] > 18
+    assert run.metrics()[-1]["psnr_mu"] > 19
 
 
 def test_clipped_highlights_are_not_pulled_down(scene, tmp_path):
