@@ -44,7 +44,8 @@ def configuration(strategy):
 def kill_after_checkpoint(out, strategy):
     root = Path(__file__).resolve().parents[2]
     process = subprocess.Popen(
-        [sys.executable, "-c", TRAIN, str(root), str(out), strategy], env=os.environ | {"PYTHONPATH": f"{root}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
+        [sys.executable, "-c", TRAIN, str(root), str(out), strategy],
+        env=os.environ | {"PYTHONPATH": f"{root}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"},
     )
     deadline = time.monotonic() + 120
     while not list((out / "checkpoints").glob("iteration_*")):
