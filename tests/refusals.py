@@ -1,0 +1,38 @@
+"""A command line that must be refused: status 1, and one clear line on standard error."""
+
+import re
+
+import pytest
+
+from sehdr_warp import cli
+
+# What may stand before the error: the steps that a command tells of.
+PROGRESS = re.compile(r"(reading|finding|matching|placing|placed|fitting|using|view|response|iteration|no exposure) ")
+
+
+def call(*arguments):
+    """Exit status of a command line in this process."""
+    with pytest.raises(SystemExit) as caught:
+        cli.main([str(argument) for argument in arguments])
+    return caught.value.code
+
+
+def error_line(capfd) -> str:
+    """The one line on standard error, native libraries' included, that is no progress."""
+    lines = [line for line in capfd.readouterr().err.splitlines() if not PROGRESS.match(line)]
+    assert len(lines) == 1 and lines[0].startswith("sehdr-warp: ") and len(lines[0]) < 700, lines
+    return lines[0]
+
+
+def refused(capfd, *arguments) -> str:
+    """The error of a command line that must fail with status 1 and one line."""
+    capfd.readouterr()
+    assert call(*arguments) == 1
+    return error_line(capfd)
+
+
+def train_refused(capfd, data, *flags) -> str:
+    out = data.parent / "run"
+    line = refused(capfd, "train", data, "--out", out, "--device", "cpu", *flags)
+    assert not out.exists()
+    return line

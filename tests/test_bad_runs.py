@@ -1,0 +1,329 @@
+"""Damaged runs, full disks and signals through the command line: one clear line, nothing half-written, nothing lost."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from .full_disk import full_disk
+from .refusals import call, refused
+
+# ------------------------------------------------------------------------------------------------------------- runs
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A very short training of the embedded scene."""
+    out = tmp_path_factory.mktemp("bad") / "run"
+    flags = ("--iterations", "4", "--max-size", "40", "--device", "cpu", "--preset", "demo")
+    assert call("train", "embedded", "--out", out, *flags) == 0
+    return out
+
+
+@pytest.fixture
+def run(trained, tmp_path):
+    """A copy to damage."""
+    shutil.copytree(trained, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def snapshot(folder) -> dict:
+    return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def checkpoint_of(run):
+    return next((run / "checkpoints").iterdir())
+
+
+def flip_byte(path, at: int = -5):
+    content = bytearray(path.read_bytes())
+    content[at] ^= 0x10
+    path.write_bytes(content)
+
+
+def edit_json(path, **fields):
+    path.write_text(json.dumps(json.loads(path.read_text()) | fields))
+
+
+def edit_view(run, **fields):
+    values = json.loads((run / "scene.json").read_text())
+    for name, value in fields.items():
+        (values["views"][0] if name in values["views"][0] else values["views"][0]["camera"])[name] = value
+    (run / "scene.json").write_text(json.dumps(values))
+
+
+def resign(run, change):
+    """Changes a checkpoint's tensors and states their hash anew."""
+    import hashlib
+
+    from safetensors.torch import load, save
+
+    folder = checkpoint_of(run)
+    tensors = load((folder / "state.safetensors").read_bytes())
+    change(tensors)
+    content = save(tensors)
+    (folder / "state.safetensors").write_bytes(content)
+    edit_json(folder / "checkpoint.json", sha256=hashlib.sha256(content).hexdigest())
+
+
+RUNS = {
+    "flipped byte": (lambda run: flip_byte(checkpoint_of(run) / "state.safetensors"), "SHA-256"),
+    "truncated tensors": (
+        lambda run: (path := checkpoint_of(run) / "state.safetensors").write_bytes(path.read_bytes()[:-9]),
+        "SHA-256",
+    ),
+    "pickle": (lambda run: (checkpoint_of(run) / "state.safetensors").write_bytes(b"\x80\x04."), "SHA-256"),
+    "no tensors": (lambda run: (checkpoint_of(run) / "state.safetensors").unlink(), "state.safetensors"),
+    "no values": (lambda run: (checkpoint_of(run) / "checkpoint.json").unlink(), "checkpoint.json"),
+    "other format": (lambda run: edit_json(checkpoint_of(run) / "checkpoint.json", format=9), "format"),
+    "values without iteration": (
+        lambda run: (path := checkpoint_of(run) / "checkpoint.json").write_text(
+            json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "iteration"})
+        ),
+        "iteration",
+    ),
+    "no checkpoint": (lambda run: shutil.rmtree(run / "checkpoints"), "checkpoint"),
+    "tensor missing": (lambda run: resign(run, lambda tensors: tensors.pop("gaussians.means")), "gaussians.means"),
+    "tensor NaN": (lambda run: resign(run, lambda tensors: tensors["gaussians.means"].fill_(float("nan"))), "finite"),
+    "tensor of other shape": (
+        lambda run: resign(
+            run, lambda tensors: tensors.update({"gaussians.means": tensors["gaussians.means"][:3].clone()})
+        ),
+        "checkpoint",
+    ),
+    "no config": (lambda run: (run / "config.json").unlink(), "config.json"),
+    "config unknown key": (lambda run: edit_json(run / "config.json", speed=3), "speed"),
+    "config wrong type": (lambda run: edit_json(run / "config.json", seed="one"), "seed"),
+    "config a list": (lambda run: (run / "config.json").write_text("[]"), "config.json"),
+    "config nested": (lambda run: (run / "config.json").write_text("[" * 100_000), "config.json"),
+    "run.json empty": (lambda run: (run / "run.json").write_text(""), "run.json"),
+    "run.json nested": (lambda run: (run / "run.json").write_text("[" * 100_000), "run.json"),
+    "run.json binary": (lambda run: (run / "run.json").write_bytes(b"\xff\xfe"), "run.json"),
+    "run.json without response": (lambda run: edit_json(run / "run.json", response=None), "run.json"),
+    "response damaged": (lambda run: edit_json(run / "run.json", response={"kind": "table"}), "response"),
+    "base exposure zero": (lambda run: edit_json(run / "run.json", base_exposure_time=0), "base_exposure_time"),
+    "base exposure words": (lambda run: edit_json(run / "run.json", base_exposure_time="long"), "base_exposure_time"),
+    "base exposure NaN": (
+        lambda run: edit_json(run / "run.json", base_exposure_time=float("nan")),
+        "base_exposure_time",
+    ),
+    "scene.json gone": (lambda run: (run / "scene.json").unlink(), "scene.json"),
+    "scene.json views": (lambda run: edit_json(run / "scene.json", views=3), "scene.json"),
+    "camera NaN": (lambda run: edit_view(run, fx=float("nan")), "scene.json"),
+    "camera huge": (lambda run: edit_view(run, width=10**9, height=10**9), "scene.json"),
+    "exposure zero": (lambda run: edit_view(run, exposure_time=0), "scene.json"),
+    "exposure in words": (lambda run: edit_view(run, exposure_time="short"), "scene.json"),
+}
+
+
+@pytest.mark.parametrize("case", RUNS)
+def test_damaged_runs(run, tmp_path, capfd, case):
+    change, words = RUNS[case]
+    change(run)
+    before = snapshot(run)
+    for arguments in (
+        ("render", run, "--out", tmp_path / "out", "--device", "cpu"),
+        ("eval", run, "--device", "cpu", "--json", tmp_path / "figures.json"),
+        ("export", run, "--out", tmp_path / "scene.ply"),
+    ):
+        line = refused(capfd, *arguments)
+        assert words in line and str(run) in line, arguments
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run"] and snapshot(run) == before
+
+
+def test_damaged_run_is_not_resumed(run, capfd):
+    flip_byte(checkpoint_of(run) / "state.safetensors")
+    before = snapshot(run)
+    flags = ("--max-size", "40", "--device", "cpu", "--resume")
+    assert "SHA-256" in refused(capfd, "train", "embedded", "--out", run, *flags)
+    assert snapshot(run) == before
+
+
+def test_a_folder_of_other_things_is_no_run(tmp_path, capfd):
+    (tmp_path / "letters").mkdir()
+    (tmp_path / "letters" / "mother.txt").write_text("dear")
+    for flag in ((), ("--overwrite",), ("--resume",)):
+        line = refused(capfd, "train", "embedded", "--out", tmp_path / "letters", "--device", "cpu", *flag)
+        assert "letters" in line
+    assert "no such folder" in refused(capfd, "render", tmp_path / "gone", "--out", tmp_path / "out")
+    assert snapshot(tmp_path) == {(tmp_path / "letters" / "mother.txt").relative_to(tmp_path): b"dear"}
+
+
+def test_moved_photos(run, tmp_path, capfd):
+    edit_json(run / "run.json", data={"path": str(tmp_path / "photos"), "exposure_index": None, "max_size": None})
+    for arguments in (("eval", run), ("report", run, "--out", tmp_path / "report")):
+        assert "--data" in refused(capfd, *arguments, "--device", "cpu")
+    assert call("render", run, "--out", tmp_path / "out", "--device", "cpu", "--cameras", "train") == 0
+
+
+CAMERAS = {
+    "empty": "",
+    "not JSON": "{",
+    "a list": "[]",
+    "nested": "[" * 100_000,
+    "no cameras": '{"cameras": []}',
+    "a number": '{"cameras": [7]}',
+    "no pose": '{"cameras": [{"width": 8, "height": 8, "fx": 9, "fy": 9, "cx": 4, "cy": 4}]}',
+    "huge": '{"cameras": [{"width": 65000, "height": 65000, "fx": 9, "fy": 9, "cx": 4, "cy": 4, "world_to_camera": '
+    "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}]}",
+    "name leaves": '{"cameras": [{"name": "../../x", "width": 8, "height": 8, "fx": 9, "fy": 9, "cx": 4, "cy": 4, '
+    '"world_to_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}]}',
+    "NaN": '{"cameras": [{"width": 8, "height": 8, "fx": NaN, "fy": 9, "cx": 4, "cy": 4, '
+    '"world_to_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}]}',
+}
+
+
+@pytest.mark.parametrize("case", CAMERAS)
+def test_camera_files(trained, tmp_path, capfd, case):
+    (tmp_path / "path.json").write_text(CAMERAS[case])
+    arguments = ("render", trained, "--out", tmp_path / "out", "--device", "cpu")
+    assert "path.json" in refused(capfd, *arguments, "--cameras", tmp_path / "path.json")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "flags, words",
+    [
+        (("--evs=",), "--evs"),
+        (("--evs=nan",), "nan"),
+        (("--evs=0,0",), "twice"),
+        (("--evs=900",), "900"),
+        (("--exposures", "0"), "0"),
+        (("--exposures=-1",), "-1"),
+        (("--exposures", "inf"), "inf"),
+        (("--multipart",), "exposures"),
+        (("--ldr-brackets", "jpeg"), "exposures"),
+        (("--cameras", "tset"), "tset"),
+        (("--cameras", "orbit", "--count", "0"), "path of 0 views"),
+        (("--cameras", "orbit", "--count", "-3"), "path of -3 views"),
+        (("--cameras", "interpolate", "--count", "100000000"), "path of 100000000 views"),
+        (("--cameras", "."), "'.'"),
+        (("--colorspace", "cmyk"), "cmyk"),
+        (("--device", "tpu"), "tpu"),
+    ],
+)
+def test_render_flags(trained, tmp_path, capfd, flags, words):
+    line = refused(capfd, "render", trained, "--out", tmp_path / "out", "--device", "cpu", *flags)
+    assert words in line and not (tmp_path / "out").exists()
+
+
+def test_nothing_is_replaced(trained, tmp_path, capfd):
+    out = tmp_path / "out"
+    arguments = ("render", trained, "--out", out, "--device", "cpu", "--evs=-2,0")
+    assert call(*arguments) == 0
+    (out / "notes.txt").write_text("mine")
+    before = snapshot(out)
+    assert "--overwrite" in refused(capfd, *arguments)
+    assert snapshot(out) == before
+    assert call(*arguments, "--overwrite") == 0 and (out / "notes.txt").read_text() == "mine"
+    (tmp_path / "scene.ply").write_text("mine")
+    assert "--overwrite" in refused(capfd, "export", trained, "--out", tmp_path / "scene.ply")
+    (tmp_path / "report").mkdir()
+    (tmp_path / "report" / "stops.png").write_text("mine")
+    assert "--overwrite" in refused(capfd, "report", trained, "--out", tmp_path / "report", "--device", "cpu")
+    assert (tmp_path / "scene.ply").read_text() == (tmp_path / "report" / "stops.png").read_text() == "mine"
+    assert "is a file" in refused(capfd, "render", trained, "--out", tmp_path / "scene.ply", "--device", "cpu")
+    assert "is a folder" in refused(capfd, "export", trained, "--out", out)
+
+
+LPIPS = {
+    "gone": None,
+    "pickle": {"squeeze.pth": b"cos\nsystem\n(S'id'\ntR.", "squeezenet1_1_features.pth": b"cos\nsystem\n(S'id'\ntR."},
+    "empty": {"squeeze.pth": b"", "squeezenet1_1_features.pth": b""},
+}
+
+
+@pytest.mark.parametrize("case", LPIPS)
+def test_lpips_weights(trained, tmp_path, capfd, case):
+    folder = tmp_path / "weights"
+    if LPIPS[case] is not None:
+        folder.mkdir()
+        for name, content in LPIPS[case].items():
+            (folder / name).write_bytes(content)
+    line = refused(capfd, "eval", trained, "--device", "cpu", "--lpips", folder)
+    assert "weights" in line
+
+
+# --------------------------------------------------------------------------------------------- full disks and signals
+
+
+@pytest.mark.parametrize(
+    "command", [("render",), ("render", "--evs=-2,0,2", "--multipart"), ("export",), ("report",)], ids=" ".join
+)
+def test_full_disk(trained, tmp_path, capfd, command):
+    out = tmp_path / "out"
+    device = () if command[0] == "export" else ("--device", "cpu")
+    with full_disk():
+        line = refused(capfd, command[0], trained, "--out", out, *device, *command[1:])
+    assert "cannot be written" in line and ".tmp" not in line and list(tmp_path.iterdir()) == []
+
+
+def test_full_disk_while_training_keeps_the_last_checkpoint(trained, tmp_path, capfd):
+    out = tmp_path / "run"
+    shutil.copytree(trained, out)
+    values = json.loads((out / "config.json").read_text())
+    values["schedule"]["iterations"] = 8
+    (out / "config.json").write_text(json.dumps(values))
+    before = snapshot(out / "checkpoints")
+    flags = ("--max-size", "40", "--device", "cpu", "--resume")
+    with full_disk():
+        line = refused(capfd, "train", "embedded", "--out", out, *flags)
+    assert "cannot be written" in line and snapshot(out / "checkpoints") == before
+    assert call("train", "embedded", "--out", out, *flags) == 0, "and goes on once there is room"
+
+
+def test_read_only_place(trained, tmp_path, capfd):
+    """/proc takes no new files, not even root's."""
+    for command in ("render", "export", "report"):
+        line = refused(capfd, command, trained, "--out", "/proc/sehdr/out")
+        assert "/proc/sehdr" in line
+    assert "/proc/sehdr" in refused(capfd, "train", "embedded", "--out", "/proc/sehdr", "--max-size", "40")
+
+
+def start(*arguments) -> subprocess.Popen:
+    command = [sys.executable, "-m", "sehdr_warp", *(str(argument) for argument in arguments)]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+
+
+def wait_for(process: subprocess.Popen, words: str) -> None:
+    for line in process.stderr:
+        if words in line:
+            return
+    raise AssertionError(f"{words!r} was never said; status {process.wait()}")
+
+
+def test_interrupted_render_leaves_nothing(trained, tmp_path):
+    process = start("render", trained, "--out", tmp_path / "out", "--cameras", "orbit", "--count", "2000", "--evs=-2,0")
+    wait_for(process, "(3 of 2000)")
+    process.send_signal(signal.SIGINT)
+    assert "Traceback" not in process.communicate(timeout=60)[1] and process.returncode == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_interrupted_training_can_be_used(tmp_path, capfd):
+    out = tmp_path / "run"
+    process = start("train", "embedded", "--out", out, "--iterations", "100000", "--max-size", "40", "--device", "cpu")
+    wait_for(process, "iteration 1/")
+    process.send_signal(signal.SIGINT)
+    rest = process.communicate(timeout=60)[1]
+    assert process.returncode == 130 and "--resume" in rest and "Traceback" not in rest
+    assert call("render", out, "--out", tmp_path / "views", "--device", "cpu") == 0
+
+
+def test_kill_while_a_checkpoint_is_written(trained, tmp_path):
+    """What a killed process leaves beside a checkpoint is not taken for one, and is cleared by the next."""
+    out = tmp_path / "run"
+    shutil.copytree(trained, out)
+    whole = checkpoint_of(out)
+    half = whole.with_name(f".{whole.name[:-1]}9.0123abcd.tmp")
+    shutil.copytree(whole, half)
+    (half / "checkpoint.json").unlink()
+    torn = whole.with_name("iteration_00000009")
+    shutil.copytree(whole, torn)
+    (torn / "state.safetensors").write_bytes((whole / "state.safetensors").read_bytes()[:1000])
+    assert call("render", out, "--out", tmp_path / "views", "--device", "cpu") == 0
+    assert call("train", "embedded", "--out", out, "--max-size", "40", "--device", "cpu", "--resume") == 0
+    assert [path.name for path in sorted((out / "checkpoints").iterdir()) if path != half] == [whole.name]

@@ -1,0 +1,376 @@
+"""Bad data, flags and configs through the command line: one clear line, status 1, nothing written."""
+
+import json
+import re
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from .make_scenes import write_blender, write_colmap
+from .refusals import call, error_line, train_refused
+
+
+@pytest.fixture
+def data(tmp_path):
+    """A COLMAP text set of 6 views, 64 x 48."""
+    write_colmap(tmp_path / "data")
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def binary(tmp_path):
+    write_colmap(tmp_path / "data", binary=True)
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def frames(tmp_path):
+    write_blender(tmp_path / "data")
+    return tmp_path / "data"
+
+
+def replace_bytes(path, old: bytes, new: bytes):
+    content = path.read_bytes()
+    assert old in content
+    path.write_bytes(content.replace(old, new, 1))
+
+
+def png_chunk(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def png_bomb(width: int, height: int) -> bytes:
+    """A PNG file of a few bytes that states a huge size."""
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    pixels = zlib.compress(b"\0" * 1000)
+    return b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", header) + png_chunk(b"IDAT", pixels) + png_chunk(b"IEND", b"")
+
+
+# ---------------------------------------------------------------------------------------------------- data folders
+
+
+def test_folders_without_a_scene(tmp_path, capfd):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "text").mkdir()
+    (tmp_path / "text" / "readme.md").write_text("photos to come")
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "one").mkdir()
+    write_blender(tmp_path / "blender", count=1)
+    Image.fromarray(np.full((8, 8, 3), 90, np.uint8)).save(tmp_path / "one" / "a.png")
+    for name, words in {
+        "nowhere": "not found",
+        "empty": "empty",
+        "text": "no photos",
+        "file": "not a folder",
+        "one": "only photo",
+        "blender": "has 1 view",
+    }.items():
+        line = train_refused(capfd, tmp_path / name)
+        assert name in line and words in line
+
+
+COLMAP_TEXT = {
+    "cameras empty": ("cameras.txt", lambda text: "", "cameras.txt"),
+    "images empty": ("images.txt", lambda text: "", "images.txt"),
+    "images without entries": ("images.txt", lambda text: "# none\n", "no registered views"),
+    "cameras truncated": ("cameras.txt", lambda text: text[:-12], "cameras.txt"),
+    "not text": ("images.txt", lambda text: "\x00\xff\xfe" * 50, "images.txt"),
+    "pose NaN": ("images.txt", lambda text: re.sub(r"(?m)^1 \S+", "1 nan", text), "not finite"),
+    "zero quaternion": ("images.txt", lambda text: re.sub(r"(?m)^1( \S+){4}", "1 0 0 0 0", text), "quaternion"),
+    "leaves the folder": ("images.txt", lambda text: text.replace("000.png", "../../etc/passwd"), "'..'"),
+    "absolute": ("images.txt", lambda text: text.replace("000.png", "/etc/passwd"), "absolute"),
+    "unknown camera": ("images.txt", lambda text: text.replace(" 1 000.png", " 9 000.png"), "camera 9"),
+    "huge camera": ("cameras.txt", lambda text: text.replace(" 64 48 ", " 999999999 48 "), "999999999"),
+    "negative focal length": ("cameras.txt", lambda text: text.replace(" 50 ", " -50 "), "cameras.txt"),
+    "infinite focal length": ("cameras.txt", lambda text: text.replace(" 50 ", " inf "), "cameras.txt"),
+    "other size": ("cameras.txt", lambda text: text.replace(" 64 48 ", " 63 48 "), "64 x 48"),
+    "unknown model": ("cameras.txt", lambda text: text.replace("PINHOLE", "PERSPEX"), "PERSPEX"),
+    "point NaN": ("points3D.txt", lambda text: re.sub(r"(?m)^1 \S+", "1 nan", text), "points3D.txt"),
+    "point in words": ("points3D.txt", lambda text: re.sub(r"(?m)^1 \S+", "1 far", text), "points3D.txt"),
+}
+
+
+@pytest.mark.parametrize("case", COLMAP_TEXT)
+def test_colmap_text(data, capfd, case):
+    name, change, words = COLMAP_TEXT[case]
+    path = data / "sparse" / "0" / name
+    before = path.read_text()
+    path.write_text(change(before), encoding="latin-1")
+    assert path.read_bytes() != before.encode()
+    assert words in train_refused(capfd, data)
+
+
+COLMAP_BINARY = {
+    "cameras truncated": ("cameras.bin", lambda content: content[:20], "cameras.bin"),
+    "cameras empty": ("cameras.bin", lambda content: b"", "empty"),
+    "huge camera count": ("cameras.bin", lambda content: struct.pack("<Q", 2**60) + content[8:], "count"),
+    "huge image count": ("images.bin", lambda content: struct.pack("<Q", 2**63 + 5) + content[8:], "count"),
+    "huge point count": ("points3D.bin", lambda content: struct.pack("<Q", 2**40) + content[8:], "count"),
+    "unterminated name": (
+        "images.bin",
+        lambda content: content[: content.index(b"000.png")] + b"a" * 9000,
+        "no end within",
+    ),
+    "name leaves": ("images.bin", lambda content: content.replace(b"000.png", b"../etc/p"), "'..'"),
+    "images are a pickle": (
+        "images.bin",
+        lambda content: b"\x80\x04\x95" + b"cos\nsystem\n(S'id'\ntR." * 9,
+        "images.bin",
+    ),
+    "unknown camera model": (
+        "cameras.bin",
+        lambda content: content[:12] + struct.pack("<i", 77) + content[16:],
+        "77",
+    ),
+    "NaN pose": ("images.bin", lambda content: content[:12] + struct.pack("<d", float("nan")) + content[20:], "finite"),
+}
+
+
+@pytest.mark.parametrize("case", COLMAP_BINARY)
+def test_colmap_binary(binary, capfd, case):
+    name, change, words = COLMAP_BINARY[case]
+    path = binary / "sparse" / "0" / name
+    path.write_bytes(change(path.read_bytes()))
+    assert words in train_refused(capfd, binary)
+
+
+def _save_exr(path, pixels, **header):
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
+    with OpenEXR.File(header, {"RGB": pixels}) as file:
+        file.write(str(path))
+
+
+def _truth(data, value=None):
+    pixels = np.full((48, 64, 3), 0.5, np.float32)
+    if value is not None:
+        pixels[7, 3, 1] = value
+    (data / "hdr").mkdir(exist_ok=True)
+    _save_exr(data / "hdr" / "001.exr", pixels)
+    return data / "hdr" / "001.exr"
+
+
+def _huge_window(path):
+    """Corners of dataWindow and displayWindow, each an int32 after its name, type and length."""
+    content = bytearray(path.read_bytes())
+    for name in (b"dataWindow\0box2i\0", b"displayWindow\0box2i\0"):
+        start = content.index(name) + len(name) + 4
+        content[start : start + 16] = struct.pack("<4i", -(2**30), -(2**30), 2**30, 2**30)
+    path.write_bytes(content)
+
+
+PHOTOS = {
+    "empty": (lambda data: (data / "images" / "002.png").write_bytes(b""), "002.png"),
+    "truncated": (
+        lambda data: (data / "images" / "002.png").write_bytes((data / "images" / "002.png").read_bytes()[:900]),
+        "002.png",
+    ),
+    "a pickle": (lambda data: (data / "images" / "002.png").write_bytes(b"cos\nsystem\n(S'id'\ntR."), "002.png"),
+    "a bomb": (lambda data: (data / "images" / "002.png").write_bytes(png_bomb(100_000, 100_000)), "100000 x 100000"),
+    "a bomb of stated size": (lambda data: (data / "images" / "002.png").write_bytes(png_bomb(64, 48)), "002.png"),
+    "another size": (
+        lambda data: Image.new("RGB", (30, 40), "grey").save(data / "images" / "002.png"),
+        "30 x 40",
+    ),
+    "a mask of another size": (
+        lambda data: ((data / "masks").mkdir(), Image.new("L", (30, 40)).save(data / "masks" / "002.png")),
+        "30 x 40",
+    ),
+    "truth with NaN": (lambda data: _truth(data, np.nan), "x=3, y=7"),
+    "truth with infinity": (lambda data: _truth(data, np.inf), "x=3, y=7"),
+    "truth truncated": (lambda data: (path := _truth(data)).write_bytes(path.read_bytes()[:-100]), "001.exr"),
+    "truth empty": (lambda data: _truth(data).write_bytes(b""), "001.exr"),
+    "truth of huge windows": (lambda data: _huge_window(_truth(data)), "001.exr"),
+    "truth is no OpenEXR": (lambda data: _truth(data).write_bytes(b"\x76\x2f\x31\x01" + b"\xff" * 64), "001.exr"),
+    "no photos": (lambda data: [path.unlink() for path in (data / "images").iterdir()], "none of the model's 6"),
+}
+
+
+@pytest.mark.parametrize("case", PHOTOS)
+def test_photos(data, capfd, case):
+    change, words = PHOTOS[case]
+    change(data)
+    assert words in train_refused(capfd, data)
+
+
+@pytest.mark.parametrize("value", [0, 255])
+def test_photos_that_show_nothing(data, capfd, value):
+    for path in (data / "images").iterdir():
+        Image.new("RGB", (64, 48), (value,) * 3).save(path)
+    assert "100.0 %" in train_refused(capfd, data)
+
+
+def test_photos_of_noise_have_no_poses(tmp_path, capfd):
+    (tmp_path / "noise").mkdir()
+    for i in range(3):
+        noise = np.random.default_rng(i).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(tmp_path / "noise" / f"{i}.png")
+    line = train_refused(capfd, tmp_path / "noise")
+    assert "none of the 3 photos could be placed" in line
+    assert [path.name for path in tmp_path.iterdir()] == ["noise"]
+
+
+EXPOSURES = {
+    "zero": '{"000.png": 0, "001.png": 1}',
+    "negative": '{"000.png": -1}',
+    "NaN": '{"000.png": NaN}',
+    "huge": '{"000.png": 1e999}',
+    "words": '{"000.png": "soon"}',
+    "absent for one": '{"000.png": 1, "001.png": 1}',
+    "not JSON": "{",
+    "nested": "[" * 100_000,
+    "a number": "3",
+    "empty": "",
+}
+
+
+@pytest.mark.parametrize("case", EXPOSURES)
+def test_exposure_times(data, capfd, case):
+    (data / "exposures.json").write_text(EXPOSURES[case])
+    line = train_refused(capfd, data)
+    assert "exposures.json" in line or "exposure time" in line
+
+
+def test_exposure_time_of_zero_in_exif(tmp_path, capfd):
+    from PIL.TiffImagePlugin import IFDRational
+
+    write_colmap(tmp_path / "data", name="{:03d}.jpg", exif={i: {33434: IFDRational(0, 1)} for i in range(6)})
+    assert "EXIF exposure time" in train_refused(capfd, tmp_path / "data")
+
+
+def test_exposure_index_that_is_not_there(data, capfd):
+    assert "exposure index 3" in train_refused(capfd, data, "--exposure-index", "3")
+
+
+TRANSFORMS = {
+    "empty": "",
+    "not JSON": "{",
+    "a list": "[]",
+    "nested": '{"frames": ' + "[" * 100_000,
+    "no frames": '{"frames": []}',
+    "frames are numbers": '{"frames": [1, 2]}',
+    "path leaves": '{"camera_angle_x": 1, "frames": [{"file_path": "../../etc/passwd", "transform_matrix": []}]}',
+    "path is a number": '{"camera_angle_x": 1, "frames": [{"file_path": 7}]}',
+    "no matrix": '{"camera_angle_x": 1, "frames": [{"file_path": "images/r_0"}]}',
+}
+
+
+@pytest.mark.parametrize("case", TRANSFORMS)
+def test_transforms(frames, capfd, case):
+    (frames / "transforms.json").write_text(TRANSFORMS[case])
+    assert "transforms.json" in train_refused(capfd, frames)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e300, "x", None])
+def test_pose_values(frames, capfd, value):
+    values = json.loads((frames / "transforms.json").read_text())
+    values["frames"][2]["transform_matrix"][0][3] = value
+    (frames / "transforms.json").write_text(json.dumps(values))
+    assert "r_2" in train_refused(capfd, frames)
+
+
+PLY_HEADER = "ply\nformat binary_little_endian 1.0\nelement vertex {}\n" + "".join(
+    f"property float {axis}\n" for axis in "xyz"
+)
+PLY = {
+    "absurd count": PLY_HEADER.format(10**15).encode() + b"end_header\n" + b"\0" * 24,
+    "negative count": PLY_HEADER.format(-4).encode() + b"end_header\n",
+    "truncated": PLY_HEADER.format(9).encode() + b"end_header\n" + b"\0" * 24,
+    "no end": PLY_HEADER.format(9).encode(),
+    "not PLY": b"\x80\x04 no points here",
+    "a list of absurd length": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list int float x\nend_header\n"
+    b"2000000000 1\n",
+}
+
+
+@pytest.mark.parametrize("case", PLY)
+def test_points_of_a_ply_file(frames, capfd, case):
+    values = json.loads((frames / "transforms.json").read_text()) | {"ply_file_path": "points.ply"}
+    (frames / "transforms.json").write_text(json.dumps(values))
+    (frames / "points.ply").write_bytes(PLY[case])
+    assert "points.ply" in train_refused(capfd, frames)
+
+
+# ------------------------------------------------------------------------------------------------ flags and configs
+
+
+CONFIGS = {
+    "not TOML": ("= 3", "not valid TOML"),
+    "unknown table": ("[speed]\nfast = true", "speed"),
+    "unknown field": ("[schedule]\niteration = 3", "schedule.iteration"),
+    "wrong type": ('[schedule]\niterations = "many"', "schedule.iterations"),
+    "a table for a number": ("[seed]\na = 1", "seed"),
+    "a number for a table": ("schedule = 3", "schedule"),
+    "NaN": ("[loss]\nlinear_weight = nan", "loss.linear_weight"),
+    "infinite": ("[optimizer]\nmeans = inf", "optimizer.means"),
+    "out of range": ("[schedule]\niterations = 0", "schedule.iterations"),
+    "huge number": ("[schedule]\niterations = 99999999999999999999", "schedule.iterations"),
+    "unknown base": ('base = "fastest"', "fastest"),
+    "its own base": ('base = "config.toml"', "base"),
+    "nested": ("a = " + "[" * 100_000, "config.toml"),
+    "deep key": (".".join("a" * 5000) + " = 1", "config.toml"),
+    "binary": ("\x80\x04\xff", "config.toml"),
+}
+
+
+@pytest.mark.parametrize("case", CONFIGS)
+def test_configs(data, tmp_path, capfd, case):
+    text, words = CONFIGS[case]
+    (tmp_path / "config.toml").write_text(text, encoding="latin-1")
+    assert words in train_refused(capfd, data, "--preset", tmp_path / "config.toml")
+
+
+RESPONSES = {
+    "unknown": ("kodak", None, "kodak"),
+    "no number": ("gamma-x", None, "gamma-x"),
+    "gamma zero": ("gamma-0", None, "gamma-0"),
+    "gamma infinite": ("gamma-inf", None, "gamma-inf"),
+    "unknown encoding": ("colour:Kodachrome", None, "Kodachrome"),
+    "falling": ("curve.csv", "0 1\n0.5 0.5\n1 0\n", "curve.csv"),
+    "NaN": ("curve.csv", "0 0\n0.5 nan\n1 1\n", "curve.csv"),
+    "empty": ("curve.csv", "", "curve.csv"),
+    "codes": ("curve.csv", "0 0\n0.5 128\n1 255\n", "curve.csv"),
+    "JSON of another kind": ("curve.json", '{"kind": "spline"}', "curve.json"),
+    "JSON of a damaged kind": ("curve.json", '{"kind": "table"}', "curve.json"),
+    "JSON of a wrong kind": ("curve.json", '{"kind": ["table"]}', "curve.json"),
+    "pickle": ("curve.mat", "cos\nsystem\n(S'id'\ntR.", "curve.mat"),
+    "pickled array": ("curve.npy", "\x93NUMPY\x01\x00", "curve.npy"),
+}
+
+
+@pytest.mark.parametrize("case", RESPONSES)
+def test_responses(data, tmp_path, capfd, monkeypatch, case):
+    name, content, words = RESPONSES[case]
+    monkeypatch.chdir(tmp_path)
+    if content is not None:
+        (tmp_path / name).write_text(content, encoding="latin-1")
+    assert words in train_refused(capfd, data, "--response", name)
+
+
+@pytest.mark.parametrize(
+    "flags, words",
+    [
+        (("--max-size", "0"), "0 pixels"),
+        (("--max-size", "-5"), "-5"),
+        (("--iterations", "-1"), "iterations"),
+        (("--seed", "-1"), "seed"),
+        (("--device", "tpu"), "tpu"),
+        (("--device", "meta"), "meta"),
+        (("--device", "cuda:99"), "cuda:99"),
+        (("--preset", "."), "."),
+    ],
+)
+def test_flags(data, capfd, flags, words):
+    assert words in train_refused(capfd, data, *flags)
+
+
+def test_tiny_photos(data, capfd):
+    """Photos reduced to single pixels cannot be compared; they must not crash either."""
+    out = data.parent / "run"
+    status = call("train", data, "--out", out, "--iterations", "2", "--device", "cpu", "--max-size", "1")
+    if status:
+        error_line(capfd)
