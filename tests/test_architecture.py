@@ -31,7 +31,8 @@ ALLOWED = {
     },
     "output": {"errors", "scene"},
     "evaluation": {"errors", "scene", "splatting"},
-    "bench": {"errors", "kernels", "scene", "splatting", "model", "training", "output", "evaluation"},
+    "synth": {"errors", "scene", "model", "output"},
+    "bench": {"errors", "synth", "kernels", "scene", "splatting", "model", "training", "output", "evaluation"},
 }
 # Packages that only some rooms may import.
 ONLY_IN = {
