@@ -5,13 +5,57 @@ from torch import Tensor
 
 from ..model.gaussians import PARAMETER_NAMES
 from ..model.radiance_field import RadianceField
+from ..splatting.adam import adam_step
 from .config import Config
 
 EPSILON = 1e-15
 """3DGS: gradients of a single Gaussian are tiny, and must not drown in Adam's usual 1e-8."""
 
 
-def make_optimizer(field: RadianceField, config: Config, extent: float) -> torch.optim.Adam:
+class Adam(torch.optim.Adam):
+    """torch's Adam with the steps of a GPU's parameters made by our kernel: the same numbers and the same state.
+
+    found_inf: scalar tensor, 1 where the next step is to change nothing; the attribute of torch's gradient scaler.
+    """
+
+    def step(self) -> None:
+        parameters = [p for group in self.param_groups for p in group["params"] if p.grad is not None]
+        if all(p.device.type == "cpu" for p in parameters):
+            super().step()
+            return
+        skipped = getattr(self, "found_inf", None)
+        if skipped is None:
+            skipped = parameters[0].new_zeros(())
+        for parameter in parameters:
+            if not self.state[parameter]:
+                self.state[parameter] = {
+                    "step": torch.zeros((), device=parameter.device),
+                    "exp_avg": torch.zeros_like(parameter, memory_format=torch.contiguous_format),
+                    "exp_avg_sq": torch.zeros_like(parameter, memory_format=torch.contiguous_format),
+                }
+        torch._foreach_add_([self.state[p]["step"] for p in parameters], 1 - skipped)
+        one = torch.ones_like(skipped)
+        for group in self.param_groups:
+            rate = group["lr"]
+            for parameter in group["params"]:
+                if parameter.grad is None:
+                    continue
+                state = self.state[parameter]
+                adam_step(
+                    parameter.detach(),
+                    parameter.grad.contiguous(),
+                    state["exp_avg"],
+                    state["exp_avg_sq"],
+                    state["step"],
+                    skipped,
+                    rate=rate if isinstance(rate, Tensor) else one,
+                    rate_factor=1.0 if isinstance(rate, Tensor) else rate,
+                    betas=group["betas"],
+                    epsilon=group["eps"],
+                )
+
+
+def make_optimizer(field: RadianceField, config: Config, extent: float) -> Adam:
     """One parameter group, with its name, for each parameter of the Gaussians and one for the fusion.
 
     On a GPU its steps can be recorded in a CUDA graph: counters and the rate of the positions live on the device.
@@ -24,7 +68,7 @@ def make_optimizer(field: RadianceField, config: Config, extent: float) -> torch
         groups.append({"name": "fusion", "params": list(field.fusion.parameters()), "lr": config.optimizer.fusion})
     if device.type == "cuda":
         groups[0]["lr"] = torch.tensor(groups[0]["lr"], device=device)
-    return torch.optim.Adam(groups, eps=EPSILON, fused=True, capturable=device.type == "cuda")
+    return Adam(groups, eps=EPSILON, fused=True, capturable=device.type == "cuda")
 
 
 def means_rate(config: Config, extent: float, iteration: int) -> float:
@@ -53,7 +97,7 @@ def guarded_step(optimizer: torch.optim.Adam, loss: Tensor, incomplete: Tensor |
     norms = torch._foreach_norm(gradients)
     nonfinite = (~torch.isfinite(torch.stack([loss.detach(), *norms])).all()).float()
     skipped = nonfinite if incomplete is None else torch.maximum(nonfinite, incomplete.float())
-    # The hook of torch's gradient scaler: the fused kernel leaves parameters, moments and step count where it is 1.
+    # The hook of torch's gradient scaler: parameters, moments and step count stay as they are where it is 1.
     optimizer.found_inf = skipped
     optimizer.step()
     return nonfinite, skipped
