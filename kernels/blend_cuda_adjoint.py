@@ -20,7 +20,7 @@ ROWS = 4
 
 
 @cache
-def backward_kernel(dtype, channels: int):
+def backward_kernel(dtype, channels: int, fast_math: bool = True):
     """blend_backward over tiles x BLOCKS_PER_TILE x 32 threads.
 
     As blend_cuda.forward_kernel, and image_gradient: [H W] vectors of C; alpha_gradient: [H W];
@@ -40,7 +40,7 @@ def backward_kernel(dtype, channels: int):
         enable_backward=False,
         launch_bounds=BLOCK_DIM,
         grid_stride=False,
-        module_options=module_options(dtype),
+        module_options=module_options(dtype, fast_math),
     )
     def blend_backward(
         ranges: wp.array(dtype=wp.vec2i),

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from .blend_style import DEFAULT_STYLE, BlendStyle
 from .blending_cpu import blend_on_cpu
 from .blending_cuda import blend_on_cuda
 from .bridge import differentiable
@@ -21,6 +22,7 @@ def blend(
     height: int,
     alpha_threshold: float,
     block_kernels: bool | None = None,
+    style: BlendStyle = DEFAULT_STYLE,
 ):
     """Blend features [N, C] over the tile lists: image [H, W, C] and alpha [H, W].
 
@@ -28,33 +30,24 @@ def blend(
     decided by the lists and by alpha_threshold, and taken as given in the derivative.
 
     block_kernels: use the CUDA kernels; None means on CUDA only. On the CPU they need wp.config.enable_cpu_blocks and
-    serve tests.
+    serve tests. style: what trades accuracy for speed beside the threshold.
     """
-    inputs = {
-        "means2d": program.read(means2d),
-        "conics": program.read(conics),
-        "opacities": program.read(opacities),
-        "features": program.read(features),
-    }
-    image = program.write((height, width, features.shape[1]), features.dtype)
+    gradients = [program.hand_over(tensor) for tensor in (features, conics, means2d, opacities)]
+    channels = features.shape[1]
+    image = program.write((height, width, channels), features.dtype)
     alpha = program.write((height, width), features.dtype)
     on_blocks = not program.is_cpu if block_kernels is None else block_kernels
     backend = blend_on_cuda if on_blocks else blend_on_cpu
-    backward = backend(program.device, features, lists, program.tensor(image), program.tensor(alpha), alpha_threshold)
+    backward = backend(
+        program.device, features, lists, program.tensor(image), program.tensor(alpha), alpha_threshold, style
+    )
 
     def adjoint():
         """backward() gives [N, C + 6]: by feature, conic a b c, x, y, opacity."""
         gathered = backward(wp.to_torch(image.grad, requires_grad=False), wp.to_torch(alpha.grad, requires_grad=False))
-        channels = features.shape[1]
-        columns = {
-            "features": gathered[:, :channels],
-            "conics": gathered[:, channels : channels + 3],
-            "means2d": gathered[:, channels + 3 : channels + 5],
-            "opacities": gathered[:, channels + 5],
-        }
-        for name, gradient in columns.items():
-            if inputs[name].grad is not None:
-                wp.to_torch(inputs[name].grad, requires_grad=False).add_(gradient)
+        parts = gathered.split((channels, 3, 2, 1), dim=1)
+        for gradient, part in zip(gradients, (*parts[:3], parts[3][:, 0]), strict=True):
+            gradient.value = part if gradient.wanted else None
 
     program.record_adjoint(adjoint)
     return image, alpha

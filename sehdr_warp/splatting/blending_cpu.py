@@ -11,10 +11,11 @@ from ..kernels.constants import TILE_SIZE
 from ..kernels.geometry import vector
 from . import threads
 from .arrays import view, warp_scalar
+from .blend_style import BlendStyle
 from .tile_lists import TileLists
 
 
-def blend_on_cpu(device, features, lists: TileLists, image, alpha, alpha_threshold: float):
+def blend_on_cpu(device, features, lists: TileLists, image, alpha, alpha_threshold: float, style: BlendStyle):
     """Fill image [H, W, C] and alpha [H, W]; return the backward pass.
 
     It takes the gradients of image and alpha and gives [N, C + 6]: by feature, conic a b c, x, y, opacity.
@@ -22,6 +23,7 @@ def blend_on_cpu(device, features, lists: TileLists, image, alpha, alpha_thresho
     scalar = warp_scalar(features.dtype)
     height, width, channels = image.shape
     halvings = exponent_halvings(alpha_threshold)
+    degree = style.exponential_degree
     row, vec4 = vector(TILE_SIZE, scalar), vector(4, scalar)
     tile_count = lists.columns * lists.rows
 
@@ -36,7 +38,7 @@ def blend_on_cpu(device, features, lists: TileLists, image, alpha, alpha_thresho
     frame = [lists.columns, width, height, alpha_threshold, iota]
     transmittance, last = rows(TILE_SIZE), rows(TILE_SIZE)
     threads.launch_ranges(
-        blend_cpu.forward_kernel(scalar, channels, halvings),
+        blend_cpu.forward_kernel(scalar, channels, halvings, style.transmittance_min, degree),
         pieces,
         [
             ranges,
@@ -56,7 +58,7 @@ def blend_on_cpu(device, features, lists: TileLists, image, alpha, alpha_thresho
     def backward(image_gradient: torch.Tensor, alpha_gradient: torch.Tensor) -> torch.Tensor:
         entry_gradients = features.new_empty(lists.entry_count, channels + 6)
         threads.launch_ranges(
-            blend_cpu.backward_kernel(scalar, channels, halvings),
+            blend_cpu.backward_kernel(scalar, channels, halvings, degree),
             pieces,
             [
                 ranges,

@@ -6,10 +6,11 @@ import warp as wp
 from ..kernels import blend_cuda, blend_cuda_adjoint
 from ..kernels.geometry import vector
 from .arrays import view, warp_scalar
+from .blend_style import BlendStyle
 from .tile_lists import TileLists
 
 
-def blend_on_cuda(device, features, lists: TileLists, image, alpha, alpha_threshold: float):
+def blend_on_cuda(device, features, lists: TileLists, image, alpha, alpha_threshold: float, style: BlendStyle):
     """Fill image [H, W, C] and alpha [H, W]; return the backward pass.
 
     It takes the gradients of image and alpha and gives [N, C + 6]: by feature, conic a b c, x, y, opacity.
@@ -48,7 +49,7 @@ def blend_on_cuda(device, features, lists: TileLists, image, alpha, alpha_thresh
         )
 
     launch(
-        blend_cuda.forward_kernel(scalar, channels),
+        blend_cuda.forward_kernel(scalar, channels, style.transmittance_min, style.fast_math),
         blend_cuda.BLOCKS_PER_TILE,
         [pixels(image), view(alpha.view(-1)), view(transmittance), view(last)],
     )
@@ -56,7 +57,7 @@ def blend_on_cuda(device, features, lists: TileLists, image, alpha, alpha_thresh
     def backward(image_gradient: torch.Tensor, alpha_gradient: torch.Tensor) -> torch.Tensor:
         gathered = features.new_zeros(features.shape[0], channels + 6)
         launch(
-            blend_cuda_adjoint.backward_kernel(scalar, channels),
+            blend_cuda_adjoint.backward_kernel(scalar, channels, style.fast_math),
             blend_cuda_adjoint.BLOCKS_PER_TILE,
             [
                 view(transmittance),

@@ -68,7 +68,10 @@ def project_reference(
     return means2d, conics, centre[:, 2], opacities, torch.where(usable[:, None], extents, 0.0)
 
 
-def blend_reference(means2d, conics, opacities, features, depths, extents, width, height, alpha_threshold):
+def blend_reference(
+    means2d, conics, opacities, features, depths, extents, width, height, alpha_threshold,
+    transmittance_min=TRANSMITTANCE_MIN,
+):
     """Front-to-back blending in torch: image [H, W, C] and alpha [H, W]."""
     device, dtype = means2d.device, means2d.dtype
     image_rows, alpha_rows = [], []
@@ -94,7 +97,7 @@ def blend_reference(means2d, conics, opacities, features, depths, extents, width
             value = torch.where(value > alpha_threshold, value, 0.0)
             # A pixel stops before its transmittance would fall to the limit, so later Gaussians count nothing there.
             running = torch.cumprod(1 - value, 0)
-            value = torch.where(running > TRANSMITTANCE_MIN, value, 0.0)
+            value = torch.where(running > transmittance_min, value, 0.0)
             after = torch.cumprod(1 - value, 0)
             before = torch.cat([torch.ones_like(after[:1]), after[:-1]]) if len(here) else after
             tile = torch.einsum("gp,gc->pc", value * before, features[here])
@@ -109,13 +112,17 @@ def blend_reference(means2d, conics, opacities, features, depths, extents, width
 def rasterize_reference(
     means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics, width, height,
     *, near=NEAR, low_pass=LOW_PASS, alpha_threshold=ALPHA_THRESHOLD, antialiased=False,
+    transmittance_min=TRANSMITTANCE_MIN,
 ) -> Rendering:
-    """rasterize() in plain torch, for float64 truth and for comparison; same arguments, same result."""
+    """rasterize() in plain torch, for float64 truth and for comparison; same arguments, same result.
+
+    transmittance_min: a pixel is finished before its transmittance would fall to this value; 0 never stops.
+    """
     means2d, conics, depths, opacities, extents = project_reference(
         means, log_scales, quaternions, opacities, world_to_camera, intrinsics, width, height, near, low_pass,
         alpha_threshold, antialiased,
     )
     image, alpha = blend_reference(
-        means2d, conics, opacities, features, depths, extents, width, height, alpha_threshold
+        means2d, conics, opacities, features, depths, extents, width, height, alpha_threshold, transmittance_min
     )
     return Rendering(image, alpha, means2d, depths, extents.amax(1), 0)
