@@ -20,12 +20,17 @@ ROWS = 4
 
 
 @cache
-def backward_kernel(dtype, channels: int, fast_math: bool = True):
+def backward_kernel(dtype, channels: int, fast_math: bool = True, ordered: bool = False):
     """blend_backward over tiles x BLOCKS_PER_TILE x 32 threads.
 
     As blend_cuda.forward_kernel, and image_gradient: [H W] vectors of C; alpha_gradient: [H W];
     rows: ROWS and gradient_count: C + 6, as arguments so that their loops stay loops;
     gradients: [N (C + 6)], flat rows (features, conic a b c, x, y, opacity), added to
+
+    ordered: the same sums in the same order every time. One launch over tiles x 32 threads for each `corner`, one of the
+    BLOCKS_PER_TILE rectangles of a tile: within it a row of gradients has one writer. rows_of: [M] the row of each entry,
+    gradients: [M (C + 6)], to be gathered by Gaussian. Unordered, neither is read: the rows are the Gaussians', and
+    atomics add to them in whatever order the GPU finishes.
     """
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4
@@ -58,13 +63,19 @@ def backward_kernel(dtype, channels: int, fast_math: bool = True):
         alpha_gradient: wp.array(dtype=real),
         rows: int,
         gradient_count: int,
+        only_corner: int,
+        rows_of: wp.array(dtype=wp.int32),
         gradients: wp.array(dtype=real),
     ):
         thread = wp.tid()
         block = thread >> 5
         lane = thread & 31
-        tile = block // wp.static(BLOCKS_PER_TILE)
-        corner = block - tile * wp.static(BLOCKS_PER_TILE)
+        if wp.static(ordered):
+            tile = block
+            corner = only_corner
+        else:
+            tile = block // wp.static(BLOCKS_PER_TILE)
+            corner = block - tile * wp.static(BLOCKS_PER_TILE)
         tile_row = tile // columns
         left = (tile - tile_row * columns) * wp.static(TILE_SIZE) + (corner % wp.static(blocks_across)) * 8
         top = tile_row * wp.static(TILE_SIZE) + (corner // wp.static(blocks_across)) * 4
@@ -243,7 +254,11 @@ def backward_kernel(dtype, channels: int, fast_math: bool = True):
                     entry = wp.tile_extract(queue_entry, owner)
                     value = wp.tile_extract(staging, owner, part)
                     if owner < ready:
-                        wp.atomic_add(gradients, entry[0] * wp.static(gradient_columns) + part, value)
+                        if wp.static(ordered):
+                            place_of = rows_of[begin + entry[1]] * wp.static(gradient_columns) + part
+                            gradients[place_of] = gradients[place_of] + value
+                        else:
+                            wp.atomic_add(gradients, entry[0] * wp.static(gradient_columns) + part, value)
 
                 queued = queued - ready
                 keep = lane < queued

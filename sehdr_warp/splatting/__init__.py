@@ -1,5 +1,6 @@
 """torch <-> Warp: differentiable splatting and the bridge that makes torch operations of Warp programs."""
 
+from .blend_style import BlendStyle
 from .bridge import Program, differentiable
 from .harmonics import spherical_harmonics
 from .neighbours import nearest_neighbour_distances
@@ -8,6 +9,7 @@ from .recording import GraphRecorder
 from .ssim import ssim, ssim_map
 
 __all__ = [
+    "BlendStyle",
     "GraphRecorder",
     "Program",
     "Rendering",

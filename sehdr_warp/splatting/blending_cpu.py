@@ -12,6 +12,7 @@ from ..kernels.geometry import vector
 from . import threads
 from .arrays import view, warp_scalar
 from .blend_style import BlendStyle
+from .gathering import gather_by_gaussian
 from .tile_lists import TileLists
 
 
@@ -79,20 +80,7 @@ def blend_on_cpu(device, features, lists: TileLists, image, alpha, alpha_thresho
             ],
             device,
         )
-        gathered = features.new_empty(features.shape[0], channels + 6)
-        threads.launch_ranges(
-            blend_cpu.gather_kernel(scalar),
-            threads.even_ranges(features.shape[0]),
-            [
-                view(lists.order),
-                view(lists.ends.clamp(0, lists.entry_count)),  # beyond a capacity there are no rows
-                view(entry_gradients),
-                channels + 6,
-                view(gathered),
-            ],
-            device,
-        )
-        return gathered
+        return gather_by_gaussian(lists, entry_gradients)
 
     return backward
 

@@ -7,6 +7,7 @@ from ..kernels import blend_cuda, blend_cuda_adjoint
 from ..kernels.geometry import vector
 from .arrays import view, warp_scalar
 from .blend_style import BlendStyle
+from .gathering import gather_by_gaussian
 from .tile_lists import TileLists
 
 
@@ -54,11 +55,10 @@ def blend_on_cuda(device, features, lists: TileLists, image, alpha, alpha_thresh
         [pixels(image), view(alpha.view(-1)), view(transmittance), view(last)],
     )
 
-    def backward(image_gradient: torch.Tensor, alpha_gradient: torch.Tensor) -> torch.Tensor:
-        gathered = features.new_zeros(features.shape[0], channels + 6)
+    def add_gradients(kernel, blocks_per_tile, image_gradient, alpha_gradient, corner, rows_of, gradients):
         launch(
-            blend_cuda_adjoint.backward_kernel(scalar, channels, style.fast_math),
-            blend_cuda_adjoint.BLOCKS_PER_TILE,
+            kernel,
+            blocks_per_tile,
             [
                 view(transmittance),
                 view(last),
@@ -66,9 +66,22 @@ def blend_on_cuda(device, features, lists: TileLists, image, alpha, alpha_thresh
                 view(alpha_gradient.view(-1)),
                 blend_cuda_adjoint.ROWS,
                 channels + 6,
-                view(gathered.view(-1)),
+                corner,
+                view(rows_of),
+                view(gradients.view(-1)),
             ],
         )
-        return gathered
+
+    def backward(image_gradient: torch.Tensor, alpha_gradient: torch.Tensor) -> torch.Tensor:
+        kernel = blend_cuda_adjoint.backward_kernel(scalar, channels, style.fast_math, style.deterministic)
+        corners = blend_cuda_adjoint.BLOCKS_PER_TILE
+        if not style.deterministic:
+            gathered = features.new_zeros(features.shape[0], channels + 6)
+            add_gradients(kernel, corners, image_gradient, alpha_gradient, 0, lists.gaussians, gathered)
+            return gathered
+        by_entry = features.new_zeros(lists.entry_count, channels + 6)
+        for corner in range(corners):
+            add_gradients(kernel, 1, image_gradient, alpha_gradient, corner, lists.emission, by_entry)
+        return gather_by_gaussian(lists, by_entry)
 
     return backward

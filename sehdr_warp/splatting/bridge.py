@@ -36,6 +36,14 @@ with silent_stderr():
     wp.init()
 
 
+class HandedGradient:
+    """Where a hand-written adjoint leaves the whole gradient of one tensor. wanted: whether anyone asks for it."""
+
+    def __init__(self):
+        self.wanted = False
+        self.value: torch.Tensor | None = None
+
+
 class Program:
     """What a program sees while it runs: arrays over torch memory, and a tape that takes its launches."""
 
@@ -45,6 +53,7 @@ class Program:
         self.tape = wp.Tape() if recording else None
         self.inputs: list[tuple[torch.Tensor, wp.array]] = []
         self.outputs: dict[int, tuple[torch.Tensor, wp.array, bool]] = {}
+        self.handed: list[tuple[torch.Tensor, HandedGradient]] = []
 
     @property
     def is_cpu(self) -> bool:
@@ -59,6 +68,13 @@ class Program:
         array = _array(tensor, dtype)
         self.inputs.append((tensor, array))
         return array
+
+    def hand_over(self, tensor: torch.Tensor) -> HandedGradient:
+        """For an input whose gradient record_adjoint()'s function makes as one tensor (any strides): nothing is zeroed
+        and nothing added to. It sets .value where .wanted."""
+        gradient = HandedGradient()
+        self.handed.append((tensor, gradient))
+        return gradient
 
     def write(self, shape, dtype, *, zero: bool = False, differentiable: bool = True) -> wp.array:
         """A new array over torch memory. `shape` is the tensor's, with the components of a vector dtype last."""
@@ -121,7 +137,8 @@ class Program:
         self.tape.record_func(adjoint, arrays=[])
 
     def record_adjoint(self, adjoint) -> None:
-        """Put a hand-written adjoint on the tape: it reads .grad of what was written, adds to .grad of what was read.
+        """Put a hand-written adjoint on the tape: it reads .grad of what was written, adds to .grad of what was read and
+        sets what hand_over() gave.
 
         .grad of an array is None where no gradient is asked for.
         """
@@ -173,19 +190,28 @@ class _ProgramFunction(torch.autograd.Function):
                 if not program.outputs[id(array)][2]:
                     continue
                 tensor = program.outputs[id(array)][0]
-                gradient = torch.zeros_like(tensor) if gradient is None else gradient.contiguous()
+                if gradient is None:
+                    gradient = torch.zeros_like(tensor)
+                elif gradient.stride() != tensor.stride():
+                    gradient = torch.empty_like(tensor).copy_(gradient)
                 array.grad = _array(gradient, array.dtype)
                 array.retain_grad = True  # the gradient is torch's: adjoint kernels must not clear it
             results = [None] * len(plain)
             by_memory = {}
+            handed = {id(tensor): gradient for tensor, gradient in program.handed}
             for position, (tensor, needed) in enumerate(zip(plain, ctx.needs_input_grad[2:], strict=True)):
-                if needed:
+                if id(tensor) in handed:
+                    handed[id(tensor)].wanted = needed
+                elif needed:
                     results[position] = torch.zeros_like(tensor, memory_format=torch.contiguous_format)
                     by_memory[id(tensor)] = results[position]
             for tensor, array in program.inputs:
                 if id(tensor) in by_memory:
                     array.grad = _array(by_memory[id(tensor)], array.dtype)
             program.tape.backward()
+            for position, tensor in enumerate(plain):
+                if id(tensor) in handed:
+                    results[position], handed[id(tensor)].value = handed[id(tensor)].value, None
         return (None, None, *results)
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 
 from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR
+from .blend_style import DEFAULT_STYLE, BlendStyle
 from .blending import blend
 from .projection import project
 from .tile_lists import LARGEST_CAPACITY, build_tile_lists
@@ -54,6 +55,7 @@ def rasterize(
     alpha_threshold: float = ALPHA_THRESHOLD,
     antialiased: bool = False,
     capacity: int | None = None,
+    style: BlendStyle = DEFAULT_STYLE,
 ) -> Rendering:
     """Splat Gaussians with any number of feature channels onto one camera's image plane (3DGS, Kerbl et al. 2023).
 
@@ -69,6 +71,7 @@ def rasterize(
     antialiased: keep a Gaussian's energy under the low pass by lowering its opacity.
     capacity: room for this many (Gaussian, tile) pairs, from 1. On a GPU nothing then waits for the device, so that the
         call can be part of a CUDA graph; Rendering.overflow says whether the room was enough.
+    style: what trades exactness and repeatability for speed; BlendStyle(deterministic=True) repeats bit for bit on a GPU.
 
     All tensors share one device (CPU or CUDA) and one dtype (float32 or float64). Differentiable with respect to
     every tensor, camera included. On the CPU results repeat bit for bit, whatever the number of threads.
@@ -93,6 +96,7 @@ def rasterize(
         height,
         alpha_threshold,
         capacity,
+        emission=means.device.type == "cpu" or style.deterministic,
     )
     image, alpha = blend(
         means2d,
@@ -103,6 +107,7 @@ def rasterize(
         width=width,
         height=height,
         alpha_threshold=alpha_threshold,
+        style=style,
     )
     return Rendering(image, alpha, means2d, depths, extents.amax(dim=1), lists.entry_count, lists.overflow)
 

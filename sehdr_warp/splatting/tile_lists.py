@@ -24,7 +24,8 @@ class TileLists:
     ends: [N] running number of entries, by place in `order`.
     ranges: [tiles, 2] first and one past the last entry of each tile.
     gaussians: [M] the Gaussian of each entry, by tile and then front to back.
-    emission: [M] the entry's position before the sort by tile: entries of one Gaussian are neighbours there.
+    emission: [M] the entry's position before the sort by tile: entries of one Gaussian are neighbours there. None
+        where it was not asked for.
     shapes: [N, 4] x, y, opacity, half-height; ellipses: [N, 4] conic a, b, c and the level where alpha meets the
         threshold.
     columns, rows: tiles across and down.
@@ -35,7 +36,7 @@ class TileLists:
     ends: torch.Tensor
     ranges: torch.Tensor
     gaussians: torch.Tensor
-    emission: torch.Tensor
+    emission: torch.Tensor | None
     shapes: torch.Tensor
     ellipses: torch.Tensor
     columns: int
@@ -59,12 +60,15 @@ def build_tile_lists(
     height: int,
     alpha_threshold: float,
     capacity: int | None = None,
+    *,
+    emission: bool = True,
 ) -> TileLists:
     """Order the projected Gaussians by depth and list, for each tile, those whose ellipse touches it.
 
     The arguments are project()'s results; nothing here is differentiable.
     capacity: room for this many entries. The host then never waits for the device to learn how many there are; entries
     beyond it are left out, and TileLists.overflow says so.
+    emission: also tell where entries came from, which adjoints need that sum by Gaussian in a fixed order.
     Raises SehdrError if the lists would need more than 2^31 - 1 entries.
     """
     columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
@@ -77,10 +81,9 @@ def build_tile_lists(
     room = _exact_room(int(total), order.shape[0], columns, rows) if capacity is None else capacity
     ends = counts.cumsum(0, dtype=torch.int32)
     tiles, gaussians = emit_entries(order, shapes, ellipses, extents, columns, rows, ends, room, capacity is not None)
-    tiles, emission = sort_by_tile(tiles, room, tile_count)
+    tiles, gaussians, places = sort_by_tile(tiles, gaussians, room, tile_count, emission)
     ranges = find_ranges(tiles, tile_count)
-    gaussians = gaussians[emission] if room else gaussians
-    return TileLists(order, ends, ranges, gaussians, emission, shapes, ellipses, columns, rows, overflow)
+    return TileLists(order, ends, ranges, gaussians, places, shapes, ellipses, columns, rows, overflow)
 
 
 def _exact_room(total: int, gaussian_count: int, columns: int, rows: int) -> int:
@@ -137,16 +140,16 @@ def count_entries(order, shapes, ellipses, extents, columns: int, rows: int):
 
 
 def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends, room: int, padded: bool):
-    """One entry for each tile that each Gaussian touches, front to back: tiles [2 room] and Gaussians [room].
+    """One entry for each tile that each Gaussian touches, front to back: tiles and Gaussians, each [2 room].
 
-    Only the first half of tiles is filled; the sort needs the rest. padded: there may be fewer entries than room, and
+    Only the first halves are filled; the sort needs the rest. padded: there may be fewer entries than room, and
     the unused ones belong to tile columns * rows.
     """
     tiles = torch.empty(2 * room, dtype=torch.int32, device=order.device)
-    gaussians = torch.empty(room, dtype=torch.int32, device=order.device)
+    gaussians = torch.empty(2 * room, dtype=torch.int32, device=order.device)
     if padded:
         tiles[:room] = columns * rows
-        gaussians.zero_()
+        gaussians[:room] = 0
     vec2, vec4 = vector(2, warp_scalar(shapes.dtype)), vector(4, warp_scalar(shapes.dtype))
     if room:
         _launch(
@@ -169,10 +172,17 @@ def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends
     return tiles, gaussians
 
 
-def sort_by_tile(tiles, entry_count: int, tile_count: int):
-    """Stable sort of the entries by tile: sorted tiles [M], and where each entry stood before [M]."""
-    emission = _sorted_places(tiles, entry_count, bits=tile_count.bit_length())
-    return tiles[:entry_count], emission
+def sort_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: bool):
+    """Stable sort of the entries by tile: tiles [M], Gaussians [M], and where each entry stood before [M] or None.
+
+    tiles, gaussians: as by emit_entries(); what is sorted is in the same memory.
+    """
+    bits = tile_count.bit_length()
+    if emission:
+        places = _sorted_places(tiles, entry_count, bits)
+        return tiles[:entry_count], gaussians[:entry_count][places] if entry_count else gaussians, places
+    _sort_pairs(tiles, gaussians, entry_count, bits)
+    return tiles[:entry_count], gaussians[:entry_count], None
 
 
 def find_ranges(tiles, tile_count: int):
@@ -188,10 +198,15 @@ def _sorted_places(keys, count: int, bits: int | None = None):
     """[count] int32 permutation that sorts keys[:count] (stable). keys has room for 2 count and is sorted in place."""
     places = torch.empty(2 * count, dtype=torch.int32, device=keys.device)
     torch.arange(count, dtype=torch.int32, device=keys.device, out=places[:count])
+    _sort_pairs(keys, places, count, bits)
+    return places[:count]
+
+
+def _sort_pairs(keys, values, count: int, bits: int | None) -> None:
+    """Sorts keys[:count] and values[:count] by the keys' lowest bits (stable); both have room for 2 count."""
     if count:
         with torch_stream(keys.device):
-            wp.utils.radix_sort_pairs(wp.from_torch(keys), wp.from_torch(places), count, end_bit=bits)
-    return places[:count]
+            wp.utils.radix_sort_pairs(wp.from_torch(keys), wp.from_torch(values), count, end_bit=bits)
 
 
 def _launch(kernel, count: int, arguments, device) -> None:

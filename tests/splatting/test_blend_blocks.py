@@ -4,6 +4,7 @@ import pytest
 import torch
 import warp as wp
 
+from sehdr_warp.splatting import BlendStyle
 from sehdr_warp.splatting.blending import blend
 from sehdr_warp.splatting.projection import project
 from sehdr_warp.splatting.reference import blend_reference
@@ -42,8 +43,8 @@ def fibers(monkeypatch):
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
-@pytest.mark.parametrize("channels", [1, 3, 9])
-def test_block_kernels_match_the_reference(fibers, dtype, channels):
+@pytest.mark.parametrize("channels, deterministic", [(1, False), (3, False), (3, True), (9, False)])
+def test_block_kernels_match_the_reference(fibers, dtype, channels, deterministic):
     # Enough overlap that queues spill over 32 and pixels finish early; a cut tile at the right and the bottom.
     scene = random_scene(count=600, channels=channels, width=44, height=26, spread=1.6, seed=2)
     threshold = 1.0 / 255.0
@@ -58,7 +59,7 @@ def test_block_kernels_match_the_reference(fibers, dtype, channels):
     def forward():
         return blend(
             *inputs, features, lists=lists, width=scene.width, height=scene.height, alpha_threshold=threshold,
-            block_kernels=True,
+            block_kernels=True, style=BlendStyle(deterministic=deterministic),
         )
 
     image, alpha = fibers(forward)
