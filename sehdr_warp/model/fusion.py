@@ -14,6 +14,7 @@ from torch import nn
 from torch.utils.checkpoint import checkpoint
 
 from ..errors import SehdrError
+from ..splatting.interpolation import interpolate
 from .exposure import bracket_log_radiance, exposure_times
 from .response_curve import Response
 
@@ -102,11 +103,12 @@ class NeuralExposureFusion(nn.Module):
 
     def _channel_mlps(self, features):
         """[n, N, 3] outputs of the three MLPs for features [n, N, 3, 2]."""
-        count, points = features.shape[:2]
-        values = features.permute(2, 0, 1, 3).reshape(3, count * points, 2)
+        # One product for each channel and bracket: the weights' gradients are sums over many points, which a GPU makes in
+        # parallel only across products.
+        values = features.permute(2, 0, 1, 3)
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            values = torch.baddbmm(bias, values.relu() if layer else values, weight)
-        return values.reshape(3, count, points).permute(1, 2, 0)
+            values = torch.matmul(values.relu() if layer else values, weight[:, None]) + bias[:, None]
+        return values[..., 0].permute(1, 2, 0)
 
     def _interpolate(self, log_base):
         """Catmull-Rom between the table's nodes; constant below them, a straight line in log radiance above."""
@@ -114,6 +116,8 @@ class NeuralExposureFusion(nn.Module):
         # One node more at either end gives every cell its four.
         grid = torch.arange(-1, self.nodes + 1, dtype=log_base.dtype, device=log_base.device) * step + self._low
         table = self._fuse(grid[:, None].expand(-1, 3))
+        if log_base.device.type == "cuda" and not torch.are_deterministic_algorithms_enabled():
+            return interpolate(table, self._low, step, log_base)
         position = ((log_base - self._low) / step).clamp_min(0.0)
         cell = position.detach().nan_to_num(0.0).clamp_max(self.nodes - 2).long()
         part = position - cell

@@ -1,0 +1,96 @@
+"""Catmull-Rom interpolation of tables of one variable, and its adjoint.
+
+A column of the table holds one function at equal steps, with one node more at either end. Below the first cell a
+function is constant, above the last one a straight line.
+"""
+
+import warp as wp
+
+from .geometry import vector
+
+COPIES = 32
+"""The adjoint adds to this many tables in turn, summed afterwards: on a GPU thousands of threads would otherwise wait
+for the few nodes that most values fall between."""
+
+_weights4 = vector(4, wp.float32)
+
+
+@wp.func
+def cell_of(position: float, last_cell: int) -> int:
+    cell = int(0)
+    if position > 0.0:  # not for NaN
+        cell = int(wp.min(position, float(last_cell)))
+    return cell
+
+
+@wp.func
+def node_weights(part: float) -> _weights4:
+    """Of the four nodes around a cell, for a place 0 <= part <= 1 within it, or beyond the last cell."""
+    t = wp.min(part, 1.0)
+    beyond = part - t
+    right_value = t * t * (3.0 - 2.0 * t)
+    left_slope = t * (1.0 + t * (t - 2.0))
+    right_slope = t * t * (t - 1.0) + beyond
+    return _weights4(
+        -0.5 * left_slope, 1.0 - right_value - 0.5 * right_slope, right_value + 0.5 * left_slope, 0.5 * right_slope
+    )
+
+
+@wp.func
+def weight_slopes(part: float) -> _weights4:
+    """Derivative of node_weights by part."""
+    t = wp.min(part, 1.0)
+    right_value = 6.0 * t * (1.0 - t)
+    left_slope = 1.0 + t * (3.0 * t - 4.0)
+    right_slope = t * (3.0 * t - 2.0)
+    return _weights4(
+        -0.5 * left_slope, -right_value - 0.5 * right_slope, right_value + 0.5 * left_slope, 0.5 * right_slope
+    )
+
+
+@wp.kernel(module="unique", module_options={"enable_backward": False})
+def interpolate(
+    table: wp.array2d(dtype=wp.float32),
+    low: float,
+    inverse_step: float,
+    positions: wp.array2d(dtype=wp.float32),
+    values: wp.array2d(dtype=wp.float32),
+):
+    """table: [nodes + 2, C], the node at `low` in row 1; positions, values: [N, C]."""
+    i, column = wp.tid()
+    position = wp.max((positions[i, column] - low) * inverse_step, 0.0)
+    cell = cell_of(position, table.shape[0] - 4)
+    weights = node_weights(position - float(cell))
+    value = float(0.0)
+    for node in range(4):
+        value += weights[node] * table[cell + node, column]
+    values[i, column] = wp.where(wp.isnan(positions[i, column]), positions[i, column], value)
+
+
+@wp.kernel(module="unique", module_options={"enable_backward": False})
+def interpolate_adjoint(
+    table: wp.array2d(dtype=wp.float32),
+    low: float,
+    inverse_step: float,
+    positions: wp.array2d(dtype=wp.float32),
+    value_gradients: wp.array2d(dtype=wp.float32),
+    position_gradients: wp.array2d(dtype=wp.float32),
+    table_gradients: wp.array3d(dtype=wp.float32),
+):
+    """table_gradients: [copies, nodes + 2, C], added to; the other gradients: [N, C]."""
+    i, column = wp.tid()
+    offset = (positions[i, column] - low) * inverse_step
+    position = wp.max(offset, 0.0)
+    cell = cell_of(position, table.shape[0] - 4)
+    part = position - float(cell)
+    weights = node_weights(part)
+    slopes = weight_slopes(part)
+    gradient = value_gradients[i, column]
+    slope = float(0.0)
+    copy = i % table_gradients.shape[0]
+    for node in range(4):
+        slope += slopes[node] * table[cell + node, column]
+        wp.atomic_add(table_gradients, copy, cell + node, column, weights[node] * gradient)
+    if offset < 0.0:
+        slope = float(0.0)
+    position_gradients[i, column] = wp.where(wp.isnan(offset), offset, gradient * slope * inverse_step)
