@@ -1,0 +1,114 @@
+"""A learned tone mapper in place of a camera response: one small perceptron for each channel, as in HDR-GS."""
+
+import math
+
+import numpy as np
+import torch
+from torch import nn
+
+from ..errors import SehdrError
+from .response_curve import HALF_CODE, Response
+
+EXPOSURE_FLOOR = 1e-6
+"""Added to exposures before the logarithm: black stays finite, and what is 100 times darker than 8-bit black in sRGB
+asks for nothing."""
+TABLE_RANGE, TABLE_NODES = (1e-6, 1e6), 8192
+"""Exposures between which decode() looks for a value, and how many it looks at."""
+
+
+class ToneMapper(nn.Module, Response, kind="mlp"):
+    """f_c(x) = sigmoid(MLP_c(log x)) for the channels c: exposure x = E dt to an encoded value, learned with the scene.
+
+    Source: HDR-GS (Cai et al., NeurIPS 2024): log exposure in, one hidden layer of 128 with ReLU, a sigmoid at the end,
+    weights as torch.nn.Linear starts them. Nothing makes the function increase, and nothing in photos of one exposure
+    tells its scale.
+
+    width: hidden units, at least 1; seed: of the start weights.
+
+    It is a Response whose tensors end in a dimension of three channels; all state is in state_dict(). encode and
+    encode_extended are the same and differentiable in exposure and weights; decode searches a table of the weights as
+    they are, on values made to increase, and is not differentiable.
+    """
+
+    name = "mlp"
+    black, peak, clip_exposure = 0.0, 1.0, math.inf
+    notes = ()
+
+    def __init__(self, width: int = 128, seed: int = 0):
+        super().__init__()
+        if not isinstance(width, int) or isinstance(width, bool) or width < 1:
+            raise SehdrError(f"tone mapper: width = {width!r} is not a number from 1")
+        self.width = width
+        generator = torch.Generator().manual_seed(seed)
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        for inputs, outputs in ((1, width), (width, 1)):
+            for parameters, rows in ((self.weights, inputs), (self.biases, 1)):
+                start = 2 * torch.rand(3, rows, outputs, generator=generator) - 1
+                parameters.append(nn.Parameter(start / math.sqrt(inputs)))
+
+    def encode(self, exposure):
+        """Encoded values in (0, 1) of exposures [..., 3]; a tensor for a tensor, else a NumPy array."""
+        if isinstance(exposure, torch.Tensor):
+            return self._of_log((exposure.clamp_min(0) + EXPOSURE_FLOOR).log())
+        return self._with_arrays(self.encode, exposure)
+
+    def encode_extended(self, exposure, *, slope: float | None = None):
+        """As encode: the sigmoid approaches 1 and leaves a gradient everywhere, so there is nothing to extend."""
+        return self.encode(exposure)
+
+    @torch.no_grad()
+    def decode(self, value):
+        """Exposures [..., 3] whose encoded values these are, within TABLE_RANGE."""
+        if not isinstance(value, torch.Tensor):
+            return self._with_arrays(self.decode, value)
+        low, high = (math.log(exposure) for exposure in TABLE_RANGE)
+        nodes = torch.linspace(low, high, TABLE_NODES, dtype=torch.float32, device=self.weights[0].device)
+        table = self._of_log(nodes[:, None].expand(-1, 3)).cummax(0).values.T.contiguous()
+        wanted = value.to(table).reshape(-1, 3).T.contiguous()
+        after = torch.searchsorted(table, wanted).clamp(1, TABLE_NODES - 1)
+        left, right = table.gather(1, after - 1), table.gather(1, after)
+        part = ((wanted - left) / (right - left).clamp_min(1e-12)).clamp(0, 1)
+        found = (nodes[after - 1] + part * (nodes[after] - nodes[after - 1])).exp()
+        return found.T.reshape(value.shape).to(value)
+
+    def slope(self, exposure):
+        """df/dx of encode, shaped like the exposures [..., 3]. Not differentiable itself."""
+        if not isinstance(exposure, torch.Tensor):
+            return self._with_arrays(self.slope, exposure)
+        with torch.enable_grad():
+            given = exposure.detach().requires_grad_()
+            return torch.autograd.grad(self.encode(given).sum(), given)[0]
+
+    @property
+    def white(self) -> float:
+        """The smallest exposure at which every channel is within half an 8-bit code of 1, within TABLE_RANGE."""
+        return float(self.decode(torch.full((1, 3), 1 - HALF_CODE)).max())
+
+    def to_dict(self) -> dict:
+        """What from_dict makes a mapper of this shape from; the weights are in state_dict()."""
+        return {"kind": "mlp", "width": self.width}
+
+    @classmethod
+    def _from_dict(cls, values):
+        return cls(values["width"])
+
+    def _of_log(self, log_exposure):
+        """Encoded values of log exposures [..., 3]."""
+        values = log_exposure.reshape(-1, 3).T[..., None]
+        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            values = torch.baddbmm(bias, values.relu() if layer else values, weight)
+        return values[..., 0].T.reshape(log_exposure.shape).sigmoid()
+
+    def _with_arrays(self, function, argument):
+        array = np.asarray(argument)
+        tensor = torch.tensor(array, dtype=torch.float32, device=self.weights[0].device)
+        with torch.no_grad():
+            return function(tensor).cpu().numpy().astype(array.dtype if array.dtype.kind == "f" else np.float64)
+
+    def _evaluate(self, exposure, with_slope):
+        return self.encode(exposure), self.slope(exposure) if with_slope else None
+
+    def _invert(self, value):
+        return self.decode(value)
+
+    __repr__ = Response.__repr__
