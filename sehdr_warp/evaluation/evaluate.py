@@ -9,6 +9,7 @@ import torch
 from ..errors import SehdrError
 from ..scene import Scene, View
 from . import metrics
+from .flip import load_flip
 from .lpips import BACKBONE, SMALLEST_EDGE, load_lpips
 from .protocols import PROTOCOLS, fit_scale, normalise, tone_map, tone_mapped_psnr
 
@@ -26,6 +27,7 @@ def evaluate(
     protocols: Sequence[str] = PROTOCOLS,
     peak_luminance: float = PEAK_LUMINANCE,
     white_percentile: float = 100.0,
+    flip: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> dict:
     """Render the scene's test views with a trained run and compare them with the photos and the HDR truth.
@@ -37,10 +39,12 @@ def evaluate(
         "split" says so.
     lpips_weights: folder, see load_lpips; protocols: names out of PROTOCOLS.
     peak_luminance, white_percentile: how PU21 maps the truth to cd/m^2, see pu21_metrics.
+    flip: also HDR-FLIP, under each protocol's scale, where flip-evaluator is installed; slow.
     progress: called with one line for each view.
 
     Returns plain values, ready for strict JSON (null in place of NaN and infinity):
-        "protocol": {name: {"psnr_mu", "ssim_mu", "lpips_mu", "views"}}; "aligned" also holds its "scale"
+        "protocol": {name: {"psnr_mu", "ssim_mu", "lpips_mu", "views"}}, with "hdr_flip" if it was asked for; "aligned"
+            also holds its "scale"
         "pu21": {name: {"psnr", "ssim"}, "peak_luminance", "white_percentile"}
         "ldr": {"psnr", "ssim", "lpips"} of the simulated photo at the view's exposure time, unquantised, against the photo
         "regions": {region: {"fraction", "psnr_ldr", "psnr_mu": {name: dB}}}, errors pooled over all views
@@ -52,11 +56,12 @@ def evaluate(
     Raises SehdrError for a scene without views, images that disagree with their camera, a render that is not finite
     or an unknown protocol; InputError for LPIPS weights that cannot be read.
     """
-    return _Evaluation(run, scene, lpips_weights, protocols, peak_luminance, white_percentile).result(progress)
+    evaluation = _Evaluation(run, scene, lpips_weights, protocols, peak_luminance, white_percentile, flip)
+    return evaluation.result(progress)
 
 
 class _Evaluation:
-    def __init__(self, run, scene, lpips_weights, names, peak_luminance, white_percentile):
+    def __init__(self, run, scene, lpips_weights, names, peak_luminance, white_percentile, flip):
         for name in names:
             if name not in PROTOCOLS:
                 raise SehdrError(f"protocol = {name!r} is unknown; choose from {', '.join(PROTOCOLS)}")
@@ -68,6 +73,8 @@ class _Evaluation:
             raise SehdrError(f"scene {scene.name!r} has no views to evaluate; check its splits and masks")
         self.device = torch.device(run.device)
         self.lpips, self.lpips_reason = load_lpips(lpips_weights, self.device)
+        self.with_flip = flip
+        self.flip, self.flip_reason = load_flip() if flip else (None, None)
         self.regions = {region: _RegionErrors(self.names) for region in metrics.REGIONS}
 
     def result(self, progress) -> dict:
@@ -84,11 +91,13 @@ class _Evaluation:
             reason = missing or (scale_reason if name == "aligned" else None)
             if reason:
                 hdr[name] = {"psnr_mu": None, "ssim_mu": None, "lpips_mu": None, "views": 0, "reason": reason}
+                hdr[name] |= {"hdr_flip": None} if self.with_flip else {}
                 pu21[name] = {"psnr": None, "ssim": None, "reason": reason}
                 continue
             hdr[name] = _mean([row["protocol"][name] for row in truths]) | {"views": len(truths)}
             pu21[name] = _mean([row["pu21"][name] for row in truths])
             self._explain(hdr[name], "lpips_mu")
+            hdr[name] |= {"flip_reason": self.flip_reason} if self.flip_reason else {}
         if "aligned" in hdr:
             hdr["aligned"]["scale"] = scale
         ldr = _mean([row["ldr"] for row in rows])
@@ -164,6 +173,8 @@ class _Evaluation:
             linear = normalise(name, hdr, truth, mask, scale=factor)
             linear = (_inside(linear[0], linear[1], mask), linear[1])
             row["pu21"][name] = metrics.pu21_metrics(*linear, mask, **self.pu21_mapping)
+            if self.with_flip:
+                row["protocol"][name]["hdr_flip"] = self.flip(*linear) if self.flip else None
             for region, weight in weights.items():
                 self.regions[region].add_hdr(name, *pair, weight)
         return row

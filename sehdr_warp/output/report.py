@@ -21,7 +21,7 @@ _DPI = 160
 _INK, _QUIET, _RULE = "#1f2328", "#6a737d", "#e1e4e8"
 # Two hues that the colour-blind tell apart (Okabe and Ito's blue and vermilion).
 _SERIES = (("psnr_ldr", "LDR", "#0072b2"), ("psnr_mu", "HDR (mu-law)", "#d55e00"))
-_STYLE = {
+STYLE = {
     "font.family": "sans-serif",
     "font.sans-serif": ["Inter", "Helvetica Neue", "Arial", "DejaVu Sans"],
     "font.size": 9,
@@ -31,6 +31,7 @@ _STYLE = {
     "ytick.color": _QUIET,
     "axes.edgecolor": _RULE,
 }
+"""How matplotlib draws all of the project's plots."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ def training_figure(metrics: Sequence[dict]):
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.2, 4.2), layout="constrained")
         figure.get_layout_engine().set(w_pad=0.12, h_pad=0.12)
         axes = figure.add_subplot()
@@ -159,7 +160,7 @@ def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, ce
     heights = [cell * row[0].shape[0] / row[0].shape[1] for row in rows]
     width = left + len(titles) * (cell + gap) - gap + edge
     height = top + sum(heights) + gap * (len(rows) - 1) + bottom
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(width, height))
         y = height - top
         for row, (pictures, name, row_height) in enumerate(zip(rows, names, heights, strict=True)):
