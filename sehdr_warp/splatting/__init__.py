@@ -5,6 +5,7 @@ from .bridge import Program, differentiable
 from .harmonics import spherical_harmonics
 from .neighbours import nearest_neighbour_distances
 from .rasterization import Rendering, rasterize
+from .recorded_rasterizer import RecordedRasterizer
 from .recording import GraphRecorder
 from .ssim import ssim, ssim_map
 
@@ -12,6 +13,7 @@ __all__ = [
     "BlendStyle",
     "GraphRecorder",
     "Program",
+    "RecordedRasterizer",
     "Rendering",
     "differentiable",
     "nearest_neighbour_distances",

@@ -6,11 +6,18 @@ long as the GPU. Recorded once and replayed, the GPU sets the pace.
 
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 
 import torch
 import warp as wp
 
 from .bridge import torch_stream
+
+
+@cache
+def _recording_stream(device: torch.device) -> torch.cuda.Stream:
+    """One for all recordings: torch runs a backward pass on its forward pass's stream, which must be the recorded one."""
+    return torch.cuda.Stream(device)
 
 
 class GraphRecorder:
@@ -30,7 +37,7 @@ class GraphRecorder:
         self._key = None
         self._graph: torch.cuda.CUDAGraph | None = None
         self._result = None
-        self._stream = torch.cuda.Stream(self.device)
+        self._stream = _recording_stream(self.device)
         self._pool = torch.cuda.graph_pool_handle()
         # Keeps the pool's memory between recordings: freed with the last graph of the pool, it would be allocated anew.
         self._anchor = self._record(lambda: torch.zeros(1, device=self.device))
@@ -48,9 +55,21 @@ class GraphRecorder:
         Raises RuntimeError if the function cannot be recorded.
         """
         if self._graph is None or key != self._key:
-            self.invalidate()
-            self._graph, self._result = self._record(function)
-            self._key = key
+            self.record(key, function)
+        return self.replay()
+
+    def record(self, key, function: Callable):
+        """Record `function` without playing it, in the place of any other recording; returns what will be its result.
+
+        Raises RuntimeError if the function cannot be recorded.
+        """
+        self.invalidate()
+        self._graph, self._result = self._record(function)
+        self._key = key
+        return self._result
+
+    def replay(self):
+        """Play the recording; returns its result."""
         self._graph.replay()
         return self._result
 
