@@ -12,11 +12,13 @@ from torch import Tensor, nn
 from ..scene import Camera
 from ..splatting import Rendering, rasterize, spherical_harmonics
 from .fusion import NeuralExposureFusion
-from .gaussians import Gaussians
+from .gaussians import HARMONIC_0, Gaussians
 from .response import Response
 
 EXPOSURE_FLOOR = 1e-6
 """Least exposure of a Gaussian with radiance "linear": keeps logarithms finite, 100 times below 8-bit black in sRGB."""
+RELATIVE_FLOOR = 1e-3
+"""Least part of its constant exposure that a Gaussian with radiance "log-chroma" shows in any direction."""
 LOG_EXPOSURE_LIMIT = 40.0
 """Log exposures are held within this: exp stays finite in float32, even squared and summed over a pixel."""
 
@@ -48,12 +50,15 @@ class Photograph:
     exposure: [H, W, 3] of the HDR colour at the base time (I^h dt_1 of the paper); None with radiance "display".
     base: [H, W, 3] of the base colour at the base time (I^b); the same tensor as `exposure` without fusion.
     rendering: what the rasteriser knows: alpha, projected means, radii.
+    light: [H, W, 3] exposure of this photo, which the response encoded; None where colours are encoded before they are
+        composited.
     """
 
     encoded: Tensor
     exposure: Tensor | None
     base: Tensor | None
     rendering: Rendering
+    light: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -75,7 +80,8 @@ class RadianceField(nn.Module):
 
     base_time: dt_1, seconds. Colours are exposures x = E dt_1 (the paper's c^{l_1}), so that their size, and with it
         the learning rates, does not depend on the unit of time.
-    radiance: "log": x = exp(SH(d)); "linear": x = SH(d), kept positive; "display": encoded = max(SH(d) + 0.5, 0).
+    radiance: "log": x = exp(SH(d)); "linear": x = SH(d), kept positive; "log-chroma": x = exp(SH_0) (1 + SH_rest(d)),
+        kept positive; "display": encoded = max(SH(d) + 0.5, 0).
     tone_map: "pixel": f(sum of weighted x); "gaussian": sum of weighted f(x), as the paper composites.
     fusion: the paper's brackets and their fusion, at the same base time; without, the HDR colour is the base colour.
     """
@@ -110,12 +116,15 @@ class RadianceField(nn.Module):
         degree: int | None = None,
         linear: bool = False,
         capacity: int | None = None,
+        presence: Tensor | None = None,
     ) -> Photograph:
         """A photo of exposure_time seconds, harmonics up to `degree`; linear: also what a linear loss needs; capacity:
-        as rasterize() takes it."""
+        as rasterize() takes it; presence: [N] factors of the opacities."""
         ratio = exposure_time / self.base_time
         if self.radiance == "display":
-            rendering = self._rasterize(camera, self._harmonics(camera, degree).add(0.5).clamp_min(0), capacity)
+            rendering = self._rasterize(
+                camera, self._harmonics(camera, degree).add(0.5).clamp_min(0), capacity, presence
+            )
             return Photograph(self._reexpose(rendering.image, ratio), None, None, rendering)
         base, fused = self._exposures(camera, degree)
         sets = {"fused": fused}
@@ -123,15 +132,13 @@ class RadianceField(nn.Module):
             sets = {"encoded": self.response.encode_extended(fused * ratio)} | (sets if linear else {})
         if linear and self.fusion is not None:
             sets["base"] = base
-        rendering = self._rasterize(
-            camera, torch.cat(list(sets.values()), dim=1) if len(sets) > 1 else next(iter(sets.values())), capacity
-        )
+        features = torch.cat(list(sets.values()), dim=1) if len(sets) > 1 else next(iter(sets.values()))
+        rendering = self._rasterize(camera, features, capacity, presence)
         images = dict(zip(sets, rendering.image.split(3, dim=2), strict=True))
-        encoded = (
-            images["encoded"] if self.tone_map == "gaussian" else self.response.encode_extended(images["fused"] * ratio)
-        )
+        light = None if self.tone_map == "gaussian" else images["fused"] * ratio
+        encoded = images["encoded"] if light is None else self.response.encode_extended(light)
         exposure = images.get("fused")
-        return Photograph(encoded, exposure, images.get("base", exposure), rendering)
+        return Photograph(encoded, exposure, images.get("base", exposure), rendering, light)
 
     @torch.no_grad()
     def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:
@@ -172,8 +179,31 @@ class RadianceField(nn.Module):
         coefficients = gaussians.harmonics_dc, gaussians.harmonics_rest
         return spherical_harmonics(used, coefficients, gaussians.means, camera.position)
 
+    def _log_constant(self) -> Tensor:
+        """[N, 3] what the harmonics of degree 0 say: a logarithm with radiance "log" and "log-chroma"."""
+        return (HARMONIC_0 * self.gaussians.harmonics_dc[:, 0]).clamp(-LOG_EXPOSURE_LIMIT, LOG_EXPOSURE_LIMIT)
+
+    def _relative_harmonics(self, camera: CameraTensors, degree: int | None) -> Tensor:
+        """[N, 3] 1 + SH_rest(d), how much brighter than the constant part each Gaussian is from here."""
+        gaussians = self.gaussians
+        used = gaussians.degree if degree is None else min(degree, gaussians.degree)
+        one = torch.full_like(gaussians.harmonics_dc, 1 / HARMONIC_0)
+        return spherical_harmonics(used, (one, gaussians.harmonics_rest), gaussians.means, camera.position)
+
+    @torch.no_grad()
+    def constant_exposures(self) -> Tensor:
+        """[N, 3] exposure at the base time of each Gaussian by its harmonics of degree 0 alone."""
+        constant = HARMONIC_0 * self.gaussians.harmonics_dc[:, 0]
+        if self.radiance == "display":
+            return self.response.decode((constant + 0.5).clamp(0, 1))
+        return constant.clamp_min(EXPOSURE_FLOOR) if self.radiance == "linear" else self._log_constant().exp()
+
     def _exposures(self, camera: CameraTensors, degree: int | None) -> tuple[Tensor, Tensor]:
         """Exposures at the base time of each Gaussian's base colour and of its HDR colour, [N, 3] each."""
+        if self.radiance == "log-chroma":
+            log_base = self._log_constant() + self._relative_harmonics(camera, degree).clamp_min(RELATIVE_FLOOR).log()
+            base = log_base.exp()
+            return base, base if self.fusion is None else self.fusion(log_base) * self.base_time
         value = self._harmonics(camera, degree)
         if self.radiance == "linear":
             base = value.clamp_min(EXPOSURE_FLOOR)
@@ -189,13 +219,16 @@ class RadianceField(nn.Module):
             return encoded
         return self.response.encode_extended(self.response.decode(encoded.clamp(0, 1)) * ratio)
 
-    def _rasterize(self, camera: CameraTensors, features: Tensor, capacity: int | None = None) -> Rendering:
+    def _rasterize(
+        self, camera: CameraTensors, features: Tensor, capacity: int | None = None, presence: Tensor | None = None
+    ) -> Rendering:
         gaussians = self.gaussians
+        opacities = gaussians.opacities() if presence is None else gaussians.opacities() * presence
         return rasterize(
             gaussians.means,
             gaussians.log_scales,
             gaussians.quaternions,
-            gaussians.opacities(),
+            opacities,
             features,
             camera.world_to_camera,
             camera.intrinsics,

@@ -81,13 +81,22 @@ def _stored(run) -> tuple[GaussianArrays, Colors | None]:
     """The run's Gaussians in the colours of its model (exposures at the base time, or encoded values), and how these
     become radiance; None where radiance is the exposure over the base time."""
     tensors = {name: value.cpu().numpy() for name, value in run.model.gaussians.tensors().items()}
+    harmonics, color_model = (
+        np.concatenate([tensors["harmonics_dc"], tensors["harmonics_rest"]], axis=1),
+        run.model.radiance,
+    )
+    if color_model == "log-chroma":
+        # exp(constant) (1 + rest) is a harmonic series itself.
+        constant = np.exp(_HARMONIC_0 * harmonics[:, :1].astype(np.float64))
+        harmonics = np.concatenate([constant / _HARMONIC_0, constant * harmonics[:, 1:]], axis=1).astype(np.float32)
+        color_model = "linear"
     gaussians = GaussianArrays(
         tensors["means"],
         tensors["log_scales"],
         tensors["quaternions"],
         tensors["opacity_logits"],
-        np.concatenate([tensors["harmonics_dc"], tensors["harmonics_rest"]], axis=1),
-        run.model.radiance,
+        harmonics,
+        color_model,
         run.exposure_time,
     )
     if run.model.radiance == "display":

@@ -28,8 +28,9 @@ class ModelConfig:
     radiance: str = option(
         "log",
         "log: log exposure is a harmonic series, so radiance is always positive; linear: exposure itself is (SeHDR); "
+        "log-chroma: exposure is exp of a constant times a harmonic series about 1 (after LCD-GS); "
         "display: encoded values are, with 3DGS's offset of 0.5",
-        choices=("log", "linear", "display"),
+        choices=("log", "linear", "log-chroma", "display"),
     )
     tone_map: str = option(
         "pixel",
@@ -43,6 +44,15 @@ class ModelConfig:
     initial_opacity: float = option(0.1, "opacity of every Gaussian at the start", above=0.0, high=0.99)
     initial_scale: float = option(
         1.0, "start size, in mean distances to the three nearest neighbours", above=0.0, high=10.0
+    )
+    far_points: int = option(
+        0, "Gaussians on a far shell behind the scene, for skies and distant light", low=0, high=1_000_000
+    )
+    dropout: float = option(
+        0.0,
+        "part of the Gaussians that a step leaves out at the end of the training, from 0 at the start (DropGaussian)",
+        low=0.0,
+        high=0.9,
     )
     antialiased: bool = option(False, "lower opacity where the low-pass filter widens a small Gaussian (Mip-Splatting)")
     low_pass: float = option(0.3, "variance in square pixels added to every projected Gaussian", low=0.0, high=10.0)
@@ -103,6 +113,16 @@ class LossConfig:
     clipping: bool = option(
         True, "a clipped pixel only says `at least`, a black one only `at most`; off: both are plain values"
     )
+    interval: str = option(
+        "off",
+        "a code z says `between z - 1/2 and z + 1/2`, and inside nothing pulls; difference: in L1; all: in SSIM as well",
+        choices=("off", "difference", "all"),
+    )
+    domain: str = option(
+        "encoded",
+        "what is compared; encoded: photos; mu-law: exposures, decoded from the photo, both by the mu-law (mu = 5000)",
+        choices=("encoded", "mu-law"),
+    )
     linear_weight: float = option(0.0, "weight of the linear loss (SeHDR: 0.5)", low=0.0, high=100.0)
     linear_detach: str = option(
         "fused",
@@ -110,6 +130,15 @@ class LossConfig:
         choices=("fused", "base", "none"),
     )
     hdr_truth: bool = option(False, "compare the base colour with HDR truth in the linear loss, where a view has it")
+    highlight_weight: float = option(
+        0.0, "weight of the mean distance, in stops, of clipped pixels from highlight_stops", low=0.0, high=10.0
+    )
+    highlight_stops: float = option(
+        0.0, "stops over white that light at clipped pixels is expected at", low=0.0, high=20.0
+    )
+    harmonics_weight: float = option(
+        0.0, "weight of the mean square of the harmonics above degree 0", low=0.0, high=100.0
+    )
     opacity_weight: float = option(0.0, "weight of the mean opacity (3DGS-MCMC: 0.01)", low=0.0, high=10.0)
     scale_weight: float = option(0.0, "weight of the mean size (3DGS-MCMC: 0.01)", low=0.0, high=10.0)
 
@@ -139,6 +168,9 @@ class DensificationConfig:
         0.1, "gradient: larger than this part of the scene is taken away after the first reset", above=0.0
     )
     reset_every: int = option(3000, "gradient: iterations between resets of the opacities", low=1)
+    slope_corrected: bool = option(
+        False, "gradient: weigh the gradients by what the response's slope takes from dark and bright Gaussians"
+    )
     revised_opacity: bool = option(False, "gradient: a split keeps the opacity of the whole (Revising Densification)")
     growth: float = option(0.05, "relocation: the count grows by this part at each change", low=0.0, high=1.0)
     noise: float = option(5e5, "relocation: strength of the noise on the positions, in learning rates", low=0.0)
@@ -156,6 +188,10 @@ class OptimizerConfig:
     harmonics_dc: float = option(2e-2, "colours, degree 0", above=0.0, high=1.0)
     harmonics_rest: float = option(1e-3, "colours, higher degrees", above=0.0, high=1.0)
     fusion: float = option(1e-3, "perceptrons and widths of the fusion", above=0.0, high=1.0)
+    final_factor: float = option(
+        1.0, "all rates but the positions' fall to this part of theirs over decay_from to the end", above=0.0, high=1.0
+    )
+    decay_from: float = option(0.5, "part of the training after which they fall, exponentially", low=0.0, high=0.99)
 
 
 @dataclass(frozen=True)
@@ -246,6 +282,19 @@ def _check_together(config: Config) -> None:
     if loss.linear_weight > 0 and not (fusion.enabled or loss.hdr_truth):
         raise ConfigError(
             f"loss.linear_weight = {loss.linear_weight} has nothing to compare: needs fusion.enabled or loss.hdr_truth"
+        )
+    if model.radiance == "display" or model.tone_map == "gaussian":
+        # Both encode before they composite: no pixel's exposure is known.
+        for field_set, shown in (
+            (loss.domain == "mu-law", 'loss.domain = "mu-law"'),
+            (loss.highlight_weight > 0, f"loss.highlight_weight = {loss.highlight_weight}"),
+        ):
+            if field_set:
+                raise ConfigError(f'{shown} needs model.tone_map = "pixel" and a model.radiance other than "display"')
+    if model.far_points >= config.densification.max_gaussians:
+        raise ConfigError(
+            f"model.far_points = {model.far_points} leaves no room below densification.max_gaussians = "
+            f"{config.densification.max_gaussians}"
         )
     if config.optimizer.means_final > config.optimizer.means:
         raise ConfigError(f"optimizer.means_final = {config.optimizer.means_final} is greater than optimizer.means")

@@ -10,11 +10,15 @@ import torch
 from torch import Tensor
 
 from ..model.gaussians import Gaussians
+from ..model.radiance_field import RadianceField
 from ..splatting import Rendering
 from .config import Config
 
 SPLIT_SHRINK = 1.6
 """The two halves of a split are this much smaller (3DGS: 0.8 times the number of halves)."""
+
+MOST_WEIGHT = 8.0
+"""Largest factor of slope_weights: beyond clipping the slope is 0, and noise would be all that is left to amplify."""
 
 SHORTEST_INTERVAL = 20
 """Iterations between changes are never fewer, however short the training: gradients need photos to be means of."""
@@ -42,8 +46,11 @@ class Densification:
     def prepare(self, count: int, device: torch.device | str) -> None:
         """Makes room for what observe() adds to."""
 
-    def observe(self, rendering: Rendering, width: int, height: int, usable: Tensor) -> None:
-        """Takes note of a step's image gradients. usable: scalar tensor, 0 where the step is to be ignored."""
+    def observe(
+        self, rendering: Rendering, width: int, height: int, usable: Tensor, weights: Tensor | None = None
+    ) -> None:
+        """Takes note of a step's image gradients. usable: scalar tensor, 0 where the step is to be ignored; weights:
+        [N] factors of the gradients."""
 
     def change(self, iteration: int, gaussians: Gaussians, optimizer: torch.optim.Optimizer, generator) -> bool:
         """Changes the Gaussians where this iteration is one for it; True if any tensor was replaced by another."""
@@ -80,10 +87,14 @@ class GradientDensification(Densification):
             self.gradient_sum, self.seen = torch.zeros(count, device=device), torch.zeros(count, device=device)
 
     @torch.no_grad()
-    def observe(self, rendering: Rendering, width: int, height: int, usable: Tensor) -> None:
+    def observe(
+        self, rendering: Rendering, width: int, height: int, usable: Tensor, weights: Tensor | None = None
+    ) -> None:
         # In normalised screen units: the screen is 2 wide, so a pixel's gradient counts width / 2 times.
         gradient = rendering.means2d.grad
         norm = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2))
+        if weights is not None:
+            norm = norm * weights
         counted = rendering.visible & usable.bool()
         self.gradient_sum += torch.where(counted, norm, 0.0)
         self.seen += counted
@@ -151,6 +162,22 @@ class GradientDensification(Densification):
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         self.gradient_sum, self.seen = state.get("gradient_sum"), state.get("seen")
+
+
+def slope_weights(field: RadianceField, ratio: float | Tensor) -> Tensor:
+    """[N] factors that give dark and bright Gaussians the image gradients of well-exposed ones.
+
+    A relative change of light moves the photo by x f'(x): little in the toe and on the shoulder of the response, so
+    gradients starve there whatever the scene needs (PhysHDR-GS, CVPR 2026, scales colour gradients for it). The factor
+    is the curve's steepest x f'(x) over the Gaussian's, both of its constant colour's mean exposure in the photo, at
+    most MOST_WEIGHT. ratio: exposure time of the photo over the base time.
+    """
+    response = field.response
+    grey = field.constant_exposures().mean(1) * ratio
+    codes = torch.linspace(0.02, 0.98, 49, device=grey.device)
+    middle = response.decode(codes)
+    steepest = (middle * response.slope(middle)).amax()
+    return (steepest / (grey * response.slope(grey)).clamp_min(1e-12)).clamp(1.0, MOST_WEIGHT)
 
 
 def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:

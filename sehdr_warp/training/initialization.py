@@ -22,6 +22,9 @@ DEPTH_RANGE = (0.5, 3.0)
 cameras: on the embedded room a start at 0.15 costs 14 dB. Preferring points on whose colour the photos agree does not
 pay there."""
 
+FAR_RADIUS = 5.0
+"""Radius of the far shell over how far the scene reaches: parallax there is a fifth of the scene's."""
+
 
 def base_exposure_time(scene: Scene) -> float:
     """dt_1: the median exposure time of the training photos, seconds."""
@@ -68,10 +71,13 @@ def make_field(scene: Scene, config: Config, response: Response, device: torch.d
     check_scene(scene)
     rng = np.random.default_rng(config.seed)
     points, colours = (scene.points, scene.point_colors) if len(scene.points) else random_points(scene, config, rng)
-    budget = config.densification.max_gaussians
+    budget = max(1, config.densification.max_gaussians - config.model.far_points)
     if len(points) > budget:
         chosen = np.sort(rng.choice(len(points), budget, replace=False))
         points, colours = points[chosen], colours[chosen]
+    if config.model.far_points:
+        far, seen = far_points(scene, config.model.far_points, rng)
+        points, colours = np.concatenate([points, far]), np.concatenate([colours, seen])
     dc = start_colours(colours, config.model.radiance, response)
     gaussians = Gaussians.from_points(
         torch.tensor(points, dtype=torch.float32),
@@ -131,7 +137,7 @@ def start_colours(encoded: np.ndarray, radiance: str, response: Response) -> np.
     if radiance == "display":
         return encoded - 0.5
     exposure = np.maximum(response.decode(encoded), EXPOSURE_FLOOR)
-    return np.log(exposure) if radiance == "log" else exposure
+    return exposure if radiance == "linear" else np.log(exposure)
 
 
 def random_points(scene: Scene, config: Config, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -152,6 +158,27 @@ def random_points(scene: Scene, config: Config, rng: np.random.Generator) -> tup
         raise SehdrError(f"{scene.name}: no two training cameras look at the same place; check the poses")
     points, colours = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
     return points, colours
+
+
+def far_points(scene: Scene, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """At most `count` points [N, 3] evenly over the part of a far sphere that training cameras see, and their mean
+    encoded colours [N, 3]. Sparse points of motion hold no sky, and what is nearer would have to stand in for it.
+
+    The sphere's centre is the cameras' mean, its radius FAR_RADIUS times the farthest of the distance to the cameras'
+    focus, their spread, and the 90th percentile of the scene's points.
+    """
+    views = scene.train_views
+    positions = np.stack([view.camera.position for view in views])
+    centre = positions.mean(0)
+    reach = [focus_distance(views), float(np.linalg.norm(positions - centre, axis=1).max())]
+    if len(scene.points):
+        reach.append(float(np.quantile(np.linalg.norm(scene.points - centre, axis=1), 0.9)))
+    directions = rng.normal(size=(8 * count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    points = centre + FAR_RADIUS * max(reach) * directions
+    seen, mean = colours_in_views(points, views)
+    chosen = np.flatnonzero(seen >= 1)[:count]
+    return points[chosen], mean[chosen]
 
 
 def focus_distance(views: tuple[View, ...]) -> float:

@@ -1,16 +1,20 @@
 """What a training minimises: photos against photos, exposures against exposures."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from ..model.radiance_field import Photograph, RadianceField
+from ..model.response import Response
 from ..splatting.ssim import ssim
 from .config import LossConfig
 
 CODE = 1 / 255
 """One step of an 8-bit photo."""
+MU = 5000.0
+"""Of the mu-law in which HDR images are compared."""
 
 
 @dataclass(frozen=True)
@@ -28,38 +32,80 @@ class Target:
     exposure_truth: Tensor | None
 
 
-def one_sided(prediction: Tensor, target: Target) -> Tensor:
-    """The prediction [H, W, 3] as far as the photo can tell. A clipped pixel says `at least white less half a code`, so
-    what is brighter equals it: without the half code a response that never quite reaches white would be pulled up for
-    ever. A black pixel says `at most half a code`, so what is darker equals it."""
+def one_sided(
+    prediction: Tensor, truth: Tensor, target: Target, lower: Tensor, upper: Tensor, interval: bool
+) -> Tensor:
+    """The prediction [H, W, 3] as far as the photo can tell: the truth, plus what lies outside of the bounds.
+
+    A clipped pixel says `at least white less half a code`, so what is brighter equals it: without the half code a
+    response that never quite reaches white would be pulled up for ever. A black pixel says `at most half a code`, so
+    what is darker equals it. With `interval` every other code too says no more than it does: between half a code less
+    and half a code more. truth, lower, upper: [H, W, 3], the photo and its bounds, in the prediction's domain.
+    """
+    below, above = (prediction - lower).clamp_max(0), (prediction - upper).clamp_min(0)
+    seen = truth + below + above if interval else prediction
     if target.clipped is not None:
-        reached = torch.minimum(prediction + CODE / 2, target.encoded)
-        prediction = torch.where(target.clipped, reached, prediction)
+        seen = torch.where(target.clipped, truth + below, seen)
     if target.black is not None:
-        prediction = torch.where(target.black, (prediction - CODE / 2).clamp_min(0), prediction)
-    return prediction
+        seen = torch.where(target.black, truth + above, seen)
+    return seen
 
 
-def image_loss(prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str, weight: float) -> Tensor:
+def image_loss(
+    prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str, weight: float, *, similar: Tensor | None = None
+) -> Tensor:
     """L1 + weight (1 - SSIM) ("sum", SeHDR's equation 11) or (1 - weight) L1 + weight (1 - SSIM) ("blend", 3DGS).
 
     prediction, truth: [H, W, 3]; mask: [H, W, 1] or None: pixels outside count nothing in L1 and as equal in SSIM.
+    similar: [H, W, 3] that stands in the SSIM for the prediction.
     """
+    similar = prediction if similar is None else similar
     if mask is not None:
-        prediction, truth = prediction * mask, truth * mask
+        prediction, truth, similar = prediction * mask, truth * mask, similar * mask
     difference = (prediction - truth).abs().mean()
     if mask is not None:
         difference = difference / mask.mean().clamp_min(1e-6)
     if weight == 0:
         return difference
-    dissimilarity = 1 - ssim(prediction, truth)
+    dissimilarity = 1 - ssim(similar, truth)
     return (difference if form == "sum" else (1 - weight) * difference) + weight * dissimilarity
 
 
-def ldr_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor:
-    """The photo against the simulated one; with `clipping`, one-sided where the camera saturated (L_LDR)."""
-    prediction = one_sided(photo.encoded, target) if config.clipping else photo.encoded
-    return image_loss(prediction, target.encoded, target.mask, config.form, config.ssim_weight)
+def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Response | None = None) -> Tensor:
+    """The photo against the simulated one, L_LDR: of encoded values, or with domain "mu-law" of exposures, for which
+    the response is needed. With `clipping` one-sided where the camera saturated; see also LossConfig.interval."""
+    prediction, truth = photo.encoded, target.encoded
+    lower, upper = truth - CODE / 2, truth + CODE / 2
+    if config.domain == "mu-law":
+        white = response.white
+        prediction = mu_law(photo.light, white)
+        truth, lower, upper = (mu_law(response.decode(image), white) for image in (truth, lower, upper))
+    plain = prediction
+    if config.clipping or config.interval != "off":
+        bounded = target if config.clipping else replace(target, clipped=None, black=None)
+        prediction = one_sided(prediction, truth, bounded, lower, upper, config.interval != "off")
+    if config.interval != "difference" or config.ssim_weight == 0:
+        return image_loss(prediction, truth, target.mask, config.form, config.ssim_weight)
+    if config.clipping:
+        plain = one_sided(plain, truth, target, lower, upper, False)
+    return image_loss(prediction, truth, target.mask, config.form, config.ssim_weight, similar=plain)
+
+
+def mu_law(exposure: Tensor, white: float) -> Tensor:
+    """log(1 + mu x / white) / log(1 + mu): 0 for no light, 1 for the exposure that photos show as white."""
+    return torch.log1p(exposure * (MU / white)) / math.log1p(MU)
+
+
+def highlight_prior(light: Tensor, clipped: Tensor | None, white: float, stops: float) -> Tensor:
+    """Mean over the image of |stops over white - `stops`| at clipped pixels brighter than white, 0 at the others.
+
+    light: [H, W, 3] exposures; clipped: [H, W, 3] bool. The photo says `at least white` there and nothing else does;
+    `stops` is how far above it light is expected.
+    """
+    if clipped is None:
+        return light.new_zeros(())
+    excess = torch.log2(light.clamp_min(white) / white)
+    return torch.where(clipped & (light > white), (excess - stops).abs(), 0.0).mean()
 
 
 def linear_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor | None:
@@ -78,11 +124,16 @@ def linear_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor
 
 
 def total_loss(field: RadianceField, photo: Photograph, target: Target, config: LossConfig) -> Tensor:
-    """L_LDR + beta L_linear (equation 13), and the regularisers of 3DGS-MCMC where they have a weight."""
-    loss = ldr_loss(photo, target, config)
+    """L_LDR + beta L_linear (equation 13), and priors and regularisers where they have a weight."""
+    loss = ldr_loss(photo, target, config, field.response)
     if config.linear_weight > 0:
         linear = linear_loss(photo, target, config)
         loss = loss if linear is None else loss + config.linear_weight * linear
+    if config.highlight_weight > 0:
+        prior = highlight_prior(photo.light, target.clipped, field.response.white, config.highlight_stops)
+        loss = loss + config.highlight_weight * prior
+    if config.harmonics_weight > 0:
+        loss = loss + config.harmonics_weight * field.gaussians.harmonics_rest.square().mean()
     if config.opacity_weight > 0:
         loss = loss + config.opacity_weight * field.gaussians.opacities().mean()
     if config.scale_weight > 0:

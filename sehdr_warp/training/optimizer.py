@@ -10,6 +10,8 @@ from .config import Config
 
 EPSILON = 1e-15
 """3DGS: gradients of a single Gaussian are tiny, and must not drown in Adam's usual 1e-8."""
+DECAY_EVERY = 10
+"""Iterations between changes of the rates that decay_rates sets: on a GPU each is a launch."""
 
 
 class Adam(torch.optim.Adam):
@@ -66,8 +68,10 @@ def make_optimizer(field: RadianceField, config: Config, extent: float) -> Adam:
     groups = [{"name": name, "params": [getattr(field.gaussians, name)], "lr": rate} for name, rate in rates.items()]
     if field.fusion is not None:
         groups.append({"name": "fusion", "params": list(field.fusion.parameters()), "lr": config.optimizer.fusion})
-    if device.type == "cuda":
-        groups[0]["lr"] = torch.tensor(groups[0]["lr"], device=device)
+    for group in groups:
+        group["start_rate"] = group["lr"]
+        if device.type == "cuda" and (group["name"] == "means" or config.optimizer.final_factor < 1):
+            group["lr"] = torch.tensor(group["lr"], device=device)
     return Adam(groups, eps=EPSILON, fused=True, capturable=device.type == "cuda")
 
 
@@ -78,9 +82,26 @@ def means_rate(config: Config, extent: float, iteration: int) -> float:
     return extent * rates.means * (rates.means_final / rates.means) ** part
 
 
+def decay_rates(optimizer: torch.optim.Adam, config: Config, iteration: int) -> None:
+    """Sets the other rates for the steps from an iteration on: theirs until decay_from of the training, then
+    exponential down to final_factor of theirs. Adam's steps do not shrink with the gradient: at full rate, colours
+    never come to rest. The rate is that of the last multiple of DECAY_EVERY, so a resumed training has the same."""
+    options, total = config.optimizer, config.schedule.iterations
+    if options.final_factor == 1:
+        return
+    done = (iteration - iteration % DECAY_EVERY) / total
+    part = max(0.0, done - options.decay_from) / (1 - options.decay_from)
+    for group in optimizer.param_groups:
+        if group["name"] != "means":
+            _set_rate(group, group["start_rate"] * options.final_factor**part)
+
+
 def set_means_rate(optimizer: torch.optim.Adam, rate: float) -> None:
     """Sets the learning rate of the positions for the next step."""
-    group = optimizer.param_groups[PARAMETER_NAMES.index("means")]
+    _set_rate(optimizer.param_groups[PARAMETER_NAMES.index("means")], rate)
+
+
+def _set_rate(group: dict, rate: float) -> None:
     if isinstance(group["lr"], Tensor):
         group["lr"].fill_(rate)
     else:

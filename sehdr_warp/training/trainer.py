@@ -10,10 +10,12 @@ from ..model.radiance_field import RadianceField
 from ..scene import Scene
 from ..splatting import GraphRecorder
 from .config import Config
-from .densification import make_densification
+from .densification import make_densification, slope_weights
 from .initialization import scene_extent
 from .losses import total_loss
 from .optimizer import (
+    DECAY_EVERY,
+    decay_rates,
     guarded_step,
     load_optimizer_tensors,
     make_optimizer,
@@ -59,6 +61,7 @@ class Trainer:
         self._launched: set = set()
         self._pairs = 0
         self._last: tuple[Tensor, Tensor, Tensor] | None = None
+        self._presence: Tensor | None = None
 
     @property
     def degree(self) -> int:
@@ -100,6 +103,9 @@ class Trainer:
             self.densification.prepare(gaussians.count, self.device)
         rate = means_rate(self.config, self.extent, self.iteration)
         set_means_rate(self.optimizer, rate)
+        if self.iteration % DECAY_EVERY == 0:
+            decay_rates(self.optimizer, self.config, self.iteration)
+        self._draw_presence()
         if self._can_record(views, (self.degree, self.level, watched)):
             self._last = self._replay(views, index, watched)
         else:
@@ -119,7 +125,12 @@ class Trainer:
         """
         linear = self.config.loss.linear_weight > 0
         photo = self.field.photograph(
-            view.camera, view.exposure_time, degree=self.degree, linear=linear, capacity=capacity
+            view.camera,
+            view.exposure_time,
+            degree=self.degree,
+            linear=linear,
+            capacity=capacity,
+            presence=self._presence,
         )
         if watched:
             photo.rendering.means2d.retain_grad()
@@ -127,7 +138,10 @@ class Trainer:
         loss.backward()
         nonfinite, skipped = guarded_step(self.optimizer, loss, photo.rendering.overflow)
         if watched:
-            self.densification.observe(photo.rendering, view.camera.width, view.camera.height, 1 - skipped)
+            weights = None
+            if self.config.densification.slope_corrected:
+                weights = slope_weights(self.field, view.exposure_time / self.field.base_time)
+            self.densification.observe(photo.rendering, view.camera.width, view.camera.height, 1 - skipped, weights)
         self.optimizer.zero_grad(set_to_none=True)
         self._skipped += nonfinite
         if capacity is None:
@@ -135,6 +149,17 @@ class Trainer:
         else:
             self._incomplete += photo.rendering.overflow
         return loss.detach(), photo.encoded.detach(), view.target.encoded
+
+    def _draw_presence(self) -> None:
+        """Which Gaussians the next step leaves out, and how much the others stand in for them (DropGaussian, CVPR
+        2025: the part grows evenly over the training). In place, where a recorded step reads it."""
+        if self.config.model.dropout == 0:
+            return
+        count, part = self.field.gaussians.count, self.config.model.dropout * self.iteration
+        if self._presence is None or len(self._presence) != count:
+            self._presence = torch.empty(count, device=self.device)
+        kept = 1 - part / self.config.schedule.iterations
+        self._presence.bernoulli_(kept, generator=self._generator).div_(kept)
 
     def _can_record(self, views, kind) -> bool:
         """Whether this step can be a recorded one: on a GPU, photos of one size, after a step like it was launched."""
@@ -204,6 +229,7 @@ class Trainer:
         if self._generator.get_state().numel() == generators["device"].numel():
             self._generator.set_state(generators["device"].cpu())
         self.iteration = values["iteration"]
+        decay_rates(self.optimizer, self.config, self.iteration)
         self._order = list(values["order"])
         self._skipped.fill_(values["skipped_steps"])
 

@@ -3,10 +3,23 @@
 import pytest
 import torch
 
-from sehdr_warp.model.radiance_field import Photograph
+from sehdr_warp.model.radiance_field import CameraTensors, Photograph
+from sehdr_warp.model.response import response_by_name
 from sehdr_warp.splatting.ssim import ssim
 from sehdr_warp.training.config import LossConfig
-from sehdr_warp.training.losses import CODE, Target, image_loss, ldr_loss, linear_loss, one_sided
+from sehdr_warp.training.losses import (
+    CODE,
+    Target,
+    highlight_prior,
+    image_loss,
+    ldr_loss,
+    linear_loss,
+    mu_law,
+    one_sided,
+    total_loss,
+)
+
+from .toy import orbit_camera, toy_field
 
 
 def images(seed=0, shape=(12, 14, 3)):
@@ -46,8 +59,9 @@ def test_without_clipping_an_overshoot_costs():
 
 def test_one_sided_keeps_the_black_hinge_continuous():
     target = target_of(torch.zeros(1, 1, 3))
-    just_above = one_sided(torch.full((1, 1, 3), CODE / 2 + 1e-6), target)
-    assert just_above.max() < 2e-6
+    half = torch.full((1, 1, 3), CODE / 2)
+    just_above = one_sided(half + 1e-6, target.encoded, target, -half, half, False)
+    assert 0 <= just_above.min() and just_above.max() < 2e-6
 
 
 def test_masked_pixels_cost_nothing():
@@ -80,3 +94,104 @@ def test_truth_supervises_the_base():
 def test_nothing_to_compare_without_fusion_and_truth():
     base, _ = images()
     assert linear_loss(Photograph(base, base, base, None), target_of(base), LossConfig()) is None
+
+
+def photo_of(light, response):
+    """A simulated photo of exposures [H, W, 3]."""
+    return Photograph(response.encode_extended(light), light, light, None, light)
+
+
+def quantised(encoded):
+    return (encoded * 255).round() / 255
+
+
+@pytest.mark.parametrize("domain", ["encoded", "mu-law"])
+@pytest.mark.parametrize("response", [response_by_name("srgb"), response_by_name("hdr-nerf")], ids=str)
+def test_an_interval_costs_nothing_inside_and_pulls_outside(domain, response):
+    generator = torch.Generator().manual_seed(2)
+    light = torch.rand(12, 14, 3, generator=generator, dtype=torch.float64) * 0.9 + 0.002
+    target = target_of(quantised(response.encode(light)))
+    plain = LossConfig(domain=domain)
+    inside = LossConfig(domain=domain, interval="all")
+    # The truth lies within half a code of its photo, by what rounding is.
+    assert ldr_loss(photo_of(light, response), target, inside, response) == pytest.approx(0, abs=1e-12)
+    assert ldr_loss(photo_of(light, response), target, plain, response) > 1e-4
+    darker = (0.9 * light).requires_grad_()
+    difference = LossConfig(domain=domain, interval="all", ssim_weight=0.0)
+    ldr_loss(photo_of(darker, response), target, difference, response).backward()
+    codes = 255 * (target.encoded - response.encode(darker.detach()))
+    assert (darker.grad[codes > 0.51] < 0).all() and (darker.grad[codes < 0.49] == 0).all()
+
+
+def test_an_interval_of_the_difference_leaves_ssim_alone():
+    response = response_by_name("srgb")
+    light = images(3)[0].double() * 0.8 + 0.05
+    target, photo = target_of(quantised(response.encode(light))), photo_of(light, response)
+    loss = ldr_loss(photo, target, LossConfig(interval="difference"), response)
+    expected = 0.2 * (1 - ssim(photo.encoded, target.encoded))
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-6) and loss > 0
+
+
+@pytest.mark.parametrize("interval", ["off", "difference", "all"])
+@pytest.mark.parametrize("domain", ["encoded", "mu-law"])
+def test_saturated_pixels_are_one_sided_in_every_domain(domain, interval):
+    response = response_by_name("srgb")
+    encoded = torch.tensor([1.0, 1.0, 0.0, 0.0]).reshape(1, 4, 1).expand(1, 4, 3).contiguous().double()
+    light = torch.tensor([7.0, 0.8, 0.4 * CODE / 12.92, 0.01]).double().reshape(1, 4, 1).expand(1, 4, 3)
+    light = light.clone().requires_grad_()
+    config = LossConfig(domain=domain, interval=interval, ssim_weight=0.0)
+    ldr_loss(photo_of(light, response), target_of(encoded), config, response).backward()
+    gradient = light.grad[0, :, 0]
+    assert gradient[0] == 0 and gradient[2] == 0 and gradient[1] < 0 and gradient[3] > 0
+
+
+@pytest.mark.parametrize("interval", ["off", "difference", "all"])
+@pytest.mark.parametrize("domain", ["encoded", "mu-law"])
+def test_gradients_of_the_photo_loss(domain, interval):
+    response = response_by_name("hdr-nerf")
+    generator = torch.Generator().manual_seed(4)
+    target = target_of(quantised(torch.rand(4, 5, 3, generator=generator, dtype=torch.float64)))
+    light = (torch.rand(4, 5, 3, generator=generator, dtype=torch.float64) + 0.1).requires_grad_()
+    config = LossConfig(domain=domain, interval=interval)
+    assert torch.autograd.gradcheck(
+        lambda x: ldr_loss(photo_of(x, response), target, config, response), light, eps=1e-7, atol=1e-6
+    )
+
+
+def test_the_mu_law_weighs_shadows_as_the_metric_does():
+    response = response_by_name("hdr-nerf")
+    light = torch.tensor([1e-3, 1.0]).double().reshape(1, 2, 1).expand(1, 2, 3)
+    target = target_of(response.encode(light))
+    config = LossConfig(domain="mu-law", ssim_weight=0.0)
+    loss = ldr_loss(photo_of(2 * light, response), target, config, response)
+    expected = (mu_law(2 * light, response.white) - mu_law(light, response.white)).mean()
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-6)
+
+
+def test_the_highlight_prior_holds_clipped_pixels_near_the_clip_point():
+    light = torch.tensor([0.5, 1.5, 4.0, 4.0]).double().reshape(1, 4, 1).expand(1, 4, 3).clone().requires_grad_()
+    clipped = torch.tensor([True, True, True, False]).reshape(1, 4, 1).expand(1, 4, 3)
+    loss = highlight_prior(light, clipped, 1.0, 1.0)
+    # 1 - log2(1.5) stops short of one stop over white, and one stop too many.
+    assert loss.item() == pytest.approx((0.4150375 + 1.0) / 4, rel=1e-6)
+    loss.backward()
+    gradient = light.grad[0, :, 0]
+    assert gradient[0] == 0 and gradient[3] == 0 and gradient[1] < 0 and gradient[2] > 0
+    assert highlight_prior(light, None, 1.0, 1.0) == 0
+
+
+def test_priors_and_regularisers_add_what_they_weigh():
+    field = toy_field()
+    field.gaussians.harmonics_rest = torch.nn.Parameter(torch.full((field.gaussians.count, 3, 3), 0.5))
+    camera = CameraTensors.of(orbit_camera(0.3), "cpu")
+    photo = field.photograph(camera, 4 * field.base_time)
+    target = target_of(photo.encoded.detach().clamp(0, 1))
+
+    def loss(**weights):
+        return total_loss(field, photo, target, LossConfig(**weights)).item()
+
+    plain = loss()
+    assert loss(harmonics_weight=2.0) - plain == pytest.approx(0.5, rel=1e-4)
+    prior = highlight_prior(photo.light, target.clipped, field.response.white, 0.5).item()
+    assert prior > 0
+    assert loss(highlight_weight=3.0, highlight_stops=0.5) - plain == pytest.approx(3 * prior, rel=1e-3)
