@@ -308,8 +308,7 @@ def _scene_of(run, data: str | None):
         exposure_index=run.data.get("exposure_index"),
         max_size=run.data.get("max_size"),
         cache=_cache_beside(run.path),
-        decode=run.response.decode,
-        encode=run.response.encode,
+        **_curves_of(run),
         progress=_say,
     )
 
@@ -322,6 +321,13 @@ def _curves(response: str) -> dict:
 
     curve = response_by_name(response)
     return {"decode": curve.decode, "encode": curve.encode}
+
+
+def _curves_of(run) -> dict:
+    """load_scene's decode and encode for a trained run: its response's, or, learned, those it was trained with."""
+    if run.config.response.form == "mlp":
+        return _curves(run.config.response.name)
+    return {"decode": run.response.decode, "encode": run.response.encode}
 
 
 def _cache_beside(run: Path) -> Path:

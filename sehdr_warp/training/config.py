@@ -74,6 +74,12 @@ class ResponseConfig:
         "what auto chooses from: names, and files of one curve or many; empty means every built-in response",
         nonempty=True,
     )
+    form: str = option(
+        "curve",
+        "curve: the named response; mlp: none, but a perceptron for each channel that is learned with the scene (HDR-GS)",
+        choices=("curve", "mlp"),
+    )
+    width: int = option(128, "mlp: hidden units of each channel's perceptron", low=1, high=4096)
 
 
 @dataclass(frozen=True)
@@ -110,6 +116,21 @@ class LossConfig:
         "sum", "sum: L1 + w (1 - SSIM), SeHDR; blend: (1 - w) L1 + w (1 - SSIM), 3DGS", choices=("sum", "blend")
     )
     ssim_weight: float = option(0.2, "w above", low=0.0, high=1.0)
+    ldr_weight: float = option(1.0, "weight of the photos; 0 leaves them out", low=0.0, high=100.0)
+    hdr_weight: float = option(
+        0.0, "weight of the HDR colour against HDR truth, where a view has it (HDR-GS: 0.6)", low=0.0, high=100.0
+    )
+    hdr_domain: str = option(
+        "mu-law",
+        "what that comparison is made of, all over the largest truth; mu-law: mu = 5000; log: the same with 2^20, "
+        "almost a logarithm over 20 stops; linear: radiance itself",
+        choices=("mu-law", "log", "linear"),
+    )
+    predictor: str = option(
+        "",
+        "what stands in for HDR truth in training: a single-image predictor's name, a folder of predictions or a file "
+        "of a network; empty: nothing, truth is the data's own",
+    )
     clipping: bool = option(
         True, "a clipped pixel only says `at least`, a black one only `at most`; off: both are plain values"
     )
@@ -141,6 +162,11 @@ class LossConfig:
     )
     opacity_weight: float = option(0.0, "weight of the mean opacity (3DGS-MCMC: 0.01)", low=0.0, high=10.0)
     scale_weight: float = option(0.0, "weight of the mean size (3DGS-MCMC: 0.01)", low=0.0, high=10.0)
+
+    @property
+    def uses_hdr(self) -> bool:
+        """Whether HDR truth of the training views takes part in the loss."""
+        return self.hdr_weight > 0 or (self.linear_weight > 0 and self.hdr_truth)
 
 
 @dataclass(frozen=True)
@@ -188,6 +214,7 @@ class OptimizerConfig:
     harmonics_dc: float = option(2e-2, "colours, degree 0", above=0.0, high=1.0)
     harmonics_rest: float = option(1e-3, "colours, higher degrees", above=0.0, high=1.0)
     fusion: float = option(1e-3, "perceptrons and widths of the fusion", above=0.0, high=1.0)
+    response: float = option(5e-4, "what a learned response is made of (HDR-GS: 0.0005)", above=0.0, high=1.0)
     final_factor: float = option(
         1.0, "all rates but the positions' fall to this part of theirs over decay_from to the end", above=0.0, high=1.0
     )
@@ -296,5 +323,30 @@ def _check_together(config: Config) -> None:
             f"model.far_points = {model.far_points} leaves no room below densification.max_gaussians = "
             f"{config.densification.max_gaussians}"
         )
+    if loss.hdr_weight > 0 and model.radiance == "display":
+        raise ConfigError(f'loss.hdr_weight = {loss.hdr_weight} needs radiance: model.radiance = "display" has none')
+    if loss.ldr_weight == loss.hdr_weight == loss.linear_weight == 0:
+        raise ConfigError("loss.ldr_weight = 0.0 leaves nothing to compare: give loss.hdr_weight or loss.ldr_weight")
+    if loss.predictor and not loss.uses_hdr:
+        raise ConfigError(f"loss.predictor = {loss.predictor!r} is for nothing: loss.hdr_weight = 0.0")
+    if config.response.form == "mlp":
+        _check_learned(config)
     if config.optimizer.means_final > config.optimizer.means:
         raise ConfigError(f"optimizer.means_final = {config.optimizer.means_final} is greater than optimizer.means")
+
+
+def _check_learned(config: Config) -> None:
+    """What needs a curve that is known before the training goes without one."""
+    needs_curve = {
+        "model.radiance": config.model.radiance == "display",
+        "fusion.enabled": config.fusion.enabled,
+        "schedule.coarse_levels": config.schedule.coarse_levels > 0,
+        "loss.domain": config.loss.domain == "mu-law",
+        "loss.highlight_weight": config.loss.highlight_weight > 0,
+        "densification.slope_corrected": config.densification.slope_corrected,
+    }
+    for path, needed in needs_curve.items():
+        if needed:
+            part, name = path.split(".")
+            value = getattr(getattr(config, part), name)
+            raise ConfigError(f'{path} = {value!r} needs a known response: response.form = "mlp" has none')

@@ -10,7 +10,7 @@ from ..model.exposure import exposure_times
 from ..model.fusion import NeuralExposureFusion
 from ..model.gaussians import Gaussians
 from ..model.radiance_field import EXPOSURE_FLOOR, RadianceField
-from ..model.response import Response, response_by_name, response_names, responses_in_file
+from ..model.response import Response, ToneMapper, response_by_name, response_names, responses_in_file
 from ..model.response_selection import select_response
 from ..scene import Scene, View
 from .config import Config
@@ -45,8 +45,11 @@ def scene_extent(scene: Scene) -> float:
 
 
 def choose_response(scene: Scene, config: Config) -> Response:
-    """The response that the config names; for "auto" the candidate that fits the training photos best."""
+    """The response that the config names; for "auto" the candidate that fits the training photos best; with form "mlp"
+    one to be learned."""
     options = config.response
+    if options.form == "mlp":
+        return ToneMapper(options.width, config.seed)
     if options.name != "auto":
         return response_by_name(options.name)
     candidates = [response for name in options.candidates or response_names() for response in _responses(name)]
@@ -136,6 +139,9 @@ def start_colours(encoded: np.ndarray, radiance: str, response: Response) -> np.
     encoded = np.clip(np.asarray(encoded, dtype=np.float64), *CODE_RANGE)
     if radiance == "display":
         return encoded - 0.5
+    if isinstance(response, ToneMapper):
+        # HDR-GS starts the logarithm at the encoded value: what the mapper will make of it is not known yet.
+        return np.exp(encoded) if radiance == "linear" else encoded
     exposure = np.maximum(response.decode(encoded), EXPOSURE_FLOOR)
     return exposure if radiance == "linear" else np.log(exposure)
 

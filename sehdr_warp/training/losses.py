@@ -15,6 +15,8 @@ CODE = 1 / 255
 """One step of an 8-bit photo."""
 MU = 5000.0
 """Of the mu-law in which HDR images are compared."""
+LOG_MU = 2.0**20
+"""Of the mu-law that is almost a logarithm, down to 20 stops below its unit."""
 
 
 @dataclass(frozen=True)
@@ -123,9 +125,26 @@ def linear_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor
     return image_loss(base, fused, target.mask, config.form, config.ssim_weight)
 
 
-def total_loss(field: RadianceField, photo: Photograph, target: Target, config: LossConfig) -> Tensor:
-    """L_LDR + beta L_linear (equation 13), and priors and regularisers where they have a weight."""
-    loss = ldr_loss(photo, target, config, field.response)
+def hdr_loss(photo: Photograph, target: Target, config: LossConfig, largest: float) -> Tensor:
+    """The HDR colour's exposure against the true one, both divided by `largest`, in LossConfig.hdr_domain.
+
+    largest: the greatest true exposure of the training views, see largest_truth. Source: HDR-GS's HDR loss, which
+    divides each image by its own maximum instead, and with that leaves the scale of the scene open.
+    """
+    images = photo.exposure / largest, target.exposure_truth / largest
+    if config.hdr_domain != "linear":
+        mu = MU if config.hdr_domain == "mu-law" else LOG_MU
+        images = tuple(torch.log1p(mu * image) / math.log1p(mu) for image in images)
+    return image_loss(*images, target.mask, config.form, config.ssim_weight)
+
+
+def total_loss(
+    field: RadianceField, photo: Photograph, target: Target, config: LossConfig, largest_truth: float = 1.0
+) -> Tensor:
+    """L_LDR + beta L_linear (equation 13), the HDR loss, and priors and regularisers, each where it has a weight."""
+    loss = config.ldr_weight * ldr_loss(photo, target, config, field.response) if config.ldr_weight > 0 else 0.0
+    if config.hdr_weight > 0 and target.exposure_truth is not None:
+        loss = loss + config.hdr_weight * hdr_loss(photo, target, config, largest_truth)
     if config.linear_weight > 0:
         linear = linear_loss(photo, target, config)
         loss = loss if linear is None else loss + config.linear_weight * linear

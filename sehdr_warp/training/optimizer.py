@@ -5,6 +5,7 @@ from torch import Tensor
 
 from ..model.gaussians import PARAMETER_NAMES
 from ..model.radiance_field import RadianceField
+from ..model.response import ToneMapper
 from ..splatting.adam import adam_step
 from .config import Config
 
@@ -58,7 +59,8 @@ class Adam(torch.optim.Adam):
 
 
 def make_optimizer(field: RadianceField, config: Config, extent: float) -> Adam:
-    """One parameter group, with its name, for each parameter of the Gaussians and one for the fusion.
+    """One parameter group, with its name, for each parameter of the Gaussians, one for the fusion, one for a
+    learned response.
 
     On a GPU its steps can be recorded in a CUDA graph: counters and the rate of the positions live on the device.
     """
@@ -68,6 +70,10 @@ def make_optimizer(field: RadianceField, config: Config, extent: float) -> Adam:
     groups = [{"name": name, "params": [getattr(field.gaussians, name)], "lr": rate} for name, rate in rates.items()]
     if field.fusion is not None:
         groups.append({"name": "fusion", "params": list(field.fusion.parameters()), "lr": config.optimizer.fusion})
+    if isinstance(field.response, ToneMapper):
+        groups.append(
+            {"name": "response", "params": list(field.response.parameters()), "lr": config.optimizer.response}
+        )
     for group in groups:
         group["start_rate"] = group["lr"]
         if device.type == "cuda" and (group["name"] == "means" or config.optimizer.final_factor < 1):

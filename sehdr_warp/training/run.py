@@ -143,10 +143,10 @@ def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) ->
     try:
         gaussians = Gaussians(*(checkpoint.tensors[f"gaussians.{name}"] for name in PARAMETER_NAMES))
         field = assemble_field(gaussians, config, Response.from_dict(info["response"]), info["base_exposure_time"])
-        if field.fusion is not None:
-            prefix = "fusion."
-            states = {k.removeprefix(prefix): v for k, v in checkpoint.tensors.items() if k.startswith(prefix)}
-            field.fusion.load_state_dict(states)
+        for name, part in (("fusion.", field.fusion), ("response.", field.response)):
+            if isinstance(part, torch.nn.Module):
+                states = {k.removeprefix(name): v for k, v in checkpoint.tensors.items() if k.startswith(name)}
+                part.load_state_dict(states)
     except (KeyError, ValueError, RuntimeError) as error:
         raise InputError(checkpoint.path, f"its tensors do not fit the config ({error})", _REMEDY) from None
     return field

@@ -7,9 +7,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ..errors import InputError
 from ..model.radiance_field import CameraTensors
 from ..model.response import Response
-from ..scene import Camera, View
+from ..scene import Camera, Scene, View
+from .config import LossConfig
 from .losses import CODE, Target
 
 
@@ -81,10 +83,32 @@ class ViewStack:
         return self._view(take, self.times if isinstance(self.times, float) else take(self.times))
 
     def _view(self, take, time) -> TrainingView:
-        camera = CameraTensors(
-            self.width, self.height, take(self.poses), take(self.intrinsics), take(self.positions)
-        )
+        camera = CameraTensors(self.width, self.height, take(self.poses), take(self.intrinsics), take(self.positions))
         return TrainingView(camera, time, Target(**{k: None if v is None else take(v) for k, v in self.images.items()}))
+
+
+def largest_truth(scene: Scene, loss: LossConfig) -> float:
+    """The greatest radiance in the HDR truth of the training views, where it counts; 1.0 where the loss needs none.
+
+    Raises InputError naming the scene and the field of the config where truth that the loss needs is missing or black.
+    """
+    if not loss.uses_hdr:
+        return 1.0
+    field = f"loss.hdr_weight = {loss.hdr_weight}" if loss.hdr_weight > 0 else "loss.hdr_truth = true"
+    remedy = "take a scene with HDR truth, a preset that needs none, or --predict-hdr"
+    given = [view for view in scene.train_views if view.hdr is not None]
+    if not given:
+        raise InputError(scene.name, f"no training view has the HDR truth that {field} needs", remedy)
+    if loss.ldr_weight == 0:
+        for view in scene.train_views:
+            if view.hdr is None:
+                problem = f"view {view.name} lacks the HDR truth that {field} needs where loss.ldr_weight = 0.0"
+                raise InputError(scene.name, problem, remedy)
+    counted = (view.hdr if view.mask is None else view.hdr[view.mask > 0] for view in given)
+    largest = max((float(radiance.max()) for radiance in counted if radiance.size), default=0.0)
+    if not largest > 0:
+        raise InputError(scene.name, f"the HDR truth that {field} needs is black in every training view", remedy)
+    return largest
 
 
 def training_views(

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from ..errors import SehdrError
 from ..model.radiance_field import RadianceField
+from ..model.response import ToneMapper
 from ..scene import Scene
 from ..splatting import GraphRecorder
 from .config import Config
@@ -23,7 +24,7 @@ from .optimizer import (
     optimizer_tensors,
     set_means_rate,
 )
-from .targets import TrainingView, ViewStack, training_views
+from .targets import TrainingView, ViewStack, largest_truth, training_views
 
 CHECK_EVERY = 20
 """Iterations between looks at the count of skipped steps, each of which waits for the device."""
@@ -50,6 +51,7 @@ class Trainer:
         self.optimizer = make_optimizer(field, config, self.extent)
         self.densification = make_densification(config, self.extent)
         self._views = scene.train_views
+        self._largest_truth = largest_truth(scene, config.loss) * field.base_time
         self._levels: dict[int, ViewStack | list[TrainingView]] = {}
         self._order: list[int] = []
         self._order_generator = torch.Generator().manual_seed(config.seed)
@@ -123,7 +125,7 @@ class Trainer:
 
         With a capacity all of it works on fixed memory and nothing waits for the device.
         """
-        linear = self.config.loss.linear_weight > 0
+        linear = self.config.loss.linear_weight > 0 or self.config.loss.hdr_weight > 0
         photo = self.field.photograph(
             view.camera,
             view.exposure_time,
@@ -134,7 +136,7 @@ class Trainer:
         )
         if watched:
             photo.rendering.means2d.retain_grad()
-        loss = total_loss(self.field, photo, view.target, self.config.loss)
+        loss = total_loss(self.field, photo, view.target, self.config.loss, self._largest_truth)
         loss.backward()
         nonfinite, skipped = guarded_step(self.optimizer, loss, photo.rendering.overflow)
         if watched:
@@ -211,6 +213,7 @@ class Trainer:
         parts = {
             "gaussians": self.field.gaussians.tensors(),
             "fusion": {} if self.field.fusion is None else self.field.fusion.state_dict(),
+            "response": self.field.response.state_dict() if isinstance(self.field.response, ToneMapper) else {},
             "optimizer": optimizer_tensors(self.optimizer),
             "densification": self.densification.state(),
             "generators": {"order": self._order_generator.get_state(), "device": self._generator.get_state()},
@@ -249,8 +252,7 @@ class Trainer:
 
     def _upload(self, level: int) -> list[TrainingView]:
         loss, field = self.config.loss, self.field
-        truth = loss.hdr_truth and loss.linear_weight > 0
-        return training_views(self._views, level, field.response, field.base_time, self.device, truth=truth)
+        return training_views(self._views, level, field.response, field.base_time, self.device, truth=loss.uses_hdr)
 
 
 def _part(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
