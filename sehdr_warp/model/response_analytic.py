@@ -92,10 +92,30 @@ class Filmic:
         return torch.where(linear > 0, 2.0 * constant / (root + linear), (root - linear) / (2.0 * square))
 
 
+class Knee:
+    """y = x up to `start`, then start + softness ln(1 + (x - start) / softness): a camera's roll-off into white.
+
+    The slope falls steadily from 1; y = 1 at clip_exposure = start + softness (exp((1 - start) / softness) - 1).
+    """
+
+    def __init__(self, start: float, softness: float):
+        self._start, self._softness = start, softness
+        self.clip_exposure = start + softness * math.expm1((1.0 - start) / softness)
+
+    def evaluate(self, exposure, with_slope):
+        beyond = (exposure - self._start).clamp_min(0.0) / self._softness
+        value = exposure.clamp_max(self._start) + self._softness * beyond.log1p()
+        return value, (1.0 + beyond).reciprocal() if with_slope else None
+
+    def invert(self, value):
+        beyond = (value - self._start).clamp_min(0.0) / self._softness
+        return value.clamp_max(self._start) + self._softness * beyond.expm1()
+
+
 class ToneMapped(AnalyticResponse):
     """A tone curve on exposure, then a display encoding: f(x) = display(tone(x))."""
 
-    def __init__(self, name: str, tone: Reinhard | Filmic, display: PowerLaw):
+    def __init__(self, name: str, tone: Reinhard | Filmic | Knee, display: PowerLaw):
         self.name = name
         self.clip_exposure = tone.clip_exposure
         self._tone, self._display = tone, display
@@ -134,6 +154,12 @@ def _aces() -> ToneMapped:
     return ToneMapped("aces", Filmic(2.51, 0.03, 2.43, 0.59, 0.14, clip), _srgb())
 
 
+def _camera() -> ToneMapped:
+    """A camera's own JPEG: Rec.709 with its linear toe, and a knee into white. The knee's two numbers are the best on a
+    grid for the worse of two measured cameras (Canon EOS 5D Mark II, Sony A6000: docs/response.md)."""
+    return ToneMapped("camera", Knee(0.55, 0.25), _rec709())
+
+
 _BANK = {
     "linear": lambda: PowerLaw("linear", 1.0, 0.0, 1.0, 1.0),
     "gamma-2.2": lambda: _gamma("gamma-2.2", 2.2),
@@ -143,6 +169,7 @@ _BANK = {
     "reinhard-gamma": lambda: ToneMapped("reinhard-gamma", Reinhard(), _gamma("gamma-2.2", 2.2)),
     "filmic": _hable,
     "aces": _aces,
+    "camera": _camera,
 }
 _ALIASES = {"hdr-nerf": "reinhard-gamma", "gamma": "gamma-2.2", "rec.709": "rec709", "bt709": "rec709"}
 

@@ -1,4 +1,4 @@
-"""Choosing a response from one photo: the paper's score, and the linearity of colour mixtures at edges."""
+"""Choosing a response from photos: colour mixtures at edges, clipped light, and a prior; or the paper's score."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,27 +15,45 @@ CODE = 1.0 / 255
 EDGE_REACH, FLAT_CODES, EDGE_CODES = 2, 3, 20
 # The two ends' encoded colours must not be one grey scaled: angle between them, in radians.
 EDGE_ANGLE = 0.05
-MAX_EDGES, MIN_EDGES = 5000, 50
-# An edge that no mixture explains (a third surface, a highlight) counts no more than this.
-MAX_RESIDUAL_CODES = 8.0
+MAX_EDGES, MIN_EDGES = 3000, 50
+# Variance of a stored value in codes^2: rounding, and a little for what two evenly coloured sides still hide.
+CODE_VARIANCE = 1 / 12 + 0.05
+# Student's t: an edge that no mixture explains (a third surface, a highlight) costs a logarithm, not a square.
+EDGE_FREEDOM = 2.0
+# Edges of one photo share what is wrong with them: this many count as one.
+EDGES_PER_FACT = 40.0
+# Radiance falls off above white by this natural log per stop, within a factor of e (one standard deviation).
+HIGHLIGHT_RATE, HIGHLIGHT_SPREAD, HIGHLIGHT_FLOOR = 0.4, 1.0, 0.002
+# Minus log prior, up to a constant. Of photos that say nothing about where they come from ...
+PRIOR = {"camera": 0.5, "srgb": 0.5, "rec709": 1.0, "gamma-2.2": 1.0, "reinhard-gamma": 1.0, "filmic": 2.0, "aces": 2.0}
+# ... and of a camera's own JPEG, which is sharpened and cleaned of noise: its edges mislead (docs/response.md).
+CAMERA_PRIOR = {"camera": 0.0, "rec709": 1.0}
+UNLIKELY = 12.0
+# Photos larger than this are read in bands.
+MOST_PIXELS, BAND_ROWS = 400_000, 32
 
 
 @dataclass(frozen=True)
 class ResponseScore:
-    """What the photo says about one candidate.
+    """What the photos say about one candidate.
 
     dynamic_range: stops between the 0.1th and the 99.9th percentile of the decoded, unclipped values.
     roughness: mean absolute second difference of log2 of the decoded values, stops.
     paper_score: dynamic_range and minus roughness, each divided by its median over the candidates; larger is better.
-    edge_deviation: RMS distance of an edge's middle colour from the mixtures of its two sides in linear light, in
-        8-bit code values; smaller is better; NaN if the photo has fewer than 50 usable edges.
+    edges: mean over edges of minus the log likelihood, nats, that the middle colour is a mixture of its two sides in
+        linear light; smaller is better; NaN if the photos have fewer than 50 usable edges.
+    highlights: minus the log likelihood, nats, of the pixels at the brightest code beside those just below it.
+    prior: minus the log prior, nats. posterior: the sum of the three, edges counted as EDGES_PER_FACT says.
     """
 
     response: Response
     dynamic_range: float
     roughness: float
     paper_score: float
-    edge_deviation: float
+    edges: float
+    highlights: float
+    prior: float
+    posterior: float
 
 
 @dataclass(frozen=True)
@@ -49,7 +67,12 @@ class ResponseSelection:
 
 
 def select_response(
-    image, candidates: Sequence[Response] | None = None, *, method: str = "edges", seed: int = 0
+    image,
+    candidates: Sequence[Response] | None = None,
+    *,
+    method: str = "edges",
+    from_camera: bool = False,
+    seed: int = 0,
 ) -> ResponseSelection:
     """The candidate under which a photo looks most like linear light.
 
@@ -62,48 +85,85 @@ def select_response(
         "edges" is after Lin et al. 2004 (Radiometric calibration from a single image): at an edge between two evenly
         coloured regions a pixel is a mixture of both in linear light, so decoded colours lie on a line. Falls back to
         "paper", and says so in `method`, where the photo has fewer than 50 such edges.
-    seed: of the sample of edges where there are more than 5000.
+        "posterior" adds a prior and what the clipped pixels tell; it needs no edges.
+    from_camera: the photos are a camera's own JPEGs: the prior is then that of cameras.
+    seed: of the sample of edges where there are more than 3000.
 
-    Both find a curve only up to the exposure's scale, and neither is calibration: docs/method.md has measured errors.
+    All find a curve only up to the exposure's scale, and none is calibration: docs/response.md has measured errors.
     Raises SehdrError for an unknown method, no candidates, an image of another shape or with NaN, or under 100 pixels
     that are neither black nor clipped.
     """
-    if method not in ("paper", "edges"):
-        raise SehdrError(f"select_response: method = {method!r} is neither 'paper' nor 'edges'")
+    if method not in ("paper", "edges", "posterior"):
+        raise SehdrError(f"select_response: method = {method!r} is not one of paper, edges, posterior")
     if candidates is None:
         candidates = [response_by_name(name) for name in response_names()]
     if not candidates:
         raise SehdrError("select_response: there are no candidates; give at least one response")
-    images = [_checked(each) for each in (image if isinstance(image, list | tuple) else [image])]
-    clear = [((each > 1.5 * CODE) & (each < 1 - 4.5 * CODE)).all(axis=2) for each in images]
-    if max(mask.sum() for mask in clear) < 100:
+    photos = [_bands(_checked(each)) for each in (image if isinstance(image, list | tuple) else [image])]
+    fullest = max(photos, key=lambda bands: sum(clear.sum() for _, clear in bands))
+    if sum(clear.sum() for _, clear in fullest) < 100:
         raise SehdrError("select_response: under 100 pixels are neither black nor clipped; name a response instead")
-    edges = np.concatenate([_edge_colours(*pair) for pair in zip(images, clear, strict=True)])
+    edges = np.concatenate([_edge_colours(*band) for bands in photos for band in bands])
     if len(edges) > MAX_EDGES:
         edges = edges[np.random.default_rng(seed).choice(len(edges), MAX_EDGES, replace=False)]
-    fullest = int(np.argmax([mask.sum() for mask in clear]))
-    statistics = [
-        (*_range_and_roughness(images[fullest], clear[fullest], each), _edge_deviation(edges, each))
-        for each in candidates
-    ]
-    ranges, roughnesses, deviations = np.array(statistics).T
+    bright = _highlight_shares([values for bands in photos for values, _ in bands])
+    rows = []
+    for each in candidates:
+        surprise, highlights, prior = _edge_surprise(edges, each), _highlights(bright, each), _prior(each, from_camera)
+        posterior = np.nan_to_num(surprise) * len(edges) / EDGES_PER_FACT + highlights + prior
+        rows.append((*_range_and_roughness(fullest, each), surprise, highlights, prior, posterior))
+    ranges, roughnesses, surprises, highlights, priors, posteriors = np.array(rows, dtype=np.float64).T
     paper = _relative(ranges) - _relative(roughnesses)
-    if method == "edges" and np.isnan(deviations).all():
+    if method == "edges" and np.isnan(surprises).all():
         method = "paper"
-    goodness = paper if method == "paper" else -np.nan_to_num(deviations, nan=np.inf)
-    scores = [
-        ResponseScore(each, *map(float, row))
-        for each, row in zip(candidates, zip(ranges, roughnesses, paper, deviations, strict=True), strict=True)
-    ]
+    goodness = {"paper": paper, "edges": -np.nan_to_num(surprises, nan=np.inf), "posterior": -posteriors}[method]
+    columns = (ranges, roughnesses, paper, surprises, highlights, priors, posteriors)
+    scores = [ResponseScore(each, *map(float, row)) for each, row in zip(candidates, np.stack(columns, 1), strict=True)]
     order = np.argsort(-goodness, kind="stable")
     return ResponseSelection(candidates[order[0]], method, len(edges), tuple(scores[index] for index in order))
 
 
 def _checked(image) -> np.ndarray:
-    image = np.asarray(image.detach().cpu() if isinstance(image, torch.Tensor) else image, np.float64)
+    image = np.asarray(image.detach().cpu() if isinstance(image, torch.Tensor) else image)
     if image.ndim != 3 or image.shape[2] != 3 or not np.isfinite(image).all():
         raise SehdrError(f"select_response: an image of shape {list(image.shape)} is not [H, W, 3] of finite values")
-    return image
+    return image.astype(np.float64)
+
+
+def _bands(image: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """A photo, or evenly spaced bands of a large one, each [h, W, 3] with where it is neither black nor clipped."""
+    rows, columns = image.shape[:2]
+    bands = [image]
+    if rows * columns > MOST_PIXELS:
+        starts = np.linspace(0, rows - BAND_ROWS, max(1, MOST_PIXELS // (BAND_ROWS * columns)))
+        bands = [image[int(start) : int(start) + BAND_ROWS] for start in starts]
+    return [(each, ((each > 1.5 * CODE) & (each < 1 - 4.5 * CODE)).all(axis=2)) for each in bands]
+
+
+def _prior(response: Response, from_camera: bool) -> float:
+    """Minus the log prior of a candidate; one that is not of the bank was given on purpose, and is as likely as any."""
+    if response.name not in response_names():
+        return 0.0
+    return (CAMERA_PRIOR if from_camera else PRIOR).get(response.name, UNLIKELY)
+
+
+def _highlight_shares(images) -> tuple[float, float]:
+    """The shares of values at the brightest code, and at the nine codes below it."""
+    count = sum(image.size for image in images)
+    at_white = sum(int((image >= 1 - CODE / 2).sum()) for image in images)
+    near_white = sum(int((image >= 1 - 9.5 * CODE).sum()) for image in images) - at_white
+    return at_white / count, near_white / count
+
+
+def _highlights(shares: tuple[float, float], response: Response) -> float:
+    """Minus the log likelihood of those shares. If log radiance falls off as exp(-rate stops), the nine codes span
+    S stops and white holds all beyond them, then near / (at + near) = 1 - exp(-rate S): a clipping camera piles values
+    up at 255, a curve that never clips spreads the same light over the codes below. The rate is log-normal."""
+    white, near = (share + HIGHLIGHT_FLOOR / 2 for share in shares)
+    stops = np.log2(float(response.decode(1 - CODE / 2)) / float(response.decode(1 - 9.5 * CODE)))
+    rate = np.log1p(near / white) / max(stops, 1e-6)
+    spread = HIGHLIGHT_SPREAD**2 + HIGHLIGHT_FLOOR / (sum(shares) + 1e-9)
+    return float(0.5 * np.log(rate / HIGHLIGHT_RATE) ** 2 / spread)
 
 
 def _relative(values: np.ndarray) -> np.ndarray:
@@ -111,14 +171,15 @@ def _relative(values: np.ndarray) -> np.ndarray:
     return values / median if median > 0 else np.zeros_like(values)
 
 
-def _range_and_roughness(image, clear, response):
-    exposure = response.decode(np.maximum(image, response.black + CODE))
-    stops = np.log2(exposure)
-    low, high = np.percentile(stops[clear], (0.1, 99.9))
-    bends = []
-    for axis in (0, 1):
-        rows, known = np.moveaxis(stops, axis, 0), np.moveaxis(clear, axis, 0)
-        bends.append(np.abs(rows[2:] - 2 * rows[1:-1] + rows[:-2])[known[2:] & known[1:-1] & known[:-2]].ravel())
+def _range_and_roughness(bands, response):
+    seen, bends = [], []
+    for image, clear in bands:
+        stops = np.log2(response.decode(np.maximum(image, response.black + CODE)))
+        seen.append(stops[clear].ravel())
+        for axis in (0, 1):
+            rows, known = np.moveaxis(stops, axis, 0), np.moveaxis(clear, axis, 0)
+            bends.append(np.abs(rows[2:] - 2 * rows[1:-1] + rows[:-2])[known[2:] & known[1:-1] & known[:-2]].ravel())
+    low, high = np.percentile(np.concatenate(seen), (0.1, 99.9))
     bends = np.concatenate(bends)
     return high - low, bends.mean() if len(bends) else 0.0
 
@@ -151,17 +212,24 @@ def _edge_colours(image, clear):
     return np.concatenate(found) if found else np.zeros((0, 3, 3))
 
 
-def _edge_deviation(edges, response):
-    """RMS over edges of |W (middle - first - a (last - first))|, a the best for each edge, W = f' at the middle colour.
+def _edge_surprise(edges, response):
+    """Mean over edges of minus the log likelihood, in nats, that the middle colour lies on the line of its two sides.
 
-    W turns distances in linear light into code values, in which the photo's noise is alike for every candidate: a
-    plain distance, or one divided by the line's length, prefers whichever curve crowds the colours together.
+    The distance from the line has the variance that rounding of all three colours gives it under this candidate,
+    measured at the middle colour in code values, where a photo's own noise is alike for every candidate. The density's
+    normalisation (log determinant) belongs to it: without, the curve that crowds colours together would win.
     """
     if len(edges) < MIN_EDGES:
         return np.nan
-    first, middle, last = np.moveaxis(response.decode(np.maximum(edges, response.black + CODE)), 1, 0)
-    slope = response.slope(middle)
-    offset, line = slope * (middle - first), slope * (last - first)
-    along = (offset * line).sum(1) / np.maximum((line**2).sum(1), 1e-300)
-    residual = np.linalg.norm(offset - along[:, None] * line, axis=1) / CODE
-    return float(np.sqrt(np.square(residual.clip(max=MAX_RESIDUAL_CODES)).mean()))
+    exposures = np.asarray(response.decode(np.maximum(edges, response.black + CODE)))
+    slopes = np.maximum(np.asarray(response.slope(exposures)), 1e-9)
+    (first, middle, last), (slope_first, slope, slope_last) = np.moveaxis(exposures, 1, 0), np.moveaxis(slopes, 1, 0)
+    offset, line = slope * (middle - first) / CODE, slope * (last - first) / CODE
+    length = np.maximum((line**2).sum(1), 1e-300)
+    share = ((offset * line).sum(1) / length)[:, None]
+    variance = CODE_VARIANCE * (1 + ((1 - share) * slope / slope_first) ** 2 + (share * slope / slope_last) ** 2)
+    weighted = np.maximum((line**2 / variance).sum(1), 1e-300)
+    share = ((offset * line / variance).sum(1) / weighted)[:, None]
+    distance = ((offset - share * line) ** 2 / variance).sum(1)
+    spread = 0.5 * (np.log(variance).sum(1) + np.log(weighted) - np.log(length))
+    return float(((EDGE_FREEDOM + 2) / 2 * np.log1p(distance / EDGE_FREEDOM) + spread).mean())

@@ -25,7 +25,7 @@ def test_edges_find_the_response_of_a_clean_picture(name):
     photos = [np.round(response.encode(peak * mosaic(seed)) * 255) / 255 for seed in range(4)]
     selection = select_response(photos)
     assert selection.response.name == name and selection.method == "edges" and selection.edge_count > 200
-    assert [score.edge_deviation for score in selection.scores] == sorted(s.edge_deviation for s in selection.scores)
+    assert [score.edges for score in selection.scores] == sorted(s.edges for s in selection.scores)
     assert {score.response.name for score in selection.scores} == set(response_names())
 
 
@@ -54,7 +54,7 @@ def test_tensor_array_and_candidates():
 def test_no_edges_falls_back_to_the_papers_score():
     ramp = np.linspace(0.1, 0.9, 64)[None, :, None] * np.ones((64, 1, 3))
     selection = select_response(ramp)
-    assert selection.method == "paper" and np.isnan(selection.scores[0].edge_deviation)
+    assert selection.method == "paper" and np.isnan(selection.scores[0].edges)
 
 
 @pytest.mark.parametrize(
