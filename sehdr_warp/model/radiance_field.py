@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ..scene import Camera
-from ..splatting import Rendering, rasterize, spherical_harmonics
+from ..splatting import BlendStyle, Rendering, rasterize, spherical_harmonics
 from .fusion import NeuralExposureFusion
 from .gaussians import HARMONIC_0, Gaussians
 from .response import Response
@@ -97,6 +97,7 @@ class RadianceField(nn.Module):
         fusion: NeuralExposureFusion | None = None,
         antialiased: bool = False,
         low_pass: float = 0.3,
+        style: BlendStyle = BlendStyle(),  # noqa: B008, frozen
     ):
         super().__init__()
         self.gaussians = gaussians
@@ -107,6 +108,7 @@ class RadianceField(nn.Module):
         self.tone_map = tone_map
         self.antialiased = antialiased
         self.low_pass = low_pass
+        self.style = style
 
     def photograph(
         self,
@@ -237,4 +239,5 @@ class RadianceField(nn.Module):
             antialiased=self.antialiased,
             low_pass=self.low_pass,
             capacity=capacity,
+            style=self.style,
         )

@@ -254,6 +254,7 @@ class Config:
     optimizer: OptimizerConfig = OptimizerConfig()
     schedule: ScheduleConfig = ScheduleConfig()
     seed: int = option(0, "of every random number in the training", low=0, high=2**62)
+    deterministic: bool = option(False, "on a GPU, the same bits every time, for some speed and memory; a CPU always does")
 
     def __post_init__(self):
         validate(self)

@@ -13,6 +13,7 @@ from ..model.radiance_field import EXPOSURE_FLOOR, RadianceField
 from ..model.response import Response, ToneMapper, response_by_name, response_names, responses_in_file
 from ..model.response_selection import select_response
 from ..scene import Scene, View
+from ..splatting import BlendStyle
 from .config import Config
 
 CODE_RANGE = (1 / 255, 250 / 255)
@@ -117,6 +118,7 @@ def assemble_field(gaussians: Gaussians, config: Config, response: Response, bas
         fusion=fusion,
         antialiased=config.model.antialiased,
         low_pass=config.model.low_pass,
+        style=BlendStyle(deterministic=config.deterministic),
     )
 
 

@@ -1,5 +1,6 @@
 """A whole training: folder, steps, reports, held-out tests, checkpoints, and a tidy end however it comes."""
 
+import os
 import signal
 import sys
 import threading
@@ -75,7 +76,7 @@ def train(
         clear_folder(out)
         write_start(out, scene, config, field, data or {})
     loop = _Loop(scene, out, trainer, seconds, tensorboard)
-    with Progress(trainer.config.schedule.iterations, enabled=not quiet) as progress, _one_torch_thread():
+    with Progress(trainer.config.schedule.iterations, enabled=not quiet) as progress, _torch_settings(trainer.config):
         progress.note(f"response {trainer.field.response.name}, {trainer.field.gaussians.count} Gaussians on {device}")
         loop.run(progress)
     return load_run(out, device=device)
@@ -247,17 +248,26 @@ def peak_memory(device: torch.device) -> dict[str, int]:
 
 
 @contextmanager
-def _one_torch_thread():
+def _torch_settings(config: Config):
     """torch on one thread: its sums then do not depend on the machine's cores, and a CPU training repeats bit for bit.
-
     It costs nothing: the work is in the kernels, which have threads of their own, and torch's would stand in their way.
+
+    With config.deterministic, also torch's sums on a GPU in a fixed order.
     """
-    before = torch.get_num_threads()
+    threads, ordered = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
+    filled = torch.utils.deterministic.fill_uninitialized_memory
     torch.set_num_threads(1)
+    if config.deterministic:
+        # cuBLAS repeats itself only with a workspace of its own; it reads this when it is first used.
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+        torch.use_deterministic_algorithms(True)
+        torch.utils.deterministic.fill_uninitialized_memory = False
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(threads)
+        torch.use_deterministic_algorithms(ordered)
+        torch.utils.deterministic.fill_uninitialized_memory = filled
 
 
 @contextmanager

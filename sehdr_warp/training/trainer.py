@@ -1,5 +1,6 @@
 """The training loop's state and its single step. What happens around steps is train.py's business."""
 
+import math
 import warnings
 
 import torch
@@ -113,8 +114,9 @@ class Trainer:
         else:
             self._last = self._optimise(views[index], watched)
         self.densification.perturb(gaussians, rate, self._generator)
+        count = gaussians.count
         if self.densification.change(self.iteration, gaussians, self.optimizer, self._generator):
-            self._forget_recording()
+            self._forget_recording(gaussians.count / max(1, count))
         if self.iteration % CHECK_EVERY == 0:
             self.check()
 
@@ -188,11 +190,11 @@ class Trainer:
             warnings.warn(f"training steps are launched one by one: {str(error).splitlines()[0]}", stacklevel=2)
             return self._optimise(views[index], watched)
 
-    def _forget_recording(self) -> None:
-        """The Gaussians are others: launch the next step, which also tells how much room it needs."""
+    def _forget_recording(self, growth: float) -> None:
+        """The Gaussians are others, `growth` times as many: they will need about so many times the room."""
         if self._recorder is not None:
             self._recorder.invalidate()
-            self._pairs = 0
+            self._pairs = math.ceil(self._pairs * growth)
 
     def check(self) -> None:
         """Raises SehdrError if more than schedule.nonfinite_limit steps were skipped."""
