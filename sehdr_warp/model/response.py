@@ -5,9 +5,10 @@ from pathlib import Path
 from .response_analytic import analytic_names, analytic_response
 from .response_curve import Response
 from .response_files import colour_response, response_from_file, responses_in_file
+from .response_refined import RefinedResponse
 from .tone_mapper import ToneMapper
 
-__all__ = ["Response", "ToneMapper", "response_by_name", "response_names", "responses_in_file"]
+__all__ = ["RefinedResponse", "Response", "ToneMapper", "response_by_name", "response_names", "responses_in_file"]
 
 
 def response_names() -> list[str]:

@@ -83,7 +83,7 @@ class Response(ABC):
 
     def encode(self, exposure):
         """f(x), in [black, peak]. Exposures below 0 count as 0; the gradient is 0 there and beyond the clip point."""
-        return self._apply(_Encode, exposure, None)
+        return self._through(_Encode, exposure, None)
 
     def encode_extended(self, exposure, *, slope: float = EXTENSION_SLOPE):
         """f(x) up to the clip point; beyond it f(clip) + slope log(x / clip), so that a gradient is left there.
@@ -91,7 +91,7 @@ class Response(ABC):
         Continuous; the derivative jumps at the clip point and is at most slope / clip beyond it. A loss can compare
         the surplus over 1 with a clipped target through a hinge. Equals encode for a curve that never clips.
         """
-        return self._apply(_Encode, exposure, slope)
+        return self._through(_Encode, exposure, slope)
 
     def decode(self, value):
         """The exposure whose encoded value this is: decode(encode(x)) = x for 0 <= x <= clip_exposure.
@@ -99,13 +99,13 @@ class Response(ABC):
         Values are first limited to [black, peak]. A curve that only approaches its peak is inverted up to `white`,
         since the brightest code says no more than "at least this" and the exact inverse of 1 would be infinite.
         """
-        return self._apply(_Decode, value, None)
+        return self._through(_Decode, value, None)
 
     def slope(self, exposure):
         """df/dx of encode, shaped like the exposures; 0 beyond the clip point. Not differentiable itself."""
-        return self._apply(_Slope, exposure, None)
+        return self._through(_Slope, exposure, None)
 
-    def _apply(self, function, argument, slope):
+    def _through(self, function, argument, slope):
         if isinstance(argument, torch.Tensor):
             if argument.dtype not in (torch.float32, torch.float64):
                 raise TypeError(f"a response takes float32 or float64 tensors, not {argument.dtype}")
