@@ -27,13 +27,17 @@ class Train:
     out: Path
     """Folder for the run."""
     preset: str | None = None
-    """default, paper, fast, demo, 3dgs, or a TOML file; with --resume the run's own config."""
+    """default, fast, demo, paper, a rival (paper-truth, hdr-gs, hdr-gs-truth, 3dgs, truth, predicted), or a TOML file;
+    with --resume the run's own config."""
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
     exposure_index: int | None = None
     """Which exposure to train on where a view has several; by default the middle one."""
     response: str | None = None
     """Camera response: a name (srgb, gamma-2.2, hdr-nerf ...), a file, or auto."""
+    predict_hdr: str | None = None
+    """Train on single-image predictions in place of HDR truth: kovaleski-oliveira, a folder of predicted EXR files named
+    as the views, or a TorchScript (.pt) or ONNX (.onnx) file; the preset is then `predicted` unless you name one."""
     iterations: int | None = None
     """Training steps; all schedules scale with it."""
     max_size: int | None = None
@@ -174,12 +178,15 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _train(command: Train) -> None:
     from .scene import load_scene
+    from .training.prediction import check_predictor
     from .training.run import check_folder
     from .training.train import pick_device, train
 
     # What can be refused is refused before the photos are read, which may take minutes.
     resumed = check_folder(command.out, resume=command.resume, overwrite=command.overwrite)
     config, device = _config(command, resumed), pick_device(command.device)
+    if config.loss.predictor:
+        check_predictor(config.loss.predictor)
     data = {"path": _absolute(command.data), "exposure_index": command.exposure_index, "max_size": command.max_size}
     scene = load_scene(
         command.data,
@@ -215,6 +222,7 @@ def _config(command: Train, resumed: bool):
 
     given = {
         "response.name": command.response,
+        "loss.predictor": _predictor(command.predict_hdr),
         "schedule.iterations": command.iterations,
         "seed": command.seed,
     }
@@ -222,7 +230,8 @@ def _config(command: Train, resumed: bool):
     if resumed and command.preset is None:
         path = command.out / CONFIG
         return override_config(read_config_json(path), overrides, path)
-    return load_config(command.preset or "default", overrides)
+    preset = command.preset or ("default" if command.predict_hdr is None else "predicted")
+    return load_config(preset, overrides)
 
 
 def _render(command: Render) -> None:
@@ -337,6 +346,11 @@ def _cache_beside(run: Path) -> Path:
 
 def _absolute(data: str) -> str:
     return data if data == "embedded" else str(Path(data).absolute())
+
+
+def _predictor(text: str | None) -> str | None:
+    """A predictor for the config, which outlives this folder: paths in full, names as they are."""
+    return str(Path(text).absolute()) if text is not None and Path(text).exists() else text
 
 
 def _numbers(flag: str, text: str | None) -> tuple[float, ...] | None:

@@ -85,8 +85,9 @@ def read_mask(path: Path, *, oriented: bool = False) -> np.ndarray:
     return (image.pixels.mean(axis=2) / image.levels).astype(np.float32)
 
 
-def read_hdr(path: Path) -> np.ndarray:
-    """[H, W, 3] float32 scene-linear radiance from an OpenEXR or Radiance file; negative values are raised to zero.
+def read_hdr(path: Path, *, keep_negative: bool = False) -> np.ndarray:
+    """[H, W, 3] float32 scene-linear radiance from an OpenEXR or Radiance file; negative values are raised to zero
+    unless they are to be kept.
 
     Raises InputError where the file is missing, damaged or too large, or a value is NaN or infinite (with its place).
     """
@@ -112,7 +113,7 @@ def read_hdr(path: Path) -> np.ndarray:
             f"{int(bad.any(axis=2).sum())} pixels not finite, one {'RGB'[channel]} = {value} at x={column}, y={row}",
             "render or export the image again",
         )
-    return np.maximum(pixels, 0.0)
+    return pixels if keep_negative else np.maximum(pixels, 0.0)
 
 
 def read_exr_channels(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[dict[str, np.ndarray], dict]:

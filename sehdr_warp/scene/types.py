@@ -42,6 +42,7 @@ class Scene:
     point_colors: [P, 3] float32 in [0, 1], encoded like the images.
     exposure_times_known: False where no file stated them (then each view's is 1 second).
     notes: one line each on what the user should know (differing exposures, views left out, ...).
+    predictor: what predicted the `hdr` of the training views, each from its photo; None where `hdr` is truth.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Scene:
     point_colors: np.ndarray
     exposure_times_known: bool = True
     notes: tuple[str, ...] = field(default=())
+    predictor: str | None = None
 
     @property
     def train_views(self) -> tuple[View, ...]:

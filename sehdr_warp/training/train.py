@@ -12,6 +12,7 @@ import torch
 
 from ..errors import InputError, SehdrError
 from ..model.gaussians import Gaussians
+from ..model.response import Response
 from ..output.files import write_json
 from ..scene import Scene
 from ..splatting.threads import thread_count
@@ -20,6 +21,7 @@ from .config import Config
 from .config_files import config_to_dict, load_config, read_config_json
 from .heldout import evaluate_views
 from .initialization import choose_response, make_field
+from .prediction import predicted_scene
 from .progress import Progress
 from .run import (
     CHECKPOINTS,
@@ -70,7 +72,9 @@ def train(
         trainer, seconds = _continue(scene, out, config, device)
     else:
         config = config or load_config()
-        field = make_field(scene, config, choose_response(scene, config), device)
+        response = choose_response(scene, config)
+        scene = with_predictions(scene, config, response)
+        field = make_field(scene, config, response, device)
         trainer, seconds = Trainer(scene, config, field), 0.0
         # Nothing is made or removed before the scene is known to be good.
         clear_folder(out)
@@ -80,6 +84,14 @@ def train(
         progress.note(f"response {trainer.field.response.name}, {trainer.field.gaussians.count} Gaussians on {device}")
         loop.run(progress)
     return load_run(out, device=device)
+
+
+def with_predictions(scene: Scene, config: Config, response: Response) -> Scene:
+    """The scene as the loss may see it: where loss.predictor names one, its predictions stand in for the truth of the
+    training views, unless they are predictions already."""
+    if not config.loss.predictor or scene.predictor is not None:
+        return scene
+    return predicted_scene(scene, config.loss.predictor, response)
 
 
 def pick_device(device: str | torch.device | None) -> torch.device:
@@ -106,11 +118,13 @@ def _continue(scene: Scene, out: Path, config: Config | None, device) -> tuple[T
         raise InputError(
             out / CONFIG, _first_difference(saved, config), "resume with the run's own config, or train anew"
         )
+    response = Response.from_dict(info["response"])
+    scene = with_predictions(scene, saved, response)
     check_same_scene(out, scene)
     checkpoint = newest_checkpoint(out / CHECKPOINTS)
     if checkpoint is None:
         rewind_metrics(out, 0)
-        return Trainer(scene, saved, make_field(scene, saved, choose_response(scene, saved), device)), 0.0
+        return Trainer(scene, saved, make_field(scene, saved, response, device)), 0.0
     trainer = Trainer(scene, saved, field_from_checkpoint(checkpoint, saved, info).to(device))
     trainer.load_state(checkpoint.tensors, checkpoint.values)
     rewind_metrics(out, trainer.iteration)
