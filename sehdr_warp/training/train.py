@@ -118,13 +118,12 @@ def _continue(scene: Scene, out: Path, config: Config | None, device) -> tuple[T
         raise InputError(
             out / CONFIG, _first_difference(saved, config), "resume with the run's own config, or train anew"
         )
-    response = Response.from_dict(info["response"])
-    scene = with_predictions(scene, saved, response)
+    scene = with_predictions(scene, saved, Response.from_dict(info["response"]))
     check_same_scene(out, scene)
     checkpoint = newest_checkpoint(out / CHECKPOINTS)
     if checkpoint is None:
         rewind_metrics(out, 0)
-        return Trainer(scene, saved, make_field(scene, saved, response, device)), 0.0
+        return Trainer(scene, saved, make_field(scene, saved, choose_response(scene, saved), device)), 0.0
     trainer = Trainer(scene, saved, field_from_checkpoint(checkpoint, saved, info).to(device))
     trainer.load_state(checkpoint.tensors, checkpoint.values)
     rewind_metrics(out, trainer.iteration)
