@@ -289,7 +289,8 @@ def backward_kernel(dtype, channels: int, halvings: int, degree: int = EXPONENTI
                 counted = wp.cw_mul(step(a - spread(alpha_threshold)), step(last[tile, j] - place))
                 inverse = wp.cw_div(ones, ones - a)
                 t = transmittance[tile, j]
-                t = t + wp.cw_mul(wp.cw_mul(t, inverse) - t, counted)
+                # As an addition: t * inverse would round each of many faint factors the same way.
+                t = t + wp.cw_mul(wp.cw_mul(t, wp.cw_mul(a, inverse)), counted)
                 transmittance[tile, j] = t
                 q = incoming[tile, 0, j] * features[i, 0]
                 for channel in range(1, wp.static(channels)):

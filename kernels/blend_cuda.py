@@ -171,7 +171,7 @@ def forward_kernel(dtype, channels: int, transmittance_min: float = TRANSMITTANC
                     dx = s[0] - x
                     dy = s[1] - y
                     upper_a = wp.min(real(ALPHA_MAX), s[2] * wp.exp(g.splat_exponent(q[0], q[1], q[2], dx, dy)))
-                    upper_next = upper_t * (real(1.0) - upper_a)
+                    upper_next = upper_t - upper_t * upper_a
                     draw = upper_done == 0 and upper_a > alpha_threshold
                     if draw and upper_next <= real(transmittance_min):
                         upper_done = 1
@@ -183,7 +183,7 @@ def forward_kernel(dtype, channels: int, transmittance_min: float = TRANSMITTANC
                         upper_last = entry[1]
                     dy = dy - real(4.0)
                     lower_a = wp.min(real(ALPHA_MAX), s[2] * wp.exp(g.splat_exponent(q[0], q[1], q[2], dx, dy)))
-                    lower_next = lower_t * (real(1.0) - lower_a)
+                    lower_next = lower_t - lower_t * lower_a
                     draw = lower_done == 0 and lower_a > alpha_threshold
                     if draw and lower_next <= real(transmittance_min):
                         lower_done = 1

@@ -184,7 +184,8 @@ def backward_kernel(dtype, channels: int, fast_math: bool = True, ordered: bool 
                             for h in range(wp.static(4)):
                                 along += quad[h] * incoming[e * 4 + h]
                         inverse = real(1.0) / (real(1.0) - a)
-                        t = t * inverse
+                        # t * inverse would round each of many faint factors the same way.
+                        t += t * (a * inverse)
                         weight = a * t
                         if unclamped < real(ALPHA_MAX):
                             slope = a * (t * along - behind * inverse)
@@ -196,7 +197,7 @@ def backward_kernel(dtype, channels: int, fast_math: bool = True, ordered: bool 
                             for h in range(wp.static(4)):
                                 along += quad[h] * incoming[e * 4 + h]
                         inverse = real(1.0) / (real(1.0) - a2)
-                        t = t * inverse
+                        t += t * (a2 * inverse)
                         weight2 = a2 * t
                         if unclamped2 < real(ALPHA_MAX):
                             slope2 = a2 * (t * along - behind * inverse)

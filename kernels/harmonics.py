@@ -33,8 +33,10 @@ def harmonics_kernel(dtype, degree: int):
         value = real(0.28209479177387814) * constant[i, 0]
         if wp.static(degree > 0):
             offset = means[i] - camera_position[0]
-            length = wp.sqrt(wp.dot(offset, offset))
-            inverse_length = wp.where(length > real(0.0), real(1.0) / wp.max(length, real(1.0e-30)), real(0.0))
+            square = wp.dot(offset, offset)
+            away = square > real(1.0e-30)
+            # At the camera there is no direction; sqrt's infinite derivative at 0 must not be met there.
+            inverse_length = wp.where(away, real(1.0) / wp.sqrt(wp.where(away, square, real(1.0))), real(0.0))
             x = offset[0] * inverse_length
             y = offset[1] * inverse_length
             z = offset[2] * inverse_length

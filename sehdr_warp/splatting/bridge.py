@@ -152,7 +152,11 @@ def _scalar(dtype) -> torch.dtype:
 
 def _array(tensor: torch.Tensor, dtype=None) -> wp.array:
     dtype = None if isinstance(dtype, torch.dtype) else dtype
-    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+    tensor = tensor.detach()
+    if tensor.is_contiguous():
+        # torch leaves the stride of an axis of length 1 as it was; Warp wants an array's and its gradient's alike.
+        tensor = tensor.view(-1).view(tensor.shape)
+    return wp.from_torch(tensor, dtype=dtype, requires_grad=False)
 
 
 class _ProgramFunction(torch.autograd.Function):
