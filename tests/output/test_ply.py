@@ -187,7 +187,7 @@ class StoredRun:
 
     def __init__(self, radiance="log", fusion=None):
         torch = pytest.importorskip("torch")
-        self.arrays = gaussians(color_model=radiance)
+        self.arrays = gaussians(color_model="log" if radiance == "log-chroma" else radiance)
         tensors = {name: torch.from_numpy(getattr(self.arrays, name)) for name in ARRAYS[:4]}
         harmonics = torch.from_numpy(self.arrays.harmonics)
         tensors |= {"harmonics_dc": harmonics[:, :1], "harmonics_rest": harmonics[:, 1:]}
@@ -197,6 +197,17 @@ class StoredRun:
 
     def exposures(self, directions):
         return evaluate_colors(self.arrays, directions)
+
+
+def test_hdr_ply_of_log_chroma_is_linear_and_exact(tmp_path):
+    run = StoredRun("log-chroma")
+    write_ply(tmp_path / "hdr.ply", run)
+    read, directions = read_gaussians(tmp_path / "hdr.ply"), sphere_directions(20)
+    basis, stored = harmonic_basis(directions, 3), run.arrays.harmonics.astype(np.float64)
+    constant = np.exp(basis[0, 0] * stored[:, None, 0])
+    exposure = constant * np.maximum(1 + basis[:, 1:] @ stored[:, 1:], 0)
+    assert read.color_model == "linear"
+    np.testing.assert_allclose(evaluate_colors(read, directions), exposure / 0.25, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("radiance", ["log", "linear"])

@@ -6,11 +6,20 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from sehdr_warp.model.gaussians import PARAMETER_NAMES, Gaussians
+from sehdr_warp.model.gaussians import HARMONIC_0, PARAMETER_NAMES, Gaussians
+from sehdr_warp.model.response import response_by_name
 from sehdr_warp.splatting import rasterize
 from sehdr_warp.training.config_files import load_config
-from sehdr_warp.training.densification import GradientDensification, make_densification, rotate
+from sehdr_warp.training.densification import (
+    MOST_WEIGHT,
+    GradientDensification,
+    make_densification,
+    rotate,
+    slope_weights,
+)
 from sehdr_warp.training.relocation import Relocation, _draw, _relocation_sums
+
+from .toy import toy_field
 
 EXTENT = 2.0
 
@@ -250,3 +259,29 @@ def test_draws_follow_the_weights():
 def test_strategies_by_name():
     assert isinstance(relocation(), Relocation)
     assert isinstance(make_densification(load_config(), EXTENT), GradientDensification)
+
+
+@pytest.mark.parametrize("name", ["srgb", "hdr-nerf"])
+def test_slope_weights_lift_dark_and_bright(name):
+    """In HDR-NeRF's curve x f'(x) = z / 2.2 / (1 + x): highest between the toe and the shoulder."""
+    response = response_by_name(name)
+    exposures = torch.tensor([1e-5, 0.3, response.white * 0.99, 100 * response.white])
+    field = toy_field(count=4)
+    constant = exposures.log()[:, None, None].expand(4, 1, 3) / HARMONIC_0
+    field.gaussians.overwrite({"harmonics_dc": constant})
+    field.response = response
+    dark, middle, bright, clipped = slope_weights(field, 1.0).tolist()
+    assert dark == MOST_WEIGHT and clipped == MOST_WEIGHT and 1 <= middle < 2
+    assert bright > 1 or name == "srgb"
+    expected = slope_weights(field, 0.5)[1].item()
+    field.gaussians.overwrite({"harmonics_dc": constant + math.log(0.5) / HARMONIC_0})
+    assert slope_weights(field, 1.0)[1].item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_weights_multiply_the_statistics():
+    strategy = gradient_strategy()
+    gradient = torch.tensor([[3.0, 0.0], [0.0, 4.0]])
+    strategy.prepare(2, "cpu")
+    shown = rendering_with(gradient, torch.tensor([True, True]))
+    strategy.observe(shown, 200, 100, torch.tensor(1.0), torch.tensor([2.0, 1.0]))
+    assert strategy.gradient_sum.tolist() == [600.0, 200.0]

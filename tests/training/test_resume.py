@@ -10,9 +10,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from sehdr_warp.training.checkpoint import newest_checkpoint
-from sehdr_warp.training.config_files import load_config
+from sehdr_warp.training.checkpoint import Checkpoint, newest_checkpoint
+from sehdr_warp.training.config_files import load_config, override_config
+from sehdr_warp.training.initialization import choose_response, make_field
+from sehdr_warp.training.run import field_from_checkpoint
 from sehdr_warp.training.train import train
+from sehdr_warp.training.trainer import Trainer
 
 from .test_train import QUICK
 
@@ -96,3 +99,37 @@ def test_resume_of_a_finished_run_changes_nothing(scene, tmp_path):
     again = train(scene, tmp_path / "run", config, device="cpu", quiet=True, resume=True)
     assert torch.equal(first.model.gaussians.means, again.model.gaussians.means)
     assert first.metrics() == again.metrics()
+
+
+def test_a_trainer_continues_from_its_state_with_rates_and_dropout(scene):
+    options = {
+        "model.dropout": 0.2,
+        "densification.slope_corrected": True,
+        "optimizer.final_factor": 0.1,
+        "optimizer.decay_from": 0.1,
+    }
+    config = override_config(configuration("gradient"), options)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        whole = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cpu"))
+        # 45 is between two changes of the rates.
+        _steps(whole, 45)
+        tensors, values = whole.state()
+        tensors = {name: value.clone() for name, value in tensors.items()}
+        info = {"response": whole.field.response.to_dict(), "base_exposure_time": whole.field.base_time}
+        field = field_from_checkpoint(Checkpoint(Path("memory"), tensors, values), config, info)
+        resumed = Trainer(scene, config, field)
+        resumed.load_state(tensors, values)
+        for trainer in (whole, resumed):
+            _steps(trainer, 35)
+    finally:
+        torch.set_num_threads(threads)
+    again = resumed.state()[0]
+    for name, value in whole.state()[0].items():
+        assert torch.equal(value, again[name]), name
+
+
+def _steps(trainer, count):
+    for _ in range(count):
+        trainer.step()

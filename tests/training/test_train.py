@@ -58,6 +58,19 @@ VARIANTS = {
         },
     ),
     "truth": quick(**{"loss.linear_weight": 0.5, "loss.hdr_truth": True}),
+    "climb": quick(
+        **{
+            "model.radiance": "log-chroma",
+            "model.dropout": 0.1,
+            "model.far_points": 30,
+            "loss.interval": "all",
+            "loss.domain": "mu-law",
+            "loss.highlight_weight": 0.01,
+            "loss.harmonics_weight": 0.01,
+            "densification.slope_corrected": True,
+            "optimizer.final_factor": 0.3,
+        }
+    ),
     "gaussian tone map": quick(**{"model.tone_map": "gaussian"}),
 }
 
@@ -242,8 +255,9 @@ def test_unknown_device_is_refused(scene, tmp_path):
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
-def test_recorded_steps_train_like_launched_ones():
-    scene, config = toy_scene(), quick()
+@pytest.mark.parametrize("variant", ["default", "climb"])
+def test_recorded_steps_train_like_launched_ones(variant):
+    scene, config = toy_scene(), VARIANTS[variant]
     scores = []
     for recorded in (True, False):
         field = make_field(scene, config, choose_response(scene, config), "cuda:0")
