@@ -3,6 +3,7 @@
 import json
 import math
 import struct
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -144,6 +145,17 @@ def exif_exposure(path: Path) -> tuple[float | None, float | None, float | None]
     if time is not None and not (math.isfinite(time) and time > 0):
         raise InputError(path, f"EXIF exposure time is {time}", _REMEDY)
     return time, speed if speed and 0 < speed < 1e9 else None, aperture if aperture and 0 < aperture < 1e4 else None
+
+
+def made_by_camera(sources: Sequence[Path | None]) -> bool:
+    """Whether photos are a camera's own JPEGs: most of the files are JPEG, and state an exposure time or f-number in
+    EXIF."""
+    made = 0
+    for path in sources:
+        if path is not None and Path(path).suffix.lower() in (".jpg", ".jpeg") and Path(path).is_file():
+            time, _, aperture = exif_exposure(Path(path))
+            made += time is not None or aperture is not None
+    return 2 * made > len(sources)
 
 
 def _number(value) -> float | None:

@@ -64,10 +64,11 @@ class ResponseConfig:
 
     name: str = option("srgb", "a response's name, a file, or auto: the one that fits the photos best", nonempty=True)
     method: str = option(
-        "edges",
-        "how auto chooses; edges: colours across edges mix linearly (Lin et al. 2004), over all training photos; "
-        "paper: dynamic range and smoothness on one random training photo",
-        choices=("edges", "paper"),
+        "posterior",
+        "how auto chooses; posterior: colours across edges mix linearly (Lin et al. 2004), light above white falls off "
+        "steadily, and cameras' own JPEGs are known to have a camera's curve; edges: the first of these alone; paper: "
+        "dynamic range and smoothness on one random training photo",
+        choices=("posterior", "edges", "paper"),
     )
     candidates: tuple[str, ...] = option(
         (),
@@ -80,6 +81,11 @@ class ResponseConfig:
         choices=("curve", "mlp"),
     )
     width: int = option(128, "mlp: hidden units of each channel's perceptron", low=1, high=4096)
+    refine: bool = option(False, "curve: correct it together with the scene, within an increasing, anchored family")
+    refine_after: int = option(5000, "refine: iterations before the correction begins: geometry comes first", low=0)
+    refine_weight: float = option(
+        1e-3, "refine: weight of the correction's size, which pulls it to the start curve", low=0.0, high=10.0
+    )
 
 
 @dataclass(frozen=True)
@@ -215,6 +221,7 @@ class OptimizerConfig:
     harmonics_rest: float = option(1e-3, "colours, higher degrees", above=0.0, high=1.0)
     fusion: float = option(1e-3, "perceptrons and widths of the fusion", above=0.0, high=1.0)
     response: float = option(5e-4, "what a learned response is made of (HDR-GS: 0.0005)", above=0.0, high=1.0)
+    refinement: float = option(2e-3, "logarithms of the slopes by which a curve is refined", above=0.0, high=1.0)
     final_factor: float = option(
         1.0, "all rates but the positions' fall to this part of theirs over decay_from to the end", above=0.0, high=1.0
     )
@@ -254,7 +261,9 @@ class Config:
     optimizer: OptimizerConfig = OptimizerConfig()
     schedule: ScheduleConfig = ScheduleConfig()
     seed: int = option(0, "of every random number in the training", low=0, high=2**62)
-    deterministic: bool = option(False, "on a GPU, the same bits every time, for some speed and memory; a CPU always does")
+    deterministic: bool = option(
+        False, "on a GPU, the same bits every time, for some speed and memory; a CPU always does"
+    )
 
     def __post_init__(self):
         validate(self)
@@ -332,6 +341,8 @@ def _check_together(config: Config) -> None:
         raise ConfigError(f"loss.predictor = {loss.predictor!r} is for nothing: loss.hdr_weight = 0.0")
     if config.response.form == "mlp":
         _check_learned(config)
+    if config.response.refine:
+        _check_refined(config)
     if config.optimizer.means_final > config.optimizer.means:
         raise ConfigError(f"optimizer.means_final = {config.optimizer.means_final} is greater than optimizer.means")
 
@@ -351,3 +362,14 @@ def _check_learned(config: Config) -> None:
             part, name = path.split(".")
             value = getattr(getattr(config, part), name)
             raise ConfigError(f'{path} = {value!r} needs a known response: response.form = "mlp" has none')
+
+
+def _check_refined(config: Config) -> None:
+    """What uses the curve elsewhere than on a rendered exposure would use the uncorrected one."""
+    for path, clash in {
+        'response.form = "mlp"': config.response.form == "mlp",
+        'model.radiance = "display"': config.model.radiance == "display",
+        "fusion.enabled = true": config.fusion.enabled,
+    }.items():
+        if clash:
+            raise ConfigError(f"response.refine = true corrects a curve, which {path} leaves no room for")

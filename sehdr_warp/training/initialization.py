@@ -10,9 +10,17 @@ from ..model.exposure import exposure_times
 from ..model.fusion import NeuralExposureFusion
 from ..model.gaussians import Gaussians
 from ..model.radiance_field import EXPOSURE_FLOOR, RadianceField
-from ..model.response import Response, ToneMapper, response_by_name, response_names, responses_in_file
+from ..model.response import (
+    RefinedResponse,
+    Response,
+    ToneMapper,
+    response_by_name,
+    response_names,
+    responses_in_file,
+)
 from ..model.response_selection import select_response
 from ..scene import Scene, View
+from ..scene.exposure import made_by_camera
 from ..splatting import BlendStyle
 from .config import Config
 
@@ -47,17 +55,28 @@ def scene_extent(scene: Scene) -> float:
 
 def choose_response(scene: Scene, config: Config) -> Response:
     """The response that the config names; for "auto" the candidate that fits the training photos best; with form "mlp"
-    one to be learned."""
+    one to be learned; with `refine` one to be corrected."""
     options = config.response
     if options.form == "mlp":
         return ToneMapper(options.width, config.seed)
-    if options.name != "auto":
-        return response_by_name(options.name)
+    chosen = _selected(scene, config) if options.name == "auto" else response_by_name(options.name)
+    return RefinedResponse(chosen) if options.refine else chosen
+
+
+def _selected(scene: Scene, config: Config) -> Response:
+    options = config.response
     candidates = [response for name in options.candidates or response_names() for response in _responses(name)]
-    images = [view.image for view in scene.train_views]
+    views = scene.train_views
+    images = [view.image for view in views]
     if options.method == "paper":
         images = [images[int(np.random.default_rng(config.seed).integers(len(images)))]]
-    return select_response(images, candidates, method=options.method, seed=config.seed).response
+    return select_response(
+        images,
+        candidates,
+        method=options.method,
+        from_camera=made_by_camera([view.source for view in views]),
+        seed=config.seed,
+    ).response
 
 
 def _responses(name: str) -> list[Response]:

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from ..model.gaussians import PARAMETER_NAMES
 from ..model.radiance_field import RadianceField
-from ..model.response import ToneMapper
+from ..model.response import RefinedResponse, ToneMapper
 from ..splatting.adam import adam_step
 from .config import Config
 
@@ -73,6 +73,10 @@ def make_optimizer(field: RadianceField, config: Config, extent: float) -> Adam:
     if isinstance(field.response, ToneMapper):
         groups.append(
             {"name": "response", "params": list(field.response.parameters()), "lr": config.optimizer.response}
+        )
+    if isinstance(field.response, RefinedResponse):
+        groups.append(
+            {"name": "refinement", "params": list(field.response.parameters()), "lr": config.optimizer.refinement}
         )
     for group in groups:
         group["start_rate"] = group["lr"]

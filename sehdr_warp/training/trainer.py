@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ..errors import SehdrError
 from ..model.radiance_field import RadianceField
-from ..model.response import ToneMapper
+from ..model.response import RefinedResponse
 from ..scene import Scene
 from ..splatting import GraphRecorder
 from .config import Config
@@ -109,8 +109,9 @@ class Trainer:
         if self.iteration % DECAY_EVERY == 0:
             decay_rates(self.optimizer, self.config, self.iteration)
         self._draw_presence()
-        if self._can_record(views, (self.degree, self.level, watched)):
-            self._last = self._replay(views, index, watched)
+        kind = (self.degree, self.level, watched, self._hold_response())
+        if self._can_record(views, kind):
+            self._last = self._replay(views, index, watched, kind)
         else:
             self._last = self._optimise(views[index], watched)
         self.densification.perturb(gaussians, rate, self._generator)
@@ -139,6 +140,8 @@ class Trainer:
         if watched:
             photo.rendering.means2d.retain_grad()
         loss = total_loss(self.field, photo, view.target, self.config.loss, self._largest_truth)
+        if isinstance(self.field.response, RefinedResponse) and self.field.response.refining:
+            loss = loss + self.config.response.refine_weight * self.field.response.penalty()
         loss.backward()
         nonfinite, skipped = guarded_step(self.optimizer, loss, photo.rendering.overflow)
         if watched:
@@ -153,6 +156,14 @@ class Trainer:
         else:
             self._incomplete += photo.rendering.overflow
         return loss.detach(), photo.encoded.detach(), view.target.encoded
+
+    def _hold_response(self) -> bool:
+        """Whether the response is corrected in this step; before response.refine_after its gradient is held back."""
+        response, options = self.field.response, self.config.response
+        if not isinstance(response, RefinedResponse):
+            return False
+        response.refining = self.iteration > (self.config.scaled(options.refine_after) if options.refine_after else 0)
+        return response.refining
 
     def _draw_presence(self) -> None:
         """Which Gaussians the next step leaves out, and how much the others stand in for them (DropGaussian, CVPR
@@ -175,12 +186,12 @@ class Trainer:
         self._launched.add(kind)
         return ready
 
-    def _replay(self, views: ViewStack, index: int, watched: bool) -> tuple[Tensor, Tensor, Tensor]:
+    def _replay(self, views: ViewStack, index: int, watched: bool, kind) -> tuple[Tensor, Tensor, Tensor]:
         capacity = max(LEAST_ROOM, int(ROOM_TO_GROW * self._pairs))
         self._index.fill_(index)
         try:
             return self._recorder.run(
-                (self.degree, self.level, watched),
+                kind,
                 lambda: self._optimise(views.at(self._index), watched, capacity),
             )
         except RuntimeError as error:
@@ -215,7 +226,7 @@ class Trainer:
         parts = {
             "gaussians": self.field.gaussians.tensors(),
             "fusion": {} if self.field.fusion is None else self.field.fusion.state_dict(),
-            "response": self.field.response.state_dict() if isinstance(self.field.response, ToneMapper) else {},
+            "response": self.field.response.state_dict() if isinstance(self.field.response, torch.nn.Module) else {},
             "optimizer": optimizer_tensors(self.optimizer),
             "densification": self.densification.state(),
             "generators": {"order": self._order_generator.get_state(), "device": self._generator.get_state()},
