@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from ..errors import SehdrError
+from .quality_command import Quality, run_quality
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,14 +73,47 @@ class Training(Output):
     """Also train gsplat as version 1.5.3 is released: without resets of the opacities."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Scale(Output):
+    """Time and memory against Gaussians, pixels and channels, with the slope of each stage."""
+
+    sweeps: str = "gaussians,pixels,channels"
+    """What is varied, separated by commas."""
+    peers: bool = False
+    """Also measure gsplat at nine channels, where it is installed and there is a GPU."""
+    steps: bool = True
+    """Also whole training steps, in the sweeps over Gaussians and pixels."""
+    repetitions: int = 30
+    """Timed runs of each variant; slow ones have fewer on the CPU."""
+    budget: float = 3.0
+    """Seconds that one variant may take on the CPU."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choices(Output):
+    """Error against run time of each choice that trades one for the other."""
+
+    size: str | None = None
+    """Gaussians@WIDTHxHEIGHT; by default 200k@800x800 on a GPU and 5k@200x200 on the CPU."""
+    iterations: int = 500
+    """Training steps of the small model on which degrees of the harmonics are compared; 0 leaves them out."""
+    repetitions: int = 30
+    """Timed runs of each variant; slow ones have fewer on the CPU."""
+    budget: float = 3.0
+    """Seconds that one variant may take on the CPU."""
+
+
 @dataclass(frozen=True)
 class Bench:
-    """Measure speed: splats, training steps, trainings."""
+    """Measure speed: splats, training steps, trainings, growth with size, and what accuracy costs."""
 
     benchmark: (
         Annotated[Kernels, tyro.conf.subcommand("kernels")]
         | Annotated[Step, tyro.conf.subcommand("step")]
         | Annotated[Training, tyro.conf.subcommand("training")]
+        | Annotated[Scale, tyro.conf.subcommand("scale")]
+        | Annotated[Choices, tyro.conf.subcommand("choices")]
+        | Annotated[Quality, tyro.conf.subcommand("quality")]
     )
 
 
@@ -91,6 +125,9 @@ def run_bench(command: Bench) -> None:
     from .report import check_writable, format_report, write_report
 
     asked = command.benchmark
+    if isinstance(asked, Quality):
+        run_quality(asked)
+        return
     check_writable(type(asked).__name__.lower(), asked.json, asked.out, asked.overwrite)
     report = _MEASURES[type(asked)](asked, pick_device(asked.device))
     print(format_report(report))
@@ -148,7 +185,38 @@ def _training(asked: Training, device) -> dict:
     )
 
 
-_MEASURES = {Kernels: _kernels, Step: _step, Training: _training}
+def _scale(asked: Scale, device) -> dict:
+    from .scale import bench_scale, parse_sweeps
+
+    return bench_scale(
+        parse_sweeps(asked.sweeps, device.type),
+        device,
+        peers=asked.peers,
+        steps=asked.steps,
+        repetitions=_positive("--repetitions", asked.repetitions),
+        budget=_positive("--budget", asked.budget),
+        progress=_say,
+    )
+
+
+def _choices(asked: Choices, device) -> dict:
+    from .choices import bench_choices
+    from .splats import Size, parse_size
+
+    if asked.iterations < 0:
+        raise SehdrError(f"--iterations {asked.iterations}: must not be negative")
+    default = {"cuda": Size(200_000, 800, 800), "cpu": Size(5000, 200, 200)}[device.type]
+    return bench_choices(
+        default if asked.size is None else parse_size(asked.size, device.type),
+        device,
+        iterations=asked.iterations,
+        repetitions=_positive("--repetitions", asked.repetitions),
+        budget=_positive("--budget", asked.budget),
+        progress=_say,
+    )
+
+
+_MEASURES = {Kernels: _kernels, Step: _step, Training: _training, Scale: _scale, Choices: _choices}
 
 
 def _channels(text: str) -> list[int]:

@@ -6,6 +6,7 @@ import torch
 
 from ..output.files import atomic_path, check_absent, write_json
 from .machine import command_line, describe_machine, now
+from .plots import PLOTS
 
 SCHEMA = 1
 
@@ -57,6 +58,55 @@ COLUMNS = {
             ("ours / this", "ours_over_this", ".4f"),
         ),
     },
+    "scale": {
+        "scale": (
+            ("sweep", "sweep", "s"),
+            ("Gaussians", "gaussians", ",d"),
+            ("width", "width", "d"),
+            ("height", "height", "d"),
+            ("C", "channels", "d"),
+            ("implementation", "implementation", "s"),
+            ("what", "what", "s"),
+            ("median ms", "median_ms", ".3f"),
+            ("n", "repetitions", "d"),
+            ("peak MiB", "peak_memory_bytes", "MiB"),
+            ("entries / tile", "entries_per_tile", ".1f"),
+        ),
+        "slope": (
+            ("sweep", "sweep", "s"),
+            ("implementation", "implementation", "s"),
+            ("what", "what", "s"),
+            ("quantity", "quantity", "s"),
+            ("slope", "slope", ".2f"),
+            ("from", "from", ",d"),
+            ("to", "to", ",d"),
+            ("at the large end", "slope_large", ".2f"),
+            ("from ", "large_from", ",d"),
+        ),
+    },
+    "choices": {
+        "choice": (
+            ("choice", "choice", "s"),
+            ("value", "value", "s"),
+            ("features", "features", "s"),
+            ("median ms", "median_ms", ".3f"),
+            ("times the default", "times_default", ".2f"),
+            ("n", "repetitions", "d"),
+            ("image error", "image_error", ".1e"),
+            ("99 % of pixels", "pixel_error_p99", ".1e"),
+            ("gradient error", "gradient_error", ".1e"),
+            ("worst gradient", "worst_gradient", "s"),
+        ),
+        "harmonics": (
+            ("degree", "value", "s"),
+            ("HDR PSNR dB", "psnr_hdr", ".2f"),
+            ("LDR PSNR dB", "psnr_ldr", ".2f"),
+            ("image error", "image_error", ".1e"),
+            ("median ms", "median_ms", ".3f"),
+            ("times the default", "times_default", ".2f"),
+            ("n", "repetitions", "d"),
+        ),
+    },
     "training": {
         "training": (
             ("trained by", "implementation", "s"),
@@ -92,7 +142,9 @@ def format_report(report: dict) -> str:
         rows = [row for row in report["rows"] if row["stage"] == stage]
         if rows:
             shown = [column for column in columns if any(row.get(column[1]) is not None for row in rows)]
-            parts.append(_table([title for title, _, _ in shown], [[_cell(row, c) for c in shown] for row in rows]))
+            parts.append(
+                _table([title for title, _, _ in shown], [[_cell(row, c) for c in shown] for row in rows])
+            )
     checks = report["checks"]
     if checks:
         failed = [check for check in checks if not check["passed"]]
@@ -105,7 +157,7 @@ def format_report(report: dict) -> str:
 
 
 def write_report(report: dict, *, json: Path | None = None, out: Path | None = None, overwrite: bool = False) -> None:
-    """Writes the JSON file, and in the folder `out` <benchmark>.json, .md and, for kernels, .png."""
+    """Writes the JSON file, and in the folder `out` <benchmark>.json, .md and, where PLOTS has one, .png."""
     if json is not None:
         write_json(json, report, overwrite)
     if out is None:
@@ -114,16 +166,16 @@ def write_report(report: dict, *, json: Path | None = None, out: Path | None = N
     write_json(out / f"{name}.json", report, overwrite)
     with atomic_path(out / f"{name}.md", overwrite) as path:
         path.write_text(format_report(report) + "\n", encoding="utf-8")
-    if name == "kernels":
+    if name in PLOTS:
         with atomic_path(out / f"{name}.png", overwrite) as path:
-            _plot_kernels(report, path)
+            PLOTS[name](report, path)
 
 
 def check_writable(benchmark: str, json: Path | None, out: Path | None, overwrite: bool) -> None:
     """Raises InputError for a file that is in the way, before minutes are spent on what could not be written."""
     paths = [] if json is None else [json]
     if out is not None:
-        endings = ("json", "md", "png") if benchmark == "kernels" else ("json", "md")
+        endings = ("json", "md", "png") if benchmark in PLOTS else ("json", "md")
         paths += [out / f"{benchmark}.{ending}" for ending in endings]
     for path in paths:
         check_absent(path, overwrite)
@@ -160,35 +212,3 @@ def _table(titles: list[str], rows: list[list[str]]) -> str:
 
     rule = "| " + " | ".join("-" * w if t else "-" * (w - 1) + ":" for w, t in zip(widths, text)) + " |"
     return "\n".join([line(titles), rule, *map(line, rows)])
-
-
-def _plot_kernels(report: dict, path: Path) -> None:
-    """Median times of the splat over the channels, one panel for each pass and size, one line for each
-    implementation."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    rows = [row for row in report["rows"] if row["stage"] == "splat"]
-    sizes = list(dict.fromkeys((row["gaussians"], row["width"], row["height"]) for row in rows))
-    passes = list(dict.fromkeys(row["pass"] for row in rows))
-    names = list(dict.fromkeys(row["implementation"] for row in rows))
-    figure = Figure(figsize=(4 * len(sizes), 3.2 * len(passes)), layout="constrained")
-    FigureCanvasAgg(figure)
-    panels = figure.subplots(len(passes), len(sizes), squeeze=False)
-    for panel_row, passing in zip(panels, passes):
-        for axes, size in zip(panel_row, sizes):
-            for name in names:
-                chosen = [
-                    (row["channels"], row["median_ms"])
-                    for row in rows
-                    if (row["gaussians"], row["width"], row["height"]) == size
-                    and row["pass"] == passing
-                    and row["implementation"] == name
-                ]
-                if chosen:
-                    axes.plot(*zip(*sorted(chosen)), marker="o", label=name)
-            axes.set(title=f"{size[0]:,} at {size[1]} x {size[2]}, {passing}", xlabel="channels", ylabel="median, ms")
-            axes.set_yscale("log")
-            axes.grid(True, which="both", alpha=0.3)
-            axes.legend(fontsize="small")
-    figure.savefig(path, dpi=120)

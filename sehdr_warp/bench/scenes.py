@@ -13,23 +13,26 @@ EXPOSURE_TIME = 0.25
 BALLS = 24
 
 
-def make_photo_scene(size: Size, views: int = 18, seed: int = 0) -> Scene:
+def make_photo_scene(size: Size, views: int = 18, seed: int = 0, device: str | torch.device = "cpu") -> Scene:
     """Photos, all for training, of coloured balls on a floor, from a circle around them; 8 bit, sRGB.
 
     size.gaussians points lie on the surfaces, as those of a trained scene do; the photos show them as Gaussians, so
-    some pixels are clipped and some black.
+    some pixels are clipped and some black. device: where they are rendered.
     """
     rng = np.random.default_rng(seed)
     points, log_exposure = _surfaces(size.gaussians, rng)
     response = response_by_name("srgb")
     gaussians = Gaussians.from_points(
-        torch.tensor(points, dtype=torch.float32), torch.tensor(log_exposure, dtype=torch.float32), 0, opacity=0.9
+        torch.tensor(points, dtype=torch.float32, device=device),
+        torch.tensor(log_exposure, dtype=torch.float32, device=device),
+        0,
+        opacity=0.9,
     )
     field = RadianceField(gaussians, response, base_time=EXPOSURE_TIME)
     photos = []
     for index in range(views):
         camera = _camera(2 * np.pi * index / views, size)
-        photo = np.round(field.render_ldr(camera).numpy() * 255) / 255
+        photo = np.round(field.render_ldr(camera).cpu().numpy() * 255) / 255
         photos.append(View(f"v_{index}", photo.astype(np.float32), camera, EXPOSURE_TIME, "train"))
     colours = np.asarray(response.encode(np.exp(log_exposure)), dtype=np.float32)
     return Scene(f"synthetic {size}", "transforms", tuple(photos), points, colours)

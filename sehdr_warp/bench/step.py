@@ -134,7 +134,7 @@ def _pairs(scene: Scene, trainer: Trainer) -> int:
 
 
 def _step_variant(trainer: Trainer, first: int) -> Variant:
-    return Variant(lambda _: trainer.step(), prepare=lambda: _between_changes(trainer, first))
+    return Variant(lambda _: trainer.step(), prepare=lambda: between_changes(trainer, first))
 
 
 def _plain_variant(trainer: Trainer, first: int) -> Variant:
@@ -142,10 +142,10 @@ def _plain_variant(trainer: Trainer, first: int) -> Variant:
         with plain_torch_rasterizer():
             trainer.step()
 
-    return Variant(run, prepare=lambda: _between_changes(trainer, first))
+    return Variant(run, prepare=lambda: between_changes(trainer, first))
 
 
-def _between_changes(trainer: Trainer, first: int) -> None:
+def between_changes(trainer: Trainer, first: int) -> None:
     """Before the next step would change the number of Gaussians, go back to just after the last change."""
     if trainer.iteration + 1 >= first + trainer.densification.every:
         trainer.iteration = first
@@ -201,14 +201,14 @@ def _time_on_cuda(trainer: Trainer, first: int, repetitions: int) -> dict:
     device was busy."""
     device = trainer.device
     for _ in range(20):
-        _between_changes(trainer, first)
+        between_changes(trainer, first)
         trainer.step()
     events = [torch.cuda.Event(enable_timing=True) for _ in range(repetitions + 1)]
     host = []
     torch.cuda.synchronize(device)
     events[0].record()
     for event in events[1:]:
-        _between_changes(trainer, first)
+        between_changes(trainer, first)
         started = time.perf_counter()
         trainer.step()
         host.append((time.perf_counter() - started) * 1e3)
@@ -217,7 +217,7 @@ def _time_on_cuda(trainer: Trainer, first: int, repetitions: int) -> dict:
     timing = Timing(tuple(a.elapsed_time(b) for a, b in pairwise(events)))
     with profile(activities=[ProfilerActivity.CUDA]) as recorded:
         for _ in range(PROFILED_STEPS):
-            _between_changes(trainer, first)
+            between_changes(trainer, first)
             trainer.step()
         torch.cuda.synchronize(device)
     averages = [entry for entry in recorded.key_averages() if entry.self_device_time_total > 0]

@@ -1,0 +1,95 @@
+"""A benchmark's result as a picture."""
+
+from pathlib import Path
+
+
+def plot_kernels(report: dict, path: Path) -> None:
+    """Median times of the splat over the channels, one panel for each pass and size, one line for each
+    implementation."""
+    rows = [row for row in report["rows"] if row["stage"] == "splat"]
+    sizes = list(dict.fromkeys((row["gaussians"], row["width"], row["height"]) for row in rows))
+    passes = list(dict.fromkeys(row["pass"] for row in rows))
+    names = list(dict.fromkeys(row["implementation"] for row in rows))
+    figure, panels = _panels(len(passes), len(sizes))
+    for panel_row, passing in zip(panels, passes):
+        for axes, size in zip(panel_row, sizes):
+            for name in names:
+                chosen = [
+                    (row["channels"], row["median_ms"])
+                    for row in rows
+                    if (row["gaussians"], row["width"], row["height"]) == size
+                    and row["pass"] == passing
+                    and row["implementation"] == name
+                ]
+                if chosen:
+                    axes.plot(*zip(*sorted(chosen)), marker="o", label=name)
+            axes.set(title=f"{size[0]:,} at {size[1]} x {size[2]}, {passing}", xlabel="channels", ylabel="median, ms")
+            axes.set_yscale("log")
+            axes.grid(True, which="both", alpha=0.3)
+            axes.legend(fontsize="small")
+    figure.savefig(path, dpi=120)
+
+
+def plot_scale(report: dict, path: Path) -> None:
+    """Median times over what is varied, a column for each sweep, and below them peak memory; both axes in decades."""
+    rows = [row for row in report["rows"] if row["stage"] == "scale"]
+    names = list(dict.fromkeys(row["sweep"] for row in rows))
+    labels = list(dict.fromkeys((row["implementation"], row["what"]) for row in rows))
+    figure, panels = _panels(2, len(names))
+    for panel_row, field, unit, scale in zip(
+        panels, ("median_ms", "peak_memory_bytes"), ("median, ms", "peak, MiB"), (1.0, 2.0**-20)
+    ):
+        for axes, name in zip(panel_row, names):
+            for who, what in labels:
+                chosen = [
+                    (row["varied"], row[field] * scale)
+                    for row in rows
+                    if (row["sweep"], row["implementation"], row["what"]) == (name, who, what) and row.get(field)
+                ]
+                if chosen:
+                    style = "--" if who == "gsplat" else "-"
+                    axes.plot(*zip(*chosen), style, marker="o", markersize=3, label=f"{who}: {what}")
+            axes.set(xlabel=name, ylabel=unit, xscale="log", yscale="log")
+            axes.grid(True, which="both", alpha=0.3)
+            axes.legend(fontsize="xx-small")
+    figure.savefig(path, dpi=120)
+
+
+def plot_choices(report: dict, path: Path) -> None:
+    """Gradient and image error over run time as a multiple of the default's, a column for each kind of features, a
+    line for each choice."""
+    rows = [row for row in report["rows"] if row["stage"] == "choice"]
+    kinds = list(dict.fromkeys(row["features"] for row in rows))
+    choices = list(dict.fromkeys(row["choice"] for row in rows))
+    figure, panels = _panels(2, len(kinds))
+    for panel_row, field, label in zip(
+        panels, ("image_error", "gradient_error"), ("image error", "largest gradient error")
+    ):
+        for axes, kind in zip(panel_row, kinds):
+            for choice in choices:
+                chosen = [row for row in rows if (row["choice"], row["features"]) == (choice, kind)]
+                chosen = [row for row in chosen if row["times_default"] and row[field]]
+                if not chosen:
+                    continue
+                points = [(row["times_default"], row[field]) for row in chosen]
+                (line,) = axes.plot(*zip(*points), marker="o", markersize=4, linewidth=0.8, label=choice)
+                for point, row in zip(points, chosen):
+                    axes.annotate(row["value"], point, fontsize=5, color=line.get_color())
+            axes.set(title=f"{kind} features", xlabel="time / default's", ylabel=label, xscale="log", yscale="log")
+            axes.grid(True, which="both", alpha=0.3)
+            axes.legend(fontsize="xx-small")
+    figure.savefig(path, dpi=120)
+
+
+def _panels(rows: int, columns: int):
+    """A figure that needs no display, and its axes [rows][columns]."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.5 * columns, 3.4 * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+PLOTS = {"kernels": plot_kernels, "scale": plot_scale, "choices": plot_choices}
+"""Which benchmarks have a picture, and what draws it."""

@@ -1,0 +1,82 @@
+"""Memory: how much Warp holds beside torch's allocator, and one clear line when there is not enough."""
+
+import functools
+import inspect
+import re
+from collections.abc import Callable
+
+import torch
+import warp as wp
+
+from ..errors import SehdrError
+
+REMEDY = "use fewer Gaussians (densification.max_gaussians) or a smaller image (--max-size)"
+
+
+class OutOfMemory(SehdrError):
+    """Not enough memory; the message gives the sizes and how much was asked for."""
+
+
+def held_by_warp(device: torch.device) -> int:
+    """Bytes that Warp itself has allocated on a CUDA device at most so far (sorting's scratch); 0 on the CPU, where
+    nothing counts them."""
+    if device.type != "cuda":
+        return 0
+    return wp.get_mempool_used_mem_high(wp.device_from_torch(device))
+
+
+def bytes_asked_for(error: BaseException) -> str | None:
+    """How much memory an error says could not be had, as text ("some memory" where it does not say how much); None if
+    the error is about something else."""
+    if isinstance(error, OutOfMemory):
+        return None
+    text = str(error)
+    is_allocation = isinstance(error, (MemoryError, torch.OutOfMemoryError)) or re.search(
+        r"can't allocate memory|[Ff]ailed to allocate|out of memory", text
+    )
+    if not is_allocation:
+        return None
+    found = re.search(r"allocate (\d[\d.]*) ?(bytes|[KMGT]iB)", text)
+    if found is None:
+        return "some memory"
+    return _readable(int(found[1])) if found[2] == "bytes" else f"{found[1]} {found[2]}"
+
+
+def out_of_memory(
+    error: BaseException, device, gaussians: int, width: int, height: int, channels: int | None = None
+) -> OutOfMemory | None:
+    """The error to raise instead, or None if `error` is not about memory."""
+    asked = bytes_asked_for(error)
+    if asked is None:
+        return None
+    sizes = f"{gaussians} Gaussians, an image of {width} x {height}"
+    sizes += "" if channels is None else f", {channels} channels"
+    return OutOfMemory(f"out of memory on {device}: {asked} could not be allocated with {sizes}; {REMEDY}")
+
+
+def tells_sizes(rasterize: Callable) -> Callable:
+    """Makes a rasterizer's failed allocations OutOfMemory errors with the sizes of what it was asked to draw."""
+    signature = inspect.signature(rasterize)
+
+    @functools.wraps(rasterize)
+    def telling(*arguments, **options):
+        try:
+            return rasterize(*arguments, **options)
+        except (RuntimeError, MemoryError) as error:
+            given = signature.bind(*arguments, **options).arguments
+            means, features = given["means"], given["features"]
+            told = out_of_memory(
+                error, means.device, means.shape[0], given["width"], given["height"], features.shape[1]
+            )
+            if told is None:
+                raise
+            raise told from error
+
+    return telling
+
+
+def _readable(count: int) -> str:
+    for unit, size in (("GiB", 1 << 30), ("MiB", 1 << 20)):
+        if count >= size:
+            return f"{count / size:.2f} {unit}"
+    return f"{count} bytes"
