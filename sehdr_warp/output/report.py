@@ -82,10 +82,10 @@ def write_report(run, scene: Scene, out: Path | str, *, view_count: int = 3, ove
 def read_metrics(path: Path | str) -> list[dict]:
     """The lines of a metrics.jsonl with "seconds" and a figure; empty without the file. Damaged lines are left out."""
     path, lines = Path(path), []
-    for text in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
+    for text in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
         try:
             line = json.loads(text)
-        except ValueError:  # A killed process leaves half a line behind.
+        except (ValueError, RecursionError):  # A killed process leaves half a line behind.
             continue
         if isinstance(line, dict) and "seconds" in line and any(line.get(key) is not None for key, _, _ in _SERIES):
             lines.append(line)

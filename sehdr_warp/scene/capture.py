@@ -84,7 +84,7 @@ def pose_from_camera_to_world(matrix, source: Path, name: str) -> np.ndarray:
     remedy = "export the poses again without scale"
     try:
         matrix = np.array(matrix, dtype=np.float64)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         raise InputError(source, f"pose of {name!r:.90} is not a matrix of numbers", remedy) from None
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
         raise InputError(source, f"pose of {name!r:.90} is not a finite 4 x 4 matrix", remedy)

@@ -138,7 +138,7 @@ def exif_exposure(path: Path) -> tuple[float | None, float | None, float | None]
             table = image.getexif().get_ifd(_EXIF_IFD)
             time, apex = _number(table.get(_EXPOSURE_TIME)), _number(table.get(_SHUTTER_APEX))
             speed, aperture = _number(table.get(_SPEED)), _number(table.get(_F_NUMBER))
-    except (OSError, SyntaxError, ValueError, KeyError, TypeError, EOFError, struct.error):
+    except (OSError, SyntaxError, ValueError, KeyError, TypeError, EOFError, MemoryError, struct.error):
         return None, None, None
     if time is None and apex is not None and math.isfinite(apex) and abs(apex) < 64:
         time = 2.0**-apex

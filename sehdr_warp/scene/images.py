@@ -16,6 +16,9 @@ from .radiance import radiance_size, read_radiance
 # exhaust memory; Pillow on its own only warns, and OpenEXR has no limit.
 MAX_PIXELS = 160_000_000
 
+# OpenEXR asks for the memory of all pixels before it reads one. Its ZIP of a single colour holds 500 pixels in a byte.
+MOST_PIXELS_PER_BYTE = 4096
+
 LDR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 HDR_SUFFIXES = (".exr", ".hdr")
 
@@ -163,8 +166,11 @@ def _exr_window(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[tuple[int, in
     except (RuntimeError, ValueError, KeyError, TypeError, MemoryError) as error:
         raise InputError(path, f"cannot be read as OpenEXR ({error})", _DAMAGED) from None
     sizes = [(high[0] - low[0] + 1, high[1] - low[1] + 1) for low, high in windows]
+    stored = path.stat().st_size
     for size in sizes:
         _check_size(path, *size, max_pixels)
+        if size[0] * size[1] > MOST_PIXELS_PER_BYTE * stored:
+            raise InputError(path, f"states {size[0]} x {size[1]} pixels, but has only {stored} bytes", _DAMAGED)
     return windows[0][0], sizes[0]
 
 
@@ -269,5 +275,5 @@ def _orientation(image: Image.Image) -> int:
     """EXIF's orientation, 1 (as stored) where there is none or EXIF is damaged: the pixels may still be good."""
     try:
         return image.getexif().get(_ORIENTATION_TAG, 1)
-    except (OSError, SyntaxError, ValueError, KeyError, TypeError, EOFError, struct.error):
+    except (OSError, SyntaxError, ValueError, KeyError, TypeError, EOFError, MemoryError, struct.error):
         return 1

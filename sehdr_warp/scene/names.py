@@ -17,8 +17,11 @@ def sibling(path: Path, suffixes: tuple[str, ...]) -> Path | None:
     """The file of the same stem beside `path` with one of the suffixes in either case, or None."""
     for suffix in suffixes:
         for candidate in (path.with_suffix(suffix), path.with_suffix(suffix.upper())):
-            if candidate.is_file():
-                return candidate
+            try:
+                if candidate.is_file():
+                    return candidate
+            except (OSError, ValueError):  # A name from a data file that no file can have.
+                return None
     return None
 
 

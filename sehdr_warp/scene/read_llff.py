@@ -61,6 +61,7 @@ def read_llff(folder: Path) -> Capture:
 def _rows(path: Path, width: int) -> np.ndarray:
     """[n, width] float64; the header's shape is checked against the file's size before any memory is asked for."""
     import io
+    import tokenize
 
     data = io.BytesIO(read_bytes(path, 1 << 28))
     try:
@@ -71,7 +72,7 @@ def _rows(path: Path, width: int) -> np.ndarray:
         if dtype.kind != "f" or len(shape) != 2 or shape[1] != width or shape[0] * width * dtype.itemsize != left:
             raise ValueError(f"shape {shape} of {dtype}, {left} bytes")
         values = np.frombuffer(data.read(), dtype).reshape(shape, order="F" if fortran else "C").astype(np.float64)
-    except (ValueError, EOFError, SyntaxError, TypeError) as error:
+    except (ValueError, EOFError, SyntaxError, TypeError, RecursionError, MemoryError, tokenize.TokenError) as error:
         raise InputError(path, f"is not an [n, {width}] array of numbers ({str(error)[:80]})", _REMEDY) from None
     return values
 

@@ -142,7 +142,7 @@ def _frame_shot(folder: Path, path: Path, values: dict, frame: dict, name: str, 
 def frame_pose(frame: dict, path: Path, name: str) -> np.ndarray:
     try:
         matrix = np.array(frame.get("transform_matrix"), dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape in ((4, 4), (3, 4)):
         # OpenGL's camera looks along -z with y up; OpenCV's along +z with y down.
@@ -155,7 +155,7 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
         for key in keys:
             value = frame.get(key, values.get(key))
             if value is not None:
-                if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+                if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
                     raise InputError(path, f"{key} = {value!r:.40} is not a finite number", _REMEDY)
                 return float(value)
         return None

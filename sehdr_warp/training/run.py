@@ -280,13 +280,15 @@ def append_metrics(path: Path, line: dict) -> None:
 
 
 def read_metrics(path: Path) -> list[dict]:
-    """The lines of metrics.jsonl; one that a killed process left half-written is passed over."""
+    """The lines of metrics.jsonl; what a killed process left half-written is passed over."""
     file, lines = path / METRICS, []
-    for text in file.read_text(encoding="utf-8").splitlines() if file.exists() else ():
+    for text in file.read_text(encoding="utf-8", errors="replace").splitlines() if file.exists() else ():
         try:
-            lines.append(json.loads(text))
-        except json.JSONDecodeError:
+            line = json.loads(text)
+        except (ValueError, RecursionError):
             continue
+        if isinstance(line, dict) and isinstance(line.get("iteration", 0), int):
+            lines.append(line)
     return lines
 
 
