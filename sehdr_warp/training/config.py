@@ -147,8 +147,11 @@ class LossConfig:
     )
     domain: str = option(
         "encoded",
-        "what is compared; encoded: photos; mu-law: exposures, decoded from the photo, both by the mu-law (mu = 5000)",
+        "what is compared; encoded: photos; mu-law: exposures, decoded from the photo, by log(1 + mu x / white)",
         choices=("encoded", "mu-law"),
+    )
+    mu: float = option(
+        5000.0, "mu-law: mu above; light below white / mu counts as light, above as its logarithm", above=0.0, high=1e9
     )
     linear_weight: float = option(0.0, "weight of the linear loss (SeHDR: 0.5)", low=0.0, high=100.0)
     linear_detach: str = option(

@@ -79,9 +79,9 @@ def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Re
     prediction, truth = photo.encoded, target.encoded
     lower, upper = truth - CODE / 2, truth + CODE / 2
     if config.domain == "mu-law":
-        white = response.white
-        prediction = mu_law(photo.light, white)
-        truth, lower, upper = (mu_law(response.decode(image), white) for image in (truth, lower, upper))
+        white, mu = response.white, config.mu
+        prediction = mu_law(photo.light, white, mu)
+        truth, lower, upper = (mu_law(response.decode(image), white, mu) for image in (truth, lower, upper))
     plain = prediction
     if config.clipping or config.interval != "off":
         bounded = target if config.clipping else replace(target, clipped=None, black=None)
@@ -93,9 +93,9 @@ def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Re
     return image_loss(prediction, truth, target.mask, config.form, config.ssim_weight, similar=plain)
 
 
-def mu_law(exposure: Tensor, white: float) -> Tensor:
+def mu_law(exposure: Tensor, white: float, mu: float = MU) -> Tensor:
     """log(1 + mu x / white) / log(1 + mu): 0 for no light, 1 for the exposure that photos show as white."""
-    return torch.log1p(exposure * (MU / white)) / math.log1p(MU)
+    return torch.log1p(exposure * (mu / white)) / math.log1p(mu)
 
 
 def highlight_prior(light: Tensor, clipped: Tensor | None, white: float, stops: float) -> Tensor:

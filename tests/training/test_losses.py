@@ -166,6 +166,14 @@ def test_the_mu_law_weighs_shadows_as_the_metric_does():
     loss = ldr_loss(photo_of(2 * light, response), target, config, response)
     expected = (mu_law(2 * light, response.white) - mu_law(light, response.white)).mean()
     assert loss.item() == pytest.approx(expected.item(), rel=1e-6)
+    # Of a doubling each, the dark one costs a smaller part of it the less mu is.
+    shares = []
+    for mu in (5000.0, 50.0):
+        dark = light * torch.tensor([2.0, 1.0]).double().reshape(1, 2, 1)
+        options = LossConfig(domain="mu-law", mu=mu, ssim_weight=0.0)
+        both = ldr_loss(photo_of(2 * light, response), target, options, response)
+        shares.append((ldr_loss(photo_of(dark, response), target, options, response) / both).item())
+    assert shares[0] > 2 * shares[1] > 0
 
 
 def test_the_highlight_prior_holds_clipped_pixels_near_the_clip_point():
