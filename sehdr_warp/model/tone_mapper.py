@@ -49,12 +49,19 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
     def encode(self, exposure):
         """Encoded values in (0, 1) of exposures [..., 3]; a tensor for a tensor, else a NumPy array."""
         if isinstance(exposure, torch.Tensor):
-            return self._of_log((exposure.clamp_min(0) + EXPOSURE_FLOOR).log())
+            return self.encode_log((exposure.clamp_min(0) + EXPOSURE_FLOOR).log())
         return self._with_arrays(self.encode, exposure)
 
     def encode_extended(self, exposure, *, slope: float | None = None):
         """As encode: the sigmoid approaches 1 and leaves a gradient everywhere, so there is nothing to extend."""
         return self.encode(exposure)
+
+    def encode_log(self, log_exposure: torch.Tensor) -> torch.Tensor:
+        """Encoded values in (0, 1) of natural logarithms of exposures [..., 3]."""
+        values = log_exposure.reshape(-1, 3).T[..., None]
+        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            values = torch.baddbmm(bias, values.relu() if layer else values, weight)
+        return values[..., 0].T.reshape(log_exposure.shape).sigmoid()
 
     @torch.no_grad()
     def decode(self, value):
@@ -63,7 +70,7 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
             return self._with_arrays(self.decode, value)
         low, high = (math.log(exposure) for exposure in TABLE_RANGE)
         nodes = torch.linspace(low, high, TABLE_NODES, dtype=torch.float32, device=self.weights[0].device)
-        table = self._of_log(nodes[:, None].expand(-1, 3)).cummax(0).values.T.contiguous()
+        table = self.encode_log(nodes[:, None].expand(-1, 3)).cummax(0).values.T.contiguous()
         wanted = value.to(table).reshape(-1, 3).T.contiguous()
         after = torch.searchsorted(table, wanted).clamp(1, TABLE_NODES - 1)
         left, right = table.gather(1, after - 1), table.gather(1, after)
@@ -91,13 +98,6 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
     @classmethod
     def _from_dict(cls, values):
         return cls(values["width"])
-
-    def _of_log(self, log_exposure):
-        """Encoded values of log exposures [..., 3]."""
-        values = log_exposure.reshape(-1, 3).T[..., None]
-        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            values = torch.baddbmm(bias, values.relu() if layer else values, weight)
-        return values[..., 0].T.reshape(log_exposure.shape).sigmoid()
 
     def _with_arrays(self, function, argument):
         array = np.asarray(argument)
