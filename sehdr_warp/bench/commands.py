@@ -9,6 +9,7 @@ import tyro
 
 from ..errors import SehdrError
 from .quality_command import Quality, run_quality
+from .response_command import Responses, run_responses
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,6 +115,7 @@ class Bench:
         | Annotated[Scale, tyro.conf.subcommand("scale")]
         | Annotated[Choices, tyro.conf.subcommand("choices")]
         | Annotated[Quality, tyro.conf.subcommand("quality")]
+        | Annotated[Responses, tyro.conf.subcommand("response")]
     )
 
 
@@ -127,6 +129,9 @@ def run_bench(command: Bench) -> None:
     asked = command.benchmark
     if isinstance(asked, Quality):
         run_quality(asked)
+        return
+    if isinstance(asked, Responses):
+        run_responses(asked, _say)
         return
     check_writable(type(asked).__name__.lower(), asked.json, asked.out, asked.overwrite)
     report = _MEASURES[type(asked)](asked, pick_device(asked.device))
