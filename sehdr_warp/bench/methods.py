@@ -13,8 +13,7 @@ from ..errors import InputError, SehdrError
 class Method:
     """What is trained, and on what.
 
-    name: in tables and on the command line. preset: of load_config. kind: "gaussians" trains the preset on the photos,
-        "predicted" trains it on the radiance that a single-image predictor makes of each photo, "hdr-nerf" trains
+    name: in tables and on the command line. preset: of load_config. kind: "gaussians" trains the preset, "hdr-nerf"
         HDR-NeRF's fields.
     truth: it gets the HDR truth of the training views; all others never see it.
     blind: whether a run without the response makes sense (one that takes nothing from the photos has no use for it).
@@ -40,7 +39,7 @@ METHODS = {
         Method("hdr-gs", "hdr-gs"),
         Method("hdr-gs-truth", "hdr-gs-truth", truth=True),
         Method("3dgs", "3dgs"),
-        Method("predicted", "predicted", kind="predicted"),
+        Method("predicted", "predicted"),
         Method("hdr-nerf", "default", kind="hdr-nerf"),
         Method("truth", "truth", truth=True, blind=False),
     )

@@ -46,7 +46,8 @@ class Quality:
     noise: str | None = None
     """Sensor noise in the training photos: electrons of a full well, and of read noise, such as 20000,5."""
     predictor: str | None = None
-    """For the method predicted: what makes HDR of a single photo."""
+    """For the method predicted: what makes HDR of a single photo, a name, a folder or a network; {scene} and {exposure}
+    in it stand for the job's."""
     lpips: Path | None = None
     """Folder with LPIPS weights; by default that of SEHDR_LPIPS, and LPIPS is null without."""
     flip: bool = False

@@ -5,6 +5,7 @@ import itertools
 import json
 import re
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 
 from ..errors import InputError, SehdrError
@@ -28,7 +29,8 @@ class Settings:
     scenes: folders with HDR truth, or names that load_scene knows. curves: responses of response_by_name that expose
     the truth. exposures: places in a ladder of exposure_count times, each exposure_factor times the last.
     responses: out of RESPONSES. iterations: None is the preset's own. noise: (full well, read noise) in electrons.
-    predictor: for the method `predicted`. lpips: whether weights are there. device: "cpu" or "cuda".
+    predictor: replaces that of methods which predict HDR from single photos; {scene} and {exposure} stand for the job's.
+    lpips: whether weights are there. device: "cpu" or "cuda".
     """
 
     scenes: tuple[str, ...]
@@ -115,7 +117,12 @@ def plan_jobs(settings: Settings) -> list[Job]:
             continue
         config = configs[method.name, iterations, seed]
         name = "auto" if response == "blind" else curve
-        trained = override_config(config, {"response.name": name}, method.preset)
+        changes, files = {"response.name": name}, {}
+        if settings.predictor is not None and config.loss.predictor:
+            place_of = {"{scene}": scenes[place]["name"], "{exposure}": str(exposure)}
+            predictor = reduce(lambda text, item: text.replace(*item), place_of.items(), settings.predictor)
+            changes, files = changes | {"loss.predictor": predictor}, {"predictor": _path_digest(predictor)}
+        trained = override_config(config, changes, method.preset)
         jobs.append(
             Job(
                 {
@@ -135,7 +142,7 @@ def plan_jobs(settings: Settings) -> list[Job]:
                         "truth": method.truth,
                         "base": method.base,
                         "overrides": method.overrides,
-                        **({"predictor": settings.predictor} if method.kind == "predicted" else {}),
+                        **files,
                     },
                     "response": response,
                     "seed": seed,
@@ -240,20 +247,29 @@ def _digest(place: str) -> dict:
         from .. import __version__
 
         return {"version": __version__}
+    if not Path(place).is_dir():
+        raise InputError(place, "no such folder", "give folders with HDR truth, or embedded")
+    return {"sha256": _path_digest(place)}
+
+
+def _path_digest(place: str) -> str | None:
+    """A hash of a file, or of all files of a folder with their names; None where there is neither."""
     folder = Path(place)
+    if folder.is_file():
+        return hashlib.sha256(folder.read_bytes()).hexdigest()
     if not folder.is_dir():
-        raise InputError(folder, "no such folder", "give folders with HDR truth, or embedded")
+        return None
     digest = hashlib.sha256()
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         digest.update(str(path.relative_to(folder)).encode() + b"\0")
         with open(path, "rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
-    return {"sha256": digest.hexdigest()}
+    return digest.hexdigest()
 
 
 def _file_digest(curve: str) -> dict:
     """A hash of the file that a curve comes from; nothing for a formula."""
     for name in (curve, curve.rpartition(":")[0]):
         if name and Path(name).is_file():
-            return {"sha256": hashlib.sha256(Path(name).read_bytes()).hexdigest()}
+            return {"sha256": _path_digest(name)}
     return {}

@@ -20,10 +20,12 @@ from filelock import FileLock, Timeout
 from ..errors import InputError, SehdrError
 from ..output.files import write_json
 from .quality_jobs import ATTEMPT, Job, read_attempt, read_failure, read_result, write_failure, write_job
-from .quality_worker import PLAN, RUN_LOCK, is_open, JobLock, work
+from .quality_worker import PLAN, RUN_LOCK, JobLock, is_open, work
 
 LAUNCHERS = ("auto", "slurm", "local", "process")
 POLL_SECONDS = 0.5
+LOCK_SECONDS = 2.0
+"""How long a run waits for its folder: a worker that looks whether its run is alive holds the lock for a moment."""
 LOCAL_MINUTES = 7 * 24 * 60
 """submitit ends its processes after a time; a worker lives as long as there are jobs."""
 USELESS_WORKERS = 3
@@ -74,7 +76,7 @@ def run_jobs(jobs: Sequence[Job], out: Path, workers: Workers, device: str, prog
     out.mkdir(parents=True, exist_ok=True)
     lock = FileLock(out / RUN_LOCK)
     try:
-        lock.acquire(timeout=2)  # a worker looking whether the run is alive holds it for a moment
+        lock.acquire(timeout=LOCK_SECONDS)
     except Timeout:
         raise InputError(
             out, "another `bench quality` is at work there", "wait for it, or choose another --out"

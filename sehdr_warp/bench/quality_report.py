@@ -197,7 +197,8 @@ def _region_line(rows: list[dict], bound: dict) -> list[str]:
     cells = []
     for region in _REGIONS:
         share = _mean(rows, lambda row, region=region: 100 * row["figures"]["regions"][region]["fraction"], 1)
-        cells += [_mean(rows, _region(region)), _difference(rows, bound, _region(region)), f"{share} %"]
+        there = [row for row in rows if row["figures"]["regions"][region]["fraction"] > 0]
+        cells += [_mean(there, _region(region)), _difference(rows, bound, _region(region)), f"{share} %"]
     return [*cells, _mean(rows, _figure("ldr", "psnr")), _mean(rows, _figure("ldr", "ssim"), 4)]
 
 

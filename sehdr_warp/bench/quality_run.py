@@ -54,8 +54,6 @@ class Runner:
         training = config_from_dict(config["training"], job.label)
         method, out = config["method"], folder / RUN
         scene = photographed if method["truth"] else without_training_truth(photographed)
-        if method["kind"] == "predicted":
-            scene = _predicted(scene, method)
         self._warm_up(method["kind"], scene, training, folder)
         shutil.rmtree(out, ignore_errors=True)
         self._forget_peaks()
@@ -90,9 +88,16 @@ class Runner:
 
     def _train(self, kind: str, scene: Scene, config: Config, out: Path):
         if kind == "hdr-nerf":
-            from .hdr_nerf import train_hdr_nerf
+            from .hdr_nerf import HdrNerfSettings, train_hdr_nerf, unit_value
 
-            return train_hdr_nerf(scene, out, config, device=self.device)
+            return train_hdr_nerf(
+                scene,
+                iterations=config.schedule.iterations,
+                device=self.device,
+                seed=config.seed,
+                settings=HdrNerfSettings(unit_value=unit_value(config.response.name)),
+                evaluate_at={config.scaled(iteration) for iteration in config.schedule.evaluate_at},
+            )
         return train(scene, out, config, device=self.device, quiet=True)
 
     def _warm_up(self, kind: str, scene: Scene, config: Config, folder: Path) -> None:
@@ -208,9 +213,3 @@ def seconds_to_final(curve: list[dict], total: float) -> float:
             break
         reached = line["seconds"]
     return reached
-
-
-def _predicted(scene: Scene, method: dict) -> Scene:
-    from ..training.prediction import predicted_scene
-
-    return predicted_scene(scene, method["predictor"])
