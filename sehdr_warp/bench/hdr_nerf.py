@@ -20,7 +20,7 @@ from ..errors import InputError, SehdrError
 from ..evaluation.metrics import psnr
 from ..evaluation.protocols import tone_map
 from ..model.radiance_field import LOG_EXPOSURE_LIMIT, RenderedView
-from ..model.response import ToneMapper
+from ..model.response import ToneMapper, response_by_name
 from ..scene import Camera, Scene
 from ..training.initialization import DEPTH_RANGE, check_scene, focus_distance
 
@@ -51,6 +51,14 @@ class HdrNerfSettings:
     unit_weight: float = 0.5
     unit_value: float = 0.5
     rays_at_once: int = 4096
+
+
+def unit_value(response: str) -> float:
+    """What the unit exposure loss holds on to where the response is known: its value there, as the paper does for its
+    synthetic scenes, within what a sigmoid reaches; 0.5 for "auto"."""
+    if response == "auto":
+        return HdrNerfSettings.unit_value
+    return float(np.clip(response_by_name(response).encode(1.0), 0.005, 0.995))
 
 
 class HdrNerf(nn.Module):

@@ -15,6 +15,7 @@ from sehdr_warp.bench.hdr_nerf import (
     ray_weights,
     stratified_depths,
     train_hdr_nerf,
+    unit_value,
 )
 from sehdr_warp.errors import InputError
 
@@ -81,6 +82,11 @@ def test_seconds_end_a_training(scene):
     assert run.iterations >= 1 and run.train_seconds >= 0.05
     with pytest.raises(ValueError, match="seconds"):
         train_hdr_nerf(scene, settings=SMALL)
+
+
+def test_a_known_response_says_what_the_unit_exposure_is():
+    assert unit_value("hdr-nerf") == pytest.approx(0.73, abs=1e-3)
+    assert (unit_value("auto"), unit_value("srgb")) == (0.5, 0.995)
 
 
 def test_one_view_is_refused(scene):
