@@ -156,7 +156,7 @@ def plain_torch_rasterizer():
     """Within this block every field renders with the plain torch rasterizer. Raises SehdrError if none did."""
     calls = 0
 
-    def rasterize(*arguments, capacity=None, **options):
+    def rasterize(*arguments, capacity=None, style=None, **options):
         nonlocal calls
         calls += 1
         return rasterize_reference(*arguments, **options)

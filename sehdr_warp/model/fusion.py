@@ -116,7 +116,8 @@ class NeuralExposureFusion(nn.Module):
         # One node more at either end gives every cell its four.
         grid = torch.arange(-1, self.nodes + 1, dtype=log_base.dtype, device=log_base.device) * step + self._low
         table = self._fuse(grid[:, None].expand(-1, 3))
-        if log_base.device.type == "cuda" and not torch.are_deterministic_algorithms_enabled():
+        plain = log_base.dtype != torch.float32 or torch.are_deterministic_algorithms_enabled()
+        if log_base.device.type == "cuda" and not plain:
             return interpolate(table, self._low, step, log_base)
         position = ((log_base - self._low) / step).clamp_min(0.0)
         cell = position.detach().nan_to_num(0.0).clamp_max(self.nodes - 2).long()
