@@ -8,6 +8,8 @@ from torch import Tensor
 
 from ..model.radiance_field import Photograph, RadianceField
 from ..model.response import Response
+from ..model.response_curve import EXTENSION_SLOPE
+from ..model.response_refined import RefinedResponse
 from ..splatting.ssim import ssim
 from .config import LossConfig
 
@@ -79,9 +81,10 @@ def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Re
     prediction, truth = photo.encoded, target.encoded
     lower, upper = truth - CODE / 2, truth + CODE / 2
     if config.domain == "mu-law":
-        white, mu = response.white, config.mu
-        prediction = mu_law(photo.light, white, mu)
-        truth, lower, upper = (mu_law(response.decode(image), white, mu) for image in (truth, lower, upper))
+        known = _known(response)
+        white, mu = known.white, config.mu
+        prediction = mu_law(_light(photo, response), white, mu)
+        truth, lower, upper = (mu_law(known.decode(image), white, mu) for image in (truth, lower, upper))
     plain = prediction
     if config.clipping or config.interval != "off":
         bounded = target if config.clipping else replace(target, clipped=None, black=None)
@@ -91,6 +94,21 @@ def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Re
     if config.clipping:
         plain = one_sided(plain, truth, target, lower, upper, False)
     return image_loss(prediction, truth, target.mask, config.form, config.ssim_weight, similar=plain)
+
+
+def _known(response: Response) -> Response:
+    """The curve by which photos are decoded, which does not change in a training: of a refined one its start."""
+    return response.start if isinstance(response, RefinedResponse) else response
+
+
+def _light(photo: Photograph, response: Response) -> Tensor:
+    """[H, W, 3] the photo's exposures; where the response is learned, those that its start curve would decode from the
+    simulated photo, so that the comparison also teaches the response."""
+    known = _known(response)
+    if known is response:
+        return photo.light
+    surplus = (photo.encoded - known.peak).clamp_min(0)
+    return known.decode(photo.encoded) * torch.exp(surplus / EXTENSION_SLOPE)
 
 
 def mu_law(exposure: Tensor, white: float, mu: float = MU) -> Tensor:
@@ -149,7 +167,7 @@ def total_loss(
         linear = linear_loss(photo, target, config)
         loss = loss if linear is None else loss + config.linear_weight * linear
     if config.highlight_weight > 0:
-        prior = highlight_prior(photo.light, target.clipped, field.response.white, config.highlight_stops)
+        prior = highlight_prior(photo.light, target.clipped, _known(field.response).white, config.highlight_stops)
         loss = loss + config.highlight_weight * prior
     if config.harmonics_weight > 0:
         loss = loss + config.harmonics_weight * field.gaussians.harmonics_rest.square().mean()

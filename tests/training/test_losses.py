@@ -5,6 +5,7 @@ import torch
 
 from sehdr_warp.model.radiance_field import CameraTensors, Photograph
 from sehdr_warp.model.response import response_by_name
+from sehdr_warp.model.response_refined import RefinedResponse
 from sehdr_warp.splatting.ssim import ssim
 from sehdr_warp.training.config import LossConfig
 from sehdr_warp.training.losses import (
@@ -203,3 +204,20 @@ def test_priors_and_regularisers_add_what_they_weigh():
     prior = highlight_prior(photo.light, target.clipped, field.response.white, 0.5).item()
     assert prior > 0
     assert loss(highlight_weight=3.0, highlight_stops=0.5) - plain == pytest.approx(3 * prior, rel=1e-3)
+
+
+def test_the_mu_law_domain_teaches_a_refined_response():
+    start = response_by_name("srgb")
+    refined, light = RefinedResponse(start), images(5)[0] * 1.2 + 0.01
+    target, config = target_of(quantised(start.encode(images(6)[0]))), LossConfig(domain="mu-law")
+    losses, gradients = [], []
+    for response in (start, refined):
+        given = light.clone().requires_grad_()
+        loss = ldr_loss(photo_of(given, response), target, config, response)
+        loss.backward()
+        losses.append(loss.item())
+        gradients.append(given.grad)
+    # At its start a refined response is the curve itself, above white too.
+    assert losses[0] == pytest.approx(losses[1], rel=1e-4)
+    torch.testing.assert_close(*gradients, rtol=1e-2, atol=1e-7)
+    assert refined.log_densities.grad.abs().sum() > 1e-4
