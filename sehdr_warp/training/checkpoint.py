@@ -57,7 +57,8 @@ def write_checkpoint(folder: Path, tensors: dict[str, Tensor], values: dict, *, 
 
 
 def newest_checkpoint(folder: Path) -> Checkpoint | None:
-    """The newest complete checkpoint in a folder, None if there is none; damaged ones are passed over.
+    """The newest complete checkpoint in a folder, None if there is none; damaged ones, and ones with numbers that are
+    not finite, are passed over.
 
     Raises InputError if checkpoints exist and none of them can be used.
     """
@@ -73,7 +74,7 @@ def newest_checkpoint(folder: Path) -> Checkpoint | None:
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """One checkpoint; raises InputError if a file is missing, damaged or of another format."""
+    """One checkpoint; raises InputError if a file is missing, damaged, of another format, or holds NaN or infinity."""
     from safetensors import SafetensorError
     from safetensors.torch import load
 
@@ -94,9 +95,20 @@ def read_checkpoint(path: Path) -> Checkpoint:
     if hashlib.sha256(data).hexdigest() != values.get("sha256"):
         raise InputError(path / TENSORS, f"its SHA-256 is not the {values.get('sha256')} of {VALUES}", remedy)
     try:
-        return Checkpoint(path, load(data), values)
-    except SafetensorError as error:
+        tensors = load(data)
+    except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
         raise InputError(path / TENSORS, f"not safetensors ({error})", remedy) from None
+    if (name := first_not_finite(tensors)) is not None:
+        raise InputError(path / TENSORS, f"{name} holds values that are not finite", remedy)
+    return Checkpoint(path, tensors, values)
+
+
+def first_not_finite(tensors: dict[str, Tensor]) -> str | None:
+    """The name of the first tensor that holds NaN or infinity, None if all numbers are finite."""
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+            return name
+    return None
 
 
 def _is_sound(path: Path) -> bool:

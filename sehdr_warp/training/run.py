@@ -137,9 +137,6 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
 
 def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) -> RadianceField:
     """The RadianceField that a checkpoint holds, on the CPU; raises InputError if tensors are missing or do not fit."""
-    for name, tensor in checkpoint.tensors.items():
-        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
-            raise InputError(checkpoint.path, f"{name} holds values that are not finite", _REMEDY)
     try:
         gaussians = Gaussians(*(checkpoint.tensors[f"gaussians.{name}"] for name in PARAMETER_NAMES))
         field = assemble_field(gaussians, config, Response.from_dict(info["response"]), info["base_exposure_time"])

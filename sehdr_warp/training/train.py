@@ -1,5 +1,6 @@
 """A whole training: folder, steps, reports, held-out tests, checkpoints, and a tidy end however it comes."""
 
+import math
 import os
 import signal
 import sys
@@ -16,7 +17,7 @@ from ..model.response import Response
 from ..output.files import write_json
 from ..scene import Scene
 from ..splatting.threads import thread_count
-from .checkpoint import newest_checkpoint, write_checkpoint
+from .checkpoint import first_not_finite, newest_checkpoint, write_checkpoint
 from .config import Config
 from .config_files import config_to_dict, load_config, read_config_json
 from .heldout import evaluate_views
@@ -125,7 +126,12 @@ def _continue(scene: Scene, out: Path, config: Config | None, device) -> tuple[T
         rewind_metrics(out, 0)
         return Trainer(scene, saved, make_field(scene, saved, choose_response(scene, saved), device)), 0.0
     trainer = Trainer(scene, saved, field_from_checkpoint(checkpoint, saved, info).to(device))
-    trainer.load_state(checkpoint.tensors, checkpoint.values)
+    try:
+        trainer.load_state(checkpoint.tensors, checkpoint.values)
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+        raise InputError(
+            checkpoint.path, f"its state cannot be taken up ({error!r:.120})", "remove it, or train again"
+        ) from None
     rewind_metrics(out, trainer.iteration)
     return trainer, checkpoint.values["seconds"]
 
@@ -169,11 +175,11 @@ class _Loop:
                     if evaluate:
                         self._evaluate(progress)
                     if save and iteration < total:
-                        self._checkpoint()
+                        self._checkpoint(progress)
                     started = time.perf_counter()
             self._stop_clock(started)
             trainer.check()
-            self._checkpoint()
+            self._checkpoint(progress)
             self._summarise()
         if self.writer is not None:
             self.writer.close()
@@ -212,8 +218,21 @@ class _Loop:
         figures = "  ".join(f"{name} {value:.2f} dB" for name, value in scores.items())
         progress.note(f"iteration {trainer.iteration}  held-out {figures}  after {self.seconds:.1f} s")
 
-    def _checkpoint(self) -> None:
+    def _checkpoint(self, progress: Progress) -> None:
+        """Saves the state, unless the training has diverged: the last good checkpoint then stays the newest.
+
+        Raises SehdrError if a parameter or the optimizer's state is not finite: no later step can mend that.
+        """
+        iteration = self.trainer.iteration
         tensors, values = self.trainer.state()
+        if (name := first_not_finite(tensors)) is not None:
+            raise SehdrError(
+                f"iteration {iteration}: {name} is not finite and was not saved; --resume goes back to the last good "
+                "checkpoint; if it happens again, lower the learning rates or check photos and cameras"
+            )
+        if iteration > self.first_iteration and not math.isfinite(loss := self.trainer.loss):
+            progress.note(f"iteration {iteration}: the loss is {loss}; no checkpoint is written, the last one stays")
+            return
         values = values | {"seconds": self.seconds}
         write_checkpoint(self.out / CHECKPOINTS, tensors, values, kept=self.schedule.checkpoints_kept)
 

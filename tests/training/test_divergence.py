@@ -1,0 +1,86 @@
+"""A training that diverges: what is skipped, what is saved, and where it goes on."""
+
+import json
+
+import pytest
+import torch
+
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.training.checkpoint import newest_checkpoint
+from sehdr_warp.training.config_files import load_config
+from sehdr_warp.training.train import train
+from sehdr_warp.training.trainer import Trainer
+
+
+def config(**overrides):
+    values = {"schedule.iterations": 30, "schedule.checkpoint_every": 10, "schedule.stated_for": 30}
+    return load_config("demo", {**values, "schedule.evaluate_at": [30], **overrides})
+
+
+def after(monkeypatch, iteration, change):
+    """Calls change(trainer) once, after a step."""
+    step = Trainer.step
+
+    def stepped(self):
+        step(self)
+        if self.iteration == iteration:
+            change(self)
+
+    monkeypatch.setattr(Trainer, "step", stepped)
+
+
+def test_a_state_that_is_not_finite_is_never_saved_and_resume_goes_back(scene, tmp_path, monkeypatch):
+    def spoil(trainer):
+        with torch.no_grad():
+            trainer.field.gaussians.means[0] = float("nan")
+
+    whole = train(scene, tmp_path / "whole", config(), device="cpu", quiet=True)
+    with monkeypatch.context() as patch:
+        after(patch, 15, spoil)
+        with pytest.raises(SehdrError, match="iteration 20: gaussians.means is not finite .*--resume"):
+            train(scene, tmp_path / "run", config(), device="cpu", quiet=True)
+    assert newest_checkpoint(tmp_path / "run" / "checkpoints").values["iteration"] == 10
+    run = train(scene, tmp_path / "run", device="cpu", resume=True, quiet=True)
+    assert torch.equal(run.model.gaussians.means, whole.model.gaussians.means)
+
+
+def test_while_the_loss_is_not_finite_the_last_checkpoint_stays(scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(Trainer, "loss", property(lambda self: float("inf") if self.iteration == 20 else 0.1))
+    train(scene, tmp_path / "run", config(**{"schedule.checkpoints_kept": 9}), device="cpu")
+    assert "iteration 20: the loss is inf; no checkpoint is written" in capsys.readouterr().err
+    kept = sorted(path.name for path in (tmp_path / "run" / "checkpoints").iterdir())
+    assert kept == ["iteration_00000010", "iteration_00000030"]
+
+
+def test_a_checkpoint_with_nan_is_passed_over(scene, tmp_path):
+    import hashlib
+
+    from safetensors.torch import load, save
+
+    train(scene, tmp_path / "run", config(**{"schedule.checkpoints_kept": 2}), device="cpu", quiet=True)
+    newest = tmp_path / "run" / "checkpoints" / "iteration_00000030"
+    tensors = load((newest / "state.safetensors").read_bytes())
+    tensors["optimizer.means.0.exp_avg"][0, 0] = float("inf")
+    data = save(tensors)
+    (newest / "state.safetensors").write_bytes(data)
+    values = json.loads((newest / "checkpoint.json").read_text()) | {"sha256": hashlib.sha256(data).hexdigest()}
+    (newest / "checkpoint.json").write_text(json.dumps(values))
+    assert newest_checkpoint(newest.parent).values["iteration"] == 20
+
+
+def test_huge_gradients_leave_finite_parameters(scene):
+    """A gradient too large to be squared in float32 would freeze Adam's second moment at infinity."""
+    from sehdr_warp.training.initialization import choose_response, make_field
+
+    options = config()
+    field = make_field(scene, options, choose_response(scene, options), "cpu")
+    trainer = Trainer(scene, options, field)
+    factor = [1e36]
+    field.gaussians.harmonics_dc.register_hook(lambda gradient: gradient * factor[0])
+    trainer.step()
+    assert trainer.skipped_steps == 1
+    factor[0] = 1.0
+    before = field.gaussians.harmonics_dc.detach().clone()
+    trainer.step()
+    assert trainer.skipped_steps == 1 and not torch.equal(before, field.gaussians.harmonics_dc)
+    assert all(bool(tensor.isfinite().all()) for tensor in trainer.state()[0].values() if tensor.is_floating_point())
