@@ -162,7 +162,7 @@ def _splat_rows(name, scene: SplatScene, gsplat: Peer | None, repetitions, budge
         if stage == WHOLE_SPLAT:
             row["peak_memory_bytes"] = peak_memory(variants[who, stage], device)
             if who == OURS:
-                # Warp's own scratch is kept from the largest call so far: sweeps ascend, so it is this one's.
+                # Warp's own scratch stays from the largest call so far, so this is an upper bound.
                 row["peak_memory_bytes"] += held_by_warp(device)
                 row["warp_memory_bytes"] = held_by_warp(device)
         rows.append(row)

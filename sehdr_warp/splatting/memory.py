@@ -4,6 +4,7 @@ import functools
 import inspect
 import re
 from collections.abc import Callable
+from contextlib import contextmanager
 
 import torch
 import warp as wp
@@ -52,6 +53,18 @@ def out_of_memory(
     sizes = f"{gaussians} Gaussians, an image of {width} x {height}"
     sizes += "" if channels is None else f", {channels} channels"
     return OutOfMemory(f"out of memory on {device}: {asked} could not be allocated with {sizes}; {REMEDY}")
+
+
+@contextmanager
+def memory_told(device, sizes: Callable[[], tuple[int, int, int]]):
+    """Makes allocations that fail within the block OutOfMemory errors. sizes: Gaussians, width and height by then."""
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        told = out_of_memory(error, device, *sizes())
+        if told is None:
+            raise
+        raise told from error
 
 
 def tells_sizes(rasterize: Callable) -> Callable:

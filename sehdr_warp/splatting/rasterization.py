@@ -8,6 +8,7 @@ import torch
 from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR
 from .blend_style import DEFAULT_STYLE, BlendStyle
 from .blending import blend
+from .memory import tells_sizes
 from .projection import project
 from .tile_lists import LARGEST_CAPACITY, build_tile_lists
 
@@ -39,6 +40,7 @@ class Rendering:
         return self.radii > 0
 
 
+@tells_sizes
 def rasterize(
     means: torch.Tensor,
     log_scales: torch.Tensor,
@@ -76,7 +78,8 @@ def rasterize(
     All tensors share one device (CPU or CUDA) and one dtype (float32 or float64). Differentiable with respect to
     every tensor, camera included. On the CPU results repeat bit for bit, whatever the number of threads.
     A Gaussian whose position or shape in the image is not finite is culled; a camera that is not finite culls them all.
-    Raises ValueError for shapes, dtypes, devices or values that do not fit.
+    Raises ValueError for shapes, dtypes, devices or values that do not fit; OutOfMemory (an SehdrError), with the sizes,
+    if memory does not suffice.
     """
     _check_tensors(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics)
     _check_options(width, height, near, low_pass, alpha_threshold, capacity)

@@ -16,6 +16,7 @@ from ..model.gaussians import Gaussians
 from ..model.response import Response
 from ..output.files import write_json
 from ..scene import Scene
+from ..splatting.memory import memory_told
 from ..splatting.threads import thread_count
 from .checkpoint import first_not_finite, newest_checkpoint, write_checkpoint
 from .config import Config
@@ -66,25 +67,43 @@ def train(
     data: how load_scene made the scene ("path", "exposure_index", "max_size"), saved so that it can be loaded again.
 
     Raises InputError for a scene, folder or config that cannot be used, SehdrError if the training diverges or the
-    disk is full, KeyboardInterrupt after an interrupt; a usable checkpoint is left then.
+    disk or the memory is full, KeyboardInterrupt after an interrupt; a usable checkpoint is left then.
     """
     out, device = Path(out), pick_device(device)
-    if check_folder(out, resume=resume, overwrite=overwrite):
-        trainer, seconds = _continue(scene, out, config, device)
-    else:
-        config = config or load_config()
-        response = choose_response(scene, config)
-        scene = with_predictions(scene, config, response)
-        field = make_field(scene, config, response, device)
-        trainer, seconds = Trainer(scene, config, field), 0.0
-        # Nothing is made or removed before the scene is known to be good.
-        clear_folder(out)
-        write_start(out, scene, config, field, data or {})
+    with memory_told(device, lambda: _sizes(scene)):
+        scene, trainer, seconds = _start(
+            scene, out, config, device, resume=resume, overwrite=overwrite, data=data or {}
+        )
     loop = _Loop(scene, out, trainer, seconds, tensorboard)
-    with Progress(trainer.config.schedule.iterations, enabled=not quiet) as progress, _torch_settings(trainer.config):
+    with (
+        memory_told(device, lambda: _sizes(scene, trainer)),
+        Progress(trainer.config.schedule.iterations, enabled=not quiet) as progress,
+        _torch_settings(trainer.config),
+    ):
         progress.note(f"response {trainer.field.response.name}, {trainer.field.gaussians.count} Gaussians on {device}")
         loop.run(progress)
     return load_run(out, device=device)
+
+
+def _start(scene, out, config, device, *, resume, overwrite, data) -> tuple[Scene, Trainer, float]:
+    """The scene as the loss sees it, the trainer and the seconds it has already trained."""
+    if check_folder(out, resume=resume, overwrite=overwrite):
+        return scene, *_continue(scene, out, config, device)
+    config = config or load_config()
+    response = choose_response(scene, config)
+    scene = with_predictions(scene, config, response)
+    field = make_field(scene, config, response, device)
+    trainer = Trainer(scene, config, field)
+    # Nothing is made or removed before the scene is known to be good.
+    clear_folder(out)
+    write_start(out, scene, config, field, data)
+    return scene, trainer, 0.0
+
+
+def _sizes(scene: Scene, trainer: Trainer | None = None) -> tuple[int, int, int]:
+    """Gaussians, and width and height of the largest photo."""
+    camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
+    return len(scene.points) if trainer is None else trainer.field.gaussians.count, camera.width, camera.height
 
 
 def with_predictions(scene: Scene, config: Config, response: Response) -> Scene:

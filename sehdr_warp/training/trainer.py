@@ -11,6 +11,7 @@ from ..model.radiance_field import RadianceField
 from ..model.response import RefinedResponse
 from ..scene import Scene
 from ..splatting import GraphRecorder
+from ..splatting.memory import OutOfMemory
 from .config import Config
 from .densification import make_densification, slope_weights
 from .initialization import scene_extent
@@ -194,7 +195,7 @@ class Trainer:
                 kind,
                 lambda: self._optimise(views.at(self._index), watched, capacity),
             )
-        except RuntimeError as error:
+        except (RuntimeError, OutOfMemory) as error:
             # Nothing of the step was done yet. Launching every step is slower, and right.
             self._recorder = None
             self.optimizer.zero_grad(set_to_none=True)
