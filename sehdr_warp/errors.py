@@ -10,6 +10,10 @@ class SehdrError(Exception):
     """
 
 
+LONGEST_PROBLEM = 400
+"""Characters of a problem that a message tells."""
+
+
 class InputError(SehdrError):
     """A file or a value that was handed in cannot be used.
 
@@ -18,4 +22,6 @@ class InputError(SehdrError):
 
     def __init__(self, path: Path | str, problem: str, remedy: str):
         self.path = str(path)
+        # A problem may quote a file, which may hold anything.
+        problem = problem if len(problem) <= LONGEST_PROBLEM else problem[:LONGEST_PROBLEM] + " ..."
         super().__init__(" ".join(f"{path}: {problem}; {remedy}".split()))

@@ -107,8 +107,12 @@ def _locate(preset: str | Path, beside: Path | None = None) -> Path:
     if str(preset) in preset_names():
         return Path(str(resources.files("sehdr_warp.configs") / f"{preset}.toml"))
     path = Path(preset) if beside is None else beside / preset
-    if not path.is_file():
-        raise InputError(preset, "no such preset or file", f"use one of {', '.join(preset_names())}, or a TOML file")
+    try:
+        found = path.is_file()
+    except (OSError, ValueError):  # A name that no file can have.
+        found = False
+    if not found:
+        raise InputError(str(preset)[:200], "no such preset or file", f"use one of {', '.join(preset_names())}, or a TOML file")
     return path
 
 
@@ -174,7 +178,10 @@ def _plain(hint, value, path: str):
             raise ConfigError(f"{path} = {_shown(value)} is not a list")
         return tuple(_plain(typing.get_args(hint)[0], item, path) for item in value)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            raise ConfigError(f"{path} = {_shown(value)} is too large") from None
     if type(value) is not hint:
         raise ConfigError(f"{path} = {_shown(value)} is not of type {hint.__name__}")
     return value

@@ -231,8 +231,8 @@ def read_run_info(path: Path) -> dict:
         if not isinstance(info[name], kind):
             raise InputError(path / RUN, f"{name} = {reprlib.repr(info[name])} is of the wrong type", _REMEDY)
     time = info["base_exposure_time"]
-    if not (math.isfinite(time) and time > 0):
-        raise InputError(path / RUN, f"base_exposure_time = {time} is not a positive number of seconds", _REMEDY)
+    if not 0 < time < math.inf or time > 1e300:
+        raise InputError(path / RUN, f"base_exposure_time = {reprlib.repr(time)} is not a positive number of seconds", _REMEDY)
     try:
         Response.from_dict(info["response"])
     except SehdrError as error:
