@@ -11,29 +11,30 @@ from .quality_report import TABLES, write_quality_report
 
 def bench_quality(
     settings: Settings, out: Path, workers: Workers, *, progress: Callable[[str], None] = lambda line: None
-) -> str:
+) -> tuple[str, SehdrError | None]:
     """Runs every job of the settings that has no result in `out`, then writes and returns the tables of all that are
-    there.
+    there; with them the error to end with, if a job failed.
 
-    Raises SehdrError for settings that cannot be run, before anything runs; and, after everything is written, if a job
-    failed.
+    Raises SehdrError for settings that cannot be run, before anything runs.
     """
     jobs = plan_jobs(settings)
     try:
         run_jobs(jobs, out, workers, settings.device, progress)
-    finally:
+    except BaseException:
         # Interrupted or not: what is finished is in the tables.
-        text = write_quality_report(out) if (out / "jobs").is_dir() else ""
-    _require(jobs, out, text)
-    return text
+        if (out / "jobs").is_dir():
+            write_quality_report(out)
+        raise
+    return write_quality_report(out), _failure(jobs, out)
 
 
-def _require(jobs: list[Job], out: Path, text: str) -> None:
+def _failure(jobs: list[Job], out: Path) -> SehdrError | None:
     folders = [out / "jobs" / job.name for job in jobs]
-    failed = [(folder, read_failure(folder)) for folder in folders if read_result(folder) is None]
-    if failed:
-        error = failed[0][1]["error"] if failed[0][1] else "it has no result"
-        raise SehdrError(
-            f"{len(failed)} of {len(jobs)} jobs failed, the first with: {error} (all in {out / TABLES}; the same command "
-            "tries them again)"
-        )
+    failed = [read_failure(folder) for folder in folders if read_result(folder) is None]
+    if not failed:
+        return None
+    error = failed[0]["error"] if failed[0] else "it has no result"
+    return SehdrError(
+        f"{len(failed)} of {len(jobs)} jobs failed, the first with: {error} (all in {out / TABLES}; the same command "
+        "tries them again)"
+    )

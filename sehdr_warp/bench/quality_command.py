@@ -115,7 +115,10 @@ def run_quality(asked: Quality) -> None:
         slurm=_pairs(asked.slurm),
         launcher=asked.launcher,
     )
-    print(bench_quality(settings, asked.out, workers, progress=_say))
+    text, failure = bench_quality(settings, asked.out, workers, progress=_say)
+    print(text)
+    if failure is not None:
+        raise failure
 
 
 def _devices(asked: Quality) -> tuple[str, tuple[int, ...]]:
