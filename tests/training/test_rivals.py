@@ -1,0 +1,218 @@
+"""The rival methods: their presets train, HDR truth supervises where it is asked to, learned tone mappers are kept."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.model.radiance_field import Photograph
+from sehdr_warp.model.response import ToneMapper, response_by_name
+from sehdr_warp.splatting.ssim import ssim
+from sehdr_warp.training.config import Config, ConfigError, LossConfig, ModelConfig, ResponseConfig
+from sehdr_warp.training.config_files import load_config
+from sehdr_warp.training.initialization import choose_response, make_field, start_colours
+from sehdr_warp.training.losses import Target, hdr_loss, total_loss
+from sehdr_warp.training.run import load_run
+from sehdr_warp.training.targets import largest_truth
+from sehdr_warp.training.train import train
+from sehdr_warp.training.trainer import Trainer
+
+from .test_train import quick
+
+RIVALS = {
+    "paper-truth": {"response.name": "srgb", "optimizer.harmonics_dc": 0.05, "optimizer.fusion": 0.01},
+    "hdr-gs": {"optimizer.harmonics_dc": 0.02, "optimizer.response": 0.005},
+    "hdr-gs-truth": {"optimizer.harmonics_dc": 0.02, "optimizer.response": 0.005},
+    "truth": {},
+    "predicted": {},
+}
+
+
+def trainer_of(scene, config):
+    return Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cpu"))
+
+
+def without_truth(scene, *names):
+    """The scene without the truth of the training views, or of those named alone."""
+    views = (
+        dataclasses.replace(view, hdr=None) if view.split == "train" and (not names or view.name in names) else view
+        for view in scene.views
+    )
+    return dataclasses.replace(scene, views=tuple(views))
+
+
+@pytest.mark.parametrize("name", RIVALS)
+def test_every_rival_learns_and_loads_as_it_was_trained(scene, tmp_path, name):
+    config = quick(name, **RIVALS[name], **{"schedule.iterations": 100})
+    # What trains without truth trains without any there.
+    given = scene if config.loss.uses_hdr and not config.loss.predictor else without_truth(scene)
+    run = train(given, tmp_path / "run", config, device="cpu", quiet=True)
+    first, last = run.metrics()
+    figure = "psnr_mu" if config.loss.ldr_weight == 0 else "psnr_ldr"
+    # Perceptrons take longer than this to find their weights.
+    gain = 0.5 if config.fusion.enabled or config.response.form == "mlp" else 1.5
+    assert last[figure] > first[figure] + gain
+    assert run.summary()["skipped_steps"] == 0
+    again, camera = load_run(tmp_path / "run"), scene.test_views[0].camera
+    assert torch.equal(again.render(camera).hdr, run.render(camera).hdr)
+    assert torch.equal(again.render_ldr(camera), run.render_ldr(camera))
+
+
+def test_presets_are_what_their_methods_say():
+    gs, truth, with_truth = (load_config(name) for name in ("hdr-gs", "truth", "hdr-gs-truth"))
+    assert (gs.model.radiance, gs.model.tone_map, gs.response.form, gs.response.width) == (
+        "log",
+        "gaussian",
+        "mlp",
+        128,
+    )
+    assert (gs.optimizer.response, gs.loss.form, gs.loss.ssim_weight, gs.loss.clipping) == (5e-4, "blend", 0.2, False)
+    assert (gs.loss.ldr_weight, gs.loss.hdr_weight) == (1.0, 0.0) and not gs.loss.uses_hdr
+    changed = dataclasses.replace(gs.loss, hdr_weight=0.6, hdr_domain="mu-law")
+    assert with_truth == dataclasses.replace(gs, loss=changed)
+    assert (truth.loss.ldr_weight, truth.loss.hdr_weight, truth.loss.hdr_domain) == (0.0, 1.0, "mu-law")
+    predicted = load_config("predicted")
+    assert predicted == dataclasses.replace(truth, loss=dataclasses.replace(truth.loss, predictor="kovaleski-oliveira"))
+    paper = load_config("paper")
+    assert load_config("paper-truth") == dataclasses.replace(
+        paper, loss=dataclasses.replace(paper.loss, hdr_truth=True)
+    )
+
+
+def images(seed):
+    generator = torch.Generator().manual_seed(seed)
+    return 4 * torch.rand((12, 14, 3), generator=generator)
+
+
+@pytest.mark.parametrize("domain", ["mu-law", "log", "linear"])
+def test_the_hdr_loss_compares_in_its_domain(domain):
+    exposure, truth = images(0), images(1)
+    config = LossConfig(form="blend", hdr_weight=1.0, hdr_domain=domain)
+    target = Target(truth, None, None, None, truth)
+    loss = hdr_loss(Photograph(exposure, exposure, exposure, None), target, config, 4.0)
+    mu = {"mu-law": 5000.0, "log": 2.0**20}.get(domain)
+    a, b = (x / 4 if mu is None else (1 + mu * x / 4).log() / math.log1p(mu) for x in (exposure, truth))
+    assert float(loss) == pytest.approx(float(0.8 * (a - b).abs().mean() + 0.2 * (1 - ssim(a, b))), rel=1e-4)
+
+
+def test_weights_mix_photos_and_truth(scene):
+    photo = Photograph(images(0) / 4, images(1), images(1), None)
+    target = Target(images(2) / 4, None, None, None, images(3))
+    field = trainer_of(scene, quick()).field
+
+    def loss(**weights):
+        return float(total_loss(field, photo, target, LossConfig(clipping=False, **weights), 4.0))
+
+    ldr, hdr = loss(), loss(ldr_weight=0.0, hdr_weight=1.0)
+    assert loss(ldr_weight=2.0, hdr_weight=0.6) == pytest.approx(2 * ldr + 0.6 * hdr, rel=1e-5)
+    # A view without truth has its photo alone.
+    target = dataclasses.replace(target, exposure_truth=None)
+    assert loss(hdr_weight=0.6) == pytest.approx(ldr)
+
+
+def test_photos_of_no_weight_teach_nothing(scene):
+    views = tuple(dataclasses.replace(view, image=view.image[::-1].copy()) for view in scene.views)
+    trainers = [
+        trainer_of(scene, quick("truth")),
+        trainer_of(dataclasses.replace(scene, views=views), quick("truth")),
+    ]
+    for trainer in trainers:
+        for _ in range(5):
+            trainer.step()
+    first, second = (trainer.field.gaussians.tensors() for trainer in trainers)
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+@pytest.mark.parametrize("preset", ["truth", "hdr-gs-truth", "paper-truth"])
+def test_a_scene_without_truth_is_refused_by_name_and_field(scene, tmp_path, preset):
+    field = "loss.hdr_truth = true" if preset == "paper-truth" else "loss.hdr_weight = "
+    with pytest.raises(InputError, match=f"^toy: no training view has the HDR truth that {field}"):
+        train(
+            without_truth(scene), tmp_path / "run", quick(preset, **{"response.name": "srgb"}), device="cpu", quiet=True
+        )
+    assert not (tmp_path / "run").exists()
+
+
+def test_truth_in_some_views_is_enough_where_photos_count(scene):
+    some = without_truth(scene, "v_1")
+    trainer = trainer_of(some, quick("hdr-gs-truth"))
+    for _ in range(7):
+        trainer.step()
+    assert trainer.skipped_steps == 0
+    with pytest.raises(InputError, match="view v_1 lacks the HDR truth"):
+        trainer_of(some, quick("truth"))
+    black = tuple(dataclasses.replace(view, hdr=np.zeros_like(view.hdr)) for view in scene.views)
+    with pytest.raises(InputError, match="black in every training view"):
+        trainer_of(dataclasses.replace(scene, views=black), quick("truth"))
+
+
+def test_the_largest_truth_is_that_of_training_views_where_they_count(scene):
+    loss = LossConfig(hdr_weight=1.0)
+    bright = [np.where(np.arange(32)[:, None, None] < 4, 900.0, view.hdr).astype(np.float32) for view in scene.views]
+    mask = np.repeat(np.arange(32)[:, None] >= 4, 32, axis=1).astype(np.float32)
+    train_max = max(float(view.hdr[4:].max()) for view in scene.train_views)
+    views = [
+        dataclasses.replace(view, hdr=hdr, mask=mask if view.split == "train" else None)
+        for view, hdr in zip(scene.views, bright, strict=True)
+    ]
+    assert largest_truth(dataclasses.replace(scene, views=tuple(views)), loss) == pytest.approx(train_max)
+    assert largest_truth(scene, LossConfig()) == 1.0
+
+
+def test_contradictions_are_refused():
+    with pytest.raises(ConfigError, match="nothing to compare"):
+        Config(loss=LossConfig(ldr_weight=0.0))
+    with pytest.raises(ConfigError, match=r"loss\.hdr_weight = 1\.0 needs radiance"):
+        Config(model=ModelConfig(radiance="display"), loss=LossConfig(hdr_weight=1.0))
+    with pytest.raises(ConfigError, match=r"loss\.predictor = 'x' is for nothing"):
+        Config(loss=LossConfig(predictor="x"))
+    for fields in ({"model.radiance": "display"}, {"schedule.coarse_levels": 1}, {"fusion.enabled": True}):
+        with pytest.raises(InputError, match=f"{next(iter(fields))} = .* needs a known response"):
+            load_config("default", {"response.form": "mlp", **fields})
+
+
+def test_a_learned_tone_mapper_starts_as_hdr_gs_does(scene):
+    config = Config(response=ResponseConfig(form="mlp", width=8), seed=5)
+    mapper = choose_response(scene, config)
+    assert isinstance(mapper, ToneMapper) and mapper.width == 8
+    assert torch.equal(mapper.weights[0], ToneMapper(8, seed=5).weights[0])
+    encoded = np.array([[0.2, 0.5, 0.9]])
+    assert np.allclose(start_colours(encoded, "log", mapper), encoded)
+    assert np.allclose(start_colours(encoded, "linear", mapper), np.exp(encoded))
+    assert not np.allclose(start_colours(encoded, "log", response_by_name("srgb")), encoded)
+
+
+def test_a_learned_tone_mapper_resumes_bit_for_bit(scene):
+    config = quick("hdr-gs")
+    straight = trainer_of(scene, config)
+    for _ in range(12):
+        straight.step()
+    stopped = trainer_of(scene, config)
+    before = stopped.field.response.encode(torch.ones(1, 3)).detach()
+    for _ in range(6):
+        stopped.step()
+    assert not torch.equal(stopped.field.response.encode(torch.ones(1, 3)).detach(), before), "it learns"
+    tensors, values = stopped.state()
+    resumed = trainer_of(scene, config)
+    resumed.field.gaussians.load_state_dict({k[10:]: v for k, v in tensors.items() if k.startswith("gaussians.")})
+    resumed.field.response.load_state_dict({k[9:]: v for k, v in tensors.items() if k.startswith("response.")})
+    resumed.load_state({name: value.clone() for name, value in tensors.items()}, values)
+    for _ in range(6):
+        resumed.step()
+    first, second = straight.state()[0], resumed.state()[0]
+    assert first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
+@pytest.mark.parametrize("name", ["hdr-gs-truth", "truth"])
+def test_rivals_are_recorded_on_a_gpu(scene, name):
+    config = quick(name, **RIVALS[name])
+    field = make_field(scene, config, choose_response(scene, config), "cuda:0")
+    trainer, replays = Trainer(scene, config, field), 0
+    for _ in range(100):
+        trainer.step()
+        replays += trainer._recorder is not None and trainer._recorder._key is not None
+    assert replays > 50 and trainer.skipped_steps == 0
