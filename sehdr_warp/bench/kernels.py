@@ -1,23 +1,19 @@
 """`bench kernels`: the whole differentiable splat (project, order, bin, blend; colours given), and the CPU's blend."""
 
-import os
 from collections.abc import Callable
-from contextlib import contextmanager
 
 import torch
 
-from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR, TILE_SIZE
-from ..splatting.blending import blend
-from ..splatting.projection import project
+from ..kernels.constants import TILE_SIZE
 from ..splatting.rasterization import rasterize
 from ..splatting.recorded_rasterizer import RecordedRasterizer
 from ..splatting.recording import GraphRecorder
-from ..splatting.tile_lists import TileLists, build_tile_lists
 from . import checks
+from .cpu_blend import BLEND_THREADS, blend_rows, using_threads
 from .machine import package_version
 from .peers import Peer, differs, find_peers
 from .report import new_report
-from .splats import Size, SplatScene, make_splat_scene
+from .splats import Size, SplatScene, make_covering_scene, make_splat_scene
 from .timing import Variant, peak_memory, time_variants
 
 OURS = "sehdr-warp"
@@ -29,7 +25,8 @@ recorded training step."""
 PLAIN_TORCH = "plain torch"
 PLAIN_TORCH_BYTES = 4 << 30
 """The plain torch rasterizer keeps about 16 numbers for each pixel-Gaussian pair; beyond this it is left out."""
-BLEND_THREADS = (1, 2)
+COVERING_SIZE = Size(200, 128, 128)
+"""Every Gaussian reaches every pixel there: what a pair costs that is really computed."""
 
 
 def bench_kernels(
@@ -58,11 +55,15 @@ def bench_kernels(
             report["checks"] += [check.to_dict() for check in _checks(scene, usable)]
             report["rows"] += _splat_rows(scene, usable, repetitions, budget, report["notes"])
             if device.type == "cpu":
-                report["rows"] += _blend_rows(scene, repetitions, budget)
+                report["rows"] += blend_rows(scene, "random", repetitions, budget)
             best = next(
                 row for row in report["rows"][::-1] if row["implementation"] == OURS and row["stage"] == "splat"
             )
             progress(f"{size}, {count} channels: {best['pass']} {best['median_ms']:.3f} ms")
+    if device.type == "cpu":
+        for count in channels:
+            covering = make_covering_scene(COVERING_SIZE, count)
+            report["rows"] += blend_rows(covering, "covering", repetitions, budget)
     report["notes"] = list(dict.fromkeys(report["notes"]))
     return report
 
@@ -181,112 +182,3 @@ def _row(scene: SplatScene, stage: str, implementation: str, passes: str) -> dic
         "implementation": implementation,
         "pass": passes,
     }
-
-
-def _blend_rows(scene: SplatScene, repetitions: int, budget: float) -> list[dict]:
-    """Rows of the CPU's blend alone: nanoseconds for each pixel of each list entry, on one thread and on two."""
-    lists, inputs, options = _blend_arguments(scene)
-    pairs, counted = listed_pairs(lists, scene.size), counted_pairs(lists, scene.size)
-    cotangent = scene.cotangent()
-    variants = {}
-    for threads in BLEND_THREADS:
-        variants["forward", threads] = _blend_forward(inputs, options, threads)
-        variants["backward", threads] = _blend_backward(inputs, options, cotangent, threads)
-    timings = time_variants(variants, scene.device, repetitions=repetitions, budget=budget)
-    rows = []
-    for (name, threads), timing in timings.items():
-        row = _row(scene, "blend", OURS, name) | {"threads": threads, "entries": lists.entry_count, "pairs": pairs}
-        row |= {"counted_pairs": counted, "ns_per_pair": timing.median * 1e6 / max(1, pairs)}
-        row |= {"ns_per_counted_pair": timing.median * 1e6 / max(1, counted)} | timing.to_dict()
-        row["speedup_over_one_thread"] = timings[name, 1].median / timing.median
-        rows.append(row)
-    return rows
-
-
-def _blend_arguments(scene: SplatScene):
-    """Tile lists, the tensors that blend() differentiates (as leaves) and its options, as rasterize() makes them."""
-    size, (*geometry, features) = scene.size, scene.leaves
-    with torch.no_grad():
-        *projected, extents = project(
-            *geometry,
-            scene.world_to_camera,
-            scene.intrinsics,
-            width=size.width,
-            height=size.height,
-            near=NEAR,
-            low_pass=LOW_PASS,
-            alpha_threshold=ALPHA_THRESHOLD,
-            antialiased=False,
-        )
-        lists = build_tile_lists(*projected, extents, size.width, size.height, ALPHA_THRESHOLD)
-    means2d, conics, _, opacities = projected
-    inputs = tuple(tensor.detach().clone().requires_grad_() for tensor in (means2d, conics, opacities, features))
-    return (
-        lists,
-        inputs,
-        {"lists": lists, "width": size.width, "height": size.height, "alpha_threshold": ALPHA_THRESHOLD},
-    )
-
-
-def listed_pairs(lists: TileLists, size: Size) -> int:
-    """Pixel-Gaussian pairs: for each tile, the entries of its list times its pixels within the image."""
-    entries = (lists.ranges[:, 1] - lists.ranges[:, 0]).long().cpu().reshape(lists.rows, lists.columns)
-    across = torch.full((lists.columns,), TILE_SIZE)
-    across[-1] = size.width - (lists.columns - 1) * TILE_SIZE
-    down = torch.full((lists.rows,), TILE_SIZE)
-    down[-1] = size.height - (lists.rows - 1) * TILE_SIZE
-    return int((entries * down[:, None] * across[None, :]).sum())
-
-
-def counted_pairs(lists: TileLists, size: Size) -> int:
-    """Of listed_pairs(), those where alpha reaches the threshold: what no algorithm may leave out (but behind pixels
-    that are finished)."""
-    tiles = torch.repeat_interleave(
-        torch.arange(lists.ranges.shape[0]), (lists.ranges[:, 1] - lists.ranges[:, 0]).long()
-    )
-    offsets = torch.arange(TILE_SIZE) + 0.5
-    total = 0
-    for tile, gaussian in zip(tiles.split(20_000), lists.gaussians.long().split(20_000)):
-        x = (tile % lists.columns * TILE_SIZE)[:, None, None] + offsets[None, None, :]
-        y = (tile // lists.columns * TILE_SIZE)[:, None, None] + offsets[None, :, None]
-        shape, ellipse = lists.shapes[gaussian].T[:, :, None, None], lists.ellipses[gaussian].T[:, :, None, None]
-        dx, dy = shape[0] - x, shape[1] - y
-        exponent = -0.5 * (ellipse[0] * dx * dx + ellipse[2] * dy * dy) - ellipse[1] * dx * dy
-        reached = shape[2] * exponent.clamp(max=0.0).exp() >= ALPHA_THRESHOLD
-        total += int((reached & (x < size.width) & (y < size.height)).sum())
-    return total
-
-
-def _blend_forward(inputs, options, threads: int) -> Variant:
-    def run(_):
-        with torch.no_grad(), using_threads(threads):
-            blend(*inputs, **options)
-
-    return Variant(run)
-
-
-def _blend_backward(inputs, options, cotangent, threads: int) -> Variant:
-    def run(image):
-        with using_threads(threads):
-            image.backward(cotangent)
-
-    def prepare():
-        for tensor in inputs:
-            tensor.grad = None
-        return blend(*inputs, **options)[0]
-
-    return Variant(run, prepare)
-
-
-@contextmanager
-def using_threads(count: int):
-    """The CPU's kernels run on so many threads (SEHDR_THREADS) within this block."""
-    before = os.environ.get("SEHDR_THREADS")
-    os.environ["SEHDR_THREADS"] = str(count)
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["SEHDR_THREADS"]
-        else:
-            os.environ["SEHDR_THREADS"] = before

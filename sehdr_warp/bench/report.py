@@ -27,6 +27,7 @@ COLUMNS = {
             ("ours / this", "ours_over_this", ".3f"),
         ),
         "blend": (
+            ("scene", "scene", "s"),
             ("Gaussians", "gaussians", ",d"),
             ("width", "width", "d"),
             ("height", "height", "d"),
@@ -37,6 +38,8 @@ COLUMNS = {
             ("n", "repetitions", "d"),
             ("Mpairs", "pairs", "M"),
             ("ns / pair", "ns_per_pair", ".2f"),
+            ("least", "least_ns_per_pair", ".2f"),
+            ("of processor time", "cpu_ns_per_pair", ".2f"),
             ("counted Mpairs", "counted_pairs", "M"),
             ("ns / counted pair", "ns_per_counted_pair", ".2f"),
             ("x one thread", "speedup_over_one_thread", ".2f"),
@@ -186,9 +189,7 @@ def format_report(report: dict) -> str:
         rows = [row for row in report["rows"] if row["stage"] == stage]
         if rows:
             shown = [column for column in columns if any(row.get(column[1]) is not None for row in rows)]
-            parts.append(
-                _table([title for title, _, _ in shown], [[_cell(row, c) for c in shown] for row in rows])
-            )
+            parts.append(_table([title for title, _, _ in shown], [[_cell(row, c) for c in shown] for row in rows]))
     checks = report["checks"]
     if checks:
         failed = [check for check in checks if not check["passed"]]

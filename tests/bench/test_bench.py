@@ -52,7 +52,12 @@ def test_kernels_report_times_checks_and_machine(tmp_path, capsys):
     }
     for row in blends:
         assert row["ns_per_pair"] == pytest.approx(row["median_ms"] * 1e6 / row["pairs"])
-        assert 0 < row["counted_pairs"] < row["pairs"]
+        assert row["least_ns_per_pair"] <= row["ns_per_pair"]
+        assert (row["cpu_ns_per_pair"] is None) == (row["threads"] == 2)
+        if row["scene"] == "covering":
+            assert row["counted_pairs"] == row["pairs"]
+        else:
+            assert 0 < row["counted_pairs"] < row["pairs"]
     # Plain torch, and ours on one and on two threads: image and five gradients, for two channel counts.
     assert len(report["checks"]) == 2 * 3 * 6
     assert all(check["passed"] and check["difference"] < 1e-4 for check in report["checks"])
