@@ -71,3 +71,38 @@ def test_bad_arguments():
         select_response(photo, method="guess")
     with pytest.raises(SehdrError, match="no candidates"):
         select_response(photo, [])
+
+
+@pytest.mark.parametrize("name", ["gamma-2.2", "srgb", "reinhard-gamma", "filmic"])
+def test_posterior_finds_the_response_of_a_clean_picture(name):
+    response = response_by_name(name)
+    photos = [np.round(response.encode(min(response.clip_exposure, 3.0) * mosaic(s)) * 255) / 255 for s in range(4)]
+    assert select_response(photos, method="posterior").response.name == name
+
+
+def test_highlights_tell_a_curve_that_clips_from_one_that_does_not():
+    """Light that falls off by e per stop and has no edges: only the pile at the brightest code can tell."""
+    light = np.exp2(np.random.default_rng(0).exponential(2.0, (64, 64, 1)) - 3) * np.ones(3)
+    for name, other in (("srgb", "reinhard-gamma"), ("reinhard-gamma", "srgb")):
+        candidates = [response_by_name(each) for each in (name, other)]
+        photo = np.round(candidates[0].encode(light * 4) * 255) / 255
+        right, wrong = (
+            next(s for s in select_response(photo, candidates, method="posterior").scores if s.response is each)
+            for each in candidates
+        )
+        assert right.highlights < wrong.highlights - 0.5
+
+
+def test_prior_of_cameras_decides_where_nothing_else_does():
+    ramp = np.linspace(0.1, 0.9, 64)[None, :, None] * np.ones((64, 1, 3))
+    selection = select_response(ramp, method="posterior", from_camera=True)
+    assert selection.response.name == "camera" and selection.method == "posterior" and selection.edge_count == 0
+    scores = {score.response.name: score.prior for score in selection.scores}
+    assert scores["camera"] < scores["rec709"] < scores["linear"]
+
+
+def test_large_photos_are_read_in_bands():
+    response = response_by_name("gamma-2.2")
+    photo = np.tile(np.round(response.encode(mosaic()) * 255) / 255, (8, 8, 1))
+    selection = select_response(photo, method="posterior")
+    assert photo.shape[0] * photo.shape[1] > 400_000 and selection.response.name == "gamma-2.2"

@@ -173,3 +173,19 @@ def test_srgb_is_the_standard():
 def test_limited_size():
     assert limited_size(2832, 2128, 400) == (400, 301) and limited_size(30, 20, 400) == (30, 20)
     assert limited_size(5000, 2, 100) == (100, 1) and limited_size(30, 20, None) == (30, 20)
+
+
+def test_photos_made_by_a_camera(tmp_path):
+    """JPEGs that state an exposure; neither other JPEGs nor other files, nor a minority of them."""
+    from sehdr_warp.scene.exposure import made_by_camera
+
+    tags = Image.Exif()
+    tags.get_ifd(0x8769)[0x829D] = 8.0
+    picture = Image.fromarray(np.zeros((8, 8, 3), np.uint8))
+    picture.save(tmp_path / "camera.JPG", exif=tags)
+    picture.save(tmp_path / "plain.jpg")
+    picture.save(tmp_path / "screen.png", exif=tags)
+    camera, plain, screen = (tmp_path / name for name in ("camera.JPG", "plain.jpg", "screen.png"))
+    assert made_by_camera([camera]) and made_by_camera([camera, camera, plain])
+    for others in ([plain], [screen], [camera, plain], [None], [tmp_path / "gone.jpg"], []):
+        assert not made_by_camera(others)

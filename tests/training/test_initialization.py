@@ -125,3 +125,15 @@ def test_far_points_join_the_scenes_points_within_the_budget(scene):
     assert field.gaussians.means.norm(dim=1).max() > 4 * RADIUS > plain.means.norm(dim=1).max()
     with pytest.raises(ConfigError, match=r"model\.far_points = 90 leaves no room"):
         dataclasses.replace(config, model=dataclasses.replace(config.model, far_points=90))
+
+
+def test_posterior_takes_a_cameras_curve_for_a_cameras_files(tmp_path):
+    from PIL import Image
+
+    tags = Image.Exif()
+    tags.get_ifd(0x8769)[0x829A] = 0.01
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / "photo.jpg", exif=tags)
+    toy = toy_scene()
+    config = load_config("default", {"response.name": "auto", "response.method": "posterior"})
+    views = tuple(dataclasses.replace(view, source=tmp_path / "photo.jpg") for view in toy.views)
+    assert choose_response(dataclasses.replace(toy, views=views), config).name == "camera"
