@@ -42,12 +42,21 @@ def tile_kernels(dtype):
         conics: wp.array(dtype=vec3),
         opacities: wp.array(dtype=real),
         extents: wp.array(dtype=vec2),
+        features: wp.array2d(dtype=real),
+        channels: int,
         alpha_threshold: real,
         shapes: wp.array(dtype=vec4),
         ellipses: wp.array(dtype=vec4),
     ):
-        """shapes: (x, y, opacity, half-height); ellipses: (conic a, b, c, level at which alpha meets the threshold)."""
+        """shapes: (x, y, opacity, half-height); ellipses: (conic a, b, c, level at which alpha meets the threshold).
+
+        A Gaussian with a feature that is not finite gets extents of 0: the CPU blend multiplies what a pixel does not
+        see by 0, and 0 times NaN would show beside it.
+        """
         i = wp.tid()
+        for channel in range(channels):
+            if not wp.isfinite(features[i, channel]):
+                extents[i] = vec2(real(0.0), real(0.0))
         mean = means2d[i]
         conic = conics[i]
         opacity = opacities[i]

@@ -77,7 +77,8 @@ def rasterize(
 
     All tensors share one device (CPU or CUDA) and one dtype (float32 or float64). Differentiable with respect to
     every tensor, camera included. On the CPU results repeat bit for bit, whatever the number of threads.
-    A Gaussian whose position or shape in the image is not finite is culled; a camera that is not finite culls them all.
+    A Gaussian whose position or shape in the image, or a feature, is not finite is culled; a camera that is not finite
+    culls them all.
     Raises ValueError for shapes, dtypes, devices or values that do not fit; OutOfMemory (an SehdrError), with the sizes,
     if memory does not suffice.
     """
@@ -93,19 +94,21 @@ def rasterize(
         alpha_threshold=alpha_threshold,
         antialiased=antialiased,
     )
+    features = features.contiguous()
     lists = build_tile_lists(
         *(tensor.detach() for tensor in (means2d, conics, depths, opacities2d, extents)),
         width,
         height,
         alpha_threshold,
         capacity,
+        features=features.detach(),
         emission=means.device.type == "cpu" or style.deterministic,
     )
     image, alpha = blend(
         means2d,
         conics,
         opacities2d,
-        features.contiguous(),
+        features,
         lists=lists,
         width=width,
         height=height,

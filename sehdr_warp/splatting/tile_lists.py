@@ -61,6 +61,7 @@ def build_tile_lists(
     alpha_threshold: float,
     capacity: int | None = None,
     *,
+    features=None,
     emission: bool = True,
 ) -> TileLists:
     """Order the projected Gaussians by depth and list, for each tile, those whose ellipse touches it.
@@ -68,12 +69,13 @@ def build_tile_lists(
     The arguments are project()'s results; nothing here is differentiable.
     capacity: room for this many entries. The host then never waits for the device to learn how many there are; entries
     beyond it are left out, and TileLists.overflow says so.
+    features: [N, C]; a Gaussian with one that is not finite is culled: its extents are set to 0.
     emission: also tell where entries came from, which adjoints need that sum by Gaussian in a fixed order.
     Raises SehdrError if the lists would need more than 2^31 - 1 entries.
     """
     columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
     tile_count = columns * rows
-    shapes, ellipses = pack_records(means2d, conics, opacities, extents, alpha_threshold)
+    shapes, ellipses = pack_records(means2d, conics, opacities, extents, features, alpha_threshold)
     order = depth_order(depths, extents)
     counts = count_entries(order, shapes, ellipses, extents, columns, rows)
     total = counts.sum(dtype=torch.int64)
@@ -95,7 +97,7 @@ def _exact_room(total: int, gaussian_count: int, columns: int, rows: int) -> int
     return total
 
 
-def pack_records(means2d, conics, opacities, extents, alpha_threshold: float):
+def pack_records(means2d, conics, opacities, extents, features, alpha_threshold: float):
     """[N] records of four numbers each: see TileLists.shapes and TileLists.ellipses."""
     scalar = warp_scalar(means2d.dtype)
     vec2, vec3, vec4 = (vector(n, scalar) for n in (2, 3, 4))
@@ -109,6 +111,8 @@ def pack_records(means2d, conics, opacities, extents, alpha_threshold: float):
             view(conics, vec3),
             view(opacities),
             view(extents, vec2),
+            view(means2d if features is None else features),
+            0 if features is None else features.shape[1],
             alpha_threshold,
             view(shapes, vec4),
             view(ellipses, vec4),

@@ -191,7 +191,7 @@ def test_options_out_of_range_are_named(option):
         rasterize(*random_scene(count=5).arguments, **option)
 
 
-@pytest.mark.parametrize("which", range(4), ids=NAMES[:4])
+@pytest.mark.parametrize("which", range(5), ids=NAMES[:5])
 def test_gaussians_that_are_not_finite_are_culled(device, which):
     scene = random_scene().to(torch.float32, device)
     rest = random_scene().to(torch.float32, device)
