@@ -172,9 +172,9 @@ class _CentreGradients:
 
 def rasterize_with_gsplat(
     means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics, width: int, height: int,
-    *, low_pass: float = LOW_PASS, antialiased: bool = False, capacity: int | None = None,
+    *, low_pass: float = LOW_PASS, antialiased: bool = False, capacity: int | None = None, style: object = None,
 ) -> Rendering:
-    """rasterize() by gsplat, for a training step of ours on its kernels. capacity: has no meaning there."""
+    """rasterize() by gsplat, for a training step of ours on its kernels. capacity, style: have no meaning there."""
     from gsplat import rasterization
 
     fx, fy, cx, cy = intrinsics
