@@ -20,7 +20,6 @@ from .report import new_report
 
 CODES = np.arange(10, 246)
 FIXED = ("srgb", "camera")
-METHODS = ("posterior", "edges", "paper")
 CURVES = ("hdr-nerf", "srgb", "gamma-2.2", "rec709", "filmic", "aces", "camera")
 """Curves that expose rendered truth where none are named."""
 GOOD = 0.35
@@ -115,10 +114,14 @@ def _scene_trials(scene: Scene, name: str, truth: Response, count: int, factor: 
 def _choices(images, from_camera: bool, seed: int):
     for name in FIXED:
         yield f"always {name}", response_by_name(name)
-    for method in METHODS:
-        # A photo that is black or white says nothing; what was chosen then is stated as none.
-        with contextlib.suppress(SehdrError):
-            yield method, select_response(images, method=method, from_camera=from_camera, seed=seed).response
+    # Photos that are black or white all over say nothing: only what is taken always is judged on them.
+    with contextlib.suppress(SehdrError):
+        scores = select_response(images, method="posterior", from_camera=from_camera, seed=seed).scores
+        yield "posterior", scores[0].response
+        paper = max(scores, key=lambda score: score.paper_score).response
+        yield "paper", paper
+        # Without edges, select_response falls back as this does.
+        yield "edges", paper if np.isnan(scores[0].edges) else min(scores, key=lambda score: score.edges).response
 
 
 def _trial(stage: str, data: str, truth: str, photo: str, method: str, response: Response, stops: np.ndarray) -> dict:
