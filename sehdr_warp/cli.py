@@ -13,6 +13,7 @@ import tyro
 from . import __version__
 from .bench.commands import Bench, run_bench
 from .errors import InputError, SehdrError
+from .synth.commands import Synth, run_synth
 
 Positional = tyro.conf.Positional
 
@@ -22,8 +23,8 @@ class Train:
     """Train a scene from photos of one exposure."""
 
     data: Positional[str]
-    """Folder of photos: COLMAP, transforms.json, HDR-NeRF, HDR-GS, LLFF or bare photos; `embedded` is the scene that
-    comes with the package."""
+    """Folder of photos: COLMAP, transforms.json, HDR-NeRF, HDR-GS, LLFF or bare photos; `embedded` is the room that
+    comes with the package, `embedded:NAME` another of its scenes."""
     out: Path
     """Folder for the run."""
     preset: str | None = None
@@ -141,6 +142,7 @@ Command = (
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
+    | Annotated[Synth, tyro.conf.subcommand("synth")]
 )
 
 
@@ -293,6 +295,7 @@ _COMMANDS = {
     Export: _export,
     Report: _report,
     Bench: run_bench,
+    Synth: run_synth,
 }
 
 
@@ -305,12 +308,12 @@ def _load_run(path: Path, device: str | None):
 
 def _scene_of(run, data: str | None):
     """The scene a run was trained on, read again in the same way."""
-    from .scene import load_scene
+    from .scene import is_embedded, load_scene
 
     place = data or run.data.get("path")
     if place is None:
         raise SehdrError(f"{run.path}: does not say where its photos are; give --data")
-    if data is None and place != "embedded" and not Path(place).is_dir():
+    if data is None and not is_embedded(place) and not Path(place).is_dir():
         raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
     return load_scene(
         place,
@@ -345,7 +348,9 @@ def _cache_beside(run: Path) -> Path:
 
 
 def _absolute(data: str) -> str:
-    return data if data == "embedded" else str(Path(data).absolute())
+    from .scene import is_embedded
+
+    return data if is_embedded(data) else str(Path(data).absolute())
 
 
 def _predictor(text: str | None) -> str | None:

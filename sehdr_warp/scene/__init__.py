@@ -2,7 +2,7 @@
 
 from .camera import Camera
 from .camera_path import load_cameras
-from .load import load_scene
+from .load import embedded_names, is_embedded, load_scene
 from .types import Scene, View
 
-__all__ = ["Camera", "Scene", "View", "load_cameras", "load_scene"]
+__all__ = ["Camera", "Scene", "View", "embedded_names", "is_embedded", "load_cameras", "load_scene"]

@@ -21,6 +21,7 @@ class Shot:
     exposure_time: seconds from the set's own files; None lets EXIF speak.
     split: "train" or "test" where the set says so.
     mask, hdr: files, where there are any.
+    derived: the set has no photos; this one is made of the truth, and `image` names the truth's file.
     oriented: the lens speaks of the pixels after EXIF orientation; None finds out from the sizes.
     """
 
@@ -33,6 +34,7 @@ class Shot:
     split: str | None = None
     mask: Path | None = None
     hdr: Path | None = None
+    derived: bool = False
     oriented: bool | None = None
 
 

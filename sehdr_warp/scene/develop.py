@@ -8,6 +8,7 @@ from sehdr_warp.errors import InputError
 
 from .camera import Camera
 from .capture import Shot
+from .hdr_nerf_layout import reinhard_gamma
 from .images import image_sizes, read_hdr, read_ldr, read_mask
 from .lens import Lens, Undistortion
 from .resample import Curve, area_average, light_table, limited_size, restore_clipping
@@ -29,6 +30,8 @@ class Developer:
 
     def view(self, shot: Shot, name: str) -> View:
         """The shot's view; raises InputError where a file is damaged or its size disagrees with the camera's."""
+        if shot.derived:
+            return self._derived(shot, name)
         lens, oriented = _fitted_lens(shot)
         working = lens if lens.is_pinhole else _working_lens(lens, self.max_size)
         undistortion = None if lens.is_pinhole else self._undistortion(working)
@@ -53,6 +56,14 @@ class Developer:
             mask = None if mask.min() >= 1 - 1e-6 else mask
         hdr = None if shot.hdr is None else _truth(shot.hdr, lens, working, undistortion, camera)
         return View(name, image, camera, shot.exposure_time, shot.split, mask, hdr, Path(shot.image))
+
+    def _derived(self, shot: Shot, name: str) -> View:
+        """A view of truth alone; its photo is HDR-NeRF's, in 8 bits, at the final size."""
+        camera = shot.lens.pinhole(shot.world_to_camera)
+        camera = camera.resized(*limited_size(camera.width, camera.height, self.max_size))
+        hdr = _truth(shot.hdr, shot.lens, shot.lens, None, camera)
+        image = (np.round(reinhard_gamma(hdr * shot.exposure_time) * 255) / 255).astype(np.float32)
+        return View(name, image, camera, shot.exposure_time, shot.split, None, hdr, Path(shot.image))
 
     def _undistortion(self, lens: Lens) -> Undistortion:
         # Sets mostly share one lens; its map is as large as an image, so only the last one is kept.

@@ -12,6 +12,10 @@ from PIL import Image
 from .camera import Camera
 
 
+DERIVED_PHOTOS = "reinhard-gamma"
+"""What a set without photos of its own states as `photo_response`: load_scene makes them of the truth by this curve."""
+
+
 @dataclass(frozen=True)
 class RadianceView:
     """name: the view's stem (`r_0`); radiance: [H, W, 3] scene-linear, >= 0; split: "train" or "test".

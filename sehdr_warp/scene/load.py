@@ -24,6 +24,7 @@ from .types import Scene, View
 
 # Every eighth view is held out: the habit of LLFF, Mip-NeRF 360 and 3DGS.
 _HOLDOUT = 8
+_EMBEDDED = Path(str(resources.files("sehdr_warp.embedded")))
 # Below this many views none can be spared for testing.
 _FEWEST_FOR_TEST = 5
 
@@ -41,8 +42,8 @@ def load_scene(
 ) -> Scene:
     """Read a folder of posed or bare photos, whatever its layout.
 
-    path: a folder (COLMAP, transforms.json, HDR-NeRF synthetic or real, HDR-GS, LLFF, or bare photos), or "embedded"
-        for the scene that comes with the package.
+    path: a folder (COLMAP, transforms.json, HDR-NeRF synthetic or real, HDR-GS, LLFF, or bare photos), "embedded"
+        for the room that comes with the package, or "embedded:NAME" for another of its scenes (embedded_names()).
     exposure_index: the number of the exposure to take where each view has several (the k of `<view>_<k>.png`); None
         takes the middle one and says so in the notes.
     max_size: longest side of the views in pixels; None keeps the photos' sizes. Averages are exact areas, of light
@@ -90,13 +91,27 @@ def load_scene(
         views.append(developer.view(shot, name))
     _require_content(views, folder)
     points, colors, more = _with_points(capture, views, cache, progress)
-    name = "embedded" if str(path) == "embedded" else folder.resolve().name
+    name = str(path) if is_embedded(path) else folder.resolve().name
     return Scene(name, capture.format, tuple(views), points, colors, times_known, (*notes, *more))
 
 
+def is_embedded(path: Path | str) -> bool:
+    """Whether this names a scene of the package, known or not, rather than a folder."""
+    return str(path) == "embedded" or str(path).startswith("embedded:")
+
+
+def embedded_names() -> tuple[str, ...]:
+    """The scenes that come with the package, for load_scene("embedded:NAME")."""
+    return tuple(sorted(folder.name for folder in _EMBEDDED.iterdir() if (folder / "transforms_train.json").is_file()))
+
+
 def _folder(path: Path | str) -> Path:
-    if str(path) == "embedded":
-        return Path(str(resources.files("sehdr_warp.embedded"))) / "room"
+    if is_embedded(path):
+        _, _, name = str(path).partition(":")
+        if name and name not in embedded_names():
+            known = ", ".join(f"embedded:{known}" for known in embedded_names())
+            raise InputError(path, "is no scene of the package", f"take one of {known}")
+        return _EMBEDDED / (name or "room")
     folder = Path(path)
     if not folder.exists():
         raise InputError(folder, "not found", "give a folder of photos, or 'embedded'")

@@ -11,6 +11,7 @@ from sehdr_warp.errors import InputError
 from .capture import Capture, Shot, pose_from_camera_to_world
 from .colmap_model import find_model, read_ply_points, read_points
 from .exposure import parse_seconds
+from .hdr_nerf_layout import DERIVED_PHOTOS
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, image_sizes
 from .lens import Lens
 from .names import sibling
@@ -58,6 +59,8 @@ def read_hdr_nerf(folder: Path) -> Capture:
     `transforms_<split>.json` with camera_angle_x and frames whose file_path lacks the `_<k>.png` of the exposure;
     `exposure_<split>.json` maps `<file_path>_<k>.png` to seconds; truth in `<split>_hdr/hdr_%03d.exr` by the frame's
     place. Any number of exposures will do; points come from `sparse/0`, `sparse` or points3d.ply where they are there.
+    `"photo_response": "reinhard-gamma"` in transforms_<split>.json marks a set of truth alone (ours, not HDR-NeRF's):
+    its photos are made of the truth by that curve.
     """
     shots = []
     for split in ("train", "test"):
@@ -65,6 +68,7 @@ def read_hdr_nerf(folder: Path) -> Capture:
         if split == "test" and not path.is_file():
             continue
         values, times = read_json(path), _exposures_of(read_json(times_path), times_path)
+        derived = _states_derived_photos(values, path)
         for place, (name, frame) in enumerate(frames_of(values, path)):
             stated = times.get(_plain(name))
             if not stated:
@@ -73,6 +77,17 @@ def read_hdr_nerf(folder: Path) -> Capture:
                 )
             hdr = sibling(folder / f"{split}_hdr" / f"hdr_{place:03d}.exr", HDR_SUFFIXES)
             matrix = frame_pose(frame, path, name)
+            if derived:
+                if hdr is None:
+                    raise InputError(folder / f"{split}_hdr" / f"hdr_{place:03d}.exr", "HDR truth not found",
+                                     "copy the whole set")  # fmt: skip
+                lens = frame_lens(values, frame, hdr, path)
+                shots += [
+                    Shot(Path(_plain(name)).name, hdr, lens, matrix, exposure_key=key, exposure_time=time, split=split,
+                         hdr=hdr, derived=True)
+                    for key, (_, time) in sorted(stated.items())
+                ]  # fmt: skip
+                continue
             present = [(k, contained(folder, file, times_path), t) for k, (file, t) in sorted(stated.items())]
             present = [entry for entry in present if entry[1].is_file()]
             if not present:
@@ -86,6 +101,13 @@ def read_hdr_nerf(folder: Path) -> Capture:
             ]  # fmt: skip
     points, colors = _sparse_points(folder)
     return Capture("hdr-nerf", tuple(shots), alpha="background", points=points, point_colors=colors)
+
+
+def _states_derived_photos(values: dict, path: Path) -> bool:
+    stated = values.get("photo_response")
+    if stated is not None and stated != DERIVED_PHOTOS:
+        raise InputError(path, f"photo_response is {stated!r:.40}", f"only {DERIVED_PHOTOS!r} can be derived")
+    return stated is not None
 
 
 def frames_of(values: dict, path: Path) -> list[tuple[str, dict]]:
