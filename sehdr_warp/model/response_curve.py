@@ -68,8 +68,8 @@ class Response(ABC):
             raise SehdrError(f"response: kind = {kind!r:.60} is not one of {', '.join(sorted(Response._kinds))}")
         try:
             return Response._kinds[kind]._from_dict(values)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise SehdrError(f"response: the stored {kind} curve is damaged ({error!r})") from error
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise SehdrError(f"response: the stored {kind} curve is damaged ({error!r:.200})") from error
 
     @property
     def clips(self) -> bool:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError, SehdrError
+from .mat_file import read_matrices
 from .response_curve import Response
 from .response_table import TabulatedResponse
 
@@ -121,13 +122,11 @@ def _select(path: Path, curves: list[Response], selector: str | None) -> Respons
 
 
 def _dorf_mat(path: Path) -> list[Response]:
-    from scipy.io import loadmat
-
     _check_size(path)
     try:
-        stored = loadmat(path, variable_names=("B", "I"))
-        values, exposures = (np.asarray(stored[key], np.float64) for key in ("B", "I"))
-    except Exception as error:
+        stored = read_matrices(path, ("B", "I"))
+        values, exposures = stored["B"], stored["I"]
+    except (OSError, ValueError, KeyError) as error:
         raise InputError(path, f"is not a DoRF file ({error!r:.120})", "give B and I of [curves, samples]") from error
     if values.ndim != 2 or values.shape != exposures.shape:
         raise InputError(path, f"B is {values.shape} and I is {exposures.shape}", "give both as [curves, samples]")
@@ -201,7 +200,7 @@ def _json_curve(path: Path, text: str) -> Response:
             raise InputError(path, str(error), remedy) from error
     try:
         exposures, values = (np.array(stored[key], np.float64) for key in ("exposures", "values"))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(path, f"has no two lists of numbers ({error!r})", remedy) from error
     return TabulatedResponse(str(stored.get("name", path.stem)), exposures, values, source=str(path))
 

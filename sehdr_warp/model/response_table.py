@@ -148,6 +148,10 @@ def _check(exposures: np.ndarray, values: np.ndarray, source: str):
             raise InputError(source, f"{what} {bad[0] + 1} is {column[bad[0]]}", remedy)
     if exposures.min() < 0:
         raise InputError(source, f"exposure {exposures.min():.6g} is negative", remedy)
+    steps = np.diff(np.unique(np.concatenate([[0.0], exposures])))
+    if exposures.max() > 1e30 or len(steps) and steps.min() < 1e-30:
+        worst = exposures.max() if exposures.max() > 1e30 else steps.min()
+        raise InputError(source, f"exposures of {worst:.3g} apart cannot be computed with", "divide them by the largest")
     if values.min() < 0 or values.max() > 1:
         worst = values.max() if values.max() > 1 else values.min()
         raise InputError(source, f"value {worst:.6g} is outside [0, 1]", "divide codes by the largest, 255 or 65535")

@@ -75,7 +75,7 @@ def _nerfstudio(entry, index: int, values: dict, path: Path) -> tuple[str, Camer
         raise InputError(
             path, f"camera {index} cannot be used ({str(error)[:120]})", "export the camera path again"
         ) from None
-    if not 0 < fov < 180:
+    if not 1e-6 <= fov < 180:
         raise InputError(path, f"camera {index} has fov {fov}", "use degrees between 0 and 180")
     _check_size(width, height, index, path)
     matrix[:3, 1:3] *= -1

@@ -147,7 +147,7 @@ def _continue(scene: Scene, out: Path, config: Config | None, device) -> tuple[T
     trainer = Trainer(scene, saved, field_from_checkpoint(checkpoint, saved, info).to(device))
     try:
         trainer.load_state(checkpoint.tensors, checkpoint.values)
-    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError, IndexError) as error:
         raise InputError(
             checkpoint.path, f"its state cannot be taken up ({error!r:.120})", "remove it, or train again"
         ) from None

@@ -1,6 +1,7 @@
 """The training loop's state and its single step. What happens around steps is train.py's business."""
 
 import math
+import operator
 import warnings
 
 import torch
@@ -247,7 +248,9 @@ class Trainer:
             self._generator.set_state(generators["device"].cpu())
         self.iteration = values["iteration"]
         decay_rates(self.optimizer, self.config, self.iteration)
-        self._order = list(values["order"])
+        self._order = [operator.index(place) for place in values["order"]]
+        if not all(0 <= place < len(self._views) for place in self._order):
+            raise ValueError(f"the order of the photos names others than the {len(self._views)} there are")
         self._skipped.fill_(values["skipped_steps"])
 
     def _training_views(self) -> ViewStack | list[TrainingView]:

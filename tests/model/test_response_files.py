@@ -180,7 +180,7 @@ def test_any_table_becomes_an_invertible_curve_or_an_input_error(rows):
     try:
         curve = TabulatedResponse("any", exposures, values)
     except InputError as error:
-        assert "rises by only" in str(error)
+        assert "rises by only" in str(error) or "cannot be computed with" in str(error)
         return
     wanted = np.linspace(curve.black, curve.peak, 200)
     decoded = curve.decode(wanted)
