@@ -211,7 +211,11 @@ class _ProgramFunction(torch.autograd.Function):
                     by_memory[id(tensor)] = results[position]
             for tensor, array in program.inputs:
                 if id(tensor) in by_memory:
-                    array.grad = _array(by_memory[id(tensor)], array.dtype)
+                    gradient = by_memory[id(tensor)]
+                    if tensor.is_contiguous() and gradient.stride() != tensor.stride():
+                        # A dimension of one element may have any stride, and Warp wants the gradient's to be the same.
+                        gradient = gradient.as_strided(tensor.shape, tensor.stride())
+                    array.grad = _array(gradient, array.dtype)
             program.tape.backward()
             for position, tensor in enumerate(plain):
                 if id(tensor) in handed:
