@@ -150,8 +150,11 @@ class LossConfig:
         "what is compared; encoded: photos; mu-law: exposures, decoded from the photo, by log(1 + mu x / white)",
         choices=("encoded", "mu-law"),
     )
-    mu: float = option(
-        5000.0, "mu-law: mu above; light below white / mu counts as light, above as its logarithm", above=0.0, high=1e9
+    knee: float = option(
+        8.0,
+        "mu-law: code of 255 whose exposure is white / mu; light below counts as light, above as its logarithm",
+        above=0.0,
+        high=250.0,
     )
     linear_weight: float = option(0.0, "weight of the linear loss (SeHDR: 0.5)", low=0.0, high=100.0)
     linear_detach: str = option(

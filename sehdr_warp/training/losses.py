@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -82,7 +83,7 @@ def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Re
     lower, upper = truth - CODE / 2, truth + CODE / 2
     if config.domain == "mu-law":
         known = _known(response)
-        white, mu = known.white, config.mu
+        white, mu = known.white, mu_of_knee(known, config.knee)
         prediction = mu_law(_light(photo, response), white, mu)
         truth, lower, upper = (mu_law(known.decode(image), white, mu) for image in (truth, lower, upper))
     plain = prediction
@@ -109,6 +110,13 @@ def _light(photo: Photograph, response: Response) -> Tensor:
         return photo.light
     surplus = (photo.encoded - known.peak).clamp_min(0)
     return known.decode(photo.encoded) * torch.exp(surplus / EXTENSION_SLOPE)
+
+
+@lru_cache(maxsize=16)
+def mu_of_knee(response: Response, knee: float) -> float:
+    """The mu whose knee, white / mu, is the exposure of code `knee` of 255: the same place among the codes for any
+    curve, where one mu would leave all shadows of a curve that never clips below it."""
+    return response.white / max(float(response.decode(knee / 255)), 1e-12)
 
 
 def mu_law(exposure: Tensor, white: float, mu: float = MU) -> Tensor:

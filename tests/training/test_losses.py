@@ -16,6 +16,7 @@ from sehdr_warp.training.losses import (
     ldr_loss,
     linear_loss,
     mu_law,
+    mu_of_knee,
     one_sided,
     total_loss,
 )
@@ -165,13 +166,14 @@ def test_the_mu_law_weighs_shadows_as_the_metric_does():
     target = target_of(response.encode(light))
     config = LossConfig(domain="mu-law", ssim_weight=0.0)
     loss = ldr_loss(photo_of(2 * light, response), target, config, response)
-    expected = (mu_law(2 * light, response.white) - mu_law(light, response.white)).mean()
+    mu = mu_of_knee(response, config.knee)
+    expected = (mu_law(2 * light, response.white, mu) - mu_law(light, response.white, mu)).mean()
     assert loss.item() == pytest.approx(expected.item(), rel=1e-6)
-    # Of a doubling each, the dark one costs a smaller part of it the less mu is.
+    # Of a doubling of both, the dark one costs a smaller part the higher the knee is.
     shares = []
-    for mu in (5000.0, 50.0):
+    for knee in (2.0, 100.0):
         dark = light * torch.tensor([2.0, 1.0]).double().reshape(1, 2, 1)
-        options = LossConfig(domain="mu-law", mu=mu, ssim_weight=0.0)
+        options = LossConfig(domain="mu-law", knee=knee, ssim_weight=0.0)
         both = ldr_loss(photo_of(2 * light, response), target, options, response)
         shares.append((ldr_loss(photo_of(dark, response), target, options, response) / both).item())
     assert shares[0] > 2 * shares[1] > 0
@@ -221,3 +223,10 @@ def test_the_mu_law_domain_teaches_a_refined_response():
     assert losses[0] == pytest.approx(losses[1], rel=1e-4)
     torch.testing.assert_close(*gradients, rtol=1e-2, atol=1e-7)
     assert refined.log_densities.grad.abs().sum() > 1e-4
+
+
+@pytest.mark.parametrize("name", ["srgb", "hdr-nerf", "linear"])
+def test_the_knee_is_at_its_code(name):
+    response = response_by_name(name)
+    knee = response.white / mu_of_knee(response, 8.0)
+    assert float(response.encode(knee)) * 255 == pytest.approx(8.0, rel=1e-6)
