@@ -48,6 +48,8 @@ class Quality:
     predictor: str | None = None
     """For the method predicted: what makes HDR of a single photo, a name, a folder or a network; {scene} and {exposure}
     in it stand for the job's."""
+    nerf_seconds: float | None = None
+    """For the method hdr-nerf: stop after so many seconds if its iterations are not done before."""
     lpips: Path | None = None
     """Folder with LPIPS weights; by default that of SEHDR_LPIPS, and LPIPS is null without."""
     flip: bool = False
@@ -85,6 +87,8 @@ def run_quality(asked: Quality) -> None:
 
     if asked.launcher not in LAUNCHERS:
         raise SehdrError(f"--launcher {asked.launcher}: not one of {', '.join(LAUNCHERS)}")
+    if asked.nerf_seconds is not None and not asked.nerf_seconds > 0:
+        raise SehdrError(f"--nerf-seconds {asked.nerf_seconds}: must be positive")
     device, gpus = _devices(asked)
     lpips = asked.lpips or (os.environ.get("SEHDR_LPIPS") or None)
     settings = Settings(
@@ -100,6 +104,7 @@ def run_quality(asked: Quality) -> None:
         exposure_factor=asked.exposure_factor,
         noise=_noise(asked.noise),
         predictor=asked.predictor,
+        nerf_seconds=asked.nerf_seconds,
         lpips=lpips is not None,
         flip=asked.flip,
         device=device,

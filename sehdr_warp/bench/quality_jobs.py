@@ -30,7 +30,8 @@ class Settings:
     the truth. exposures: places in a ladder of exposure_count times, each exposure_factor times the last.
     responses: out of RESPONSES. iterations: None is the preset's own. noise: (full well, read noise) in electrons.
     predictor: replaces that of methods which predict HDR from single photos; {scene} and {exposure} stand for the job's.
-    lpips: whether weights are there. device: "cpu" or "cuda".
+    nerf_seconds: HDR-NeRF stops after so many, if its iterations are not done before. lpips: whether weights are there.
+    device: "cpu" or "cuda".
     """
 
     scenes: tuple[str, ...]
@@ -45,6 +46,7 @@ class Settings:
     exposure_factor: float = 4.0
     noise: tuple[float, float] | None = None
     predictor: str | None = None
+    nerf_seconds: float | None = None
     lpips: bool = False
     flip: bool = False
     device: str = "cpu"
@@ -143,6 +145,7 @@ def plan_jobs(settings: Settings) -> list[Job]:
                         "base": method.base,
                         "overrides": method.overrides,
                         **files,
+                        **({"seconds": settings.nerf_seconds} if method.kind == "hdr-nerf" else {}),
                     },
                     "response": response,
                     "seed": seed,

@@ -54,10 +54,10 @@ class Runner:
         training = config_from_dict(config["training"], job.label)
         method, out = config["method"], folder / RUN
         scene = photographed if method["truth"] else without_training_truth(photographed)
-        self._warm_up(method["kind"], scene, training, folder)
+        self._warm_up(method, scene, training, folder)
         shutil.rmtree(out, ignore_errors=True)
         self._forget_peaks()
-        run = self._train(method["kind"], scene, training, out)
+        run = self._train(method, scene, training, out)
         peak = self._peak_memory()
         figures = evaluate(run, judged, lpips_weights=self.lpips if config["lpips"] else None, flip=config["flip"])
         curve = run.metrics()
@@ -86,8 +86,8 @@ class Runner:
             "complete": True,
         }
 
-    def _train(self, kind: str, scene: Scene, config: Config, out: Path):
-        if kind == "hdr-nerf":
+    def _train(self, method: dict, scene: Scene, config: Config, out: Path):
+        if method["kind"] == "hdr-nerf":
             from .hdr_nerf import HdrNerfSettings, train_hdr_nerf, unit_value
 
             return train_hdr_nerf(
@@ -100,17 +100,17 @@ class Runner:
             )
         return train(scene, out, config, device=self.device, quiet=True)
 
-    def _warm_up(self, kind: str, scene: Scene, config: Config, folder: Path) -> None:
+    def _warm_up(self, method: dict, scene: Scene, config: Config, folder: Path) -> None:
         # What is compiled depends on the shape of the computation, not on seeds, rates or lengths.
-        shape = repr((kind, config.model, config.fusion, config.loss, config.densification.strategy))
-        if shape in self._warm:
+        shape = repr((config.model, config.response.form, config.fusion, config.loss, config.densification.strategy))
+        if shape in self._warm or method["kind"] == "hdr-nerf":
             return
         count = min(WARM_UP_ITERATIONS, config.schedule.iterations)
         overrides = {"schedule.iterations": count, "schedule.evaluate_at": [config.schedule.stated_for]}
         scratch = folder / "warm-up"
         try:
             shutil.rmtree(scratch, ignore_errors=True)
-            self._train(kind, scene, override_config(config, overrides), scratch)
+            self._train(method, scene, override_config(config, overrides), scratch)
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
         self._warm.add(shape)
@@ -151,6 +151,22 @@ class Runner:
     def _wait(self) -> None:
         if self.device.startswith("cuda"):
             torch.cuda.synchronize(self.device)
+
+
+def _hdr_nerf(scene: Scene, config: Config, seconds: float | None, device: str):
+    """HDR-NeRF for the config's iterations, or until the seconds are over."""
+    from .hdr_nerf import HdrNerfSettings, train_hdr_nerf, unit_value
+
+    return train_hdr_nerf(
+        scene,
+        iterations=config.schedule.iterations,
+        seconds=seconds,
+        device=device,
+        seed=config.seed,
+        settings=HdrNerfSettings(unit_value=unit_value(config.response.name)),
+        # A test renders every view with hundreds of samples a pixel: a quarter of them will do.
+        evaluate_at=[config.scaled(number) for number in config.schedule.evaluate_at[::-4]],
+    )
 
 
 def photos(job: Job) -> tuple[Scene, Scene]:
