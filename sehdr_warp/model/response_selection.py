@@ -85,13 +85,13 @@ def select_response(
         "edges" is after Lin et al. 2004 (Radiometric calibration from a single image): at an edge between two evenly
         coloured regions a pixel is a mixture of both in linear light, so decoded colours lie on a line. Falls back to
         "paper", and says so in `method`, where the photo has fewer than 50 such edges.
-        "posterior" adds a prior and what the clipped pixels tell; it needs no edges.
+        "posterior" adds a prior and what the clipped pixels tell; it needs no edges, and no well-exposed pixels.
     from_camera: the photos are a camera's own JPEGs: the prior is then that of cameras.
     seed: of the sample of edges where there are more than 3000.
 
     All find a curve only up to the exposure's scale, and none is calibration: docs/response.md has measured errors.
-    Raises SehdrError for an unknown method, no candidates, an image of another shape or with NaN, or under 100 pixels
-    that are neither black nor clipped.
+    Raises SehdrError for an unknown method, no candidates, an image of another shape or with NaN, or, but for the
+    posterior, under 100 pixels that are neither black nor clipped.
     """
     if method not in ("paper", "edges", "posterior"):
         raise SehdrError(f"select_response: method = {method!r} is not one of paper, edges, posterior")
@@ -101,7 +101,7 @@ def select_response(
         raise SehdrError("select_response: there are no candidates; give at least one response")
     photos = [_bands(_checked(each)) for each in (image if isinstance(image, list | tuple) else [image])]
     fullest = max(photos, key=lambda bands: sum(clear.sum() for _, clear in bands))
-    if sum(clear.sum() for _, clear in fullest) < 100:
+    if method != "posterior" and sum(clear.sum() for _, clear in fullest) < 100:
         raise SehdrError("select_response: under 100 pixels are neither black nor clipped; name a response instead")
     edges = np.concatenate([_edge_colours(*band) for bands in photos for band in bands])
     if len(edges) > MAX_EDGES:
@@ -179,8 +179,8 @@ def _range_and_roughness(bands, response):
         for axis in (0, 1):
             rows, known = np.moveaxis(stops, axis, 0), np.moveaxis(clear, axis, 0)
             bends.append(np.abs(rows[2:] - 2 * rows[1:-1] + rows[:-2])[known[2:] & known[1:-1] & known[:-2]].ravel())
-    low, high = np.percentile(np.concatenate(seen), (0.1, 99.9))
-    bends = np.concatenate(bends)
+    seen, bends = np.concatenate(seen), np.concatenate(bends)
+    low, high = np.percentile(seen, (0.1, 99.9)) if len(seen) else (0.0, 0.0)
     return high - low, bends.mean() if len(bends) else 0.0
 
 

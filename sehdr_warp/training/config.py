@@ -62,7 +62,7 @@ class ModelConfig:
 class ResponseConfig:
     """The camera response f: exposure (radiance x seconds) to encoded values."""
 
-    name: str = option("srgb", "a response's name, a file, or auto: the one that fits the photos best", nonempty=True)
+    name: str = option("auto", "a response's name, a file, or auto: the one that fits the photos best", nonempty=True)
     method: str = option(
         "posterior",
         "how auto chooses; posterior: colours across edges mix linearly (Lin et al. 2004), light above white falls off "

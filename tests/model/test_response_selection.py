@@ -106,3 +106,9 @@ def test_large_photos_are_read_in_bands():
     photo = np.tile(np.round(response.encode(mosaic()) * 255) / 255, (8, 8, 1))
     selection = select_response(photo, method="posterior")
     assert photo.shape[0] * photo.shape[1] > 400_000 and selection.response.name == "gamma-2.2"
+
+
+def test_posterior_needs_no_well_exposed_pixel():
+    for photo in (np.zeros((32, 32, 3)), np.ones((32, 32, 3))):
+        chosen = select_response(photo, method="posterior", from_camera=True)
+        assert chosen.response.name in ("camera", "rec709") and np.isnan(chosen.scores[0].edges)
