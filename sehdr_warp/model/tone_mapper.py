@@ -7,11 +7,16 @@ import torch
 from torch import nn
 
 from ..errors import SehdrError
+from ..splatting.interpolation import interpolate
 from .response_curve import HALF_CODE, Response
 
 EXPOSURE_FLOOR = 1e-6
 """Added to exposures before the logarithm: black stays finite, and what is 100 times darker than 8-bit black in sRGB
 asks for nothing."""
+LOG_RANGE, LOG_NODES = (-20.0, 12.0), 2048
+"""The table from which many exposures are encoded, in their logarithm; below it the function is constant, above straight."""
+EXACT_BELOW = 4096
+"""Fewer exposures than this are encoded without the table."""
 TABLE_RANGE, TABLE_NODES = (1e-6, 1e6), 8192
 """Exposures between which decode() looks for a value, and how many it looks at."""
 
@@ -57,11 +62,25 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
         return self.encode(exposure)
 
     def encode_log(self, log_exposure: torch.Tensor) -> torch.Tensor:
-        """Encoded values in (0, 1) of natural logarithms of exposures [..., 3]."""
-        values = log_exposure.reshape(-1, 3).T[..., None]
+        """Encoded values in (0, 1) of natural logarithms of exposures [..., 3].
+
+        Many of them are interpolated in a table of the perceptrons, as the fusion's are: a function of one number need
+        not be evaluated for every Gaussian. The table is of what the sigmoid takes, which is linear but for kinks.
+        """
+        points = log_exposure.reshape(-1, 3)
+        if len(points) < EXACT_BELOW or points.dtype != torch.float32 or torch.are_deterministic_algorithms_enabled():
+            return self._logits(points).sigmoid().reshape(log_exposure.shape)
+        step = (LOG_RANGE[1] - LOG_RANGE[0]) / (LOG_NODES - 1)
+        grid = torch.arange(-1, LOG_NODES + 1, dtype=torch.float32, device=points.device) * step + LOG_RANGE[0]
+        table = self._logits(grid[:, None].expand(-1, 3))
+        return interpolate(table, LOG_RANGE[0], step, points).sigmoid().reshape(log_exposure.shape)
+
+    def _logits(self, log_exposure):
+        """What the perceptrons make of log exposures [N, 3]."""
+        values = log_exposure.T[..., None]
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             values = torch.baddbmm(bias, values.relu() if layer else values, weight)
-        return values[..., 0].T.reshape(log_exposure.shape).sigmoid()
+        return values[..., 0].T
 
     @torch.no_grad()
     def decode(self, value):

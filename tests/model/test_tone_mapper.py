@@ -8,6 +8,7 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.radiance_field import CameraTensors, RadianceField
 from sehdr_warp.model.response import Response, ToneMapper, response_by_name
+from sehdr_warp.model.tone_mapper import EXACT_BELOW
 from sehdr_warp.scene import Camera
 
 CAMERA = Camera(16, 12, 15.0, 15.0, 8.0, 6.0, np.eye(4))
@@ -59,6 +60,25 @@ def test_it_learns_a_curve_and_inverts_what_it_learned(fitted):
     rise = (fitted.encode(exposures + step) - fitted.encode(exposures - step)) / (2 * step)
     # ReLUs have kinks, where the two differ.
     assert float(((fitted.slope(exposures) - rise).abs() < 0.02 * rise).float().mean()) > 0.9
+
+
+def test_many_exposures_are_encoded_as_few_are(fitted, device):
+    mapper = ToneMapper(32).to(device)
+    mapper.load_state_dict(fitted.state_dict())
+    mapper.requires_grad_(True)
+    generator = torch.Generator().manual_seed(0)
+    logs = (16 * torch.rand(EXACT_BELOW, 3, generator=generator) - 13).to(device).requires_grad_()
+    weights = torch.rand(EXACT_BELOW, 3, generator=generator).to(device)
+    results = []
+    for parts in (1, 2):
+        encoded = torch.cat([mapper.encode_log(part) for part in logs.split(EXACT_BELOW // parts)])
+        gradients = torch.autograd.grad((weights * encoded).sum(), [logs, *mapper.parameters()])
+        results.append((encoded.detach(), *gradients))
+    (encoded, slopes, *ours), (exact, true_slopes, *true) = results
+    assert not torch.equal(encoded, exact) and float((encoded - exact).abs().max()) < 1e-3
+    assert float((slopes - true_slopes).square().mean().sqrt() / true_slopes.square().mean().sqrt()) < 0.03
+    for ours_, true_ in zip(ours, true, strict=True):
+        assert float((ours_ - true_).norm() / true_.norm()) < 0.01
 
 
 def test_seeds_differ_and_descriptions_keep_the_shape():
