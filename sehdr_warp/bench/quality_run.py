@@ -228,4 +228,4 @@ def seconds_to_final(curve: list[dict], total: float) -> float:
         if line.get(key) is None or line[key] < curve[-1][key] - NEAR_FINAL:
             break
         reached = line["seconds"]
-    return reached
+    return min(reached, total)
