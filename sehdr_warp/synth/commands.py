@@ -101,6 +101,7 @@ def _render(asked: RenderTruth) -> None:
 
 def _expose(asked: ExposeTruth) -> None:
     from ..model.response import response_by_name
+    from ..output.files import check_absent_folder
     from ..scene import load_scene
     from .expose import SensorNoise, exposure_ladder
     from .photo_set import write_photo_set
@@ -112,9 +113,10 @@ def _expose(asked: ExposeTruth) -> None:
         if len(figures) != 2:
             raise SehdrError(f"--noise {asked.noise}: give two numbers, full well and read noise in electrons")
         noise = SensorNoise(*figures)
+    times = None if asked.exposures is None else _numbers("--exposures", asked.exposures, float)
+    check_absent_folder(asked.out, asked.overwrite)
     scene = load_scene(asked.truth, progress=_say)
-    given = asked.exposures
-    times = exposure_ladder(scene, response) if given is None else tuple(_numbers("--exposures", given, float))
+    times = times or exposure_ladder(scene, response)
     write_photo_set(scene, asked.out, response, times, noise=noise, seed=asked.seed, overwrite=asked.overwrite)
     stated = ", ".join(f"{time:.4g}" for time in times)
     print(f"{asked.out}: {len(scene.views)} views at {stated} s through {response.name}")

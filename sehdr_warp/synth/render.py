@@ -62,6 +62,9 @@ def render_scene(
     denoising: unbiased but for paths longer than the recipe's depth, which all views lack alike. The halves of the
     samples, compared, give the truth's own noise (in synth.json).
 
+    A seed gives the same things and lights again. The paths, and with them the noise, may differ: Mitsuba does not number
+    its lights in the same order each time.
+
     Raises InputError where the folder holds a set of other settings, SehdrError where a pixel is not finite.
     """
     folder = Path(out) / recipe.name

@@ -35,8 +35,8 @@ RECIPES = {
         Recipe("lamps", interiors.lamps, interiors.LAMPS_VIEWS, effort=2),
         Recipe("metal", interiors.metal, interiors.METAL_VIEWS, effort=3),
         Recipe("glass", outdoors.glass, outdoors.GLASS_VIEWS, depth=14, effort=3),
-        Recipe("sunlit", outdoors.sunlit, outdoors.SUNLIT_VIEWS),
-        Recipe("night", outdoors.night, outdoors.NIGHT_VIEWS),
+        Recipe("sunlit", outdoors.sunlit, outdoors.SUNLIT_VIEWS, effort=2),
+        Recipe("night", outdoors.night, outdoors.NIGHT_VIEWS, effort=2),
         Recipe("overcast", outdoors.overcast, outdoors.OVERCAST_VIEWS),
     )
 }

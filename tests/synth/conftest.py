@@ -1,0 +1,37 @@
+"""Sets of truth without a renderer: flat pictures seen by real cameras."""
+
+import numpy as np
+import pytest
+
+from sehdr_warp.output.exr import write_exr
+from sehdr_warp.scene.hdr_nerf_layout import RadianceView
+from sehdr_warp.synth.cameras import Grid, make_cameras, split_of
+from sehdr_warp.synth.truth_set import truth_path, write_truth_tables
+
+VIEWS = 6
+
+
+def write_truth(folder, size=32, scale=1.0):
+    """Six views, radiance over four decades, 200 points; returns (views, times)."""
+    rng = np.random.default_rng(3)
+    cameras = make_cameras(Grid((0.0, -3.0, 1.0), (0.0, 0.0, 1.0), 0.8, 0.4), size, size)[:VIEWS]
+    y, x = np.mgrid[0:size, 0:size] / size
+    views, counts = [], {"train": 0, "test": 0}
+    for index, camera in enumerate(cameras):
+        ramp = 10 ** (4 * x - 2)[..., None] * np.stack([1 + 0 * y, 0.5 + y, 1.5 - y], -1)
+        radiance = (scale * ramp * rng.uniform(0.9, 1.1, (size, size, 1))).astype(np.float32)
+        split = split_of(index)
+        channels = dict(zip("RGB", np.moveaxis(radiance, 2, 0), strict=True))
+        write_exr(truth_path(folder, split, counts[split]), channels, pixel="float")
+        counts[split] += 1
+        views.append(RadianceView(f"r_{index}", camera, radiance, split))
+    points = rng.uniform(-1, 1, (200, 3)).astype(np.float32)
+    times = write_truth_tables(folder, views, points, rng.uniform(0, 2, (200, 3)), {"scene": "flat"})
+    return views, times
+
+
+@pytest.fixture
+def truth(tmp_path):
+    folder = tmp_path / "truth"
+    views, times = write_truth(folder)
+    return folder, views, times

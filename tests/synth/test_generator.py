@@ -1,0 +1,150 @@
+"""Textures, shapes and cameras (always), and the scenes themselves (where Mitsuba is)."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.scene import load_scene
+from sehdr_warp.synth import shapes, textures
+from sehdr_warp.synth.cameras import VIEWS, Arc, Grid, make_cameras, split_of
+from sehdr_warp.synth.scenes import RECIPES
+
+TEXTURES = ("wood", "brick", "checker", "wallpaper", "plaster", "painting", "globe", "ground", "books")
+
+
+@pytest.mark.parametrize("name", TEXTURES)
+def test_textures_are_reflectances_with_detail_and_repeat(name):
+    make = getattr(textures, name)
+    image, again, other = (make(np.random.default_rng(seed), size=64) for seed in (0, 0, 1))
+    assert image.dtype == np.float32 and image.shape[2] == 3
+    assert 0 < image.min() and image.max() < 0.9 and image.std() > 0.02
+    np.testing.assert_array_equal(image, again)
+    assert (image != other).any()
+
+
+def test_noise_tiles_and_fills_its_range():
+    field = textures.noise(np.random.default_rng(0), 64, 64)
+    assert field.min() == 0 and field.max() == pytest.approx(1)
+    inside = np.abs(np.diff(field, axis=0)).max()
+    assert np.abs(field[0] - field[-1]).max() <= 1.5 * inside, "the last row leads into the first"
+
+
+def test_a_lathe_faces_outwards(tmp_path):
+    from plyfile import PlyData
+
+    shapes.write_mesh(tmp_path / "cup.ply", shapes.lathe([[0.5, 0.0], [1.0, 0.5], [0.5, 1.0]]), 24, 12)
+    mesh = PlyData.read(str(tmp_path / "cup.ply"))
+    vertex = mesh["vertex"].data
+    places = np.stack([vertex[axis] for axis in "xyz"], 1)
+    normals = np.stack([vertex[axis] for axis in ("nx", "ny", "nz")], 1)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-4)
+    assert ((places[:, :2] * normals[:, :2]).sum(1) > 0).all()
+    corners = places[np.stack(mesh["face"].data["vertex_indices"])]
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert ((corners.mean(1)[:, :2] * facing[:, :2]).sum(1) > 0).all()
+
+
+def test_a_knot_closes():
+    surface = shapes.torus_knot()
+    edge = np.linspace(0, 1, 9)
+    np.testing.assert_allclose(surface(edge, 0 * edge), surface(edge, 0 * edge + 1), atol=1e-9)
+    np.testing.assert_allclose(surface(0 * edge, edge), surface(0 * edge + 1, edge), atol=1e-6)
+
+
+def test_a_grid_looks_one_way_from_one_plane():
+    layout = Grid((0.0, -2.0, 1.5), (0.5, 3.0, 1.0), 1.0, 0.5)
+    cameras = make_cameras(layout, 60, 40)
+    positions = np.stack([camera.position for camera in cameras])
+    forward = np.stack([camera.world_to_camera[2, :3] for camera in cameras])
+    assert len(cameras) == VIEWS == 35 and np.allclose(forward, forward[0])
+    np.testing.assert_allclose((positions - positions.mean(0)) @ forward[0], 0, atol=1e-12)
+    assert np.linalg.norm(positions[6] - positions[0]) == pytest.approx(1.0)
+    assert positions[0, 2] > positions[34, 2], "rows from top to bottom"
+    assert 2 * np.degrees(np.arctan(30 / cameras[0].fx)) == pytest.approx(50.0)
+
+
+def test_an_arc_looks_at_its_target_from_its_radius():
+    layout = Arc((0.2, 1.0, 0.8), 3.0, 35.0, (-5.0, 20.0))
+    for camera in make_cameras(layout, 60, 60):
+        ahead = camera.world_to_camera @ [0.2, 1.0, 0.8, 1.0]
+        np.testing.assert_allclose(ahead[:3], [0, 0, 3.0], atol=1e-12)
+        assert camera.world_to_camera[1, 2] < 0, "up is up"
+
+
+def test_half_of_the_scenes_have_each_layout_and_18_views_train():
+    kinds = [type(recipe.layout) for recipe in RECIPES.values()]
+    assert kinds.count(Grid) == kinds.count(Arc) == 4
+    assert [split_of(view) for view in range(VIEWS)].count("train") == 18
+
+
+@pytest.fixture(scope="module")
+def mitsuba():
+    pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
+    from sehdr_warp.synth.mitsuba_variant import load_mitsuba
+
+    return load_mitsuba("scalar_rgb")
+
+
+@pytest.fixture(scope="module")
+def rendered(mitsuba, tmp_path_factory):
+    """The smallest scene, three views of 24 x 24 pixels."""
+    from sehdr_warp.synth.render import Settings, render_scene
+
+    out, lines = tmp_path_factory.mktemp("synth"), []
+    settings = Settings(24, 24, 8, 5, (0, 1, 34))
+    return render_scene(mitsuba, RECIPES["night"], out, settings, lines.append), settings, lines
+
+
+def test_a_rendered_scene_loads(rendered):
+    folder, _, lines = rendered
+    scene = load_scene(folder)
+    assert [view.name for view in scene.train_views] == ["r_0", "r_34"]
+    assert [view.name for view in scene.test_views] == ["r_1"]
+    for view in scene.views:
+        assert np.isfinite(view.hdr).all() and view.hdr.min() >= 0 and view.hdr.max() > 10
+    making = json.loads((folder / "synth.json").read_text())
+    assert making["paths_of_a_pixel"] == 16 and 10 < making["noise_db"] < 60
+    assert sum("view" in line for line in lines) == 3
+
+
+def test_points_lie_where_their_colour_is_seen(rendered):
+    scene = load_scene(rendered[0])
+    matching = 0
+    for view in scene.train_views:
+        camera = view.camera
+        x, y, z = camera.world_to_camera[:3, :3] @ scene.points.T + camera.world_to_camera[:3, 3:]
+        column, row = (np.floor(v).astype(int) for v in (camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy))
+        seen = (z > 0) & (column >= 0) & (row >= 0) & (column < 24) & (row < 24)
+        difference = np.abs(view.image[row[seen], column[seen]] - scene.point_colors[seen]).max(axis=1)
+        matching += (difference < 1.5 / 255).sum()
+    assert matching > 0.9 * len(scene.points) > 300
+
+
+def test_finished_views_are_not_rendered_again(rendered, mitsuba, monkeypatch):
+    from sehdr_warp.synth import render
+
+    folder, settings, _ = rendered
+    path = folder / "train_hdr" / "hdr_001.exr"
+    kept, before = (folder / "train_hdr" / "hdr_000.exr").stat().st_mtime_ns, load_scene(folder).views
+    path.unlink()
+    lines = []
+    render.render_scene(mitsuba, RECIPES["night"], folder.parent, settings, lines.append)
+    assert [line for line in lines if "view 34" in line] and not [line for line in lines if "view 0 of" in line]
+    assert (folder / "train_hdr" / "hdr_000.exr").stat().st_mtime_ns == kept
+    again = {view.name: view.hdr for view in load_scene(folder).views}
+    for view in before:
+        if view.name == "r_34":  # The same things, the same light; Mitsuba may number its lights in another order.
+            assert 0.9 < np.median(again["r_34"] / view.hdr) < 1.1
+        else:
+            np.testing.assert_array_equal(again[view.name], view.hdr)
+    monkeypatch.setattr(render, "_render_view", None)
+    render.render_scene(mitsuba, RECIPES["night"], folder.parent, settings)
+
+
+def test_other_settings_do_not_mix(rendered, mitsuba):
+    from sehdr_warp.synth.render import Settings, render_scene
+
+    with pytest.raises(InputError, match="other settings"):
+        render_scene(mitsuba, RECIPES["night"], rendered[0].parent, Settings(24, 24, 9, 5, (0, 1, 34)))

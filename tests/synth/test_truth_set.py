@@ -1,0 +1,131 @@
+"""Sets of truth alone, read by load_scene; and packed, with the cost measured."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.model.response import response_by_name
+from sehdr_warp.scene import embedded_names, load_scene
+from sehdr_warp.synth.pack import pack_truth
+from sehdr_warp.synth.truth_set import HdrNerfCurve
+
+from .conftest import write_truth
+
+
+def test_the_curve_without_torch_is_the_models():
+    ours, models = HdrNerfCurve(), response_by_name("hdr-nerf")
+    exposure = np.geomspace(1e-3, 1e3, 50)
+    np.testing.assert_allclose(ours.encode(exposure), models.encode(exposure), atol=1e-9)
+    assert ours.clips == models.clips and abs(ours.white / models.white - 1) < 1e-6
+
+
+@pytest.mark.parametrize("index", [None, 0, 4])
+def test_photos_are_derived_at_the_chosen_exposure(truth, index):
+    folder, views, times = truth
+    scene = load_scene(folder, exposure_index=index)
+    time = times[2 if index is None else index]
+    assert [view.name for view in scene.train_views] == ["r_0", "r_2", "r_4"] and len(scene.test_views) == 3
+    assert len(scene.points) == 200 and scene.exposure_times_known
+    stored = {view.name: view for view in views}
+    for view in scene.views:
+        np.testing.assert_array_equal(view.hdr, stored[view.name].radiance)
+        assert view.exposure_time == pytest.approx(time)
+        expected = HdrNerfCurve.encode(view.hdr * time)
+        assert np.abs(view.image - expected).max() <= 0.5 / 255 + 1e-6
+        np.testing.assert_allclose(view.image * 255, np.round(view.image * 255), atol=1e-4)
+        np.testing.assert_allclose(view.camera.world_to_camera, stored[view.name].camera.world_to_camera, atol=1e-9)
+        assert view.camera.fx == pytest.approx(stored[view.name].camera.fx)
+
+
+def test_a_derived_photo_is_scaled_in_light(truth):
+    folder, _, times = truth
+    small = load_scene(folder, max_size=16)
+    for view in small.views:
+        assert view.image.shape == (16, 16, 3)
+        assert np.abs(view.image - HdrNerfCurve.encode(view.hdr * times[2])).max() <= 0.5 / 255 + 1e-6
+
+
+def test_truth_that_is_missing_or_of_another_curve_is_refused(truth):
+    folder, _, _ = truth
+    path = folder / "transforms_train.json"
+    values = json.loads(path.read_text())
+    path.write_text(json.dumps(values | {"photo_response": "kodak"}))
+    with pytest.raises(InputError, match="kodak"):
+        load_scene(folder)
+    path.write_text(json.dumps(values))
+    (folder / "train_hdr" / "hdr_001.exr").unlink()
+    with pytest.raises(InputError, match="hdr_001.exr: HDR truth not found"):
+        load_scene(folder)
+
+
+@pytest.mark.parametrize("compression", ["zip", "piz"])
+def test_lossless_packing_costs_half_precision_alone(truth, tmp_path, compression):
+    folder, _, times = truth
+    packing = pack_truth(folder, tmp_path / "small", compression=compression)
+    assert packing["relative_error"] < 3e-4 and packing["mu_law_psnr"] > 85
+    scene = load_scene(tmp_path / "small")
+    scale = times[2] / scene.views[0].exposure_time
+    assert 0.7 <= scene.views[0].exposure_time <= 1.42 and np.log2(scale) == round(np.log2(scale))
+    before = load_scene(folder)
+    for a, b in zip(scene.views, before.views, strict=True):
+        np.testing.assert_allclose(a.hdr, b.hdr * scale, rtol=6e-4)
+        assert np.abs(a.image - b.image).max() <= 1.001 / 255
+    size = sum(path.stat().st_size for path in (tmp_path / "small").rglob("*.*") if path.name != "synth.json")
+    assert packing["bytes"] == size
+    assert json.loads((tmp_path / "small" / "synth.json").read_text())["packing"]["compression"] == compression
+
+
+def test_the_stated_error_is_the_packed_files(truth, tmp_path):
+    folder, views, _ = truth
+    errors = []
+    for level in (20.0, 200.0):
+        out = tmp_path / f"dwab{level}"
+        packing = pack_truth(folder, out, compression="dwab", level=level)
+        packed, stored = load_scene(out), {view.name: view.radiance for view in views}
+        scale = 2 ** np.round(np.log2(packed.views[0].hdr.max() / stored["r_0"].max()))
+        squares = []
+        for view in packed.views:
+            true = stored[view.name].astype(np.float64) * scale
+            mu = [np.log1p(5000 * image / true.max()) / np.log1p(5000) for image in (view.hdr, true)]
+            squares.append(np.mean((mu[0] - mu[1]) ** 2))
+        assert packing["mu_law_psnr"] == pytest.approx(-10 * np.log10(np.mean(squares)), abs=0.01)
+        errors.append(packing["relative_error"])
+    assert 0 < errors[0] < 0.5 * errors[1]
+
+
+def test_packing_refuses_what_it_cannot_keep(truth, tmp_path):
+    folder, _, _ = truth
+    with pytest.raises(InputError, match="exists already"):
+        pack_truth(folder, folder)
+    (folder / "points3d.ply").unlink()
+    with pytest.raises(InputError, match="no finished set"):
+        pack_truth(folder, tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_the_scale_of_truth_only_moves_the_times(tmp_path):
+    _, times = write_truth(tmp_path / "plain")
+    _, moved = write_truth(tmp_path / "bright", scale=64.0)
+    np.testing.assert_allclose(times, np.multiply(moved, 64.0), rtol=0.05)
+
+
+@pytest.mark.parametrize("name", [name for name in embedded_names() if name != "room"])
+def test_embedded_scenes_have_truth_and_a_well_exposed_photo(name):
+    scene = load_scene(f"embedded:{name}")
+    assert scene.name == f"embedded:{name}" and len(scene.points) > 1000
+    assert len(scene.train_views) == 18 and len(scene.test_views) == 17
+    for view in scene.views:
+        assert view.hdr.shape == view.image.shape == (200, 200, 3)
+        assert np.isfinite(view.hdr).all() and view.hdr.min() >= 0
+    median = np.median([view.image for view in scene.train_views])
+    assert 0.2 < median < 0.8
+
+
+def test_a_scene_that_is_not_embedded_is_refused_with_the_names():
+    with pytest.raises(InputError, match="embedded:nowhere: is no scene of the package; take one of .*embedded:room"):
+        load_scene("embedded:nowhere")
+    with pytest.raises(InputError):
+        load_scene("embedded:../room")
+    assert load_scene("embedded:room", max_size=16).name == "embedded:room"
