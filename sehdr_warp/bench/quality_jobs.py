@@ -6,10 +6,12 @@ import json
 import re
 from dataclasses import dataclass
 from functools import reduce
+from importlib import resources
 from pathlib import Path
 
 from ..errors import InputError, SehdrError
 from ..output.files import write_json
+from ..scene.load import embedded_names, is_embedded
 from ..training.config import Config
 from ..training.config_files import config_to_dict, load_config, override_config
 from .methods import Method
@@ -229,11 +231,11 @@ def _read_json(path: Path):
 
 
 def _scene_name(place: str) -> str:
-    return place if place.startswith("embedded") else Path(place).resolve().name
+    return place if is_embedded(place) else Path(place).resolve().name
 
 
 def _absolute(place: str) -> str:
-    return place if place.startswith("embedded") else str(Path(place).absolute())
+    return place if is_embedded(place) else str(Path(place).absolute())
 
 
 def _check_names_differ(scenes: dict[str, dict]) -> None:
@@ -245,11 +247,12 @@ def _check_names_differ(scenes: dict[str, dict]) -> None:
 
 
 def _digest(place: str) -> dict:
-    """What tells this scene from others: the version of the package for its own, a hash of all files for a folder."""
-    if place.startswith("embedded"):
-        from .. import __version__
-
-        return {"version": __version__}
+    """What tells this scene from others, wherever it lies: a hash of all its files."""
+    if is_embedded(place):
+        name = place.partition(":")[2]
+        if name and name not in embedded_names():
+            raise InputError(place, "no such scene", f"take embedded or embedded:NAME, {', '.join(embedded_names())}")
+        return {"sha256": _path_digest(str(resources.files("sehdr_warp.embedded") / (name or "room")))}
     if not Path(place).is_dir():
         raise InputError(place, "no such folder", "give folders with HDR truth, or embedded")
     return {"sha256": _path_digest(place)}

@@ -103,6 +103,7 @@ def test_seconds_to_final_is_the_first_time_that_stays_within_a_tenth(psnr, expe
         ("--responses sometimes", "response 'sometimes' is not one of known, blind"),
         ("--methods truth --responses blind", "none of the methods makes sense without the response"),
         ("--scenes nowhere", "nowhere: no such folder"),
+        ("--scenes embedded:nowhere", "embedded:nowhere: no such scene"),
         ("--curves kodachrome", "kodachrome"),
         ("--workers 0", "--workers 0: must be positive"),
         ("--launcher ship", "--launcher ship: not one of auto, slurm, local, process"),
