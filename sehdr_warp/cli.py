@@ -12,6 +12,7 @@ import tyro
 
 from . import __version__
 from .bench.commands import Bench, run_bench
+from .check.commands import Check, run_check
 from .errors import InputError, SehdrError
 from .synth.commands import Synth, run_synth
 
@@ -142,6 +143,7 @@ Command = (
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
+    | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[Synth, tyro.conf.subcommand("synth")]
 )
 
@@ -295,6 +297,7 @@ _COMMANDS = {
     Export: _export,
     Report: _report,
     Bench: run_bench,
+    Check: run_check,
     Synth: run_synth,
 }
 

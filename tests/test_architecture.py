@@ -32,11 +32,12 @@ ALLOWED = {
     "output": {"errors", "scene"},
     "evaluation": {"errors", "scene", "splatting"},
     "synth": {"errors", "scene", "model", "output"},
+    "check": {"errors", "kernels", "scene", "splatting", "model", "training", "output"},
     "bench": {"errors", "synth", "kernels", "scene", "splatting", "model", "training", "output", "evaluation"},
 }
 # Packages that only some rooms may import.
 ONLY_IN = {
-    "torch": {"model", "splatting", "training", "output", "evaluation", "bench"},
+    "torch": {"model", "splatting", "training", "output", "evaluation", "bench", "check"},
     "warp": {"kernels", "splatting"},
 }
 LARGEST_FILE = 400

@@ -1,0 +1,1 @@
+"""`sehdr-warp check`: numerical stability on stiff and extreme cases, against float64 truth."""

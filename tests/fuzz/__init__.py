@@ -1,0 +1,1 @@
+"""Fuzzing of every file reader: real small files, mutated; `python -m tests.fuzz --help`."""

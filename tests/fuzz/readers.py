@@ -1,0 +1,334 @@
+"""Every reader of files, with small real files to start from."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tests.make_scenes import pattern, write_blender, write_colmap
+
+
+@dataclass(frozen=True)
+class Reader:
+    """make: writes the files into an empty folder. files: globs of those that are mutated. read: what is tried.
+
+    text: the files are text. repair: after a mutation, makes good what would otherwise hide the reader behind it (a
+    checksum).
+    """
+
+    make: Callable[[Path], None]
+    files: tuple[str, ...]
+    read: Callable[[Path], object]
+    text: bool = False
+    repair: Callable[[Path], None] | None = None
+
+
+def _colmap(folder: Path, binary: bool) -> None:
+    write_colmap(folder, 4, binary=binary, size=(24, 16), params=(20.0, 21.0, 12.0, 8.0))
+
+
+def _read_colmap(folder: Path):
+    from sehdr_warp.scene.read_colmap import read_colmap
+
+    return read_colmap(folder)
+
+
+def _transforms(folder: Path) -> None:
+    write_blender(folder, 4, size=(16, 12), fl_x=20.0, fl_y=20.0, w=16, h=12, k1=0.01, train_filenames=["images/r_0"])
+
+
+def _read_transforms(folder: Path):
+    from sehdr_warp.scene.read_transforms import read_transforms
+
+    return read_transforms(folder)
+
+
+def _hdr_nerf(folder: Path) -> None:
+    from sehdr_warp.scene.hdr_nerf_layout import RadianceView, write_hdr_nerf_scene
+    from tests.training.toy import orbit_camera
+
+    view = orbit_camera(0.0, 16)
+    views = [
+        RadianceView(f"r_{i}", view, np.full((16, 16, 3), 0.1 * i + 0.1), ("train", "test")[i % 2]) for i in (0, 1)
+    ]
+    write_hdr_nerf_scene(folder, views, [0.5, 2.0], points=(np.eye(3), np.eye(3)))
+
+
+def _load_scene(folder: Path):
+    from sehdr_warp.scene import load_scene
+
+    return load_scene(folder)
+
+
+def _exposures(folder: Path) -> None:
+    _colmap(folder, False)
+    names = sorted(path.name for path in (folder / "images").iterdir())
+    (folder / "exposures.json").write_text(json.dumps({name: 0.01 * (i + 1) for i, name in enumerate(names)}))
+
+
+def _llff(folder: Path) -> None:
+    from tests.scene.test_llff import write_llff
+
+    write_llff(folder, 4, size=(16, 12))
+
+
+def _read_llff(folder: Path):
+    from sehdr_warp.scene.read_llff import read_llff
+
+    return read_llff(folder)
+
+
+def _points(folder: Path) -> None:
+    from plyfile import PlyData, PlyElement
+
+    rows = np.zeros(6, [(n, "f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")])
+    for name, text in (("binary", False), ("text", True)):
+        PlyData([PlyElement.describe(rows, "vertex")], text=text).write(str(folder / f"{name}.ply"))
+
+
+def _read_points(folder: Path):
+    from sehdr_warp.scene.colmap_model import read_ply_points
+
+    return each(folder, "*.ply", read_ply_points)
+
+
+def _gaussians(folder: Path) -> None:
+    from sehdr_warp.output.gaussian_file import GaussianArrays, write_gaussians
+
+    rng = np.random.default_rng(0)
+    arrays = [rng.normal(size=shape).astype(np.float32) for shape in ((5, 3), (5, 3), (5, 4), (5,), (5, 4, 3))]
+    write_gaussians(folder / "g.ply", GaussianArrays(*arrays, "log", 0.5))
+
+
+def _read_gaussians(folder: Path):
+    from sehdr_warp.output.gaussian_file import read_gaussians
+
+    return read_gaussians(folder / "g.ply")
+
+
+def _exr(folder: Path) -> None:
+    from sehdr_warp.output.exr import Part, write_exr, write_multipart_exr
+
+    pixels = np.linspace(0, 3, 8 * 6 * 3, dtype=np.float32).reshape(6, 8, 3)
+    channels = {name: pixels[..., i] for i, name in enumerate("RGB")}
+    write_exr(folder / "half.exr", channels)
+    write_exr(folder / "float.exr", channels, pixel="float")
+    write_multipart_exr(folder / "parts.exr", [Part(channels, name="a"), Part(channels, name="b")])
+
+
+def _read_exr(folder: Path):
+    from sehdr_warp.output.exr import read_exr
+    from sehdr_warp.scene.images import image_sizes, read_hdr
+
+    each(folder, "*.exr", image_sizes)
+    each(folder, "*.exr", read_hdr)
+    return each(folder, "*.exr", read_exr)
+
+
+def _radiance(folder: Path) -> None:
+    header = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=2.0\n\n-Y 4 +X 9\n"
+    row = b"\x02\x02\x00\x09" + (b"\x89\x40" + b"\x89\x50" + b"\x09abcdefghi" + b"\x89\x81")
+    (folder / "coded.hdr").write_bytes(header + row * 4)
+    (folder / "flat.hdr").write_bytes(header.replace(b"X 9", b"X 3") + bytes(range(120, 168)))
+
+
+def _read_radiance(folder: Path):
+    from sehdr_warp.scene.images import read_hdr
+
+    return each(folder, "*.hdr", read_hdr)
+
+
+def _photos(folder: Path) -> None:
+    from PIL import Image
+
+    picture = Image.fromarray(pattern(12, 10))
+    tags = Image.Exif()
+    tags[0x0112] = 6
+    tags.get_ifd(0x8769)[33434] = 0.01
+    picture.save(folder / "a.jpg", exif=tags)
+    picture.save(folder / "a.png", exif=tags)
+    picture.save(folder / "a.tif", exif=tags)
+    picture.save(folder / "a.webp")
+    picture.convert("RGBA").save(folder / "b.png")
+    picture.convert("P").save(folder / "c.png")
+    picture.save(folder / "a.bmp")
+    Image.fromarray(np.arange(120, dtype=np.uint16).reshape(10, 12)).save(folder / "d.png")
+
+
+def _read_photos(folder: Path):
+    from sehdr_warp.scene.exposure import exif_exposure
+    from sehdr_warp.scene.images import image_sizes, read_ldr, read_mask
+
+    each(folder, "*", image_sizes)
+    each(folder, "*", read_mask)
+    each(folder, "*", exif_exposure)
+    return each(folder, "*", lambda path: read_ldr(path, oriented=True))
+
+
+def _config(folder: Path) -> None:
+    from sehdr_warp.training.config_files import config_to_toml, load_config
+
+    (folder / "own.toml").write_text('base = "paper"\nseed = 3\n[schedule]\niterations = 100\nevaluate_at = [1, 2]\n')
+    (folder / "all.toml").write_text(config_to_toml(load_config("fast")))
+
+
+def _read_config(folder: Path):
+    from sehdr_warp.training.config_files import load_config
+
+    return each(folder, "*.toml", load_config)
+
+
+def _run(folder: Path) -> None:
+    import torch
+
+    from sehdr_warp.model.gaussians import Gaussians
+    from sehdr_warp.model.response import response_by_name
+    from sehdr_warp.training.checkpoint import write_checkpoint
+    from sehdr_warp.training.config_files import load_config
+    from sehdr_warp.training.initialization import assemble_field
+    from sehdr_warp.training.run import CHECKPOINTS, append_metrics, write_start
+    from sehdr_warp.training.trainer import Trainer
+    from tests.training.toy import toy_scene
+
+    config = load_config("paper", {"schedule.iterations": 10, "fusion.width": 2})
+    gaussians = Gaussians.from_points(torch.rand(4, 3), torch.zeros(4, 3), 3)
+    scene = toy_scene(2, 8)
+    field = assemble_field(gaussians, config, response_by_name("srgb"), 0.25)
+    write_start(folder, scene, config, field, {"path": "embedded"})
+    tensors, values = Trainer(scene, config, field).state()
+    write_checkpoint(folder / CHECKPOINTS, tensors, values | {"seconds": 1.0}, kept=1)
+    append_metrics(folder, {"iteration": 1, "seconds": 0.5, "psnr_ldr": 20.0})
+    (folder / "summary.json").write_text(json.dumps({"iteration": 10, "train_seconds": 2.0}))
+
+
+def _read_run(folder: Path):
+    from sehdr_warp.output.report import read_metrics
+    from sehdr_warp.training.run import load_run
+
+    run = load_run(folder)
+    return run.metrics(), run.summary(), read_metrics(folder / "metrics.jsonl"), run.degree
+
+
+def _read_resume(folder: Path):
+    """What --resume reads."""
+    import torch
+
+    from sehdr_warp.training.train import _continue
+    from tests.training.toy import toy_scene
+
+    return _continue(toy_scene(2, 8), folder, None, torch.device("cpu"))
+
+
+def _resign(folder: Path) -> None:
+    for path in folder.glob("checkpoints/*/checkpoint.json"):
+        try:
+            values = json.loads(path.read_bytes())
+            data = (path.parent / "state.safetensors").read_bytes()
+            path.write_text(json.dumps(values | {"sha256": hashlib.sha256(data).hexdigest()}))
+        except (OSError, ValueError, TypeError, RecursionError):
+            pass
+
+
+def _responses(folder: Path) -> None:
+    from scipy.io import savemat
+
+    x = np.linspace(0, 1, 9)
+    y = x**0.5
+    row = " ".join(f"{v:.4f}" for v in x)
+    curve = " ".join(f"{v:.4f}" for v in y)
+    (folder / "c.csv").write_text("exposure,value\n" + "".join(f"{a},{b}\n" for a, b in zip(x, y)))
+    (folder / "c.json").write_text(json.dumps({"exposures": x.tolist(), "values": y.tolist()}))
+    stored = {"kind": "table", "name": "n", "exposures": x.tolist(), "values": y.tolist(), "notes": []}
+    (folder / "d.json").write_text(json.dumps(stored))
+    (folder / "dorf.txt").write_text("".join(f"n{i}\nkind\nI =\n{row}\nB =\n{curve}\n" for i in range(2)))
+    (folder / "emor.txt").write_text(f"E =\n{row}\nf0 =\n{curve}\nh(1)=\n{row}\n")
+    savemat(folder / "m.mat", {"B": np.stack([y, y]), "I": np.stack([x, x])})
+
+
+def _read_responses(folder: Path):
+    from sehdr_warp.model.response import response_by_name
+
+    selectors = {"dorf.txt": ":1", "emor.txt": ":0.1", "m.mat": ":0"}
+
+    def read(path: Path):
+        curve = response_by_name(f"{path}{selectors.get(path.name, '')}")
+        return curve.decode(curve.encode(np.array([0.0, 0.2, 3.0]))), curve.white
+
+    return each(folder, "*", read)
+
+
+def _cameras(folder: Path) -> None:
+    from tests.output.helpers import camera
+
+    view = camera(16, 12).to_dict()
+    (folder / "own.json").write_text(json.dumps({"cameras": [{"name": "a", **view}, {"camera": view}]}))
+    path = [{"camera_to_world": np.eye(4).ravel().tolist(), "fov": 50}]
+    (folder / "studio.json").write_text(json.dumps({"render_width": 8, "render_height": 6, "camera_path": path}))
+
+
+def _read_cameras(folder: Path):
+    from sehdr_warp.scene.camera_path import load_cameras
+
+    return each(folder, "*.json", load_cameras)
+
+
+def each(folder: Path, pattern_: str, read):
+    """read(path) of every file, though some raise: the first error is raised at the end."""
+    from sehdr_warp.errors import SehdrError
+
+    problem = None
+    for path in sorted(folder.glob(pattern_)):
+        try:
+            read(path)
+        except SehdrError as error:
+            problem = problem or error
+    if problem:
+        raise problem
+
+
+READERS = {
+    "colmap-binary": Reader(lambda f: _colmap(f, True), ("sparse/0/*.bin",), _read_colmap),
+    "colmap-text": Reader(lambda f: _colmap(f, False), ("sparse/0/*.txt",), _read_colmap, text=True),
+    "transforms": Reader(_transforms, ("transforms.json",), _read_transforms, text=True),
+    "hdr-nerf": Reader(_hdr_nerf, ("*.json", "sparse/0/*"), _read_transforms, text=True),
+    "exposures": Reader(_exposures, ("exposures.json",), _load_scene, text=True),
+    "scene": Reader(_transforms, ("transforms.json", "images/*"), _load_scene, text=True),
+    "llff": Reader(_llff, ("poses_bounds.npy",), _read_llff),
+    "ply-points": Reader(_points, ("*.ply",), _read_points, text=True),
+    "ply-gaussians": Reader(_gaussians, ("g.ply",), _read_gaussians, text=True),
+    "exr": Reader(_exr, ("*.exr",), _read_exr),
+    "radiance": Reader(_radiance, ("*.hdr",), _read_radiance),
+    "photos": Reader(_photos, ("*",), _read_photos),
+    "config": Reader(_config, ("*.toml",), _read_config, text=True),
+    "run": Reader(_run, ("*.json", "metrics.jsonl"), _read_run, text=True),
+    "checkpoint": Reader(_run, ("checkpoints/*/*",), _read_run, text=True, repair=_resign),
+    "resume": Reader(_run, ("*.json", "metrics.jsonl", "checkpoints/*/*"), _read_resume, text=True, repair=_resign),
+    "responses": Reader(_responses, ("*",), _read_responses, text=True),
+    "cameras": Reader(_cameras, ("*.json",), _read_cameras, text=True),
+}
+
+
+class Workspace:
+    """A reader's files in a folder of their own, of which one at a time is changed."""
+
+    def __init__(self, reader: Reader, folder: Path):
+        self.reader, self.folder = reader, folder
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        reader.make(folder)
+        self.whole = {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+        targets = sorted({path for glob in reader.files for path in folder.glob(glob) if path.is_file()})
+        self.targets = {path: self.whole[path] for path in targets}
+
+    def restore(self) -> None:
+        for path in sorted(self.folder.rglob("*")):
+            if path.is_file() and path not in self.whole:
+                path.unlink()
+        for path, data in self.whole.items():
+            if not path.is_file() or path.stat().st_size != len(data) or path.read_bytes() != data:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(data)
