@@ -29,6 +29,8 @@ PRIOR = {"camera": 0.5, "srgb": 0.5, "rec709": 1.0, "gamma-2.2": 1.0, "reinhard-
 # ... and of a camera's own JPEG, which is sharpened and cleaned of noise: its edges mislead (docs/response.md).
 CAMERA_PRIOR = {"camera": 0.0, "rec709": 1.0}
 UNLIKELY = 12.0
+# Nobody stores 8-bit linear photos, and photos scaled down in encoded values have edges that are linear in them.
+LINEAR_PRIOR = 1000.0
 # Photos larger than this are read in bands.
 MOST_PIXELS, BAND_ROWS = 400_000, 32
 
@@ -144,6 +146,8 @@ def _prior(response: Response, from_camera: bool) -> float:
     """Minus the log prior of a candidate; one that is not of the bank was given on purpose, and is as likely as any."""
     if response.name not in response_names():
         return 0.0
+    if response.name == "linear":
+        return LINEAR_PRIOR
     return (CAMERA_PRIOR if from_camera else PRIOR).get(response.name, UNLIKELY)
 
 

@@ -35,6 +35,10 @@ FAR_RADIUS = 5.0
 """Radius of the far shell over how far the scene reaches: parallax there is a fifth of the scene's."""
 
 
+MOST_JUDGED = 24
+"""Photos that a response is chosen from, evenly spread: their edges are more than can be used."""
+
+
 def base_exposure_time(scene: Scene) -> float:
     """dt_1: the median exposure time of the training photos, seconds."""
     return float(np.median([view.exposure_time for view in scene.train_views]))
@@ -70,6 +74,7 @@ def _selected(scene: Scene, config: Config) -> Response:
     images = [view.image for view in views]
     if options.method == "paper":
         images = [images[int(np.random.default_rng(config.seed).integers(len(images)))]]
+    images = images[:: -(-len(images) // MOST_JUDGED)]
     return select_response(
         images,
         candidates,

@@ -112,3 +112,9 @@ def test_posterior_needs_no_well_exposed_pixel():
     for photo in (np.zeros((32, 32, 3)), np.ones((32, 32, 3))):
         chosen = select_response(photo, method="posterior", from_camera=True)
         assert chosen.response.name in ("camera", "rec709") and np.isnan(chosen.scores[0].edges)
+
+
+def test_posterior_never_takes_photos_for_linear():
+    photos = [np.round(mosaic(seed) * 255) / 255 for seed in range(4)]
+    assert select_response(photos).response.name == "linear"
+    assert select_response(photos, method="posterior").response.name != "linear"
