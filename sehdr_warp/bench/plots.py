@@ -56,14 +56,14 @@ def plot_scale(report: dict, path: Path) -> None:
 
 
 def plot_choices(report: dict, path: Path) -> None:
-    """Gradient and image error over run time as a multiple of the default's, a column for each kind of features, a
+    """Own image and gradient error over run time as a multiple of the default's, a column for each kind of features, a
     line for each choice."""
     rows = [row for row in report["rows"] if row["stage"] == "choice"]
     kinds = list(dict.fromkeys(row["features"] for row in rows))
     choices = list(dict.fromkeys(row["choice"] for row in rows))
     figure, panels = _panels(2, len(kinds))
     for panel_row, field, label in zip(
-        panels, ("image_error", "gradient_error"), ("image error", "largest gradient error")
+        panels, ("own_image_error", "own_gradient_error"), ("own image error", "own gradient error")
     ):
         for axes, kind in zip(panel_row, kinds):
             for choice in choices:

@@ -99,6 +99,8 @@ COLUMNS = {
             ("99 % of pixels", "pixel_error_p99", ".1e"),
             ("gradient error", "gradient_error", ".1e"),
             ("worst gradient", "worst_gradient", "s"),
+            ("own image error", "own_image_error", ".1e"),
+            ("own gradient error", "own_gradient_error", ".1e"),
         ),
         "harmonics": (
             ("degree", "value", "s"),
