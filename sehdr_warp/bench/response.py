@@ -11,7 +11,7 @@ from ..errors import SehdrError
 from ..evaluation.metrics import decibels, mu_law
 from ..evaluation.protocols import fit_scale
 from ..model.response import Response, response_by_name
-from ..model.response_selection import select_response
+from ..model.response_selection import EDGES_PER_FACT, ResponseScore, select_response
 from ..scene import Scene, load_scene
 from ..scene.exposure import made_by_camera
 from ..synth.expose import expose, exposure_ladder
@@ -116,12 +116,23 @@ def _choices(images, from_camera: bool, seed: int):
         yield f"always {name}", response_by_name(name)
     # Photos that are black or white all over say nothing: only what is taken always is judged on them.
     with contextlib.suppress(SehdrError):
-        scores = select_response(images, method="posterior", from_camera=from_camera, seed=seed).scores
+        selection = select_response(images, method="posterior", from_camera=from_camera, seed=seed)
+        scores, edge_count = selection.scores, selection.edge_count
         yield "posterior", scores[0].response
+        for part in ("edges", "highlights", "prior"):
+            without = min(scores, key=lambda score, part=part: score.posterior - _weighted(score, part, edge_count))
+            yield f"posterior without {part}", without.response
         paper = max(scores, key=lambda score: score.paper_score).response
         yield "paper", paper
         # Without edges, select_response falls back as this does.
         yield "edges", paper if np.isnan(scores[0].edges) else min(scores, key=lambda score: score.edges).response
+
+
+def _weighted(score: ResponseScore, part: str, edge_count: int) -> float:
+    """What a part adds to the posterior."""
+    if part == "edges":
+        return 0.0 if np.isnan(score.edges) else score.edges * edge_count / EDGES_PER_FACT
+    return getattr(score, part)
 
 
 def _trial(stage: str, data: str, truth: str, photo: str, method: str, response: Response, stops: np.ndarray) -> dict:
