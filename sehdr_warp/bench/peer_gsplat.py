@@ -156,36 +156,44 @@ def _upload(view, device):
     return pose, intrinsics, torch.tensor(view.image, device=device), mask
 
 
-class _CentreGradients:
-    """The centres in the image as training asks for them: gsplat's are [1, N, 2]."""
-
-    def __init__(self, means2d: torch.Tensor):
-        self._means2d = means2d
-
-    def retain_grad(self) -> None:
-        self._means2d.retain_grad()
-
-    @property
-    def grad(self) -> torch.Tensor:
-        return self._means2d.grad[0]
-
-
 def rasterize_with_gsplat(
-    means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics, width: int, height: int,
-    *, low_pass: float = LOW_PASS, antialiased: bool = False, capacity: int | None = None, style: object = None,
+    means,
+    log_scales,
+    quaternions,
+    opacities,
+    features,
+    world_to_camera,
+    intrinsics,
+    width: int,
+    height: int,
+    *,
+    low_pass: float = LOW_PASS,
+    antialiased: bool = False,
+    capacity: int | None = None,
+    style: object = None,
 ) -> Rendering:
-    """rasterize() by gsplat, for a training step of ours on its kernels. capacity, style: have no meaning there."""
+    """rasterize() by gsplat, for a training step of ours on its kernels. capacity, style: have no meaning there. Its centres in the image
+    are not those that the gradient passes, so densification cannot watch them."""
     from gsplat import rasterization
 
     fx, fy, cx, cy = intrinsics
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
     matrix = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).reshape(1, 3, 3)
     image, alpha, info = rasterization(
-        means, quaternions, log_scales.exp(), opacities, features, world_to_camera[None], matrix, width, height,
-        packed=False, rasterize_mode="antialiased" if antialiased else "classic", eps2d=low_pass,
+        means,
+        quaternions,
+        log_scales.exp(),
+        opacities,
+        features,
+        world_to_camera[None],
+        matrix,
+        width,
+        height,
+        packed=False,
+        rasterize_mode="antialiased" if antialiased else "classic",
+        eps2d=low_pass,
     )
     # gsplat 1.5 gives two radii, its forerunners one.
     radii = info["radii"][0]
     radii = radii.amax(-1) if radii.ndim == 2 else radii
-    centres = _CentreGradients(info["means2d"])
-    return Rendering(image[0], alpha[0, ..., 0], centres, info["depths"][0], radii, 0)
+    return Rendering(image[0], alpha[0, ..., 0], info["means2d"][0], info["depths"][0], radii, 0)

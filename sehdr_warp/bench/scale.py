@@ -172,7 +172,8 @@ def _splat_rows(name, scene: SplatScene, gsplat: Peer | None, repetitions, budge
 def _step_rows(name: str, size: Size, device, with_gsplat: bool, repetitions: int, budget: float) -> list[dict]:
     """Whole training steps of the preset on photos of this size; peak memory is all that is held on a GPU, photos,
     parameters and optimiser included."""
-    config = load_config(STEP_PRESET, {"densification.max_gaussians": size.gaussians * 11 // 10 + 1})
+    # Without densification, which on both sides would watch gradients that gsplat gives in another form.
+    config = load_config(STEP_PRESET, {"densification.stop": 0, "densification.max_gaussians": size.gaussians + 1})
     scene = make_photo_scene(size, views=STEP_VIEWS, device=device)
     first = thick_of_training(config)
     rows = []
