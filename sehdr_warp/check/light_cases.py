@@ -12,7 +12,7 @@ from ..model.response_table import TabulatedResponse
 from ..splatting import ssim
 from ..training.config import LossConfig
 from ..training.losses import CODE, Target, ldr_loss
-from .case import UNIT, Case, Reading, compare, count, not_finite
+from .case import ROUNDINGS, UNIT, Case, Reading, compare, count, not_finite
 
 LIGHT = "light"
 CURVES = ("linear", "gamma-2.2", "srgb", "rec709", "reinhard-gamma", "filmic", "aces")
@@ -114,7 +114,7 @@ def _fused(fusion: NeuralExposureFusion):
 
 
 def _fusion_case(sigma: float, gain: float) -> callable:
-    """sigma: start of the widths. gain: of the last layer, so that logits reach about 50 times it."""
+    """sigma: start of the widths. gain: of the last layer: logits reach a tenth of it."""
 
     def measure(device):
         fusion = _fusion(sigma)
@@ -126,25 +126,14 @@ def _fusion_case(sigma: float, gain: float) -> callable:
             "last": fusion.weights[1].detach().double() * gain,
         }
         function = _fused(fusion)
-        readings = compare(
-            function,
-            lambda _, *t: function(*t),
-            tensors,
-            device,
-            gradients=("last",),
-            extra=_logit_error(fusion, tensors),
-        )
+        # Each logit is rounded by itself, at its own size; what differs by that much, the softmax sees as a factor.
+        extra = ROUNDINGS * UNIT * gain / 10
+        readings = compare(function, lambda _, *t: function(*t), tensors, device, gradients=("last",), extra=extra)
         given = {name: t.to(device, torch.float32).requires_grad_() for name, t in tensors.items()}
         function(*given.values())["fused"].sum().backward()
         return [*readings, count("derivatives not finite", not_finite(*(t.grad for t in given.values())))]
 
     return measure
-
-
-def _logit_error(fusion: NeuralExposureFusion, tensors) -> float:
-    """A logit of size L has an error of some units of L, and a softmax weight that as a relative error."""
-    largest = float(tensors["last"].abs().amax() * math.sqrt(fusion.weights[1].shape[1]))
-    return 16 * UNIT * largest
 
 
 def _sigma_limits(device):
@@ -240,7 +229,7 @@ CASES = (
         "logits",
         LIGHT,
         "softmax logits of +-1e4",
-        _fusion_case(1e3, 2e3),
+        _fusion_case(1e3, 1e5),
         note="a logit of 1e4 is known to 1e-3 in float32, and the weights of the brackets to no better",
     ),
     Case("photos", LIGHT, "photos all clipped, all black, and with one bright pixel", _photos),

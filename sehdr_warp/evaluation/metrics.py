@@ -59,7 +59,9 @@ def squared_error(
     squared = (prediction.double() - truth.double()) ** 2
     if mask is None:
         return squared.sum((0, 1)), float(squared.shape[0] * squared.shape[1])
-    return (squared * mask.double()[..., None]).sum((0, 1)), float(mask.double().sum())
+    # What the mask leaves out may be anything: 0 times NaN would be NaN.
+    weighted = torch.where(mask[..., None] > 0, squared * mask.double()[..., None], 0.0)
+    return weighted.sum((0, 1)), float(mask.double().sum())
 
 
 def decibels(mean_squared_error: float, peak: float = 1.0) -> float:

@@ -1,0 +1,112 @@
+"""Public operations under any numbers (hypothesis): a right result, a documented culling, or an error by name."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.splatting import nearest_neighbour_distances, rasterize, spherical_harmonics, ssim_map
+from sehdr_warp.splatting.reference import rasterize_reference
+
+from .scenes import relative_error
+
+SETTINGS = settings(
+    max_examples=40, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+anything = st.floats(width=32, allow_nan=True, allow_infinity=True, allow_subnormal=True)
+modest = st.floats(-4, 4, width=32)
+COUNT = 5
+
+
+def tensor(rows):
+    return torch.tensor(rows, dtype=torch.float32)
+
+
+def rows(element, columns, count=COUNT):
+    return st.lists(st.lists(element, min_size=columns, max_size=columns), min_size=count, max_size=count).map(tensor)
+
+
+def camera():
+    pose = torch.eye(4)
+    pose[2, 3] = 4.0
+    return pose, torch.tensor([20.0, 20.0, 9.0, 7.0])
+
+
+@SETTINGS
+@given(rows(modest, 3), rows(modest, 3), rows(modest, 4), rows(st.floats(0, 1, width=32), 1), rows(modest, 3))
+def test_any_modest_gaussians_match_the_reference(means, log_scales, quaternions, opacities, features):
+    # Distances from the cut-offs of opacity are left to chance; a contribution there is worth 1 / 255 at most.
+    tensors = [means, log_scales.clamp_max(1.0), quaternions, opacities[:, 0], features, *camera()]
+    ours = rasterize(*tensors, 18, 14)
+    truth = rasterize_reference(*(t.double() for t in tensors), 18, 14)
+    step = 1.1 / 255 * float(features.abs().max().clamp_min(1e-30))
+    differ = (ours.image - truth.image).abs() > 1e-4 * float(truth.image.abs().max().clamp_min(1e-30))
+    assert float((ours.image - truth.image).abs().max()) <= step * COUNT
+    assert int(differ.any(2).sum()) <= 3
+    assert 0 <= float(ours.alpha.min()) and float(ours.alpha.max()) <= 1
+
+
+@SETTINGS
+@given(st.data())
+def test_one_gaussian_of_any_numbers_leaves_the_others_alone(data):
+    generator = torch.Generator().manual_seed(0)
+    good = [torch.randn(COUNT, n, generator=generator) * 0.5 for n in (3, 3, 4, 1, 3)]
+    good[1] -= 2.0
+    good[3] = torch.full((COUNT, 1), 0.5)
+    for part in good:
+        part[2] = tensor([data.draw(anything) for _ in range(part.shape[1])])
+    leaves = [part.clone().requires_grad_() for part in good]
+    given_ = [leaves[0], leaves[1], leaves[2], leaves[3][:, 0], leaves[4]]
+    rendering = rasterize(*given_, *camera(), 18, 14)
+    others = torch.arange(COUNT) != 2
+    if not bool(rendering.visible[2]):
+        without = rasterize(*(part[others] for part in given_), *camera(), 18, 14)
+        assert torch.equal(rendering.image, without.image)
+        rendering.image.sum().backward()
+        assert all(bool(leaf.grad[others].isfinite().all()) for leaf in leaves)
+    elif float(good[4][2].abs().max()) < 1e30:
+        assert bool(rendering.image.isfinite().all())
+
+
+@SETTINGS
+@given(rows(anything, 3), st.integers(0, 3))
+def test_harmonics_keep_each_row_to_itself(means, degree):
+    coefficients = torch.randn(COUNT, 16, 3, generator=torch.Generator().manual_seed(1))
+    together = spherical_harmonics(degree, coefficients, means, torch.zeros(3))
+    for i in range(COUNT):
+        alone = spherical_harmonics(degree, coefficients[i : i + 1], means[i : i + 1], torch.zeros(3))
+        assert torch.equal(together[i].nan_to_num(7.0), alone[0].nan_to_num(7.0))
+        if 1e-15 < float(means[i].norm()) < 1e15:
+            assert bool(alone.isfinite().all())
+
+
+@SETTINGS
+@given(rows(anything, 3, 9), st.integers(1, 4))
+def test_neighbours_are_exact_or_refused(points, k):
+    if not bool(points.isfinite().all()):
+        with pytest.raises(SehdrError, match="finite coordinates"):
+            nearest_neighbour_distances(points, k)
+        return
+    found = nearest_neighbour_distances(points, k).double()
+    wide = points.double()
+    exact = (wide[:, None] - wide[None]).norm(dim=2)
+    exact.fill_diagonal_(math.inf)
+    exact = exact.sort(1).values[:, :k]
+    inside = exact < 3e38
+    assert bool((found[~inside] > 3e38).all()) or bool(inside.all())
+    torch.testing.assert_close(found[inside], exact[inside], rtol=1e-6, atol=1e-44)
+
+
+@SETTINGS
+@given(anything, st.integers(1, 9), st.integers(1, 9))
+def test_similarity_is_at_most_one_and_local(value, height, width):
+    image = torch.rand(height + 20, width + 20, 1, generator=torch.Generator().manual_seed(0))
+    assert relative_error(ssim_map(image, image), torch.ones_like(image)) < 1e-6
+    spoiled = image.clone()
+    spoiled[0, 0, 0] = value
+    similarity = ssim_map(spoiled, image)
+    assert torch.equal(similarity[6:, 6:], ssim_map(image, image)[6:, 6:])
+    assert not bool((similarity > 1 + 1e-5).any())
