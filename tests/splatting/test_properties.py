@@ -14,7 +14,11 @@ from sehdr_warp.splatting.reference import rasterize_reference
 from .scenes import relative_error
 
 SETTINGS = settings(
-    max_examples=40, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=40,
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 anything = st.floats(width=32, allow_nan=True, allow_infinity=True, allow_subnormal=True)
 modest = st.floats(-4, 4, width=32)
@@ -38,14 +42,15 @@ def camera():
 @SETTINGS
 @given(rows(modest, 3), rows(modest, 3), rows(modest, 4), rows(st.floats(0, 1, width=32), 1), rows(modest, 3))
 def test_any_modest_gaussians_match_the_reference(means, log_scales, quaternions, opacities, features):
-    # Distances from the cut-offs of opacity are left to chance; a contribution there is worth 1 / 255 at most.
+    # A contribution at the threshold counts on one side and not on the other, and so does a whole Gaussian of that
+    # opacity; a low threshold makes them worth little. The same holds where a pixel is finished.
+    means[:, 2].clamp_(min=-3.5)
+    quaternions[quaternions.norm(dim=1) < 1e-6] = 0.0
     tensors = [means, log_scales.clamp_max(1.0), quaternions, opacities[:, 0], features, *camera()]
-    ours = rasterize(*tensors, 18, 14)
-    truth = rasterize_reference(*(t.double() for t in tensors), 18, 14)
-    step = 1.1 / 255 * float(features.abs().max().clamp_min(1e-30))
-    differ = (ours.image - truth.image).abs() > 1e-4 * float(truth.image.abs().max().clamp_min(1e-30))
-    assert float((ours.image - truth.image).abs().max()) <= step * COUNT
-    assert int(differ.any(2).sum()) <= 3
+    ours = rasterize(*tensors, 18, 14, alpha_threshold=1e-5)
+    truth = rasterize_reference(*(t.double() for t in tensors), 18, 14, alpha_threshold=1e-5)
+    largest = float(features.abs().max())
+    assert float((ours.image - truth.image).abs().max()) <= (1e-4 + (COUNT + 1) * 1e-4) * largest
     assert 0 <= float(ours.alpha.min()) and float(ours.alpha.max()) <= 1
 
 
