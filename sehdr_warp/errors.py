@@ -10,8 +10,8 @@ class SehdrError(Exception):
     """
 
 
-LONGEST_PROBLEM = 400
-"""Characters of a problem that a message tells."""
+LONGEST_PART = 400
+"""Characters of a path and of a problem that a message tells."""
 
 
 class InputError(SehdrError):
@@ -22,6 +22,8 @@ class InputError(SehdrError):
 
     def __init__(self, path: Path | str, problem: str, remedy: str):
         self.path = str(path)
-        # A problem may quote a file, which may hold anything.
-        problem = problem if len(problem) <= LONGEST_PROBLEM else problem[:LONGEST_PROBLEM] + " ..."
-        super().__init__(" ".join(f"{path}: {problem}; {remedy}".split()))
+        # A problem may quote a file, which may hold anything; names of files may come from files as well.
+        place, problem = (
+            text if len(text) <= LONGEST_PART else text[:LONGEST_PART] + " ..." for text in (str(path), problem)
+        )
+        super().__init__(" ".join(f"{place}: {problem}; {remedy}".split()))
