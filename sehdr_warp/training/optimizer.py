@@ -36,7 +36,8 @@ class Adam(torch.optim.Adam):
                     "exp_avg": torch.zeros_like(parameter, memory_format=torch.contiguous_format),
                     "exp_avg_sq": torch.zeros_like(parameter, memory_format=torch.contiguous_format),
                 }
-        torch._foreach_add_([self.state[p]["step"] for p in parameters], 1 - skipped)
+        # With lists on both sides: to add one tensor to many, torch reads it on the host, which no recording allows.
+        torch._foreach_add_([self.state[p]["step"] for p in parameters], [1 - skipped] * len(parameters))
         one = torch.ones_like(skipped)
         for group in self.param_groups:
             rate = group["lr"]
