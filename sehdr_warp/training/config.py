@@ -8,11 +8,7 @@ The defaults are the `default` preset. A TOML file states only what differs from
 import math
 from dataclasses import dataclass, field, fields, is_dataclass
 
-from ..errors import SehdrError
-
-
-class ConfigError(SehdrError):
-    """A field of a config has a value that cannot be used; names field, value and what is allowed."""
+from .config_checks import ConfigError, check_together
 
 
 def option(default, doc: str, *, low=None, high=None, above=None, choices=None, nonempty=False):
@@ -283,7 +279,7 @@ def validate(config: Config) -> None:
     """Raises ConfigError for the first field that is out of range, or for fields that contradict each other."""
     for path, value, limits in _leaves(config, ""):
         _check(path, value, limits)
-    _check_together(config)
+    check_together(config)
 
 
 def _leaves(node, prefix: str):
@@ -310,72 +306,3 @@ def _check(path: str, value, limits: dict) -> None:
             raise ConfigError(f"{shown} is greater than {limits['high']}")
         if limits["nonempty"] and not item:
             raise ConfigError(f"{shown} is empty")
-
-
-def _check_together(config: Config) -> None:
-    model, fusion, loss = config.model, config.fusion, config.loss
-    if fusion.enabled and len(fusion.exposures) < 2:
-        raise ConfigError(f"fusion.exposures = {list(fusion.exposures)} is too few; a fusion needs two or more")
-    if model.radiance == "display" and fusion.enabled:
-        raise ConfigError('fusion.enabled = true needs radiance: model.radiance = "display" has none')
-    if model.radiance == "display" and loss.linear_weight > 0:
-        raise ConfigError(
-            f'loss.linear_weight = {loss.linear_weight} needs radiance: model.radiance = "display" has none'
-        )
-    if loss.linear_weight > 0 and not (fusion.enabled or loss.hdr_truth):
-        raise ConfigError(
-            f"loss.linear_weight = {loss.linear_weight} has nothing to compare: needs fusion.enabled or loss.hdr_truth"
-        )
-    if model.radiance == "display" or model.tone_map == "gaussian":
-        # Both encode before they composite: no pixel's exposure is known.
-        for field_set, shown in (
-            (loss.domain == "mu-law", 'loss.domain = "mu-law"'),
-            (loss.highlight_weight > 0, f"loss.highlight_weight = {loss.highlight_weight}"),
-        ):
-            if field_set:
-                raise ConfigError(f'{shown} needs model.tone_map = "pixel" and a model.radiance other than "display"')
-    if model.far_points >= config.densification.max_gaussians:
-        raise ConfigError(
-            f"model.far_points = {model.far_points} leaves no room below densification.max_gaussians = "
-            f"{config.densification.max_gaussians}"
-        )
-    if loss.hdr_weight > 0 and model.radiance == "display":
-        raise ConfigError(f'loss.hdr_weight = {loss.hdr_weight} needs radiance: model.radiance = "display" has none')
-    if loss.ldr_weight == loss.hdr_weight == loss.linear_weight == 0:
-        raise ConfigError("loss.ldr_weight = 0.0 leaves nothing to compare: give loss.hdr_weight or loss.ldr_weight")
-    if loss.predictor and not loss.uses_hdr:
-        raise ConfigError(f"loss.predictor = {loss.predictor!r} is for nothing: loss.hdr_weight = 0.0")
-    if config.response.form == "mlp":
-        _check_learned(config)
-    if config.response.refine:
-        _check_refined(config)
-    if config.optimizer.means_final > config.optimizer.means:
-        raise ConfigError(f"optimizer.means_final = {config.optimizer.means_final} is greater than optimizer.means")
-
-
-def _check_learned(config: Config) -> None:
-    """What needs a curve that is known before the training goes without one."""
-    needs_curve = {
-        "model.radiance": config.model.radiance == "display",
-        "fusion.enabled": config.fusion.enabled,
-        "schedule.coarse_levels": config.schedule.coarse_levels > 0,
-        "loss.domain": config.loss.domain == "mu-law",
-        "loss.highlight_weight": config.loss.highlight_weight > 0,
-        "densification.slope_corrected": config.densification.slope_corrected,
-    }
-    for path, needed in needs_curve.items():
-        if needed:
-            part, name = path.split(".")
-            value = getattr(getattr(config, part), name)
-            raise ConfigError(f'{path} = {value!r} needs a known response: response.form = "mlp" has none')
-
-
-def _check_refined(config: Config) -> None:
-    """What uses the curve elsewhere than on a rendered exposure would use the uncorrected one."""
-    for path, clash in {
-        'response.form = "mlp"': config.response.form == "mlp",
-        'model.radiance = "display"': config.model.radiance == "display",
-        "fusion.enabled = true": config.fusion.enabled,
-    }.items():
-        if clash:
-            raise ConfigError(f"response.refine = true corrects a curve, which {path} leaves no room for")
