@@ -15,45 +15,9 @@ from .bench.commands import Bench, run_bench
 from .check.commands import Check, run_check
 from .errors import InputError, SehdrError
 from .synth.commands import Synth, run_synth
+from .training.commands import Train, cache_beside, known_curves, run_train
 
 Positional = tyro.conf.Positional
-
-
-@dataclass(frozen=True)
-class Train:
-    """Train a scene from photos of one exposure."""
-
-    data: Positional[str]
-    """Folder of photos: COLMAP, transforms.json, HDR-NeRF, HDR-GS, LLFF or bare photos; `embedded` is the room that
-    comes with the package, `embedded:NAME` another of its scenes."""
-    out: Path
-    """Folder for the run."""
-    preset: str | None = None
-    """default, fast, demo, paper, a rival (paper-truth, hdr-gs, hdr-gs-truth, 3dgs, truth, predicted), or a TOML file;
-    with --resume the run's own config."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
-    exposure_index: int | None = None
-    """Which exposure to train on where a view has several; by default the middle one."""
-    response: str | None = None
-    """Camera response: a name (srgb, gamma-2.2, hdr-nerf ...), a file, or auto."""
-    predict_hdr: str | None = None
-    """Train on single-image predictions in place of HDR truth: kovaleski-oliveira, a folder of predicted EXR files named
-    as the views, or a TorchScript (.pt) or ONNX (.onnx) file; the preset is then `predicted` unless you name one."""
-    iterations: int | None = None
-    """Training steps; all schedules scale with it."""
-    max_size: int | None = None
-    """Longest side of the photos, in pixels; larger ones are reduced."""
-    seed: int | None = None
-    """Seed of every random number."""
-    resume: bool = False
-    """Continue the run in --out from its newest checkpoint."""
-    overwrite: bool = False
-    """Replace the run in --out."""
-    tensorboard: bool = False
-    """Write TensorBoard event files into the run."""
-    json: bool = False
-    """Print the result as JSON on standard output."""
 
 
 @dataclass(frozen=True)
@@ -180,64 +144,6 @@ def main(arguments: list[str] | None = None) -> None:
     sys.exit(0)
 
 
-def _train(command: Train) -> None:
-    from .scene import load_scene
-    from .training.prediction import check_predictor
-    from .training.run import check_folder
-    from .training.train import pick_device, train
-
-    # What can be refused is refused before the photos are read, which may take minutes.
-    resumed = check_folder(command.out, resume=command.resume, overwrite=command.overwrite)
-    config, device = _config(command, resumed), pick_device(command.device)
-    if config.loss.predictor:
-        check_predictor(config.loss.predictor)
-    data = {"path": _absolute(command.data), "exposure_index": command.exposure_index, "max_size": command.max_size}
-    scene = load_scene(
-        command.data,
-        exposure_index=command.exposure_index,
-        max_size=command.max_size,
-        cache=_cache_beside(command.out),
-        progress=_say,
-        **_curves(config.response.name),
-    )
-    for note in scene.notes:
-        _say(note)
-    run = train(
-        scene,
-        command.out,
-        config,
-        device=device,
-        resume=command.resume,
-        overwrite=command.overwrite,
-        tensorboard=command.tensorboard,
-        data=data,
-    )
-    summary = run.summary() | {"run": str(run.path), "metrics": run.metrics()}
-    if command.json:
-        print(json.dumps(summary))
-    else:
-        seconds, count = summary["train_seconds"], summary["gaussians"]
-        print(f"{run.path}: {run.iterations} iterations, {count} Gaussians, {seconds:.1f} s on {summary['device']}")
-
-
-def _config(command: Train, resumed: bool):
-    from .training.config_files import load_config, override_config, read_config_json
-    from .training.run import CONFIG
-
-    given = {
-        "response.name": command.response,
-        "loss.predictor": _predictor(command.predict_hdr),
-        "schedule.iterations": command.iterations,
-        "seed": command.seed,
-    }
-    overrides = {name: value for name, value in given.items() if value is not None}
-    if resumed and command.preset is None:
-        path = command.out / CONFIG
-        return override_config(read_config_json(path), overrides, path)
-    preset = command.preset or ("default" if command.predict_hdr is None else "predicted")
-    return load_config(preset, overrides)
-
-
 def _render(command: Render) -> None:
     from .output.render_views import render_views
 
@@ -291,7 +197,7 @@ def _report(command: Report) -> None:
 
 
 _COMMANDS = {
-    Train: _train,
+    Train: run_train,
     Render: _render,
     Evaluate: _evaluate,
     Export: _export,
@@ -322,43 +228,17 @@ def _scene_of(run, data: str | None):
         place,
         exposure_index=run.data.get("exposure_index"),
         max_size=run.data.get("max_size"),
-        cache=_cache_beside(run.path),
+        cache=cache_beside(run.path),
         **_curves_of(run),
         progress=_say,
     )
 
 
-def _curves(response: str) -> dict:
-    """load_scene's decode and encode for a response that is known before the photos are read."""
-    if response == "auto":
-        return {}
-    from .model.response import response_by_name
-
-    curve = response_by_name(response)
-    return {"decode": curve.decode, "encode": curve.encode}
-
-
 def _curves_of(run) -> dict:
     """load_scene's decode and encode for a trained run: its response's, or, learned, those it was trained with."""
     if run.config.response.form == "mlp":
-        return _curves(run.config.response.name)
+        return known_curves(run.config.response.name)
     return {"decode": run.response.decode, "encode": run.response.encode}
-
-
-def _cache_beside(run: Path) -> Path:
-    """Where structure from motion keeps its results: beside the run, so that a second run finds them too."""
-    return run.absolute().parent / f"{run.name}.cache"
-
-
-def _absolute(data: str) -> str:
-    from .scene import is_embedded
-
-    return data if is_embedded(data) else str(Path(data).absolute())
-
-
-def _predictor(text: str | None) -> str | None:
-    """A predictor for the config, which outlives this folder: paths in full, names as they are."""
-    return str(Path(text).absolute()) if text is not None and Path(text).exists() else text
 
 
 def _numbers(flag: str, text: str | None) -> tuple[float, ...] | None:

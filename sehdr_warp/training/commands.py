@@ -1,0 +1,133 @@
+"""The command line of `sehdr-warp train`: what may be asked for, and the call. torch is imported when it runs."""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a scene from photos of one exposure."""
+
+    data: tyro.conf.Positional[str]
+    """Folder of photos: COLMAP, transforms.json, HDR-NeRF, HDR-GS, LLFF or bare photos; `embedded` is the room that
+    comes with the package, `embedded:NAME` another of its scenes."""
+    out: Path
+    """Folder for the run."""
+    preset: str | None = None
+    """default, fast, demo, paper, a rival (paper-truth, hdr-gs, hdr-gs-truth, 3dgs, truth, predicted), or a TOML file;
+    with --resume the run's own config."""
+    device: str | None = None
+    """cpu or cuda:N; by default the first GPU if there is one."""
+    exposure_index: int | None = None
+    """Which exposure to train on where a view has several; by default the middle one."""
+    response: str | None = None
+    """Camera response: a name (srgb, gamma-2.2, hdr-nerf ...), a file, or auto."""
+    predict_hdr: str | None = None
+    """Train on single-image predictions in place of HDR truth: kovaleski-oliveira, a folder of predicted EXR files named
+    as the views, or a TorchScript (.pt) or ONNX (.onnx) file; the preset is then `predicted` unless you name one."""
+    iterations: int | None = None
+    """Training steps; all schedules scale with it."""
+    max_size: int | None = None
+    """Longest side of the photos, in pixels; larger ones are reduced."""
+    seed: int | None = None
+    """Seed of every random number."""
+    resume: bool = False
+    """Continue the run in --out from its newest checkpoint."""
+    overwrite: bool = False
+    """Replace the run in --out."""
+    tensorboard: bool = False
+    """Write TensorBoard event files into the run."""
+    json: bool = False
+    """Print the result as JSON on standard output."""
+
+
+def run_train(command: Train) -> None:
+    from ..scene import load_scene
+    from .prediction import check_predictor
+    from .run import check_folder
+    from .train import pick_device, train
+
+    # What can be refused is refused before the photos are read, which may take minutes.
+    resumed = check_folder(command.out, resume=command.resume, overwrite=command.overwrite)
+    config, device = _config(command, resumed), pick_device(command.device)
+    if config.loss.predictor:
+        check_predictor(config.loss.predictor)
+    data = {"path": _absolute(command.data), "exposure_index": command.exposure_index, "max_size": command.max_size}
+    scene = load_scene(
+        command.data,
+        exposure_index=command.exposure_index,
+        max_size=command.max_size,
+        cache=cache_beside(command.out),
+        progress=_say,
+        **known_curves(config.response.name),
+    )
+    for note in scene.notes:
+        _say(note)
+    run = train(
+        scene,
+        command.out,
+        config,
+        device=device,
+        resume=command.resume,
+        overwrite=command.overwrite,
+        tensorboard=command.tensorboard,
+        data=data,
+    )
+    summary = run.summary() | {"run": str(run.path), "metrics": run.metrics()}
+    if command.json:
+        print(json.dumps(summary))
+    else:
+        seconds, count = summary["train_seconds"], summary["gaussians"]
+        print(f"{run.path}: {run.iterations} iterations, {count} Gaussians, {seconds:.1f} s on {summary['device']}")
+
+
+def _config(command: Train, resumed: bool):
+    from .config_files import load_config, override_config, read_config_json
+    from .run import CONFIG
+
+    given = {
+        "response.name": command.response,
+        "loss.predictor": _predictor(command.predict_hdr),
+        "schedule.iterations": command.iterations,
+        "seed": command.seed,
+    }
+    overrides = {name: value for name, value in given.items() if value is not None}
+    if resumed and command.preset is None:
+        path = command.out / CONFIG
+        return override_config(read_config_json(path), overrides, path)
+    preset = command.preset or ("default" if command.predict_hdr is None else "predicted")
+    return load_config(preset, overrides)
+
+
+def known_curves(response: str) -> dict:
+    """load_scene's decode and encode for a response that is known before the photos are read."""
+    if response == "auto":
+        return {}
+    from ..model.response import response_by_name
+
+    curve = response_by_name(response)
+    return {"decode": curve.decode, "encode": curve.encode}
+
+
+def cache_beside(run: Path) -> Path:
+    """Where structure from motion keeps its results: beside the run, so that a second run finds them too."""
+    return run.absolute().parent / f"{run.name}.cache"
+
+
+def _absolute(data: str) -> str:
+    from ..scene import is_embedded
+
+    return data if is_embedded(data) else str(Path(data).absolute())
+
+
+def _predictor(text: str | None) -> str | None:
+    """A predictor for the config, which outlives this folder: paths in full, names as they are."""
+    return str(Path(text).absolute()) if text is not None and Path(text).exists() else text
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
