@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 
@@ -285,7 +286,9 @@ def test_read_only_place(trained, tmp_path, capfd):
 
 def start(*arguments) -> subprocess.Popen:
     command = [sys.executable, "-m", "sehdr_warp", *(str(argument) for argument in arguments)]
-    return subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    # Tests that run in a shell's background have SIGINT ignored, and children inherit that.
+    listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    return subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, preexec_fn=listen)
 
 
 def wait_for(process: subprocess.Popen, words: str) -> None:
