@@ -1,13 +1,20 @@
-"""Files that appear whole or not at all: written beside their place, flushed to the disk, then renamed."""
+"""Files that appear whole or not at all: written beside their place, flushed to the disk, then renamed.
+
+What a killed process left is removed when something is written to the same folder again.
+"""
 
 import errno
+import functools
+import hashlib
 import json
 import math
 import os
+import platform
+import re
 import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +23,19 @@ from sehdr_warp.errors import InputError, SehdrError
 _REPLACE = "choose another place, or ask for it to be replaced (--overwrite)"
 _WRITE_ERRORS = frozenset(
     getattr(errno, name)
-    for name in "ENOSPC EDQUOT EFBIG EROFS EACCES EPERM EIO ENAMETOOLONG ENOTDIR EISDIR EMFILE".split()
+    for name in (
+        "ENOSPC",
+        "EDQUOT",
+        "EFBIG",
+        "EROFS",
+        "EACCES",
+        "EPERM",
+        "EIO",
+        "ENAMETOOLONG",
+        "ENOTDIR",
+        "EISDIR",
+        "EMFILE",
+    )
     if hasattr(errno, name)
 )
 
@@ -39,6 +58,7 @@ def atomic_path(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     full or the folder is not writable.
     """
     path = Path(path)
+    _remove_stale(path)
     check_absent(path, overwrite)
     with _in_place(path) as made:
         temporary = _beside(path)
@@ -65,6 +85,7 @@ def atomic_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     or the parent is not writable.
     """
     path = Path(path)
+    _remove_stale(path)
     check_absent_folder(path, overwrite)
     with _in_place(path) as made:
         temporary = _beside(path)
@@ -127,9 +148,55 @@ def writing(path: Path | str) -> Iterator[None]:
         raise SehdrError(f"{path}: cannot be written ({reason}); free space or choose another folder") from error
 
 
-def _beside(path: Path) -> Path:
+def _beside(path: Path, kind: str = "tmp") -> Path:
+    """A new hidden name beside `path` that says whose it is, and whether it is written (`tmp`) or set aside (`old`)."""
     # Short stems keep the temporary name within the 255 bytes that file systems allow.
-    return path.with_name(f".{path.stem[:40]}.{secrets.token_hex(4)}.tmp{path.suffix[:20]}")
+    owner = f"{_process_space()}-{os.getpid()}-{secrets.token_hex(4)}"
+    return path.with_name(f".{path.stem[:40]}.{owner}.{kind}{path.suffix[:20]}")
+
+
+@functools.cache
+def _process_space() -> str:
+    """Eight digits that tell the process numbers of this machine or container from another's on the same disk."""
+    try:
+        space = os.readlink("/proc/self/ns/pid")
+    except OSError:
+        space = ""
+    return hashlib.blake2s(f"{platform.node()} {space}".encode(), digest_size=4).hexdigest()
+
+
+def _remove_stale(path: Path) -> None:
+    """Removes what killed processes of this machine left in the folder of `path`. A folder that was set aside to be
+    replaced by `path` goes back where nothing stands in its place; what others may still be writing is left alone."""
+    names = re.compile(rf"\.(.*)\.{_process_space()}-(\d+)-[0-9a-f]{{8}}\.(tmp|old)(\.[^.]*)?", re.ASCII)
+    try:
+        found = [match for name in os.listdir(path.parent) if (match := names.fullmatch(name))]
+    except OSError:  # No such folder yet, or not ours to read.
+        return
+    for match in found:
+        left = path.parent / match[0]
+        if _runs(int(match[2])):
+            continue
+        if match[3] == "tmp" or (match[1] + (match[4] or "") == path.name and path.exists()):
+            shutil.rmtree(left, ignore_errors=True)
+            with suppress(OSError):
+                left.unlink(missing_ok=True)
+        elif match[1] + (match[4] or "") == path.name:
+            with suppress(OSError):  # Another process was as quick.
+                os.rename(left, path)
+
+
+def _runs(process: int) -> bool:
+    """Whether a process of this number runs here; yes where that cannot be told."""
+    if os.name != "posix":  # Elsewhere os.kill ends the process.
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # Someone else's process, or no number of one.
+        return True
+    return True
 
 
 def _make_parents(path: Path) -> list[Path]:
@@ -157,7 +224,7 @@ def _remove_empty(folders: list[Path]) -> None:
 
 
 def _swap_in(temporary: Path, path: Path) -> None:
-    old = _beside(path)
+    old = _beside(path, "old")
     replaced = path.exists()
     if replaced:
         os.rename(path, old)

@@ -1,5 +1,8 @@
 import json
 import os
+import signal
+import subprocess
+import sys
 
 import pytest
 
@@ -119,3 +122,71 @@ def test_json_has_no_nan(tmp_path):
     with pytest.raises(TypeError):
         write_json(tmp_path / "b.json", {"a": object()})
     assert listing(tmp_path) == ["a.json"]
+
+
+def killed(code, folder):
+    """Runs code in a process that is killed where it says so; the names it left."""
+    head = "import os, signal; from pathlib import Path; from sehdr_warp.output import files\n"
+    die = "def die(*_, **__): os.kill(os.getpid(), signal.SIGKILL)\n"
+    result = subprocess.run([sys.executable, "-c", head + die + code], cwd=folder, timeout=60)
+    assert result.returncode == -signal.SIGKILL
+    return sorted(os.listdir(folder))
+
+
+def test_what_a_killed_process_left_goes_with_the_next_write(tmp_path):
+    code = """
+with files.atomic_folder(Path("set")) as folder, files.atomic_path(Path("a.txt")) as file:
+    (folder / "half").write_text("1")
+    file.write_text("half")
+    die()
+"""
+    left = killed(code, tmp_path)
+    assert len(left) == 2 and all(name.startswith(".") for name in left)
+    (tmp_path / ".a.12345678.tmp.txt").write_text("not ours")
+    with atomic_path(tmp_path / "a.txt") as temporary:
+        temporary.write_text("whole")
+    assert listing(tmp_path) == [".a.12345678.tmp.txt", "a.txt"]
+
+
+@pytest.mark.parametrize("place", ["before", "after"])
+def test_a_folder_that_was_being_replaced_by_a_killed_process_is_never_lost(tmp_path, place):
+    """Killed between the two renames, or before what was set aside is removed."""
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "old").write_text("1")
+    hook = {
+        "before": "rename = os.rename\nos.rename = lambda a, b: (rename(a, b), die())",
+        "after": "files.shutil.rmtree = die",
+    }[place]
+    code = (
+        hook
+        + """
+with files.atomic_folder(Path("set"), overwrite=True) as folder:
+    (folder / "new").write_text("1")
+"""
+    )
+    assert (
+        len([name for name in killed(code, tmp_path) if name.startswith(".set.")]) == {"before": 2, "after": 1}[place]
+    )
+    with pytest.raises(InputError, match="exists already"), atomic_folder(tmp_path / "set"):
+        pass
+    assert listing(tmp_path) == ["set", {"before": "set/old", "after": "set/new"}[place]]
+
+
+def test_what_another_process_is_writing_is_left_alone(tmp_path):
+    code = """
+with files.atomic_path(Path("a.txt"), overwrite=True) as file:
+    file.write_text("theirs")
+    print(flush=True)
+    input()
+"""
+    head = "from pathlib import Path; from sehdr_warp.output import files\n"
+    with subprocess.Popen(
+        [sys.executable, "-c", head + code], cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        other.stdout.readline()
+        with atomic_path(tmp_path / "a.txt") as temporary:
+            temporary.write_text("ours")
+        assert (tmp_path / "a.txt").read_text() == "ours"
+        other.communicate(b"\n")
+    assert other.returncode == 0 and (tmp_path / "a.txt").read_text() == "theirs"
+    assert listing(tmp_path) == ["a.txt"]
