@@ -76,4 +76,5 @@ def _photo(field: RadianceField, scene, degree: int):
 
     recorded()  # loads the kernels, which a recording cannot
     recorder = GraphRecorder(camera.intrinsics.device)
-    return (lambda _: recorder.run("photo", recorded)), (lambda: None)
+    sorts = max(capacity, field.gaussians.count)
+    return (lambda _: recorder.run("photo", recorded, sorts=sorts)), (lambda: None)

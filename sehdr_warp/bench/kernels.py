@@ -77,28 +77,23 @@ def _replayed(scene: SplatScene) -> Callable[[], torch.Tensor]:
     return lambda: splat(*scene.arguments).image
 
 
-def _renderer_with_capacity(scene: SplatScene) -> Callable[[], torch.Tensor]:
-    with torch.no_grad():
-        capacity = rasterize(*scene.arguments).entry_count * 5 // 4
-    return lambda: rasterize(*scene.arguments, capacity=capacity).image
-
-
 def _recorded(scene: SplatScene, cotangent: torch.Tensor | None) -> Callable[[], list[torch.Tensor]]:
     """A replay of the render with a capacity: of [image], or with a cotangent of [image, gradients of the leaves]."""
-    render = _renderer_with_capacity(scene)
+    with torch.no_grad():
+        capacity = rasterize(*scene.arguments).entry_count * 5 // 4
 
     def forward():
         with torch.no_grad():
-            return [render()]
+            return [rasterize(*scene.arguments, capacity=capacity).image]
 
     def forward_backward():
-        image = render()
+        image = rasterize(*scene.arguments, capacity=capacity).image
         return [image.detach(), *torch.autograd.grad(image, scene.leaves, cotangent)]
 
     function = forward if cotangent is None else forward_backward
     function()  # loads the kernels, which a recording cannot
     recorder = GraphRecorder(scene.device)
-    return lambda: recorder.run("render", function)
+    return lambda: recorder.run("render", function, sorts=max(capacity, scene.size.gaussians))
 
 
 def _checks(scene: SplatScene, peers: list[Peer]) -> list[checks.Check]:

@@ -223,7 +223,7 @@ class _ProgramFunction(torch.autograd.Function):
         return (None, None, *results)
 
 
-_streams: dict[int, wp.Stream] = {}
+_streams: dict[tuple[int, int], wp.Stream] = {}
 
 
 def torch_stream(device: torch.device):
@@ -232,9 +232,10 @@ def torch_stream(device: torch.device):
         return nullcontext()
     current = torch.cuda.current_stream(device)
     # One Warp object a stream, for good: when a second one dies, Warp forgets the stream, in mid-capture too.
-    if current.cuda_stream not in _streams:
-        _streams[current.cuda_stream] = wp.Stream(wp.device_from_torch(device), cuda_stream=current.cuda_stream)
-    return wp.ScopedStream(_streams[current.cuda_stream], sync_enter=False, sync_exit=False)
+    key = current.device_index, current.cuda_stream
+    if key not in _streams:
+        _streams[key] = wp.Stream(wp.device_from_torch(device), cuda_stream=current.cuda_stream)
+    return wp.ScopedStream(_streams[key], sync_enter=False, sync_exit=False)
 
 
 def differentiable(body):

@@ -34,7 +34,8 @@ class RecordedRasterizer:
     """
 
     def __init__(self, device: torch.device | str):
-        self._forward, self._backward = GraphRecorder(device), GraphRecorder(device)
+        self._forward = GraphRecorder(device)
+        self._backward = GraphRecorder(device, self._forward.stream)
         self._key = None
         self._arguments: list[torch.Tensor] = []
         self._rendering: Rendering | None = None
@@ -78,7 +79,8 @@ class RecordedRasterizer:
         for recorder in (self._forward, self._backward):
             recorder.invalidate()
         # Not run(): a recording is made, not played, and the backward pass is recorded on the forward's own graph.
-        rendering = self._forward.record(key, lambda: forward(capacity))
+        sorts = max(capacity, len(self._arguments[0]))
+        rendering = self._forward.record(key, lambda: forward(capacity), sorts=sorts)
         made = iter(self._backward.record(key, lambda: backward(rendering)) if leaves else ())
         self._gradients = [next(made) if want else None for want in wanted]
         self._rendering = replace(

@@ -6,18 +6,12 @@ long as the GPU. Recorded once and replayed, the GPU sets the pace.
 
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache
 
 import torch
 import warp as wp
 
 from .bridge import torch_stream
-
-
-@cache
-def _recording_stream(device: torch.device) -> torch.cuda.Stream:
-    """One for all recordings: torch runs a backward pass on its forward pass's stream, which must be the recorded one."""
-    return torch.cuda.Stream(device)
+from .sorting import reserve
 
 
 class GraphRecorder:
@@ -27,17 +21,18 @@ class GraphRecorder:
     It must neither wait for the device nor copy from the host, and every kernel in it must have run once before. Its
     result must be tensors (or tuples of them), which the next replay overwrites.
 
-    device: a CUDA device; raises ValueError for another.
+    device: a CUDA device; raises ValueError for another. stream: to record on, by default one of its own; what continues
+    another recording's work, as a backward pass does, must be recorded on the same.
     """
 
-    def __init__(self, device: torch.device):
+    def __init__(self, device: torch.device | str, stream: torch.cuda.Stream | None = None):
         self.device = torch.device(device)
         if self.device.type != "cuda":
             raise ValueError(f"device {self.device} has no CUDA graphs; use a GPU, or call the function itself")
         self._key = None
         self._graph: torch.cuda.CUDAGraph | None = None
         self._result = None
-        self._stream = _recording_stream(self.device)
+        self.stream = stream or torch.cuda.Stream(self.device)
         self._pool = torch.cuda.graph_pool_handle()
         # Keeps the pool's memory between recordings: freed with the last graph of the pool, it would be allocated anew.
         self._anchor = self._record(lambda: torch.zeros(1, device=self.device))
@@ -49,21 +44,24 @@ class GraphRecorder:
             self._graph.reset()
             self._graph = None
 
-    def run(self, key, function: Callable):
+    def run(self, key, function: Callable, *, sorts: int = 0):
         """Replay the recording made under `key`, after recording `function` if there is none; returns its result.
 
-        Raises RuntimeError if the function cannot be recorded.
+        As record() otherwise.
         """
         if self._graph is None or key != self._key:
-            self.record(key, function)
+            self.record(key, function, sorts=sorts)
         return self.replay()
 
-    def record(self, key, function: Callable):
+    def record(self, key, function: Callable, *, sorts: int = 0):
         """Record `function` without playing it, in the place of any other recording; returns what will be its result.
 
+        sorts: the most pairs that it sorts at once; of rasterize() the capacity or the number of Gaussians.
         Raises RuntimeError if the function cannot be recorded.
         """
         self.invalidate()
+        with torch.cuda.stream(self.stream):
+            reserve(self.device, sorts)
         self._graph, self._result = self._record(function)
         self._key = key
         return self._result
@@ -76,8 +74,8 @@ class GraphRecorder:
     def _record(self, function: Callable):
         graph = torch.cuda.CUDAGraph()
         current = torch.cuda.current_stream(self.device)
-        self._stream.wait_stream(current)
-        with torch.cuda.stream(self._stream), torch_stream(self.device):
+        self.stream.wait_stream(current)
+        with torch.cuda.stream(self.stream), torch_stream(self.device):
             stream = wp.get_stream(wp.device_from_torch(self.device))
             graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
             wp.capture_begin(stream=stream, external=True)
@@ -92,5 +90,5 @@ class GraphRecorder:
                 raise
             wp.capture_end(stream=stream)
             graph.capture_end()
-        current.wait_stream(self._stream)
+        current.wait_stream(self.stream)
         return graph, result
