@@ -144,7 +144,7 @@ class Trainer:
         loss = total_loss(self.field, photo, view.target, self.config.loss, self._largest_truth)
         if isinstance(self.field.response, RefinedResponse) and self.field.response.refining:
             loss = loss + self.config.response.refine_weight * self.field.response.penalty()
-        self._differentiate(loss, photo.rendering.means2d if watched else None)
+        loss.backward()
         nonfinite, skipped = guarded_step(self.optimizer, loss, photo.rendering.overflow)
         if watched:
             weights = None
@@ -158,15 +158,6 @@ class Trainer:
         else:
             self._incomplete += photo.rendering.overflow
         return loss.detach(), photo.encoded.detach(), view.target.encoded
-
-    def _differentiate(self, loss: Tensor, means2d: Tensor | None) -> None:
-        """Sets the gradients of the optimizer's parameters and of means2d. Not by backward(), whose last nodes belong to
-        the stream that first used a parameter: a recording on another one would have to wait for it, and cannot."""
-        wanted = [p for group in self.optimizer.param_groups for p in group["params"] if p.requires_grad]
-        if means2d is not None:
-            wanted.append(means2d)
-        for tensor, gradient in zip(wanted, torch.autograd.grad(loss, wanted, allow_unused=True), strict=True):
-            tensor.grad = gradient
 
     def _hold_response(self) -> bool:
         """Whether the response is corrected in this step; before response.refine_after its gradient is held back."""
@@ -204,6 +195,7 @@ class Trainer:
             return self._recorder.run(
                 kind,
                 lambda: self._optimise(views.at(self._index), watched, capacity),
+                sorts=max(capacity, self.field.gaussians.count),
             )
         except (RuntimeError, OutOfMemory) as error:
             # Nothing of the step was done yet. Launching every step is slower, and right.
