@@ -31,7 +31,7 @@ _HOMES = {
     "InputError": "errors",
 }
 
-__all__ = sorted(_HOMES)
+__all__ = sorted(_HOMES)  # noqa: PLE0605
 
 
 def __getattr__(name: str):

@@ -5,7 +5,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from functools import partial
 
 import pytest
 
@@ -285,10 +284,11 @@ def test_read_only_place(trained, tmp_path, capfd):
 
 
 def start(*arguments) -> subprocess.Popen:
-    command = [sys.executable, "-m", "sehdr_warp", *(str(argument) for argument in arguments)]
     # Tests that run in a shell's background have SIGINT ignored, and children inherit that.
-    listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    return subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, preexec_fn=listen)
+    code = "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    code += "runpy.run_module('sehdr_warp', run_name='__main__')"
+    command = [sys.executable, "-c", code, *(str(argument) for argument in arguments)]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
 
 
 def wait_for(process: subprocess.Popen, words: str) -> None:

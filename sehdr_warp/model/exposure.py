@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from fractions import Fraction
 from functools import lru_cache
+from itertools import pairwise
 
 import torch
 
@@ -39,7 +40,7 @@ def exposure_times(base_time: float, spec: str | Sequence[str | float] = PAPER_B
     times = sorted(_bracket_time(base_time, item) for item in items)
     if not times:
         raise SehdrError("exposures: the list is empty; give at least one, such as 'base'")
-    for first, second in zip(times, times[1:], strict=False):
+    for first, second in pairwise(times):
         if second <= first * (1 + 1e-9):
             raise SehdrError(f"exposures: {first:.6g} s occurs twice in {spec!r}; leave one out")
     return tuple(times)

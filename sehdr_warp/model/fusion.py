@@ -8,6 +8,7 @@ number; gradients reach the MLPs, the sigmas and the radiances through the table
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import nn
@@ -147,7 +148,7 @@ def _channel_layers(sizes: list[int], seed: int) -> tuple[nn.ParameterList, nn.P
     def uniform(*shape, bound):
         return nn.Parameter((2.0 * torch.rand(*shape, generator=generator) - 1.0) * bound)
 
-    pairs = list(zip(sizes[:-1], sizes[1:], strict=True))
+    pairs = list(pairwise(sizes))
     weights = nn.ParameterList([uniform(3, a, b, bound=a**-0.5) for a, b in pairs])
     biases = nn.ParameterList([uniform(3, 1, b, bound=a**-0.5) for a, b in pairs])
     return weights, biases

@@ -3,6 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -36,7 +37,7 @@ class Response(ABC):
     peak: float
     clip_exposure: float
     notes: tuple[str, ...] = ()
-    _kinds: dict[str, type["Response"]] = {}
+    _kinds: ClassVar[dict[str, type["Response"]]] = {}
 
     def __init_subclass__(cls, *, kind: str | None = None, **options):
         super().__init_subclass__(**options)

@@ -151,7 +151,9 @@ def _check(exposures: np.ndarray, values: np.ndarray, source: str):
     steps = np.diff(np.unique(np.concatenate([[0.0], exposures])))
     if exposures.max() > 1e30 or len(steps) and steps.min() < 1e-30:
         worst = exposures.max() if exposures.max() > 1e30 else steps.min()
-        raise InputError(source, f"exposures of {worst:.3g} apart cannot be computed with", "divide them by the largest")
+        raise InputError(
+            source, f"exposures of {worst:.3g} apart cannot be computed with", "divide them by the largest"
+        )
     if values.min() < 0 or values.max() > 1:
         worst = values.max() if values.max() > 1 else values.min()
         raise InputError(source, f"value {worst:.6g} is outside [0, 1]", "divide codes by the largest, 255 or 65535")

@@ -5,7 +5,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -98,7 +100,7 @@ def bracket_exposures(
             raise SehdrError(f"{field}: {value:g} is outside {_SHORTEST:g} to {_LONGEST:g} seconds")
         made.append(Exposure(time, value if field == "evs" else math.log2(value / base_time)))
     made.sort(key=lambda exposure: exposure.time)
-    for first, second in zip(made, made[1:], strict=False):
+    for first, second in pairwise(made):
         if first.time == second.time:
             raise SehdrError(f"{field}: {first.ev if field == 'evs' else first.time:g} is given twice")
     return tuple(made)
@@ -161,7 +163,7 @@ class BracketFolder:
         self._overwrite = overwrite
         self._views: list[dict] = []
 
-    def __enter__(self) -> "BracketFolder":
+    def __enter__(self) -> Self:
         with ExitStack() as stack:
             self._manifest = stack.enter_context(atomic_path(self.out / "brackets.json", self._overwrite))
             self._folder = stack.enter_context(atomic_folder(self.out / "brackets", self._overwrite))

@@ -93,7 +93,8 @@ def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
             colors = colors / 255 if np.issubdtype(colors.dtype, np.integer) else colors
         else:
             colors = np.full(points.shape, 0.5)
-    except Exception as error:
+    # plyfile has no exception of its own for what damaged files do to it.
+    except Exception as error:  # noqa: BLE001
         raise InputError(path, f"cannot be read as PLY points ({error!r:.120})", "export the points again") from None
     return _checked_points(points, np.clip(colors, 0, 1).astype(np.float32), path)
 

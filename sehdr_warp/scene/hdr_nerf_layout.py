@@ -11,7 +11,6 @@ from PIL import Image
 
 from .camera import Camera
 
-
 DERIVED_PHOTOS = "reinhard-gamma"
 """What a set without photos of its own states as `photo_response`: load_scene makes them of the truth by this curve."""
 

@@ -9,7 +9,6 @@ from PIL import Image
 
 from ..errors import InputError
 from ..quiet import silent_stderr
-
 from .radiance import radiance_size, read_radiance
 
 # Far above any single camera frame (the largest medium-format backs give 151 megapixels) and far below what would
@@ -172,8 +171,6 @@ def _exr_window(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[tuple[int, in
         if size[0] * size[1] > MOST_PIXELS_PER_BYTE * stored:
             raise InputError(path, f"states {size[0]} x {size[1]} pixels, but has only {stored} bytes", _DAMAGED)
     return windows[0][0], sizes[0]
-
-
 
 
 def _require_file(path: Path) -> None:

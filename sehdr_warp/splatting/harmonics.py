@@ -46,9 +46,7 @@ def _check(constant, rest, means, camera_position) -> None:
         if tuple(tensor.shape) != shape:
             raise ValueError(f"shape {tuple(tensor.shape)} of {name}, expected {shape}")
         if tensor.dtype != means.dtype or tensor.device != means.device:
-            raise ValueError(
-                f"{name}: {tensor.dtype} on {tensor.device}, but means is {means.dtype} on {means.device}"
-            )
+            raise ValueError(f"{name}: {tensor.dtype} on {tensor.device}, but means is {means.dtype} on {means.device}")
 
 
 @differentiable

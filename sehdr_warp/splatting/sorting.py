@@ -24,7 +24,9 @@ def sort_pairs(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int |
     if keys.device.type == "cuda" and torch.cuda.is_current_stream_capturing():
         room = _reserved.get(_stream_key(keys.device), 0)
         if count > room:
-            raise RuntimeError(f"a recording that sorts {count} pairs has room for {room}: record it with sorts={count}")
+            raise RuntimeError(
+                f"a recording that sorts {count} pairs has room for {room}: record it with sorts={count}"
+            )
     with torch_stream(keys.device):
         wp.utils.radix_sort_pairs(wp.from_torch(keys), wp.from_torch(values), count, end_bit=bits)
 

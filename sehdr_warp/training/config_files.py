@@ -112,7 +112,9 @@ def _locate(preset: str | Path, beside: Path | None = None) -> Path:
     except (OSError, ValueError):  # A name that no file can have.
         found = False
     if not found:
-        raise InputError(str(preset)[:200], "no such preset or file", f"use one of {', '.join(preset_names())}, or a TOML file")
+        raise InputError(
+            str(preset)[:200], "no such preset or file", f"use one of {', '.join(preset_names())}, or a TOML file"
+        )
     return path
 
 

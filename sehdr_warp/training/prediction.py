@@ -144,7 +144,7 @@ def _through_network(network: Callable, path: Path, view: View) -> np.ndarray:
     try:
         output = network(encoded)
     # Whatever a network raises, a user wants to know which network and which view.
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001
         reason = (str(error).strip().splitlines() or [repr(error)])[-1]
         raise InputError(
             path, f"fails on view {view.name}, {_shown(view.image.shape)} ({reason:.200})", remedy
@@ -185,7 +185,7 @@ def _onnx(path: Path) -> Callable:
     try:
         session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     # onnxruntime's own exceptions have no common base but this.
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001
         reason = (str(error).strip().splitlines() or [repr(error)])[0]
         raise InputError(path, f"is not a usable ONNX network ({reason:.200})", "export it again") from None
     name = session.get_inputs()[0].name

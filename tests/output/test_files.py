@@ -66,9 +66,13 @@ def test_failure_leaves_nothing_new_and_keeps_the_old(tmp_path, error):
 
 
 def test_full_disk_is_one_line(tmp_path):
-    with pytest.raises(SehdrError, match=r"big.bin: cannot be written \(.*\); free space") as caught, full_disk():
-        with atomic_path(tmp_path / "big.bin") as temporary:
-            temporary.write_bytes(bytes(1 << 20))
+    line = r"big.bin: cannot be written \(.*\); free space"
+    with (
+        pytest.raises(SehdrError, match=line) as caught,
+        full_disk(),
+        atomic_path(tmp_path / "big.bin") as temporary,
+    ):
+        temporary.write_bytes(bytes(1 << 20))
     assert "\n" not in str(caught.value)
     assert listing(tmp_path) == []
 
@@ -128,7 +132,7 @@ def killed(code, folder):
     """Runs code in a process that is killed where it says so; the names it left."""
     head = "import os, signal; from pathlib import Path; from sehdr_warp.output import files\n"
     die = "def die(*_, **__): os.kill(os.getpid(), signal.SIGKILL)\n"
-    result = subprocess.run([sys.executable, "-c", head + die + code], cwd=folder, timeout=60)
+    result = subprocess.run([sys.executable, "-c", head + die + code], cwd=folder, timeout=60, check=False)
     assert result.returncode == -signal.SIGKILL
     return sorted(os.listdir(folder))
 

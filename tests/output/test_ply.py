@@ -166,7 +166,10 @@ def test_bake_follows_the_cameras_where_harmonics_cannot_hold_all():
     start = gaussians(200, color_model="log")
     positions = np.array([[x, y, -8.0] for x in (-1, 0, 1) for y in (-1, 0, 1)])
     encode = GammaResponse().encode
-    wanted = lambda radiance: encode(radiance * 4)  # noqa: E731
+
+    def wanted(radiance):
+        return encode(radiance * 4)
+
     seen = start.means[:, None] - positions
     seen /= np.linalg.norm(seen, axis=2, keepdims=True)
     target = wanted(evaluate_colors(start, seen))

@@ -1,4 +1,5 @@
 import json
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -156,7 +157,7 @@ def test_interpolation_passes_through_its_cameras():
     assert len(path) == 41
     for i, view in enumerate(given):
         np.testing.assert_allclose(path[10 * i].world_to_camera, view.world_to_camera, atol=1e-6)
-    turns = [np.linalg.norm(a.world_to_camera - b.world_to_camera) for a, b in zip(path, path[1:], strict=False)]
+    turns = [np.linalg.norm(a.world_to_camera - b.world_to_camera) for a, b in pairwise(path)]
     assert max(turns) < 1.5 * min(turns)
     repeated = interpolate([given[0], given[0], given[1]], 3)
     np.testing.assert_allclose(repeated[2].world_to_camera, given[1].world_to_camera, atol=1e-9)

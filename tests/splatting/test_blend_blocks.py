@@ -58,8 +58,14 @@ def test_block_kernels_match_the_reference(fibers, dtype, channels, deterministi
 
     def forward():
         return blend(
-            *inputs, features, lists=lists, width=scene.width, height=scene.height, alpha_threshold=threshold,
-            block_kernels=True, style=BlendStyle(deterministic=deterministic),
+            *inputs,
+            features,
+            lists=lists,
+            width=scene.width,
+            height=scene.height,
+            alpha_threshold=threshold,
+            block_kernels=True,
+            style=BlendStyle(deterministic=deterministic),
         )
 
     image, alpha = fibers(forward)

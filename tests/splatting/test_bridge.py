@@ -65,7 +65,7 @@ def test_only_one_output_used(device):
 
 
 def test_memory_is_shared_not_copied(device):
-    values, gain = leaves(device)
+    values, _ = leaves(device)
     seen = []
 
     @differentiable
@@ -82,7 +82,7 @@ def test_memory_is_shared_not_copied(device):
 
 def test_the_gradient_that_torch_hands_in_is_left_alone(device):
     values, gain = leaves(device)
-    scaled, squared = scale_and_square(values, gain)
+    scaled, _ = scale_and_square(values, gain)
     scaled.retain_grad()
     (3.0 * scaled).sum().backward()
     torch.testing.assert_close(scaled.grad, torch.full_like(scaled, 3.0))

@@ -70,9 +70,7 @@ def test_gradients_match_finite_differences(device, degree, which):
 def test_pair_of_coefficient_tensors_gives_the_same(device):
     coefficients, means, camera = (t.to(device) for t in inputs())
     pair = (coefficients[:, :1], coefficients[:, 1:])
-    assert torch.equal(
-        spherical_harmonics(2, pair, means, camera), spherical_harmonics(2, coefficients, means, camera)
-    )
+    assert torch.equal(spherical_harmonics(2, pair, means, camera), spherical_harmonics(2, coefficients, means, camera))
 
 
 def test_a_gaussian_at_the_camera_has_its_constant_colour(device):
