@@ -82,8 +82,8 @@ class Scale(Output):
     """What is varied, separated by commas."""
     peers: bool = False
     """Also measure gsplat at nine channels, where it is installed and there is a GPU."""
-    steps: bool = True
-    """Also whole training steps, in the sweeps over Gaussians and pixels."""
+    no_steps: bool = False
+    """Leave out whole training steps, which the sweeps over Gaussians and pixels have."""
     repetitions: int = 30
     """Timed runs of each variant; slow ones have fewer on the CPU."""
     budget: float = 3.0
@@ -197,7 +197,7 @@ def _scale(asked: Scale, device) -> dict:
         parse_sweeps(asked.sweeps, device.type),
         device,
         peers=asked.peers,
-        steps=asked.steps,
+        steps=not asked.no_steps,
         repetitions=_positive("--repetitions", asked.repetitions),
         budget=_positive("--budget", asked.budget),
         progress=_say,
