@@ -17,6 +17,68 @@ def bias_correction(decay_log: float, step: float) -> float:
     return correction
 
 
+@wp.func
+def updated(
+    i: int,
+    gradients: wp.array(dtype=wp.float32),
+    step: float,
+    scale: float,
+    first_gain: float,
+    second_gain: float,
+    first_decay_log: float,
+    second_decay_log: float,
+    epsilon: float,
+    parameters: wp.array(dtype=wp.float32),
+    first_moments: wp.array(dtype=wp.float32),
+    second_moments: wp.array(dtype=wp.float32),
+):
+    """One step of number i."""
+    gradient = gradients[i]
+    first = first_moments[i] + first_gain * (gradient - first_moments[i])
+    second = second_moments[i] + second_gain * (gradient * gradient - second_moments[i])
+    first_moments[i] = first
+    second_moments[i] = second
+    deviation = wp.sqrt(second / bias_correction(second_decay_log, step)) + epsilon
+    parameters[i] = parameters[i] - scale / bias_correction(first_decay_log, step) * first / deviation
+
+
+@wp.kernel(module="unique", module_options={"enable_backward": False})
+def adam_update_visible(
+    gradients: wp.array(dtype=wp.float32),
+    step: wp.array(dtype=wp.float32),
+    rate: wp.array(dtype=wp.float32),
+    skipped: wp.array(dtype=wp.float32),
+    visible: wp.array(dtype=wp.bool),
+    row: int,
+    rate_factor: float,
+    first_gain: float,
+    second_gain: float,
+    first_decay_log: float,
+    second_decay_log: float,
+    epsilon: float,
+    parameters: wp.array(dtype=wp.float32),
+    first_moments: wp.array(dtype=wp.float32),
+    second_moments: wp.array(dtype=wp.float32),
+):
+    """adam_update of the rows of `row` numbers that are visible: of the others neither is read or written."""
+    i = wp.tid()
+    if skipped[0] == 0.0 and visible[i // row]:
+        updated(
+            i,
+            gradients,
+            step[0],
+            rate[0] * rate_factor,
+            first_gain,
+            second_gain,
+            first_decay_log,
+            second_decay_log,
+            epsilon,
+            parameters,
+            first_moments,
+            second_moments,
+        )
+
+
 @wp.kernel(module="unique", module_options={"enable_backward": False})
 def adam_update(
     gradients: wp.array(dtype=wp.float32),
@@ -40,11 +102,17 @@ def adam_update(
     """
     i = wp.tid()
     if skipped[0] == 0.0:
-        gradient = gradients[i]
-        first = first_moments[i] + first_gain * (gradient - first_moments[i])
-        second = second_moments[i] + second_gain * (gradient * gradient - second_moments[i])
-        first_moments[i] = first
-        second_moments[i] = second
-        scale = rate[0] * rate_factor / bias_correction(first_decay_log, step[0])
-        deviation = wp.sqrt(second / bias_correction(second_decay_log, step[0])) + epsilon
-        parameters[i] = parameters[i] - scale * first / deviation
+        updated(
+            i,
+            gradients,
+            step[0],
+            rate[0] * rate_factor,
+            first_gain,
+            second_gain,
+            first_decay_log,
+            second_decay_log,
+            epsilon,
+            parameters,
+            first_moments,
+            second_moments,
+        )

@@ -47,7 +47,8 @@ class Photograph:
     """A differentiable simulated photo.
 
     encoded: [H, W, 3] encoded values, extended beyond [0, 1] as by Response.encode_extended.
-    exposure: [H, W, 3] of the HDR colour at the base time (I^h dt_1 of the paper); None with radiance "display".
+    exposure: [H, W, 3] of the HDR colour at the base time (I^h dt_1 of the paper); None with radiance "display", and
+        where neither it nor the photo was asked for.
     base: [H, W, 3] of the base colour at the base time (I^b); the same tensor as `exposure` without fusion.
     rendering: what the rasteriser knows: alpha, projected means, radii.
     light: [H, W, 3] exposure of this photo, which the response encoded; None where colours are encoded before they are
@@ -84,6 +85,8 @@ class RadianceField(nn.Module):
         kept positive; "display": encoded = max(SH(d) + 0.5, 0).
     tone_map: "pixel": f(sum of weighted x); "gaussian": sum of weighted f(x), as the paper composites.
     fusion: the paper's brackets and their fusion, at the same base time; without, the HDR colour is the base colour.
+    confidence: [N] in [0, 1] of a trained scene, how far its photos vouch for each Gaussian (model/confidence.py); None
+        where it was not measured.
     """
 
     def __init__(
@@ -109,6 +112,7 @@ class RadianceField(nn.Module):
         self.antialiased = antialiased
         self.low_pass = low_pass
         self.style = style
+        self.register_buffer("confidence", None, persistent=False)
 
     def photograph(
         self,
@@ -116,12 +120,13 @@ class RadianceField(nn.Module):
         exposure_time: float | Tensor,
         *,
         degree: int | None = None,
-        linear: bool = False,
+        also: frozenset[str] = frozenset(),
         capacity: int | None = None,
         presence: Tensor | None = None,
     ) -> Photograph:
-        """A photo of exposure_time seconds, harmonics up to `degree`; linear: also what a linear loss needs; capacity:
-        as rasterize() takes it; presence: [N] factors of the opacities."""
+        """A photo of exposure_time seconds, harmonics up to `degree`; also: which of "exposure" and "base" are
+        wanted, each a colour set more to render where the photo does not need it; capacity: as rasterize() takes it;
+        presence: [N] factors of the opacities."""
         ratio = exposure_time / self.base_time
         if self.radiance == "display":
             rendering = self._rasterize(
@@ -131,8 +136,9 @@ class RadianceField(nn.Module):
         base, fused = self._exposures(camera, degree)
         sets = {"fused": fused}
         if self.tone_map == "gaussian":
-            sets = {"encoded": self.response.encode_extended(fused * ratio)} | (sets if linear else {})
-        if linear and self.fusion is not None:
+            wanted = "exposure" in also or ("base" in also and self.fusion is None)
+            sets = {"encoded": self.response.encode_extended(fused * ratio)} | (sets if wanted else {})
+        if "base" in also and self.fusion is not None:
             sets["base"] = base
         features = torch.cat(list(sets.values()), dim=1) if len(sets) > 1 else next(iter(sets.values()))
         rendering = self._rasterize(camera, features, capacity, presence)
@@ -162,6 +168,27 @@ class RadianceField(nn.Module):
         tensors = CameraTensors.of(camera, self.gaussians.means.device)
         photo = self.photograph(tensors, exposure_time or self.base_time, degree=degree)
         return photo.encoded.clamp(0, 1)
+
+    @torch.no_grad()
+    def render_confidence(self, camera: Camera) -> Tensor | None:
+        """[H, W] in [0, 1]: the mean confidence of what a camera sees, weighted as the light is; 0 where alpha is not
+        above 0.001. None where it was not measured."""
+        if self.confidence is None:
+            return None
+        # As wide as a training's features, though one channel is meant: no further kernel is compiled.
+        features = self.confidence[:, None].expand(-1, 3).contiguous()
+        rendering = self._rasterize(CameraTensors.of(camera, features.device), features)
+        alpha = rendering.alpha
+        mean = (rendering.image[..., 0] / alpha.clamp_min(1e-3)).clamp(0, 1)
+        return torch.where(alpha > 1e-3, mean, torch.zeros_like(mean))
+
+    def weighted_sums(self, camera: CameraTensors, images: Tensor) -> Tensor:
+        """[N, C]: for each Gaussian the sum over a view's pixels of its blending weight times images [H, W, C]. Blending is
+        linear in the features, so this is the adjoint of a render."""
+        with torch.enable_grad():
+            features = images.new_zeros(self.gaussians.count, images.shape[2]).requires_grad_()
+            blended = self._rasterize(camera, features).image
+            return torch.autograd.grad(blended, features, images)[0]
 
     @torch.no_grad()
     def radiance_from(self, position: Tensor, *, degree: int | None = None) -> Tensor:

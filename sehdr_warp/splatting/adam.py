@@ -5,7 +5,7 @@ import math
 import torch
 import warp as wp
 
-from ..kernels.adam import adam_update
+from ..kernels.adam import adam_update, adam_update_visible
 from .arrays import view
 from .bridge import torch_stream
 
@@ -23,12 +23,14 @@ def adam_step(
     rate_factor: float,
     betas: tuple[float, float],
     epsilon: float,
+    visible: torch.Tensor | None = None,
 ) -> None:
     """Changes parameter and moments in place, or nothing where `skipped` is 1.
 
     parameter, gradient, first_moment, second_moment: contiguous float32 of one shape. step, rate, skipped: float32 of
     one element; step is the number of this step, from 1; rate times rate_factor is the learning rate. All on one
     device: nothing waits for it, so that the call can be part of a CUDA graph.
+    visible: [N] bool for a parameter [N, ...]: the other rows and their moments stay as they are.
     Raises ValueError for a tensor that is not contiguous float32 of the parameter's shape.
     """
     for name, tensor in {"gradient": gradient, "first moment": first_moment, "second moment": second_moment}.items():
@@ -38,16 +40,20 @@ def adam_step(
             )
     if not parameter.numel():
         return
+    if visible is not None and visible.shape != parameter.shape[:1]:
+        raise ValueError(f"visible has shape {tuple(visible.shape)}, expected {tuple(parameter.shape[:1])}")
     first_decay, second_decay = betas
+    rows = [] if visible is None else [view(visible), parameter.numel() // parameter.shape[0]]
     with torch_stream(parameter.device):
         wp.launch(
-            adam_update,
+            adam_update if visible is None else adam_update_visible,
             dim=parameter.numel(),
             inputs=[
                 view(gradient.view(-1)),
                 view(step.view(1)),
                 view(rate.view(1)),
                 view(skipped.view(1)),
+                *rows,
                 rate_factor,
                 1 - first_decay,
                 1 - second_decay,

@@ -206,6 +206,17 @@ class DensificationConfig:
         False, "gradient: weigh the gradients by what the response's slope takes from dark and bright Gaussians"
     )
     revised_opacity: bool = option(False, "gradient: a split keeps the opacity of the whole (Revising Densification)")
+    contribution: float = option(
+        0.0,
+        "those that add less than this many pixels' worth to every training photo are taken away at contribution_at",
+        low=0.0,
+        high=100.0,
+    )
+    contribution_at: tuple[int, ...] = option(
+        (5900, 8900, 11_900, 15_000, 20_000),
+        "iterations of that, before resets of the opacities rather than after",
+        low=1,
+    )
     growth: float = option(0.05, "relocation: the count grows by this part at each change", low=0.0, high=1.0)
     noise: float = option(5e5, "relocation: strength of the noise on the positions, in learning rates", low=0.0)
 
@@ -228,6 +239,9 @@ class OptimizerConfig:
         1.0, "all rates but the positions' fall to this part of theirs over decay_from to the end", above=0.0, high=1.0
     )
     decay_from: float = option(0.5, "part of the training after which they fall, exponentially", low=0.0, high=0.99)
+    visible_only: bool = option(
+        False, "a step changes only what is in its photo, with its moments; off: momentum also moves the unseen (Adam)"
+    )
 
 
 @dataclass(frozen=True)
@@ -237,6 +251,16 @@ class ScheduleConfig:
     iterations: int = option(30_000, "training steps; one photo each", low=1, high=10_000_000)
     stated_for: int = option(30_000, "the number of iterations for which all other iteration numbers are stated", low=1)
     harmonics_every: int = option(1000, "iterations between degrees of the harmonics; degree 0 first", low=1)
+    harmonics_on_demand: bool = option(
+        False, "a degree is stored and optimised from the iteration that adds it; off: all are from the start"
+    )
+    harmonics_gain: float = option(
+        0.0,
+        "decibels by which a degree must lower the loss over training photos after its first harmonics_every iterations; "
+        "with less it is taken out again, and no higher one is added; 0: none is",
+        low=0.0,
+        high=10.0,
+    )
     coarse_levels: int = option(0, "start with photos halved this often", low=0, high=4)
     coarse_every: int = option(1000, "iterations at each coarse level", low=1)
     evaluate_at: tuple[int, ...] = option(
@@ -246,8 +270,47 @@ class ScheduleConfig:
     )
     checkpoint_every: int = option(5000, "iterations between checkpoints; one is always written at the end", low=1)
     checkpoints_kept: int = option(1, "older checkpoints are deleted", low=1, high=1000)
+    early_stop: int = option(
+        0, "the training ends after this many looks in a row without early_stop_gain; 0: never", low=0, high=1000
+    )
+    early_stop_every: int = option(1000, "iterations between looks", low=1)
+    early_stop_gain: float = option(0.02, "decibels over the best look so far that count as a gain", low=0.0, high=10.0)
+    early_stop_on: str = option(
+        "held-in",
+        "held-in: the mean loss of the steps since the last look, as an amplitude; held-out: PSNR of the held-out photos, "
+        "which then are no fair test any more",
+        choices=("held-in", "held-out"),
+    )
     nonfinite_limit: int = option(
         20, "steps with a loss or gradient that is not finite are skipped; more than this stop the training", low=0
+    )
+
+
+DECISIONS = (
+    "response",
+    "brackets",
+    "linear-loss",
+    "harmonics",
+    "densification",
+    "resolution",
+    "background",
+    "iterations",
+    "early-stop",
+    "pruning",
+    "optimizer",
+    "confidence",
+)
+"""What a plan decides, in this order."""
+
+
+@dataclass(frozen=True)
+class PlanConfig:
+    """What is left out because the scene does not need it (docs/plan.md)."""
+
+    enabled: bool = option(False, "read the scene before the training and decide what it does not need")
+    decisions: tuple[str, ...] = option((), "which decisions are made; empty: all", choices=DECISIONS)
+    keep: tuple[str, ...] = option(
+        (), "fields that the plan leaves as they are, such as those given on the command line", nonempty=True
     )
 
 
@@ -262,6 +325,7 @@ class Config:
     densification: DensificationConfig = DensificationConfig()
     optimizer: OptimizerConfig = OptimizerConfig()
     schedule: ScheduleConfig = ScheduleConfig()
+    plan: PlanConfig = PlanConfig()
     seed: int = option(0, "of every random number in the training", low=0, high=2**62)
     deterministic: bool = option(
         False, "on a GPU, the same bits every time, for some speed and memory; a CPU always does"

@@ -50,6 +50,11 @@ def check_together(config: "Config") -> None:
         _check_learned(config)
     if config.response.refine:
         _check_refined(config)
+    if loss.harmonics_weight > 0 and config.schedule.harmonics_on_demand:
+        raise ConfigError(
+            f"loss.harmonics_weight = {loss.harmonics_weight} is a mean over all degrees, which "
+            "schedule.harmonics_on_demand = true does not hold"
+        )
     if config.optimizer.means_final > config.optimizer.means:
         raise ConfigError(f"optimizer.means_final = {config.optimizer.means_final} is greater than optimizer.means")
 

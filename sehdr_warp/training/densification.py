@@ -56,6 +56,9 @@ class Densification:
         """Changes the Gaussians where this iteration is one for it; True if any tensor was replaced by another."""
         return False
 
+    def keep(self, kept: Tensor) -> None:
+        """Forgets the Gaussians that are taken away elsewhere. kept: [N] bool."""
+
     def perturb(self, gaussians: Gaussians, means_rate: float, generator) -> None:
         """What happens to the positions after each step of the optimizer."""
 
@@ -110,6 +113,10 @@ class GradientDensification(Densification):
         if iteration < self.stop and iteration % self.reset_every == 0 and self.reset_every >= SHORTEST_RESET:
             self._reset_opacities(gaussians, optimizer)
         return changed
+
+    def keep(self, kept: Tensor) -> None:
+        if self.gradient_sum is not None:
+            self.gradient_sum, self.seen = self.gradient_sum[kept], self.seen[kept]
 
     @torch.no_grad()
     def _grow(self, gaussians: Gaussians, gradient: Tensor, optimizer, generator) -> None:

@@ -110,7 +110,7 @@ def make_field(scene: Scene, config: Config, response: Response, device: torch.d
     gaussians = Gaussians.from_points(
         torch.tensor(points, dtype=torch.float32),
         torch.tensor(dc, dtype=torch.float32),
-        config.model.harmonics_degree,
+        0 if config.schedule.harmonics_on_demand else config.model.harmonics_degree,
         opacity=config.model.initial_opacity,
         scale=config.model.initial_scale,
     )
@@ -180,7 +180,7 @@ def random_points(scene: Scene, config: Config, rng: np.random.Generator) -> tup
     views, count = scene.train_views, config.model.initial_count
     distance, found, total = focus_distance(views), [], 0
     for _ in range(8):
-        points = _points_on_rays(views, count, distance, rng)
+        points = points_on_rays(views, count, distance, rng)
         seen, mean = colours_in_views(points, views)
         found.append((points[seen >= 2], mean[seen >= 2]))
         total += len(found[-1][0])
@@ -225,7 +225,8 @@ def focus_distance(views: tuple[View, ...]) -> float:
     return float(np.median(ahead)) if np.median(ahead) > 0.2 * spread else max(2 * spread, 1e-3)
 
 
-def _points_on_rays(views, count: int, distance: float, rng: np.random.Generator) -> np.ndarray:
+def points_on_rays(views, count: int, distance: float, rng: np.random.Generator) -> np.ndarray:
+    """[N, 3] points in front of the cameras, uniform over views, pixels and inverse depth within DEPTH_RANGE distances."""
     near, far = (factor * distance for factor in DEPTH_RANGE)
     chosen = rng.integers(len(views), size=count)
     across, depth = rng.random((count, 2)), 1 / rng.uniform(1 / far, 1 / near, count)

@@ -164,6 +164,17 @@ def hdr_loss(photo: Photograph, target: Target, config: LossConfig, largest: flo
     return image_loss(*images, target.mask, config.form, config.ssim_weight)
 
 
+def needed_colours(config: LossConfig, has_truth: bool) -> frozenset[str]:
+    """What RadianceField.photograph must render besides the photo for total_loss of a view with or without HDR truth:
+    a colour set that nothing is compared with costs channels of every blend."""
+    wanted = set()
+    if config.hdr_weight > 0 and has_truth:
+        wanted.add("exposure")
+    if config.linear_weight > 0:
+        wanted |= {"base"} if config.hdr_truth and has_truth else {"base", "exposure"}
+    return frozenset(wanted)
+
+
 def total_loss(
     field: RadianceField, photo: Photograph, target: Target, config: LossConfig, largest_truth: float = 1.0
 ) -> Tensor:

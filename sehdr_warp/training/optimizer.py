@@ -19,11 +19,15 @@ class Adam(torch.optim.Adam):
     """torch's Adam with the steps of a GPU's parameters made by our kernel: the same numbers and the same state.
 
     found_inf: scalar tensor, 1 where the next step is to change nothing; the attribute of torch's gradient scaler.
+    visible: [N] bool, which Gaussians the next step changes, with their moments; None: all. That saves the memory
+        traffic of the others. It is not Adam: what is unseen keeps its momentum and is not moved by it.
     """
+
+    visible: Tensor | None = None
 
     def step(self) -> None:
         parameters = [p for group in self.param_groups for p in group["params"] if p.grad is not None]
-        if all(p.device.type == "cpu" for p in parameters):
+        if self.visible is None and all(p.device.type == "cpu" for p in parameters):
             super().step()
             return
         skipped = getattr(self, "found_inf", None)
@@ -41,6 +45,7 @@ class Adam(torch.optim.Adam):
         one = torch.ones_like(skipped)
         for group in self.param_groups:
             rate = group["lr"]
+            visible = self.visible if group["name"] in PARAMETER_NAMES else None
             for parameter in group["params"]:
                 if parameter.grad is None:
                     continue
@@ -56,6 +61,7 @@ class Adam(torch.optim.Adam):
                     rate_factor=1.0 if isinstance(rate, Tensor) else rate,
                     betas=group["betas"],
                     epsilon=group["eps"],
+                    visible=visible,
                 )
 
 

@@ -15,8 +15,10 @@ from ..splatting import GraphRecorder
 from ..splatting.memory import OutOfMemory
 from .config import Config
 from .densification import make_densification, slope_weights
+from .early_stop import EarlyStop
+from .heldout import evaluate_views
 from .initialization import scene_extent
-from .losses import total_loss
+from .losses import needed_colours, total_loss
 from .optimizer import (
     DECAY_EVERY,
     decay_rates,
@@ -28,6 +30,7 @@ from .optimizer import (
     set_means_rate,
 )
 from .targets import TrainingView, ViewStack, largest_truth, training_views
+from .thinning import contributing, degree_gain
 
 CHECK_EVERY = 20
 """Iterations between looks at the count of skipped steps, each of which waits for the device."""
@@ -67,12 +70,26 @@ class Trainer:
         self._pairs = 0
         self._last: tuple[Tensor, Tensor, Tensor] | None = None
         self._presence: Tensor | None = None
+        self._degree_limit = config.model.harmonics_degree
+        self._early_stop = EarlyStop(config)
+        self._held_out = scene.test_views
+        self._loss_sum = torch.zeros((), device=self.device)
+        stages = config.densification.contribution_at if config.densification.contribution > 0 else ()
+        self._thin_at = {config.scaled(stage) for stage in stages}
 
     @property
     def degree(self) -> int:
-        """The degree of the harmonics at this iteration: one more every harmonics_every iterations."""
-        every = self.config.scaled(self.config.schedule.harmonics_every)
-        return min(self.config.model.harmonics_degree, self.iteration // every)
+        """The degree of the harmonics at this iteration: one more every harmonics_every iterations, as long as they gain."""
+        return min(self._degree_limit, self.iteration // self._degree_every)
+
+    @property
+    def _degree_every(self) -> int:
+        return self.config.scaled(self.config.schedule.harmonics_every)
+
+    @property
+    def stopped_at(self) -> int | None:
+        """The iteration at which the training had nothing more to gain; None while it goes on."""
+        return self._early_stop.stopped_at
 
     @property
     def level(self) -> int:
@@ -103,6 +120,7 @@ class Trainer:
         views = self._training_views()
         index = self._next_index(len(views))
         gaussians = self.field.gaussians
+        self._choose_degree(views)
         watched = self.densification.needs_gradients(self.iteration)
         if watched:
             self.densification.prepare(gaussians.count, self.device)
@@ -120,6 +138,10 @@ class Trainer:
         count = gaussians.count
         if self.densification.change(self.iteration, gaussians, self.optimizer, self._generator):
             self._forget_recording(gaussians.count / max(1, count))
+        if self.iteration in self._thin_at:
+            self._thin(views)
+        if self._early_stop.is_due(self.iteration):
+            self._look()
         if self.iteration % CHECK_EVERY == 0:
             self.check()
 
@@ -130,12 +152,11 @@ class Trainer:
 
         With a capacity all of it works on fixed memory and nothing waits for the device.
         """
-        linear = self.config.loss.linear_weight > 0 or self.config.loss.hdr_weight > 0
         photo = self.field.photograph(
             view.camera,
             view.exposure_time,
             degree=self.degree,
-            linear=linear,
+            also=needed_colours(self.config.loss, view.target.exposure_truth is not None),
             capacity=capacity,
             presence=self._presence,
         )
@@ -145,6 +166,8 @@ class Trainer:
         if isinstance(self.field.response, RefinedResponse) and self.field.response.refining:
             loss = loss + self.config.response.refine_weight * self.field.response.penalty()
         loss.backward()
+        if self.config.optimizer.visible_only:
+            self.optimizer.visible = photo.rendering.visible
         nonfinite, skipped = guarded_step(self.optimizer, loss, photo.rendering.overflow)
         if watched:
             weights = None
@@ -153,6 +176,8 @@ class Trainer:
             self.densification.observe(photo.rendering, view.camera.width, view.camera.height, 1 - skipped, weights)
         self.optimizer.zero_grad(set_to_none=True)
         self._skipped += nonfinite
+        if self._early_stop.patience:
+            self._loss_sum += loss.detach()
         if capacity is None:
             self._pairs = max(self._pairs, photo.rendering.entry_count)
         else:
@@ -166,6 +191,42 @@ class Trainer:
             return False
         response.refining = self.iteration > (self.config.scaled(options.refine_after) if options.refine_after else 0)
         return response.refining
+
+    def _choose_degree(self, views: ViewStack | list[TrainingView]) -> None:
+        """Ends what the harmonics' last degree did not pay for, and makes room for those of this step."""
+        schedule, gaussians = self.config.schedule, self.field.gaussians
+        degree = (self.iteration - 1) // self._degree_every
+        judged = schedule.harmonics_gain > 0 and self.iteration % self._degree_every == 0
+        if judged and 0 < degree <= self._degree_limit:
+            gain = degree_gain(self.field, views, degree, self.config.loss, self._largest_truth)
+            if gain < schedule.harmonics_gain and gaussians.set_degree(degree - 1, self.optimizer):
+                self._degree_limit = degree - 1
+                self._forget_recording(1.0)
+        if schedule.harmonics_on_demand and gaussians.degree < self.degree:
+            gaussians.set_degree(self.degree, self.optimizer)
+            self._forget_recording(1.0)
+
+    def _thin(self, views: ViewStack | list[TrainingView]) -> None:
+        """Takes away the Gaussians that add nothing to any training photo."""
+        gaussians, count = self.field.gaussians, self.field.gaussians.count
+        kept = contributing(self.field, views, self.config.densification.contribution)
+        if bool(kept.all()):
+            return
+        with torch.no_grad():
+            gaussians.keep(kept, self.optimizer)
+        self.densification.keep(kept)
+        self._forget_recording(gaussians.count / count)
+
+    def _look(self) -> None:
+        """A look at the error, for the early stop; part of the training, and of its time."""
+        if self.config.schedule.early_stop_on == "held-out" and self._held_out:
+            scores = evaluate_views(self.field, self._held_out, self.degree)
+            figure = scores.get("psnr_ldr", math.nan)
+        else:
+            mean = float(self._loss_sum) / self._early_stop.every
+            figure = -20 * math.log10(mean) if mean > 0 else math.nan
+        self._loss_sum.zero_()
+        self._early_stop.look(self.iteration, figure)
 
     def _draw_presence(self) -> None:
         """Which Gaussians the next step leaves out, and how much the others stand in for them (DropGaussian, CVPR
@@ -235,7 +296,14 @@ class Trainer:
             "generators": {"order": self._order_generator.get_state(), "device": self._generator.get_state()},
         }
         tensors = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
-        return tensors, {"iteration": self.iteration, "order": list(self._order), "skipped_steps": self.skipped_steps}
+        values = {
+            "iteration": self.iteration,
+            "order": list(self._order),
+            "skipped_steps": self.skipped_steps,
+            "degree_limit": self._degree_limit,
+            "early_stop": self._early_stop.state() | {"loss_sum": float(self._loss_sum)},
+        }
+        return tensors, values
 
     def load_state(self, tensors: dict[str, Tensor], values: dict) -> None:
         """Takes up what state() gave; the field's Gaussians must already be those of the state."""
@@ -248,6 +316,10 @@ class Trainer:
         if self._generator.get_state().numel() == generators["device"].numel():
             self._generator.set_state(generators["device"].cpu())
         self.iteration = values["iteration"]
+        self._degree_limit = operator.index(values.get("degree_limit", self._degree_limit))
+        if looks := values.get("early_stop"):
+            self._early_stop.load_state(looks)
+            self._loss_sum.fill_(looks["loss_sum"])
         decay_rates(self.optimizer, self.config, self.iteration)
         self._order = [operator.index(place) for place in values["order"]]
         if not all(0 <= place < len(self._views) for place in self._order):

@@ -90,7 +90,7 @@ def test_brackets_share_one_rasterisation(tone_map, channels, monkeypatch):
         return original(*arguments, **options)
 
     monkeypatch.setattr(radiance_field, "rasterize", counted)
-    photo = photograph(wall(0.2, tone_map=tone_map, fusion=fusion_of()), linear=True)
+    photo = photograph(wall(0.2, tone_map=tone_map, fusion=fusion_of()), also=frozenset({"base", "exposure"}))
     assert calls == [channels]
     assert photo.encoded.shape == photo.exposure.shape == photo.base.shape == (24, 32, 3)
 
@@ -101,7 +101,7 @@ def test_fused_radiance_is_neefs():
     with torch.no_grad():
         expected = fusion(torch.full((1, 3), math.log(0.2)))[0]
     torch.testing.assert_close(field.radiance_from(torch.zeros(3))[0], expected)
-    photo = photograph(field, linear=True)
+    photo = photograph(field, also=frozenset({"base", "exposure"}))
     coverage = float(photo.rendering.alpha.detach()[12, 16])
     torch.testing.assert_close(photo.exposure.detach()[12, 16], expected * TIME * coverage, rtol=1e-4, atol=0)
     torch.testing.assert_close(photo.base.detach()[12, 16], torch.full((3,), 0.2 * coverage), rtol=1e-4, atol=0)

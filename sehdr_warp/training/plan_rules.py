@@ -1,0 +1,219 @@
+"""The rules of a plan: one function a decision, from the scene's figures and the config so far to fields and a reason."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from .config import Config
+from .plan_scene import SceneFacts
+
+PHOTOS_A_DEGREE = 2.0
+"""A degree is taken where a place is seen by this many photos for each of its harmonics' unknowns: with fewer they fit
+each photo by itself."""
+DEGREES_A_BAND = 45.0
+"""Harmonics of degree d tell directions apart that are some 180 / d degrees apart; cameras within a quarter of that see
+their constant and slope alone."""
+GEOMETRY_UNKNOWNS = 11
+"""Of a Gaussian besides its colour: place, sizes, rotation, opacity."""
+FEWEST_GAUSSIANS = 20_000
+"""A budget is never less: small photos of a room use as many."""
+COARSE_SIDE = 400
+"""Photos are halved for a start as long as their longer side is above this many pixels."""
+COARSE_PART = 0.05
+"""Part of a training that each halved level takes."""
+LEAST_SKY = 0.03
+"""Part of the pixels from which on a sky gets Gaussians of its own."""
+SKY_PART = 0.05
+"""Of the budget, for the sky."""
+PASSES = 400
+"""Steps on each photo. A second look at the same photos teaches less and less, and in the end their noise."""
+FEWEST_ITERATIONS = 3000
+LEAST_CONTRIBUTION = 0.1
+"""Pixels' worth in the photo that shows it best below which a Gaussian is taken away."""
+MOST_VISIBLE = 0.6
+"""Part of the Gaussians in a photo above which skipping the others saves little."""
+EARLY_STOP = 3
+"""Looks without gain."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """name: of config.DECISIONS. fields: dotted names of the config and their values. choice: in words; reason: with the
+    figures it rests on."""
+
+    name: str
+    fields: dict[str, object]
+    choice: str
+    reason: str
+
+
+def _response(facts: SceneFacts, config: Config) -> Decision:
+    if config.response.form == "mlp":
+        return Decision("response", {}, "learned", "response.form = mlp learns one with the scene: nothing to search")
+    if config.response.name != "auto":
+        return Decision("response", {}, "no search", f"{config.response.name} was named")
+    made = "a camera made the files" if facts.from_camera else "nothing says what made the files"
+    return Decision(
+        "response", {}, "search", f"no curve was named, and {made}: it is chosen from {facts.photos} photos"
+    )
+
+
+def _brackets(facts: SceneFacts, config: Config) -> Decision:
+    darker, brighter = (2 if facts.clipped < 0.001 else 4), (2 if facts.black < 0.001 else 4)
+    reason = (
+        f"{facts.clipped:.1%} of the pixels clip, {facts.black:.1%} are black: look at -{darker} to +{brighter} EV "
+        f"(render --evs=-{darker},0,{brighter}); all are scalings of one render, made at export"
+    )
+    if not config.fusion.enabled:
+        return Decision("brackets", {}, "plain scaling", reason)
+    fields: dict[str, object] = {"fusion.enabled": False}
+    if config.loss.linear_weight > 0 and not (config.loss.hdr_truth and facts.truths):
+        fields["loss.linear_weight"] = 0.0
+    count = len(config.fusion.exposures)
+    return Decision(
+        "brackets", fields, "plain scaling", f"{count} brackets of one base hold no light of their own; {reason}"
+    )
+
+
+def _linear_loss(facts: SceneFacts, config: Config) -> Decision:
+    if config.loss.linear_weight == 0:
+        return Decision("linear-loss", {}, "none", f"loss.linear_weight = 0; {facts.truths} photos have HDR truth")
+    if config.loss.hdr_truth and facts.truths:
+        return Decision("linear-loss", {}, "against truth", f"{facts.truths} of {facts.photos} photos have HDR truth")
+    return Decision(
+        "linear-loss",
+        {"loss.linear_weight": 0.0},
+        "none",
+        f"{facts.truths} of {facts.photos} photos have HDR truth: against its own brackets a base learns nothing",
+    )
+
+
+def _harmonics(facts: SceneFacts, config: Config) -> Decision:
+    by_photos = max(0, math.isqrt(int(facts.seen / PHOTOS_A_DEGREE)) - 1)
+    by_spread = max(1, round(facts.spread / DEGREES_A_BAND))
+    degree = min(config.model.harmonics_degree, by_photos, by_spread)
+    reason = (
+        f"a place is seen by {facts.seen:.1f} photos within {facts.spread:.0f} degrees: enough for degree {by_photos} by "
+        f"count, {by_spread} by angle"
+    )
+    fields = {"model.harmonics_degree": degree}
+    if config.loss.harmonics_weight == 0:
+        fields["schedule.harmonics_on_demand"] = True
+    return Decision("harmonics", fields, f"degree {degree}", reason)
+
+
+def _densification(facts: SceneFacts, config: Config) -> Decision:
+    unknowns = GEOMETRY_UNKNOWNS + 3 * (config.model.harmonics_degree + 1) ** 2
+    determined = 3 * facts.pixels // unknowns
+    budget = min(config.densification.max_gaussians, max(FEWEST_GAUSSIANS, determined, 2 * facts.points))
+    fields = {"densification.max_gaussians": budget}
+    if config.model.initial_count > budget // 2 and not facts.points:
+        fields["model.initial_count"] = max(100, budget // 2)
+    return Decision(
+        "densification",
+        fields,
+        f"{budget} Gaussians",
+        f"{3 * facts.pixels} numbers in {facts.photos} photos determine {determined} Gaussians of {unknowns} unknowns; "
+        f"{facts.points} points to start from",
+    )
+
+
+def _resolution(facts: SceneFacts, config: Config) -> Decision:
+    side = max(facts.width, facts.height)
+    levels = 0 if side <= COARSE_SIDE else min(2, math.ceil(math.log2(side / COARSE_SIDE)))
+    if config.response.form == "mlp":
+        return Decision("resolution", {}, "full size", "a learned response cannot average photos as light")
+    fields: dict[str, object] = {"schedule.coarse_levels": levels}
+    if levels:
+        fields["schedule.coarse_every"] = max(1, round(COARSE_PART * config.schedule.stated_for))
+    choice = f"{levels} coarse levels" if levels else "full size"
+    return Decision("resolution", fields, choice, f"the longer side has {side} pixels; halved from {COARSE_SIDE} up")
+
+
+def _background(facts: SceneFacts, config: Config) -> Decision:
+    count = config.model.far_points
+    if facts.sky >= LEAST_SKY and not count:
+        count = max(100, round(SKY_PART * min(config.densification.max_gaussians, 400_000)))
+    return Decision(
+        "background",
+        {"model.far_points": count},
+        f"{count} far points" if count else "none",
+        f"{facts.sky:.1%} of the pixels are bright, flat, without points, and reach the upper border",
+    )
+
+
+def _iterations(facts: SceneFacts, config: Config) -> Decision:
+    wanted = max(FEWEST_ITERATIONS, PASSES * facts.photos)
+    count = min(config.schedule.iterations, math.ceil(wanted / 100) * 100)
+    return Decision(
+        "iterations",
+        {"schedule.iterations": count},
+        f"{count}",
+        f"{PASSES} steps on each of {facts.photos} photos, no fewer than {FEWEST_ITERATIONS}, no more than the preset's "
+        f"{config.schedule.iterations}",
+    )
+
+
+def _early_stop(facts: SceneFacts, config: Config) -> Decision:
+    steps = config.scaled(config.schedule.early_stop_every)
+    if steps < facts.photos:
+        return Decision(
+            "early-stop",
+            {},
+            "off",
+            f"{steps} steps between looks are fewer than the {facts.photos} photos: their mean loss is of other photos",
+        )
+    return Decision(
+        "early-stop",
+        {"schedule.early_stop": EARLY_STOP, "schedule.early_stop_on": "held-in"},
+        f"{EARLY_STOP} looks",
+        f"a look every {steps} steps, {steps / facts.photos:.0f} passes over the photos; on training photos alone",
+    )
+
+
+def _pruning(facts: SceneFacts, config: Config) -> Decision:
+    stated = config.schedule.stated_for
+    stages = [max(1, round(part * stated)) for part in (0.29, 0.39, 0.5, 0.66)]
+    return Decision(
+        "pruning",
+        {"densification.contribution": LEAST_CONTRIBUTION, "densification.contribution_at": stages},
+        f"below {LEAST_CONTRIBUTION:g} pixels",
+        f"each of {len(stages)} times costs {facts.photos} renders; what adds less to every photo is not seen there",
+    )
+
+
+def _optimizer(facts: SceneFacts, config: Config) -> Decision:
+    only = facts.visible <= MOST_VISIBLE
+    return Decision(
+        "optimizer",
+        {"optimizer.visible_only": only},
+        "what is visible" if only else "all",
+        f"a photo's field of view holds {facts.visible:.0%} of the places; skipping the others pays up to {MOST_VISIBLE:.0%}",
+    )
+
+
+def _confidence(facts: SceneFacts, config: Config) -> Decision:
+    unsure = facts.clipped + facts.black
+    return Decision(
+        "confidence",
+        {},
+        "worth a look" if unsure >= 0.001 or facts.seen < 4 else "high throughout",
+        f"{unsure:.1%} of the pixels state a bound alone, and a place is seen by {facts.seen:.1f} photos",
+    )
+
+
+RULES: dict[str, Callable[[SceneFacts, Config], Decision]] = {
+    "response": _response,
+    "brackets": _brackets,
+    "linear-loss": _linear_loss,
+    "harmonics": _harmonics,
+    "densification": _densification,
+    "resolution": _resolution,
+    "background": _background,
+    "iterations": _iterations,
+    "early-stop": _early_stop,
+    "pruning": _pruning,
+    "optimizer": _optimizer,
+    "confidence": _confidence,
+}
+"""A rule for each of config.DECISIONS."""

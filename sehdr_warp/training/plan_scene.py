@@ -1,0 +1,151 @@
+"""What a plan rests on: a scene measured from its photos, cameras and points, before anything is trained."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..scene import Scene, View
+from ..scene.exposure import made_by_camera
+from .initialization import focus_distance, points_on_rays
+
+PROBES = 2000
+"""Places at which overlap, parallax and visibility are measured."""
+FEWEST_POINTS = 100
+"""With fewer sparse points places along the cameras' rays serve as probes."""
+CELL = 16
+"""Cells a photo is divided into, along its longer side, in the search for skies."""
+FLAT = 0.02
+"""Standard deviation of codes (of 1) within a cell, below which it shows no structure."""
+MOST_VIEWS = 64
+"""Photos that codes are read from, evenly spread; geometry is of all."""
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """Figures of a scene's training views; parts are of 1.
+
+    photos, held_out: views. width, height: of the largest photo, pixels. pixels: of all photos together.
+    exposure_times: how many differ. times_known: whether files state them. from_camera: whether a camera made the files.
+    truths: photos with HDR truth. points: sparse points.
+    seen: mean number of photos whose field of view holds a probe (what stands in the way is not known).
+    spread: degrees, the median over probes of the angle of the cone of directions they are seen from.
+    visible: mean part of the probes in a photo's field of view.
+    overlap: part of places along the cameras' rays that at least one other photo shows too.
+    clipped, black: part of the pixels with a channel at 255, with all channels at 0. contrast: standard deviation of all
+    codes. sky: part of the pixels in flat, bright cells without sparse points that reach the upper border.
+    """
+
+    photos: int
+    held_out: int
+    width: int
+    height: int
+    pixels: int
+    exposure_times: int
+    times_known: bool
+    from_camera: bool
+    truths: int
+    points: int
+    seen: float
+    spread: float
+    visible: float
+    overlap: float
+    clipped: float
+    black: float
+    contrast: float
+    sky: float
+
+
+def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
+    """The facts of a scene with at least one training view; takes a second or so, draws its probes from a seed."""
+    views = scene.train_views
+    rng = np.random.default_rng(seed)
+    drawn = points_on_rays(views, PROBES, focus_distance(views), rng)
+    probes = drawn
+    if len(scene.points) >= FEWEST_POINTS:
+        count = min(PROBES, len(scene.points))
+        probes = np.asarray(scene.points)[rng.choice(len(scene.points), count, replace=False)]
+    shown = visibility(probes, views)
+    codes = [view.image for view in views[:: -(-len(views) // MOST_VIEWS)]]
+    clipped, black = (
+        float(np.mean([np.mean(marked(image)) for image in codes]))
+        for marked in (lambda c: (c >= 254.5 / 255).any(2), lambda c: (c <= 0.5 / 255).all(2))
+    )
+    largest = max((view.camera for view in views), key=lambda camera: camera.width * camera.height)
+    return SceneFacts(
+        photos=len(views),
+        held_out=len(scene.test_views),
+        width=largest.width,
+        height=largest.height,
+        pixels=sum(view.camera.width * view.camera.height for view in views),
+        exposure_times=len({view.exposure_time for view in views}),
+        times_known=scene.exposure_times_known,
+        from_camera=made_by_camera([view.source for view in views]),
+        truths=sum(view.hdr is not None for view in views),
+        points=len(scene.points),
+        seen=_mean_where(shown.sum(0), shown.any(0)),
+        spread=_spread(probes, views, shown),
+        visible=float(shown.mean()),
+        overlap=float((visibility(drawn, views).sum(0) >= 2).mean()),
+        clipped=clipped,
+        black=black,
+        contrast=float(np.sqrt(np.mean([image.var() for image in codes]) + np.var([image.mean() for image in codes]))),
+        sky=_sky(scene),
+    )
+
+
+def visibility(points: np.ndarray, views: tuple[View, ...]) -> np.ndarray:
+    """[V, P] bool: whether a view's field of view holds a point [P, 3]; what stands in the way is not considered."""
+    shown = np.zeros((len(views), len(points)), bool)
+    for row, view in zip(shown, views, strict=True):
+        x, y, depth = _project(points, view)
+        row[:] = (depth > 0) & (x >= 0) & (x < view.camera.width) & (y >= 0) & (y < view.camera.height)
+    return shown
+
+
+def _project(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels x and y, and depth, of points [P, 3]; pixels are -1 behind the camera."""
+    camera = view.camera
+    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    depth = np.where(local[:, 2] > 1e-9, local[:, 2], np.nan)
+    with np.errstate(invalid="ignore"):
+        x, y = camera.fx * local[:, 0] / depth + camera.cx, camera.fy * local[:, 1] / depth + camera.cy
+    return tuple(np.nan_to_num(values, nan=-1.0) for values in (x, y, depth))
+
+
+def _mean_where(values: np.ndarray, chosen: np.ndarray) -> float:
+    return float(values[chosen].mean()) if chosen.any() else 0.0
+
+
+def _spread(probes: np.ndarray, views: tuple[View, ...], shown: np.ndarray) -> float:
+    """Twice the angle between a probe's mean direction to the cameras that show it and the farthest of them."""
+    positions = np.stack([view.camera.position for view in views])
+    directions = positions[:, None] - probes[None]
+    directions /= np.maximum(np.linalg.norm(directions, axis=2, keepdims=True), 1e-12)
+    mean = np.where(shown[..., None], directions, 0.0).sum(0)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    cosines = np.where(shown, (directions * mean[None]).sum(2), 1.0).min(0)
+    angles = 2 * np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    seen = shown.sum(0) >= 2
+    return float(np.median(angles[seen])) if seen.any() else 0.0
+
+
+def _sky(scene: Scene) -> float:
+    """Part of the pixels that may be sky: cells without structure, brighter than their photo's median, without sparse
+    points, joined to the upper border by such cells above them."""
+    if len(scene.points) < FEWEST_POINTS:
+        return 0.0
+    parts = []
+    for view in scene.train_views[:: -(-len(scene.train_views) // MOST_VIEWS)]:
+        grey = view.image.mean(2)
+        size = max(1, max(grey.shape) // CELL)
+        rows, columns = grey.shape[0] // size, grey.shape[1] // size
+        cells = grey[: rows * size, : columns * size].reshape(rows, size, columns, size).swapaxes(1, 2)
+        cells = cells.reshape(rows, columns, -1)
+        x, y, depth = _project(scene.points, view)
+        row, column = (y // size).astype(int), (x // size).astype(int)
+        inside = (depth > 0) & (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        empty = np.ones((rows, columns), bool)
+        empty[row[inside], column[inside]] = False
+        plain = empty & (cells.std(2) < FLAT) & (cells.mean(2) > np.median(grey))
+        parts.append(float(np.logical_and.accumulate(plain, axis=0).mean()))
+    return float(np.mean(parts))
