@@ -10,7 +10,7 @@ from ..output.files import atomic_path
 from .methods import METHODS, UPPER_BOUND
 from .quality_jobs import read_failure, read_job, read_result
 from .quality_plot import plot_error_over_time
-from .report import _table as markdown_table
+from .report import markdown_table
 
 RESULTS, TABLES, PLOT = "results.jsonl", "quality.md", "error-over-time-{}.png"
 _PROTOCOLS = ("gt-max", "self-max", "aligned")

@@ -11,12 +11,34 @@ from .plots import PLOTS
 SCHEMA = 1
 
 # Column title, field, format.
+_SIZE = (
+    ("Gaussians", "gaussians", ",d"),
+    ("width", "width", "d"),
+    ("height", "height", "d"),
+)
+_AGAINST_DEFAULT = (
+    ("median ms", "median_ms", ".3f"),
+    ("times the default", "times_default", ".2f"),
+    ("n", "repetitions", "d"),
+)
+_JUDGED = (
+    ("method", "method", "s"),
+    ("n", "trials", "d"),
+    ("mean stops", "mean_error", ".2f"),
+    ("worst", "worst_error", ".2f"),
+    ("under 0.35", "good", "d"),
+)
+_DECIBELS = (
+    ("gt-max dB", "gt_max_db", ".1f"),
+    ("known", "gt_max_known_db", ".1f"),
+    ("aligned dB", "aligned_db", ".1f"),
+    ("known", "aligned_known_db", ".1f"),
+)
+# Benchmark, stage, columns.
 COLUMNS = {
     "kernels": {
         "splat": (
-            ("Gaussians", "gaussians", ",d"),
-            ("width", "width", "d"),
-            ("height", "height", "d"),
+            *_SIZE,
             ("C", "channels", "d"),
             ("pass", "pass", "s"),
             ("implementation", "implementation", "s"),
@@ -28,9 +50,7 @@ COLUMNS = {
         ),
         "blend": (
             ("scene", "scene", "s"),
-            ("Gaussians", "gaussians", ",d"),
-            ("width", "width", "d"),
-            ("height", "height", "d"),
+            *_SIZE,
             ("C", "channels", "d"),
             ("pass", "pass", "s"),
             ("threads", "threads", "d"),
@@ -48,9 +68,7 @@ COLUMNS = {
     "step": {
         "step": (
             ("rasterizer", "implementation", "s"),
-            ("Gaussians", "gaussians", ",d"),
-            ("width", "width", "d"),
-            ("height", "height", "d"),
+            *_SIZE,
             ("median ms", "median_ms", ".3f"),
             ("mean ms", "mean_ms", ".3f"),
             ("with densification", "amortised_ms", ".3f"),
@@ -64,9 +82,7 @@ COLUMNS = {
     "scale": {
         "scale": (
             ("sweep", "sweep", "s"),
-            ("Gaussians", "gaussians", ",d"),
-            ("width", "width", "d"),
-            ("height", "height", "d"),
+            *_SIZE,
             ("C", "channels", "d"),
             ("implementation", "implementation", "s"),
             ("what", "what", "s"),
@@ -92,9 +108,7 @@ COLUMNS = {
             ("choice", "choice", "s"),
             ("value", "value", "s"),
             ("features", "features", "s"),
-            ("median ms", "median_ms", ".3f"),
-            ("times the default", "times_default", ".2f"),
-            ("n", "repetitions", "d"),
+            *_AGAINST_DEFAULT,
             ("image error", "image_error", ".1e"),
             ("99 % of pixels", "pixel_error_p99", ".1e"),
             ("gradient error", "gradient_error", ".1e"),
@@ -107,9 +121,7 @@ COLUMNS = {
             ("HDR PSNR dB", "psnr_hdr", ".2f"),
             ("LDR PSNR dB", "psnr_ldr", ".2f"),
             ("image error", "image_error", ".1e"),
-            ("median ms", "median_ms", ".3f"),
-            ("times the default", "times_default", ".2f"),
-            ("n", "repetitions", "d"),
+            *_AGAINST_DEFAULT,
         ),
     },
     "training": {
@@ -124,45 +136,21 @@ COLUMNS = {
     },
     "response": {
         "scenes": (
-            ("method", "method", "s"),
-            ("n", "trials", "d"),
-            ("mean stops", "mean_error", ".2f"),
-            ("worst", "worst_error", ".2f"),
-            ("under 0.35", "good", "d"),
-            ("gt-max dB", "gt_max_db", ".1f"),
-            ("known", "gt_max_known_db", ".1f"),
-            ("aligned dB", "aligned_db", ".1f"),
-            ("known", "aligned_known_db", ".1f"),
+            *_JUDGED,
+            *_DECIBELS,
         ),
         "scene": (
             ("data", "data", "s"),
             ("truth", "truth", "s"),
-            ("method", "method", "s"),
-            ("n", "trials", "d"),
-            ("mean stops", "mean_error", ".2f"),
-            ("worst", "worst_error", ".2f"),
-            ("under 0.35", "good", "d"),
-            ("gt-max dB", "gt_max_db", ".1f"),
-            ("known", "gt_max_known_db", ".1f"),
-            ("aligned dB", "aligned_db", ".1f"),
-            ("known", "aligned_known_db", ".1f"),
+            *_JUDGED,
+            *_DECIBELS,
             ("chosen", "chosen", "s"),
         ),
-        "stacks": (
-            ("method", "method", "s"),
-            ("n", "trials", "d"),
-            ("mean stops", "mean_error", ".2f"),
-            ("worst", "worst_error", ".2f"),
-            ("under 0.35", "good", "d"),
-        ),
+        "stacks": (*_JUDGED,),
         "stack": (
             ("data", "data", "s"),
             ("truth", "truth", "s"),
-            ("method", "method", "s"),
-            ("n", "trials", "d"),
-            ("mean stops", "mean_error", ".2f"),
-            ("worst", "worst_error", ".2f"),
-            ("under 0.35", "good", "d"),
+            *_JUDGED,
             ("chosen", "chosen", "s"),
         ),
     },
@@ -191,7 +179,9 @@ def format_report(report: dict) -> str:
         rows = [row for row in report["rows"] if row["stage"] == stage]
         if rows:
             shown = [column for column in columns if any(row.get(column[1]) is not None for row in rows)]
-            parts.append(_table([title for title, _, _ in shown], [[_cell(row, c) for c in shown] for row in rows]))
+            parts.append(
+                markdown_table([title for title, _, _ in shown], [[_cell(row, c) for c in shown] for row in rows])
+            )
     checks = report["checks"]
     if checks:
         failed = [check for check in checks if not check["passed"]]
@@ -249,7 +239,7 @@ def _cell(row: dict, column: tuple[str, str, str]) -> str:
     return f"{value:{form}}"
 
 
-def _table(titles: list[str], rows: list[list[str]]) -> str:
+def markdown_table(titles: list[str], rows: list[list[str]]) -> str:
     """Aligned Markdown: text columns to the left, numbers to the right."""
     widths = [max(len(line[k]) for line in [titles, *rows]) for k in range(len(titles))]
     text = [all(row[k][:1].isalpha() for row in rows) for k in range(len(titles))]

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from sehdr_warp.bench import scale
+from sehdr_warp.bench import commands, scale
 from sehdr_warp.bench.peer_gsplat import rasterize_with_gsplat
 from sehdr_warp.bench.peers import Peer
 from sehdr_warp.bench.report import format_report, write_report
@@ -119,3 +119,13 @@ def test_sweeps_are_named_and_ascend():
             assert varied == sorted(set(varied)) and len(varied) >= 4
     with pytest.raises(SehdrError, match="--sweeps pixel: 'pixel' is none"):
         parse_sweeps("pixel", "cpu")
+
+
+@pytest.mark.parametrize("no_steps", [False, True])
+def test_the_command_line_measures_steps_unless_told_not_to(no_steps, monkeypatch):
+    def measured(*_, steps, **__):
+        raise SehdrError(f"steps: {steps}")
+
+    monkeypatch.setattr(scale, "bench_scale", measured)
+    with pytest.raises(SehdrError, match=f"steps: {not no_steps}"):
+        commands.run_bench(commands.Bench(commands.Scale(no_steps=no_steps, device="cpu")))
