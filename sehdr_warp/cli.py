@@ -14,6 +14,7 @@ from . import __version__
 from .bench.commands import Bench, run_bench
 from .check.commands import Check, run_check
 from .errors import InputError, SehdrError
+from .quiet import silence_exit
 from .synth.commands import Synth, run_synth
 from .training.commands import Train, cache_beside, known_curves, run_train
 
@@ -117,6 +118,7 @@ def main(arguments: list[str] | None = None) -> None:
     # torch's OpenMP threads spin while they wait, which on a processor shared with other programs costs a training on
     # the CPU most of its time; read once, when torch is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    silence_exit()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if arguments[:1] == ["--version"]:
         print(f"sehdr-warp {__version__}")

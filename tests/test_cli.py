@@ -242,3 +242,15 @@ def test_export_writes_ply(run, tmp_path, kind, capsys):
 def test_report_writes_pictures(run, tmp_path, capsys):
     assert call("report", run, "--out", tmp_path / "report", "--device", "cpu") == 0
     assert len(list((tmp_path / "report").iterdir())) >= 2
+
+
+def test_libraries_are_silent_when_python_ends():
+    """OpenImageIO lists what Python still held of it, tens of lines."""
+    pytest.importorskip("OpenImageIO")
+    hold = "import sys, OpenImageIO; kept = OpenImageIO.TypeDesc('float'); "
+    code = hold + "from sehdr_warp.cli import main; main(['--version'])"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ended.stdout == f"sehdr-warp {__version__}\n" and ended.stderr == ""
+    code = hold + "from sehdr_warp.quiet import silence_exit; silence_exit(); sys.exit('what the program says last')"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ended.stderr == "what the program says last\n"
