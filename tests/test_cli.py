@@ -247,7 +247,8 @@ def test_report_writes_pictures(run, tmp_path, capsys):
 def test_libraries_are_silent_when_python_ends():
     """OpenImageIO lists what Python still held of it, tens of lines."""
     pytest.importorskip("OpenImageIO")
-    hold = "import sys, OpenImageIO; kept = OpenImageIO.TypeDesc('float'); "
+    hold = "import ctypes, sys, OpenImageIO; "
+    hold += "ctypes.pythonapi.Py_IncRef(ctypes.py_object(OpenImageIO.TypeDesc('float'))); "
     code = hold + "from sehdr_warp.cli import main; main(['--version'])"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ended.stdout == f"sehdr-warp {__version__}\n" and ended.stderr == ""
