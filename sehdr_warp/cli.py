@@ -173,11 +173,14 @@ def _evaluate(command: Evaluate) -> None:
     from .evaluation.evaluate import evaluate
     from .evaluation.table import format_table
     from .output.files import check_absent, write_json
+    from .training.confidence import ensure_confidence
 
     if command.json is not None:
         check_absent(command.json, command.overwrite)
     run = _load_run(command.run, command.device)
-    result = evaluate(run, _scene_of(run, command.data), lpips_weights=command.lpips, progress=_say)
+    scene = _scene_of(run, command.data)
+    ensure_confidence(run, scene, _say)
+    result = evaluate(run, scene, lpips_weights=command.lpips, progress=_say)
     if command.json is not None:
         write_json(command.json, result, command.overwrite)
     print(format_table(result))
@@ -192,9 +195,12 @@ def _export(command: Export) -> None:
 
 def _report(command: Report) -> None:
     from .output.report import write_report
+    from .training.confidence import ensure_confidence
 
     run = _load_run(command.run, command.device)
-    for path in write_report(run, _scene_of(run, command.data), command.out, overwrite=command.overwrite):
+    scene = _scene_of(run, command.data)
+    ensure_confidence(run, scene, _say)
+    for path in write_report(run, scene, command.out, overwrite=command.overwrite):
         print(path)
 
 

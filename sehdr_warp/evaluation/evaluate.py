@@ -12,6 +12,7 @@ from . import metrics
 from .flip import load_flip
 from .lpips import BACKBONE, SMALLEST_EDGE, load_lpips
 from .protocols import PROTOCOLS, fit_scale, normalise, tone_map, tone_mapped_psnr
+from .ranking import DARKEST_CODE, ErrorRanking
 
 # cd/m^2 at which the brightest value of a view's truth is shown for PU21: the peak of a common HDR display.
 PEAK_LUMINANCE = 1000.0
@@ -34,7 +35,8 @@ def evaluate(
 
     run: a sehdr_warp.training.Run, or anything with its `render(camera)` (an object with `.hdr`, [H, W, 3] scene-linear
         radiance on `device`), `render_ldr(camera, seconds)` ([H, W, 3] in [0, 1]), and the numbers `train_seconds`,
-        `gaussian_count` and `iterations`.
+        `gaussian_count` and `iterations`; where it has them, `render_confidence(camera)` ([H, W] in [0, 1], or None) and
+        `response` tell how well its confidence ranks its errors.
     scene: the views, at the exposure that was trained on. Without test views the training views are taken, and
         "split" says so.
     lpips_weights: folder, see load_lpips; protocols: names out of PROTOCOLS.
@@ -48,6 +50,8 @@ def evaluate(
         "pu21": {name: {"psnr", "ssim"}, "peak_luminance", "white_percentile"}
         "ldr": {"psnr", "ssim", "lpips"} of the simulated photo at the view's exposure time, unquantised, against the photo
         "regions": {region: {"fraction", "psnr_ldr", "psnr_mu": {name: dB}}}, errors pooled over all views
+        "confidence": {"spearman_log2", "spearman_mu": rank correlation of 1 - confidence with the error; "mean",
+            "pixels", "scale"}, see ranking.py
         "views": the same for each view; and "split", "lpips_backbone", "train_seconds", "gaussians", "iterations"
     Means are over views. What cannot be computed is null with "reason" (or "lpips_reason") beside it. A view's mask
     applies to everything: outside it the prediction is taken to be right, and nothing there is averaged; a view whose
@@ -76,6 +80,7 @@ class _Evaluation:
         self.with_flip = flip
         self.flip, self.flip_reason = load_flip() if flip else (None, None)
         self.regions = {region: _RegionErrors(self.names) for region in metrics.REGIONS}
+        self.ranking = ErrorRanking()
 
     def result(self, progress) -> dict:
         scale, scale_reason = self._scale(progress)
@@ -109,6 +114,7 @@ class _Evaluation:
             "pu21": pu21 | self.pu21_mapping,
             "ldr": ldr,
             "regions": {region: errors.result(self.names, missing) for region, errors in self.regions.items()},
+            "confidence": self.ranking.result() | ({"reason": missing} if missing else {}),
             "views": rows,
             "lpips_backbone": BACKBONE if self.lpips else None,
             "train_seconds": self.run.train_seconds,
@@ -159,6 +165,7 @@ class _Evaluation:
             self.regions[region].add_ldr(encoded, photo, weight, counted)
         if truth is None:
             return row
+        self._rank(view, hdr, truth, regions["well-exposed"], mask)
         for name in self.names:
             if name == "aligned" and scale is None:
                 continue
@@ -178,6 +185,15 @@ class _Evaluation:
             for region, weight in weights.items():
                 self.regions[region].add_hdr(name, *pair, weight)
         return row
+
+    def _rank(self, view: View, prediction, truth, well_exposed, mask) -> None:
+        """Sets the confidence of a view beside its errors, if the run knows its confidence."""
+        render = getattr(self.run, "render_confidence", None)
+        confidence = render(view.camera) if render else None
+        if confidence is not None:
+            black = self.run.response.decode(truth.new_full((1, 3), DARKEST_CODE))
+            darkest = float(black.mean()) / view.exposure_time
+            self.ranking.add(confidence, prediction, truth, well_exposed, darkest, mask)
 
     def _ldr(self, encoded, photo, mask) -> dict:
         return {

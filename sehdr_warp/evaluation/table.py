@@ -22,6 +22,10 @@ def format_table(result: dict) -> str:
         values = [figures["psnr_ldr"], *(figures["psnr_mu"][name] for name in names)]
         text = "".join(_number(value, width, 2) for value, width in zip(values, [9] + [10] * len(names)))
         lines.append(f"{region:<22}{figures['fraction']:>8.1%}{text}")
+    ranking = result["confidence"]
+    if ranking["spearman_log2"] is not None:
+        lines += ["", f"confidence ranks errors: {ranking['spearman_log2']:.2f} (log2), {ranking['spearman_mu']:.2f} (mu-law); "
+                  f"mean confidence {ranking['mean']:.2f}"]  # fmt: skip
     lines += ["", *_notes(result)]
     return "\n".join(lines)
 

@@ -37,6 +37,9 @@ class RenderableRun(Protocol):
     def render(self, camera: Camera):
         """hdr [H, W, 3] scene-linear radiance, alpha [H, W], depth [H, W]."""
 
+    def render_confidence(self, camera: Camera):
+        """[H, W] in [0, 1], how far the photos vouch for what is seen; None where that was not measured."""
+
 
 def render_views(
     run: RenderableRun,
@@ -55,8 +58,8 @@ def render_views(
 ) -> list[Path]:
     """Renders views of a run into `out`; returns the files written.
 
-    Always: `hdr/<view>.exr` (R, G, B scene-linear radiance; A coverage; Z distance along the axis, 0 where empty) and
-    `preview/<view>.png` (tone-mapped, sRGB). With evs or exposures: brackets, see output/brackets.py; ldr_brackets
+    Always: `hdr/<view>.exr` (R, G, B scene-linear radiance; A coverage; Z distance along the axis, 0 where empty;
+    confidence, if the run has it) and `preview/<view>.png` (tone-mapped, sRGB). With evs or exposures: brackets, see output/brackets.py; ldr_brackets
     ("jpeg", "png" or "png16") adds simulated photos through the run's response.
 
     cameras: "train", "test", "all", "orbit", "interpolate", or a JSON file. count: views of an orbit or interpolation.
@@ -91,8 +94,15 @@ def render_views(
         tone_map = fit_run_tone_map(run, [camera for _, camera in views])
         for index, (name, camera) in enumerate(views, start=1):
             rendered = run.render(camera)
-            hdr, alpha, depth = _array(rendered.hdr), _array(rendered.alpha), _array(rendered.depth)
-            stored = {_write_hdr(hdr_folder / f"{name}.exr", hdr, alpha, depth, camera, options)}
+            hdr, layers = _array(rendered.hdr), {"A": _array(rendered.alpha), "Z": _array(rendered.depth)}
+            confidence = run.render_confidence(camera)
+            if confidence is not None:
+                layers["confidence"] = _array(confidence)
+            elif index == 1:
+                say(
+                    "without a confidence channel: the run has none yet; `sehdr-warp report` measures it from the photos"
+                )
+            stored = {_write_hdr(hdr_folder / f"{name}.exr", hdr, layers, camera, options)}
             write_png(preview_folder / f"{name}.png", quantize(tone_map(hdr)))
             if brackets is not None:
                 stored.add(brackets.add(name, hdr, camera))
@@ -143,7 +153,7 @@ def fit_run_tone_map(run: RenderableRun, cameras: Sequence[Camera]) -> ToneMap:
     return fit_tone_map([_array(run.render(_small(camera)).hdr) for camera in chosen])
 
 
-def _write_hdr(path: Path, hdr, alpha, depth, camera: Camera, options: BracketOptions) -> str:
+def _write_hdr(path: Path, hdr, layers: dict, camera: Camera, options: BracketOptions) -> str:
     linear = from_rec709(hdr, options.colorspace)
     header = exr_header(
         colorspace=options.colorspace,
@@ -152,7 +162,7 @@ def _write_hdr(path: Path, hdr, alpha, depth, camera: Camera, options: BracketOp
         captured=options.captured,
         provenance={**options.provenance, "view": path.stem, "baseExposureTime": repr(options.base_time)},
     )
-    channels = dict(zip("RGB", np.moveaxis(linear, 2, 0), strict=True)) | {"A": alpha, "Z": depth}
+    channels = dict(zip("RGB", np.moveaxis(linear, 2, 0), strict=True)) | layers
     return write_exr(path, channels, pixel=options.pixel, header=header)
 
 

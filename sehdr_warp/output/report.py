@@ -40,6 +40,7 @@ class Comparison:
 
     name: of the view. photo: [H, W, 3] encoded, in [0, 1]. from_photo: [H, W, 3] the radiance that the photo alone
     gives, its response undone. hdr: [H, W, 3] rendered radiance. truth: [H, W, 3] true radiance; None without.
+    confidence: [H, W] in [0, 1] of the render; None where the run's was not measured.
     """
 
     name: str
@@ -47,16 +48,18 @@ class Comparison:
     from_photo: np.ndarray
     hdr: np.ndarray
     truth: np.ndarray | None = None
+    confidence: np.ndarray | None = None
 
 
 def write_report(run, scene: Scene, out: Path | str, *, view_count: int = 3, overwrite: bool = False) -> list[Path]:
     """Renders some held-out views and writes the report's pictures; returns their paths.
 
     `comparison.png`: held-out photo, tone-mapped HDR and truth (where the scene has it), one row a view.
-    `stops.png`: one view from -4 to +4 stops: the photo alone, the HDR scene, the truth.
+    `stops.png`: one view as photographed and from -4 to +4 stops: the photo alone, the HDR scene with its confidence, the
+    truth.
     `training.png`: held-out error against training time, from `RUN/metrics.jsonl`; left out where that has no lines.
 
-    run: a trained run (render, response, exposure_time, path). view_count: rows of the comparison, evenly chosen.
+    run: a trained run (render, render_confidence, response, exposure_time, path). view_count: rows of the comparison, evenly chosen.
     Without test views the training views are shown, and captions say so.
     Raises InputError where a picture exists (unless overwrite), SehdrError for a scene without views.
     """
@@ -106,18 +109,24 @@ def comparison_figure(comparisons: Sequence[Comparison], caption: str, *, held_o
 
 
 def stops_figure(comparison: Comparison, exposure_time: float, stops: Sequence[float] = STOPS):
-    """A matplotlib Figure: one view at several exposures, as radiance on a plain sRGB display.
+    """A matplotlib Figure: one view at several exposures, as radiance on a plain sRGB display: no tone map.
 
-    The first row re-exposes the photo alone: what it clipped stays white or black. exposure_time: seconds at 0 EV.
+    The first row holds the photo as it is and re-exposed alone: what it clipped stays white or black. Beside the HDR scene
+    stands its confidence, where there is one, as grey. exposure_time: seconds at 0 EV.
     """
     sources = {"Photo alone": comparison.from_photo, "HDR scene": comparison.hdr, "Truth": comparison.truth}
     sources = {name: radiance for name, radiance in sources.items() if radiance is not None}
-    rows = [[expose(radiance, stop, scale=exposure_time) for stop in stops] for radiance in sources.values()]
-    titles = [f"{stop:+g} EV".replace("-", "\N{MINUS SIGN}") if stop else "0 EV" for stop in stops]
+    rows = [[None, *(expose(radiance, stop, scale=exposure_time) for stop in stops)] for radiance in sources.values()]
+    rows[0][0] = comparison.photo
+    titles = ["Photo"] + [f"{stop:+g} EV".replace("-", "\N{MINUS SIGN}") if stop else "0 EV" for stop in stops]
     caption = (
         f"View {comparison.name}, re-exposed from {_seconds(exposure_time)} (0 EV) and shown on a plain sRGB display. "
         "What the photo clipped stays flat."
     )
+    if comparison.confidence is not None:
+        rows[1].append(np.repeat(comparison.confidence[..., None], 3, axis=2))
+        titles.append("Confidence")
+        caption += " Confidence: white where the photos vouch for the light, black where they say nothing of it."
     return _grid(rows, titles, list(sources), caption, cell=1.9)
 
 
@@ -152,27 +161,33 @@ def training_figure(metrics: Sequence[dict]):
 
 
 def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, cell: float):
-    """Pictures [H, W, 3] in rows and columns with column titles, row names at the left, and a caption below."""
+    """Pictures [H, W, 3] in rows and columns with column titles, row names at the left, and a caption below.
+
+    rows: of the titles' length or shorter; None leaves a place empty, and so does the end of a shorter row.
+    """
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
     gap, left, top, bottom, edge = 0.06, 0.3, 0.36, 0.46, 0.12
-    heights = [cell * row[0].shape[0] / row[0].shape[1] for row in rows]
+    shapes = [next(picture.shape for picture in row if picture is not None) for row in rows]
+    heights = [cell * shape[0] / shape[1] for shape in shapes]
     width = left + len(titles) * (cell + gap) - gap + edge
     height = top + sum(heights) + gap * (len(rows) - 1) + bottom
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(width, height))
+        for column, title in enumerate(titles):
+            where = ((left + column * (cell + gap) + cell / 2) / width, (height - top + 0.1) / height)
+            figure.text(*where, title, ha="center", va="bottom", fontsize=9.5, fontweight="bold")
         y = height - top
-        for row, (pictures, name, row_height) in enumerate(zip(rows, names, heights, strict=True)):
+        for pictures, name, row_height in zip(rows, names, heights, strict=True):
             y -= row_height
             for column, picture in enumerate(pictures):
+                if picture is None:
+                    continue
                 x = left + column * (cell + gap)
                 axes = figure.add_axes((x / width, y / height, cell / width, row_height / height))
                 axes.imshow(np.clip(picture, 0, 1), aspect="auto", interpolation="lanczos")
                 axes.set_axis_off()
-                if row == 0:
-                    where = ((x + cell / 2) / width, (height - top + 0.1) / height)
-                    figure.text(*where, titles[column], ha="center", va="bottom", fontsize=9.5, fontweight="bold")
             where = ((left - 0.1) / width, (y + row_height / 2) / height)
             figure.text(*where, name, rotation=90, ha="right", va="center", color=_QUIET, fontsize=8.5)
             y -= gap
@@ -226,10 +241,16 @@ def _chosen(views: Sequence[View], count: int) -> list[View]:
 
 
 def _compare(run, view: View) -> Comparison:
-    hdr = run.render(view.camera).hdr
-    hdr = np.asarray(hdr.detach().cpu() if hasattr(hdr, "detach") else hdr)
+    hdr, confidence = _array(run.render(view.camera).hdr), run.render_confidence(view.camera)
     from_photo = np.asarray(run.response.decode(view.image)) / view.exposure_time
-    return Comparison(view.name, view.image, from_photo, hdr, view.hdr)
+    return Comparison(
+        view.name, view.image, from_photo, hdr, view.hdr, None if confidence is None else _array(confidence)
+    )
+
+
+def _array(value) -> np.ndarray:
+    """A torch tensor on any device, or an array, as an array."""
+    return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
 
 
 def _caption(run, views: Sequence[View], metrics: Sequence[dict], held_out: bool) -> str:

@@ -5,6 +5,7 @@ scene.json          cameras of all views, splits, exposure times, names: enough 
 run.json            response, base exposure time, version, where the photos were
 metrics.jsonl       one line for each evaluation
 checkpoints/        see checkpoint.py
+confidence.safetensors      how far the photos vouch for each Gaussian, see confidence.py
 summary.json        times, memory and counts, when the training ended
 """
 
@@ -27,6 +28,7 @@ from ..output.files import atomic_path, write_json, writing
 from ..scene import Camera, Scene
 from ..scene.images import MAX_PIXELS
 from .checkpoint import Checkpoint, newest_checkpoint
+from .confidence import CONFIDENCE, read_confidence
 from .config import Config
 from .config_files import config_to_dict, read_config_json
 from .initialization import assemble_field
@@ -58,7 +60,8 @@ class Run:
 
     path: its folder. config: the choices it was trained with. model: the RadianceField, on `device`.
     cameras: the views of the scene, in its order. response: the camera's curve. exposure_time: the base one, seconds.
-    iterations, train_seconds: how far the training was. data: where the photos were, for load_scene; may be empty.
+    iterations, train_seconds: how far the training was. checkpoint_hash: of the tensors it was loaded from.
+    data: where the photos were, for load_scene; may be empty.
     """
 
     def __init__(
@@ -76,6 +79,7 @@ class Run:
         self.cameras = cameras
         self.iterations: int = values["iteration"]
         self.train_seconds: float = values["seconds"]
+        self.checkpoint_hash: str = values["sha256"]
         self.data: dict = info["data"]
         self.scene_name: str = info["scene"]
 
@@ -109,6 +113,10 @@ class Run:
         """[H, W, 3] in [0, 1]: the simulated photo of exposure_time seconds, by default the base exposure."""
         return self.model.render_ldr(camera, exposure_time, degree=self.degree)
 
+    def render_confidence(self, camera: Camera) -> Tensor | None:
+        """[H, W] in [0, 1]: how far the photos vouch for what a camera sees; None where that was not measured."""
+        return self.model.render_confidence(camera)
+
     def metrics(self) -> list[dict]:
         """The evaluations made during training, as in metrics.jsonl."""
         return read_metrics(self.path)
@@ -130,7 +138,9 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
     checkpoint = newest_checkpoint(path / CHECKPOINTS)
     if checkpoint is None:
         raise InputError(path / CHECKPOINTS, "holds no complete checkpoint", "train again, or continue with --resume")
-    model = field_from_checkpoint(checkpoint, config, info).to(device)
+    model = field_from_checkpoint(checkpoint, config, info)
+    model.confidence = read_confidence(path, checkpoint)
+    model = model.to(device)
     model.requires_grad_(False)
     return Run(path, config, model, read_cameras(path), info, checkpoint.values)
 
@@ -170,7 +180,7 @@ def clear_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(path, f"cannot be made ({error.strerror})", "choose another folder for the run") from None
-    for name in (SUMMARY, METRICS, SCENE, RUN, CONFIG):
+    for name in (SUMMARY, METRICS, CONFIDENCE, SCENE, RUN, CONFIG):
         (path / name).unlink(missing_ok=True)
     shutil.rmtree(path / CHECKPOINTS, ignore_errors=True)
 
@@ -232,7 +242,9 @@ def read_run_info(path: Path) -> dict:
             raise InputError(path / RUN, f"{name} = {reprlib.repr(info[name])} is of the wrong type", _REMEDY)
     time = info["base_exposure_time"]
     if not 0 < time < math.inf or time > 1e300:
-        raise InputError(path / RUN, f"base_exposure_time = {reprlib.repr(time)} is not a positive number of seconds", _REMEDY)
+        raise InputError(
+            path / RUN, f"base_exposure_time = {reprlib.repr(time)} is not a positive number of seconds", _REMEDY
+        )
     try:
         Response.from_dict(info["response"])
     except SehdrError as error:

@@ -19,6 +19,7 @@ from ..scene import Scene
 from ..splatting.memory import memory_told
 from ..splatting.threads import thread_count
 from .checkpoint import first_not_finite, newest_checkpoint, write_checkpoint
+from .confidence import measure_confidence, write_confidence
 from .config import Config
 from .config_files import config_to_dict, load_config, read_config_json
 from .heldout import evaluate_views
@@ -82,7 +83,9 @@ def train(
     ):
         progress.note(f"response {trainer.field.response.name}, {trainer.field.gaussians.count} Gaussians on {device}")
         loop.run(progress)
-    return load_run(out, device=device)
+        run = load_run(out, device=device)
+        write_confidence(run, measure_confidence(run, scene))
+    return run
 
 
 def _start(scene, out, config, device, *, resume, overwrite, data) -> tuple[Scene, Trainer, float]:

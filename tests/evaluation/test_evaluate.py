@@ -189,3 +189,21 @@ def test_the_table_holds_every_figure():
         assert f"{value:.2f}" in text
     assert "4,321 Gaussians" in text and "12.5 s" in text and "1000 cd/m^2" in text and "times 2" in text
     assert max(map(len, text.splitlines())) <= 120
+
+
+def test_confidence_is_ranked_against_errors():
+    plain = evaluate(run(lambda hdr: hdr / 2.1), scene(VIEWS))["confidence"]
+    assert plain["spearman_log2"] is None and "not measured" in plain["reason"]
+    doubt = torch.rand(24, 30, generator=torch.Generator().manual_seed(1))
+    made = run(lambda hdr: hdr * 2 ** (3 * doubt[..., None]))
+    made.response, made.render_confidence = RESPONSE, lambda camera: 1 - doubt
+    result = evaluate(made, scene(VIEWS))
+    assert result["confidence"]["pixels"] == 2 * 24 * 30
+    # The scale is the median's: errors grow with doubt on one side of it and fall on the other.
+    made.render_confidence = lambda camera: 1 - (doubt - doubt.median()).abs()
+    better = evaluate(made, scene(VIEWS))
+    assert better["confidence"]["spearman_log2"] > 0.8 > result["confidence"]["spearman_log2"]
+    assert "confidence ranks errors: " in format_table(better)
+    assert "confidence" not in format_table(evaluate(run(), scene(VIEWS)))
+    without = evaluate(made, scene([view(0, "train", truth=False), view(1, "test", truth=False)]))
+    assert without["confidence"]["spearman_log2"] is None and "no HDR truth" in without["confidence"]["reason"]

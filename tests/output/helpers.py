@@ -65,8 +65,14 @@ class AnalyticRun:
             Entry(name, split, camera(position=(0.3 * i - 0.6, 0.1 * (i % 2), -3)))
             for i, (name, split) in enumerate(names)
         ]
-        self.gain = 1.0
+        self.gain, self.confident = 1.0, True
         self.rendered = 0
+
+    def render_confidence(self, view):
+        """Falls from left to right, and from 1; none where it is switched off."""
+        if not self.confident:
+            return None
+        return np.broadcast_to(np.linspace(1, 0, view.width, dtype=np.float32), (view.height, view.width))
 
     def render(self, view):
         self.rendered += 1

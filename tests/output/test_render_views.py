@@ -35,14 +35,23 @@ def test_hdr_file_holds_what_was_rendered(tmp_path):
     entry = run.cameras[3]
     pixels, names, header = read_exr(tmp_path / "hdr" / "t_0.exr")
     rendered = run.render(entry.camera)
-    assert names == ("R", "G", "B", "A", "Z")
+    assert names == ("R", "G", "B", "A", "Z", "confidence")
     np.testing.assert_array_equal(pixels[..., :3], rendered.hdr)
     np.testing.assert_array_equal(pixels[..., 3], rendered.alpha)
     np.testing.assert_array_equal(pixels[..., 4], rendered.depth)
+    np.testing.assert_array_equal(pixels[..., 5], run.render_confidence(entry.camera))
     assert header["expTime"] == 1 and header["sehdr:baseExposureTime"] == "0.5"
     assert header["sehdr:scene"] == "sky" and header["sehdr:view"] == "t_0"
     assert json.loads(header["sehdr:camera"]) == entry.camera.to_dict()
     assert Image.open(tmp_path / "preview" / "t_0.png").size == (entry.camera.width, entry.camera.height)
+
+
+def test_without_confidence_there_is_no_channel_and_a_line_says_so(tmp_path):
+    run, said = AnalyticRun(), []
+    run.confident = False
+    render_views(run, tmp_path, progress=said.append)
+    assert read_exr(tmp_path / "hdr" / "t_0.exr")[1] == ("R", "G", "B", "A", "Z")
+    assert sum("without a confidence channel" in line for line in said) == 1
 
 
 def test_brackets_are_the_hdr_file_times_the_exposure(tmp_path):

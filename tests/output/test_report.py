@@ -103,9 +103,22 @@ def test_stops_show_what_the_photo_lost(tmp_path):
     comparison = Comparison(view.name, view.image, from_photo, run.render(view.camera).hdr, view.hdr)
     figure = stops_figure(comparison, 0.5)
     pictures = [axes.get_images()[0].get_array() for axes in figure.axes]
-    photo, hdr, truth = pictures[:5], pictures[5:10], pictures[10:]
+    np.testing.assert_array_equal(pictures[0], view.image)
+    photo, hdr, truth = pictures[1:6], pictures[6:11], pictures[11:]
     clipped = comparison.photo == 1
     assert clipped.any()
     assert np.ptp(photo[0][clipped]) < 1e-6
     assert np.ptp(hdr[0][clipped]) > 0.01
     np.testing.assert_array_equal(hdr, truth)
+
+
+def test_confidence_stands_beside_the_scene(tmp_path):
+    run, scene = make(tmp_path)
+    view = scene.views[1]
+    confidence = run.render_confidence(view.camera)
+    comparison = Comparison(view.name, view.image, view.image, view.hdr, view.hdr, confidence)
+    axes = stops_figure(comparison, 0.5).axes
+    assert len(axes) == 1 + 5 + 6 + 5
+    np.testing.assert_array_equal(axes[11].get_images()[0].get_array()[..., 0], confidence)
+    assert axes[11].get_position().x0 > axes[5].get_position().x1
+    assert axes[11].get_position().y0 == pytest.approx(axes[6].get_position().y0)

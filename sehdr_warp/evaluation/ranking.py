@@ -1,0 +1,82 @@
+"""Whether confidence ranks errors: Spearman's correlation between doubt (1 - confidence) and the true error of pixels."""
+
+import torch
+from torch import Tensor
+
+from .metrics import mu_law
+
+MOST_PIXELS = 16384
+"""Taken from one view, evenly spaced."""
+DARKEST_CODE = 0.5 / 255
+"""An exposure that is stored as black: light below it counts as it, in truth and render, before logarithms."""
+
+
+class ErrorRanking:
+    """Gathers confidence, render and truth of the pixels of held-out views; all views of a scene are ranked together."""
+
+    def __init__(self):
+        self._views: list[tuple[Tensor, Tensor, Tensor, Tensor, float, float]] = []
+
+    def add(
+        self,
+        confidence: Tensor,
+        prediction: Tensor,
+        truth: Tensor,
+        well_exposed: Tensor,
+        darkest: float,
+        mask: Tensor | None = None,
+    ) -> None:
+        """confidence: [H, W] in [0, 1]. prediction, truth: [H, W, 3] radiance. well_exposed: [H, W] bool, of the photo.
+        darkest: radiance that the photo shows as black. mask: [H, W]; only pixels above 0.5 count."""
+        counted = torch.ones_like(well_exposed) if mask is None else mask > 0.5
+        unit = float(truth[counted].max()) if bool(counted.any()) else 0.0
+        step = max(1, -(-int(counted.sum()) // MOST_PIXELS))
+        images = (confidence, prediction.float().clamp_min(0), truth.float(), well_exposed)
+        self._views.append((*(image[counted][::step].cpu() for image in images), darkest, unit or 1.0))
+
+    def result(self) -> dict:
+        """{"spearman_log2", "spearman_mu": in [-1, 1], "mean": of the confidence, "pixels", "scale"}; null with "reason"
+        where nothing can be ranked. The error of a pixel is the mean over channels of
+
+        log2    |log2((scale prediction + darkest) / (truth + darkest))|, stops
+        mu      |mu-law(scale prediction) - mu-law(truth)|, both over the largest truth of the view
+
+        scale takes the renders to the truth by the median over well-exposed pixels. That of the protocol `aligned` counts
+        clipped pixels too; where they are the majority it would move their error into all others.
+        """
+        figures = dict.fromkeys(("spearman_log2", "spearman_mu", "mean", "scale")) | {"pixels": 0}
+        confidence = torch.cat([view[0] for view in self._views]) if self._views else torch.zeros(0)
+        if not len(confidence):
+            return figures | {"reason": "the run's confidence was not measured"}
+        scale = self._scale()
+        errors = {"log2": [], "mu": []}
+        for _, prediction, truth, _, darkest, unit in self._views:
+            ratio = (scale * prediction.double() + darkest) / (truth.double() + darkest)
+            errors["log2"].append(ratio.log2().abs().mean(1))
+            difference = mu_law(scale * prediction.double() / unit) - mu_law(truth.double() / unit)
+            errors["mu"].append(difference.abs().mean(1))
+        for name, values in errors.items():
+            figures[f"spearman_{name}"] = spearman(1 - confidence.double(), torch.cat(values))
+        figures |= {"mean": float(confidence.mean()), "pixels": len(confidence), "scale": scale}
+        if figures["spearman_log2"] is None:
+            figures["reason"] = "all pixels have one confidence or one error"
+        return figures
+
+    def _scale(self) -> float:
+        """exp of the median of log(truth / prediction) over well-exposed pixels; 1 where there are none."""
+        ratios = []
+        for _, prediction, truth, well_exposed, _, _ in self._views:
+            lit = (prediction > 0) & (truth > 0) & well_exposed[:, None]
+            ratios.append((truth[lit].double() / prediction[lit].double()).log())
+        joined = torch.cat(ratios)
+        return float(joined.median().exp()) if len(joined) else 1.0
+
+
+def spearman(first: Tensor, second: Tensor) -> float | None:
+    """Spearman's rank correlation of two [K] tensors, ties at their mean rank; None where one of them is constant."""
+    from scipy.stats import rankdata
+
+    ranks = [torch.from_numpy(rankdata(values.numpy())) for values in (first, second)]
+    ranks = [values - values.mean() for values in ranks]
+    size = ranks[0].norm() * ranks[1].norm()
+    return float(ranks[0] @ ranks[1] / size) if size > 0 else None

@@ -1,0 +1,102 @@
+"""How far the photos vouch for a scene's light: for each Gaussian, what its blending weight fell on in the training views.
+
+The sum over a photo's pixels of (weight of a Gaussian) x (number at the pixel) is the derivative of the blend with respect to
+that Gaussian's feature, so the splat's own adjoint gathers it for all Gaussians in one pass a view. What is gathered is how
+uncertain each pixel leaves its light, in stops; see pixel_uncertainty. docs/confidence.md has the measurements.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..scene import View
+from .radiance_field import CameraTensors, RadianceField
+from .response import Response
+
+CLIPPED_STOPS = 1.0
+"""Uncertainty of a pixel that is clipped in all channels, which is known to be white or brighter and no more."""
+PARTLY_CLIPPED_STOPS = 0.25
+"""Uncertainty of a clipped channel beside one that is not: the others say where the light is, this one its hue."""
+MOST_STOPS = 4.0
+"""A misfit counts no more than this: 1/16 of the confidence already says that nothing is known."""
+LEAST_SEEN = 0.01
+"""Pixels of blending weight, over all training photos, at which a Gaussian has half of the confidence that its photos give it."""
+MOST_VIEWS = 200
+"""Training views that are looked at, evenly chosen: more change the means little."""
+
+_HALF_CODE = 0.5 / 255
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the training photos say of each of N Gaussians.
+
+    seen: [N] pixels, the sum of its blending weights over the photos. stops: [N] mean uncertainty of these pixels, from 0.
+    clipped: [N] in [0, 1], the share of their colour values that were clipped.
+    """
+
+    seen: Tensor
+    stops: Tensor
+    clipped: Tensor
+
+    def confidence(self) -> Tensor:
+        """[N] in [0, 1]: 2^-stops, times seen / (seen + LEAST_SEEN). 1: observed unclipped, and the scene agrees; 1/2: light
+        known to a factor of two; 0: never seen."""
+        return torch.exp2(-self.stops) * self.seen / (self.seen + LEAST_SEEN)
+
+
+def pixel_uncertainty(photo: Tensor, exposure: Tensor, response: Response) -> tuple[Tensor, Tensor]:
+    """How many stops of doubt a photo leaves about the light at its pixels, [H, W], and the clipped share of each, [H, W].
+
+    photo: [H, W, 3] encoded, in [0, 1]. exposure: [H, W, 3] what the scene shows there, E dt. Mean over channels of
+
+        an unclipped channel    |log2(exposure / decoded value)|, the misfit, at least 0, plus a quarter of the width of its
+                                8-bit code's interval in stops (the mean distance from its middle), at most 1
+        a clipped channel       by how much the exposure falls short of white, if it does, plus CLIPPED_STOPS where all
+                                channels are clipped, else PARTLY_CLIPPED_STOPS
+        a black channel         by how much the exposure is above half a code, if it is, plus 1
+    """
+    dark = response.decode(photo.new_full((1, 3), _HALF_CODE))
+    white = response.white
+    clipped, black = photo >= 1 - _HALF_CODE, photo <= _HALF_CODE
+    # Below half a code two exposures are the same to the photo.
+    lit = torch.maximum(exposure, dark)
+    misfit = (lit / torch.maximum(response.decode(photo), dark)).log2().abs()
+    misfit = torch.where(clipped, (white / lit).log2().clamp_min(0), misfit)
+    misfit = torch.where(black, (lit / dark).log2(), misfit).clamp_max(MOST_STOPS)
+    low, high = (response.decode((photo + offset).clamp(0, 1)) for offset in (-_HALF_CODE, _HALF_CODE))
+    rounding = ((high.clamp_min(1e-12) / low.clamp_min(1e-12)).log2() / 4).clamp(0, 1)
+    every = clipped.all(2, keepdim=True)
+    unknown = torch.where(every, CLIPPED_STOPS, PARTLY_CLIPPED_STOPS).expand_as(photo)
+    stops = misfit + torch.where(clipped, unknown, rounding)
+    return stops.mean(2), clipped.to(photo).mean(2)
+
+
+@torch.no_grad()
+def gather_evidence(
+    field: RadianceField, views: Sequence[View], *, degree: int | None = None, truth: bool = False
+) -> Evidence:
+    """What the photos of some views say of a field's Gaussians; where a view has a mask, only where it counts.
+
+    degree: of the harmonics. truth: the field was trained on HDR truth, which is then what was observed where a view has it:
+    nothing is clipped, and the misfit is all the doubt.
+    """
+    device = field.gaussians.means.device
+    total = torch.zeros(field.gaussians.count, 3, device=device)
+    step = -(-len(views) // MOST_VIEWS) or 1
+    for view in views[::step]:
+        exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time
+        if truth and view.hdr is not None:
+            observed = torch.tensor(view.hdr, device=device) * view.exposure_time
+            stops = (exposure.clamp_min(1e-9) / observed.clamp_min(1e-9)).log2().abs().clamp_max(MOST_STOPS).mean(2)
+            clipped = torch.zeros_like(stops)
+        else:
+            stops, clipped = pixel_uncertainty(torch.tensor(view.image, device=device), exposure, field.response)
+        counted = torch.ones_like(stops) if view.mask is None else torch.tensor(view.mask, device=device).to(stops)
+        images = torch.stack([counted, counted * stops, counted * clipped], dim=2)
+        total += field.weighted_sums(CameraTensors.of(view.camera, device), images)
+    seen = total[:, 0].clamp_min(0)
+    means = total[:, 1:] / seen.clamp_min(1e-12)[:, None]
+    return Evidence(seen, means[:, 0].clamp_min(0), means[:, 1].clamp(0, 1))
