@@ -14,6 +14,8 @@ from .truth_set import read_making
 COMPRESSIONS = ("zip", "piz", "dwab")
 """OpenEXR's names; zip and piz keep every half as it is, dwab is lossy."""
 _MU = 5000.0
+# Below half's 65504 by more than a lossy file errs.
+_LARGEST = 40000.0
 
 
 def pack_truth(
@@ -29,26 +31,29 @@ def pack_truth(
 
     folder: from render_scene. level: of dwab: 45 is OpenEXR's default, lower keeps more.
     The radiance is first multiplied by a power of two (and the times divided by it) that brings the middle exposure
-    time near 1 second, because dwab spends its bits around a value of 1; the scale of rendered light means nothing.
+    time near 1/16 second, or less where the brightest pixel would pass 40000: dwab's steps are relative above a value
+    of 1 and grow below it, so dark parts must not lie far below. The scale of rendered light means nothing.
 
     Returned, and added to synth.json as `packing`: relative_error, RMS of (stored - truth) / (truth + 1e-3 median
     truth); mu_law_psnr of stored against truth, both over the view's largest value (mu 5000, RMS over all views);
     bytes of the whole set.
-    Raises InputError where the folder is no finished set of truth or a value does not fit half floats.
+    Raises InputError where the folder is no finished set of truth.
     """
     if compression not in COMPRESSIONS:
         raise ValueError(f"compression {compression!r} is not one of {COMPRESSIONS}")
     folder, out = Path(folder), Path(out)
     tables, times = _tables(folder)
-    scale = 2.0 ** round(np.log2(times[len(times) // 2]))
+    sources = {split: sorted((folder / f"{split}_hdr").glob("hdr_*.exr")) for split in tables}
+    largest = max(float(read_hdr(source).max()) for found in sources.values() for source in found)
+    scale = 2.0 ** min(round(np.log2(16 * times[len(times) // 2])), np.floor(np.log2(_LARGEST / max(largest, 1e-30))))
     squared = {"relative": [], "mu_law": []}
     with atomic_folder(out, overwrite) as made:
         for split in tables:
-            for source in sorted((folder / f"{split}_hdr").glob("hdr_*.exr")):
+            for source in sources[split]:
                 truth = read_hdr(source) * np.float32(scale)
                 target = made / f"{split}_hdr" / source.name
                 target.parent.mkdir(exist_ok=True)
-                _write_half(target, source, truth, compression, level)
+                _write_half(target, truth, compression, level)
                 for name, error in _errors(read_hdr(target), truth).items():
                     squared[name].append(float(np.mean(error**2)))
         for split, table in tables.items():
@@ -98,11 +103,9 @@ def _errors(stored: np.ndarray, truth: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def _write_half(path: Path, source: Path, pixels: np.ndarray, compression: str, level: float) -> None:
+def _write_half(path: Path, pixels: np.ndarray, compression: str, level: float) -> None:
     import OpenEXR
 
-    if pixels.max() > 65504:
-        raise InputError(source, f"radiance {pixels.max():g} does not fit half floats", "keep the floats")
     kinds = {"zip": OpenEXR.ZIP_COMPRESSION, "piz": OpenEXR.PIZ_COMPRESSION, "dwab": OpenEXR.DWAB_COMPRESSION}
     header = {"compression": kinds[compression], "type": OpenEXR.scanlineimage}
     if compression == "dwab":

@@ -16,6 +16,7 @@ from ..output.files import atomic_path, write_json
 from ..scene import Camera
 from ..scene.hdr_nerf_layout import RadianceView
 from .cameras import VIEWS, make_cameras, split_of
+from .denoise import Denoiser, check_denoiser, denoiser_version
 from .scenes import Recipe
 from .stage import Stage
 from .truth_set import truth_path, write_truth_tables
@@ -31,8 +32,8 @@ _OPENCV_TO_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's camera: +x lef
 class Settings:
     """What the pixels of a set depend on.
 
-    width, height: pixels; samples: light paths of a pixel, to be multiplied by the recipe's effort; seed: of geometry, textures and paths; views: numbers in
-    [0, 35) or None for all.
+    width, height: pixels; samples: light paths of a pixel, to be multiplied by the recipe's effort; seed: of geometry,
+    textures and paths; views: numbers in [0, 35) or None for all; denoise: one of denoise.DENOISERS.
     """
 
     width: int = 200
@@ -40,6 +41,7 @@ class Settings:
     samples: int = 512
     seed: int = 0
     views: tuple[int, ...] | None = None
+    denoise: str = "none"
 
     def __post_init__(self):
         if not (1 <= self.width <= 8192 and 1 <= self.height <= 8192):
@@ -51,6 +53,7 @@ class Settings:
         wrong = [view for view in self.views or () if not 0 <= view < VIEWS]
         if wrong or self.views == ():
             raise SehdrError(f"--views {wrong}: views are numbered from 0 to {VIEWS - 1}")
+        check_denoiser(self.denoise)
 
 
 def render_scene(
@@ -58,9 +61,9 @@ def render_scene(
 ) -> Path:
     """Render `out`/<name>: finished views are kept, so a run that was stopped goes on. Returns the folder.
 
-    mi: from load_mitsuba. Each view is the mean of its paths a pixel under a box filter, without clamping or
-    denoising: unbiased but for paths longer than the recipe's depth, which all views lack alike. The halves of the
-    samples, compared, give the truth's own noise (in synth.json).
+    mi: from load_mitsuba. Each view is the mean of its paths a pixel under a box filter, without clamping: unbiased
+    but for paths longer than the recipe's depth, which all views lack alike. The halves of the samples, compared, give
+    the noise of that mean (in synth.json). Settings.denoise "oidn" then trades most of it for a bias of the denoiser's.
 
     A seed gives the same things and lights again. The paths, and with them the noise, may differ: Mitsuba does not number
     its lights in the same order each time.
@@ -84,9 +87,11 @@ def render_scene(
             stage = Stage(mi, np.random.default_rng([settings.seed, *recipe.name.encode()]), Path(meshes))
             recipe.build(stage)
             scene = mi.load_dict(stage.items)
+            denoiser = Denoiser(mi, stage.items, scene) if settings.denoise == "oidn" else None
         progress(f"{recipe.name}: {len(stage.items)} things built in {time.perf_counter() - started:.1f} s")
         for view in missing:
-            line = _render_view(mi, scene, recipe, cameras[view], view, settings, places[view], _aside(folder, view))
+            where = places[view], _aside(folder, view)
+            line = _render_view(mi, scene, recipe, cameras[view], view, settings, denoiser, *where)
             progress(f"{recipe.name}: view {view} of {VIEWS}, {line}")
     _finish(mi, recipe, folder, settings, {view: cameras[view] for view in chosen}, places)
     return folder
@@ -114,9 +119,8 @@ def _aside(folder: Path, view: int) -> Path:
     return folder / "work" / f"r_{view}.npz"
 
 
-def _render_view(mi, scene, recipe: Recipe, camera: Camera, view: int, settings: Settings, path: Path, aside: Path):
-    started = time.perf_counter()
-    sensor = mi.load_dict(
+def _sensor(mi, camera: Camera):
+    return mi.load_dict(
         {
             "type": "perspective",
             "to_world": mi.ScalarTransform4f(camera.camera_to_world @ _OPENCV_TO_MITSUBA),
@@ -135,6 +139,12 @@ def _render_view(mi, scene, recipe: Recipe, camera: Camera, view: int, settings:
             },
         }
     )
+
+
+def _render_view(mi, scene, recipe: Recipe, camera: Camera, view: int, settings: Settings, denoiser: Denoiser | None,
+                 path: Path, aside: Path) -> str:  # fmt: skip
+    started = time.perf_counter()
+    sensor = _sensor(mi, camera)
     tracer = mi.load_dict({"type": "path", "max_depth": recipe.depth, "rr_depth": 6})
     halves = [np.zeros((camera.height, camera.width, 3)) for _ in range(2)]
     samples = settings.samples * recipe.effort
@@ -151,6 +161,8 @@ def _render_view(mi, scene, recipe: Recipe, camera: Camera, view: int, settings:
     if not np.isfinite(radiance).all() or radiance.min() < 0:
         raise SehdrError(f"{recipe.name}: view {view} has pixels that are not finite or negative; take another --seed")
     noise = _noise(*(half / count for half, count in zip(halves, counts, strict=True)))
+    if denoiser is not None:
+        radiance = denoiser(radiance, sensor, (settings.seed * VIEWS + view) % 2**32)
     seconds = time.perf_counter() - started
     found = {"seconds": seconds, "noise": noise, "largest": radiance.max()}
     if split_of(view) == "train":
@@ -201,6 +213,8 @@ def _finish(mi, recipe: Recipe, folder: Path, settings: Settings, cameras: dict[
         "decades": dynamic_range([view.radiance for view in views]),
     }
     empty = [np.zeros((0, 3), np.float32)]
+    if settings.denoise == "oidn":
+        making["denoiser"] = denoiser_version()
     write_truth_tables(folder, views, np.concatenate(points or empty), np.concatenate(colours or empty), making)
 
 

@@ -114,8 +114,9 @@ def globe(rng, size: int = 512):
     image = mix((0.03, 0.10, 0.30), (0.10, 0.25, 0.45), tint)
     dry = land > 0.52
     image[dry] = mix((0.12, 0.28, 0.06), (0.50, 0.36, 0.16), np.clip((land[dry] - 0.52) * 5, 0, 1))
-    image[np.arange(height) / height * 12 % 1 < 0.14] *= 0.35
-    image[:, np.arange(width) / width * 24 % 1 < 0.14] *= 0.35
+    line = max(1, 3 * height // 256)
+    image[np.arange(height) % (height // 12) < line] *= 0.35
+    image[:, np.arange(width) % (width // 24) < line] *= 0.35
     return limited(image)
 
 

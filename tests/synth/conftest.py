@@ -11,8 +11,8 @@ from sehdr_warp.synth.truth_set import truth_path, write_truth_tables
 VIEWS = 6
 
 
-def write_truth(folder, size=32, scale=1.0):
-    """Six views, radiance over four decades, 200 points; returns (views, times)."""
+def write_truth(folder, size=32, scale=1.0, peak=None):
+    """Six views, radiance over four decades, 200 points; one pixel of each is `peak`. Returns (views, times)."""
     rng = np.random.default_rng(3)
     cameras = make_cameras(Grid((0.0, -3.0, 1.0), (0.0, 0.0, 1.0), 0.8, 0.4), size, size)[:VIEWS]
     y, x = np.mgrid[0:size, 0:size] / size
@@ -20,6 +20,8 @@ def write_truth(folder, size=32, scale=1.0):
     for index, camera in enumerate(cameras):
         ramp = 10 ** (4 * x - 2)[..., None] * np.stack([1 + 0 * y, 0.5 + y, 1.5 - y], -1)
         radiance = (scale * ramp * rng.uniform(0.9, 1.1, (size, size, 1))).astype(np.float32)
+        if peak is not None:
+            radiance[3, 5] = peak
         split = split_of(index)
         channels = dict(zip("RGB", np.moveaxis(radiance, 2, 0), strict=True))
         write_exr(truth_path(folder, split, counts[split]), channels, pixel="float")

@@ -1,17 +1,22 @@
 """Sets of truth alone, read by load_scene; and packed, with the cost measured."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import sehdr_warp
 from sehdr_warp.errors import InputError
 from sehdr_warp.model.response import response_by_name
 from sehdr_warp.scene import embedded_names, load_scene
 from sehdr_warp.synth.pack import pack_truth
+from sehdr_warp.synth.scenes import RECIPES
 from sehdr_warp.synth.truth_set import HdrNerfCurve
 
 from .conftest import write_truth
+
+EMBEDDED = Path(sehdr_warp.__file__).parent / "embedded"
 
 
 def test_the_curve_without_torch_is_the_models():
@@ -67,7 +72,7 @@ def test_lossless_packing_costs_half_precision_alone(truth, tmp_path, compressio
     assert packing["relative_error"] < 3e-4 and packing["mu_law_psnr"] > 85
     scene = load_scene(tmp_path / "small")
     scale = times[2] / scene.views[0].exposure_time
-    assert 0.7 <= scene.views[0].exposure_time <= 1.42 and np.log2(scale) == round(np.log2(scale))
+    assert 0.7 <= 16 * scene.views[0].exposure_time <= 1.42 and np.log2(scale) == round(np.log2(scale))
     before = load_scene(folder)
     for a, b in zip(scene.views, before.views, strict=True):
         np.testing.assert_allclose(a.hdr, b.hdr * scale, rtol=6e-4)
@@ -95,6 +100,15 @@ def test_the_stated_error_is_the_packed_files(truth, tmp_path):
     assert 0 < errors[0] < 0.5 * errors[1]
 
 
+def test_no_half_overflows_when_one_light_is_bright(tmp_path):
+    _, times = write_truth(tmp_path / "truth", peak=1e7)
+    pack_truth(tmp_path / "truth", tmp_path / "small", compression="dwab")
+    packed = load_scene(tmp_path / "small")
+    largest = max(view.hdr.max() for view in packed.views)
+    assert 2e4 * 0.9 <= largest <= 4e4 * 1.1
+    assert largest * packed.views[0].exposure_time == pytest.approx(1e7 * times[2], rel=0.1), "photos are as before"
+
+
 def test_packing_refuses_what_it_cannot_keep(truth, tmp_path):
     folder, _, _ = truth
     with pytest.raises(InputError, match="exists already"):
@@ -111,7 +125,7 @@ def test_the_scale_of_truth_only_moves_the_times(tmp_path):
     np.testing.assert_allclose(times, np.multiply(moved, 64.0), rtol=0.05)
 
 
-@pytest.mark.parametrize("name", [name for name in embedded_names() if name != "room"])
+@pytest.mark.parametrize("name", RECIPES)
 def test_embedded_scenes_have_truth_and_a_well_exposed_photo(name):
     scene = load_scene(f"embedded:{name}")
     assert scene.name == f"embedded:{name}" and len(scene.points) > 1000
@@ -119,8 +133,16 @@ def test_embedded_scenes_have_truth_and_a_well_exposed_photo(name):
     for view in scene.views:
         assert view.hdr.shape == view.image.shape == (200, 200, 3)
         assert np.isfinite(view.hdr).all() and view.hdr.min() >= 0
+    making = json.loads((EMBEDDED / name / "synth.json").read_text())
+    assert making["scene"] == name and making["denoise"] == "oidn" and making["seed"] == 0
+    size = sum(p.stat().st_size for p in (EMBEDDED / name).rglob("*.*") if p.name != "synth.json")
+    assert size == making["packing"]["bytes"] < 2e6
     median = np.median([view.image for view in scene.train_views])
     assert 0.2 < median < 0.8
+
+
+def test_every_scene_of_the_generator_is_embedded():
+    assert {*embedded_names()} == {"room", *RECIPES}
 
 
 def test_a_scene_that_is_not_embedded_is_refused_with_the_names():
