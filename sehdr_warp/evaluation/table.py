@@ -24,8 +24,8 @@ def format_table(result: dict) -> str:
         lines.append(f"{region:<22}{figures['fraction']:>8.1%}{text}")
     ranking = result["confidence"]
     if ranking["spearman_log2"] is not None:
-        lines += ["", f"confidence ranks errors: {ranking['spearman_log2']:.2f} (log2), {ranking['spearman_mu']:.2f} (mu-law); "
-                  f"mean confidence {ranking['mean']:.2f}"]  # fmt: skip
+        correlations = f"{ranking['spearman_log2']:.2f} (log2), {ranking['spearman_mu']:.2f} (mu-law)"
+        lines += ["", f"confidence ranks errors: {correlations}; mean confidence {ranking['mean']:.2f}"]
     lines += ["", *_notes(result)]
     return "\n".join(lines)
 

@@ -66,7 +66,7 @@ def read_confidence(folder: Path, checkpoint: Checkpoint) -> Tensor | None:
                 return None
             confidence = file.get_tensor("confidence")
     except (SafetensorError, OSError, ValueError, KeyError, RuntimeError) as error:
-        raise InputError(path, f"not safetensors ({str(error):.200})", remedy) from None
+        raise InputError(path, f"not safetensors ({error!s:.200})", remedy) from None
     count = len(checkpoint.tensors["gaussians.means"])
     if tuple(confidence.shape) != (count,) or not confidence.is_floating_point():
         raise InputError(path, f"confidence has shape {tuple(confidence.shape)}, not {(count,)}", remedy)
