@@ -189,7 +189,8 @@ def _evaluate(command: Evaluate) -> None:
 def _export(command: Export) -> None:
     from .output.ply import write_ply
 
-    path = write_ply(command.out, _load_run(command.run, "cpu"), kind=command.kind, overwrite=command.overwrite)
+    run = _load_run(command.run, "cpu")
+    path = write_ply(command.out, run, kind=command.kind, overwrite=command.overwrite, progress=_say)
     print(path)
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ..errors import InputError, SehdrError
+from ..training.config_files import toml_value
 
 
 @dataclass(frozen=True)
@@ -93,14 +94,7 @@ def _parse_variant(text: str) -> Method:
     items = [item.partition("=") for item in re.split(r",(?=\s*[A-Za-z_][\w.]*\s*=)", settings) if item.strip()]
     if not name or not base or not items or not all(equals for _, equals, _ in items):
         raise SehdrError(f"--variant {text}: not NAME:BASE:field=value,...; write no-clip:default:loss.clipping=false")
-    return _variant(name, base, {key.strip(): _value(value.strip()) for key, _, value in items})
-
-
-def _value(text: str):
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
+    return _variant(name, base, {key.strip(): toml_value(value.strip()) for key, _, value in items})
 
 
 def _read_variants(path: Path) -> list[Method]:

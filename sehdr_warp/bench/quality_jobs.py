@@ -170,6 +170,10 @@ def _config(method: Method, iterations: int | None, seed: int) -> Config:
     if iterations is not None:
         overrides["schedule.iterations"] = iterations
     config = load_config(method.preset, overrides)
+    if config.plan.enabled:
+        # What a variant or --iterations states is no plan's to change.
+        stated = [path for path in (*method.overrides, *overrides) if not path.startswith("plan.")]
+        config = override_config(config, {"plan.keep": sorted({*config.plan.keep, *stated})}, method.preset)
     schedule = config.schedule
     steps = (schedule.stated_for * FIRST_TEST ** (-k / (TESTS - 1)) for k in range(TESTS))
     stated = sorted({max(1, round(step)) for step in steps})

@@ -18,6 +18,7 @@ from ..scene import Scene, load_scene
 from ..synth.expose import SensorNoise, expose, exposure_ladder
 from ..training.config import Config
 from ..training.config_files import config_from_dict, override_config
+from ..training.plan import apply_plan
 from ..training.train import train
 from .machine import describe_machine, now, package_version
 from .quality_jobs import FORMAT, Job
@@ -54,6 +55,7 @@ class Runner:
         training = config_from_dict(config["training"], job.label)
         method, out = config["method"], folder / RUN
         scene = photographed if method["truth"] else without_training_truth(photographed)
+        training, plan = apply_plan(scene, training)
         self._warm_up(method, scene, training, folder)
         shutil.rmtree(out, ignore_errors=True)
         self._forget_peaks()
@@ -81,6 +83,7 @@ class Runner:
             "shared_by": self.shared_by,
             "exposure_time": judged.views[0].exposure_time,
             "config": config,
+            **({} if plan is None else {"plan": plan.to_dict()}),
             "figures": figures,
             "curve": curve,
             "complete": True,

@@ -14,6 +14,8 @@ from .gaussian_file import GaussianArrays, write_gaussians
 KINDS = ("hdr", "ldr")
 
 _HARMONIC_0 = 0.5 / np.sqrt(np.pi)
+# A degree of the harmonics that changes no colour by more than this part is not stored: a half float rounds by more.
+_UNSEEN = 1e-4
 # Radiance below this is written as this: its logarithm must be finite.
 _DARKEST = 1e-12
 
@@ -21,12 +23,19 @@ Colors = Callable[[np.ndarray], np.ndarray]
 
 
 def write_ply(
-    path: Path | str, run, *, kind: str = "hdr", exposure_time: float | None = None, overwrite: bool = False
+    path: Path | str,
+    run,
+    *,
+    kind: str = "hdr",
+    exposure_time: float | None = None,
+    overwrite: bool = False,
+    progress: Callable[[str], None] | None = None,
 ) -> Path:
     """Writes the Gaussians of a trained run; returns the path.
 
     kind: "hdr": scene-linear radiance, see hdr_gaussians; "ldr": display colours, see ldr_gaussians.
     exposure_time: of "ldr", seconds; by default the one the scene was photographed at.
+    progress: takes a line that says which degrees of the harmonics were left out, because they change no colour.
 
     Raises SehdrError for another kind or an exposure time that is not positive, InputError where the file exists
     (unless overwrite) or a value is not finite.
@@ -36,10 +45,33 @@ def write_ply(
     if exposure_time is not None and kind == "hdr":
         raise SehdrError("an HDR PLY has no exposure time; leave it out, or write kind ldr")
     check_absent(path, overwrite)  # Before minutes of fitting.
-    write_gaussians(
-        path, hdr_gaussians(run) if kind == "hdr" else ldr_gaussians(run, exposure_time), overwrite=overwrite
-    )
+    gaussians = hdr_gaussians(run) if kind == "hdr" else ldr_gaussians(run, exposure_time)
+    stored = without_unseen_degrees(gaussians)
+    if stored.degree < gaussians.degree and progress is not None:
+        progress(
+            f"harmonics above degree {stored.degree} change no colour by more than {_UNSEEN:.2%}: "
+            f"stored up to degree {stored.degree} of {gaussians.degree}"
+        )
+    write_gaussians(path, stored, overwrite=overwrite)
     return Path(path)
+
+
+def without_unseen_degrees(gaussians: GaussianArrays) -> GaussianArrays:
+    """The Gaussians without their highest degrees, as far as these change no colour of any of them, in any direction, by
+    more than a ten-thousandth (with "display": of white).
+
+    A degree l with coefficients c changes a colour by at most |c| sqrt((2 l + 1) / (4 pi)) (addition theorem).
+    """
+    harmonics, degree = gaussians.harmonics.astype(np.float64), gaussians.degree
+    scale = np.abs(_HARMONIC_0 * harmonics[:, 0]) if gaussians.color_model == "linear" else 1.0
+    while degree > 0:
+        band = harmonics[:, degree**2 : (degree + 1) ** 2]
+        largest = np.sqrt((band**2).sum(1) * (2 * degree + 1) / (4 * np.pi))
+        if not (largest <= _UNSEEN * scale).all():  # NaN counts as seen, and is refused by name when it is written.
+            break
+        degree -= 1
+    kept = np.ascontiguousarray(gaussians.harmonics[:, : (degree + 1) ** 2])
+    return gaussians if degree == gaussians.degree else gaussians.with_colors(kept, gaussians.color_model)
 
 
 def hdr_gaussians(run) -> GaussianArrays:

@@ -41,6 +41,25 @@ def override_config(config: Config, overrides: dict, source: Path | str = "confi
     return _override(source, config_to_dict(config), overrides)
 
 
+def parse_setting(text: str) -> tuple[str, object]:
+    """A field's dotted name and its value from `field=value`, the value as in TOML (plain words need no quotes).
+
+    Raises InputError for a text without a name or an equals sign; load_config checks name and value.
+    """
+    path, equals, value = (part.strip() for part in text.partition("="))
+    if not path or not equals:
+        raise InputError(f"--set {text}", "is not field=value", "write for example --set loss.clipping=false")
+    return path, toml_value(value)
+
+
+def toml_value(text: str):
+    """A value written as in TOML; what is no TOML is taken as a plain word."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
 def config_to_dict(config: Config) -> dict:
     """Plain nested values; config_from_dict reads them back exactly, through JSON as well."""
     return asdict(config)

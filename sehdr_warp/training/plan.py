@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 from ..scene import Scene
 from .config import DECISIONS, Config
@@ -9,6 +10,9 @@ from .config_files import config_to_dict, override_config
 from .plan_checks import check_fields, check_scene
 from .plan_rules import RULES, Decision
 from .plan_scene import SceneFacts, measure_scene
+
+PLAN = "plan.json"
+"""The plan's file in the folder of a run."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,27 @@ def make_plan(scene: Scene, config: Config) -> Plan:
         planned = override_config(planned, changes, f"{scene.name}: plan of {name}")
     planned = override_config(planned, {"plan.enabled": False}, scene.name)
     return Plan(planned, facts, tuple(decisions), kept)
+
+
+def apply_plan(scene: Scene, config: Config) -> tuple[Config, Plan | None]:
+    """The config to train a scene with, and its plan where config.plan asks for one; without, the fields in plan.keep
+    are checked against the scene all the same. Raises InputError as make_plan does."""
+    if config.plan.enabled:
+        plan = make_plan(scene, config)
+        return plan.config, plan
+    if config.plan.keep:
+        check_fields(scene, measure_scene(scene, config.seed), config, config.plan.keep)
+    return config, None
+
+
+def read_plan(folder: Path) -> dict | None:
+    """The plan that a run was trained by, as Plan.to_dict gave it; None without one, or where its file is damaged."""
+    try:
+        values = json.loads((folder / PLAN).read_text(encoding="utf-8"))
+        format_plan(values)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None
+    return values
 
 
 def format_plan(values: dict) -> str:

@@ -26,7 +26,7 @@ def check_scene(scene: Scene, facts: SceneFacts) -> None:
         raise InputError(
             scene.name,
             f"{facts.photos} training photos: depth and light cannot be told apart from so few",
-            f"take {FEWEST_PHOTOS} or more photos from different places, better 20; --set plan.enabled=false trains anyway",
+            f"take {FEWEST_PHOTOS} or more photos from different places, better 20; without a plan it trains anyway",
         )
     if facts.contrast < LEAST_CONTRAST:
         raise InputError(

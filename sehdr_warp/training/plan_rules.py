@@ -23,8 +23,8 @@ COARSE_PART = 0.05
 """Part of a training that each halved level takes."""
 LEAST_SKY = 0.03
 """Part of the pixels from which on a sky gets Gaussians of its own."""
-SKY_PART = 0.05
-"""Of the budget, for the sky."""
+SKY_PART, MOST_FOR_SKY = 0.05, 400_000
+"""Of the budget, up to this many, for the sky."""
 PASSES = 400
 """Steps on each photo. A second look at the same photos teaches less and less, and in the end their noise."""
 FEWEST_ITERATIONS = 3000
@@ -34,6 +34,9 @@ MOST_VISIBLE = 0.6
 """Part of the Gaussians in a photo above which skipping the others saves little."""
 EARLY_STOP = 3
 """Looks without gain."""
+PASSES_A_LOOK = 5
+LOOKS = 30
+"""Looks in a whole training."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ def _brackets(facts: SceneFacts, config: Config) -> Decision:
     if not config.fusion.enabled:
         return Decision("brackets", {}, "plain scaling", reason)
     fields: dict[str, object] = {"fusion.enabled": False}
-    if config.loss.linear_weight > 0 and not (config.loss.hdr_truth and facts.truths):
+    if config.loss.linear_weight > 0 and not (config.loss.hdr_truth and (facts.truths or config.loss.predictor)):
         fields["loss.linear_weight"] = 0.0
     count = len(config.fusion.exposures)
     return Decision(
@@ -78,7 +81,7 @@ def _brackets(facts: SceneFacts, config: Config) -> Decision:
 def _linear_loss(facts: SceneFacts, config: Config) -> Decision:
     if config.loss.linear_weight == 0:
         return Decision("linear-loss", {}, "none", f"loss.linear_weight = 0; {facts.truths} photos have HDR truth")
-    if config.loss.hdr_truth and facts.truths:
+    if config.loss.hdr_truth and (facts.truths or config.loss.predictor):
         return Decision("linear-loss", {}, "against truth", f"{facts.truths} of {facts.photos} photos have HDR truth")
     return Decision(
         "linear-loss",
@@ -123,20 +126,23 @@ def _resolution(facts: SceneFacts, config: Config) -> Decision:
     levels = 0 if side <= COARSE_SIDE else min(2, math.ceil(math.log2(side / COARSE_SIDE)))
     if config.response.form == "mlp":
         return Decision("resolution", {}, "full size", "a learned response cannot average photos as light")
-    fields: dict[str, object] = {"schedule.coarse_levels": levels}
-    if levels:
-        fields["schedule.coarse_every"] = max(1, round(COARSE_PART * config.schedule.stated_for))
-    choice = f"{levels} coarse levels" if levels else "full size"
-    return Decision("resolution", fields, choice, f"the longer side has {side} pixels; halved from {COARSE_SIDE} up")
+    reason = f"the longer side has {side} pixels; halved as long as it has more than {COARSE_SIDE}"
+    if levels <= config.schedule.coarse_levels:
+        given = config.schedule.coarse_levels
+        return Decision("resolution", {}, f"{given} coarse levels" if given else "full size", reason)
+    every = max(1, round(COARSE_PART * config.schedule.stated_for))
+    fields = {"schedule.coarse_levels": levels, "schedule.coarse_every": every}
+    return Decision("resolution", fields, f"{levels} coarse levels", reason)
 
 
 def _background(facts: SceneFacts, config: Config) -> Decision:
-    count = config.model.far_points
+    count, fields = config.model.far_points, {}
     if facts.sky >= LEAST_SKY and not count:
-        count = max(100, round(SKY_PART * min(config.densification.max_gaussians, 400_000)))
+        count = max(100, round(SKY_PART * min(config.densification.max_gaussians, MOST_FOR_SKY)))
+        fields["model.far_points"] = count
     return Decision(
         "background",
-        {"model.far_points": count},
+        fields,
         f"{count} far points" if count else "none",
         f"{facts.sky:.1%} of the pixels are bright, flat, without points, and reach the upper border",
     )
@@ -155,19 +161,26 @@ def _iterations(facts: SceneFacts, config: Config) -> Decision:
 
 
 def _early_stop(facts: SceneFacts, config: Config) -> Decision:
-    steps = config.scaled(config.schedule.early_stop_every)
-    if steps < facts.photos:
+    every = max(1, config.schedule.stated_for // LOOKS)
+    steps = config.scaled(every)
+    passes = steps / facts.photos
+    if passes < PASSES_A_LOOK:
         return Decision(
             "early-stop",
             {},
             "off",
-            f"{steps} steps between looks are fewer than the {facts.photos} photos: their mean loss is of other photos",
+            f"{steps} steps between looks are {passes:.1f} passes over the {facts.photos} photos, and their mean loss is "
+            f"steady from {PASSES_A_LOOK} on",
         )
     return Decision(
         "early-stop",
-        {"schedule.early_stop": EARLY_STOP, "schedule.early_stop_on": "held-in"},
-        f"{EARLY_STOP} looks",
-        f"a look every {steps} steps, {steps / facts.photos:.0f} passes over the photos; on training photos alone",
+        {
+            "schedule.early_stop": EARLY_STOP,
+            "schedule.early_stop_every": every,
+            "schedule.early_stop_on": "held-in",
+        },
+        f"after {EARLY_STOP} looks",
+        f"a look every {steps} steps, {passes:.0f} passes over the photos; on training photos alone",
     )
 
 

@@ -30,7 +30,7 @@ class SceneFacts:
     seen: mean number of photos whose field of view holds a probe (what stands in the way is not known).
     spread: degrees, the median over probes of the angle of the cone of directions they are seen from.
     visible: mean part of the probes in a photo's field of view.
-    overlap: part of places along the cameras' rays that at least one other photo shows too.
+    overlap: part of the probes, or of places along the cameras' rays if that is more, that two photos show.
     clipped, black: part of the pixels with a channel at 255, with all channels at 0. contrast: standard deviation of all
     codes. sky: part of the pixels in flat, bright cells without sparse points that reach the upper border.
     """
@@ -85,7 +85,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         seen=_mean_where(shown.sum(0), shown.any(0)),
         spread=_spread(probes, views, shown),
         visible=float(shown.mean()),
-        overlap=float((visibility(drawn, views).sum(0) >= 2).mean()),
+        overlap=max(float((other.sum(0) >= 2).mean()) for other in (shown, visibility(drawn, views))),
         clipped=clipped,
         black=black,
         contrast=float(np.sqrt(np.mean([image.var() for image in codes]) + np.var([image.mean() for image in codes]))),

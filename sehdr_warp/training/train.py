@@ -24,6 +24,7 @@ from .config import Config
 from .config_files import config_to_dict, load_config, read_config_json
 from .heldout import evaluate_views
 from .initialization import choose_response, make_field
+from .plan import PLAN, apply_plan, format_plan, read_plan
 from .prediction import predicted_scene
 from .progress import Progress
 from .run import (
@@ -82,6 +83,8 @@ def train(
         _torch_settings(trainer.config),
     ):
         progress.note(f"response {trainer.field.response.name}, {trainer.field.gaussians.count} Gaussians on {device}")
+        if plan := read_plan(out):
+            progress.note(format_plan(plan))
         loop.run(progress)
         run = load_run(out, device=device)
         write_confidence(run, measure_confidence(run, scene))
@@ -92,13 +95,16 @@ def _start(scene, out, config, device, *, resume, overwrite, data) -> tuple[Scen
     """The scene as the loss sees it, the trainer and the seconds it has already trained."""
     if check_folder(out, resume=resume, overwrite=overwrite):
         return scene, *_continue(scene, out, config, device)
-    config = config or load_config()
+    config, plan = apply_plan(scene, config or load_config())
     response = choose_response(scene, config)
     scene = with_predictions(scene, config, response)
     field = make_field(scene, config, response, device)
     trainer = Trainer(scene, config, field)
     # Nothing is made or removed before the scene is known to be good.
     clear_folder(out)
+    (out / PLAN).unlink(missing_ok=True)
+    if plan is not None:
+        write_json(out / PLAN, plan.to_dict())
     write_start(out, scene, config, field, data)
     return scene, trainer, 0.0
 
@@ -137,7 +143,7 @@ def pick_device(device: str | torch.device | None) -> torch.device:
 def _continue(scene: Scene, out: Path, config: Config | None, device) -> tuple[Trainer, float]:
     """Trainer and training seconds as the newest checkpoint has them; from the start where there is none yet."""
     saved, info = read_config_json(out / CONFIG), read_run_info(out)
-    if config is not None and config != saved:
+    if config is not None and (config := apply_plan(scene, config)[0]) != saved:
         raise InputError(
             out / CONFIG, _first_difference(saved, config), "resume with the run's own config, or train anew"
         )
@@ -186,12 +192,13 @@ class _Loop:
         trainer, total = self.trainer, self.schedule.iterations
         with _interruptible() as interrupted:
             started = time.perf_counter()
-            while trainer.iteration < total and not interrupted.is_set():
+            while not self._is_done() and not interrupted.is_set():
                 trainer.step()
                 iteration = trainer.iteration
                 if progress.is_due(iteration):
                     self._report(progress, self.seconds + time.perf_counter() - started)
-                evaluate, save = iteration in self.evaluate_at, iteration % self.checkpoint_every == 0
+                evaluate = iteration in self.evaluate_at or trainer.stopped_at is not None
+                save = iteration % self.checkpoint_every == 0
                 if evaluate or save:
                     self._stop_clock(started)
                     if evaluate:
@@ -205,9 +212,14 @@ class _Loop:
             self._summarise()
         if self.writer is not None:
             self.writer.close()
-        if interrupted.is_set() and trainer.iteration < total:
+        if trainer.stopped_at is not None:
+            progress.note(f"stopped at iteration {trainer.stopped_at}: the error no longer fell")
+        if interrupted.is_set() and not self._is_done():
             progress.note(f"stopped at iteration {trainer.iteration}; continue with --resume")
             raise KeyboardInterrupt
+
+    def _is_done(self) -> bool:
+        return self.trainer.iteration >= self.schedule.iterations or self.trainer.stopped_at is not None
 
     def _stop_clock(self, started: float) -> None:
         """Adds the seconds since `started`, in which steps ran, to the training's; the device finishes first."""
@@ -259,12 +271,14 @@ class _Loop:
         write_checkpoint(self.out / CHECKPOINTS, tensors, values, kept=self.schedule.checkpoints_kept)
 
     def _summarise(self) -> None:
-        trainer = self.trainer
+        trainer, plan = self.trainer, read_plan(self.out)
         write_json(
             self.out / SUMMARY,
             {
                 "iteration": trainer.iteration,
-                "finished": trainer.iteration >= self.schedule.iterations,
+                "finished": self._is_done(),
+                "stopped_at": trainer.stopped_at,
+                "plan": plan and {decision["name"]: decision["choice"] for decision in plan["decisions"]},
                 "train_seconds": round(self.seconds, 3),
                 "gaussians": self._gaussians().count,
                 "skipped_steps": trainer.skipped_steps,

@@ -1,0 +1,215 @@
+"""The plan of a training: what it decides from which figures, what it refuses, and that the training follows it."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sehdr_warp import cli
+from sehdr_warp.errors import InputError
+from sehdr_warp.scene import Camera
+from sehdr_warp.training.config import DECISIONS
+from sehdr_warp.training.config_files import config_to_dict, load_config, parse_setting
+from sehdr_warp.training.plan import apply_plan, make_plan, read_plan
+from sehdr_warp.training.plan_rules import RULES
+from sehdr_warp.training.plan_scene import measure_scene
+from sehdr_warp.training.train import train
+
+from .toy import orbit_camera, toy_scene
+
+
+def config_of(**changes):
+    changes = {name.replace("__", "."): value for name, value in changes.items()}
+    return load_config("default", {"response.name": "srgb", "plan.enabled": True} | changes)
+
+
+def with_images(scene, change):
+    return replace(scene, views=tuple(replace(view, image=change(view)) for view in scene.views))
+
+
+def fields(plan):
+    return {path: value for decision in plan.decisions for path, value in decision.fields.items()}
+
+
+def flat(config):
+    return {
+        f"{part}.{name}": value
+        for part, values in config_to_dict(config).items()
+        if isinstance(values, dict)
+        for name, value in values.items()
+    }
+
+
+@pytest.fixture(scope="module")
+def facts(scene):
+    return measure_scene(scene)
+
+
+def test_facts_are_those_of_the_scene(scene, facts):
+    assert (facts.photos, facts.held_out, facts.truths, facts.width) == (6, 2, 6, 32)
+    assert facts.pixels == 6 * 32 * 32 and facts.points == len(scene.points) == 60
+    # Cameras on a full circle see most of a cloud in its middle, from all sides.
+    assert facts.overlap > 0.5 and facts.seen > 4 and facts.spread > 120
+    clipped = [(view.image >= 254.5 / 255).any(2).mean() for view in scene.train_views]
+    assert facts.clipped == pytest.approx(float(np.mean(clipped)))
+
+
+def test_a_plan_decides_everything_once_with_figures(scene):
+    plan = make_plan(scene, config_of())
+    assert [decision.name for decision in plan.decisions] == list(DECISIONS) == list(RULES)
+    for decision in plan.decisions:
+        assert any(character.isdigit() for character in decision.reason) or decision.name == "response"
+    applied = flat(plan.config)
+    for path, value in fields(plan).items():
+        assert applied[path] == (tuple(value) if isinstance(value, list) else value), path
+    assert not plan.config.plan.enabled
+    assert json.loads(json.dumps(plan.to_dict()))["decisions"]
+
+
+@pytest.mark.parametrize(
+    "name,change,field,few,many",
+    [
+        ("iterations", {"photos": 200}, "schedule.iterations", 3000, 30_000),
+        ("harmonics", {"seen": 40.0, "spread": 150.0}, "model.harmonics_degree", 0, 3),
+        ("densification", {"pixels": 10**7}, "densification.max_gaussians", 20_000, 508_474),
+        ("resolution", {"width": 1200}, "schedule.coarse_levels", None, 2),
+        ("background", {"sky": 0.3}, "model.far_points", None, 20_000),
+        ("optimizer", {"visible": 0.2}, "optimizer.visible_only", False, True),
+        ("early-stop", {"photos": 10_000}, "schedule.early_stop", 3, None),
+    ],
+)
+def test_decisions_follow_their_figures(facts, name, change, field, few, many):
+    small = {"photos": 6, "seen": 3.0, "spread": 20.0, "pixels": 6144, "width": 32, "sky": 0.0, "visible": 0.9}
+    config = config_of()
+    assert RULES[name](replace(facts, **small), config).fields.get(field) == few
+    assert RULES[name](replace(facts, **small | change), config).fields.get(field) == many
+
+
+def test_one_decision_alone_changes_its_own_fields(scene):
+    plan = make_plan(scene, config_of(plan__decisions=["iterations"]))
+    before, after = flat(config_of()), flat(plan.config)
+    changed = {path for path in before if before[path] != after[path]} - {"plan.enabled", "plan.decisions"}
+    assert changed == {"schedule.iterations"}
+
+
+def test_brackets_of_one_base_become_a_scaling(scene):
+    untrue = replace(scene, views=tuple(replace(view, hdr=None) for view in scene.views))
+    plan = make_plan(untrue, load_config("paper", {"response.name": "srgb", "plan.enabled": True}))
+    assert not plan.config.fusion.enabled and plan.config.loss.linear_weight == 0
+    truth = make_plan(scene, load_config("paper-truth", {"response.name": "srgb", "plan.enabled": True}))
+    assert truth.config.loss.linear_weight > 0 and truth.config.loss.hdr_truth
+
+
+def test_what_the_user_gave_stays(scene):
+    plan = make_plan(scene, config_of(schedule__iterations=9000, plan__keep=["schedule.iterations"]))
+    assert plan.config.schedule.iterations == 9000
+    assert plan.kept == {"schedule.iterations": 9000}
+    assert "schedule.iterations" not in fields(plan)
+    assert "kept as given: schedule.iterations = 9000" in plan.table()
+
+
+def outwards(index):
+    """A camera on a circle that looks away from its middle, through a long lens."""
+    camera = orbit_camera(index)
+    turn = np.diag([-1.0, 1.0, -1.0, 1.0])
+    return Camera(32, 32, 400.0, 400.0, 16, 16, turn @ camera.world_to_camera)
+
+
+@pytest.mark.parametrize(
+    "spoil,words",
+    [
+        (lambda scene: toy_scene(2), ["2 training photos", "20"]),
+        (lambda scene: with_images(scene, lambda view: np.full_like(view.image, 0.5)), ["single colour", "0.00"]),
+        (
+            lambda scene: replace(
+                scene,
+                points=scene.points[:0],
+                point_colors=scene.point_colors[:0],
+                views=tuple(replace(view, camera=outwards(i)) for i, view in enumerate(scene.views)),
+            ),
+            ["share no view", "0.0%", "poses"],
+        ),
+    ],
+    ids=["two views", "one colour", "no overlap"],
+)
+def test_scenes_without_a_plan_get_one_line(scene, spoil, words):
+    with pytest.raises(InputError) as caught:
+        make_plan(spoil(scene), config_of())
+    assert "\n" not in str(caught.value)
+    for word in words:
+        assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "changes,spoil,words",
+    [
+        ({"densification.max_gaussians": 20}, None, ["max_gaussians = 20", "60 points"]),
+        ({"model.harmonics_degree": 3}, None, ["harmonics_degree = 3", "16", "6 photos"]),
+        ({"loss.hdr_weight": 0.6}, "hdr", ["hdr_weight = 0.6", "0 of 6"]),
+        ({"loss.hdr_truth": True, "loss.linear_weight": 0.5}, "hdr", ["hdr_truth = true", "0 of 6"]),
+        ({"schedule.coarse_levels": 3}, None, ["coarse_levels = 3", "32 x 32", "4"]),
+        (
+            {"fusion.enabled": True, "fusion.exposures": ["1", "1/125s"]},
+            "times",
+            ["fusion.exposures", "1/125s", "state none"],
+        ),
+        ({"fusion.enabled": True, "fusion.exposures": ["1", "30ev"]}, None, ["fusion.exposures", "1.07e+09 times"]),
+    ],
+)
+def test_values_that_the_scene_contradicts_are_refused_with_both(scene, changes, spoil, words):
+    if spoil == "hdr":
+        scene = replace(scene, views=tuple(replace(view, hdr=None) for view in scene.views))
+    if spoil == "times":
+        scene = replace(scene, exposure_times_known=False)
+    config = load_config("default", {"response.name": "srgb", "plan.keep": list(changes), **changes})
+    for planned in (config, load_config("default", changes | {"plan.enabled": True, "plan.keep": list(changes)})):
+        with pytest.raises(InputError) as caught:
+            apply_plan(scene, planned)
+        for word in words:
+            assert word in str(caught.value)
+    assert "\n" not in str(caught.value)
+    # What a preset states is not the user's contradiction.
+    apply_plan(scene, load_config("default", changes))
+
+
+def test_a_training_follows_its_plan_and_keeps_it(scene, tmp_path):
+    config = config_of(schedule__iterations=12, schedule__stated_for=12, densification__strategy="none")
+    config = replace(config, plan=replace(config.plan, keep=("schedule.iterations",)))
+    run = train(scene, tmp_path / "run", config, device="cpu", quiet=True)
+    plan = read_plan(tmp_path / "run")
+    assert {decision["name"] for decision in plan["decisions"]} == set(DECISIONS)
+    assert run.config == make_plan(scene, config).config
+    assert run.summary()["plan"]["harmonics"] == "degree 0"
+    assert run.model.gaussians.degree == 0
+    # Asking again for the same plan resumes; without one the old plan goes with the old run.
+    assert train(scene, tmp_path / "run", config, device="cpu", quiet=True, resume=True).iterations == 12
+    unplanned = load_config("default", {"response.name": "srgb", "schedule.iterations": 2, "model.harmonics_degree": 0})
+    assert train(scene, tmp_path / "run", unplanned, device="cpu", quiet=True, overwrite=True).summary()["plan"] is None
+    assert read_plan(tmp_path / "run") is None
+
+
+def test_settings_are_written_as_in_toml():
+    assert parse_setting("loss.clipping = false") == ("loss.clipping", False)
+    assert parse_setting("fusion.exposures=['1', '2ev']") == ("fusion.exposures", ["1", "2ev"])
+    assert parse_setting("response.name=gamma-2.2") == ("response.name", "gamma-2.2")
+    with pytest.raises(InputError, match="--set seed: is not field=value"):
+        parse_setting("seed")
+
+
+def test_plan_only_prints_and_trains_nothing(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arguments = ["train", "embedded", "--plan-only", "--max-size", "48", "--response", "hdr-nerf"]
+    with pytest.raises(SystemExit) as done:
+        cli.main([*arguments, "--json", "--set", "schedule.iterations=500", "--set", "seed=4"])
+    assert done.value.code == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert plan["kept"] == {"schedule.iterations": 500} and plan["facts"]["photos"] == 18
+    with pytest.raises(SystemExit):
+        cli.main(arguments)
+    table = capsys.readouterr().out
+    assert "schedule.iterations = 7200" in table and "400 steps on each of 18 photos" in table
+    with pytest.raises(SystemExit) as refused:
+        cli.main(arguments[:2])
+    assert refused.value.code == 1 and "--out" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
