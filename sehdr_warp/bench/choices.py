@@ -225,8 +225,7 @@ def _timed(scene: SplatScene, option: Option, cotangent: torch.Tensor) -> Varian
 
     forward_backward()  # loads the kernels, which a recording cannot
     recorder = GraphRecorder(scene.device)
-    sorts = max(entries * 5 // 4, scene.size.gaussians)
-    return Variant(lambda _: recorder.run("splat", forward_backward, sorts=sorts))
+    return Variant(lambda _: recorder.run("splat", forward_backward))
 
 
 def _tile_rows(size: Size, device: torch.device, repetitions: int, budget: float) -> list[dict]:

@@ -76,5 +76,4 @@ def _photo(field: RadianceField, scene, degree: int):
 
     recorded()  # loads the kernels, which a recording cannot
     recorder = GraphRecorder(camera.intrinsics.device)
-    sorts = max(capacity, field.gaussians.count)
-    return (lambda _: recorder.run("photo", recorded, sorts=sorts)), (lambda: None)
+    return (lambda _: recorder.run("photo", recorded)), (lambda: None)

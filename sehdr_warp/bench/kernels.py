@@ -93,7 +93,7 @@ def _recorded(scene: SplatScene, cotangent: torch.Tensor | None) -> Callable[[],
     function = forward if cotangent is None else forward_backward
     function()  # loads the kernels, which a recording cannot
     recorder = GraphRecorder(scene.device)
-    return lambda: recorder.run("render", function, sorts=max(capacity, scene.size.gaussians))
+    return lambda: recorder.run("render", function)
 
 
 def _checks(scene: SplatScene, peers: list[Peer]) -> list[checks.Check]:

@@ -79,8 +79,7 @@ class RecordedRasterizer:
         for recorder in (self._forward, self._backward):
             recorder.invalidate()
         # Not run(): a recording is made, not played, and the backward pass is recorded on the forward's own graph.
-        sorts = max(capacity, len(self._arguments[0]))
-        rendering = self._forward.record(key, lambda: forward(capacity), sorts=sorts)
+        rendering = self._forward.record(key, lambda: forward(capacity))
         made = iter(self._backward.record(key, lambda: backward(rendering)) if leaves else ())
         self._gradients = [next(made) if want else None for want in wanted]
         self._rendering = replace(

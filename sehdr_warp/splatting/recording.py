@@ -4,14 +4,27 @@ A training step is some sixty kernels of a few microseconds each: launched one b
 long as the GPU. Recorded once and replayed, the GPU sets the pace.
 """
 
+import gc
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 
 import torch
 import warp as wp
 
 from .bridge import torch_stream
-from .sorting import reserve
+
+
+@contextmanager
+def _no_collection():
+    """No garbage collection within this block. A recording that only the collector frees (trainings live in reference
+    cycles) takes its memory along, and in the middle of another recording that spoils both."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 class GraphRecorder:
@@ -44,24 +57,21 @@ class GraphRecorder:
             self._graph.reset()
             self._graph = None
 
-    def run(self, key, function: Callable, *, sorts: int = 0):
+    def run(self, key, function: Callable):
         """Replay the recording made under `key`, after recording `function` if there is none; returns its result.
 
-        As record() otherwise.
+        Raises RuntimeError if the function cannot be recorded.
         """
         if self._graph is None or key != self._key:
-            self.record(key, function, sorts=sorts)
+            self.record(key, function)
         return self.replay()
 
-    def record(self, key, function: Callable, *, sorts: int = 0):
+    def record(self, key, function: Callable):
         """Record `function` without playing it, in the place of any other recording; returns what will be its result.
 
-        sorts: the most pairs that it sorts at once; of rasterize() the capacity or the number of Gaussians.
         Raises RuntimeError if the function cannot be recorded.
         """
         self.invalidate()
-        with torch.cuda.stream(self.stream):
-            reserve(self.device, sorts)
         self._graph, self._result = self._record(function)
         self._key = key
         return self._result
@@ -75,7 +85,7 @@ class GraphRecorder:
         graph = torch.cuda.CUDAGraph()
         current = torch.cuda.current_stream(self.device)
         self.stream.wait_stream(current)
-        with torch.cuda.stream(self.stream), torch_stream(self.device):
+        with _no_collection(), torch.cuda.stream(self.stream), torch_stream(self.device):
             stream = wp.get_stream(wp.device_from_torch(self.device))
             graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
             wp.capture_begin(stream=stream, external=True)

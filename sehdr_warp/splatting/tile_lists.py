@@ -11,7 +11,6 @@ from ..kernels.geometry import vector
 from ..kernels.tiles import mark_ranges, tile_kernels
 from .arrays import view, warp_scalar
 from .bridge import torch_stream
-from .sorting import sort_pairs, sorted_places
 
 LARGEST_CAPACITY = 2**31 - 1
 """Entries are counted in int32."""
@@ -128,7 +127,7 @@ def depth_order(depths, extents):
     count = depths.shape[0]
     keys = depths.new_empty(2 * count)
     keys[:count] = torch.where(extents[:, 0] > 0, depths, torch.inf)
-    return sorted_places(keys, count)
+    return _sorted_places(keys, count)
 
 
 def count_entries(order, shapes, ellipses, extents, columns: int, rows: int):
@@ -184,9 +183,9 @@ def sort_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: 
     """
     bits = tile_count.bit_length()
     if emission:
-        places = sorted_places(tiles, entry_count, bits)
+        places = _sorted_places(tiles, entry_count, bits)
         return tiles[:entry_count], gaussians[:entry_count][places] if entry_count else gaussians, places
-    sort_pairs(tiles, gaussians, entry_count, bits)
+    _sort_pairs(tiles, gaussians, entry_count, bits)
     return tiles[:entry_count], gaussians[:entry_count], None
 
 
@@ -197,6 +196,21 @@ def find_ranges(tiles, tile_count: int):
         arguments = [view(tiles), tiles.shape[0], tile_count, view(ranges, wp.vec2i)]
         _launch(mark_ranges, tiles.shape[0], arguments, tiles.device)
     return ranges
+
+
+def _sorted_places(keys, count: int, bits: int | None = None):
+    """[count] int32 permutation that sorts keys[:count] (stable). keys has room for 2 count and is sorted in place."""
+    places = torch.empty(2 * count, dtype=torch.int32, device=keys.device)
+    torch.arange(count, dtype=torch.int32, device=keys.device, out=places[:count])
+    _sort_pairs(keys, places, count, bits)
+    return places[:count]
+
+
+def _sort_pairs(keys, values, count: int, bits: int | None) -> None:
+    """Sorts keys[:count] and values[:count] by the keys' lowest bits (stable); both have room for 2 count."""
+    if count:
+        with torch_stream(keys.device):
+            wp.utils.radix_sort_pairs(wp.from_torch(keys), wp.from_torch(values), count, end_bit=bits)
 
 
 def _launch(kernel, count: int, arguments, device) -> None:

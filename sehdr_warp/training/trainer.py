@@ -256,7 +256,6 @@ class Trainer:
             return self._recorder.run(
                 kind,
                 lambda: self._optimise(views.at(self._index), watched, capacity),
-                sorts=max(capacity, self.field.gaussians.count),
             )
         except (RuntimeError, OutOfMemory) as error:
             # Nothing of the step was done yet. Launching every step is slower, and right.
