@@ -105,7 +105,8 @@ class Runner:
 
     def _warm_up(self, method: dict, scene: Scene, config: Config, folder: Path) -> None:
         # What is compiled depends on the shape of the computation, not on seeds, rates or lengths.
-        shape = repr((config.model, config.response.form, config.fusion, config.loss, config.densification.strategy))
+        parts = config.model, config.response.form, config.fusion, config.loss, config.densification.strategy
+        shape = repr((*parts, config.optimizer.visible_only, config.densification.contribution > 0))
         if shape in self._warm or method["kind"] == "hdr-nerf":
             return
         count = min(WARM_UP_ITERATIONS, config.schedule.iterations)
