@@ -147,6 +147,8 @@ def _guard(device):
     hook = trainer.field.gaussians.means.register_hook(lambda gradient: gradient * math.nan)
     trainer.step()
     hook.remove()
+    if trainer._recorder is not None:
+        trainer._recorder.invalidate()  # the hook is in the recording
     after = {name: tensor.clone() for name, tensor in trainer.field.gaussians.tensors().items()}
     changed = sum(int((before[name] != after[name]).sum()) for name in before)
     skipped = trainer.skipped_steps
