@@ -190,7 +190,7 @@ def _hdr_line(rows: list[dict], bound: dict) -> list[str]:
 
 
 _REGION_TITLES = ["method", *(f"{name}{what}" for name in _REGIONS for what in ("", ", to U", ", share")),
-                  "LDR", "LDR SSIM"]  # fmt: skip
+                  "LDR", "LDR SSIM", "confidence"]  # fmt: skip
 
 
 def _region_line(rows: list[dict], bound: dict) -> list[str]:
@@ -199,7 +199,8 @@ def _region_line(rows: list[dict], bound: dict) -> list[str]:
         share = _mean(rows, lambda row, region=region: 100 * row["figures"]["regions"][region]["fraction"], 1)
         there = [row for row in rows if row["figures"]["regions"][region]["fraction"] > 0]
         cells += [_mean(there, _region(region)), _difference(rows, bound, _region(region)), f"{share} %"]
-    return [*cells, _mean(rows, _figure("ldr", "psnr")), _mean(rows, _figure("ldr", "ssim"), 4)]
+    cells += [_mean(rows, _figure("ldr", "psnr")), _mean(rows, _figure("ldr", "ssim"), 4)]
+    return [*cells, _mean(rows, lambda row: row["figures"].get("confidence", {}).get("spearman_log2"))]
 
 
 _COST_TITLES = ["method", "seconds", "most", "to 0.1 dB", "peak MiB", "Gaussians", "renders / s"]
@@ -295,7 +296,8 @@ def _heading(rows: Sequence[dict]) -> str:
         f"{', '.join(machines)}; sehdr-warp {', '.join(sorted({str(row['version']) for row in rows}))}.\n\n"
         "PSNR in dB of mu-law values (gt-max, self-max, aligned), of PU21 values (aligned scale) and of the simulated "
         "photo (LDR), means over jobs; *worst* is that of the worst job; *to U* the mean difference to 3DGS trained on "
-        "the HDR truth of the same scenes and views; regions are of the photo, aligned."
+        "the HDR truth of the same scenes and views; regions are of the photo, aligned; *confidence* is the rank correlation of "
+        "1 - confidence with the error in stops."
     )
 
 

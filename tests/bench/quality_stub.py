@@ -51,6 +51,7 @@ def result(job, psnr: float = 30.0, seconds: float = 2.0, date: str = "2026-11-2
                 "well-exposed": {"fraction": 0.9, "psnr_mu": {"aligned": psnr + 2}},
                 "dark": {"fraction": 0.0, "psnr_mu": {"aligned": None}},
             },
+            "confidence": {"spearman_log2": psnr / 50, "spearman_mu": 0.5, "mean": 0.8, "pixels": 10},
             "views": [],
             "train_seconds": seconds,
             "seconds_to_final": seconds / 2,

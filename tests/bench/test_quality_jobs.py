@@ -244,6 +244,8 @@ def test_tables_pair_each_job_with_the_upper_bound_and_with_its_base(tmp_path):
     line = dict(zip(titles[:7], lines["default"]))
     assert (line["jobs"], line["gt-max"], line["worst"], line["to U"]) == ("2", "25.00", "20.00", "-3.00")
     assert list(lines) == ["default", "plain", "truth"]
+    titles, lines = table(text, "clipped")
+    assert dict(zip(titles, lines["default"]))["confidence"] == "0.50"
     ablation = next(line for line in text.splitlines() if line.startswith("| plain") and "loss.clipping" in line)
     assert [c.strip() for c in ablation.split("|")][1:5] == ["plain", "default", "1", "-1.00"]
     assert (tmp_path / "error-over-time-cpu.png").read_bytes()[:4] == b"\x89PNG"
