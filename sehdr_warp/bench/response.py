@@ -118,7 +118,8 @@ def _choices(images, from_camera: bool, seed: int):
     with contextlib.suppress(SehdrError):
         selection = select_response(images, method="posterior", from_camera=from_camera, seed=seed)
         scores, edge_count = selection.scores, selection.edge_count
-        yield "posterior", scores[0].response
+        yield "posterior", selection.response
+        yield "posterior, formulae only", scores[0].response
         for part in ("edges", "highlights", "prior"):
             without = min(scores, key=lambda score, part=part: score.posterior - _weighted(score, part, edge_count))
             yield f"posterior without {part}", without.response

@@ -1,4 +1,4 @@
-"""Choosing a response from photos: colour mixtures at edges, clipped light, and a prior; or the paper's score."""
+"""A response from photos: by colour mixtures at edges, clipped light and a prior; or by the paper's score."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +9,8 @@ import torch
 from ..errors import SehdrError
 from .response import response_by_name, response_names
 from .response_curve import Response
+from .response_family import CODES, family_logs
+from .response_table import TabulatedResponse
 
 CODE = 1.0 / 255
 # Edges: pixel pairs this far from the middle one; each end must be flat to 3 codes and 20 codes apart from the other.
@@ -16,6 +18,8 @@ EDGE_REACH, FLAT_CODES, EDGE_CODES = 2, 3, 20
 # The two ends' encoded colours must not be one grey scaled: angle between them, in radians.
 EDGE_ANGLE = 0.05
 MAX_EDGES, MIN_EDGES = 3000, 50
+# The middle lies between these shares of the way from one side to the other, in encoded values.
+LEAST_SHARE, MOST_SHARE = 0.15, 0.85
 # Variance of a stored value in codes^2: rounding, and a little for what two evenly coloured sides still hide.
 CODE_VARIANCE = 1 / 12 + 0.05
 # Student's t: an edge that no mixture explains (a third surface, a highlight) costs a logarithm, not a square.
@@ -31,6 +35,11 @@ CAMERA_PRIOR = {"camera": 0.0, "rec709": 1.0}
 UNLIKELY = 12.0
 # Nobody stores 8-bit linear photos, and photos scaled down in encoded values have edges that are linear in them.
 LINEAR_PRIOR = 1000.0
+# How likely it is beforehand that no formula made the photos, and the probability from which a formula is taken for the
+# truth (docs/response.md: set on half of the scenes and curves).
+NO_FORMULA, DECISIVE = 0.5, 0.25
+# Members of the family that are judged at once.
+BATCH = 16
 # Photos larger than this are read in bands.
 MOST_PIXELS, BAND_ROWS = 400_000, 32
 
@@ -43,7 +52,7 @@ class ResponseScore:
     roughness: mean absolute second difference of log2 of the decoded values, stops.
     paper_score: dynamic_range and minus roughness, each divided by its median over the candidates; larger is better.
     edges: mean over edges of minus the log likelihood, nats, that the middle colour is a mixture of its two sides in
-        linear light; smaller is better; NaN if the photos have fewer than 50 usable edges.
+        linear light, every share as likely; smaller is better; NaN if the photos have fewer than 50 usable edges.
     highlights: minus the log likelihood, nats, of the pixels at the brightest code beside those just below it.
     prior: minus the log prior, nats. posterior: the sum of the three, edges counted as EDGES_PER_FACT says.
     """
@@ -60,12 +69,16 @@ class ResponseScore:
 
 @dataclass(frozen=True)
 class ResponseSelection:
-    """The chosen response, by which score, and every candidate's scores, best first."""
+    """The chosen response, by which score, and every candidate's scores, best first.
+
+    none_fits: the posterior probability that the curve is none of the candidates; 0 where this was not asked.
+    """
 
     response: Response
     method: str
     edge_count: int
     scores: tuple[ResponseScore, ...]
+    none_fits: float = 0.0
 
 
 def select_response(
@@ -81,13 +94,17 @@ def select_response(
     image: [H, W, 3] encoded values in [0, 1], NumPy array or tensor, as photographed: resampling in encoded values
         mixes colours in them, and the edges then tell of the resampling. Or a list of such images of one camera: their
         edges are pooled, and the paper's statistics are of the one with the most pixels neither black nor clipped.
-    candidates: responses; by default the analytic bank. A DoRF file's are responses_in_file(path).
+    candidates: responses, of which one is taken; by default the analytic bank. A DoRF file's are
+        responses_in_file(path).
     method: "paper" is SeHDR, section 3.3: the curve of DoRF that does best "on a randomly sampled training image,
         evaluated by dynamic range and smoothness". The paper gives no formula; ours is ResponseScore.paper_score.
         "edges" is after Lin et al. 2004 (Radiometric calibration from a single image): at an edge between two evenly
         coloured regions a pixel is a mixture of both in linear light, so decoded colours lie on a line. Falls back to
         "paper", and says so in `method`, where the photo has fewer than 50 such edges.
         "posterior" adds a prior and what the clipped pixels tell; it needs no edges, and no well-exposed pixels.
+        Without `candidates`, and for photos that are not a camera's own, a smooth family of cameras' curves stands
+        beside the bank. A formula with a quarter of the posterior is taken; else the response is the posterior's
+        mean of log exposure at each code, a table that is none of the candidates.
     from_camera: the photos are a camera's own JPEGs: the prior is then that of cameras.
     seed: of the sample of edges where there are more than 3000.
 
@@ -97,6 +114,7 @@ def select_response(
     """
     if method not in ("paper", "edges", "posterior"):
         raise SehdrError(f"select_response: method = {method!r} is not one of paper, edges, posterior")
+    beside = candidates is None and method == "posterior" and not from_camera
     if candidates is None:
         candidates = [response_by_name(name) for name in response_names()]
     if not candidates:
@@ -109,9 +127,14 @@ def select_response(
     if len(edges) > MAX_EDGES:
         edges = edges[np.random.default_rng(seed).choice(len(edges), MAX_EDGES, replace=False)]
     bright = _highlight_shares([values for bands in photos for values, _ in bands])
-    rows = []
+    points, rows = _edge_points(edges), []
     for each in candidates:
-        surprise, highlights, prior = _edge_surprise(edges, each), _highlights(bright, each), _prior(each, from_camera)
+        stops = np.log2(float(each.decode(1 - CODE / 2)) / float(each.decode(1 - 9.5 * CODE)))
+        surprise, highlights, prior = (
+            _edge_surprise(points, each),
+            _highlights(bright, stops),
+            _prior(each, from_camera),
+        )
         posterior = np.nan_to_num(surprise) * len(edges) / EDGES_PER_FACT + highlights + prior
         rows.append((*_range_and_roughness(fullest, each), surprise, highlights, prior, posterior))
     ranges, roughnesses, surprises, highlights, priors, posteriors = np.array(rows, dtype=np.float64).T
@@ -122,7 +145,34 @@ def select_response(
     columns = (ranges, roughnesses, paper, surprises, highlights, priors, posteriors)
     scores = [ResponseScore(each, *map(float, row)) for each, row in zip(candidates, np.stack(columns, 1), strict=True)]
     order = np.argsort(-goodness, kind="stable")
-    return ResponseSelection(candidates[order[0]], method, len(edges), tuple(scores[index] for index in order))
+    ranked, best = tuple(scores[index] for index in order), candidates[order[0]]
+    if not beside:
+        return ResponseSelection(best, method, len(edges), ranked)
+    chances, logs = _beside_family(points, bright, candidates, priors, posteriors)
+    none_fits = float(chances[len(candidates) :].sum())
+    if chances[order[0]] < DECISIVE:
+        best = _mean_response(chances, logs)
+    return ResponseSelection(best, method, len(edges), ranked, none_fits)
+
+
+def _beside_family(points, bright, candidates, priors, posteriors):
+    """Probabilities [K + 512] of the candidates and of the family's members, and their log exposures [K + 512, 256]."""
+    logs, rises = family_logs()
+    surprise = _family_surprise(points, logs, rises)
+    stops = (logs[:, 254:].mean(1) - logs[:, 245:247].mean(1)) / np.log(2)
+    members = np.array([_highlights(bright, each) for each in stops])
+    members += np.nan_to_num(surprise) * len(points) / EDGES_PER_FACT + np.log(len(logs) / NO_FORMULA)
+    named = posteriors + np.log(np.exp(-priors).sum() / (1 - NO_FORMULA))
+    costs = np.concatenate([named, members])
+    chances = np.exp(costs.min() - costs)
+    known = np.stack([np.log(each.decode(np.maximum(CODES, each.black + CODE))) for each in candidates])
+    return chances / chances.sum(), np.concatenate([known, logs])
+
+
+def _mean_response(chances, logs) -> TabulatedResponse:
+    exposures = np.exp(chances @ logs)
+    exposures[0] = 0.0
+    return TabulatedResponse("posterior mean", exposures, CODES)
 
 
 def _checked(image) -> np.ndarray:
@@ -159,12 +209,11 @@ def _highlight_shares(images) -> tuple[float, float]:
     return at_white / count, near_white / count
 
 
-def _highlights(shares: tuple[float, float], response: Response) -> float:
+def _highlights(shares: tuple[float, float], stops: float) -> float:
     """Minus the log likelihood of those shares. If log radiance falls off as exp(-rate stops), the nine codes span
-    S stops and white holds all beyond them, then near / (at + near) = 1 - exp(-rate S): a clipping camera piles values
+    S `stops` and white holds all beyond them, then near / (at + near) = 1 - exp(-rate S): a clipping camera piles values
     up at 255, a curve that never clips spreads the same light over the codes below. The rate is log-normal."""
     white, near = (share + HIGHLIGHT_FLOOR / 2 for share in shares)
-    stops = np.log2(float(response.decode(1 - CODE / 2)) / float(response.decode(1 - 9.5 * CODE)))
     rate = np.log1p(near / white) / max(stops, 1e-6)
     spread = HIGHLIGHT_SPREAD**2 + HIGHLIGHT_FLOOR / (sum(shares) + 1e-9)
     return float(0.5 * np.log(rate / HIGHLIGHT_RATE) ** 2 / spread)
@@ -211,29 +260,71 @@ def _edge_colours(image, clear):
         cosine = (first * last).sum(-1) / (np.linalg.norm(first, axis=-1) * np.linalg.norm(last, axis=-1) + 1e-12)
         coloured = cosine < np.cos(EDGE_ANGLE)
         seen = at(-reach, known) & at(0, known) & at(reach, known)
-        chosen = flat & apart & between & coloured & seen & (share > 0.15) & (share < 0.85)
+        chosen = flat & apart & between & coloured & seen & (share > LEAST_SHARE) & (share < MOST_SHARE)
         found.append(np.stack([first[chosen], middle[chosen], last[chosen]], axis=1))
     return np.concatenate(found) if found else np.zeros((0, 3, 3))
 
 
-def _edge_surprise(edges, response):
-    """Mean over edges of minus the log likelihood, in nats, that the middle colour lies on the line of its two sides.
+def _edge_points(edges):
+    """[E, 13] encoded: the three colours of each edge; of the channel that changes most, where the middle may lie (2),
+    and the two sides."""
+    channel = np.abs(edges[:, 2] - edges[:, 0]).argmax(1)[:, None]
+    first, last = (np.take_along_axis(edges[:, side], channel, 1) for side in (0, 2))
+    limits = [first + share * (last - first) for share in (LEAST_SHARE, MOST_SHARE)]
+    return np.concatenate([edges.reshape(-1, 9), *limits, first, last], axis=1)
 
-    The distance from the line has the variance that rounding of all three colours gives it under this candidate,
-    measured at the middle colour in code values, where a photo's own noise is alike for every candidate. The density's
-    normalisation (log determinant) belongs to it: without, the curve that crowds colours together would win.
-    """
-    if len(edges) < MIN_EDGES:
+
+def _edge_surprise(points, response) -> float:
+    """Mean over edges of minus the log likelihood under a response, nats; NaN for too few edges."""
+    if len(points) < MIN_EDGES:
         return np.nan
-    exposures = np.asarray(response.decode(np.maximum(edges, response.black + CODE)))
-    slopes = np.maximum(np.asarray(response.slope(exposures)), 1e-9)
-    (first, middle, last), (slope_first, slope, slope_last) = np.moveaxis(exposures, 1, 0), np.moveaxis(slopes, 1, 0)
+    exposures = np.asarray(response.decode(np.maximum(points, response.black + CODE)))
+    slopes = np.maximum(np.asarray(response.slope(exposures[:, :9])), 1e-9)
+    return float(_mixture_surprise(torch.from_numpy(exposures), torch.from_numpy(slopes)))
+
+
+def _family_surprise(points, logs, rises) -> np.ndarray:
+    """[512] the same under each member of the family, in float32; read off between codes along straight lines."""
+    if len(points) < MIN_EDGES:
+        return np.full(len(logs), np.nan)
+    exposures = torch.from_numpy(np.exp(logs)).float()
+    slopes = 1 / (exposures * torch.from_numpy(rises).float())
+    place = torch.from_numpy(np.clip(points * 255, 1, 255)).float()
+    below = place.floor().clamp_max(254)
+    part, below = place - below, below.long()
+    found = []
+    for start in range(0, len(logs), BATCH):
+        read = [
+            table[:, at].lerp(table[:, at + 1], weight)
+            for table, at, weight in (
+                (exposures[start : start + BATCH], below, part),
+                (slopes[start : start + BATCH], below[:, :9], part[:, :9]),
+            )
+        ]
+        found.append(_mixture_surprise(*read))
+    return torch.cat(found).double().numpy()
+
+
+def _mixture_surprise(exposures, slopes):
+    """[...] from exposures [..., E, 13] of _edge_points and the curve's slopes [..., E, 9] at the nine colours.
+
+    The middle colour lies on the line of its two sides. Its distance from the line has the variance that rounding of
+    all three colours gives it under this candidate, measured at the middle colour in code values, where a photo's own
+    noise is alike for every candidate. Along the line every share in linear light is as likely, within the limits that
+    the choice of edges left. The densities' normalisation belongs to both: without, the curve that crowds colours
+    together would win.
+    """
+    first, middle, last = exposures[..., :9].unflatten(-1, (3, 3)).unbind(-2)
+    slope_first, slope, slope_last = slopes.unflatten(-1, (3, 3)).unbind(-2)
+    low, high, begin, end = exposures[..., 9:].unbind(-1)
     offset, line = slope * (middle - first) / CODE, slope * (last - first) / CODE
-    length = np.maximum((line**2).sum(1), 1e-300)
-    share = ((offset * line).sum(1) / length)[:, None]
+    length = line.square().sum(-1).clamp_min(1e-30)
+    share = ((offset * line).sum(-1) / length)[..., None]
     variance = CODE_VARIANCE * (1 + ((1 - share) * slope / slope_first) ** 2 + (share * slope / slope_last) ** 2)
-    weighted = np.maximum((line**2 / variance).sum(1), 1e-300)
-    share = ((offset * line / variance).sum(1) / weighted)[:, None]
-    distance = ((offset - share * line) ** 2 / variance).sum(1)
-    spread = 0.5 * (np.log(variance).sum(1) + np.log(weighted) - np.log(length))
-    return float(((EDGE_FREEDOM + 2) / 2 * np.log1p(distance / EDGE_FREEDOM) + spread).mean())
+    weighted = (line.square() / variance).sum(-1).clamp_min(1e-30)
+    share = ((offset * line / variance).sum(-1) / weighted)[..., None]
+    distance = ((offset - share * line).square() / variance).sum(-1)
+    spread = (
+        0.5 * (variance.log().sum(-1) + weighted.log()) + ((high - low) / (end - begin)).abs().clamp_min(1e-3).log()
+    )
+    return ((EDGE_FREEDOM + 2) / 2 * (distance / EDGE_FREEDOM).log1p() + spread).mean(-1)

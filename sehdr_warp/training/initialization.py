@@ -15,7 +15,6 @@ from ..model.response import (
     Response,
     ToneMapper,
     response_by_name,
-    response_names,
     responses_in_file,
 )
 from ..model.response_selection import select_response
@@ -69,7 +68,7 @@ def choose_response(scene: Scene, config: Config) -> Response:
 
 def _selected(scene: Scene, config: Config) -> Response:
     options = config.response
-    candidates = [response for name in options.candidates or response_names() for response in _responses(name)]
+    candidates = [response for name in options.candidates for response in _responses(name)] or None
     views = scene.train_views
     images = [view.image for view in views]
     if options.method == "paper":

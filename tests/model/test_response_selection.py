@@ -5,8 +5,10 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.model.response import response_by_name, response_names
+from sehdr_warp.model.response import Response, response_by_name, response_names
+from sehdr_warp.model.response_family import family_logs
 from sehdr_warp.model.response_selection import select_response
+from sehdr_warp.model.response_table import TabulatedResponse
 
 
 def mosaic(seed=0, size=96, tile=12) -> np.ndarray:
@@ -118,3 +120,56 @@ def test_posterior_never_takes_photos_for_linear():
     photos = [np.round(mosaic(seed) * 255) / 255 for seed in range(4)]
     assert select_response(photos).response.name == "linear"
     assert select_response(photos, method="posterior").response.name != "linear"
+
+
+def family_curve(draw: int):
+    """A member of the family that posterior photos are judged by, as a response."""
+    logs, _ = family_logs()
+    return TabulatedResponse(f"member {draw}", np.concatenate([[0.0], np.exp(logs[draw, 1:])]), np.arange(256) / 255)
+
+
+def stops_off(response, truth) -> float:
+    codes = np.arange(10, 246) / 255
+    return float(np.std(np.log2(response.decode(codes)) - np.log2(truth.decode(codes))))
+
+
+def test_family_is_increasing_and_holds_what_cameras_do():
+    logs, rises = family_logs()
+    assert logs.shape == rises.shape == (512, 256) and (np.diff(logs[:, 1:]) > 0).all()
+    assert rises[:, 128] == pytest.approx((logs[:, 129] - logs[:, 127]) * 127.5, rel=1e-3)
+    # Nearer than this to one of 512 curves: the camera's, sRGB, and light that is stored as it is.
+    for name, most in (("camera", 0.12), ("srgb", 0.15), ("linear", 0.2)):
+        stops = np.log2(response_by_name(name).decode(np.arange(10, 246) / 255))
+        assert (logs[:, 10:246] / np.log(2) - stops).std(1).min() < most
+
+
+def test_curve_that_is_no_formula_is_met_by_the_posteriors_mean():
+    off_mean, off_formula = [], []
+    for draw in (3, 40, 77):
+        truth = family_curve(draw)
+        photos = [np.round(truth.encode(truth.clip_exposure * mosaic(seed)) * 255) / 255 for seed in range(4)]
+        selection = select_response(photos, method="posterior")
+        assert selection.none_fits > 0.75 and selection.response.name == "posterior mean"
+        off_mean.append(stops_off(selection.response, truth))
+        off_formula.append(stops_off(selection.scores[0].response, truth))
+    assert np.mean(off_mean) < 0.15 and np.mean(off_mean) < 0.5 * np.mean(off_formula)
+
+
+def test_candidates_that_are_given_and_photos_of_cameras_get_no_family():
+    truth = family_curve(3)
+    photo = np.round(truth.encode(truth.clip_exposure * mosaic()) * 255) / 255
+    given = [response_by_name(name) for name in ("srgb", "camera")]
+    for selection in (
+        select_response(photo, given, method="posterior"),
+        select_response(photo, method="posterior", from_camera=True),
+        select_response(photo),
+    ):
+        assert selection.none_fits == 0 and selection.response is selection.scores[0].response
+
+
+def test_posteriors_mean_can_be_stored():
+    selection = select_response(np.full((32, 32, 3), 0.5), method="posterior")
+    again = Response.from_dict(selection.response.to_dict())
+    assert selection.edge_count == 0 and selection.response.name == "posterior mean"
+    values = np.linspace(0, 1, 50)
+    assert np.allclose(again.decode(values), selection.response.decode(values))
