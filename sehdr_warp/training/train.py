@@ -72,11 +72,12 @@ def train(
     disk or the memory is full, KeyboardInterrupt after an interrupt; a usable checkpoint is left then.
     """
     out, device = Path(out), pick_device(device)
+    make_writer = _summary_writer() if tensorboard else None
     with memory_told(device, lambda: _sizes(scene)):
         scene, trainer, seconds = _start(
             scene, out, config, device, resume=resume, overwrite=overwrite, data=data or {}
         )
-    loop = _Loop(scene, out, trainer, seconds, tensorboard)
+    loop = _Loop(scene, out, trainer, seconds, make_writer and make_writer(str(out / "tensorboard")))
     with (
         memory_told(device, lambda: _sizes(scene, trainer)),
         Progress(trainer.config.schedule.iterations, enabled=not quiet) as progress,
@@ -179,14 +180,14 @@ def _first_difference(saved: Config, given: Config) -> str:
 class _Loop:
     """The steps of one process's part of a training."""
 
-    def __init__(self, scene: Scene, out: Path, trainer: Trainer, seconds: float, tensorboard: bool):
+    def __init__(self, scene: Scene, out: Path, trainer: Trainer, seconds: float, writer):
         self.scene, self.out, self.trainer = scene, out, trainer
         self.schedule = trainer.config.schedule
         self.evaluate_at = {trainer.config.scaled(n) for n in self.schedule.evaluate_at} | {self.schedule.iterations}
         self.checkpoint_every = trainer.config.scaled(self.schedule.checkpoint_every)
         self.seconds = seconds
         self.first_iteration, self.first_seconds = trainer.iteration, seconds
-        self.writer = _tensorboard_writer(out) if tensorboard else None
+        self.writer = writer
 
     def run(self, progress: Progress) -> None:
         trainer, total = self.trainer, self.schedule.iterations
@@ -358,9 +359,9 @@ def _interruptible():
         signal.signal(signal.SIGINT, previous)
 
 
-def _tensorboard_writer(out: Path):
+def _summary_writer() -> type:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
         raise SehdrError("TensorBoard is not installed; run `pip install sehdr-warp[tensorboard]`") from None
-    return SummaryWriter(str(out / "tensorboard"))
+    return SummaryWriter

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import signal
+import sys
 import threading
 
 import numpy as np
@@ -274,3 +275,20 @@ def test_recorded_steps_train_like_launched_ones(variant):
         assert trainer.skipped_steps == 0
         scores.append(evaluate_views(field, scene.test_views, trainer.degree)["psnr_ldr"])
     assert abs(scores[0] - scores[1]) < 1.5
+
+
+def test_tensorboard_gets_the_figures_of_the_held_out_views(scene, tmp_path, monkeypatch):
+    short = quick(**{"schedule.iterations": 4})
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "torch.utils.tensorboard", None)
+        with pytest.raises(SehdrError, match=r"pip install sehdr-warp\[tensorboard\]"):
+            train(scene, tmp_path / "without", short, device="cpu", quiet=True, tensorboard=True)
+    assert not (tmp_path / "without").exists()
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    run = train(scene, tmp_path / "run", short, device="cpu", quiet=True, tensorboard=True)
+    events = EventAccumulator(str(run.path / "tensorboard")).Reload()
+    last = run.metrics()[-1]
+    written = events.Scalars("test/psnr_ldr")[-1]
+    assert written.step == last["iteration"] == 4 and abs(written.value - last["psnr_ldr"]) < 1e-3
