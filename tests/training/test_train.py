@@ -108,7 +108,8 @@ def test_run_folder_is_complete_and_loads_without_photos(scene, tmp_path):
     out = tmp_path / "run"
     run = train(scene, out, quick(), device="cpu", quiet=True, data={"path": "somewhere"})
     names = {path.name for path in out.iterdir()}
-    assert names == {"config.json", "scene.json", "run.json", "metrics.jsonl", "summary.json", "checkpoints"}
+    files = {"config.json", "scene.json", "run.json", "metrics.jsonl", "summary.json", "confidence.safetensors"}
+    assert names == files | {"checkpoints"}
     again = load_run(out)
     assert again.config == run.config == quick() and again.data == {"path": "somewhere"}
     assert [entry.name for entry in again.cameras] == [view.name for view in scene.views]
