@@ -128,8 +128,7 @@ def test_changelog_and_citation_state_the_version():
 def test_constraints_pin_what_the_package_needs():
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
-    needs = [Requirement(text) for text in PROJECT["dependencies"] + PROJECT["optional-dependencies"]["test"]]
-    for need in needs:
+    for need in map(Requirement, sum(PROJECT["optional-dependencies"].values(), PROJECT["dependencies"])):
         name = need.name.lower().replace("_", "-")
         assert name in pins and need.specifier.contains(pins[name]), f"{need} against {pins.get(name)}"
 
