@@ -68,7 +68,7 @@ class ResponseConfig:
     )
     candidates: tuple[str, ...] = option(
         (),
-        "what auto chooses from: names, and files of one curve or many; empty means every built-in response, and what lies between",
+        "what auto chooses from: names, and files of one curve or many; empty: the built-in ones and those between",
         nonempty=True,
     )
     form: str = option(
