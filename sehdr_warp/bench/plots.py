@@ -35,7 +35,9 @@ def plot_scale(report: dict, path: Path) -> None:
     rows = [row for row in report["rows"] if row["stage"] == "scale"]
     names = list(dict.fromkeys(row["sweep"] for row in rows))
     labels = list(dict.fromkeys((row["implementation"], row["what"]) for row in rows))
+    colors = {what: f"C{place}" for place, what in enumerate(dict.fromkeys(what for _, what in labels))}
     figure, panels = _panels(2, len(names))
+    lines = {}
     for panel_row, field, unit, scale in zip(
         panels, ("median_ms", "peak_memory_bytes"), ("median, ms", "peak, MiB"), (1.0, 2.0**-20)
     ):
@@ -48,10 +50,10 @@ def plot_scale(report: dict, path: Path) -> None:
                 ]
                 if chosen:
                     style = "--" if who == "gsplat" else "-"
-                    axes.plot(*zip(*chosen), style, marker="o", markersize=3, label=f"{who}: {what}")
+                    lines[f"{who}: {what}"] = axes.plot(*zip(*chosen), style, color=colors[what], marker="o", ms=3)[0]
             axes.set(xlabel=name, ylabel=unit, xscale="log", yscale="log")
-            axes.grid(True, which="both", alpha=0.3)
-            axes.legend(fontsize="xx-small")
+            axes.grid(True, which="major", alpha=0.3)
+    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4, fontsize="small")
     figure.savefig(path, dpi=120)
 
 
