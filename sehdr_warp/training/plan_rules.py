@@ -7,12 +7,8 @@ from dataclasses import dataclass
 from .config import Config
 from .plan_scene import SceneFacts
 
-PHOTOS_A_DEGREE = 2.0
-"""A degree is taken where a place is seen by this many photos for each of its harmonics' unknowns: with fewer they fit
-each photo by itself."""
-DEGREES_A_BAND = 45.0
-"""Harmonics of degree d tell directions apart that are some 180 / d degrees apart; cameras within a quarter of that see
-their constant and slope alone."""
+LEAST_GAIN = 0.05
+"""Decibels on training photos that a degree of the harmonics is kept for; about half of it shows in other photos."""
 GEOMETRY_UNKNOWNS = 11
 """Of a Gaussian besides its colour: place, sizes, rotation, opacity."""
 FEWEST_GAUSSIANS = 20_000
@@ -92,17 +88,18 @@ def _linear_loss(facts: SceneFacts, config: Config) -> Decision:
 
 
 def _harmonics(facts: SceneFacts, config: Config) -> Decision:
-    by_photos = max(0, math.isqrt(int(facts.seen / PHOTOS_A_DEGREE)) - 1)
-    by_spread = max(1, round(facts.spread / DEGREES_A_BAND))
-    degree = min(config.model.harmonics_degree, by_photos, by_spread)
-    reason = (
-        f"a place is seen by {facts.seen:.1f} photos within {facts.spread:.0f} degrees: enough for degree {by_photos} by "
-        f"count, {by_spread} by angle"
-    )
-    fields = {"model.harmonics_degree": degree}
+    degree = min(config.model.harmonics_degree, math.isqrt(facts.photos) - 1)
+    fields: dict[str, object] = {"model.harmonics_degree": degree, "schedule.harmonics_gain": LEAST_GAIN}
     if config.loss.harmonics_weight == 0:
         fields["schedule.harmonics_on_demand"] = True
-    return Decision("harmonics", fields, f"degree {degree}", reason)
+    return Decision(
+        "harmonics",
+        fields,
+        f"degree {degree}",
+        f"its {(degree + 1) ** 2} unknowns a channel are no more than the {facts.photos} photos; a place is seen by "
+        f"{facts.seen:.1f} of them within {facts.spread:.0f} degrees; each degree goes again if it gains less than "
+        f"{LEAST_GAIN:g} dB",
+    )
 
 
 def _densification(facts: SceneFacts, config: Config) -> Decision:
@@ -129,10 +126,14 @@ def _resolution(facts: SceneFacts, config: Config) -> Decision:
     reason = f"the longer side has {side} pixels; halved as long as it has more than {COARSE_SIDE}"
     if levels <= config.schedule.coarse_levels:
         given = config.schedule.coarse_levels
-        return Decision("resolution", {}, f"{given} coarse levels" if given else "full size", reason)
+        return Decision("resolution", {}, _levels(given), reason)
     every = max(1, round(COARSE_PART * config.schedule.stated_for))
     fields = {"schedule.coarse_levels": levels, "schedule.coarse_every": every}
-    return Decision("resolution", fields, f"{levels} coarse levels", reason)
+    return Decision("resolution", fields, _levels(levels), reason)
+
+
+def _levels(count: int) -> str:
+    return f"{count} coarse level{'s' if count > 1 else ''}" if count else "full size"
 
 
 def _background(facts: SceneFacts, config: Config) -> Decision:
