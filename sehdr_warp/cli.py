@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from . import __version__
+from .arguments import numbers, say
 from .bench.commands import Bench, run_bench
 from .check.commands import Check, run_check
 from .errors import InputError, SehdrError
@@ -154,14 +155,14 @@ def _render(command: Render) -> None:
         command.out,
         cameras=command.cameras,
         count=command.count,
-        evs=_numbers("--evs", command.evs),
-        exposures=_numbers("--exposures", command.exposures),
+        evs=numbers("--evs", command.evs),
+        exposures=numbers("--exposures", command.exposures),
         multipart=command.multipart,
         colorspace=command.colorspace,
         pixel=command.pixel,
         ldr_brackets=command.ldr_brackets,
         overwrite=command.overwrite,
-        progress=_say,
+        progress=say,
     )
     if command.json:
         print(json.dumps({"files": [str(path) for path in written]}))
@@ -179,8 +180,8 @@ def _evaluate(command: Evaluate) -> None:
         check_absent(command.json, command.overwrite)
     run = _load_run(command.run, command.device)
     scene = _scene_of(run, command.data)
-    ensure_confidence(run, scene, _say)
-    result = evaluate(run, scene, lpips_weights=command.lpips, progress=_say)
+    ensure_confidence(run, scene, say)
+    result = evaluate(run, scene, lpips_weights=command.lpips, progress=say)
     if command.json is not None:
         write_json(command.json, result, command.overwrite)
     print(format_table(result))
@@ -190,7 +191,7 @@ def _export(command: Export) -> None:
     from .output.ply import write_ply
 
     run = _load_run(command.run, "cpu")
-    path = write_ply(command.out, run, kind=command.kind, overwrite=command.overwrite, progress=_say)
+    path = write_ply(command.out, run, kind=command.kind, overwrite=command.overwrite, progress=say)
     print(path)
 
 
@@ -200,7 +201,7 @@ def _report(command: Report) -> None:
 
     run = _load_run(command.run, command.device)
     scene = _scene_of(run, command.data)
-    ensure_confidence(run, scene, _say)
+    ensure_confidence(run, scene, say)
     for path in write_report(run, scene, command.out, overwrite=command.overwrite):
         print(path)
 
@@ -239,7 +240,7 @@ def _scene_of(run, data: str | None):
         max_size=run.data.get("max_size"),
         cache=cache_beside(run.path),
         **_curves_of(run),
-        progress=_say,
+        progress=say,
     )
 
 
@@ -248,19 +249,6 @@ def _curves_of(run) -> dict:
     if run.config.response.form == "mlp":
         return known_curves(run.config.response.name)
     return {"decode": run.response.decode, "encode": run.response.encode}
-
-
-def _numbers(flag: str, text: str | None) -> tuple[float, ...] | None:
-    if text is None:
-        return None
-    try:
-        return tuple(float(item) for item in text.split(","))
-    except ValueError:
-        raise SehdrError(f"{flag} {text}: not numbers separated by commas; write for example {flag}=-2,0,2") from None
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

@@ -16,11 +16,13 @@ ALLOWED = {
     "kernels": set(),
     "errors": set(),
     "quiet": set(),
+    "arguments": {"errors"},
     "scene": {"errors", "quiet", "embedded"},
     "splatting": {"errors", "quiet", "kernels"},
     "model": {"errors", "scene", "splatting"},
     "training": {
         "errors",
+        "arguments",
         "scene",
         "model",
         "splatting",
@@ -31,9 +33,20 @@ ALLOWED = {
     },
     "output": {"errors", "scene"},
     "evaluation": {"errors", "scene", "splatting"},
-    "synth": {"errors", "scene", "model", "output"},
-    "check": {"errors", "kernels", "scene", "splatting", "model", "training", "output"},
-    "bench": {"errors", "synth", "kernels", "scene", "splatting", "model", "training", "output", "evaluation"},
+    "synth": {"errors", "arguments", "scene", "model", "output"},
+    "check": {"errors", "arguments", "kernels", "scene", "splatting", "model", "training", "output"},
+    "bench": {
+        "errors",
+        "arguments",
+        "synth",
+        "kernels",
+        "scene",
+        "splatting",
+        "model",
+        "training",
+        "output",
+        "evaluation",
+    },
 }
 # Packages that only some rooms may import.
 ONLY_IN = {

@@ -1,12 +1,12 @@
 """The command line of `sehdr-warp bench`: what may be asked for, and the call. torch is imported when it runs."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from ..arguments import say
 from ..errors import SehdrError
 from .quality_command import Quality, run_quality
 from .response_command import Responses, run_responses
@@ -131,7 +131,7 @@ def run_bench(command: Bench) -> None:
         run_quality(asked)
         return
     if isinstance(asked, Responses):
-        run_responses(asked, _say)
+        run_responses(asked, say)
         return
     check_writable(type(asked).__name__.lower(), asked.json, asked.out, asked.overwrite)
     report = _MEASURES[type(asked)](asked, pick_device(asked.device))
@@ -151,7 +151,7 @@ def _kernels(asked: Kernels, device) -> dict:
         peers=asked.peers,
         repetitions=_positive("--repetitions", asked.repetitions),
         budget=_positive("--budget", asked.budget),
-        progress=_say,
+        progress=say,
     )
 
 
@@ -166,7 +166,7 @@ def _step(asked: Step, device) -> dict:
         preset=asked.preset,
         repetitions=_positive("--repetitions", asked.repetitions),
         budget=_positive("--budget", asked.budget),
-        progress=_say,
+        progress=say,
     )
 
 
@@ -176,7 +176,7 @@ def _training(asked: Training, device) -> dict:
 
     cache = None if asked.out is None else asked.out / "cache"
     scene = load_scene(
-        asked.data, exposure_index=asked.exposure_index, max_size=asked.max_size, cache=cache, progress=_say
+        asked.data, exposure_index=asked.exposure_index, max_size=asked.max_size, cache=cache, progress=say
     )
     return bench_training(
         scene,
@@ -186,7 +186,7 @@ def _training(asked: Training, device) -> dict:
         released=asked.released,
         out=asked.out,
         overwrite=asked.overwrite,
-        progress=_say,
+        progress=say,
     )
 
 
@@ -200,7 +200,7 @@ def _scale(asked: Scale, device) -> dict:
         steps=not asked.no_steps,
         repetitions=_positive("--repetitions", asked.repetitions),
         budget=_positive("--budget", asked.budget),
-        progress=_say,
+        progress=say,
     )
 
 
@@ -217,7 +217,7 @@ def _choices(asked: Choices, device) -> dict:
         iterations=asked.iterations,
         repetitions=_positive("--repetitions", asked.repetitions),
         budget=_positive("--budget", asked.budget),
-        progress=_say,
+        progress=say,
     )
 
 
@@ -237,7 +237,3 @@ def _positive(flag: str, value):
     if value <= 0:
         raise SehdrError(f"{flag} {value}: must be positive")
     return value
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

@@ -1,13 +1,13 @@
 """The command line of `sehdr-warp bench quality`. torch is imported by the workers, not here."""
 
 import os
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from ..arguments import say
 from ..errors import InputError, SehdrError
 
 
@@ -120,7 +120,7 @@ def run_quality(asked: Quality) -> None:
         slurm=_pairs(asked.slurm),
         launcher=asked.launcher,
     )
-    text, failure = bench_quality(settings, asked.out, workers, progress=_say)
+    text, failure = bench_quality(settings, asked.out, workers, progress=say)
     print(text)
     if failure is not None:
         raise failure
@@ -174,7 +174,3 @@ def _pairs(text: str | None) -> dict[str, str]:
     if not all(name and equals for name, equals, _ in pairs):
         raise SehdrError(f"--slurm {text}: not name=value pairs separated by commas")
     return {name: value for name, _, value in pairs}
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

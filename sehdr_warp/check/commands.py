@@ -1,9 +1,9 @@
 """The command line of `sehdr-warp check`: what may be asked for, and the call. torch is imported when it runs."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..arguments import say
 from ..errors import SehdrError
 
 
@@ -39,7 +39,7 @@ def run_check(command: Check) -> None:
     if command.plots is not None:
         from .stability import plot_stability
 
-        for path in plot_stability(command.plots, device, overwrite=command.overwrite, progress=_say):
+        for path in plot_stability(command.plots, device, overwrite=command.overwrite, progress=say):
             print(path)
         return
     result = run_cases(choose_cases(command.cases, command.quick), device, print)
@@ -50,7 +50,3 @@ def run_check(command: Check) -> None:
             f"{len(result['failed'])} of {len(result['cases'])} cases exceed their bounds on {device}: "
             f"{', '.join(result['failed'])}; please report them with the device and its driver"
         )
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

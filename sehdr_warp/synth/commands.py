@@ -1,12 +1,12 @@
 """The command line of `sehdr-warp synth`: what may be asked for, and the calls."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
+from ..arguments import numbers, say
 from ..errors import SehdrError
 
 Positional = tyro.conf.Positional
@@ -93,12 +93,12 @@ def _render(asked: RenderTruth) -> None:
 
     recipes = recipes_named(asked.name)
     width, height = _size(asked.size)
-    views = None if asked.views is None else tuple(int(view) for view in _numbers("--views", asked.views, int))
+    views = numbers("--views", asked.views, int)
     settings = Settings(width, height, asked.samples, asked.seed, views, asked.denoise)
     mi = load_mitsuba(asked.variant)
-    _say(f"Mitsuba {mi.__version__}, {mi.variant()}")
+    say(f"Mitsuba {mi.__version__}, {mi.variant()}")
     for recipe in recipes:
-        print(render_scene(mi, recipe, asked.out, settings, _say))
+        print(render_scene(mi, recipe, asked.out, settings, say))
 
 
 def _expose(asked: ExposeTruth) -> None:
@@ -111,13 +111,13 @@ def _expose(asked: ExposeTruth) -> None:
     response = response_by_name(asked.response)
     noise = None
     if asked.noise is not None:
-        figures = _numbers("--noise", asked.noise, float)
+        figures = numbers("--noise", asked.noise)
         if len(figures) != 2:
             raise SehdrError(f"--noise {asked.noise}: give two numbers, full well and read noise in electrons")
         noise = SensorNoise(*figures)
-    times = None if asked.exposures is None else _numbers("--exposures", asked.exposures, float)
+    times = numbers("--exposures", asked.exposures)
     check_absent_folder(asked.out, asked.overwrite)
-    scene = load_scene(asked.truth, progress=_say)
+    scene = load_scene(asked.truth, progress=say)
     times = times or exposure_ladder(scene, response)
     write_photo_set(scene, asked.out, response, times, noise=noise, seed=asked.seed, overwrite=asked.overwrite)
     stated = ", ".join(f"{time:.4g}" for time in times)
@@ -145,14 +145,3 @@ def _size(text: str) -> tuple[int, int]:
     if not (cross and width.isdecimal() and height.isdecimal()):
         raise SehdrError(f"--size {text}: is not WIDTHxHEIGHT in pixels; write for example --size 200x200")
     return int(width), int(height)
-
-
-def _numbers(flag: str, text: str, kind: type) -> list:
-    try:
-        return [kind(item) for item in text.split(",")]
-    except ValueError:
-        raise SehdrError(f"{flag} {text}: not numbers separated by commas") from None
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

@@ -1,13 +1,13 @@
 """The command line of `sehdr-warp train`: what may be asked for, and the call. torch is imported when it runs."""
 
 import json
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from ..arguments import say
 from ..errors import SehdrError
 
 
@@ -109,11 +109,11 @@ def _load(command: Train, config):
         exposure_index=command.exposure_index,
         max_size=command.max_size,
         cache=None if command.out is None else cache_beside(command.out),
-        progress=_say,
+        progress=say,
         **known_curves(config.response.name),
     )
     for note in scene.notes:
-        _say(note)
+        say(note)
     return scene
 
 
@@ -165,7 +165,3 @@ def _absolute(data: str) -> str:
 def _predictor(text: str | None) -> str | None:
     """A predictor for the config, which outlives this folder: paths in full, names as they are."""
     return str(Path(text).absolute()) if text is not None and Path(text).exists() else text
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
