@@ -8,7 +8,7 @@ from .config import Config
 from .plan_scene import SceneFacts
 
 LEAST_GAIN = 0.05
-"""Decibels on training photos that a degree of the harmonics is kept for; about half of it shows in other photos."""
+"""Decibels on training photos that a degree of the harmonics is kept for; a fifth to three fifths of it show in other photos."""
 GEOMETRY_UNKNOWNS = 11
 """Of a Gaussian besides its colour: place, sizes, rotation, opacity."""
 FEWEST_GAUSSIANS = 20_000
