@@ -73,7 +73,7 @@ def write_report(run, scene: Scene, out: Path | str, *, view_count: int = 3, ove
     comparisons = [_compare(run, view) for view in views]
     figures = [
         comparison_figure(comparisons, _caption(run, views, metrics, held_out), held_out=held_out),
-        stops_figure(comparisons[len(comparisons) // 2], run.exposure_time),
+        stops_figure(comparisons[len(comparisons) // 2], views[len(views) // 2].exposure_time),
     ] + ([training_figure(metrics)] if metrics else [])
     with ExitStack() as stack:
         for name, figure in zip(names, figures, strict=True):
