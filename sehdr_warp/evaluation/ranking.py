@@ -1,4 +1,5 @@
-"""Whether confidence ranks errors: Spearman's correlation between doubt (1 - confidence) and the true error of pixels."""
+"""Whether confidence ranks errors: Spearman's correlation between doubt (1 - confidence) and the true error of
+pixels."""
 
 import torch
 from torch import Tensor
@@ -12,7 +13,8 @@ DARKEST_CODE = 0.5 / 255
 
 
 class ErrorRanking:
-    """Gathers confidence, render and truth of the pixels of held-out views; all views of a scene are ranked together."""
+    """Gathers confidence, render and truth of the pixels of held-out views; all views of a scene are ranked
+    together."""
 
     def __init__(self):
         self._views: list[tuple[Tensor, Tensor, Tensor, Tensor, float, float]] = []
@@ -35,14 +37,14 @@ class ErrorRanking:
         self._views.append((*(image[counted][::step].cpu() for image in images), darkest, unit or 1.0))
 
     def result(self) -> dict:
-        """{"spearman_log2", "spearman_mu": in [-1, 1], "mean": of the confidence, "pixels", "scale"}; null with "reason"
-        where nothing can be ranked. The error of a pixel is the mean over channels of
+        """{"spearman_log2", "spearman_mu": in [-1, 1], "mean": of the confidence, "pixels", "scale"}; null with
+        "reason" where nothing can be ranked. The error of a pixel is the mean over channels of
 
         log2    |log2((scale prediction + darkest) / (truth + darkest))|, stops
         mu      |mu-law(scale prediction) - mu-law(truth)|, both over the largest truth of the view
 
-        scale takes the renders to the truth by the median over well-exposed pixels. That of the protocol `aligned` counts
-        clipped pixels too; where they are the majority it would move their error into all others.
+        scale takes the renders to the truth by the median over well-exposed pixels. That of the protocol `aligned`
+        counts clipped pixels too; where they are the majority it would move their error into all others.
         """
         figures = dict.fromkeys(("spearman_log2", "spearman_mu", "mean", "scale")) | {"pixels": 0}
         confidence = torch.cat([view[0] for view in self._views]) if self._views else torch.zeros(0)

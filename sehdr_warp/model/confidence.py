@@ -1,8 +1,10 @@
-"""How far the photos vouch for a scene's light: for each Gaussian, what its blending weight fell on in the training views.
+"""How far the photos vouch for a scene's light: for each Gaussian, what its blending weight fell on in the training
+views.
 
-The sum over a photo's pixels of (weight of a Gaussian) x (number at the pixel) is the derivative of the blend with respect to
-that Gaussian's feature, so the splat's own adjoint gathers it for all Gaussians in one pass a view. What is gathered is how
-uncertain each pixel leaves its light, in stops; see pixel_uncertainty. docs/confidence.md has the measurements.
+The sum over a photo's pixels of (weight of a Gaussian) x (number at the pixel) is the derivative of the blend with
+respect to that Gaussian's feature, so the splat's own adjoint gathers it for all Gaussians in one pass a view. What is
+gathered is how uncertain each pixel leaves its light, in stops; see pixel_uncertainty. docs/confidence.md has the
+measurements.
 """
 
 from collections.abc import Sequence
@@ -22,7 +24,8 @@ PARTLY_CLIPPED_STOPS = 0.25
 MOST_STOPS = 4.0
 """A misfit counts no more than this: 1/16 of the confidence already says that nothing is known."""
 LEAST_SEEN = 0.01
-"""Pixels of blending weight, over all training photos, at which a Gaussian has half of the confidence that its photos give it."""
+"""Pixels of blending weight, over all training photos, at which a Gaussian has half of the confidence that its photos
+give it."""
 MOST_VIEWS = 200
 """Training views that are looked at, evenly chosen: more change the means little."""
 
@@ -33,7 +36,8 @@ _HALF_CODE = 0.5 / 255
 class Evidence:
     """What the training photos say of each of N Gaussians.
 
-    seen: [N] pixels, the sum of its blending weights over the photos. stops: [N] mean uncertainty of these pixels, from 0.
+    seen: [N] pixels, the sum of its blending weights over the photos. stops: [N] mean uncertainty of these pixels,
+    from 0.
     clipped: [N] in [0, 1], the share of their colour values that were clipped.
     """
 
@@ -42,17 +46,19 @@ class Evidence:
     clipped: Tensor
 
     def confidence(self) -> Tensor:
-        """[N] in [0, 1]: 2^-stops, times seen / (seen + LEAST_SEEN). 1: observed unclipped, and the scene agrees; 1/2: light
-        known to a factor of two; 0: never seen."""
+        """[N] in [0, 1]: 2^-stops, times seen / (seen + LEAST_SEEN). 1: observed unclipped, and the scene agrees; 1/2:
+        light known to a factor of two; 0: never seen."""
         return torch.exp2(-self.stops) * self.seen / (self.seen + LEAST_SEEN)
 
 
 def pixel_uncertainty(photo: Tensor, exposure: Tensor, response: Response) -> tuple[Tensor, Tensor]:
-    """How many stops of doubt a photo leaves about the light at its pixels, [H, W], and the clipped share of each, [H, W].
+    """How many stops of doubt a photo leaves about the light at its pixels, [H, W], and the clipped share of each, [H,
+    W].
 
     photo: [H, W, 3] encoded, in [0, 1]. exposure: [H, W, 3] what the scene shows there, E dt. Mean over channels of
 
-        an unclipped channel    |log2(exposure / decoded value)|, the misfit, at least 0, plus a quarter of the width of its
+        an unclipped channel    |log2(exposure / decoded value)|, the misfit, at least 0, plus a quarter of the width
+        of its
                                 8-bit code's interval in stops (the mean distance from its middle), at most 1
         a clipped channel       by how much the exposure falls short of white, if it does, plus CLIPPED_STOPS where all
                                 channels are clipped, else PARTLY_CLIPPED_STOPS
@@ -80,8 +86,8 @@ def gather_evidence(
 ) -> Evidence:
     """What the photos of some views say of a field's Gaussians; where a view has a mask, only where it counts.
 
-    degree: of the harmonics. truth: the field was trained on HDR truth, which is then what was observed where a view has it:
-    nothing is clipped, and the misfit is all the doubt.
+    degree: of the harmonics. truth: the field was trained on HDR truth, which is then what was observed where a view
+    has it: nothing is clipped, and the misfit is all the doubt.
     """
     device = field.gaussians.means.device
     total = torch.zeros(field.gaussians.count, 3, device=device)

@@ -55,12 +55,12 @@ def write_report(run, scene: Scene, out: Path | str, *, view_count: int = 3, ove
     """Renders some held-out views and writes the report's pictures; returns their paths.
 
     `comparison.png`: held-out photo, tone-mapped HDR and truth (where the scene has it), one row a view.
-    `stops.png`: one view as photographed and from -4 to +4 stops: the photo alone, the HDR scene with its confidence, the
-    truth.
+    `stops.png`: one view as photographed and from -4 to +4 stops: the photo alone, the HDR scene with its confidence,
+    the truth.
     `training.png`: held-out error against training time, from `RUN/metrics.jsonl`; left out where that has no lines.
 
-    run: a trained run (render, render_confidence, response, exposure_time, path). view_count: rows of the comparison, evenly chosen.
-    Without test views the training views are shown, and captions say so.
+    run: a trained run (render, render_confidence, response, exposure_time, path). view_count: rows of the comparison,
+    evenly chosen. Without test views the training views are shown, and captions say so.
     Raises InputError where a picture exists (unless overwrite), SehdrError for a scene without views.
     """
     out = Path(out)
@@ -111,8 +111,8 @@ def comparison_figure(comparisons: Sequence[Comparison], caption: str, *, held_o
 def stops_figure(comparison: Comparison, exposure_time: float, stops: Sequence[float] = STOPS):
     """A matplotlib Figure: one view at several exposures, as radiance on a plain sRGB display: no tone map.
 
-    The first row holds the photo as it is and re-exposed alone: what it clipped stays white or black. Beside the HDR scene
-    stands its confidence, where there is one, as grey. exposure_time: seconds at 0 EV.
+    The first row holds the photo as it is and re-exposed alone: what it clipped stays white or black. Beside the HDR
+    scene stands its confidence, where there is one, as grey. exposure_time: seconds at 0 EV.
     """
     sources = {"Photo alone": comparison.from_photo, "HDR scene": comparison.hdr, "Truth": comparison.truth}
     sources = {name: radiance for name, radiance in sources.items() if radiance is not None}

@@ -1,7 +1,7 @@
 """The confidence of a trained scene: measured on its training photos, kept in the run, so that renders need no photos.
 
-RUN/confidence.safetensors holds confidence, seen, stops and clipped, [N] float32 each (see model/confidence.py), and states
-the checkpoint that it belongs to: after more training it counts as absent until it is measured again.
+RUN/confidence.safetensors holds confidence, seen, stops and clipped, [N] float32 each (see model/confidence.py), and
+states the checkpoint that it belongs to: after more training it counts as absent until it is measured again.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,8 @@ FORMAT = "1"
 def measure_confidence(run, scene: Scene) -> Evidence:
     """What the training photos of a scene say of a run's Gaussians; the run's model has their confidence from then on.
 
-    run: a Run. scene: of its photos; its training views are looked at, without their HDR truth unless that was trained on.
+    run: a Run. scene: of its photos; its training views are looked at, without their HDR truth unless that was trained
+    on.
     """
     loss = run.config.loss
     truth = loss.uses_hdr and not loss.predictor

@@ -43,7 +43,8 @@ def test_doubt_of_single_pixels():
 
 
 def wall(x, exposure):
-    """One opaque Gaussian, 2 in front of CAMERA's kind, that fills the pixels about x; all harmonics but the first are 0."""
+    """One opaque Gaussian, 2 in front of CAMERA's kind, that fills the pixels about x; all harmonics but the first are
+    0."""
     points = torch.tensor([[x, 0.0, 2.0]])
     gaussians = Gaussians.from_points(points, torch.full((1, 3), float(np.log(exposure))), 0, opacity=0.99)
     gaussians.log_scales.data.fill_(np.log(0.05))

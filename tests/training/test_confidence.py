@@ -1,4 +1,5 @@
-"""The confidence of a run: measured at its end, kept beside its checkpoint, refused where damaged, and not needed to load."""
+"""The confidence of a run: measured at its end, kept beside its checkpoint, refused where damaged, and not needed to
+load."""
 
 import pytest
 import torch
