@@ -1,5 +1,4 @@
-"""How far the photos vouch for a scene's light: for each Gaussian, what its blending weight fell on in the training
-views.
+"""How far the photos vouch for a scene's light: what each Gaussian's weight fell on in the training views.
 
 The sum over a photo's pixels of (weight of a Gaussian) x (number at the pixel) is the derivative of the blend with
 respect to that Gaussian's feature, so the splat's own adjoint gathers it for all Gaussians in one pass a view. What is
@@ -52,13 +51,11 @@ class Evidence:
 
 
 def pixel_uncertainty(photo: Tensor, exposure: Tensor, response: Response) -> tuple[Tensor, Tensor]:
-    """How many stops of doubt a photo leaves about the light at its pixels, [H, W], and the clipped share of each, [H,
-    W].
+    """Stops of doubt that a photo leaves about the light at its pixels, and the clipped share of each; [H, W] both.
 
     photo: [H, W, 3] encoded, in [0, 1]. exposure: [H, W, 3] what the scene shows there, E dt. Mean over channels of
 
-        an unclipped channel    |log2(exposure / decoded value)|, the misfit, at least 0, plus a quarter of the width
-        of its
+        an unclipped channel    |log2(exposure / decoded value)|, the misfit, plus a quarter of the width of its
                                 8-bit code's interval in stops (the mean distance from its middle), at most 1
         a clipped channel       by how much the exposure falls short of white, if it does, plus CLIPPED_STOPS where all
                                 channels are clipped, else PARTLY_CLIPPED_STOPS
