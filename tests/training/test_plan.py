@@ -10,7 +10,7 @@ from sehdr_warp import cli
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import Camera
 from sehdr_warp.training.config import DECISIONS
-from sehdr_warp.training.config_files import config_to_dict, load_config, parse_setting
+from sehdr_warp.training.config_files import config_to_dict, load_config, override_config, parse_setting
 from sehdr_warp.training.plan import apply_plan, make_plan, read_plan
 from sehdr_warp.training.plan_rules import RULES
 from sehdr_warp.training.plan_scene import measure_scene
@@ -64,6 +64,8 @@ def test_a_plan_decides_everything_once_with_figures(scene):
     for path, value in fields(plan).items():
         assert applied[path] == (tuple(value) if isinstance(value, list) else value), path
     assert not plan.config.plan.enabled
+    # --resume --plan plans again, on top of the plan.
+    assert make_plan(scene, override_config(plan.config, {"plan.enabled": True})).config == plan.config
     assert json.loads(json.dumps(plan.to_dict()))["decisions"]
 
 
