@@ -1,5 +1,7 @@
 """What the pages say, held: examples run, command lines parse, links lead somewhere, versions agree."""
 
+import dataclasses
+import inspect
 import os
 import re
 import runpy
@@ -7,6 +9,7 @@ import shlex
 import shutil
 import subprocess
 import tomllib
+import typing
 from pathlib import Path
 
 import pytest
@@ -15,6 +18,9 @@ from packaging.requirements import Requirement
 
 import sehdr_warp
 from sehdr_warp import cli
+from sehdr_warp.training import commands
+from sehdr_warp.training.config import Config
+from sehdr_warp.training.config_files import preset_names
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
@@ -86,6 +92,40 @@ def parse(line):
 @pytest.mark.parametrize("line", list(command_lines()))
 def test_documented_command_lines_parse(line):
     parse(line)
+
+
+def flags_of(kind):
+    """Flags of a command and of all below it."""
+    for part in typing.get_args(kind):
+        yield from flags_of(part)
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+        for field in dataclasses.fields(kind):
+            yield "--" + field.name.replace("_", "-")
+            yield from flags_of(field.type)
+
+
+def fields_of(config, prefix=""):
+    """Dotted names of all choices of a training."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        nested = dataclasses.is_dataclass(value)
+        yield from fields_of(value, f"{prefix}{field.name}.") if nested else [prefix + field.name]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_flags_and_fields_on_the_pages_exist(page):
+    text = page.read_text()
+    others = {"--version", "--help", "--debug", "--index-url", "--clock-control"}  # the last two of pip and Nsight
+    assert set(re.findall(r"(?<![\w-])(--[a-z][a-z-]*)", text)) <= {*flags_of(cli.Command), *others}
+    fields = set(fields_of(Config()))
+    parts = "|".join({field.split(".")[0] for field in fields if "." in field})
+    named = set(re.findall(rf"`((?:{parts})\.[a-z_]+)", text)) - {"plan.json", "model.response"}  # a file, a module
+    assert named <= fields
+
+
+def test_the_help_names_every_preset():
+    (doc,) = re.findall(r'preset: str \| None = None\n    """(.*?)"""', inspect.getsource(commands.Train), re.DOTALL)
+    assert {name for name in preset_names() if re.search(rf"(?<![\w-]){name}(?![\w-])", doc)} == set(preset_names())
 
 
 def test_the_pages_hold_command_lines():
