@@ -18,7 +18,7 @@ class Quality:
     out: Path
     """Folder for jobs, results, tables and plots; finished jobs in it never run again."""
     scenes: str = "embedded"
-    """Folders with HDR truth in all views, or embedded, separated by commas."""
+    """Folders with HDR truth in all views, embedded or embedded:NAME, separated by commas."""
     methods: str = "default,paper,hdr-gs,3dgs,truth"
     """default, paper, paper-truth, hdr-gs, hdr-gs-truth, 3dgs, predicted, hdr-nerf, truth, other presets or TOML files,
     separated by commas; empty for variants alone."""
