@@ -281,6 +281,7 @@ class ScheduleConfig:
         "which then are no fair test any more",
         choices=("held-in", "held-out"),
     )
+    recorded: bool = option(True, "on a GPU, replay training steps as CUDA graphs; off, launch each: much slower")
     nonfinite_limit: int = option(
         20, "steps with a loss or gradient that is not finite are skipped; more than this stop the training", low=0
     )

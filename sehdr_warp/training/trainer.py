@@ -2,7 +2,6 @@
 
 import math
 import operator
-import warnings
 
 import torch
 from torch import Tensor
@@ -12,7 +11,6 @@ from ..model.radiance_field import RadianceField
 from ..model.response import RefinedResponse
 from ..scene import Scene
 from ..splatting import GraphRecorder
-from ..splatting.memory import OutOfMemory
 from .config import Config
 from .densification import make_densification, slope_weights
 from .early_stop import EarlyStop
@@ -65,7 +63,8 @@ class Trainer:
         self._skipped = torch.zeros((), device=self.device)
         self._incomplete = torch.zeros((), device=self.device)
         self._index = torch.zeros(1, dtype=torch.int64, device=self.device)
-        self._recorder = GraphRecorder(self.device) if self.device.type == "cuda" else None
+        recorded = self.device.type == "cuda" and config.schedule.recorded
+        self._recorder = GraphRecorder(self.device) if recorded else None
         self._launched: set = set()
         self._pairs = 0
         self._last: tuple[Tensor, Tensor, Tensor] | None = None
@@ -257,12 +256,12 @@ class Trainer:
                 kind,
                 lambda: self._optimise(views.at(self._index), watched, capacity),
             )
-        except (RuntimeError, OutOfMemory) as error:
-            # Nothing of the step was done yet. Launching every step is slower, and right.
-            self._recorder = None
-            self.optimizer.zero_grad(set_to_none=True)
-            warnings.warn(f"training steps are launched one by one: {str(error).splitlines()[0]}", stacklevel=2)
-            return self._optimise(views[index], watched)
+        except RuntimeError as error:
+            # What a broken recording leaves behind on the device is no ground to go on from.
+            raise SehdrError(
+                f"iteration {self.iteration}: the step could not be recorded as a CUDA graph "
+                f"({str(error).splitlines()[0]}); train with --set schedule.recorded=false, which is slower"
+            ) from error
 
     def _forget_recording(self, growth: float) -> None:
         """The Gaussians are others, `growth` times as many: they will need about so many times the room."""

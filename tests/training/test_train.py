@@ -258,6 +258,21 @@ def test_unknown_device_is_refused(scene, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_a_step_that_cannot_be_recorded_ends_the_training_with_a_way_out(scene, monkeypatch):
+    class BrokenRecorder:
+        def run(self, key, function):
+            raise RuntimeError("operation not permitted when stream is capturing\nmore")
+
+    config = load_config("default", QUICK)
+    trainer = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cpu"))
+    trainer._recorder = BrokenRecorder()
+    monkeypatch.setattr(trainer, "_can_record", lambda *_: trainer.iteration > 1)
+    monkeypatch.setattr(trainer, "_training_views", lambda views=trainer._training_views(): views)
+    trainer.step()
+    with pytest.raises(SehdrError, match=r"iteration 2: .*not permitted.*schedule.recorded=false"):
+        trainer.step()
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
 @pytest.mark.parametrize("variant", ["default", "climb"])
 def test_recorded_steps_train_like_launched_ones(variant):
