@@ -267,7 +267,6 @@ def test_a_step_that_cannot_be_recorded_ends_the_training_with_a_way_out(scene, 
     trainer = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cpu"))
     trainer._recorder = BrokenRecorder()
     monkeypatch.setattr(trainer, "_can_record", lambda *_: trainer.iteration > 1)
-    monkeypatch.setattr(trainer, "_training_views", lambda views=trainer._training_views(): views)
     trainer.step()
     with pytest.raises(SehdrError, match=r"iteration 2: .*not permitted.*schedule.recorded=false"):
         trainer.step()
