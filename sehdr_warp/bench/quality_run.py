@@ -91,16 +91,7 @@ class Runner:
 
     def _train(self, method: dict, scene: Scene, config: Config, out: Path):
         if method["kind"] == "hdr-nerf":
-            from .hdr_nerf import HdrNerfSettings, train_hdr_nerf, unit_value
-
-            return train_hdr_nerf(
-                scene,
-                iterations=config.schedule.iterations,
-                device=self.device,
-                seed=config.seed,
-                settings=HdrNerfSettings(unit_value=unit_value(config.response.name)),
-                evaluate_at={config.scaled(iteration) for iteration in config.schedule.evaluate_at},
-            )
+            return _hdr_nerf(scene, config, method["seconds"], self.device)
         return train(scene, out, config, device=self.device, quiet=True)
 
     def _warm_up(self, method: dict, scene: Scene, config: Config, folder: Path) -> None:
