@@ -114,5 +114,6 @@ class _Replay(torch.autograd.Function):
         for target, gradient in zip(owner._upstream, upstream, strict=True):
             target.zero_() if gradient is None else target.copy_(gradient)
         owner._backward.replay()
-        # These objects are kept here, so that torch copies what it accumulates instead of taking them for its own.
-        return None, *owner._gradients
+        # Copies: torch may keep what it is given, or a view of it, as a parameter's gradient, which the next replay
+        # would overwrite.
+        return None, *(None if gradient is None else gradient.clone() for gradient in owner._gradients)

@@ -58,6 +58,21 @@ def test_gradients_add_up_over_calls_and_without_alpha():
 
 
 @needs_gpu
+def test_gradients_of_a_reshaped_parameter_add_up():
+    scene = random_scene(count=300).to(torch.float32, "cuda:0")
+    column = scene.tensors[3].detach()[:, None].requires_grad_()
+
+    def summed(splat):
+        column.grad = None
+        for seed in (1, 2):
+            image = splat(*scene.tensors[:3], column.squeeze(1), *scene.arguments[4:]).image
+            (image * random_like(image, seed)).sum().backward()
+        return column.grad.clone()
+
+    assert relative_error(summed(RecordedRasterizer("cuda:0")), summed(rasterize)) < 1e-5
+
+
+@needs_gpu
 def test_a_backward_pass_that_comes_too_late_is_refused():
     splat = RecordedRasterizer("cuda:0")
     scene = random_scene(count=100).to(torch.float32, "cuda:0")
