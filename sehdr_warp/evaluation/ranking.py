@@ -29,7 +29,8 @@ class ErrorRanking:
         mask: Tensor | None = None,
     ) -> None:
         """confidence: [H, W] in [0, 1]. prediction, truth: [H, W, 3] radiance. well_exposed: [H, W] bool, of the photo.
-        darkest: radiance that the photo shows as black. mask: [H, W]; only pixels above 0.5 count."""
+        darkest: radiance that the photo shows as black, in the render's unit. mask: [H, W]; only pixels above 0.5
+        count."""
         counted = torch.ones_like(well_exposed) if mask is None else mask > 0.5
         unit = float(truth[counted].max()) if bool(counted.any()) else 0.0
         step = max(1, -(-int(counted.sum()) // MOST_PIXELS))
@@ -40,7 +41,7 @@ class ErrorRanking:
         """{"spearman_log2", "spearman_mu": in [-1, 1], "mean": of the confidence, "pixels", "scale"}; null with
         "reason" where nothing can be ranked. The error of a pixel is the mean over channels of
 
-        log2    |log2((scale prediction + darkest) / (truth + darkest))|, stops
+        log2    |log2((scale prediction + black) / (truth + black))|, black = scale darkest, stops
         mu      |mu-law(scale prediction) - mu-law(truth)|, both over the largest truth of the view
 
         scale takes the renders to the truth by the median over well-exposed pixels. That of the protocol `aligned`
@@ -53,7 +54,8 @@ class ErrorRanking:
         scale = self._scale()
         errors = {"log2": [], "mu": []}
         for _, prediction, truth, _, darkest, unit in self._views:
-            ratio = (scale * prediction.double() + darkest) / (truth.double() + darkest)
+            black = scale * darkest
+            ratio = (scale * prediction.double() + black) / (truth.double() + black)
             errors["log2"].append(ratio.log2().abs().mean(1))
             difference = mu_law(scale * prediction.double() / unit) - mu_law(truth.double() / unit)
             errors["mu"].append(difference.abs().mean(1))
