@@ -54,8 +54,8 @@ def evaluate(
             "pixels", "scale"}, see ranking.py
         "views": the same for each view; and "split", "lpips_backbone", "train_seconds", "gaussians", "iterations"
     Means are over views. What cannot be computed is null with "reason" (or "lpips_reason") beside it. A view's mask
-    applies to everything: outside it the prediction is taken to be right, and nothing there is averaged; a view whose
-    mask is empty is left out.
+    applies to everything: outside it the prediction is taken to be right, and nothing there is averaged, but by LPIPS and
+    HDR-FLIP, which are of whole images; a view whose mask is empty is left out.
 
     Raises SehdrError for a scene without views, images that disagree with their camera, a render that is not finite
     or an unknown protocol; InputError for LPIPS weights that cannot be read.

@@ -11,7 +11,7 @@ CELLS = 8
 ANCHOR = 0.5
 """The encoded value that keeps its exposure, so that the radiance of the scene cannot drift."""
 SHARPEST = 3.0
-"""Log densities are held within this: a cell's slope stays within a factor of 20 of its neighbours'."""
+"""Log densities are held within this: of one half of the values, no slope is more than e^6 = 403 times another."""
 
 
 class RefinedResponse(nn.Module, Response, kind="refined"):

@@ -1,6 +1,6 @@
 """rasterize() replayed: called like it, at what the GPU needs instead of what Python needs.
 
-A splat is some fifteen launches, forward and backward each. Called one by one from Python they take 2.5 ms whatever
+A splat is some fifteen launches, forward and backward each. Called one by one from Python they take 3 ms whatever
 they draw; recorded as two CUDA graphs and replayed they take what the GPU needs, 0.3 ms for a small scene.
 """
 
