@@ -196,8 +196,8 @@ def _row(option: Option, kind: str) -> dict:
 
 
 def _times(scene: SplatScene, asked: list[Option], repetitions: int, budget: float) -> list[dict]:
-    """Times of forward and backward of each option, all in turns; times_default is of the shortest runs. On a GPU as a recorded graph, whose time is the
-    GPU's own. Rounding of features is not timed: no kernel reads rounded ones."""
+    """Times of forward and backward of each option, all in turns; times_default is of the shortest runs. On a GPU as a
+    recorded graph, whose time is the GPU's own. Rounding of features is not timed: no kernel reads rounded ones."""
     cotangent = scene.cotangent()
     distinct = list(dict.fromkeys((o.alpha_threshold, o.style) for o in asked if o.rounded is None))
     variants = {key: _timed(scene, Option("", "", alpha_threshold=key[0], style=key[1]), cotangent) for key in distinct}

@@ -172,8 +172,8 @@ def rasterize_with_gsplat(
     capacity: int | None = None,
     style: object = None,
 ) -> Rendering:
-    """rasterize() by gsplat, for a training step of ours on its kernels. capacity, style: have no meaning there. Its centres in the image
-    are not those that the gradient passes, so densification cannot watch them."""
+    """rasterize() by gsplat, for a training step of ours on its kernels. capacity, style: have no meaning there. Its
+    centres in the image are not those that the gradient passes, so densification cannot watch them."""
     from gsplat import rasterization
 
     fx, fy, cx, cy = intrinsics

@@ -41,7 +41,10 @@ def pareto_front(lines: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.nda
 
 
 def plot_error_over_time(rows: Sequence[dict], path: Path, line_name: Callable) -> None:
-    """Writes a PNG; line_name(row, rows) names a result's line. A panel for each curve and knowledge of the response; HDR error under gt-max over seconds."""
+    """Writes a PNG: a panel for each curve and knowledge of the response, HDR error under gt-max over seconds.
+
+    line_name(row, rows) names a result's line.
+    """
     import matplotlib as mpl
     from matplotlib.figure import Figure
 

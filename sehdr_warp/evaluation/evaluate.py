@@ -35,8 +35,8 @@ def evaluate(
 
     run: a sehdr_warp.training.Run, or anything with its `render(camera)` (an object with `.hdr`, [H, W, 3] scene-linear
         radiance on `device`), `render_ldr(camera, seconds)` ([H, W, 3] in [0, 1]), and the numbers `train_seconds`,
-        `gaussian_count` and `iterations`; where it has them, `render_confidence(camera)` ([H, W] in [0, 1], or None) and
-        `response` tell how well its confidence ranks its errors.
+        `gaussian_count` and `iterations`; where it has them, `render_confidence(camera)` ([H, W] in [0, 1], or None)
+        and `response` tell how well its confidence ranks its errors.
     scene: the views, at the exposure that was trained on. Without test views the training views are taken, and
         "split" says so.
     lpips_weights: folder, see load_lpips; protocols: names out of PROTOCOLS.
@@ -48,14 +48,15 @@ def evaluate(
         "protocol": {name: {"psnr_mu", "ssim_mu", "lpips_mu", "views"}}, with "hdr_flip" if it was asked for; "aligned"
             also holds its "scale"
         "pu21": {name: {"psnr", "ssim"}, "peak_luminance", "white_percentile"}
-        "ldr": {"psnr", "ssim", "lpips"} of the simulated photo at the view's exposure time, unquantised, against the photo
+        "ldr": {"psnr", "ssim", "lpips"} of the simulated photo at the view's exposure time, unquantised, against the
+            photo
         "regions": {region: {"fraction", "psnr_ldr", "psnr_mu": {name: dB}}}, errors pooled over all views
         "confidence": {"spearman_log2", "spearman_mu": rank correlation of 1 - confidence with the error; "mean",
             "pixels", "scale"}, see ranking.py
         "views": the same for each view; and "split", "lpips_backbone", "train_seconds", "gaussians", "iterations"
     Means are over views. What cannot be computed is null with "reason" (or "lpips_reason") beside it. A view's mask
-    applies to everything: outside it the prediction is taken to be right, and nothing there is averaged, but by LPIPS and
-    HDR-FLIP, which are of whole images; a view whose mask is empty is left out.
+    applies to everything: outside it the prediction is taken to be right, and nothing there is averaged, but by LPIPS
+    and HDR-FLIP, which are of whole images; a view whose mask is empty is left out.
 
     Raises SehdrError for a scene without views, images that disagree with their camera, a render that is not finite
     or an unknown protocol; InputError for LPIPS weights that cannot be read.

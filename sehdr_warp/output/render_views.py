@@ -59,8 +59,8 @@ def render_views(
     """Renders views of a run into `out`; returns the files written.
 
     Always: `hdr/<view>.exr` (R, G, B scene-linear radiance; A coverage; Z distance along the axis, 0 where empty;
-    confidence, if the run has it) and `preview/<view>.png` (tone-mapped, sRGB). With evs or exposures: brackets, see output/brackets.py; ldr_brackets
-    ("jpeg", "png" or "png16") adds simulated photos through the run's response.
+    confidence, if the run has it) and `preview/<view>.png` (tone-mapped, sRGB). With evs or exposures: brackets, see
+    output/brackets.py; ldr_brackets ("jpeg", "png" or "png16") adds simulated photos through the run's response.
 
     cameras: "train", "test", "all", "orbit", "interpolate", or a JSON file. count: views of an orbit or interpolation.
     overwrite: replaces the folders hdr, preview and brackets of an earlier render; other files in `out` stay.

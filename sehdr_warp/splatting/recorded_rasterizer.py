@@ -29,8 +29,8 @@ class RecordedRasterizer:
     otherwise. Other shapes, options or tensors that ask for gradients make a new recording (some 30 ms) in the place of
     the old. Rendering.means2d is no part of the graph; densification by its gradient needs rasterize().
 
-    device: a CUDA device; raises ValueError for another. Besides what rasterize() needs, a recording keeps copies of the
-    arguments and of the gradients.
+    device: a CUDA device; raises ValueError for another. Besides what rasterize() needs, a recording keeps copies of
+    the arguments and of the gradients.
     """
 
     def __init__(self, device: torch.device | str):

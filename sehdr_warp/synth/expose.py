@@ -69,7 +69,8 @@ def expose(
     bits: of a stored value, 1 to 16.
 
     Points keep their places. Each takes its new colour from the training view whose old photo showed it most nearly in
-    its old colour, since that view is the likeliest to see it unoccluded; one outside of all training views keeps its own.
+    its old colour, since that view is the likeliest to see it unoccluded; one outside of all training views keeps its
+    own.
 
     Raises InputError for a view without truth or an impossible time, ValueError for impossible bits or counts.
     """
