@@ -183,8 +183,8 @@ def _photos(device):
 
 
 def _loss(prediction, target: Target):
-    """The training's default loss of a simulated photo [H, W, 3]."""
-    return ldr_loss(SimpleNamespace(encoded=prediction), target, LossConfig())
+    """The training's loss between encoded values of a simulated photo [H, W, 3]."""
+    return ldr_loss(SimpleNamespace(encoded=prediction), target, LossConfig(domain="encoded"))
 
 
 def _similarity(device):
