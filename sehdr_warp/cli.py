@@ -245,10 +245,13 @@ def _scene_of(run, data: str | None):
 
 
 def _curves_of(run) -> dict:
-    """load_scene's decode and encode for a trained run: its response's, or, learned, those it was trained with."""
-    if run.config.response.form == "mlp":
-        return known_curves(run.config.response.name)
-    return {"decode": run.response.decode, "encode": run.response.encode}
+    """load_scene's decode and encode as the training had them: a run is judged by the photos that it was trained on, and
+    these were scaled before a response was chosen, corrected or learned."""
+    options = run.config.response
+    if options.name == "auto" or options.form == "mlp":
+        return known_curves(options.name)
+    known = run.response.start if options.refine else run.response
+    return {"decode": known.decode, "encode": known.encode}
 
 
 if __name__ == "__main__":

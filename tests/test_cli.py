@@ -3,13 +3,15 @@
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sehdr_warp import __version__, cli
-from sehdr_warp.model.response import response_by_name
+from sehdr_warp.model.response import RefinedResponse, response_by_name
 from sehdr_warp.scene.images import read_hdr, read_ldr
+from sehdr_warp.training.config import ResponseConfig
 
 
 def call(*arguments):
@@ -235,6 +237,18 @@ def test_eval_writes_json_and_prints_a_table(run, tmp_path, capsys, monkeypatch)
     assert result["ldr"]["lpips"] is None and "SEHDR_LPIPS" in result["ldr"]["lpips_reason"]
     assert result["protocol"]["gt-max"]["lpips_mu"] is None and "lpips_reason" in result["protocol"]["gt-max"]
     assert call("eval", run, "--json", file, "--device", "cpu") == 1
+
+
+def test_a_run_is_judged_by_photos_scaled_as_those_it_was_trained_on():
+    def curves(options, response):
+        return cli._curves_of(SimpleNamespace(config=SimpleNamespace(response=options), response=response))
+
+    srgb = response_by_name("srgb")
+    # Chosen after the photos were read, so they were scaled by load_scene's own curve.
+    assert curves(ResponseConfig(name="auto"), srgb) == {}
+    assert curves(ResponseConfig(name="srgb"), srgb) == {"decode": srgb.decode, "encode": srgb.encode}
+    corrected = curves(ResponseConfig(name="srgb", refine=True), RefinedResponse(srgb))
+    assert corrected == {"decode": srgb.decode, "encode": srgb.encode}
 
 
 @pytest.mark.parametrize("kind", ["hdr", "ldr"])
