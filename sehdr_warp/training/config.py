@@ -142,9 +142,10 @@ class LossConfig:
         choices=("off", "difference", "all"),
     )
     domain: str = option(
-        "encoded",
-        "what is compared; encoded: photos; mu-law: exposures, decoded from the photo, by log(1 + mu x / white)",
-        choices=("encoded", "mu-law"),
+        "auto",
+        "what is compared; encoded: photos; mu-law: exposures, decoded from the photo, by log(1 + mu x / white); auto: "
+        "mu-law where pixels have an exposure and the curve is known",
+        choices=("auto", "encoded", "mu-law"),
     )
     knee: float = option(
         8.0,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..model.radiance_field import Photograph, RadianceField
-from ..model.response import Response
+from ..model.response import Response, ToneMapper
 from ..model.response_curve import EXTENSION_SLOPE
 from ..model.response_refined import RefinedResponse
 from ..splatting.ssim import ssim
@@ -81,7 +81,7 @@ def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Re
     the response is needed. With `clipping` one-sided where the camera saturated; see also LossConfig.interval."""
     prediction, truth = photo.encoded, target.encoded
     lower, upper = truth - CODE / 2, truth + CODE / 2
-    if config.domain == "mu-law":
+    if config.domain == "mu-law" or (config.domain == "auto" and _is_decodable(photo, response)):
         known = _known(response)
         white, mu = known.white, mu_of_knee(known, config.knee)
         prediction = mu_law(_light(photo, response), white, mu)
@@ -117,6 +117,11 @@ def mu_of_knee(response: Response, knee: float) -> float:
     """The mu whose knee, white / mu, is the exposure of code `knee` of 255: the same place among the codes for any
     curve, where one mu would leave all shadows of a curve that never clips below it."""
     return response.white / max(float(response.decode(knee / 255)), 1e-12)
+
+
+def _is_decodable(photo: Photograph, response: Response | None) -> bool:
+    """Whether the simulated photo's pixels have exposures, and a curve that is not itself learned tells the photo's."""
+    return photo.light is not None and response is not None and not isinstance(response, ToneMapper)
 
 
 def mu_law(exposure: Tensor, white: float, mu: float = MU) -> Tensor:

@@ -1,10 +1,12 @@
 """Losses: forms, one-sidedness where the camera saturated, masks, and which side learns."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from sehdr_warp.model.radiance_field import CameraTensors, Photograph
-from sehdr_warp.model.response import response_by_name
+from sehdr_warp.model.response import ToneMapper, response_by_name
 from sehdr_warp.model.response_refined import RefinedResponse
 from sehdr_warp.splatting.ssim import ssim
 from sehdr_warp.training.config import LossConfig
@@ -129,9 +131,23 @@ def test_an_interval_of_the_difference_leaves_ssim_alone():
     response = response_by_name("srgb")
     light = images(3)[0].double() * 0.8 + 0.05
     target, photo = target_of(quantised(response.encode(light))), photo_of(light, response)
-    loss = ldr_loss(photo, target, LossConfig(interval="difference"), response)
+    loss = ldr_loss(photo, target, LossConfig(interval="difference", domain="encoded"), response)
     expected = 0.2 * (1 - ssim(photo.encoded, target.encoded))
     assert loss.item() == pytest.approx(expected.item(), rel=1e-6) and loss > 0
+
+
+def test_auto_compares_exposures_where_there_are_some_and_the_curve_is_known():
+    response = response_by_name("srgb")
+    light = images(3)[0].double() * 0.8 + 0.05
+    target, photo = target_of(quantised(response.encode(light))), photo_of(light, response)
+    by_domain = {
+        domain: ldr_loss(photo, target, LossConfig(domain=domain), response).item() for domain in ("encoded", "mu-law")
+    }
+    assert by_domain["encoded"] != by_domain["mu-law"]
+    assert LossConfig().domain == "auto"
+    assert ldr_loss(photo, target, LossConfig(), response).item() == by_domain["mu-law"]
+    assert ldr_loss(replace(photo, light=None), target, LossConfig(), response).item() == by_domain["encoded"]
+    assert ldr_loss(photo, target, LossConfig(), ToneMapper(8)).item() == by_domain["encoded"]
 
 
 @pytest.mark.parametrize("interval", ["off", "difference", "all"])
