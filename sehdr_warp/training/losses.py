@@ -27,7 +27,8 @@ class Target:
     """One training photo on the device, at one resolution.
 
     encoded: [H, W, 3] in [0, 1]; clipped, black: [H, W, 3] bool, or None where the photo has none of them;
-    mask: [H, W, 1] in [0, 1] or None; exposure_truth: [H, W, 3] true radiance times the base time, or None.
+    mask: [H, W, 1] in [0, 1] or None; exposure_truth: [H, W, 3] true radiance times the base time, or None;
+    light: [H, W, 3] exposures decoded from the photo, where they are kept for every step; None: decode them.
     """
 
     encoded: Tensor
@@ -35,6 +36,7 @@ class Target:
     black: Tensor | None
     mask: Tensor | None
     exposure_truth: Tensor | None
+    light: Tensor | None = None
 
 
 def one_sided(
@@ -82,10 +84,16 @@ def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Re
     prediction, truth = photo.encoded, target.encoded
     lower, upper = truth - CODE / 2, truth + CODE / 2
     if config.domain == "mu-law" or (config.domain == "auto" and _is_decodable(photo, response)):
-        known = _known(response)
+        known = known_response(response)
         white, mu = known.white, mu_of_knee(known, config.knee)
         prediction = mu_law(_light(photo, response), white, mu)
-        truth, lower, upper = (mu_law(known.decode(image), white, mu) for image in (truth, lower, upper))
+        if config.interval == "off":
+            # Bounds count at white and at black alone, and there half a code is the same everywhere.
+            truth = mu_law(known.decode(truth) if target.light is None else target.light, white, mu)
+            below_white, above_black = _half_codes(known, mu)
+            lower, upper = truth - below_white, truth + above_black
+        else:
+            truth, lower, upper = (mu_law(known.decode(image), white, mu) for image in (truth, lower, upper))
     plain = prediction
     if config.clipping or config.interval != "off":
         bounded = target if config.clipping else replace(target, clipped=None, black=None)
@@ -97,7 +105,13 @@ def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Re
     return image_loss(prediction, truth, target.mask, config.form, config.ssim_weight, similar=plain)
 
 
-def _known(response: Response) -> Response:
+def compares_light(config: LossConfig, field: RadianceField) -> bool:
+    """Whether ldr_loss decodes the photos of this field's training."""
+    decodable = field.radiance != "display" and field.tone_map == "pixel" and not isinstance(field.response, ToneMapper)
+    return config.ldr_weight > 0 and (config.domain == "mu-law" or (config.domain == "auto" and decodable))
+
+
+def known_response(response: Response) -> Response:
     """The curve by which photos are decoded, which does not change in a training: of a refined one its start."""
     return response.start if isinstance(response, RefinedResponse) else response
 
@@ -105,7 +119,7 @@ def _known(response: Response) -> Response:
 def _light(photo: Photograph, response: Response) -> Tensor:
     """[H, W, 3] the photo's exposures; where the response is learned, those that its start curve would decode from the
     simulated photo, so that the comparison also teaches the response."""
-    known = _known(response)
+    known = known_response(response)
     if known is response:
         return photo.light
     surplus = (photo.encoded - known.peak).clamp_min(0)
@@ -117,6 +131,16 @@ def mu_of_knee(response: Response, knee: float) -> float:
     """The mu whose knee, white / mu, is the exposure of code `knee` of 255: the same place among the codes for any
     curve, where one mu would leave all shadows of a curve that never clips below it."""
     return response.white / max(float(response.decode(knee / 255)), 1e-12)
+
+
+@lru_cache(maxsize=16)
+def _half_codes(response: Response, mu: float) -> tuple[float, float]:
+    """How far half a code below white and half a code above black are from them, in the mu-law of exposures."""
+    exposures = (1.0, 1.0 - CODE / 2, CODE / 2, 0.0)
+    white, below, above, black = (
+        math.log1p(mu * float(response.decode(value)) / response.white) / math.log1p(mu) for value in exposures
+    )
+    return white - below, above - black
 
 
 def _is_decodable(photo: Photograph, response: Response | None) -> bool:
@@ -191,7 +215,9 @@ def total_loss(
         linear = linear_loss(photo, target, config)
         loss = loss if linear is None else loss + config.linear_weight * linear
     if config.highlight_weight > 0:
-        prior = highlight_prior(photo.light, target.clipped, _known(field.response).white, config.highlight_stops)
+        prior = highlight_prior(
+            photo.light, target.clipped, known_response(field.response).white, config.highlight_stops
+        )
         loss = loss + config.highlight_weight * prior
     if config.harmonics_weight > 0:
         loss = loss + config.harmonics_weight * field.gaussians.harmonics_rest.square().mean()

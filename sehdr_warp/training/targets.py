@@ -1,6 +1,6 @@
 """The training photos on the device, at every resolution of the schedule, uploaded once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -48,7 +48,7 @@ class ViewStack:
         if len(sizes) > 1 or len(truths) > 1:
             return None
         images = {}
-        for name in ("encoded", "clipped", "black", "mask", "exposure_truth"):
+        for name in ("encoded", "clipped", "black", "mask", "exposure_truth", "light"):
             values = [getattr(view.target, name) for view in views]
             given = next((value for value in values if value is not None), None)
             if given is not None:
@@ -112,15 +112,25 @@ def largest_truth(scene: Scene, loss: LossConfig) -> float:
 
 
 def training_views(
-    views: tuple[View, ...], level: int, response: Response, base_time: float, device, *, truth: bool
+    views: tuple[View, ...],
+    level: int,
+    response: Response,
+    base_time: float,
+    device,
+    *,
+    truth: bool,
+    light: Response | None = None,
 ) -> list[TrainingView]:
-    """The views at 1 / 2^level of their size. truth: also upload HDR truth. Photos are averaged as exposures, since
+    """The views at 1 / 2^level of their size. truth: also upload HDR truth; light: keep the exposures that this response
+    decodes from the photos. Photos are averaged as exposures, since
     light adds up and encoded values do not; a pixel with a clipped part stays a lower bound."""
     made = []
     for view in views:
         width, height = (max(1, round(size / 2**level)) for size in (view.camera.width, view.camera.height))
         camera: Camera = view.camera.resized(width, height) if level else view.camera
         target = _target(view, (height, width), response, base_time, device, truth)
+        if light is not None:
+            target = replace(target, light=light.decode(target.encoded))
         made.append(TrainingView(CameraTensors.of(camera, device), view.exposure_time, target))
     return made
 

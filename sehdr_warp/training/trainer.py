@@ -11,12 +11,13 @@ from ..model.radiance_field import RadianceField
 from ..model.response import RefinedResponse
 from ..scene import Scene
 from ..splatting import GraphRecorder
+from ..splatting.memory import bytes_asked_for
 from .config import Config
 from .densification import make_densification, slope_weights
 from .early_stop import EarlyStop
 from .heldout import evaluate_views
 from .initialization import scene_extent
-from .losses import needed_colours, total_loss
+from .losses import compares_light, known_response, needed_colours, total_loss
 from .optimizer import (
     DECAY_EVERY,
     decay_rates,
@@ -35,6 +36,8 @@ CHECK_EVERY = 20
 ROOM_TO_GROW = 2.0
 """A recorded step has room for this many times the (Gaussian, tile) pairs of the step before it: photos differ."""
 LEAST_ROOM = 1 << 14
+DECODED_PIXELS = 1 << 27
+"""Photos of so many pixels in all are kept decoded as well, in 1.6 GB at most; those of more are decoded in each step."""
 
 
 class Trainer:
@@ -207,14 +210,15 @@ class Trainer:
 
     def _thin(self, views: ViewStack | list[TrainingView]) -> None:
         """Takes away the Gaussians that add nothing to any training photo."""
-        gaussians, count = self.field.gaussians, self.field.gaussians.count
+        gaussians = self.field.gaussians
         kept = contributing(self.field, views, self.config.densification.contribution)
         if bool(kept.all()):
             return
         with torch.no_grad():
             gaussians.keep(kept, self.optimizer)
         self.densification.keep(kept)
-        self._forget_recording(gaussians.count / count)
+        # What added nothing hardly filled the room for pairs: the rest needs as much as before.
+        self._forget_recording(1.0)
 
     def _look(self) -> None:
         """A look at the error, for the early stop; part of the training, and of its time."""
@@ -257,6 +261,8 @@ class Trainer:
                 lambda: self._optimise(views.at(self._index), watched, capacity),
             )
         except RuntimeError as error:
+            if bytes_asked_for(error):
+                raise
             # What a broken recording leaves behind on the device is no ground to go on from.
             raise SehdrError(
                 f"iteration {self.iteration}: the step could not be recorded as a CUDA graph "
@@ -340,7 +346,17 @@ class Trainer:
 
     def _upload(self, level: int) -> list[TrainingView]:
         loss, field = self.config.loss, self.field
-        return training_views(self._views, level, field.response, field.base_time, self.device, truth=loss.uses_hdr)
+        pixels = sum(view.camera.width * view.camera.height for view in self._views) // 4**level
+        kept = compares_light(loss, field) and pixels <= DECODED_PIXELS
+        return training_views(
+            self._views,
+            level,
+            field.response,
+            field.base_time,
+            self.device,
+            truth=loss.uses_hdr,
+            light=known_response(field.response) if kept else None,
+        )
 
 
 def _part(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:

@@ -150,6 +150,19 @@ def test_auto_compares_exposures_where_there_are_some_and_the_curve_is_known():
     assert ldr_loss(photo, target, LossConfig(), ToneMapper(8)).item() == by_domain["encoded"]
 
 
+@pytest.mark.parametrize("name", ["srgb", "hdr-nerf"])
+def test_photos_that_are_kept_decoded_give_the_same_loss(name):
+    response = response_by_name(name)
+    light = images(3)[0].double() * 2.5  # some of it clips, some is black
+    light[:2] = 0
+    encoded = quantised(response.encode(light))
+    target = replace(target_of(encoded), clipped=encoded >= 1 - CODE / 2, black=encoded <= CODE / 2)
+    photo = photo_of(light * 0.9 + 0.01, response)
+    decoding = ldr_loss(photo, target, LossConfig(), response)
+    keeping = ldr_loss(photo, replace(target, light=response.decode(encoded)), LossConfig(), response)
+    assert keeping.item() == decoding.item() > 0
+
+
 @pytest.mark.parametrize("interval", ["off", "difference", "all"])
 @pytest.mark.parametrize("domain", ["encoded", "mu-law"])
 def test_saturated_pixels_are_one_sided_in_every_domain(domain, interval):
