@@ -156,12 +156,12 @@ def _kernels(asked: Kernels, device) -> dict:
 
 
 def _step(asked: Step, device) -> dict:
-    from .splats import Size, parse_size
+    from .splats import parse_size
     from .step import bench_step
 
-    default = {"cuda": Size(100_000, 400, 400), "cpu": Size(20_000, 200, 200)}[device.type]
+    default = {"cuda": "100k@400x400", "cpu": "20k@200x200"}[device.type]
     return bench_step(
-        default if asked.size is None else parse_size(asked.size, device.type),
+        parse_size(default if asked.size is None else asked.size, device.type),
         device,
         preset=asked.preset,
         repetitions=_positive("--repetitions", asked.repetitions),
@@ -206,13 +206,13 @@ def _scale(asked: Scale, device) -> dict:
 
 def _choices(asked: Choices, device) -> dict:
     from .choices import bench_choices
-    from .splats import Size, parse_size
+    from .splats import parse_size
 
     if asked.iterations < 0:
         raise SehdrError(f"--iterations {asked.iterations}: must not be negative")
-    default = {"cuda": Size(200_000, 800, 800), "cpu": Size(5000, 200, 200)}[device.type]
+    default = {"cuda": "200k@800x800", "cpu": "5k@200x200"}[device.type]
     return bench_choices(
-        default if asked.size is None else parse_size(asked.size, device.type),
+        parse_size(default if asked.size is None else asked.size, device.type),
         device,
         iterations=asked.iterations,
         repetitions=_positive("--repetitions", asked.repetitions),
