@@ -1,7 +1,8 @@
 """rasterize() replayed: called like it, at what the GPU needs instead of what Python needs.
 
 A splat is some fifteen launches, forward and backward each. Called one by one from Python they take 3 ms whatever
-they draw; recorded as two CUDA graphs and replayed they take what the GPU needs, 0.3 ms for a small scene.
+they draw; recorded as two CUDA graphs and replayed, what the GPU needs and a few tenths of a millisecond
+(docs/benchmarks.md).
 """
 
 from dataclasses import replace
@@ -26,7 +27,7 @@ class RecordedRasterizer:
         loss(rendering.image).backward()
 
     What a call returns is overwritten by the next call, and its backward pass must have run before that: RuntimeError
-    otherwise. Other shapes, options or tensors that ask for gradients make a new recording (some 30 ms) in the place of
+    otherwise. Other shapes, options or tensors that ask for gradients make a new recording in the place of
     the old. Rendering.means2d is no part of the graph; densification by its gradient needs rasterize().
 
     device: a CUDA device; raises ValueError for another. Besides what rasterize() needs, a recording keeps copies of
