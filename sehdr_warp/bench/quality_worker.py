@@ -32,7 +32,8 @@ PLAN, RUN_LOCK = "plan.json", "run.lock"
 def work(out: str, worker: str, gpu: str | None = None, environment: dict[str, str] | None = None) -> int:
     """Runs jobs of out/plan.json; returns how many. gpu: what CUDA_VISIBLE_DEVICES is set to, None to leave it.
 
-    Ends when no job is free, or when the run that started it has gone.
+    Ends when no job is free, or when the run that started it has gone; on a GPU also after a job that failed, which may
+    have spoilt the device for this process: quality_pool.py starts another worker.
     """
     # Before torch is imported: it reads these once.
     os.environ.update(environment or {})
@@ -53,8 +54,10 @@ def work(out: str, worker: str, gpu: str | None = None, environment: dict[str, s
             with JobLock(job_folder) as held:
                 if held and is_open(job_folder, plan["run"]):
                     runner = runner or _runner(plan)
-                    _attempt(runner, job_folder, plan["run"], worker)
+                    done = _attempt(runner, job_folder, plan["run"], worker)
                     count += 1
+                    if not done and plan["device"] == "cuda":
+                        return count
     return count
 
 
@@ -104,12 +107,14 @@ def _runner(plan: dict):
     )
 
 
-def _attempt(runner, folder: Path, run: str, worker: str) -> None:
+def _attempt(runner, folder: Path, run: str, worker: str) -> bool:
+    """Whether the job has a result now; what went wrong is in its folder."""
     write_json(folder / ATTEMPT, {"run": run, "worker": worker, "pid": os.getpid()}, overwrite=True)
     try:
         result = runner.run(read_job(folder), folder)
         write_json(folder / RESULT, result, overwrite=True)
         (folder / FAILURE).unlink(missing_ok=True)
+        return True
     except SehdrError as error:
         write_failure(folder, run, str(error))
     except Exception as error:  # noqa: BLE001 - a defect, or a device out of memory, costs one job, not the run
@@ -118,6 +123,7 @@ def _attempt(runner, folder: Path, run: str, worker: str) -> None:
     finally:
         # Not reached by a worker that is killed: then the attempt stays, and tells.
         (folder / ATTEMPT).unlink(missing_ok=True)
+    return False
 
 
 if __name__ == "__main__":

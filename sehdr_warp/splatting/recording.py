@@ -44,7 +44,7 @@ class GraphRecorder:
             raise ValueError(f"device {self.device} has no CUDA graphs; use a GPU, or call the function itself")
         self._key = None
         self._graph: torch.cuda.CUDAGraph | None = None
-        self._result = None
+        self._modules = self._result = None
         self.stream = stream or torch.cuda.Stream(self.device)
         self._pool = torch.cuda.graph_pool_handle()
         # Keeps the pool's memory between recordings: freed with the last graph of the pool, it would be allocated anew.
@@ -52,7 +52,7 @@ class GraphRecorder:
 
     def invalidate(self) -> None:
         """Forget the recording: something that it holds fixed has changed."""
-        self._key = self._result = None
+        self._key = self._modules = self._result = None
         if self._graph is not None:
             self._graph.reset()
             self._graph = None
@@ -72,7 +72,7 @@ class GraphRecorder:
         Raises RuntimeError if the function cannot be recorded.
         """
         self.invalidate()
-        self._graph, self._result = self._record(function)
+        self._graph, self._modules, self._result = self._record(function)
         self._key = key
         return self._result
 
@@ -98,7 +98,8 @@ class GraphRecorder:
                 with suppress(RuntimeError):
                     graph.capture_end()
                 raise
-            wp.capture_end(stream=stream)
+            launched = wp.capture_end(stream=stream)
             graph.capture_end()
         current.wait_stream(self.stream)
-        return graph, result
+        # Warp's part of the recording is empty but for the modules that it launched, which must stay loaded.
+        return graph, launched, result
