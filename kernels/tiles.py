@@ -20,7 +20,8 @@ def tile_kernels(dtype):
     g = geometry(dtype)
     real, vec2, vec3, vec4 = g.real, g.vec2, g.vec3, g.vec4
     size = float(TILE_SIZE)
-    options = {"enable_backward": False}
+    # Without fused multiply-adds: count_tiles and emit_entries must decide alike, and a compiler fuses each its own way.
+    options = {"enable_backward": False, "fuse_fp": False}
 
     @wp.func
     def tile_span(centre: real, extent: real, tiles: int) -> wp.vec2i:
@@ -107,7 +108,8 @@ def tile_kernels(dtype):
     ):
         """ends: the running sum of the counts, so that Gaussian `place` fills the entries before ends[place].
 
-        Entries from `capacity` on are left out.
+        Entries from `capacity` on are left out. Whatever the counts say, every entry below both is filled, by its own
+        Gaussian: with columns * rows, no tile at all, where there are fewer tiles than were counted.
         """
         place = wp.tid()
         i = order[place]
@@ -115,17 +117,22 @@ def tile_kernels(dtype):
         entry = int(0)
         if place > 0:
             entry = ends[place - 1]
-        if extent[0] > real(0.0) and ends[place] > entry:
+        end = wp.min(ends[place], capacity)
+        if extent[0] > real(0.0) and end > entry:
             shape = shapes[i]
             ellipse = ellipses[i]
             across = tile_span(shape[0], extent[0], columns)
             down = tile_span(shape[1], extent[1], rows)
             for row in range(down[0], down[1]):
                 for column in range(across[0], across[1]):
-                    if entry < capacity and tile_is_touched(shape, ellipse, column, row):
+                    if entry < end and tile_is_touched(shape, ellipse, column, row):
                         tiles[entry] = row * columns + column
                         gaussians[entry] = i
                         entry += 1
+        while entry < end:
+            tiles[entry] = columns * rows
+            gaussians[entry] = i
+            entry += 1
 
     return pack_records, count_tiles, emit_entries
 

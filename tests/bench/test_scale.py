@@ -107,7 +107,7 @@ def test_points_have_stages_memory_steps_and_gsplat(monkeypatch, tmp_path):
     assert (tmp_path / "scale.png").read_bytes()[:4] == b"\x89PNG"
     assert json.loads((tmp_path / "scale.json").read_text())["benchmark"] == "scale"
     table = format_report(report)
-    assert "at the large end" in table and "gswarp" not in table
+    assert "at the large end" in table and "| gswarp" not in table
 
 
 def test_sweeps_are_named_and_ascend():

@@ -45,6 +45,8 @@ def test_any_modest_gaussians_match_the_reference(means, log_scales, quaternions
     # A contribution at the threshold counts on one side and not on the other, and so does a whole Gaussian of that
     # opacity; a low threshold makes them worth little. The same holds where a pixel is finished.
     means[:, 2].clamp_(min=-3.5)
+    # Depths that float32 cannot tell apart may be drawn in either order: only equal ones have theirs by index.
+    means[:, 2] = (means[:, 2] * 1024).round() / 1024
     quaternions[quaternions.norm(dim=1) < 1e-6] = 0.0
     tensors = [means, log_scales.clamp_max(1.0), quaternions, opacities[:, 0], features, *camera()]
     ours = rasterize(*tensors, 18, 14, alpha_threshold=1e-5)
