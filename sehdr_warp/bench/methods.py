@@ -39,6 +39,7 @@ METHODS = {
         Method("paper-truth", "paper-truth", truth=True),
         Method("hdr-gs", "hdr-gs"),
         Method("hdr-gs-truth", "hdr-gs-truth", truth=True),
+        Method("gauss-hdr", "gauss-hdr"),
         Method("3dgs", "3dgs"),
         Method("predicted", "predicted"),
         Method("hdr-nerf", "default", kind="hdr-nerf"),

@@ -21,8 +21,8 @@ class Train:
     out: Path | None = None
     """Folder for the run; needed for all but --plan-only."""
     preset: str | None = None
-    """default, fast, demo, paper, a rival (paper-truth, hdr-gs, hdr-gs-truth, 3dgs, truth, predicted), or a TOML file;
-    with --resume the run's own config."""
+    """default, fast, demo, paper, a rival (paper-truth, hdr-gs, hdr-gs-truth, gauss-hdr, 3dgs, truth, predicted), or a
+    TOML file; with --resume the run's own config."""
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
     exposure_index: int | None = None

@@ -169,6 +169,10 @@ class LossConfig:
     harmonics_weight: float = option(
         0.0, "weight of the mean square of the harmonics above degree 0", low=0.0, high=100.0
     )
+    anchor_weight: float = option(
+        0.0, "mlp: weight of (f(1) - anchor_value)^2, which holds the scale (HDR-NeRF: 0.5)", low=0.0, high=100.0
+    )
+    anchor_value: float = option(0.5, "mlp: what the unit exposure is encoded as", above=0.0, high=0.999)
     opacity_weight: float = option(0.0, "weight of the mean opacity (3DGS-MCMC: 0.01)", low=0.0, high=10.0)
     scale_weight: float = option(0.0, "weight of the mean size (3DGS-MCMC: 0.01)", low=0.0, high=10.0)
 

@@ -48,6 +48,8 @@ def check_together(config: "Config") -> None:
         raise ConfigError(f"loss.predictor = {loss.predictor!r} is for nothing: loss.hdr_weight = 0.0")
     if config.response.form == "mlp":
         _check_learned(config)
+    elif loss.anchor_weight > 0:
+        raise ConfigError(f'loss.anchor_weight = {loss.anchor_weight} is for nothing: needs response.form = "mlp"')
     if config.response.refine:
         _check_refined(config)
     if loss.harmonics_weight > 0 and config.schedule.harmonics_on_demand:

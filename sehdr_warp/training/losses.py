@@ -165,6 +165,16 @@ def highlight_prior(light: Tensor, clipped: Tensor | None, white: float, stops: 
     return torch.where(clipped & (light > white), (excess - stops).abs(), 0.0).mean()
 
 
+def anchor_loss(mapper: ToneMapper, value: float) -> Tensor:
+    """Mean over channels of (f(1) - value)^2: photos of one exposure leave a learned f's scale open, and it drifts.
+
+    Source: the unit exposure loss of HDR-NeRF (CVPR 2022), which GaussHDR (CVPR 2025) keeps; value is 0.5 there for
+    photos, the middle of the encoded range.
+    """
+    log_unit = mapper.weights[0].new_zeros(1, 3)
+    return (mapper.encode_log(log_unit) - value).square().mean()
+
+
 def linear_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor | None:
     """SeHDR's L_linear: base exposure against true exposure where there is truth (and hdr_truth is on), else against
     the fused one; None where there is nothing to compare."""
@@ -219,6 +229,8 @@ def total_loss(
             photo.light, target.clipped, known_response(field.response).white, config.highlight_stops
         )
         loss = loss + config.highlight_weight * prior
+    if config.anchor_weight > 0:
+        loss = loss + config.anchor_weight * anchor_loss(field.response, config.anchor_value)
     if config.harmonics_weight > 0:
         loss = loss + config.harmonics_weight * field.gaussians.harmonics_rest.square().mean()
     if config.opacity_weight > 0:

@@ -14,7 +14,7 @@ from sehdr_warp.splatting.ssim import ssim
 from sehdr_warp.training.config import Config, ConfigError, LossConfig, ModelConfig, ResponseConfig
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.initialization import choose_response, make_field, start_colours
-from sehdr_warp.training.losses import Target, hdr_loss, total_loss
+from sehdr_warp.training.losses import Target, anchor_loss, hdr_loss, total_loss
 from sehdr_warp.training.run import load_run
 from sehdr_warp.training.targets import largest_truth
 from sehdr_warp.training.train import train
@@ -26,6 +26,7 @@ RIVALS = {
     "paper-truth": {"response.name": "srgb", "optimizer.harmonics_dc": 0.05, "optimizer.fusion": 0.01},
     "hdr-gs": {"optimizer.harmonics_dc": 0.02, "optimizer.response": 0.005},
     "hdr-gs-truth": {"optimizer.harmonics_dc": 0.02, "optimizer.response": 0.005},
+    "gauss-hdr": {"optimizer.harmonics_dc": 0.02, "optimizer.response": 0.005},
     "truth": {},
     "predicted": {},
 }
@@ -73,6 +74,10 @@ def test_presets_are_what_their_methods_say():
     assert (gs.loss.ldr_weight, gs.loss.hdr_weight) == (1.0, 0.0) and not gs.loss.uses_hdr
     changed = dataclasses.replace(gs.loss, hdr_weight=0.6, hdr_domain="mu-law")
     assert with_truth == dataclasses.replace(gs, loss=changed)
+    gauss = load_config("gauss-hdr")
+    pixel = dataclasses.replace(gs.model, tone_map="pixel")
+    assert gauss == dataclasses.replace(gs, model=pixel, loss=dataclasses.replace(gs.loss, anchor_weight=0.5))
+    assert gauss.loss.anchor_value == 0.5
     assert (truth.loss.ldr_weight, truth.loss.hdr_weight, truth.loss.hdr_domain) == (0.0, 1.0, "mu-law")
     predicted = load_config("predicted")
     assert predicted == dataclasses.replace(truth, loss=dataclasses.replace(truth.loss, predictor="kovaleski-oliveira"))
@@ -185,6 +190,35 @@ def test_a_learned_tone_mapper_starts_as_hdr_gs_does(scene):
     assert not np.allclose(start_colours(encoded, "log", response_by_name("srgb")), encoded)
 
 
+def test_the_anchor_holds_the_unit_exposure_of_a_learned_tone_mapper(scene):
+    mapper = ToneMapper(8, seed=1)
+    loss = anchor_loss(mapper, 0.5)
+    expected = (mapper.encode(torch.ones(1, 3)) - 0.5).square().mean()
+    assert loss.item() == pytest.approx(expected.item(), abs=1e-6)
+    loss.backward()
+    gradients = [parameter.grad for parameter in mapper.parameters() if parameter.grad is not None]
+    assert all(torch.isfinite(gradient).all() for gradient in gradients)
+    assert mapper.biases[-1].grad.abs().min() > 0
+    trainers = {
+        (weight, value): trainer_of(
+            scene,
+            quick("gauss-hdr", **RIVALS["gauss-hdr"], **{"loss.anchor_weight": weight, "loss.anchor_value": value}),
+        )
+        for weight, value in ((0.0, 0.5), (50.0, 0.5), (50.0, 0.8))
+    }
+    for trainer in trainers.values():
+        for _ in range(60):
+            trainer.step()
+        assert trainer.skipped_steps == 0
+    unit = {
+        key: trainer.field.response.encode(torch.ones(1, 3)).detach().flatten() for key, trainer in trainers.items()
+    }
+    assert (unit[50.0, 0.5] - 0.5).abs().max() < 0.03 and (unit[50.0, 0.8] - 0.8).abs().max() < 0.03
+    assert (unit[0.0, 0.5] - 0.5).abs().max() > 0.06
+    with pytest.raises(InputError, match=r'anchor_weight = 0\.5 is for nothing: needs response\.form = "mlp"'):
+        load_config("default", {"loss.anchor_weight": 0.5})
+
+
 def test_a_learned_tone_mapper_resumes_bit_for_bit(scene):
     config = quick("hdr-gs")
     straight = trainer_of(scene, config)
@@ -207,7 +241,7 @@ def test_a_learned_tone_mapper_resumes_bit_for_bit(scene):
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
-@pytest.mark.parametrize("name", ["hdr-gs-truth", "truth"])
+@pytest.mark.parametrize("name", ["hdr-gs-truth", "gauss-hdr", "truth"])
 def test_rivals_are_recorded_on_a_gpu(scene, name):
     config = quick(name, **RIVALS[name])
     field = make_field(scene, config, choose_response(scene, config), "cuda:0")
