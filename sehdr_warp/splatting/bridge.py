@@ -93,19 +93,19 @@ class Program:
         with self.tape if recorded and self.tape is not None else nullcontext():
             wp.launch(kernel, dim, list(inputs), list(outputs), device=self.device, block_dim=block_dim)
 
-    def launch_ranges(self, kernel, count: int, inputs, outputs) -> None:
+    def launch_ranges(self, kernel, count: int, inputs, outputs, *, recorded: bool = True) -> None:
         """Launch `kernel(first, *inputs, *outputs)` for `count` items; on the CPU spread over threads, adjoint too.
 
         The kernel adds the argument `first` to its thread index and writes only what belongs to that item; an input
         that several items share must not ask for a gradient here when threads run side by side, so the adjoint of
-        such a launch is left to one thread.
+        such a launch is left to one thread. recorded: as in launch().
         """
         if not self.is_cpu:
-            self.launch(kernel, count, [0, *inputs], outputs)
+            self.launch(kernel, count, [0, *inputs], outputs, recorded=recorded)
             return
         arguments = [*inputs, *outputs]
         threads.launch_ranges(kernel, threads.even_ranges(count), arguments, self.device)
-        if self.tape is None:
+        if self.tape is None or not recorded:
             return
         # The tape holds the adjoint. If that held the program or the tape, memory would wait for the garbage collector.
         device = self.device

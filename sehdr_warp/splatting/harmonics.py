@@ -3,8 +3,9 @@
 import torch
 
 from ..kernels.geometry import vector
-from ..kernels.harmonics import harmonics_kernel
-from .arrays import warp_scalar
+from ..kernels.harmonics import harmonics_adjoint_kernel, harmonics_kernel
+from . import threads
+from .arrays import view, warp_scalar
 from .bridge import differentiable
 
 MAX_DEGREE = 3
@@ -53,16 +54,29 @@ def _check(constant, rest, means, camera_position) -> None:
 def _evaluate(program, constant, rest, means, camera_position, *, degree):
     scalar = warp_scalar(means.dtype)
     vec3 = vector(3, scalar)
+    gradients = [program.hand_over(tensor) for tensor in (constant, rest, means, camera_position)]
     values = program.write(means.shape, vec3)
-    program.launch_ranges(
-        harmonics_kernel(scalar, degree),
-        means.shape[0],
-        [
-            program.read(constant, vec3),
-            program.read(rest, vec3),
-            program.read(means, vec3),
-            program.read(camera_position, vec3),
-        ],
-        [values],
-    )
+    rest3, means3, camera3 = (program.read(tensor, vec3) for tensor in (rest, means, camera_position))
+    kernel = harmonics_kernel(scalar, degree)
+    arguments = [program.read(constant, vec3), rest3, means3, camera3]
+    program.launch_ranges(kernel, means.shape[0], arguments, [values], recorded=False)
+
+    device, is_cpu = program.device, program.is_cpu  # the tape holds the adjoint, which must not hold the program
+
+    def adjoint():
+        """By hand: the generated one adds to zeros, number by number, which for 48 numbers a Gaussian takes several
+        times as long as to write them."""
+        made = [torch.empty_like(tensor) for tensor in (constant, rest, means)]
+        threads.launch_ranges(
+            harmonics_adjoint_kernel(scalar, degree),
+            threads.even_ranges(len(means)) if is_cpu else [(0, len(means))],
+            [rest3, means3, camera3, values.grad, *(view(tensor, vec3) for tensor in made)],
+            device,
+        )
+        for gradient, value in zip(gradients, made, strict=False):
+            gradient.value = value if gradient.wanted else None
+        if gradients[3].wanted:
+            gradients[3].value = -made[2].sum(0)
+
+    program.record_adjoint(adjoint)
     return values
