@@ -46,7 +46,8 @@ class CameraTensors:
 class Photograph:
     """A differentiable simulated photo.
 
-    encoded: [H, W, 3] encoded values, extended beyond [0, 1] as by Response.encode_extended.
+    encoded: [H, W, 3] encoded values, extended beyond [0, 1] as by Response.encode_extended; None where they were not
+        asked for.
     exposure: [H, W, 3] of the HDR colour at the base time (I^h dt_1 of the paper); None with radiance "display", and
         where neither it nor the photo was asked for.
     base: [H, W, 3] of the base colour at the base time (I^b); the same tensor as `exposure` without fusion.
@@ -55,7 +56,7 @@ class Photograph:
         composited.
     """
 
-    encoded: Tensor
+    encoded: Tensor | None
     exposure: Tensor | None
     base: Tensor | None
     rendering: Rendering
@@ -123,10 +124,11 @@ class RadianceField(nn.Module):
         also: frozenset[str] = frozenset(),
         capacity: int | None = None,
         presence: Tensor | None = None,
+        encode: bool = True,
     ) -> Photograph:
         """A photo of exposure_time seconds, harmonics up to `degree`; also: which of "exposure" and "base" are
         wanted, each a colour set more to render where the photo does not need it; capacity: as rasterize() takes it;
-        presence: [N] factors of the opacities."""
+        presence: [N] factors of the opacities; encode: False leaves a photo that has an exposure at that."""
         ratio = exposure_time / self.base_time
         if self.radiance == "display":
             rendering = self._rasterize(
@@ -144,7 +146,10 @@ class RadianceField(nn.Module):
         rendering = self._rasterize(camera, features, capacity, presence)
         images = dict(zip(sets, rendering.image.split(3, dim=2), strict=True))
         light = None if self.tone_map == "gaussian" else images["fused"] * ratio
-        encoded = images["encoded"] if light is None else self.response.encode_extended(light)
+        if light is None:
+            encoded = images["encoded"]
+        else:
+            encoded = self.response.encode_extended(light) if encode else None
         exposure = images.get("fused")
         return Photograph(encoded, exposure, images.get("base", exposure), rendering, light)
 

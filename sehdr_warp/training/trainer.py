@@ -16,6 +16,7 @@ from .config import Config
 from .densification import make_densification, slope_weights
 from .early_stop import EarlyStop
 from .heldout import evaluate_views
+from .highlights import expected_excess
 from .initialization import scene_extent
 from .losses import compares_light, known_response, needed_colours, total_loss
 from .optimizer import (
@@ -58,7 +59,10 @@ class Trainer:
         self.optimizer = make_optimizer(field, config, self.extent)
         self.densification = make_densification(config, self.extent)
         self._views = scene.train_views
+        # Where light is compared, by a curve that stays: encoding the photo, some twenty operations, waits until asked for.
+        self._encoded = not compares_light(config.loss, field) or isinstance(field.response, RefinedResponse)
         self._largest_truth = largest_truth(scene, config.loss) * field.base_time
+        self._highlights = expected_excess(self._views, known_response(field.response), config.loss)
         self._levels: dict[int, ViewStack | list[TrainingView]] = {}
         self._order: list[int] = []
         self._order_generator = torch.Generator().manual_seed(config.seed)
@@ -109,6 +113,8 @@ class Trainer:
         if self._last is None:
             return float("nan")
         _, prediction, truth = self._last
+        if not self._encoded:
+            prediction = self.field.response.encode_extended(prediction)
         return float(-10 * (prediction.clamp(0, 1) - truth).square().mean().clamp_min(1e-10).log10())
 
     @property
@@ -150,7 +156,8 @@ class Trainer:
     def _optimise(
         self, view: TrainingView, watched: bool, capacity: int | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Photograph, compare, differentiate, step. Returns the loss, the simulated photo and the photo.
+        """Photograph, compare, differentiate, step. Returns the loss, the simulated photo (its exposures, where encoded
+        values are not needed) and the photo.
 
         With a capacity all of it works on fixed memory and nothing waits for the device.
         """
@@ -161,6 +168,7 @@ class Trainer:
             also=needed_colours(self.config.loss, view.target.exposure_truth is not None),
             capacity=capacity,
             presence=self._presence,
+            encode=self._encoded,
         )
         if watched:
             photo.rendering.means2d.retain_grad()
@@ -184,7 +192,7 @@ class Trainer:
             self._pairs = max(self._pairs, photo.rendering.entry_count)
         else:
             self._incomplete += photo.rendering.overflow
-        return loss.detach(), photo.encoded.detach(), view.target.encoded
+        return loss.detach(), (photo.encoded if self._encoded else photo.light).detach(), view.target.encoded
 
     def _hold_response(self) -> bool:
         """Whether the response is corrected in this step; before response.refine_after its gradient is held back."""
@@ -356,6 +364,7 @@ class Trainer:
             self.device,
             truth=loss.uses_hdr,
             light=known_response(field.response) if kept else None,
+            highlights=self._highlights,
         )
 
 

@@ -196,6 +196,21 @@ def test_seeds_decide_and_global_state_does_not(scene, tmp_path):
     assert results[2].shape != results[0].shape or not torch.equal(results[0], results[2])
 
 
+def test_steps_that_compare_light_do_not_encode_it_and_report_the_same(scene):
+    config = quick()
+    trainers = [
+        Trainer(scene, config, make_field(scene, config, choose_response(scene, config), torch.device("cpu")))
+        for _ in range(2)
+    ]
+    assert not trainers[0]._encoded
+    trainers[1]._encoded = True
+    for trainer in trainers:
+        trainer.step()
+        trainer.step()
+    assert trainers[0].loss == trainers[1].loss
+    assert trainers[0].psnr == trainers[1].psnr
+
+
 def test_non_finite_steps_are_skipped_and_then_stop(scene):
     config = quick(**{"schedule.nonfinite_limit": 20})
     field = make_field(scene, config, choose_response(scene, config), "cpu")
