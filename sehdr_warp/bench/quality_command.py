@@ -20,8 +20,8 @@ class Quality:
     scenes: str = "embedded"
     """Folders with HDR truth in all views, embedded or embedded:NAME, separated by commas."""
     methods: str = "default,paper,hdr-gs,3dgs,truth"
-    """default, paper, paper-truth, hdr-gs, hdr-gs-truth, 3dgs, predicted, hdr-nerf, truth, other presets or TOML files,
-    separated by commas; empty for variants alone."""
+    """default, paper, paper-truth, hdr-gs, hdr-gs-truth, gauss-hdr, 3dgs, predicted, hdr-nerf, truth, other presets or
+    TOML files, separated by commas; empty for variants alone."""
     variant: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """A method with other values, NAME:BASE:field=value,field=value, such as no-clip:default:loss.clipping=false; may be
     given several times."""
@@ -69,16 +69,21 @@ class Quality:
     """Keep the trained models in their job folders."""
     report_only: bool = False
     """Run nothing: make results, tables and plots again from the job folders."""
+    report_scenes: str | None = None
+    """With --report-only: tables of these scenes alone, names separated by commas, written as quality-NAMES.md."""
 
 
 def run_quality(asked: Quality) -> None:
     """Plans, runs, reports; raises SehdrError if a job failed, after everything was written."""
-    from .quality_report import write_quality_report
+    from .quality_report import write_quality_report, write_scenes_report
 
+    if asked.report_scenes is not None and not (asked.report_only and _words(asked.report_scenes)):
+        raise SehdrError(f"--report-scenes {asked.report_scenes}: needs --report-only and names of scenes")
     if asked.report_only:
         if not (asked.out / "jobs").is_dir():
             raise InputError(asked.out, "holds no jobs", "give the --out of an earlier `bench quality`")
-        print(write_quality_report(asked.out))
+        scenes = _words(asked.report_scenes or "")
+        print(write_scenes_report(asked.out, scenes) if scenes else write_quality_report(asked.out))
         return
     from .methods import choose_methods
     from .quality import bench_quality

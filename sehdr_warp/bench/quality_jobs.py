@@ -22,6 +22,8 @@ JOB, RESULT, FAILURE, ATTEMPT, LOCK = "job.json", "result.json", "failure.json",
 TESTS, FIRST_TEST = 16, 100
 """A training tests its held-out views this often, at iterations spaced evenly on a log scale from 1/100 of all."""
 RESPONSES = ("known", "blind")
+LEARNED = "learned"
+"""Of a method that learns the response with the scene: known or blind, it is the same training, and runs once."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,8 @@ class Job:
 
 
 def plan_jobs(settings: Settings) -> list[Job]:
-    """Every job of the settings, scene by scene. Blind jobs of methods that cannot be blind are left out.
+    """Every job of the settings, scene by scene. Blind jobs of methods that cannot be blind are left out; methods that
+    learn the response have one job for known and blind together.
 
     Raises InputError or SehdrError for a preset, field, curve or folder that cannot be used, before anything runs.
     """
@@ -117,10 +120,13 @@ def plan_jobs(settings: Settings) -> list[Job]:
         dict.fromkeys(settings.responses),
         settings.methods,
     ):
-        if response == "blind" and not method.blind:
-            continue
         config = configs[method.name, iterations, seed]
-        name = "auto" if response == "blind" else curve
+        told = [name for name in settings.responses if name == "known" or method.blind]
+        learned = config.response.form == "mlp"
+        if response not in (told[:1] if learned else told):
+            continue
+        response = LEARNED if learned else response
+        name = curve if response == "known" else "auto"
         changes, files = {"response.name": name}, {}
         if settings.predictor is not None and config.loss.predictor:
             place_of = {"{scene}": scenes[place]["name"], "{exposure}": str(exposure)}

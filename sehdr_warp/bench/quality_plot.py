@@ -1,11 +1,12 @@
 """Held-out error over training seconds, a line for each method, with the Pareto front."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ..output.report import STYLE
+from .quality_rows import by_table, line_name
 
 # Hues that the colour-blind tell apart (Okabe and Ito); later methods repeat them dashed.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#1f2328")
@@ -40,19 +41,19 @@ def pareto_front(lines: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.nda
     return tuple(np.array(front, float).reshape(-1, 2).T)
 
 
-def plot_error_over_time(rows: Sequence[dict], path: Path, line_name: Callable) -> None:
+def plot_error_over_time(rows: Sequence[dict], path: Path) -> None:
     """Writes a PNG: a panel for each curve and knowledge of the response, HDR error under gt-max over seconds.
 
-    line_name(row, rows) names a result's line.
+    rows: of one kind of device.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
     panels: dict[tuple, dict[str, list[dict]]] = {}
-    for row in rows:
-        config = row["config"]
-        panel = panels.setdefault((config["photo"]["curve"], config["response"]), {})
-        panel.setdefault(line_name(row, rows), []).append(row)
+    for (_, curve, response), members in by_table(rows).items():
+        panel = panels.setdefault((curve, response), {})
+        for row in members:
+            panel.setdefault(line_name(row, rows), []).append(row)
     names = list(dict.fromkeys(name for panel in panels.values() for name in panel))
     styles = {
         name: (COLOURS[k % len(COLOURS)], ("-", "--", ":")[k // len(COLOURS) % 3]) for k, name in enumerate(names)

@@ -2,14 +2,17 @@
 of each variant to its base."""
 
 import json
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import fmean
 
+from ..errors import InputError
 from ..output.files import atomic_path
 from .methods import METHODS, UPPER_BOUND
-from .quality_jobs import read_failure, read_job, read_result
+from .quality_jobs import LEARNED
 from .quality_plot import plot_error_over_time
+from .quality_rows import axes, by_table, collect, exposure, grouped, iterations, knowledge, line_name, method, newest
 from .report import markdown_table
 
 RESULTS, TABLES, PLOT = "results.jsonl", "quality.md", "error-over-time-{}.png"
@@ -35,69 +38,40 @@ def write_quality_report(out: Path) -> str:
         path.write_text(text + "\n", encoding="utf-8")
     for device in sorted({row["config"]["device"] for row in rows}):
         with atomic_path(out / PLOT.format({"cuda": "gpu"}.get(device, device)), overwrite=True) as path:
-            plot_error_over_time([row for row in rows if row["config"]["device"] == device], path, line_name)
+            plot_error_over_time([row for row in rows if row["config"]["device"] == device], path)
     return text
 
 
-def collect(out: Path) -> tuple[list[dict], list[tuple[str, str]]]:
-    """Every complete result in the job folders, without its single views, and (job, error) of every failed one."""
-    rows, failures = [], []
-    for folder in sorted((out / "jobs").glob("*")) if (out / "jobs").is_dir() else ():
-        result, failure = read_result(folder), read_failure(folder)
-        if result is not None:
-            figures = {name: value for name, value in result["figures"].items() if name != "views"}
-            rows.append(result | {"figures": figures})
-        elif failure is not None:
-            failures.append((read_job(folder).label, failure["error"]))
-    return rows, failures
+def write_scenes_report(out: Path, scenes: Sequence[str]) -> str:
+    """Writes the tables of these scenes alone as quality-SCENES.md, and returns them: a method that was tuned on some
+    scenes is judged on others. Names are those in the tables; `embedded:` may be left out.
+
+    Raises InputError for a scene of which there is no result.
+    """
+    rows, outdated = newest(collect(out)[0])
+    there = {_scene(row) for row in rows}
+    names = [name if name in there else f"embedded:{name}" for name in scenes]
+    for asked, name in zip(scenes, names, strict=True):
+        if name not in there:
+            raise InputError(out, f"has no result of scene {asked}", f"choose from {', '.join(sorted(there))}")
+    notes = [f"{outdated} results of configs that have changed since are left out."] if outdated else []
+    text = format_tables([row for row in rows if _scene(row) in names], [], notes)
+    short = "-".join(re.sub(r"[^A-Za-z0-9.]+", "-", name.removeprefix("embedded:")) for name in names)
+    with atomic_path(out / f"quality-{short[:100]}.md", overwrite=True) as path:
+        path.write_text(text + "\n", encoding="utf-8")
+    return text
 
 
-def newest(rows: Sequence[dict]) -> tuple[list[dict], int]:
-    """Of results for one place in the table (config changed in between), the newest; and how many were left out."""
-    kept: dict[tuple, dict] = {}
-    for row in sorted(rows, key=lambda row: row["date"]):
-        kept[(*axes(row), iterations(row), method(row), row["config"]["response"])] = row
-    keys = {row["key"] for row in kept.values()}
-    return [row for row in rows if row["key"] in keys], len(rows) - len(keys)
-
-
-def axes(row: dict) -> tuple:
-    """What two results must share to be compared: photos, views, seed and kind of device."""
-    config = row["config"]
-    scene, photo = config["scene"], config["photo"]
-    noise = tuple(photo["noise"] or ())
-    places = (
-        scene["name"],
-        scene["max_size"],
-        photo["curve"],
-        photo["exposure"],
-        photo["count"],
-        photo["factor"],
-        noise,
-    )
-    return (*places, config["seed"], config["device"])
-
-
-def method(row: dict) -> str:
-    return row["config"]["method"]["name"]
-
-
-def iterations(row: dict) -> int:
-    return row["config"]["training"]["schedule"]["iterations"]
-
-
-def line_name(row: dict, rows: Sequence[dict]) -> str:
-    """The method, with its iterations where it was trained in several lengths."""
-    lengths = {iterations(other) for other in rows if method(other) == method(row)}
-    return method(row) if len(lengths) == 1 else f"{method(row)} {iterations(row):,}"
+def _scene(row: dict) -> str:
+    return row["config"]["scene"]["name"]
 
 
 def format_tables(rows: Sequence[dict], failures: Sequence[tuple[str, str]], notes: Sequence[str] = ()) -> str:
-    """Markdown: for each device, curve and knowledge of the response one table each of HDR figures, regions and costs;
-    the variants against their bases; failures."""
+    """Markdown: for each device, curve and knowledge of the response one table each of HDR figures, of these by
+    exposure where there are several, of regions and of costs; the variants against their bases; failures."""
     parts = [_heading(rows)]
     bound = _upper_bound(rows)
-    for (device, curve, response), members in grouped(rows, _group).items():
+    for (device, curve, response), members in by_table(rows).items():
         parts.append(f"## {device}, {curve}, response {response}")
         methods = _by_method(members)
         for titles, line in (
@@ -106,20 +80,14 @@ def format_tables(rows: Sequence[dict], failures: Sequence[tuple[str, str]], not
             (_COST_TITLES, _cost_line),
         ):
             parts.append(markdown_table(titles, [[name, *line(items, bound)] for name, items in methods.items()]))
+            if line is _hdr_line:
+                parts += _by_exposure(methods, bound)
         variants = [_ablation_line(name, items, members) for name, items in methods.items() if _base(items[0])]
         if variants:
             parts += ["Variants, difference to their base:", markdown_table(_ABLATION_TITLES, variants)]
     if failures:
         parts.append(f"{len(failures)} failed:\n\n" + "\n".join(f"- {label}: {error}" for label, error in failures))
     return "\n\n".join([*parts, *_notes(rows), *notes])
-
-
-def grouped(rows: Sequence[dict], key: Callable) -> dict:
-    """Rows by key, keys sorted."""
-    found: dict = {}
-    for row in rows:
-        found.setdefault(key(row), []).append(row)
-    return {name: found[name] for name in sorted(found)}
 
 
 def _by_method(rows: Sequence[dict]) -> dict[str, list[dict]]:
@@ -138,11 +106,6 @@ def _by_method(rows: Sequence[dict]) -> dict[str, list[dict]]:
 
     found = grouped(rows, place)
     return {line_name(items[0], rows): items for items in found.values()}
-
-
-def _group(row: dict) -> tuple:
-    config = row["config"]
-    return config["device"], config["photo"]["curve"], config["response"]
 
 
 def _upper_bound(rows: Sequence[dict]) -> dict[tuple, dict]:
@@ -187,6 +150,28 @@ def _hdr_line(rows: list[dict], bound: dict) -> list[str]:
         if name != "self-max":
             cells.append(_difference(rows, bound, psnr))
     return [*cells, _mean(rows, _figure("pu21", "aligned", "psnr")), _mean(rows, _hdr("aligned", "hdr_flip"), 3)]
+
+
+def _by_exposure(methods: dict[str, list[dict]], bound: dict) -> list[str]:
+    """A table for each protocol with an absolute or fitted scale, a column for each exposure; none for one exposure."""
+    places = sorted({exposure(row) for rows in methods.values() for row in rows})
+    if len(places) < 2:
+        return []
+    tables = []
+    for name in ("gt-max", "aligned"):
+        lines = [[line, *_exposure_cells(rows, bound, places, _hdr(name, "psnr_mu"))] for line, rows in methods.items()]
+        titles = [f"{name} (to U)", *(f"exposure {place}" for place in places)]
+        tables.append(markdown_table(titles, lines))
+    return tables
+
+
+def _exposure_cells(rows: list[dict], bound: dict, places: Sequence[int], psnr) -> list[str]:
+    cells = []
+    for place in places:
+        there = [row for row in rows if exposure(row) == place]
+        gain = _difference(there, bound, psnr)
+        cells.append(_mean(there, psnr) + ("" if gain == "-" else f" ({gain})"))
+    return cells
 
 
 _REGION_TITLES = ["method", *(f"{name}{what}" for name in _REGIONS for what in ("", ", to U", ", share")),
@@ -303,6 +288,11 @@ def _heading(rows: Sequence[dict]) -> str:
 
 def _notes(rows: Sequence[dict]) -> list[str]:
     notes = []
+    learned = sorted({method(row) for row in rows if knowledge(row) == LEARNED})
+    if learned:
+        notes.append(
+            f"Learn the response with the scene, so one training stands under known and under blind: {', '.join(learned)}."
+        )
     shared = max((row["shared_by"] for row in rows), default=1)
     if shared > 1:
         notes.append(f"Up to {shared} trainings shared a device: seconds and renders / s are those of a shared one.")

@@ -128,6 +128,7 @@ def test_seconds_to_final_is_the_first_time_that_stays_within_a_tenth(psnr, expe
         ("--variant a:b", "not NAME:BASE:field=value"),
         ("--slurm gpu", "--slurm gpu: not name=value"),
         ("--report-only", "holds no jobs"),
+        ("--report-scenes embedded", "--report-scenes embedded: needs --report-only"),
     ],
 )
 def test_flags_that_cannot_be_are_refused_in_one_line_before_anything_runs(flags, message, tmp_path, capsys):

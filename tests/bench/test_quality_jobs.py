@@ -17,6 +17,7 @@ from sehdr_warp.bench.quality_jobs import RESULT, Settings, plan_jobs, read_fail
 from sehdr_warp.bench.quality_plot import error_over_time, pareto_front
 from sehdr_warp.bench.quality_pool import Workers, run_jobs, slurm_parameters
 from sehdr_warp.bench.quality_report import RESULTS, write_quality_report
+from sehdr_warp.cli import main
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.files import write_json
 
@@ -65,6 +66,19 @@ def test_jobs_are_every_combination_and_their_keys_tell_them_apart():
     plain = next(job for job in jobs if job.config["method"]["name"] == "plain").config
     assert plain["method"]["base"] == "default"
     assert (plain["training"]["loss"]["clipping"], plain["training"]["model"]["low_pass"]) == (False, 0.1)
+
+
+@pytest.mark.parametrize("responses", [("known",), ("blind",), ("known", "blind"), ("blind", "known", "blind")])
+def test_a_method_that_learns_the_response_is_trained_once(responses):
+    chosen = choose_methods(["hdr-gs", "gauss-hdr", "default"], ["own:default:response.form=mlp,loss.domain=encoded"])
+    jobs = plan_jobs(settings(methods=tuple(chosen), responses=responses))
+    trained = [(job.config["method"]["name"], job.config["response"]) for job in jobs]
+    others = [("default", response) for response in dict.fromkeys(responses)]
+    assert sorted(trained) == sorted([(name, "learned") for name in ("hdr-gs", "gauss-hdr", "own")] + others)
+    # Which of the two was asked for does not make it another training.
+    keys = {job.key for job in jobs if job.config["response"] == "learned"}
+    known = plan_jobs(settings(methods=tuple(chosen), responses=("known",)))
+    assert keys == {job.key for job in known if job.config["response"] == "learned"}
 
 
 def test_a_folder_of_truth_is_known_by_its_files_not_by_its_place(tmp_path):
@@ -249,6 +263,60 @@ def test_tables_pair_each_job_with_the_upper_bound_and_with_its_base(tmp_path):
     ablation = next(line for line in text.splitlines() if line.startswith("| plain") and "loss.clipping" in line)
     assert [c.strip() for c in ablation.split("|")][1:5] == ["plain", "default", "1", "-1.00"]
     assert (tmp_path / "error-over-time-cpu.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def section(text: str, heading: str) -> str:
+    return text.partition(f"## {heading}\n")[2].partition("\n## ")[0]
+
+
+def test_a_learned_response_stands_under_known_and_under_blind(tmp_path):
+    both = {"responses": ("known", "blind")}
+    results_in(tmp_path, (METHODS["default"], 30.0, 2.0, both), (METHODS["hdr-gs"], 20.0, 2.0, both))
+    text = write_quality_report(tmp_path)
+    assert text.count("## ") == 2 and "3 trainings" in text
+    for response in ("known", "blind"):
+        _, lines = table(section(text, f"cpu, hdr-nerf, response {response}"), "gt-max")
+        assert {name: line[1:3] for name, line in lines.items()} == {
+            "default": ["1", "30.00"],
+            "hdr-gs": ["1", "20.00"],
+        }
+    assert "one training stands under known and under blind: hdr-gs." in text
+
+
+def test_a_learned_response_alone_has_a_table_of_its_own(tmp_path):
+    results_in(tmp_path, (METHODS["hdr-gs"], 20.0, 2.0, {}))
+    text = write_quality_report(tmp_path)
+    assert text.count("## ") == 1 and "## cpu, hdr-nerf, response learned" in text
+
+
+def test_each_exposure_has_its_difference_to_the_upper_bound(tmp_path):
+    for place, (default, truth) in enumerate([(30.0, 31.0), (20.0, 25.0), (28.0, None)]):
+        results_in(tmp_path, (METHODS["default"], default, 2.0, {"exposures": (place,)}))
+        if truth is not None:
+            results_in(tmp_path, (METHODS["truth"], truth, 2.0, {"exposures": (place,)}))
+    text = write_quality_report(tmp_path)
+    for protocol in ("gt-max", "aligned"):
+        titles, lines = table(text, f"{protocol} (to U)")
+        assert titles[1:] == ["exposure 0", "exposure 1", "exposure 2"]
+        assert lines["default"][1:] == ["30.00 (-1.00)", "20.00 (-5.00)", "28.00"]
+        assert lines["truth"][1:] == ["31.00 (+0.00)", "25.00 (+0.00)", "-"]
+
+
+def test_tables_of_chosen_scenes_alone(tmp_path, capsys):
+    for scene, psnr in (("embedded:study", 30.0), ("embedded:night", 20.0), ("embedded:glass", 10.0)):
+        results_in(tmp_path, (METHODS["default"], psnr, 2.0, {"scenes": (scene,)}))
+    asked = ["bench", "quality", "--out", str(tmp_path), "--report-only", "--report-scenes"]
+    with pytest.raises(SystemExit) as done:
+        main([*asked, "study,embedded:night"])
+    assert done.value.code == 0
+    text = (tmp_path / "quality-study-night.md").read_text()
+    assert capsys.readouterr().out == text
+    assert table(text, "gt-max")[1]["default"][1:4] == ["2", "25.00", "20.00"]
+    assert "2 scenes (embedded:night, embedded:study)" in text and not (tmp_path / RESULTS).exists()
+    with pytest.raises(SystemExit):
+        main([*asked, "study,attic"])
+    known = "choose from embedded:glass, embedded:night, embedded:study"
+    assert f"has no result of scene attic; {known}" in capsys.readouterr().err
 
 
 def test_of_two_results_for_one_place_the_newer_counts(tmp_path):
