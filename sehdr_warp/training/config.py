@@ -161,10 +161,16 @@ class LossConfig:
     )
     hdr_truth: bool = option(False, "compare the base colour with HDR truth in the linear loss, where a view has it")
     highlight_weight: float = option(
-        0.0, "weight of the mean distance, in stops, of clipped pixels from highlight_stops", low=0.0, high=10.0
+        0.0, "weight of the mean distance, in stops, of clipped pixels from what is expected", low=0.0, high=10.0
     )
     highlight_stops: float = option(
-        0.0, "stops over white that light at clipped pixels is expected at", low=0.0, high=20.0
+        1.8, "stops over white that light at clipped pixels is expected at, at most", low=0.0, high=20.0
+    )
+    highlight_expected: str = option(
+        "photos",
+        "fixed: highlight_stops at every clipped pixel; photos: less where few channels of it clip, and where much light "
+        "lies just below white",
+        choices=("fixed", "photos"),
     )
     harmonics_weight: float = option(
         0.0, "weight of the mean square of the harmonics above degree 0", low=0.0, high=100.0

@@ -29,6 +29,8 @@ class Target:
     encoded: [H, W, 3] in [0, 1]; clipped, black: [H, W, 3] bool, or None where the photo has none of them;
     mask: [H, W, 1] in [0, 1] or None; exposure_truth: [H, W, 3] true radiance times the base time, or None;
     light: [H, W, 3] exposures decoded from the photo, where they are kept for every step; None: decode them.
+    highlights: [4] stops over white that light is expected at where none (unused), one, two and three channels of a pixel
+    clip; None: nothing is expected.
     """
 
     encoded: Tensor
@@ -37,6 +39,7 @@ class Target:
     mask: Tensor | None
     exposure_truth: Tensor | None
     light: Tensor | None = None
+    highlights: Tensor | None = None
 
 
 def one_sided(
@@ -153,16 +156,17 @@ def mu_law(exposure: Tensor, white: float, mu: float = MU) -> Tensor:
     return torch.log1p(exposure * (mu / white)) / math.log1p(mu)
 
 
-def highlight_prior(light: Tensor, clipped: Tensor | None, white: float, stops: float) -> Tensor:
-    """Mean over the image of |stops over white - `stops`| at clipped pixels brighter than white, 0 at the others.
+def highlight_prior(light: Tensor, clipped: Tensor | None, white: float, stops: Tensor | None) -> Tensor:
+    """Mean over the image of |stops over white - expected ones| at clipped pixels brighter than white, 0 at the others.
 
-    light: [H, W, 3] exposures; clipped: [H, W, 3] bool. The photo says `at least white` there and nothing else does;
-    `stops` is how far above it light is expected.
+    light: [H, W, 3] exposures; clipped: [H, W, 3] bool; stops: [4], as Target.highlights, by how many channels of the
+    pixel clip. The photo says `at least white` there and nothing else does.
     """
-    if clipped is None:
+    if clipped is None or stops is None:
         return light.new_zeros(())
+    expected = stops[clipped.sum(dim=-1, keepdim=True)]
     excess = torch.log2(light.clamp_min(white) / white)
-    return torch.where(clipped & (light > white), (excess - stops).abs(), 0.0).mean()
+    return torch.where(clipped & (light > white), (excess - expected).abs(), 0.0).mean()
 
 
 def anchor_loss(mapper: ToneMapper, value: float) -> Tensor:
@@ -225,9 +229,7 @@ def total_loss(
         linear = linear_loss(photo, target, config)
         loss = loss if linear is None else loss + config.linear_weight * linear
     if config.highlight_weight > 0:
-        prior = highlight_prior(
-            photo.light, target.clipped, known_response(field.response).white, config.highlight_stops
-        )
+        prior = highlight_prior(photo.light, target.clipped, known_response(field.response).white, target.highlights)
         loss = loss + config.highlight_weight * prior
     if config.anchor_weight > 0:
         loss = loss + config.anchor_weight * anchor_loss(field.response, config.anchor_value)

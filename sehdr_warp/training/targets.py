@@ -1,5 +1,6 @@
 """The training photos on the device, at every resolution of the schedule, uploaded once."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,7 +30,7 @@ class ViewStack:
     """V training views of one size in shared memory: [i] is view i; at() takes the view whose number is on the device.
 
     cameras: poses [V, 4, 4], intrinsics [V, 4], positions [V, 3]; times: exposure times in seconds [V], float32, or
-    one float where all are equal; the images as in Target, each [V, H, W, ...] or None.
+    one float where all are equal; the rest as in Target, each [V, ...] or None.
     """
 
     width: int
@@ -48,7 +49,7 @@ class ViewStack:
         if len(sizes) > 1 or len(truths) > 1:
             return None
         images = {}
-        for name in ("encoded", "clipped", "black", "mask", "exposure_truth", "light"):
+        for name in ("encoded", "clipped", "black", "mask", "exposure_truth", "light", "highlights"):
             values = [getattr(view.target, name) for view in views]
             given = next((value for value in values if value is not None), None)
             if given is not None:
@@ -120,10 +121,13 @@ def training_views(
     *,
     truth: bool,
     light: Response | None = None,
+    highlights: Sequence[float] | None = None,
 ) -> list[TrainingView]:
     """The views at 1 / 2^level of their size. truth: also upload HDR truth; light: keep the exposures that this response
-    decodes from the photos. Photos are averaged as exposures, since
-    light adds up and encoded values do not; a pixel with a clipped part stays a lower bound."""
+    decodes from the photos; highlights: stops over white that light is expected at where one, two and three channels of
+    a pixel clip. Photos are averaged as exposures, since light adds up and encoded values do not; a pixel with a clipped
+    part stays a lower bound."""
+    expected = None if highlights is None else torch.tensor((0.0, *highlights), device=device)
     made = []
     for view in views:
         width, height = (max(1, round(size / 2**level)) for size in (view.camera.width, view.camera.height))
@@ -131,6 +135,8 @@ def training_views(
         target = _target(view, (height, width), response, base_time, device, truth)
         if light is not None:
             target = replace(target, light=light.decode(target.encoded))
+        if expected is not None:
+            target = replace(target, highlights=expected)
         made.append(TrainingView(CameraTensors.of(camera, device), view.exposure_time, target))
     return made
 

@@ -208,16 +208,25 @@ def test_the_mu_law_weighs_shadows_as_the_metric_does():
     assert shares[0] > 2 * shares[1] > 0
 
 
-def test_the_highlight_prior_holds_clipped_pixels_near_the_clip_point():
+def test_the_highlight_prior_holds_clipped_pixels_near_what_is_expected():
     light = torch.tensor([0.5, 1.5, 4.0, 4.0]).double().reshape(1, 4, 1).expand(1, 4, 3).clone().requires_grad_()
     clipped = torch.tensor([True, True, True, False]).reshape(1, 4, 1).expand(1, 4, 3)
-    loss = highlight_prior(light, clipped, 1.0, 1.0)
+    loss = highlight_prior(light, clipped, 1.0, torch.tensor([9.0, 9.0, 9.0, 1.0]))
     # 1 - log2(1.5) stops short of one stop over white, and one stop too many.
     assert loss.item() == pytest.approx((0.4150375 + 1.0) / 4, rel=1e-6)
     loss.backward()
     gradient = light.grad[0, :, 0]
     assert gradient[0] == 0 and gradient[3] == 0 and gradient[1] < 0 and gradient[2] > 0
-    assert highlight_prior(light, None, 1.0, 1.0) == 0
+    assert highlight_prior(light, None, 1.0, torch.ones(4)) == 0
+    assert highlight_prior(light, clipped, 1.0, None) == 0
+
+
+def test_the_highlight_prior_expects_more_where_more_channels_clip():
+    light = torch.full((1, 3, 3), 4.0).double()
+    clipped = torch.tensor([[[True, False, False], [True, True, False], [True, True, True]]])
+    # Two stops over white, in one, two and three channels of nine.
+    expected = torch.tensor([9.0, 0.5, 1.0, 1.75])
+    assert highlight_prior(light, clipped, 1.0, expected).item() == pytest.approx((1.5 + 2 * 1.0 + 3 * 0.25) / 9)
 
 
 def test_priors_and_regularisers_add_what_they_weigh():
@@ -225,16 +234,17 @@ def test_priors_and_regularisers_add_what_they_weigh():
     field.gaussians.harmonics_rest = torch.nn.Parameter(torch.full((field.gaussians.count, 3, 3), 0.5))
     camera = CameraTensors.of(orbit_camera(0.3), "cpu")
     photo = field.photograph(camera, 4 * field.base_time)
-    target = target_of(photo.encoded.detach().clamp(0, 1))
+    expected = torch.tensor([0.0, 0.1, 0.3, 0.5])
+    target = replace(target_of(photo.encoded.detach().clamp(0, 1)), highlights=expected)
 
     def loss(**weights):
         return total_loss(field, photo, target, LossConfig(**weights)).item()
 
     plain = loss()
     assert loss(harmonics_weight=2.0) - plain == pytest.approx(0.5, rel=1e-4)
-    prior = highlight_prior(photo.light, target.clipped, field.response.white, 0.5).item()
+    prior = highlight_prior(photo.light, target.clipped, field.response.white, expected).item()
     assert prior > 0
-    assert loss(highlight_weight=3.0, highlight_stops=0.5) - plain == pytest.approx(3 * prior, rel=1e-3)
+    assert loss(highlight_weight=3.0) - plain == pytest.approx(3 * prior, rel=1e-3)
 
 
 def test_the_mu_law_domain_teaches_a_refined_response():
