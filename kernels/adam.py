@@ -116,3 +116,25 @@ def adam_update(
             first_moments,
             second_moments,
         )
+
+
+@wp.kernel(module="unique", module_options={"enable_backward": False})
+def judge_step(
+    loss: wp.array(dtype=wp.float32),
+    norms: wp.array(dtype=wp.float32),
+    incomplete: wp.array(dtype=wp.bool),
+    verdict: wp.array(dtype=wp.float32),
+):
+    """verdict: [3], 1 or 0 each: the loss or a gradient is not finite; the step is to be skipped; it is not to be.
+
+    norms: [K] of the gradients; incomplete: [1], or [0] where nothing can be. One thread.
+    """
+    finite = wp.isfinite(loss[0])
+    for i in range(norms.shape[0]):
+        finite = finite and wp.isfinite(norms[i])
+    skipped = not finite
+    if incomplete.shape[0] > 0:
+        skipped = skipped or incomplete[0]
+    verdict[0] = wp.where(finite, 0.0, 1.0)
+    verdict[1] = wp.where(skipped, 1.0, 0.0)
+    verdict[2] = wp.where(skipped, 0.0, 1.0)

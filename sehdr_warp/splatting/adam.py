@@ -5,7 +5,7 @@ import math
 import torch
 import warp as wp
 
-from ..kernels.adam import adam_update, adam_update_visible
+from ..kernels.adam import adam_update, adam_update_visible, judge_step
 from .arrays import view
 from .bridge import torch_stream
 
@@ -67,3 +67,30 @@ def adam_step(
             device=wp.device_from_torch(parameter.device),
             record_tape=False,
         )
+
+
+@torch.no_grad()
+def judge(
+    loss: torch.Tensor, norms: torch.Tensor, incomplete: torch.Tensor | None = None
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Three scalars, 1 or 0: whether the loss or a norm is not finite; whether a step is therefore, or as `incomplete`
+    is true, to be skipped; whether it is to be made. In one launch, and nothing waits for the device.
+
+    loss: float32 scalar; norms: [K] float32; incomplete: bool scalar. All on one device.
+    """
+    verdict = norms.new_empty(3)
+    empty = torch.empty(0, dtype=torch.bool, device=norms.device)
+    with torch_stream(norms.device):
+        wp.launch(
+            judge_step,
+            dim=1,
+            inputs=[
+                view(loss.detach().reshape(1)),
+                view(norms),
+                view(empty if incomplete is None else incomplete.reshape(1)),
+                view(verdict),
+            ],
+            device=wp.device_from_torch(norms.device),
+            record_tape=False,
+        )
+    return tuple(verdict.unbind())

@@ -6,7 +6,7 @@ from torch import Tensor
 from ..model.gaussians import PARAMETER_NAMES
 from ..model.radiance_field import RadianceField
 from ..model.response import RefinedResponse, ToneMapper
-from ..splatting.adam import adam_step
+from ..splatting.adam import adam_step, judge
 from .config import Config
 
 EPSILON = 1e-15
@@ -24,6 +24,8 @@ class Adam(torch.optim.Adam):
     """
 
     visible: Tensor | None = None
+    made: Tensor | None = None
+    """1 - found_inf, where that is at hand."""
 
     def step(self) -> None:
         parameters = [p for group in self.param_groups for p in group["params"] if p.grad is not None]
@@ -41,8 +43,10 @@ class Adam(torch.optim.Adam):
                     "exp_avg_sq": torch.zeros_like(parameter, memory_format=torch.contiguous_format),
                 }
         # With lists on both sides: to add one tensor to many, torch reads it on the host, which no recording allows.
-        torch._foreach_add_([self.state[p]["step"] for p in parameters], [1 - skipped] * len(parameters))
-        one = torch.ones_like(skipped)
+        made = 1 - skipped if self.made is None else self.made
+        torch._foreach_add_([self.state[p]["step"] for p in parameters], [made] * len(parameters))
+        on_device = all(isinstance(group["lr"], Tensor) for group in self.param_groups)
+        one = None if on_device else torch.ones_like(skipped)
         for group in self.param_groups:
             rate = group["lr"]
             visible = self.visible if group["name"] in PARAMETER_NAMES else None
@@ -69,7 +73,7 @@ def make_optimizer(field: RadianceField, config: Config, extent: float) -> Adam:
     """One parameter group, with its name, for each parameter of the Gaussians, one for the fusion, one for a
     learned response.
 
-    On a GPU its steps can be recorded in a CUDA graph: counters and the rate of the positions live on the device.
+    On a GPU its steps can be recorded in a CUDA graph: counters and rates live on the device.
     """
     device = field.gaussians.means.device
     rates = {name: getattr(config.optimizer, name) for name in PARAMETER_NAMES}
@@ -87,7 +91,7 @@ def make_optimizer(field: RadianceField, config: Config, extent: float) -> Adam:
         )
     for group in groups:
         group["start_rate"] = group["lr"]
-        if device.type == "cuda" and (group["name"] == "means" or config.optimizer.final_factor < 1):
+        if device.type == "cuda":
             group["lr"] = torch.tensor(group["lr"], device=device)
     return Adam(groups, eps=EPSILON, fused=True, capturable=device.type == "cuda")
 
@@ -129,16 +133,26 @@ def guarded_step(optimizer: torch.optim.Adam, loss: Tensor, incomplete: Tensor |
     """One step of Adam, or none if the loss or a gradient is not finite or the rendering was incomplete; decided on the
     device, without waiting for it.
 
-    Returns two scalar float tensors: 1 if something was not finite, and 1 if the step was skipped for either reason.
+    Returns two scalar float tensors: 1 if something was not finite, and 1 if the step was made, 0 if it was skipped for
+    either reason.
     """
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
-    norms = torch._foreach_norm(gradients)
-    nonfinite = (~torch.isfinite(torch.stack([loss.detach(), *norms])).all()).float()
-    skipped = nonfinite if incomplete is None else torch.maximum(nonfinite, incomplete.float())
+    norms = torch.stack(torch._foreach_norm(gradients))
+    if loss.device.type == "cuda":
+        nonfinite, skipped, made = judge(loss, norms, incomplete)
+    else:
+        nonfinite, skipped, made = judge_in_torch(loss, norms, incomplete)
     # The hook of torch's gradient scaler: parameters, moments and step count stay as they are where it is 1.
-    optimizer.found_inf = skipped
+    optimizer.found_inf, optimizer.made = skipped, made
     optimizer.step()
-    return nonfinite, skipped
+    return nonfinite, made
+
+
+def judge_in_torch(loss: Tensor, norms: Tensor, incomplete: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    """splatting.adam's judge() by torch's own operations, a dozen of them."""
+    nonfinite = (~(torch.isfinite(norms).all() & torch.isfinite(loss.detach()))).float()
+    skipped = nonfinite if incomplete is None else torch.maximum(nonfinite, incomplete.float())
+    return nonfinite, skipped, 1 - skipped
 
 
 def optimizer_tensors(optimizer: torch.optim.Adam) -> dict[str, Tensor]:

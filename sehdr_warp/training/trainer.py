@@ -178,12 +178,12 @@ class Trainer:
         loss.backward()
         if self.config.optimizer.visible_only:
             self.optimizer.visible = photo.rendering.visible
-        nonfinite, skipped = guarded_step(self.optimizer, loss, photo.rendering.overflow)
+        nonfinite, made = guarded_step(self.optimizer, loss, photo.rendering.overflow)
         if watched:
             weights = None
             if self.config.densification.slope_corrected:
                 weights = slope_weights(self.field, view.exposure_time / self.field.base_time)
-            self.densification.observe(photo.rendering, view.camera.width, view.camera.height, 1 - skipped, weights)
+            self.densification.observe(photo.rendering, view.camera.width, view.camera.height, made, weights)
         self.optimizer.zero_grad(set_to_none=True)
         self._skipped += nonfinite
         if self._early_stop.patience:

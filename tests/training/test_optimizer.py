@@ -1,10 +1,22 @@
 """Learning rates over a training."""
 
+from itertools import product
+from math import inf, nan
+
 import pytest
+import torch
 
 from sehdr_warp.model.gaussians import PARAMETER_NAMES
+from sehdr_warp.splatting.adam import judge
 from sehdr_warp.training.config_files import load_config
-from sehdr_warp.training.optimizer import DECAY_EVERY, decay_rates, make_optimizer, set_means_rate
+from sehdr_warp.training.optimizer import (
+    DECAY_EVERY,
+    decay_rates,
+    guarded_step,
+    judge_in_torch,
+    make_optimizer,
+    set_means_rate,
+)
 
 from .toy import toy_field
 
@@ -35,3 +47,29 @@ def test_a_resumed_training_has_the_rates_of_the_last_change():
 def test_rates_stay_without_a_final_factor():
     plain = load_config("default").optimizer
     assert rates(1000, **{"optimizer.final_factor": 1.0})["harmonics_dc"] == plain.harmonics_dc
+
+
+def test_steps_are_judged_as_torch_would(device):
+    some = [0.0, 3.0, inf, nan]
+    for loss, norm, incomplete in product(some, some, (None, False, True)):
+        given = torch.tensor(loss), torch.tensor([1.0, norm, 2.0])
+        told = None if incomplete is None else torch.tensor(incomplete)
+        ours = judge(*(t.to(device) for t in given), None if told is None else told.to(device))
+        assert [float(t) for t in ours] == [float(t) for t in judge_in_torch(*given, told)], (loss, norm, incomplete)
+
+
+@pytest.mark.parametrize("incomplete", [None, False, True])
+@pytest.mark.parametrize("bad", [False, True])
+def test_a_guarded_step_is_made_or_left_out_whole(device, incomplete, bad):
+    field = toy_field().to(device)
+    optimizer = make_optimizer(field, load_config("default"), 1.0)
+    means = field.gaussians.means
+    before = means.detach().clone()
+    loss = (means * (nan if bad else 1.0)).sum()
+    loss.backward()
+    told = None if incomplete is None else torch.tensor(incomplete, device=device)
+    nonfinite, made = guarded_step(optimizer, loss, told)
+    assert bool(nonfinite) == bad
+    assert bool(made) == (not bad and not incomplete)
+    assert torch.equal(means, before) == (not bool(made))
+    assert float(optimizer.state[means]["step"]) == float(made)
