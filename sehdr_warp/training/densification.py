@@ -12,6 +12,7 @@ from torch import Tensor
 from ..model.gaussians import Gaussians
 from ..model.radiance_field import RadianceField
 from ..splatting import Rendering
+from ..splatting.noting import note_image_gradients
 from .config import Config
 
 SPLIT_SHRINK = 1.6
@@ -93,8 +94,13 @@ class GradientDensification(Densification):
     def observe(
         self, rendering: Rendering, width: int, height: int, usable: Tensor, weights: Tensor | None = None
     ) -> None:
-        # In normalised screen units: the screen is 2 wide, so a pixel's gradient counts width / 2 times.
         gradient = rendering.means2d.grad
+        if gradient.device.type == "cuda":
+            note_image_gradients(
+                gradient, rendering.radii, usable, weights, width, height, self.gradient_sum, self.seen
+            )
+            return
+        # In normalised screen units: the screen is 2 wide, so a pixel's gradient counts width / 2 times.
         norm = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2))
         if weights is not None:
             norm = norm * weights
