@@ -27,10 +27,10 @@ def backward_kernel(dtype, channels: int, fast_math: bool = True, ordered: bool 
     rows: ROWS and gradient_count: C + 6, as arguments so that their loops stay loops;
     gradients: [N (C + 6)], flat rows (features, conic a b c, x, y, opacity), added to
 
-    ordered: the same sums in the same order every time. One launch over tiles x 32 threads for each `corner`, one of the
-    BLOCKS_PER_TILE rectangles of a tile: within it a row of gradients has one writer. rows_of: [M] the row of each entry,
-    gradients: [M (C + 6)], to be gathered by Gaussian. Unordered, neither is read: the rows are the Gaussians', and
-    atomics add to them in whatever order the GPU finishes.
+    ordered: the same sums in the same order every time. One launch over tiles x 32 threads for each `corner`, one of
+    the BLOCKS_PER_TILE rectangles of a tile: within it a row of gradients has one writer. rows_of: [M] the row of each
+    entry, gradients: [M (C + 6)], to be gathered by Gaussian. Unordered, neither is read: the rows are the Gaussians',
+    and atomics add to them in whatever order the GPU finishes.
     """
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4

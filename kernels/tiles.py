@@ -16,11 +16,11 @@ from .geometry import geometry
 
 @cache
 def tile_kernels(dtype):
-    """(pack_records, count_tiles, emit_entries) for one scalar type."""
+    """(pack_records, count_tiles, emit_entries, key_by_depth) for one scalar type."""
     g = geometry(dtype)
     real, vec2, vec3, vec4 = g.real, g.vec2, g.vec3, g.vec4
     size = float(TILE_SIZE)
-    # Without fused multiply-adds: count_tiles and emit_entries must decide alike, and a compiler fuses each its own way.
+    # Without fused multiply-adds: count_tiles and emit_entries must decide alike; a compiler fuses each its own way.
     options = {"enable_backward": False, "fuse_fp": False}
 
     @wp.func
@@ -32,9 +32,16 @@ def tile_kernels(dtype):
     @wp.func
     def tile_is_touched(shape: vec4, conic: vec4, column: int, row: int) -> bool:
         return g.ellipse_meets_rectangle(
-            shape[0], shape[1], conic[0], conic[1], conic[2], conic[3],
-            real(column) * real(size) + real(0.5), real(row) * real(size) + real(0.5),
-            real(wp.static(size - 1.0)), real(wp.static(size - 1.0)),
+            shape[0],
+            shape[1],
+            conic[0],
+            conic[1],
+            conic[2],
+            conic[3],
+            real(column) * real(size) + real(0.5),
+            real(row) * real(size) + real(0.5),
+            real(wp.static(size - 1.0)),
+            real(wp.static(size - 1.0)),
         )
 
     @wp.kernel(module="unique", module_options=options)
@@ -67,6 +74,21 @@ def tile_kernels(dtype):
             level = real(2.0) * wp.log(wp.max(opacity / alpha_threshold, real(1.0)))
         shapes[i] = vec4(mean[0], mean[1], opacity, extent[1])
         ellipses[i] = vec4(conic[0], conic[1], conic[2], level)
+
+    @wp.kernel(module="unique", module_options=options)
+    def key_by_depth(
+        depths: wp.array(dtype=real),
+        extents: wp.array(dtype=vec2),
+        keys: wp.array(dtype=real),
+        places: wp.array(dtype=int),
+    ):
+        """What sorts Gaussians nearest first, culled ones last, and their indices."""
+        i = wp.tid()
+        key = depths[i]
+        if not (extents[i][0] > real(0.0)):
+            key = real(wp.inf)
+        keys[i] = key
+        places[i] = i
 
     @wp.kernel(module="unique", module_options=options)
     def count_tiles(
@@ -134,7 +156,7 @@ def tile_kernels(dtype):
             gaussians[entry] = i
             entry += 1
 
-    return pack_records, count_tiles, emit_entries
+    return pack_records, count_tiles, emit_entries, key_by_depth
 
 
 @wp.kernel(module="unique", module_options={"enable_backward": False})

@@ -245,8 +245,8 @@ def _scene_of(run, data: str | None):
 
 
 def _curves_of(run) -> dict:
-    """load_scene's decode and encode as the training had them: a run is judged by the photos that it was trained on, and
-    these were scaled before a response was chosen, corrected or learned."""
+    """load_scene's decode and encode as the training had them: a run is judged by the photos that it was trained on,
+    and these were scaled before a response was chosen, corrected or learned."""
     options = run.config.response
     if options.name == "auto" or options.form == "mlp":
         return known_curves(options.name)

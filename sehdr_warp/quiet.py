@@ -25,8 +25,8 @@ def silent_stderr() -> Iterator[None]:
 
 
 def silence_exit() -> None:
-    """From the interpreter's end on nothing reaches file descriptor 2, where OpenImageIO is loaded: colour-science loads
-    it if it is installed, and it lists, when Python has gone, what Python still held."""
+    """From the interpreter's end on nothing reaches file descriptor 2, where OpenImageIO is loaded: colour-science
+    loads it if it is installed, and it lists, when Python has gone, what Python still held."""
     atexit.unregister(_silence_if_loaded)
     atexit.register(_silence_if_loaded, "OpenImageIO")
 

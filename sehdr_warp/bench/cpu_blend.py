@@ -20,8 +20,8 @@ BLEND_THREADS = (1, 2)
 def blend_rows(scene: SplatScene, name: str, repetitions: int, budget: float) -> list[dict]:
     """Rows of one scene, called `name`: forward and backward on each of BLEND_THREADS.
 
-    ns_per_pair is of the median, least_ns_per_pair of the least time; cpu_ns_per_pair of the least processor time, which
-    leaves out when others had the core (one thread only).
+    ns_per_pair is of the median, least_ns_per_pair of the least time; cpu_ns_per_pair of the least processor time,
+    which leaves out when others had the core (one thread only).
     """
     prepared = prepare(scene)
     lists, inputs, options = prepared.lists, prepared.blend_inputs, prepared.options

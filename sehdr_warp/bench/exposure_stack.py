@@ -18,8 +18,8 @@ MOST_PIXELS = 60_000
 def read_stack(folder: Path) -> tuple[list[Path], list[np.ndarray], np.ndarray]:
     """Files, images [H, W, 3] in [0, 1] and exposure times [J] in seconds of a folder with `exposures.json`.
 
-    exposures.json: a list of {"file": name, "exposure_time": seconds}. Raises InputError for a file that is not one, for
-    photos of different sizes, and for fewer than two different times.
+    exposures.json: a list of {"file": name, "exposure_time": seconds}. Raises InputError for a file that is not one,
+    for photos of different sizes, and for fewer than two different times.
     """
     listed = folder / "exposures.json"
     try:

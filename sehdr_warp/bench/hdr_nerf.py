@@ -35,8 +35,8 @@ class HdrNerfSettings:
     depth, width: hidden layers of the trunk and their units; the input joins again after half of them. samples,
     more_samples: stratified ones a ray for the coarse field, and those drawn by importance for the fine one. rays: a
     step. positions, directions: octaves of the encodings. rate falls to a tenth in decay_steps, exponentially.
-    unit_weight, unit_value: of the unit exposure loss, which fixes the scale: f(1) = unit_value. The paper takes 0.5 for
-    photos, and for its synthetic scenes 0.73, which is the true curve's value there.
+    unit_weight, unit_value: of the unit exposure loss, which fixes the scale: f(1) = unit_value. The paper takes 0.5
+    for photos, and for its synthetic scenes 0.73, which is the true curve's value there.
     """
 
     depth: int = 8
@@ -65,8 +65,8 @@ class HdrNerf(nn.Module):
     """One field: position and direction to density and log radiance, and a tone mapper for each channel.
 
     forward(points [R, S, 3] in [-1, 1], directions [R, 3] of length 1) gives densities [R, S] > 0 and log radiance
-    [R, S, 3]. Densities are softplus(x - 1) (Mip-NeRF) where the authors' are ReLU: those may start at 0 everywhere, and
-    stay there. seed: of the tone mapper; the other weights come from torch's own generator.
+    [R, S, 3]. Densities are softplus(x - 1) (Mip-NeRF) where the authors' are ReLU: those may start at 0 everywhere,
+    and stay there. seed: of the tone mapper; the other weights come from torch's own generator.
     """
 
     def __init__(self, settings: HdrNerfSettings, seed: int = 0):
@@ -191,7 +191,7 @@ class HdrNerfRun:
 
     @torch.no_grad()
     def render_ldr(self, camera: Camera, exposure_time: float | None = None) -> Tensor:
-        """[H, W, 3] in [0, 1]: the simulated photo of exposure_time seconds, by default the median of the training's."""
+        """[H, W, 3] in [0, 1]: the simulated photo of exposure_time seconds, by default the training's median."""
         return self._image(camera, exposure_time or self.exposure_time)[1]
 
     def _image(self, camera: Camera, exposure_time: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -304,7 +304,7 @@ def _step(run: HdrNerfRun, rays: tuple[Tensor, ...], optimizer: torch.optim.Adam
 
 
 def _training_rays(scene: Scene, device: torch.device) -> tuple[Tensor, ...]:
-    """Origins [P, 3], directions [P, 3], log exposure times [P, 1] and encoded values [P, 3] of all pixels that count."""
+    """Origins [P, 3], directions [P, 3], log exposure times [P, 1], encoded values [P, 3] of all pixels that count."""
     parts = []
     for view in scene.train_views:
         counts = slice(None) if view.mask is None else view.mask.ravel() > 0.5

@@ -23,8 +23,8 @@ class Quality:
     """default, paper, paper-truth, hdr-gs, hdr-gs-truth, gauss-hdr, 3dgs, predicted, hdr-nerf, truth, other presets or
     TOML files, separated by commas; empty for variants alone."""
     variant: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """A method with other values, NAME:BASE:field=value,field=value, such as no-clip:default:loss.clipping=false; may be
-    given several times."""
+    """A method with other values, NAME:BASE:field=value,field=value, such as no-clip:default:loss.clipping=false; may
+    be given several times."""
     variants: Path | None = None
     """TOML file with a table for each variant: base and the fields that differ."""
     curves: str = "hdr-nerf"

@@ -33,9 +33,9 @@ class Settings:
     scenes: folders with HDR truth, or names that load_scene knows. curves: responses of response_by_name that expose
     the truth. exposures: places in a ladder of exposure_count times, each exposure_factor times the last.
     responses: out of RESPONSES. iterations: None is the preset's own. noise: (full well, read noise) in electrons.
-    predictor: replaces that of methods which predict HDR from single photos; {scene} and {exposure} stand for the job's.
-    nerf_seconds: HDR-NeRF stops after so many, if its iterations are not done before. lpips: whether weights are there.
-    device: "cpu" or "cuda".
+    predictor: replaces that of methods which predict HDR from single photos; {scene} and {exposure} stand for the
+    job's. nerf_seconds: HDR-NeRF stops after so many, if its iterations are not done before. lpips: whether weights are
+    there. device: "cpu" or "cuda".
     """
 
     scenes: tuple[str, ...]

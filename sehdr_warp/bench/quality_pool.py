@@ -37,8 +37,8 @@ class Workers:
     """How jobs are run.
 
     count: processes at one time. gpus: numbers of the GPUs they share in turn, empty on the CPU. lpips: folder of
-    weights. keep_runs: keep trained models. slurm: parameters of submitit's SLURM executor, without their prefix; "time"
-    is in minutes. launcher: out of LAUNCHERS; auto is submitit where it is installed, with SLURM where there is one.
+    weights. keep_runs: keep trained models. slurm: parameters of submitit's SLURM executor, without their prefix;
+    "time" is in minutes. launcher: out of LAUNCHERS; auto is submitit where it is installed, on SLURM if there is one.
     """
 
     count: int = 1

@@ -1,5 +1,5 @@
-"""The figures of `bench quality`: all results in one file, means over jobs as tables, differences to the upper bound and
-of each variant to its base."""
+"""The figures of `bench quality`: all results in one file, means over jobs as tables, differences to the upper bound
+and of each variant to its base."""
 
 import json
 import re
@@ -281,8 +281,8 @@ def _heading(rows: Sequence[dict]) -> str:
         f"{', '.join(machines)}; sehdr-warp {', '.join(sorted({str(row['version']) for row in rows}))}.\n\n"
         "PSNR in dB of mu-law values (gt-max, self-max, aligned), of PU21 values (aligned scale) and of the simulated "
         "photo (LDR), means over jobs; *worst* is that of the worst job; *to U* the mean difference to 3DGS trained on "
-        "the HDR truth of the same scenes and views; regions are of the photo, aligned; *confidence* is the rank correlation of "
-        "1 - confidence with the error in stops."
+        "the HDR truth of the same scenes and views; regions are of the photo, aligned; *confidence* is the rank "
+        "correlation of 1 - confidence with the error in stops."
     )
 
 
@@ -290,9 +290,8 @@ def _notes(rows: Sequence[dict]) -> list[str]:
     notes = []
     learned = sorted({method(row) for row in rows if knowledge(row) == LEARNED})
     if learned:
-        notes.append(
-            f"Learn the response with the scene, so one training stands under known and under blind: {', '.join(learned)}."
-        )
+        names = ", ".join(learned)
+        notes.append(f"Learn the response with the scene, so one training stands under known and under blind: {names}.")
     shared = max((row["shared_by"] for row in rows), default=1)
     if shared > 1:
         notes.append(f"Up to {shared} trainings shared a device: seconds and renders / s are those of a shared one.")

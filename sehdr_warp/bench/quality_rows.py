@@ -75,7 +75,8 @@ def knowledge(row: dict) -> str:
 
 def by_table(rows: Sequence[dict]) -> dict[tuple[str, str, str], list[dict]]:
     """The results of each table by (device, curve, known or blind). One with a learned response stands in both: it is a
-    rival of those that were told the curve and of those that were not. Where there is no other: (device, curve, learned).
+    rival of those that were told the curve and of those that were not. Where there is no other, the key
+    ends in "learned".
     """
     found: dict = {}
     for (device, curve), members in grouped(rows, lambda row: (row["config"]["device"], _curve(row))).items():

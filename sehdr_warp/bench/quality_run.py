@@ -25,8 +25,8 @@ from .quality_jobs import FORMAT, Job
 
 RUN = "run"
 WARM_UP_ITERATIONS = 30
-"""Of a training that is thrown away before the first of its kind in a process: kernels are compiled and loaded, on a GPU
-steps are recorded. All schedules scale with the length, so every part of a training is in it."""
+"""Of a training that is thrown away before the first of its kind in a process: kernels are compiled and loaded, on a
+GPU steps are recorded. All schedules scale with the length, so every part of a training is in it."""
 NEAR_FINAL = 0.1
 """dB below the final held-out figure that count as reaching it."""
 RENDER_SECONDS, RENDERS = 1.0, 100
@@ -216,7 +216,7 @@ def without_training_truth(scene: Scene) -> Scene:
 
 
 def seconds_to_final(curve: list[dict], total: float) -> float:
-    """The first test from which on the held-out HDR figure stays within 0.1 dB of the last; without truth the LDR one."""
+    """The first test from which on the held-out HDR figure stays within 0.1 dB of the last; else the LDR one."""
     key = "psnr_mu" if all("psnr_mu" in line for line in curve) else "psnr_ldr"
     reached = total
     for line in reversed(curve):

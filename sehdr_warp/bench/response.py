@@ -1,4 +1,4 @@
-"""How well a camera's response is found from photos alone: on rendered truth through known curves, and on real stacks."""
+"""How well a camera's response is found from photos alone: on rendered truth through known curves, on real stacks."""
 
 import contextlib
 from collections.abc import Callable, Sequence

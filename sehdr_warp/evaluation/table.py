@@ -4,7 +4,8 @@
 def format_table(result: dict) -> str:
     """The figures of evaluate() as a table for a terminal; missing ones are dashes, with the reasons below."""
     count, split = len(result["views"]), result["split"]
-    title = f"{result['scene']}: {count} {split} views, {result['gaussians']:,} Gaussians, {result['iterations']:,} iterations"
+    trained = f"{result['gaussians']:,} Gaussians, {result['iterations']:,} iterations"
+    title = f"{result['scene']}: {count} {split} views, {trained}"
     lines = [
         f"{title} in {result['train_seconds']:.1f} s",
         "",

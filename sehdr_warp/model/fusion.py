@@ -104,8 +104,8 @@ class NeuralExposureFusion(nn.Module):
 
     def _channel_mlps(self, features):
         """[n, N, 3] outputs of the three MLPs for features [n, N, 3, 2]."""
-        # One product for each channel and bracket: the weights' gradients are sums over many points, which a GPU makes in
-        # parallel only across products.
+        # One product for each channel and bracket: the weights' gradients are sums over many points, which a GPU makes
+        # in parallel only across products.
         values = features.permute(2, 0, 1, 3)
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             values = torch.matmul(values.relu() if layer else values, weight[:, None]) + bias[:, None]

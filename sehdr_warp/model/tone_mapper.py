@@ -14,7 +14,7 @@ EXPOSURE_FLOOR = 1e-6
 """Added to exposures before the logarithm: black stays finite, and what is 100 times darker than 8-bit black in sRGB
 asks for nothing."""
 LOG_RANGE, LOG_NODES = (-20.0, 12.0), 2048
-"""The table from which many exposures are encoded, in their logarithm; below it the function is constant, above straight."""
+"""The table from which many exposures are encoded, in their logarithm; below it f is constant, above straight."""
 EXACT_BELOW = 4096
 """Fewer exposures than this are encoded without the table."""
 TABLE_RANGE, TABLE_NODES = (1e-6, 1e6), 8192

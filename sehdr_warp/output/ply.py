@@ -57,8 +57,8 @@ def write_ply(
 
 
 def without_unseen_degrees(gaussians: GaussianArrays) -> GaussianArrays:
-    """The Gaussians without their highest degrees, as far as these change no colour of any of them, in any direction, by
-    more than a ten-thousandth (with "display": of white).
+    """The Gaussians without their highest degrees, as far as these change no colour of any of them, in any direction,
+    by more than a ten-thousandth (with "display": of white).
 
     A degree l with coefficients c changes a colour by at most |c| sqrt((2 l + 1) / (4 pi)) (addition theorem).
     """

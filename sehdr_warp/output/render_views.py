@@ -100,7 +100,8 @@ def render_views(
                 layers["confidence"] = _array(confidence)
             elif index == 1:
                 say(
-                    "without a confidence channel: the run has none yet; `sehdr-warp report` measures it from the photos"
+                    "without a confidence channel: the run has none yet; `sehdr-warp report` measures it from the "
+                    "photos"
                 )
             stored = {_write_hdr(hdr_folder / f"{name}.exr", hdr, layers, camera, options)}
             write_png(preview_folder / f"{name}.png", quantize(tone_map(hdr)))

@@ -12,16 +12,16 @@ def interpolate(table: torch.Tensor, low: float, step: float, positions: torch.T
     """[N, C] values at positions [N, C] of C functions given at equal steps (Catmull and Rom 1974).
 
     table: [nodes + 2, C] float32, column c holding function c at low - step, low, low + step ...; nodes from 2. Below
-    `low` a function is constant, above its last node but one a straight line. Differentiable once with respect to table and
-    positions; on a GPU sums by node are made in no fixed order.
+    `low` a function is constant, above its last node but one a straight line. Differentiable once with respect to table
+    and positions; on a GPU sums by node are made in no fixed order.
     Raises ValueError for a table that is too short or for shapes, types or devices that do not fit.
     """
     fits = table.ndim == positions.ndim == 2 and table.shape[1] == positions.shape[1] and table.shape[0] >= 4
     same = table.dtype == positions.dtype == torch.float32 and table.device == positions.device
     if not (fits and same):
         raise ValueError(
-            f"interpolate takes float32 [nodes + 2, C] and [N, C] on one device, not {table.dtype} {list(table.shape)} on "
-            f"{table.device} and {positions.dtype} {list(positions.shape)} on {positions.device}"
+            f"interpolate takes float32 [nodes + 2, C] and [N, C] on one device, not {table.dtype} {list(table.shape)} "
+            f"on {table.device} and {positions.dtype} {list(positions.shape)} on {positions.device}"
         )
     return _Interpolation.apply(table, low, step, positions)
 

@@ -73,14 +73,14 @@ def rasterize(
     antialiased: keep a Gaussian's energy under the low pass by lowering its opacity.
     capacity: room for this many (Gaussian, tile) pairs, from 1. On a GPU nothing then waits for the device, so that the
         call can be part of a CUDA graph; Rendering.overflow says whether the room was enough.
-    style: what trades exactness and repeatability for speed; BlendStyle(deterministic=True) repeats bit for bit on a GPU.
+    style: what trades exactness and repeatability for speed; BlendStyle(deterministic=True) repeats bits on a GPU.
 
     All tensors share one device (CPU or CUDA) and one dtype (float32 or float64). Differentiable with respect to
     every tensor, camera included. On the CPU results repeat bit for bit, whatever the number of threads.
     A Gaussian whose position or shape in the image, or a feature, is not finite is culled; a camera that is not finite
     culls them all.
-    Raises ValueError for shapes, dtypes, devices or values that do not fit; OutOfMemory (an SehdrError), with the sizes,
-    if memory does not suffice.
+    Raises ValueError for shapes, dtypes, devices or values that do not fit; OutOfMemory (an SehdrError), with the
+    sizes, if memory does not suffice.
     """
     _check_tensors(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics)
     _check_options(width, height, near, low_pass, alpha_threshold, capacity)

@@ -101,7 +101,8 @@ def lamps(stage: Stage) -> None:
         left=stage.matt(textures.brick(rng, 16, 8, (0.2, 0.22, 0.25), (0.45, 0.46, 0.48))),
         right=stage.matt(textures.brick(rng)),
         front_wall=stage.matt(textures.plaster(rng)),
-        back_wall=stage.matt(textures.wallpaper(rng, (0.36, 0.30, 0.34), (0.16, 0.20, 0.30), (0.6, 0.45, 0.12)), (1.8, 1)),
+        back_wall=stage.matt(
+            textures.wallpaper(rng, (0.36, 0.30, 0.34), (0.16, 0.20, 0.30), (0.6, 0.45, 0.12)), (1.8, 1)),
     )  # fmt: skip
     steel, dark = stage.metal("Cr", 0.3), stage.matt((0.05, 0.05, 0.05))
     # Three hanging bulbs of different strength and colour, in front of the back wall.

@@ -14,7 +14,8 @@ VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 _PROBE = """
 import sys, mitsuba as mi
 mi.set_variant(sys.argv[1])
-scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "light": {"type": "constant"}, "ball": {"type": "sphere"},
+scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "light": {"type": "constant"},
+    "ball": {"type": "sphere"},
     "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}}})
 import numpy as np
 assert np.isfinite(np.array(mi.render(scene, spp=1))).all()

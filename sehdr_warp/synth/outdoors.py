@@ -39,13 +39,14 @@ def glass(stage: Stage) -> None:
     )
     floor = top + 0.008
     clear, green, amber, water = (
-        stage.glass(), stage.glass(tint=(0.72, 0.93, 0.80)), stage.glass(tint=(0.95, 0.75, 0.42)), stage.glass(1.33, (0.93, 0.97, 0.99))
+        stage.glass(), stage.glass(tint=(0.72, 0.93, 0.80)),
+        stage.glass(tint=(0.95, 0.75, 0.42)), stage.glass(1.33, (0.93, 0.97, 0.99))
     )  # fmt: skip
     stage.ball([-0.38, 0.3, floor + 0.15], 0.15, clear)
     stage.ball([0.32, 0.18, floor + 0.09], 0.09, amber)
     stage.ball([0.02, 0.12, floor + 0.06], 0.06, green)
-    goblet = lathe([[0.001, 0], [0.09, 0.002], [0.09, 0.012], [0.015, 0.03], [0.013, 0.14], [0.06, 0.2], [0.09, 0.3], [0.075, 0.4],
-                    [0.068, 0.398], [0.08, 0.3], [0.05, 0.215], [0.001, 0.19]])  # fmt: skip
+    goblet = lathe([[0.001, 0], [0.09, 0.002], [0.09, 0.012], [0.015, 0.03], [0.013, 0.14], [0.06, 0.2], [0.09, 0.3],
+                    [0.075, 0.4], [0.068, 0.398], [0.08, 0.3], [0.05, 0.215], [0.001, 0.19]])  # fmt: skip
     bottle = lathe(
         [
             [0.001, 0],
@@ -158,7 +159,8 @@ def night(stage: Stage) -> None:
     # Windows: a few rows glow, each pane with its own strength.
     warm, cold = (1.0, 0.60, 0.26), (0.5, 0.75, 1.0)
     for x, y, z, tint, strength, weight in (
-        (-2.58, 1.4, 2.7, warm, 5.0, 2), (-2.58, 4.6, 2.5, cold, 1.2, 1), (2.58, 3.2, 2.9, warm, 0.6, 1), (2.58, 6.4, 2.4, warm, 9.0, 2)
+        (-2.58, 1.4, 2.7, warm, 5.0, 2), (-2.58, 4.6, 2.5, cold, 1.2, 1),
+        (2.58, 3.2, 2.9, warm, 0.6, 1), (2.58, 6.4, 2.4, warm, 9.0, 2)
     ):  # fmt: skip
         side = 1 if x < 0 else -1
         panes = textures.facade(rng, 0.6, tint, 4, 3) * strength + 1e-4
@@ -169,7 +171,8 @@ def night(stage: Stage) -> None:
     )
     # Lanterns on posts and brackets: small, and 10^5 times the darkest wall.
     for x, y, z, radiance, weight in (
-        (-1.5, 2.2, 2.35, (520.0, 330.0, 140.0), 4), (1.6, 4.8, 2.5, (380.0, 400.0, 420.0), 3), (-1.4, 7.4, 2.4, (400.0, 240.0, 90.0), 2)
+        (-1.5, 2.2, 2.35, (520.0, 330.0, 140.0), 4), (1.6, 4.8, 2.5, (380.0, 400.0, 420.0), 3),
+        (-1.4, 7.4, 2.4, (400.0, 240.0, 90.0), 2)
     ):  # fmt: skip
         stage.lamp([x, y, z], 0.07, radiance, weight)
         stage.rod([x, y, 0], [x, y, z - 0.09], 0.035, stage.varnished((0.05, 0.06, 0.05), 0.3))

@@ -8,7 +8,8 @@ from .stage import Material, Stage
 
 
 def room(stage: Stage, half_width: float, front: float, back: float, height: float, *, floor: Material,
-         ceiling: Material, left: Material, right: Material, front_wall: Material, back_wall: Material | None):  # fmt: skip
+         ceiling: Material, left: Material, right: Material, front_wall: Material,
+         back_wall: Material | None):  # fmt: skip
     """Six panels facing inwards; back_wall None leaves the +y side open, for a wall with a hole."""
     middle, half = (front + back) / 2, (back - front) / 2
     stage.panel([0, middle, 0], [half_width, 0, 0], [0, half, 0], floor)

@@ -65,8 +65,8 @@ def render_scene(
     but for paths longer than the recipe's depth, which all views lack alike. The halves of the samples, compared, give
     the noise of that mean (in synth.json). Settings.denoise "oidn" then trades most of it for a bias of the denoiser's.
 
-    A seed gives the same things and lights again. The paths, and with them the noise, may differ: Mitsuba does not number
-    its lights in the same order each time.
+    A seed gives the same things and lights again. The paths, and with them the noise, may differ: Mitsuba does not
+    number its lights in the same order each time.
 
     Raises InputError where the folder holds a set of other settings, SehdrError where a pixel is not finite.
     """

@@ -30,8 +30,9 @@ class Train:
     response: str | None = None
     """Camera response: a name (srgb, gamma-2.2, hdr-nerf ...), a file, or auto."""
     predict_hdr: str | None = None
-    """Train on single-image predictions in place of HDR truth: kovaleski-oliveira, a folder of predicted EXR files named
-    as the views, or a TorchScript (.pt) or ONNX (.onnx) file; the preset is then `predicted` unless you name one."""
+    """Train on single-image predictions in place of HDR truth: kovaleski-oliveira, a folder of predicted EXR files
+    named as the views, or a TorchScript (.pt) or ONNX (.onnx) file; the preset is then `predicted` unless you name
+    one."""
     iterations: int | None = None
     """Training steps; all schedules scale with it."""
     max_size: int | None = None
@@ -39,8 +40,8 @@ class Train:
     seed: int | None = None
     """Seed of every random number."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Another value of any field of the config, such as loss.clipping=false; may be given several times. A value that the
-    scene contradicts is refused, and a plan leaves these fields as they are."""
+    """Another value of any field of the config, such as loss.clipping=false; may be given several times. A value that
+    the scene contradicts is refused, and a plan leaves these fields as they are."""
     plan: bool = False
     """Read the scene first and leave out what it does not need, on top of the preset."""
     plan_only: bool = False

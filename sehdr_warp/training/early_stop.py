@@ -9,8 +9,8 @@ from .config import Config
 class EarlyStop:
     """Ends a training after schedule.early_stop looks in a row that gained less than schedule.early_stop_gain.
 
-    A look comes every schedule.early_stop_every iterations, once the photos are at their full size and all degrees of the
-    harmonics had their time: before, an error that stands still says nothing about the end.
+    A look comes every schedule.early_stop_every iterations, once the photos are at their full size and all degrees of
+    the harmonics had their time: before, an error that stands still says nothing about the end.
     figure: decibels, higher is better. stopped_at: the iteration that ended the training, or None.
     """
 

@@ -225,7 +225,7 @@ def focus_distance(views: tuple[View, ...]) -> float:
 
 
 def points_on_rays(views, count: int, distance: float, rng: np.random.Generator) -> np.ndarray:
-    """[N, 3] points in front of the cameras, uniform over views, pixels and inverse depth within DEPTH_RANGE distances."""
+    """[N, 3] points in front of the cameras, uniform over views, pixels and inverse depth, DEPTH_RANGE away."""
     near, far = (factor * distance for factor in DEPTH_RANGE)
     chosen = rng.integers(len(views), size=count)
     across, depth = rng.random((count, 2)), 1 / rng.uniform(1 / far, 1 / near, count)

@@ -1,4 +1,4 @@
-"""The plan of a training: what its scene does not need, decided before it begins, each time with a reason in figures."""
+"""The plan of a training: what its scene does not need, decided before it begins, each with a reason in figures."""
 
 import json
 from dataclasses import asdict, dataclass

@@ -17,7 +17,7 @@ LEAST_CONTRAST = 1 / 255
 SMALLEST_SIDE = 16
 """Pixels of a photo's shorter side at the coarsest level."""
 REACH = 2.0**16
-"""Brackets farther from the photos' exposure than this are black or white in every pixel of 8 bits and some headroom."""
+"""Brackets farther from the photos' exposure than this are black or white in all pixels of 8 bits and some headroom."""
 
 
 def check_scene(scene: Scene, facts: SceneFacts) -> None:
@@ -37,13 +37,14 @@ def check_scene(scene: Scene, facts: SceneFacts) -> None:
     if facts.overlap < LEAST_OVERLAP:
         raise InputError(
             scene.name,
-            f"the photos share no view: {facts.overlap:.1%} of the places that one shows are in the field of view of another",
+            f"the photos share no view: {facts.overlap:.1%} of the places that one shows are in the field of view of "
+            "another",
             "check the poses and the axes' convention, or take photos that overlap by a half",
         )
 
 
 def check_fields(scene: Scene, facts: SceneFacts, config: Config, given: Collection[str]) -> None:
-    """Raises InputError, with both values, for fields that the user gave and the scene contradicts. given: their names."""
+    """Raises InputError, with both values, for fields that the user gave and the scene contradicts. given: names."""
 
     def refuse(path: str, value, problem: str, remedy: str) -> None:
         raise InputError(scene.name, f"{path} = {json.dumps(value)}, but {problem}", remedy)

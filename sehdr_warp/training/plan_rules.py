@@ -1,4 +1,4 @@
-"""The rules of a plan: one function a decision, from the scene's figures and the config so far to fields and a reason."""
+"""The rules of a plan: one function a decision, from the scene's figures and the config to fields and a reason."""
 
 import math
 from collections.abc import Callable
@@ -8,7 +8,8 @@ from .config import Config
 from .plan_scene import SceneFacts
 
 LEAST_GAIN = 0.05
-"""Decibels on training photos that a degree of the harmonics is kept for; a fifth to three fifths of it show in other photos."""
+"""Decibels on training photos that a degree of the harmonics is kept for; of it a fifth to three fifths show
+in other photos."""
 GEOMETRY_UNKNOWNS = 11
 """Of a Gaussian besides its colour: place, sizes, rotation, opacity."""
 FEWEST_GAUSSIANS = 20_000
@@ -37,8 +38,8 @@ LOOKS = 30
 
 @dataclass(frozen=True)
 class Decision:
-    """name: of config.DECISIONS. fields: dotted names of the config and their values. choice: in words; reason: with the
-    figures it rests on."""
+    """name: of config.DECISIONS. fields: dotted names of the config and their values. choice: in words; reason: with
+    the figures it rests on."""
 
     name: str
     fields: dict[str, object]
@@ -156,8 +157,8 @@ def _iterations(facts: SceneFacts, config: Config) -> Decision:
         "iterations",
         {"schedule.iterations": count},
         f"{count}",
-        f"{PASSES} steps on each of {facts.photos} photos, no fewer than {FEWEST_ITERATIONS}, no more than the preset's "
-        f"{config.schedule.iterations}",
+        f"{PASSES} steps on each of {facts.photos} photos, no fewer than {FEWEST_ITERATIONS}, no more than the "
+        f"preset's {config.schedule.iterations}",
     )
 
 
@@ -170,8 +171,8 @@ def _early_stop(facts: SceneFacts, config: Config) -> Decision:
             "early-stop",
             {},
             "off",
-            f"{steps} steps between looks are {passes:.1f} passes over the {facts.photos} photos, and their mean loss is "
-            f"steady from {PASSES_A_LOOK} on",
+            f"{steps} steps between looks are {passes:.1f} passes over the {facts.photos} photos, and their mean loss "
+            f"is steady from {PASSES_A_LOOK} on",
         )
     return Decision(
         "early-stop",
@@ -202,7 +203,8 @@ def _optimizer(facts: SceneFacts, config: Config) -> Decision:
         "optimizer",
         {"optimizer.visible_only": only},
         "what is visible" if only else "all",
-        f"a photo's field of view holds {facts.visible:.0%} of the places; skipping the others pays up to {MOST_VISIBLE:.0%}",
+        f"a photo's field of view holds {facts.visible:.0%} of the places; skipping the others pays up to "
+        f"{MOST_VISIBLE:.0%}",
     )
 
 

@@ -25,14 +25,14 @@ class SceneFacts:
     """Figures of a scene's training views; parts are of 1.
 
     photos, held_out: views. width, height: of the largest photo, pixels. pixels: of all photos together.
-    exposure_times: how many differ. times_known: whether files state them. from_camera: whether a camera made the files.
-    truths: photos with HDR truth. points: sparse points.
+    exposure_times: how many differ. times_known: whether files state them. from_camera: whether a camera made the
+    files. truths: photos with HDR truth. points: sparse points.
     seen: mean number of photos whose field of view holds a probe (what stands in the way is not known).
     spread: degrees, the median over probes of the angle of the cone of directions they are seen from.
     visible: mean part of the probes in a photo's field of view.
     overlap: part of the probes, or of places along the cameras' rays if that is more, that two photos show.
-    clipped, black: part of the pixels with a channel at 255, with all channels at 0. contrast: standard deviation of all
-    codes. sky: part of the pixels in flat, bright cells without sparse points that reach the upper border.
+    clipped, black: part of the pixels with a channel at 255, with all channels at 0. contrast: standard deviation of
+    all codes. sky: part of the pixels in flat, bright cells without sparse points that reach the upper border.
     """
 
     photos: int

@@ -1,4 +1,4 @@
-"""Mutations of files: bytes for any format, numbers and words for text, nodes for JSON. All from one random generator."""
+"""Mutations of files: bytes for any format, numbers and words for text, nodes for JSON. All from one generator."""
 
 import json
 import random

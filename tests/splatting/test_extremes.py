@@ -134,8 +134,8 @@ def test_a_failed_allocation_says_the_sizes(device, monkeypatch):
     with pytest.raises(OutOfMemory) as caught:
         rasterize(*scene.arguments)
     assert str(caught.value) == (
-        f"out of memory on {device}: 3.00 GiB could not be allocated with 5 Gaussians, an image of 70 x 50, 3 channels; "
-        + memory.REMEDY
+        f"out of memory on {device}: 3.00 GiB could not be allocated with 5 Gaussians, an image of 70 x 50, "
+        "3 channels; " + memory.REMEDY
     )
     assert isinstance(caught.value, SehdrError)
 
