@@ -32,16 +32,9 @@ def tile_kernels(dtype):
     @wp.func
     def tile_is_touched(shape: vec4, conic: vec4, column: int, row: int) -> bool:
         return g.ellipse_meets_rectangle(
-            shape[0],
-            shape[1],
-            conic[0],
-            conic[1],
-            conic[2],
-            conic[3],
-            real(column) * real(size) + real(0.5),
-            real(row) * real(size) + real(0.5),
-            real(wp.static(size - 1.0)),
-            real(wp.static(size - 1.0)),
+            shape[0], shape[1], conic[0], conic[1], conic[2], conic[3],
+            real(column) * real(size) + real(0.5), real(row) * real(size) + real(0.5),
+            real(wp.static(size - 1.0)), real(wp.static(size - 1.0)),
         )
 
     @wp.kernel(module="unique", module_options=options)

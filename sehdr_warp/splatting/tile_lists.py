@@ -125,9 +125,14 @@ def pack_records(means2d, conics, opacities, extents, features, alpha_threshold:
 def depth_order(depths, extents):
     """[N] int32: Gaussians nearest first, culled ones last; equal depths keep the order of their indices."""
     count = depths.shape[0]
+    # The sort needs room for twice as many.
     keys = depths.new_empty(2 * count)
-    keys[:count] = torch.where(extents[:, 0] > 0, depths, torch.inf)
-    return _sorted_places(keys, count)
+    places = torch.empty(2 * count, dtype=torch.int32, device=depths.device)
+    scalar = warp_scalar(depths.dtype)
+    arguments = [view(depths), view(extents, vector(2, scalar)), view(keys), view(places)]
+    _launch(tile_kernels(scalar)[3], count, arguments, depths.device)
+    _sort_pairs(keys, places, count, None)
+    return places[:count]
 
 
 def count_entries(order, shapes, ellipses, extents, columns: int, rows: int):
@@ -183,7 +188,10 @@ def sort_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: 
     """
     bits = tile_count.bit_length()
     if emission:
-        places = _sorted_places(tiles, entry_count, bits)
+        places = torch.empty(2 * entry_count, dtype=torch.int32, device=tiles.device)
+        torch.arange(entry_count, dtype=torch.int32, device=tiles.device, out=places[:entry_count])
+        _sort_pairs(tiles, places, entry_count, bits)
+        places = places[:entry_count]
         return tiles[:entry_count], gaussians[:entry_count][places] if entry_count else gaussians, places
     _sort_pairs(tiles, gaussians, entry_count, bits)
     return tiles[:entry_count], gaussians[:entry_count], None
@@ -196,14 +204,6 @@ def find_ranges(tiles, tile_count: int):
         arguments = [view(tiles), tiles.shape[0], tile_count, view(ranges, wp.vec2i)]
         _launch(mark_ranges, tiles.shape[0], arguments, tiles.device)
     return ranges
-
-
-def _sorted_places(keys, count: int, bits: int | None = None):
-    """[count] int32 permutation that sorts keys[:count] (stable). keys has room for 2 count and is sorted in place."""
-    places = torch.empty(2 * count, dtype=torch.int32, device=keys.device)
-    torch.arange(count, dtype=torch.int32, device=keys.device, out=places[:count])
-    _sort_pairs(keys, places, count, bits)
-    return places[:count]
 
 
 def _sort_pairs(keys, values, count: int, bits: int | None) -> None:
