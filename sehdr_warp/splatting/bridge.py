@@ -159,6 +159,17 @@ def _array(tensor: torch.Tensor, dtype=None) -> wp.array:
     return wp.from_torch(tensor, dtype=dtype, requires_grad=False)
 
 
+def _zeros_like(tensors: list[torch.Tensor]) -> list[torch.Tensor]:
+    """Contiguous zeros of the tensors' shapes. On a GPU those of one type share memory, filled by a single launch."""
+    if not tensors or tensors[0].device.type == "cpu" or len({tensor.dtype for tensor in tensors}) > 1:
+        return [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in tensors]
+    # Each starts at a multiple of 64 numbers, as memory of its own would.
+    sizes = [tensor.numel() for tensor in tensors]
+    rooms = [-(-size // 64) * 64 for size in sizes]
+    parts = tensors[0].new_zeros(sum(rooms)).split(rooms)
+    return [part[:size].view(tensor.shape) for part, size, tensor in zip(parts, sizes, tensors, strict=True)]
+
+
 class _ProgramFunction(torch.autograd.Function):
     @staticmethod
     def forward(ctx, body, options, *tensors):
@@ -203,12 +214,15 @@ class _ProgramFunction(torch.autograd.Function):
             results = [None] * len(plain)
             by_memory = {}
             handed = {id(tensor): gradient for tensor, gradient in program.handed}
+            wanted = []
             for position, (tensor, needed) in enumerate(zip(plain, ctx.needs_input_grad[2:], strict=True)):
                 if id(tensor) in handed:
                     handed[id(tensor)].wanted = needed
                 elif needed:
-                    results[position] = torch.zeros_like(tensor, memory_format=torch.contiguous_format)
-                    by_memory[id(tensor)] = results[position]
+                    wanted.append(position)
+            for position, zeros in zip(wanted, _zeros_like([plain[position] for position in wanted]), strict=True):
+                results[position] = zeros
+                by_memory[id(plain[position])] = zeros
             for tensor, array in program.inputs:
                 if id(tensor) in by_memory:
                     gradient = by_memory[id(tensor)]
