@@ -2,6 +2,7 @@
 
 from .blend_style import BlendStyle
 from .bridge import Program, differentiable
+from .exploration import add_exploration_noise
 from .harmonics import spherical_harmonics
 from .neighbours import nearest_neighbour_distances
 from .rasterization import Rendering, rasterize
@@ -15,6 +16,7 @@ __all__ = [
     "Program",
     "RecordedRasterizer",
     "Rendering",
+    "add_exploration_noise",
     "differentiable",
     "nearest_neighbour_distances",
     "rasterize",

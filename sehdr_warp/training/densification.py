@@ -60,7 +60,7 @@ class Densification:
     def keep(self, kept: Tensor) -> None:
         """Forgets the Gaussians that are taken away elsewhere. kept: [N] bool."""
 
-    def perturb(self, gaussians: Gaussians, means_rate: float, generator) -> None:
+    def perturb(self, iteration: int, gaussians: Gaussians, means_rate: float) -> None:
         """What happens to the positions after each step of the optimizer."""
 
     def state(self) -> dict[str, Tensor]:

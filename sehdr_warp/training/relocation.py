@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from ..model.gaussians import Gaussians
+from ..splatting import add_exploration_noise
 from .config import Config
-from .densification import Densification, rotate
+from .densification import Densification
 
 MOST_COPIES = 51
 """A Gaussian is shared by at most this many at once, as in the authors' code: the binomial sums stay exact."""
-NOISE_SHARPNESS, NOISE_CENTRE = 100.0, 0.995
-"""Equation 8: noise is for Gaussians of opacity below 1 - 0.995."""
+SEED_STEP = 1_000_003
+"""Seeds of trainings are this far apart in the seeds of their noise, one for each iteration."""
 
 
 class Relocation(Densification):
@@ -38,16 +39,18 @@ class Relocation(Densification):
             self._add(gaussians, target - count, optimizer, generator)
         return moved or target > count
 
-    @torch.no_grad()
-    def perturb(self, gaussians: Gaussians, means_rate: float, generator) -> None:
+    def perturb(self, iteration: int, gaussians: Gaussians, means_rate: float) -> None:
         if self.options.noise == 0:
             return
-        faintness = torch.sigmoid(NOISE_SHARPNESS * (1 - gaussians.opacities() - NOISE_CENTRE))
-        normal = torch.randn(gaussians.means.shape, generator=generator, device=gaussians.means.device)
-        step = normal * (faintness * (self.options.noise * means_rate))[:, None]
-        # Noise shaped by the covariance R S S R^T.
-        turned = rotate(gaussians.quaternions * _CONJUGATE.to(gaussians.quaternions), step)
-        gaussians.means += rotate(gaussians.quaternions, turned * (2 * gaussians.log_scales).exp())
+        add_exploration_noise(
+            gaussians.means,
+            gaussians.log_scales,
+            gaussians.quaternions,
+            gaussians.opacity_logits,
+            strength=self.options.noise * means_rate,
+            # Of the iteration and not of a running generator, so that a resumed training draws what it would have.
+            seed=(self.config.seed * SEED_STEP + iteration) % 2**31,
+        )
 
     def _relocate(self, gaussians: Gaussians, dead: Tensor, optimizer, generator) -> bool:
         dead_index, alive = dead.nonzero()[:, 0], (~dead).nonzero()[:, 0]
@@ -87,9 +90,6 @@ class Relocation(Densification):
         )
         for name in ("means", "quaternions", "harmonics_dc", "harmonics_rest"):
             gaussians.forget(name, index, optimizer)
-
-
-_CONJUGATE = torch.tensor([1.0, -1.0, -1.0, -1.0])
 
 
 def _draw(weights: Tensor, count: int, generator) -> Tensor:

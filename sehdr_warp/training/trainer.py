@@ -142,7 +142,7 @@ class Trainer:
             self._last = self._replay(views, index, watched, kind)
         else:
             self._last = self._optimise(views[index], watched)
-        self.densification.perturb(gaussians, rate, self._generator)
+        self.densification.perturb(self.iteration, gaussians, rate)
         count = gaussians.count
         if self.densification.change(self.iteration, gaussians, self.optimizer, self._generator):
             self._forget_recording(gaussians.count / max(1, count))
