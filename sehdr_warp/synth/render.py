@@ -141,6 +141,12 @@ def _sensor(mi, camera: Camera):
     )
 
 
+def _check_light(radiance: np.ndarray, found: str, remedy: str) -> None:
+    """SehdrError where a pixel [H, W, 3] cannot be light: truth that is not finite would poison whatever it judges."""
+    if not np.isfinite(radiance).all() or radiance.min() < 0:
+        raise SehdrError(f"{found} pixels that are not finite or negative; {remedy}")
+
+
 def _render_view(mi, scene, recipe: Recipe, camera: Camera, view: int, settings: Settings, denoiser: Denoiser | None,
                  path: Path, aside: Path) -> str:  # fmt: skip
     started = time.perf_counter()
@@ -158,11 +164,11 @@ def _render_view(mi, scene, recipe: Recipe, camera: Camera, view: int, settings:
         halves[turn % 2] += np.array(image, np.float64)[..., :3] * share
         counts[turn % 2] += share
     radiance = (sum(halves) / samples).astype(np.float32)
-    if not np.isfinite(radiance).all() or radiance.min() < 0:
-        raise SehdrError(f"{recipe.name}: view {view} has pixels that are not finite or negative; take another --seed")
+    _check_light(radiance, f"{recipe.name}: view {view} has", "take another --seed")
     noise = _noise(*(half / count for half, count in zip(halves, counts, strict=True)))
     if denoiser is not None:
         radiance = denoiser(radiance, sensor, (settings.seed * VIEWS + view) % 2**32)
+        _check_light(radiance, f"{recipe.name}: view {view}, denoised, has", "take --denoise none, with more --samples")
     seconds = time.perf_counter() - started
     found = {"seconds": seconds, "noise": noise, "largest": radiance.max()}
     if split_of(view) == "train":

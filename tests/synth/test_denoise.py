@@ -9,7 +9,8 @@ import pytest
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene.images import read_hdr
 from sehdr_warp.synth import denoise
-from sehdr_warp.synth.render import Settings, render_scene
+from sehdr_warp.synth.cameras import make_cameras
+from sehdr_warp.synth.render import Settings, _render_view, render_scene
 from sehdr_warp.synth.scenes import RECIPES
 from sehdr_warp.synth.stage import Stage
 from sehdr_warp.synth.truth_set import truth_path
@@ -76,6 +77,31 @@ def test_an_unknown_or_missing_denoiser_is_refused(monkeypatch):
     with pytest.raises(SehdrError, match=r"pip install 'sehdr-warp\[synth\]', or take --denoise none"):
         Settings(denoise="oidn")
     Settings(denoise="none")
+
+
+@pytest.mark.parametrize(
+    "spoilt,words", [("rendered", "view 1 has pixels"), ("denoised", "view 1, denoised, has pixels")]
+)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_pixels_that_are_no_light_are_refused_before_and_after_denoising(tmp_path, spoilt, words, value):
+    images = {name: np.ones((24, 24, 3), np.float32) for name in ("rendered", "denoised")}
+    images[spoilt][3, 4] = value
+    mitsuba = SimpleNamespace(
+        variant=lambda: "scalar_rgb",
+        load_dict=lambda item: item,
+        ScalarTransform4f=lambda pose: pose,
+        render=lambda *_, **__: images["rendered"],
+    )
+    recipe, (path, aside) = RECIPES["night"], (tmp_path / "view.exr", tmp_path / "view.npz")
+    camera = make_cameras(recipe.layout, 24, 24)[1]
+    with pytest.raises(SehdrError, match=f"^night: {words} that are not finite or negative; take"):
+        _render_view(
+            mitsuba, None, recipe, camera, 1, Settings(24, 24, 4, 0), lambda *_: images["denoised"], path, aside
+        )
+    assert not path.exists() and not aside.exists()
+    images[spoilt][3, 4] = 1.0
+    _render_view(mitsuba, None, recipe, camera, 1, Settings(24, 24, 4, 0), lambda *_: images["denoised"], path, aside)
+    assert read_hdr(path).max() == 1.0
 
 
 def test_a_denoised_scene_says_so_and_is_nearer_to_many_paths(tmp_path):
