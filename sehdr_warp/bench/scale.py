@@ -12,7 +12,7 @@ from ..errors import SehdrError
 from ..model import radiance_field
 from ..splatting.memory import held_by_warp
 from ..splatting.rasterization import rasterize
-from ..training import trainer as trainer_module
+from ..training.config import Config
 from ..training.config_files import load_config
 from . import checks
 from .kernels import OURS
@@ -172,15 +172,13 @@ def _splat_rows(name, scene: SplatScene, gsplat: Peer | None, repetitions, budge
 def _step_rows(name: str, size: Size, device, with_gsplat: bool, repetitions: int, budget: float) -> list[dict]:
     """Whole training steps of the preset on photos of this size; peak memory is all that is held on a GPU, photos,
     parameters and optimiser included."""
-    # Without densification, which on both sides would watch gradients that gsplat gives in another form.
-    config = load_config(STEP_PRESET, {"densification.stop": 0, "densification.max_gaussians": size.gaussians + 1})
     scene = make_photo_scene(size, views=STEP_VIEWS, device=device)
-    first = thick_of_training(config)
+    first = thick_of_training(_step_config(OURS, size))
     rows = []
     for who in (OURS, "gsplat") if with_gsplat else (OURS,):
         _empty(device)
         with _rasterizer_of(who):
-            trainer = make_trainer(scene, config, device, first)
+            trainer = make_trainer(scene, _step_config(who, size), device, first)
             variant = Variant(lambda _, t=trainer: t.step(), prepare=lambda t=trainer: between_changes(t, first))
             variant.once()
             # One variant: turns would only add untimed runs.
@@ -198,16 +196,26 @@ def _step_rows(name: str, size: Size, device, with_gsplat: bool, repetitions: in
     return rows
 
 
+def _step_config(who: str, size: Size) -> Config:
+    """Without densification, which on both sides would watch gradients that gsplat gives in another form; steps of
+    gsplat are launched, since they cannot be recorded as a CUDA graph."""
+    return load_config(
+        STEP_PRESET,
+        {
+            "densification.stop": 0,
+            "densification.max_gaussians": size.gaussians + 1,
+            "schedule.recorded": who == OURS,
+        },
+    )
+
+
 @contextmanager
 def _rasterizer_of(who: str):
-    """Within the block training steps are drawn by ours or by gsplat, which cannot be recorded as a CUDA graph."""
+    """Within the block training steps are drawn by ours or by gsplat."""
     if who == OURS:
         yield
         return
-    with (
-        patch.object(radiance_field, "rasterize", rasterize_with_gsplat),
-        patch.object(trainer_module, "GraphRecorder", lambda device: None),
-    ):
+    with patch.object(radiance_field, "rasterize", rasterize_with_gsplat):
         yield
 
 

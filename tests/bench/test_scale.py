@@ -77,6 +77,13 @@ def test_gsplat_draws_what_a_training_step_of_ours_asks_for(monkeypatch):
         torch.testing.assert_close(other, mine, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.parametrize("who", ["sehdr-warp", "gsplat"])
+def test_steps_of_gsplat_are_launched_and_ours_recorded(who):
+    config = scale._step_config(who, Size(200, 48, 40))
+    assert config.schedule.recorded == (who == "sehdr-warp")
+    assert (config.densification.stop, config.densification.max_gaussians) == (0, 201)
+
+
 def test_points_have_stages_memory_steps_and_gsplat(monkeypatch, tmp_path):
     fake_gsplat(monkeypatch)
 
