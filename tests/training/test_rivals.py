@@ -20,6 +20,7 @@ from sehdr_warp.training.targets import largest_truth
 from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
 
+from .recorded import train_on_gpu
 from .test_train import quick
 
 RIVALS = {
@@ -243,10 +244,5 @@ def test_a_learned_tone_mapper_resumes_bit_for_bit(scene):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
 @pytest.mark.parametrize("name", ["hdr-gs-truth", "gauss-hdr", "truth"])
 def test_rivals_are_recorded_on_a_gpu(scene, name):
-    config = quick(name, **RIVALS[name])
-    field = make_field(scene, config, choose_response(scene, config), "cuda:0")
-    trainer, replays = Trainer(scene, config, field), 0
-    for _ in range(100):
-        trainer.step()
-        replays += trainer._recorder is not None and trainer._recorder._key is not None
-    assert replays > 50 and trainer.skipped_steps == 0
+    _, replays = train_on_gpu(scene, quick(name, **RIVALS[name]), iterations=100)
+    assert replays > 50

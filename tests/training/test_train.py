@@ -12,12 +12,12 @@ import torch
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.training.config_files import load_config
-from sehdr_warp.training.heldout import evaluate_views
 from sehdr_warp.training.initialization import choose_response, make_field
 from sehdr_warp.training.run import load_run
 from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
 
+from .recorded import check_recorded_like_launched
 from .toy import EXPOSURE_TIME, toy_scene
 
 QUICK = {
@@ -290,21 +290,7 @@ def test_a_step_that_cannot_be_recorded_ends_the_training_with_a_way_out(scene, 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
 @pytest.mark.parametrize("variant", ["default", "climb"])
 def test_recorded_steps_train_like_launched_ones(variant):
-    scene, config = toy_scene(), VARIANTS[variant]
-    scores = []
-    for recorded in (True, False):
-        field = make_field(scene, config, choose_response(scene, config), "cuda:0")
-        trainer = Trainer(scene, config, field)
-        if not recorded:
-            trainer._recorder = None
-        replays = 0
-        for _ in range(config.schedule.iterations):
-            trainer.step()
-            replays += recorded and trainer._recorder._key is not None
-        assert replays > 100 or not recorded
-        assert trainer.skipped_steps == 0
-        scores.append(evaluate_views(field, scene.test_views, trainer.degree)["psnr_ldr"])
-    assert abs(scores[0] - scores[1]) < 1.5
+    check_recorded_like_launched(toy_scene(), VARIANTS[variant], 100)
 
 
 def test_tensorboard_gets_the_figures_of_the_held_out_views(scene, tmp_path, monkeypatch):

@@ -1,0 +1,29 @@
+"""Whole trainings on a GPU, with recorded steps and with launched ones."""
+
+from sehdr_warp.training.config_files import override_config
+from sehdr_warp.training.heldout import evaluate_views
+from sehdr_warp.training.initialization import choose_response, make_field
+from sehdr_warp.training.trainer import Trainer
+
+
+def train_on_gpu(scene, config, *, recorded: bool = True, iterations: int | None = None) -> tuple[Trainer, int]:
+    """The trainer after its iterations, and how many of them were replayed."""
+    config = override_config(config, {"schedule.recorded": recorded})
+    trainer = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cuda:0"))
+    replays = 0
+    for _ in range(iterations or config.schedule.iterations):
+        trainer.step()
+        replays += trainer._recorder is not None and trainer._recorder._key is not None
+    assert trainer.skipped_steps == 0
+    return trainer, replays
+
+
+def check_recorded_like_launched(scene, config, least_replays: int) -> list[Trainer]:
+    """Trains both ways: held-out photos come out alike. The trainers, recorded first."""
+    (first, replays), (second, none) = (train_on_gpu(scene, config, recorded=recorded) for recorded in (True, False))
+    assert replays > least_replays and none == 0
+    scores = [
+        evaluate_views(trainer.field, scene.test_views, trainer.degree)["psnr_ldr"] for trainer in (first, second)
+    ]
+    assert abs(scores[0] - scores[1]) < 1.5
+    return [first, second]
