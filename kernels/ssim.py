@@ -33,13 +33,16 @@ def window() -> list[float]:
 
 
 @cache
-def ssim_kernels(dtype, lanes: int) -> SimpleNamespace:
+def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
     """The four passes for one scalar type (wp.float32 or wp.float64); images need W C >= lanes.
 
     blur_columns, then compare: the SSIM map and its derivatives by the four windowed moments, combined for `a`.
     blur_derivatives, then gradient: the adjoint of the blurs, applied to those derivatives.
 
-    A launch covers [0, rows * blocks) with blocks = ceil(W C / lanes); `first` is added to the thread's index.
+    A launch covers [0, rows * blocks) with blocks = ceil(W C / lanes); `first` is added to the thread's index. With one
+    lane the blurs write the zeros on both sides too, and cover [0, rows * (W C + 2 RADIUS C)).
+
+    distance: for a weighted sum of |a - b| and 1 - SSIM in place of the SSIM; the weights are read with it alone.
     """
     real = dtype
     run = wp.types.vector(length=lanes, dtype=dtype)
@@ -63,10 +66,20 @@ def ssim_kernels(dtype, lanes: int) -> SimpleNamespace:
         channels: int,
         moments: wp.array3d(dtype=run),
     ):
-        blocks = (length + wp.static(lanes - 1)) // wp.static(lanes)
         index = first + wp.tid()
-        y = index // blocks
-        i = start_of(index % blocks, length)
+        if wp.static(lanes == 1):
+            margin = radius * channels
+            span = length + 2 * margin
+            y = index // span
+            i = index % span - margin
+            if i < 0 or i >= length:
+                for k in range(4):
+                    moments[k, y, i + margin] = run(real(0.0))
+                return
+        else:
+            blocks = (length + wp.static(lanes - 1)) // wp.static(lanes)
+            y = index // blocks
+            i = start_of(index % blocks, length)
         s1 = run(real(0.0))
         d1 = run(real(0.0))
         s2 = run(real(0.0))
@@ -94,6 +107,10 @@ def ssim_kernels(dtype, lanes: int) -> SimpleNamespace:
         weights: wp.array(dtype=real),
         length: int,
         channels: int,
+        a: wp.array2d(dtype=run),
+        b: wp.array2d(dtype=run),
+        distance_weight: real,
+        dissimilarity_weight: real,
         similarity: wp.array2d(dtype=run),
         derivatives: wp.array3d(dtype=run),
     ):
@@ -125,7 +142,11 @@ def ssim_kernels(dtype, lanes: int) -> SimpleNamespace:
         qb = wp.cw_mul(vd, rb)
         luminance = one - qa
         structure = one - qb
-        similarity[y, i] = wp.cw_mul(luminance, structure)
+        if wp.static(distance):
+            apart = wp.abs(a[y, i] - b[y, i])
+            similarity[y, i] = apart * distance_weight + (one - wp.cw_mul(luminance, structure)) * dissimilarity_weight
+        else:
+            similarity[y, i] = wp.cw_mul(luminance, structure)
         # d/dE[s^2], d/dE[d^2], then d/dE[s] + d/dE[d], since both s and d follow `a` with slope one.
         by_ss = wp.cw_mul(wp.cw_mul(luminance, qb), rb) * half
         by_dd = by_ss - wp.cw_mul(luminance, rb)
@@ -144,10 +165,20 @@ def ssim_kernels(dtype, lanes: int) -> SimpleNamespace:
         channels: int,
         blurred: wp.array3d(dtype=run),
     ):
-        blocks = (length + wp.static(lanes - 1)) // wp.static(lanes)
         index = first + wp.tid()
-        y = index // blocks
-        i = start_of(index % blocks, length)
+        if wp.static(lanes == 1):
+            margin = radius * channels
+            span = length + 2 * margin
+            y = index // span
+            i = index % span - margin
+            if i < 0 or i >= length:
+                for k in range(3):
+                    blurred[k, y, i + margin] = run(real(0.0))
+                return
+        else:
+            blocks = (length + wp.static(lanes - 1)) // wp.static(lanes)
+            y = index // blocks
+            i = start_of(index % blocks, length)
         sd = run(real(0.0))
         ss = run(real(0.0))
         dd = run(real(0.0))
@@ -171,6 +202,8 @@ def ssim_kernels(dtype, lanes: int) -> SimpleNamespace:
         length: int,
         channels: int,
         scale: wp.array(dtype=real),
+        distance_weight: real,
+        dissimilarity_weight: real,
         adjoint_a: wp.array2d(dtype=run),
     ):
         blocks = (length + wp.static(lanes - 1)) // wp.static(lanes)
@@ -188,7 +221,14 @@ def ssim_kernels(dtype, lanes: int) -> SimpleNamespace:
         x = a[y, i]
         z = b[y, i]
         moments = (wp.cw_mul(x + z, ss) + wp.cw_mul(x - z, dd)) * real(2.0)
-        adjoint_a[y, i] = (sd + moments) * scale[0]
+        if wp.static(distance):
+            d = x - z
+            side = run(real(0.0))
+            for k in range(wp.static(lanes)):
+                side[k] = wp.where(d[k] > real(0.0), real(1.0), wp.where(d[k] < real(0.0), real(-1.0), real(0.0)))
+            adjoint_a[y, i] = (side * distance_weight - (sd + moments) * dissimilarity_weight) * scale[0]
+        else:
+            adjoint_a[y, i] = (sd + moments) * scale[0]
 
     return SimpleNamespace(
         run=run, blur_columns=blur_columns, compare=compare, blur_derivatives=blur_derivatives, gradient=gradient

@@ -35,6 +35,30 @@ def ssim_map(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return _Similarity.apply(a, b, False)
 
 
+def image_distance(a: torch.Tensor, b: torch.Tensor, distance_weight: float, dissimilarity_weight: float):
+    """distance_weight mean |a - b| + dissimilarity_weight (1 - ssim(a, b)), in as few launches as ssim() takes.
+
+    a, b: as for ssim(), with its errors. Returns a scalar, differentiable once with respect to a.
+    """
+    return _Distance.apply(a, b, distance_weight, dissimilarity_weight)
+
+
+class _Distance(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, a, b, distance_weight, dissimilarity_weight):
+        _check(a, b)
+        a, b = a.detach().contiguous(), b.detach().contiguous()
+        ctx.weights = distance_weight / a.numel(), dissimilarity_weight / a.numel()
+        terms, derivatives = _compare(a, b, ctx.weights)
+        ctx.save_for_backward(a, b, derivatives)
+        return terms.sum() if a.device.type == "cuda" else terms.flatten(1).sum(1).sum()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, upstream):
+        return _gradient(*ctx.saved_tensors, upstream, ctx.weights), None, None, None
+
+
 class _Similarity(torch.autograd.Function):
     @staticmethod
     def forward(ctx, a, b, mean):
@@ -72,29 +96,41 @@ def _check(a: torch.Tensor, b: torch.Tensor) -> None:
         )
 
 
-def _compare(a: torch.Tensor, b: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """The similarity [H, W, C] and its derivatives [3, H, W C] by the windowed moments."""
-    runs = _Runs(a)
+def _compare(
+    a: torch.Tensor, b: torch.Tensor, weights: tuple[float, float] | None = None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The similarity [H, W, C] and its derivatives [3, H, W C] by the windowed moments. weights: of |a - b| and of the
+    dissimilarity, whose sum [H, W, C] then stands in the similarity's place."""
+    runs = _Runs(a, weights)
     similarity = torch.empty_like(a)
     derivatives = a.new_empty(3, runs.rows, runs.length)
     buffer = runs.padded(4)
     moments = runs.view(buffer)
     with torch_stream(a.device):
         runs.launch("blur_columns", [runs.view(a), runs.view(b)], [moments])
-        runs.launch("compare", [moments], [runs.view(similarity), runs.view(derivatives)])
+        compared = [runs.view(a), runs.view(b), *runs.weights_of_both, runs.view(similarity), runs.view(derivatives)]
+        runs.launch("compare", [moments], compared)
     return similarity, derivatives
 
 
-def _gradient(a: torch.Tensor, b: torch.Tensor, derivatives: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
-    """scale times the gradient of the sum of the similarity by `a`, [H, W, C]."""
-    runs = _Runs(a)
+def _gradient(
+    a: torch.Tensor,
+    b: torch.Tensor,
+    derivatives: torch.Tensor,
+    scale: torch.Tensor,
+    weights: tuple[float, float] | None = None,
+) -> torch.Tensor:
+    """scale times the gradient by `a`, [H, W, C], of the sum of what _compare() gives."""
+    runs = _Runs(a, weights)
     result = torch.empty_like(a)
     buffer = runs.padded(3)
     blurred = runs.view(buffer)
     scale = scale.reshape(1)
     with torch_stream(a.device):
         runs.launch("blur_derivatives", [runs.view(derivatives)], [blurred])
-        runs.launch("gradient", [blurred, runs.view(a), runs.view(b)], [view(scale), runs.view(result)])
+        runs.launch(
+            "gradient", [blurred, runs.view(a), runs.view(b)], [view(scale), *runs.weights_of_both, runs.view(result)]
+        )
     return result
 
 
@@ -105,21 +141,24 @@ class _Runs:
     must live until the launches are made.
     """
 
-    def __init__(self, image: torch.Tensor):
+    def __init__(self, image: torch.Tensor, weights: tuple[float, float] | None = None):
         self.rows, width, self.channels = image.shape
         self.length = width * self.channels
         self.like = image
         self.lanes = CPU_LANES if image.device.type == "cpu" and self.length >= CPU_LANES else 1
-        self.kernels = ssim_kernels(wp.dtype_from_torch(image.dtype), self.lanes)
+        self.kernels = ssim_kernels(wp.dtype_from_torch(image.dtype), self.lanes, weights is not None)
+        self.weights_of_both = weights or (0.0, 0.0)
         self.weights = view(_weights(image.dtype, image.device))
         self.device = wp.device_from_torch(image.device)
 
     def padded(self, count: int) -> torch.Tensor:
-        """[count, rows, ...] uninitialised rows with the zeros that the horizontal blur finds beyond the border."""
+        """[count, rows, ...] uninitialised rows with the zeros that the horizontal blur finds beyond the border; with one
+        lane the kernels that fill the rows write those too."""
         margin = RADIUS * self.channels
         buffer = self.like.new_empty(count, self.rows, self.length + 2 * margin)
-        buffer[..., :margin] = 0
-        buffer[..., -margin:] = 0
+        if self.lanes > 1:
+            buffer[..., :margin] = 0
+            buffer[..., -margin:] = 0
         return buffer
 
     def view(self, tensor: torch.Tensor):
@@ -134,7 +173,10 @@ class _Runs:
         """Launch a kernel over the whole image."""
         arguments = [*inputs, self.weights, self.length, self.channels, *results]
         kernel = getattr(self.kernels, name)
-        count = self.rows * -(-self.length // self.lanes)
+        blocks = -(-self.length // self.lanes)
+        if self.lanes == 1 and name.startswith("blur"):
+            blocks += 2 * RADIUS * self.channels
+        count = self.rows * blocks
         if self.device.is_cpu:
             threads.launch_ranges(kernel, threads.even_ranges(count, STEPS_PER_THREAD), arguments, self.device)
         else:

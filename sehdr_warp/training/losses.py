@@ -11,7 +11,7 @@ from ..model.radiance_field import Photograph, RadianceField
 from ..model.response import Response, ToneMapper
 from ..model.response_curve import EXTENSION_SLOPE
 from ..model.response_refined import RefinedResponse
-from ..splatting.ssim import ssim
+from ..splatting.ssim import image_distance, ssim
 from .config import LossConfig
 
 CODE = 1 / 255
@@ -69,6 +69,8 @@ def image_loss(
     prediction, truth: [H, W, 3]; mask: [H, W, 1] or None: pixels outside count nothing in L1 and as equal in SSIM.
     similar: [H, W, 3] that stands in the SSIM for the prediction.
     """
+    if weight and mask is None and similar is None and prediction.device.type == "cuda" and not truth.requires_grad:
+        return image_distance(prediction, truth, 1.0 if form == "sum" else 1 - weight, weight)
     similar = prediction if similar is None else similar
     if mask is not None:
         prediction, truth, similar = prediction * mask, truth * mask, similar * mask
@@ -222,7 +224,9 @@ def total_loss(
     field: RadianceField, photo: Photograph, target: Target, config: LossConfig, largest_truth: float = 1.0
 ) -> Tensor:
     """L_LDR + beta L_linear (equation 13), the HDR loss, and priors and regularisers, each where it has a weight."""
-    loss = config.ldr_weight * ldr_loss(photo, target, config, field.response) if config.ldr_weight > 0 else 0.0
+    loss = ldr_loss(photo, target, config, field.response) if config.ldr_weight > 0 else 0.0
+    if config.ldr_weight not in (0, 1):
+        loss = config.ldr_weight * loss
     if config.hdr_weight > 0 and target.exposure_truth is not None:
         loss = loss + config.hdr_weight * hdr_loss(photo, target, config, largest_truth)
     if config.linear_weight > 0:

@@ -8,7 +8,7 @@ import scipy.ndimage
 import torch
 import torch.nn.functional as F
 
-from sehdr_warp.splatting.ssim import ssim, ssim_map
+from sehdr_warp.splatting.ssim import image_distance, ssim, ssim_map
 
 SHAPES = [(32, 48, 3), (37, 29, 3), (5, 4, 3), (1, 1, 1), (1, 40, 2), (40, 1, 3), (11, 11, 1), (16, 9, 27), (3, 2, 9)]
 
@@ -65,6 +65,23 @@ def test_values_and_gradients_equal_the_convolution(shape, dtype, tolerance, dev
     assert (ssim_map(x, y).double() - expected_map).abs().max() < 20 * tolerance
     assert relative_error(x.grad, expected[0]) < 10 * tolerance
     assert relative_error(y.grad, expected[1]) < 10 * tolerance
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-5), (torch.float64, 1e-12)])
+def test_the_distance_is_the_weighted_sum(shape, dtype, tolerance, device, lanes):
+    a, b = images(shape, device)
+    a.view(-1)[1::5] = b.view(-1)[1::5]  # where they are equal, |a - b| pulls neither way
+    a.requires_grad_()
+    expected = 0.7 * (a - b).abs().mean() + 0.3 * (1 - conv_ssim(a, b).mean())
+    expected.backward()
+    x, y = a.detach().to(dtype).requires_grad_(), b.to(dtype)
+    value = image_distance(x, y, 0.7, 0.3)
+    (2 * value).backward()
+    assert value.dtype == dtype and value.shape == ()
+    assert abs(value.item() - expected.item()) < tolerance
+    # Of equal numbers float32 makes equal numbers: the sides are those of float64.
+    assert relative_error(x.grad / 2, a.grad) < 10 * tolerance
 
 
 def test_gradient_equals_finite_differences(device, lanes):
