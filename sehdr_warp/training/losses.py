@@ -11,6 +11,7 @@ from ..model.radiance_field import Photograph, RadianceField
 from ..model.response import Response, ToneMapper
 from ..model.response_curve import EXTENSION_SLOPE
 from ..model.response_refined import RefinedResponse
+from ..splatting.one_sided import seen_by_photo
 from ..splatting.ssim import image_distance, ssim
 from .config import LossConfig
 
@@ -87,18 +88,26 @@ def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Re
     """The photo against the simulated one, L_LDR: of encoded values, or with domain "mu-law" of exposures, for which
     the response is needed. With `clipping` one-sided where the camera saturated; see also LossConfig.interval."""
     prediction, truth = photo.encoded, target.encoded
-    lower, upper = truth - CODE / 2, truth + CODE / 2
     if config.domain == "mu-law" or (config.domain == "auto" and _is_decodable(photo, response)):
         known = known_response(response)
         white, mu = known.white, mu_of_knee(known, config.knee)
-        prediction = mu_law(_light(photo, response), white, mu)
+        light = _light(photo, response)
         if config.interval == "off":
             # Bounds count at white and at black alone, and there half a code is the same everywhere.
-            truth = mu_law(known.decode(truth) if target.light is None else target.light, white, mu)
-            below_white, above_black = _half_codes(known, mu)
-            lower, upper = truth - below_white, truth + above_black
+            half_codes = _half_codes(known, mu)
+            photo_light = known.decode(truth) if target.light is None else target.light
+            if config.clipping and light.device.type == "cuda":
+                masks = target.clipped, target.black
+                seen, truth = seen_by_photo(light, photo_light, *masks, white=white, mu=mu, half_codes=half_codes)
+                return image_loss(seen, truth, target.mask, config.form, config.ssim_weight)
+            truth = mu_law(photo_light, white, mu)
+            lower, upper = truth - half_codes[0], truth + half_codes[1]
         else:
-            truth, lower, upper = (mu_law(known.decode(image), white, mu) for image in (truth, lower, upper))
+            bounds = truth, truth - CODE / 2, truth + CODE / 2
+            truth, lower, upper = (mu_law(known.decode(image), white, mu) for image in bounds)
+        prediction = mu_law(light, white, mu)
+    else:
+        lower, upper = truth - CODE / 2, truth + CODE / 2
     plain = prediction
     if config.clipping or config.interval != "off":
         bounded = target if config.clipping else replace(target, clipped=None, black=None)
