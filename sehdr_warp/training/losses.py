@@ -167,17 +167,21 @@ def mu_law(exposure: Tensor, white: float, mu: float = MU) -> Tensor:
     return torch.log1p(exposure * (mu / white)) / math.log1p(mu)
 
 
-def highlight_prior(light: Tensor, clipped: Tensor | None, white: float, stops: Tensor | None) -> Tensor:
+def highlight_prior(
+    light: Tensor, clipped: Tensor | None, white: float, stops: Tensor | None, mask: Tensor | None = None
+) -> Tensor:
     """Mean over the image of |stops over white - expected ones| at clipped pixels brighter than white, 0 at the others.
 
     light: [H, W, 3] exposures; clipped: [H, W, 3] bool; stops: [4], as Target.highlights, by how many channels of the
-    pixel clip. The photo says `at least white` there and nothing else does.
+    pixel clip; mask: [H, W, 1] or None: pixels outside count nothing. The photo says `at least white` there and nothing
+    else does.
     """
     if clipped is None or stops is None:
         return light.new_zeros(())
     expected = stops[clipped.sum(dim=-1, keepdim=True)]
     excess = torch.log2(light.clamp_min(white) / white)
-    return torch.where(clipped & (light > white), (excess - expected).abs(), 0.0).mean()
+    distance = torch.where(clipped & (light > white), (excess - expected).abs(), 0.0)
+    return distance.mean() if mask is None else (distance * mask).mean() / mask.mean().clamp_min(1e-6)
 
 
 def anchor_loss(mapper: ToneMapper, value: float) -> Tensor:
@@ -242,7 +246,8 @@ def total_loss(
         linear = linear_loss(photo, target, config)
         loss = loss if linear is None else loss + config.linear_weight * linear
     if config.highlight_weight > 0:
-        prior = highlight_prior(photo.light, target.clipped, known_response(field.response).white, target.highlights)
+        white = known_response(field.response).white
+        prior = highlight_prior(photo.light, target.clipped, white, target.highlights, target.mask)
         loss = loss + config.highlight_weight * prior
     if config.anchor_weight > 0:
         loss = loss + config.anchor_weight * anchor_loss(field.response, config.anchor_value)

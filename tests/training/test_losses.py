@@ -227,6 +227,8 @@ def test_the_highlight_prior_expects_more_where_more_channels_clip():
     # Two stops over white, in one, two and three channels of nine.
     expected = torch.tensor([9.0, 0.5, 1.0, 1.75])
     assert highlight_prior(light, clipped, 1.0, expected).item() == pytest.approx((1.5 + 2 * 1.0 + 3 * 0.25) / 9)
+    mask = torch.tensor([0.0, 1.0, 0.0]).double().reshape(1, 3, 1)
+    assert highlight_prior(light, clipped, 1.0, expected, mask).item() == pytest.approx(2 * 1.0 / 3)
 
 
 def test_priors_and_regularisers_add_what_they_weigh():
