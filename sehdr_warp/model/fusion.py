@@ -15,6 +15,7 @@ from torch import nn
 from torch.utils.checkpoint import checkpoint
 
 from ..errors import SehdrError
+from ..splatting.exposure_fusion import fuse_exposures
 from ..splatting.interpolation import interpolate
 from .exposure import bracket_log_radiance, exposure_times
 from .response_curve import Response
@@ -79,6 +80,7 @@ class NeuralExposureFusion(nn.Module):
         self.weights, self.biases = _channel_layers([2, *[width] * hidden_layers, 1], seed)
         brackets = [math.log(time / self.base_time) for time in self.times]
         self._low = math.log(response.decode(response.black + DARKEST_VALUE)) - max(brackets)
+        self._kept_nodes = None
         self._high = math.log(response.white) + OCTAVES_ABOVE_WHITE * math.log(2) - min(brackets)
 
     def forward(self, log_base: torch.Tensor) -> torch.Tensor:
@@ -91,12 +93,20 @@ class NeuralExposureFusion(nn.Module):
 
     def fusion_weights(self, log_base: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The weights w and the encoded brackets f(c^{l_p}) behind the sum, each [n, N, 3], for [N, 3] log c^{l_1}."""
-        encoded = self.response.encode_extended(bracket_log_radiance(log_base, self.times, self.base_time).exp())
+        encoded = self._encode(log_base)
+        return self._weights(encoded), encoded
+
+    def _encode(self, log_base):
+        """[n, N, 3] the encoded brackets of log_base [N, 3]."""
+        return self.response.encode_extended(bracket_log_radiance(log_base, self.times, self.base_time).exp())
+
+    def _weights(self, encoded):
+        """[n, N, 3] weights that sum to 1 over the brackets."""
         sigma = self.log_sigma.clamp(-MAX_LOG_SIGMA, MAX_LOG_SIGMA).exp()
         deviation = ((encoded - 0.5) / sigma).clamp(-MAX_DEVIATION, MAX_DEVIATION)
         exposedness = (-0.5 * deviation.square()).exp()
         logits = self._channel_mlps(torch.stack([exposedness, encoded], dim=-1)) * exposedness
-        return logits.softmax(dim=0), encoded
+        return logits.softmax(dim=0)
 
     def _fuse(self, log_base):
         weights, encoded = self.fusion_weights(log_base)
@@ -114,11 +124,10 @@ class NeuralExposureFusion(nn.Module):
     def _interpolate(self, log_base):
         """Catmull-Rom between the table's nodes; constant below them, a straight line in log radiance above."""
         step = (self._high - self._low) / (self.nodes - 1)
-        # One node more at either end gives every cell its four.
-        grid = torch.arange(-1, self.nodes + 1, dtype=log_base.dtype, device=log_base.device) * step + self._low
-        table = self._fuse(grid[:, None].expand(-1, 3))
         plain = log_base.dtype != torch.float32 or torch.are_deterministic_algorithms_enabled()
-        if log_base.device.type == "cuda" and not plain:
+        on_gpu = log_base.device.type == "cuda" and not plain
+        table = self._table(log_base, step, on_gpu)
+        if on_gpu:
             return interpolate(table, self._low, step, log_base)
         position = ((log_base - self._low) / step).clamp_min(0.0)
         cell = position.detach().nan_to_num(0.0).clamp_max(self.nodes - 2).long()
@@ -131,6 +140,27 @@ class NeuralExposureFusion(nn.Module):
         square = 3.0 * rise - 2.0 * slope_left - slope_right
         value = left + inside * (slope_left + inside * (square + inside * cubic))
         return value + (part - inside) * slope_right
+
+    def _table(self, like, step, on_gpu):
+        """[nodes + 2, 3] the fused values at the table's nodes."""
+        encoded = self._encoded_at_nodes(like, step)
+        if on_gpu and not encoded.requires_grad and len(self.weights) == 2:
+            layers = (part for layer in zip(self.weights, self.biases, strict=True) for part in layer)
+            limits = {"log_sigma_limit": MAX_LOG_SIGMA, "deviation_limit": MAX_DEVIATION}
+            return fuse_exposures(encoded, self.log_sigma, *layers, scale=self.radiance_scale, **limits)
+        return self.radiance_scale * (self._weights(encoded) * encoded).sum(dim=0)
+
+    def _encoded_at_nodes(self, like, step):
+        """[n, nodes + 2, 3] the encoded brackets at the table's nodes; kept, as long as the curve is not itself learned."""
+        key = self.response, like.device, like.dtype
+        if self._kept_nodes is not None and self._kept_nodes[0] == key:
+            return self._kept_nodes[1]
+        # One node more at either end gives every cell its four.
+        grid = torch.arange(-1, self.nodes + 1, dtype=like.dtype, device=like.device) * step + self._low
+        encoded = self._encode(grid[:, None].expand(-1, 3))
+        if not isinstance(self.response, nn.Module):
+            self._kept_nodes = key, encoded
+        return encoded
 
 
 def _radiance_scale(scale: float | str, response: Response, base_time: float) -> float:

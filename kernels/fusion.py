@@ -1,0 +1,190 @@
+"""Neural exposure fusion (SeHDR, section 3.3) at given encoded brackets, and its adjoint by what it learns.
+
+P brackets of M colours, Q = P M points of each of the three channels, in the order [3, P, M]. The perceptron of a channel
+has H hidden units: its terms of a point are read by all threads of a warp at once, or a warp's threads are its units.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+POINTS_PER_THREAD = 64
+"""Of one hidden unit's gradients, summed before the atomics."""
+
+
+@cache
+def fusion_kernels(dtype) -> SimpleNamespace:
+    """perceptrons, mix, mix_adjoint, unit_adjoint and point_adjoint for one scalar type.
+
+    encoded, exposedness, outputs and what is made of them: [3, Q]; inner [3, 2, H], inner_bias, outer [3, H], outer_bias
+    [3]: the perceptrons' weights; log_sigma: [3]; results: [M, 3].
+    """
+    real = dtype
+
+    @wp.func
+    def deviation_of(encoded: real, log_sigma: real, most_log: real, most: real) -> real:
+        sigma = wp.exp(wp.clamp(log_sigma, -most_log, most_log))
+        return wp.clamp((encoded - real(0.5)) / sigma, -most, most)
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    def perceptrons(
+        encoded: wp.array2d(dtype=real),
+        log_sigma: wp.array(dtype=real),
+        most_log: real,
+        most: real,
+        inner: wp.array3d(dtype=real),
+        inner_bias: wp.array2d(dtype=real),
+        outer: wp.array2d(dtype=real),
+        outer_bias: wp.array(dtype=real),
+        exposedness: wp.array2d(dtype=real),
+        outputs: wp.array2d(dtype=real),
+    ):
+        """exposedness: exp(-d^2 / 2) of the deviations from mid grey; outputs: of the perceptron of both."""
+        channel, point = wp.tid()
+        x = encoded[channel, point]
+        deviation = deviation_of(x, log_sigma[channel], most_log, most)
+        near = wp.exp(real(-0.5) * deviation * deviation)
+        output = outer_bias[channel]
+        for unit in range(outer.shape[1]):
+            value = inner[channel, 0, unit] * near + inner[channel, 1, unit] * x + inner_bias[channel, unit]
+            output += outer[channel, unit] * wp.max(value, real(0.0))
+        exposedness[channel, point] = near
+        outputs[channel, point] = output
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    def mix(
+        encoded: wp.array2d(dtype=real),
+        exposedness: wp.array2d(dtype=real),
+        outputs: wp.array2d(dtype=real),
+        brackets: int,
+        scale: real,
+        results: wp.array2d(dtype=real),
+    ):
+        """scale times the mean of the encoded brackets, weighted by the softmax of outputs times exposedness."""
+        place, channel = wp.tid()
+        count = results.shape[0]
+        largest = outputs[channel, place] * exposedness[channel, place]
+        for p in range(1, brackets):
+            largest = wp.max(largest, outputs[channel, p * count + place] * exposedness[channel, p * count + place])
+        total = real(0.0)
+        weighted = real(0.0)
+        for p in range(brackets):
+            q = p * count + place
+            weight = wp.exp(outputs[channel, q] * exposedness[channel, q] - largest)
+            total += weight
+            weighted += weight * encoded[channel, q]
+        results[place, channel] = scale * weighted / total
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    def mix_adjoint(
+        encoded: wp.array2d(dtype=real),
+        exposedness: wp.array2d(dtype=real),
+        outputs: wp.array2d(dtype=real),
+        brackets: int,
+        scale: real,
+        results: wp.array2d(dtype=real),
+        result_gradients: wp.array2d(dtype=real),
+        by_exposedness: wp.array2d(dtype=real),
+        by_output: wp.array2d(dtype=real),
+    ):
+        """by_exposedness: through the logits alone."""
+        place, channel = wp.tid()
+        count = results.shape[0]
+        largest = outputs[channel, place] * exposedness[channel, place]
+        for p in range(1, brackets):
+            largest = wp.max(largest, outputs[channel, p * count + place] * exposedness[channel, p * count + place])
+        total = real(0.0)
+        for p in range(brackets):
+            q = p * count + place
+            total += wp.exp(outputs[channel, q] * exposedness[channel, q] - largest)
+        gradient = result_gradients[place, channel]
+        for p in range(brackets):
+            q = p * count + place
+            weight = wp.exp(outputs[channel, q] * exposedness[channel, q] - largest) / total
+            by_logit = gradient * weight * (scale * encoded[channel, q] - results[place, channel])
+            by_exposedness[channel, q] = by_logit * outputs[channel, q]
+            by_output[channel, q] = by_logit * exposedness[channel, q]
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    def unit_adjoint(
+        encoded: wp.array2d(dtype=real),
+        exposedness: wp.array2d(dtype=real),
+        by_output: wp.array2d(dtype=real),
+        inner: wp.array3d(dtype=real),
+        inner_bias: wp.array2d(dtype=real),
+        outer: wp.array2d(dtype=real),
+        points: int,
+        by_inner: wp.array3d(dtype=real),
+        by_inner_bias: wp.array2d(dtype=real),
+        by_outer: wp.array2d(dtype=real),
+        by_outer_bias: wp.array(dtype=real),
+    ):
+        """Added to: the gradients by the perceptrons' weights, of `points` points a thread."""
+        channel, chunk, unit = wp.tid()
+        first_weight = inner[channel, 0, unit]
+        second_weight = inner[channel, 1, unit]
+        bias = inner_bias[channel, unit]
+        outer_weight = outer[channel, unit]
+        by_first = real(0.0)
+        by_second = real(0.0)
+        by_bias = real(0.0)
+        by_out = real(0.0)
+        output_sum = real(0.0)
+        for q in range(chunk * points, wp.min((chunk + 1) * points, encoded.shape[1])):
+            near = exposedness[channel, q]
+            x = encoded[channel, q]
+            gradient = by_output[channel, q]
+            value = first_weight * near + second_weight * x + bias
+            output_sum += gradient
+            if value > real(0.0):
+                by_out += gradient * value
+                through = gradient * outer_weight
+                by_bias += through
+                by_first += through * near
+                by_second += through * x
+        wp.atomic_add(by_inner, channel, 0, unit, by_first)
+        wp.atomic_add(by_inner, channel, 1, unit, by_second)
+        wp.atomic_add(by_inner_bias, channel, unit, by_bias)
+        wp.atomic_add(by_outer, channel, unit, by_out)
+        if unit == 0:
+            wp.atomic_add(by_outer_bias, channel, output_sum)
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    def point_adjoint(
+        encoded: wp.array2d(dtype=real),
+        exposedness: wp.array2d(dtype=real),
+        by_exposedness: wp.array2d(dtype=real),
+        by_output: wp.array2d(dtype=real),
+        log_sigma: wp.array(dtype=real),
+        most_log: real,
+        most: real,
+        inner: wp.array3d(dtype=real),
+        inner_bias: wp.array2d(dtype=real),
+        outer: wp.array2d(dtype=real),
+        by_log_sigma: wp.array2d(dtype=real),
+    ):
+        """by_log_sigma: [3, Q], to be summed over Q."""
+        channel, point = wp.tid()
+        x = encoded[channel, point]
+        near = exposedness[channel, point]
+        through = real(0.0)
+        for unit in range(outer.shape[1]):
+            weight = inner[channel, 0, unit]
+            if weight * near + inner[channel, 1, unit] * x + inner_bias[channel, unit] > real(0.0):
+                through += outer[channel, unit] * weight
+        gradient = by_exposedness[channel, point] + by_output[channel, point] * through
+        log = log_sigma[channel]
+        deviation = (x - real(0.5)) / wp.exp(wp.clamp(log, -most_log, most_log))
+        result = real(0.0)
+        if wp.abs(log) <= most_log and wp.abs(deviation) <= most:
+            result = gradient * near * deviation * deviation
+        by_log_sigma[channel, point] = result
+
+    return SimpleNamespace(
+        perceptrons=perceptrons,
+        mix=mix,
+        mix_adjoint=mix_adjoint,
+        unit_adjoint=unit_adjoint,
+        point_adjoint=point_adjoint,
+    )

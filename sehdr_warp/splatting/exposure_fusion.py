@@ -1,0 +1,110 @@
+"""Neural exposure fusion of given brackets as a torch operation (kernels/fusion.py)."""
+
+import torch
+import warp as wp
+
+from ..kernels.fusion import POINTS_PER_THREAD, fusion_kernels
+from .arrays import view, warp_scalar
+from .bridge import torch_stream
+
+
+def fuse_exposures(
+    encoded: torch.Tensor,
+    log_sigma: torch.Tensor,
+    inner: torch.Tensor,
+    inner_bias: torch.Tensor,
+    outer: torch.Tensor,
+    outer_bias: torch.Tensor,
+    *,
+    scale: float,
+    log_sigma_limit: float,
+    deviation_limit: float,
+) -> torch.Tensor:
+    """[M, 3]: scale times the encoded brackets [P, M, 3], weighted by the softmax over P of MLP_c(gamma, encoded) gamma.
+
+    gamma = exp(-d^2 / 2), d = (encoded - 0.5) / exp(log_sigma), with log_sigma [3] and d held within their limits. The
+    perceptrons, one a channel: inner [3, 2, H], inner_bias [3, 1, H], ReLU, outer [3, H, 1], outer_bias [3, 1, 1].
+    Differentiable once with respect to all but the brackets; sums of gradients are made in no fixed order on a GPU.
+    All contiguous, of one type, float32 or float64, and on one device; raises ValueError for other shapes.
+    """
+    hidden = inner.shape[-1]
+    shapes = {
+        "encoded": (encoded, (*encoded.shape[:2], 3)),
+        "log_sigma": (log_sigma, (3,)),
+        "inner": (inner, (3, 2, hidden)),
+        "inner_bias": (inner_bias, (3, 1, hidden)),
+        "outer": (outer, (3, hidden, 1)),
+        "outer_bias": (outer_bias, (3, 1, 1)),
+    }
+    for name, (tensor, shape) in shapes.items():
+        if tuple(tensor.shape) != shape or tensor.dtype != encoded.dtype or tensor.device != encoded.device:
+            raise ValueError(
+                f"{name} is {tensor.dtype} {list(tensor.shape)} on {tensor.device}, expected {encoded.dtype} "
+                f"{list(shape)} on {encoded.device}"
+            )
+    return _Fusion.apply(
+        encoded, log_sigma, inner, inner_bias, outer, outer_bias, scale, log_sigma_limit, deviation_limit
+    )
+
+
+class _Fusion(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, encoded, log_sigma, inner, inner_bias, outer, outer_bias, *numbers):
+        scale, *limits = numbers
+        brackets, count, _ = encoded.shape
+        by_channel = encoded.detach().permute(2, 0, 1).reshape(3, -1).contiguous()
+        weights = [tensor.detach().contiguous() for tensor in (inner, inner_bias, outer, outer_bias)]
+        log_sigma = log_sigma.detach().contiguous()
+        exposedness, outputs = torch.empty_like(by_channel), torch.empty_like(by_channel)
+        results = encoded.new_empty(count, 3)
+        run = _Launches(encoded)
+        run("perceptrons", by_channel.shape, by_channel, log_sigma, *limits, *_flat(weights), exposedness, outputs)
+        run("mix", results.shape, by_channel, exposedness, outputs, brackets, scale, results)
+        ctx.save_for_backward(by_channel, log_sigma, *weights, exposedness, outputs, results)
+        ctx.numbers = brackets, scale, limits
+        return results
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradients):
+        encoded, log_sigma, *weights, exposedness, outputs, results = ctx.saved_tensors
+        brackets, scale, limits = ctx.numbers
+        by_exposedness, by_output, by_log_sigma = (torch.empty_like(encoded) for _ in range(3))
+        sizes = [weight.numel() for weight in weights]
+        zeros = encoded.new_zeros(sum(sizes)).split(sizes)
+        by_weights = [part.view(weight.shape) for part, weight in zip(zeros, weights, strict=True)]
+        inner, inner_bias, outer, _ = _flat(weights)
+        run = _Launches(encoded)
+        mixed = encoded, exposedness, outputs, brackets, scale, results, gradients.contiguous()
+        run("mix_adjoint", results.shape, *mixed, by_exposedness, by_output)
+        chunks = -(-encoded.shape[1] // POINTS_PER_THREAD)
+        learned = inner, inner_bias, outer
+        run(
+            "unit_adjoint",
+            (3, chunks, outer.shape[1]),
+            *(encoded, exposedness, by_output, *learned, POINTS_PER_THREAD, *_flat(by_weights)),
+        )
+        points = encoded, exposedness, by_exposedness, by_output, log_sigma, *limits
+        run("point_adjoint", encoded.shape, *points, *learned, by_log_sigma)
+        return None, by_log_sigma.sum(1), *by_weights, None, None, None
+
+
+def _flat(weights):
+    """inner [3, 2, H], inner_bias [3, H], outer [3, H] and outer_bias [3]: without the axes of length 1."""
+    inner, inner_bias, outer, outer_bias = weights
+    return inner, inner_bias.view(3, -1), outer.view(3, -1), outer_bias.view(3)
+
+
+class _Launches:
+    """Launches of fusion_kernels where a tensor is, on torch's stream."""
+
+    def __init__(self, like: torch.Tensor):
+        self.device = like.device
+        self.kernels = fusion_kernels(warp_scalar(like.dtype))
+
+    def __call__(self, name: str, shape, *arguments) -> None:
+        inputs = [view(value) if isinstance(value, torch.Tensor) else value for value in arguments]
+        with torch_stream(self.device):
+            kernel = getattr(self.kernels, name)
+            device = wp.device_from_torch(self.device)
+            wp.launch(kernel, dim=tuple(shape), inputs=inputs, device=device, record_tape=False)

@@ -1,0 +1,59 @@
+"""The fusion's kernels against NeuralExposureFusion's own torch operations, and finite differences."""
+
+import pytest
+import torch
+
+from sehdr_warp.model.fusion import MAX_DEVIATION, MAX_LOG_SIGMA, NeuralExposureFusion
+from sehdr_warp.model.response import response_by_name
+from sehdr_warp.splatting.exposure_fusion import fuse_exposures
+
+from .scenes import relative_error
+
+LIMITS = {"log_sigma_limit": MAX_LOG_SIGMA, "deviation_limit": MAX_DEVIATION}
+
+
+def learned(dtype, device="cpu", width=24, sigmas=(-1.6, -0.4, 0.5)):
+    fusion = NeuralExposureFusion(response_by_name("srgb"), (0.125, 0.5, 4.0), 0.5, width=width, radiance_scale=2.5)
+    with torch.no_grad():
+        fusion.log_sigma.copy_(torch.tensor(sigmas))
+    return fusion.to(device, dtype)
+
+
+def parts(fusion):
+    (inner, outer), (inner_bias, outer_bias) = fusion.weights, fusion.biases
+    return fusion.log_sigma, inner, inner_bias, outer, outer_bias
+
+
+def brackets(count=200):
+    return 1.3 * torch.rand(3, count, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+
+
+# The last: within the limits' reach, where deviations are held and pull no longer.
+@pytest.mark.parametrize("sigmas", [(-1.6, -0.4, 0.5), (-4.0, 31.0, -31.0)])
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-5), (torch.float64, 1e-12)])
+def test_values_and_gradients_are_those_of_torch(device, dtype, bound, sigmas):
+    encoded = brackets()
+    upstream = torch.randn(200, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    plain, ours = learned(torch.float64, sigmas=sigmas), learned(dtype, device, sigmas=sigmas)
+    truth = 2.5 * (plain._weights(encoded) * encoded).sum(0)
+    (truth * upstream).sum().backward()
+    value = fuse_exposures(encoded.to(device, dtype), *parts(ours), scale=2.5, **LIMITS)
+    (value * upstream.to(device, dtype)).sum().backward()
+    assert relative_error(value, truth) < bound
+    for name, mine, true in zip(("sigma", "W", "b", "V", "c"), parts(ours), parts(plain), strict=True):
+        assert mine.grad.shape == true.grad.shape
+        assert relative_error(mine.grad, true.grad) < 10 * bound, name
+
+
+def test_gradients_match_finite_differences(device):
+    encoded = brackets(5).to(device)
+    leaves = [part.detach().requires_grad_() for part in parts(learned(torch.float64, device, width=4))]
+    assert torch.autograd.gradcheck(lambda *given: fuse_exposures(encoded, *given, scale=1.5, **LIMITS), leaves)
+
+
+def test_what_does_not_fit_is_refused(device):
+    given = parts(learned(torch.float32, device))
+    with pytest.raises(ValueError, match=r"encoded is torch.float32 \[3, 200, 2\]"):
+        fuse_exposures(brackets().float().to(device)[..., :2], *given, scale=1.0, **LIMITS)
+    with pytest.raises(ValueError, match="log_sigma is torch.float32"):
+        fuse_exposures(brackets().to(device), *given, scale=1.0, **LIMITS)
