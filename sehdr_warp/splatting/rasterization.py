@@ -24,6 +24,7 @@ class Rendering:
     radii: [N] the longer half-extent in pixels within which a Gaussian counts; 0 where culled.
     entry_count: (Gaussian, tile) pairs that there was room for.
     overflow: scalar bool tensor, whether the given capacity left some of them out; None without a capacity.
+    pair_count: scalar int64 tensor, how many there are; None from rasterizers that do not count them.
     """
 
     image: torch.Tensor
@@ -33,6 +34,7 @@ class Rendering:
     radii: torch.Tensor
     entry_count: int
     overflow: torch.Tensor | None = None
+    pair_count: torch.Tensor | None = None
 
     @property
     def visible(self) -> torch.Tensor:
@@ -115,7 +117,8 @@ def rasterize(
         alpha_threshold=alpha_threshold,
         style=style,
     )
-    return Rendering(image, alpha, means2d, depths, extents.amax(dim=1), lists.entry_count, lists.overflow)
+    radii = extents.amax(dim=1)
+    return Rendering(image, alpha, means2d, depths, radii, lists.entry_count, lists.overflow, lists.total)
 
 
 def _check_tensors(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics) -> None:

@@ -30,6 +30,7 @@ class TileLists:
         threshold.
     columns, rows: tiles across and down.
     overflow: scalar bool, whether a given capacity was too small for all entries; None without a capacity.
+    total: scalar int64, how many entries there are, with or without room for them.
     """
 
     order: torch.Tensor
@@ -42,6 +43,7 @@ class TileLists:
     columns: int
     rows: int
     overflow: torch.Tensor | None
+    total: torch.Tensor
 
     @property
     def entry_count(self) -> int:
@@ -85,7 +87,7 @@ def build_tile_lists(
     tiles, gaussians = emit_entries(order, shapes, ellipses, extents, columns, rows, ends, room, capacity is not None)
     tiles, gaussians, places = sort_by_tile(tiles, gaussians, room, tile_count, emission)
     ranges = find_ranges(tiles, tile_count)
-    return TileLists(order, ends, ranges, gaussians, places, shapes, ellipses, columns, rows, overflow)
+    return TileLists(order, ends, ranges, gaussians, places, shapes, ellipses, columns, rows, overflow, total)
 
 
 def _exact_room(total: int, gaussian_count: int, columns: int, rows: int) -> int:

@@ -29,14 +29,12 @@ from .optimizer import (
     optimizer_tensors,
     set_means_rate,
 )
+from .pair_room import PairRoom
 from .targets import TrainingView, ViewStack, largest_truth, training_views
 from .thinning import contributing, degree_gain
 
 CHECK_EVERY = 20
 """Iterations between looks at the count of skipped steps, each of which waits for the device."""
-ROOM_TO_GROW = 2.0
-"""A recorded step has room for this many times the (Gaussian, tile) pairs of the step before it: photos differ."""
-LEAST_ROOM = 1 << 14
 DECODED_PIXELS = 1 << 27
 """Photos of so many pixels in all are kept decoded as well, in 1.6 GB at most; those of more are decoded in each step."""
 
@@ -68,12 +66,11 @@ class Trainer:
         self._order_generator = torch.Generator().manual_seed(config.seed)
         self._generator = torch.Generator(device=self.device).manual_seed(config.seed)
         self._skipped = torch.zeros((), device=self.device)
-        self._incomplete = torch.zeros((), device=self.device)
         self._index = torch.zeros(1, dtype=torch.int64, device=self.device)
         recorded = self.device.type == "cuda" and config.schedule.recorded
         self._recorder = GraphRecorder(self.device) if recorded else None
         self._launched: set = set()
-        self._pairs = 0
+        self._room = PairRoom(self.device)
         self._last: tuple[Tensor, Tensor, Tensor] | None = None
         self._presence: Tensor | None = None
         self._degree_limit = config.model.harmonics_degree
@@ -189,9 +186,9 @@ class Trainer:
         if self._early_stop.patience:
             self._loss_sum += loss.detach()
         if capacity is None:
-            self._pairs = max(self._pairs, photo.rendering.entry_count)
+            self._room.launched(photo.rendering.entry_count)
         else:
-            self._incomplete += photo.rendering.overflow
+            self._room.note(photo.rendering.pair_count)
         return loss.detach(), (photo.encoded if self._encoded else photo.light).detach(), view.target.encoded
 
     def _hold_response(self) -> bool:
@@ -256,12 +253,12 @@ class Trainer:
             return False
         if self.field.radiance == "display" and not isinstance(views.times, float):
             return False
-        ready = kind in self._launched and self._pairs > 0
+        ready = kind in self._launched and self._room.known
         self._launched.add(kind)
         return ready
 
     def _replay(self, views: ViewStack, index: int, watched: bool, kind) -> tuple[Tensor, Tensor, Tensor]:
-        capacity = max(LEAST_ROOM, int(ROOM_TO_GROW * self._pairs))
+        capacity = self._room.capacity(len(views))
         self._index.fill_(index)
         try:
             return self._recorder.run(
@@ -281,7 +278,7 @@ class Trainer:
         """The Gaussians are others, `growth` times as many: they will need about so many times the room."""
         if self._recorder is not None:
             self._recorder.invalidate()
-            self._pairs = math.ceil(self._pairs * growth)
+            self._room.change(growth)
 
     def check(self) -> None:
         """Raises SehdrError if more than schedule.nonfinite_limit steps were skipped."""
@@ -291,11 +288,9 @@ class Trainer:
                 f"iteration {self.iteration}: {self.skipped_steps} steps had a loss or gradient that is not finite, "
                 f"more than schedule.nonfinite_limit = {limit}; lower the learning rates or check photos and cameras"
             )
-        if self._recorder is not None and self._incomplete:
-            # Steps without room for all pairs changed nothing; record again with room for any photo.
-            self._incomplete.zero_()
+        if self._recorder is not None and self._room.look():
+            # Steps without room for all pairs changed nothing; record again with what they needed.
             self._recorder.invalidate()
-            self._pairs *= 2
 
     def state(self) -> tuple[dict[str, Tensor], dict]:
         """Named tensors and plain values that together are the whole state."""
@@ -343,6 +338,7 @@ class Trainer:
         if level not in self._levels:
             # One resolution at a time: the coarser ones are not needed again.
             views = self._upload(level)
+            self._room.resize()
             self._levels = {level: ViewStack.of(views) or views}
         return self._levels[level]
 

@@ -1,0 +1,69 @@
+"""How much room for (Gaussian, tile) pairs recorded steps get: fixed when they are recorded, while photos differ."""
+
+import math
+
+import torch
+from torch import Tensor
+
+ROOM_UNSEEN = 1.5
+"""Room in multiples of the most pairs seen, while fewer steps were replayed than there are photos. In the embedded scenes,
+trained for 300 steps, the photo with most pairs has up to 1.32 times those of the one with fewest."""
+ROOM_SEEN = 1.25
+"""And afterwards: for what 100 steps change. Of photos beyond 100 the greatest may be among those not yet seen."""
+PHOTOS_SEEN = 100
+KEPT = 0.97
+"""What a change of the Gaussians keeps at least of the room: after a reset of the opacities pairs are few for a while."""
+LEAST_ROOM = 1 << 14
+
+
+class PairRoom:
+    """Counts pairs on the device and says how many the next recording gets room for."""
+
+    def __init__(self, device: torch.device | str):
+        self._needed = torch.zeros((), dtype=torch.int64, device=device)
+        self._pairs = 0
+        self._steps = 0
+        self._given = 0
+
+    @property
+    def known(self) -> bool:
+        """Whether any step was launched whose pairs were counted exactly."""
+        return self._pairs > 0
+
+    def launched(self, pairs: int) -> None:
+        """A step was launched with exactly so many pairs."""
+        self._pairs = max(self._pairs, pairs)
+
+    def note(self, pairs: Tensor) -> None:
+        """Part of a recorded step: the pairs [] that it would have needed, int64."""
+        torch.maximum(self._needed, pairs, out=self._needed)
+
+    def capacity(self, photos: int) -> int:
+        """The room for pairs of the step that is recorded or replayed now; stays until one of the calls below."""
+        self._steps += 1
+        if not self._given:
+            factor = ROOM_SEEN if self._steps > min(photos, PHOTOS_SEEN) else ROOM_UNSEEN
+            self._given = max(LEAST_ROOM, math.ceil(factor * self._pairs))
+        return self._given
+
+    def look(self) -> bool:
+        """Whether steps since the last look lacked room; the next recording then has what they needed. Waits for the
+        device."""
+        needed = int(self._needed)
+        if not 0 < self._given < needed:
+            return False
+        self._pairs, self._given = needed, 0
+        return True
+
+    def change(self, growth: float) -> None:
+        """The Gaussians are others, `growth` times as many. Waits for the device."""
+        needed = int(self._needed) or self._pairs
+        # The kept part does not grow: new Gaussians are smaller, and pairs grow more slowly than their number.
+        self._pairs = math.ceil(max(needed * growth, KEPT * self._pairs))
+        self._needed.zero_()
+        self._given = 0
+
+    def resize(self) -> None:
+        """The photos have another size: what was seen of them says little."""
+        self._needed.zero_()
+        self._steps = self._given = 0
