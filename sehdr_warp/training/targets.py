@@ -29,15 +29,13 @@ class TrainingView:
 class ViewStack:
     """V training views of one size in shared memory: [i] is view i; at() takes the view whose number is on the device.
 
-    cameras: poses [V, 4, 4], intrinsics [V, 4], positions [V, 3]; times: exposure times in seconds [V], float32, or
+    cameras: [V, 24], each view's pose [4, 4], intrinsics [4], position [3] and a 0; times: exposure times in seconds [V], float32, or
     one float where all are equal; the rest as in Target, each [V, ...] or None.
     """
 
     width: int
     height: int
-    poses: Tensor
-    intrinsics: Tensor
-    positions: Tensor
+    cameras: Tensor
     times: Tensor | float
     images: dict[str, Tensor | None]
 
@@ -61,15 +59,19 @@ class ViewStack:
         cameras = [view.camera for view in views]
         return ViewStack(
             *sizes.pop(),
-            torch.stack([camera.world_to_camera for camera in cameras]),
-            torch.stack([camera.intrinsics for camera in cameras]),
-            torch.stack([camera.position for camera in cameras]),
+            # A multiple of 16 bytes each: kernels may read four numbers at once.
+            torch.stack(
+                [
+                    functional.pad(torch.cat([c.world_to_camera.flatten(), c.intrinsics, c.position]), (0, 1))
+                    for c in cameras
+                ]
+            ),
             times[0] if len(set(times)) == 1 else torch.tensor(times, device=cameras[0].position.device),
             images,
         )
 
     def __len__(self) -> int:
-        return len(self.poses)
+        return len(self.cameras)
 
     def __getitem__(self, index: int) -> TrainingView:
         time = self.times if isinstance(self.times, float) else float(self.times[index])
@@ -84,7 +86,8 @@ class ViewStack:
         return self._view(take, self.times if isinstance(self.times, float) else take(self.times))
 
     def _view(self, take, time) -> TrainingView:
-        camera = CameraTensors(self.width, self.height, take(self.poses), take(self.intrinsics), take(self.positions))
+        pose, intrinsics, position = take(self.cameras)[:23].split((16, 4, 3))
+        camera = CameraTensors(self.width, self.height, pose.view(4, 4), intrinsics, position)
         return TrainingView(camera, time, Target(**{k: None if v is None else take(v) for k, v in self.images.items()}))
 
 
