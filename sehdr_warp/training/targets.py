@@ -29,8 +29,8 @@ class TrainingView:
 class ViewStack:
     """V training views of one size in shared memory: [i] is view i; at() takes the view whose number is on the device.
 
-    cameras: [V, 24], each view's pose [4, 4], intrinsics [4], position [3] and a 0; times: exposure times in seconds [V], float32, or
-    one float where all are equal; the rest as in Target, each [V, ...] or None.
+    cameras: [V, 24], each view's pose [4, 4], intrinsics [4], position [3] and a 0; times: exposure times in seconds [V],
+    float32, or one float where all are equal; the rest as in Target, each [V, ...] or None.
     """
 
     width: int
