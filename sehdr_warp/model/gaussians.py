@@ -90,6 +90,8 @@ class Gaussians(nn.Module):
 
     def keep(self, index: Tensor, optimizer: torch.optim.Optimizer | None = None) -> None:
         """Keeps only the Gaussians at an index or mask [N], with their optimizer state."""
+        if index.dtype == torch.bool:
+            index = index.nonzero()[:, 0]  # once: each tensor indexed by a mask would wait for the device
         for name in PARAMETER_NAMES:
             self._exchange(name, getattr(self, name).detach()[index], optimizer, lambda state: state[index])
 
