@@ -179,7 +179,9 @@ class LossConfig:
         0.0, "mlp: weight of (f(1) - anchor_value)^2, which holds the scale (HDR-NeRF: 0.5)", low=0.0, high=100.0
     )
     anchor_value: float = option(0.5, "mlp: what the unit exposure is encoded as", above=0.0, high=0.999)
-    opacity_weight: float = option(0.0, "weight of the mean opacity (3DGS-MCMC: 0.01)", low=0.0, high=10.0)
+    opacity_weight: float = option(
+        0.01, "weight of the mean opacity: relocation needs some that fade (3DGS-MCMC: 0.01)", low=0.0, high=10.0
+    )
     scale_weight: float = option(0.0, "weight of the mean size (3DGS-MCMC: 0.01)", low=0.0, high=10.0)
 
     @property
@@ -193,7 +195,7 @@ class DensificationConfig:
     """How Gaussians are added and taken away."""
 
     strategy: str = option(
-        "gradient",
+        "relocation",
         "gradient: clone and split where image gradients are large (3DGS); relocation: move the dead to where the "
         "living are (3DGS-MCMC); none",
         choices=("gradient", "relocation", "none"),
@@ -202,6 +204,12 @@ class DensificationConfig:
     stop: int = option(15_000, "the iteration from which it may no longer", low=0)
     every: int = option(100, "iterations between changes", low=1)
     max_gaussians: int = option(3_000_000, "the count never exceeds this", low=1)
+    budget: float = option(
+        120.0,
+        "relocation: nor this many times the square root of the training photos' pixels, if they start with fewer; 0: "
+        "no such bound",
+        low=0.0,
+    )
     grow_gradient: float = option(
         0.0002, "gradient: mean gradient in normalised screen units that makes one grow", above=0.0
     )

@@ -201,9 +201,12 @@ def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
     return vectors + scalar * cross + torch.linalg.cross(axis, cross)
 
 
-def make_densification(config: Config, extent: float) -> Densification:
-    """The strategy that config.densification.strategy names; extent: the scene's, in world units."""
+def make_densification(config: Config, extent: float, pixels: int) -> Densification:
+    """The strategy that config.densification.strategy names; extent: the scene's, in world units; pixels: of all
+    training photos."""
     from .relocation import Relocation
 
-    kinds = {"gradient": GradientDensification, "relocation": Relocation, "none": Densification}
+    if config.densification.strategy == "relocation":
+        return Relocation(config, extent, pixels)
+    kinds = {"gradient": GradientDensification, "none": Densification}
     return kinds[config.densification.strategy](config, extent)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from .config import Config
 from .plan_scene import SceneFacts
+from .relocation import gaussian_budget
 
 LEAST_GAIN = 0.05
 """Decibels on training photos that a degree of the harmonics is kept for; of it a fifth to three fifths show
@@ -104,6 +105,11 @@ def _harmonics(facts: SceneFacts, config: Config) -> Decision:
 
 
 def _densification(facts: SceneFacts, config: Config) -> Decision:
+    options = config.densification
+    if options.strategy == "relocation":
+        most = gaussian_budget(options, facts.pixels)
+        reason = f"{options.budget:g} times the square root of {facts.pixels} pixels, below {options.max_gaussians}"
+        return Decision("densification", {}, f"at most {most} Gaussians", reason)
     unknowns = GEOMETRY_UNKNOWNS + 3 * (config.model.harmonics_degree + 1) ** 2
     determined = 3 * facts.pixels // unknowns
     budget = min(config.densification.max_gaussians, max(FEWEST_GAUSSIANS, determined, 2 * facts.points))
@@ -187,6 +193,13 @@ def _early_stop(facts: SceneFacts, config: Config) -> Decision:
 
 
 def _pruning(facts: SceneFacts, config: Config) -> Decision:
+    if config.densification.strategy == "relocation":
+        return Decision(
+            "pruning",
+            {},
+            "none",
+            f"relocation moves what fades below {config.densification.prune_opacity:g} to where it is of use",
+        )
     stated = config.schedule.stated_for
     stages = [max(1, round(part * stated)) for part in (0.29, 0.39, 0.5, 0.66)]
     return Decision(

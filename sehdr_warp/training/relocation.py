@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..model.gaussians import Gaussians
 from ..splatting import add_exploration_noise
-from .config import Config
+from .config import Config, DensificationConfig
 from .densification import Densification
 
 MOST_COPIES = 51
@@ -21,10 +21,11 @@ SEED_STEP = 1_000_003
 
 
 class Relocation(Densification):
-    """Relocation, growth and noise; see the module."""
+    """Relocation, growth and noise; see the module. pixels: of all training photos, for the budget."""
 
-    def __init__(self, config: Config, extent: float):
+    def __init__(self, config: Config, extent: float, pixels: int):
         super().__init__(config, extent)
+        self._most = gaussian_budget(self.options, pixels)
         self._sums = _relocation_sums()
 
     @torch.no_grad()
@@ -32,12 +33,12 @@ class Relocation(Densification):
         if not self._is_due(iteration):
             return False
         dead = gaussians.opacities() <= self.options.prune_opacity
-        moved = self._relocate(gaussians, dead, optimizer, generator)
+        self._relocate(gaussians, dead, optimizer, generator)
         count = gaussians.count
-        target = min(self.options.max_gaussians, int((1 + self.options.growth) * count))
+        target = min(self._most, int((1 + self.options.growth) * count))
         if target > count:
             self._add(gaussians, target - count, optimizer, generator)
-        return moved or target > count
+        return target > count
 
     def perturb(self, iteration: int, gaussians: Gaussians, means_rate: float) -> None:
         if self.options.noise == 0:
@@ -52,17 +53,17 @@ class Relocation(Densification):
             seed=(self.config.seed * SEED_STEP + iteration) % 2**31,
         )
 
-    def _relocate(self, gaussians: Gaussians, dead: Tensor, optimizer, generator) -> bool:
+    def _relocate(self, gaussians: Gaussians, dead: Tensor, optimizer, generator) -> None:
+        """Moves the dead, in place."""
         dead_index, alive = dead.nonzero()[:, 0], (~dead).nonzero()[:, 0]
         if len(dead_index) == 0 or len(alive) == 0:
-            return False
+            return
         chosen = alive[_draw(gaussians.opacities()[alive], len(dead_index), generator)]
         self._share(gaussians, chosen, optimizer)
         # In the authors' code the moved ones keep their Adam state, and only those that share lose it.
         with torch.no_grad():
             for name, values in gaussians.rows(chosen).items():
                 getattr(gaussians, name)[dead_index] = values
-        return True
 
     def _add(self, gaussians: Gaussians, count: int, optimizer, generator) -> None:
         chosen = _draw(gaussians.opacities(), count, generator)
@@ -90,6 +91,13 @@ class Relocation(Densification):
         )
         for name in ("means", "quaternions", "harmonics_dc", "harmonics_rest"):
             gaussians.forget(name, index, optimizer)
+
+
+def gaussian_budget(options: DensificationConfig, pixels: int) -> int:
+    """The most Gaussians that relocation makes for training photos of so many pixels in all."""
+    if not options.budget:
+        return options.max_gaussians
+    return min(options.max_gaussians, int(options.budget * math.sqrt(pixels)))
 
 
 def _draw(weights: Tensor, count: int, generator) -> Tensor:

@@ -185,7 +185,7 @@ def test_nothing_changes_outside_the_schedule(iteration):
 
 
 def test_none_changes_nothing():
-    strategy = make_densification(load_config("default", {"densification.strategy": "none"}), EXTENT)
+    strategy = make_densification(load_config("default", {"densification.strategy": "none"}), EXTENT, 1)
     gaussians = cloud(4)
     before = gaussians.means.detach().clone()
     strategy.perturb(gaussians, 1.0, torch.Generator())
@@ -195,7 +195,7 @@ def test_none_changes_nothing():
 
 def relocation(**options):
     values = {"densification.strategy": "relocation"} | {f"densification.{k}": v for k, v in options.items()}
-    return make_densification(load_config("default", values), EXTENT)
+    return make_densification(load_config("default", values), EXTENT, 10**6)
 
 
 def test_relocation_sums_are_equation_9():
@@ -237,8 +237,10 @@ def test_relocation_moves_the_dead_and_keeps_the_image():
                 32,
             ).image
 
-    before = image()
-    assert relocation(growth=0.0).change(600, gaussians, optimizer, generator)
+    before, tensors = image(), dict(gaussians.named_parameters())
+    # In place: what a recorded step holds of them stays good.
+    assert not relocation(growth=0.0).change(600, gaussians, optimizer, generator)
+    assert all(gaussians.get_parameter(name) is parameter for name, parameter in tensors.items())
     after = image()
     assert gaussians.count == 8 and (gaussians.opacities() > 0.005).all()
     positions = {tuple(row) for row in gaussians.means.detach().tolist()}
@@ -256,6 +258,10 @@ def test_relocation_grows_to_the_budget():
     assert gaussians.count == 104
     strategy.change(700, gaussians, optimizer, torch.Generator().manual_seed(0))
     assert gaussians.count == 104
+    # 0.106 Gaussians for each of 1000, the square root of 10^6 pixels.
+    strategy = relocation(budget=0.106)
+    strategy.change(600, gaussians, optimizer, torch.Generator().manual_seed(0))
+    assert gaussians.count == 106
 
 
 def test_noise_comes_with_the_iteration():
@@ -280,7 +286,8 @@ def test_draws_follow_the_weights():
 
 def test_strategies_by_name():
     assert isinstance(relocation(), Relocation)
-    assert isinstance(make_densification(load_config(), EXTENT), GradientDensification)
+    gradient = load_config("default", {"densification.strategy": "gradient"})
+    assert isinstance(make_densification(gradient, EXTENT, 1), GradientDensification)
 
 
 @pytest.mark.parametrize("name", ["srgb", "hdr-nerf"])

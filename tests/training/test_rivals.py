@@ -110,7 +110,7 @@ def test_weights_mix_photos_and_truth(scene):
     field = trainer_of(scene, quick()).field
 
     def loss(**weights):
-        return float(total_loss(field, photo, target, LossConfig(clipping=False, **weights), 4.0))
+        return float(total_loss(field, photo, target, LossConfig(clipping=False, opacity_weight=0.0, **weights), 4.0))
 
     ldr, hdr = loss(), loss(ldr_weight=0.0, hdr_weight=1.0)
     assert loss(ldr_weight=2.0, hdr_weight=0.6) == pytest.approx(2 * ldr + 0.6 * hdr, rel=1e-5)
