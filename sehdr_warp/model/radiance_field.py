@@ -145,7 +145,9 @@ class RadianceField(nn.Module):
             sets["base"] = base
         features = torch.cat(list(sets.values()), dim=1) if len(sets) > 1 else next(iter(sets.values()))
         rendering = self._rasterize(camera, features, capacity, presence)
-        images = dict(zip(sets, rendering.image.split(3, dim=2), strict=True))
+        # Not split where it is one: the split's derivative would be a copy.
+        parts = rendering.image.split(3, dim=2) if len(sets) > 1 else (rendering.image,)
+        images = dict(zip(sets, parts, strict=True))
         light = None if self.tone_map == "gaussian" else images["fused"] * ratio
         if light is None:
             encoded = images["encoded"]

@@ -59,10 +59,12 @@ class _SeenByPhoto(torch.autograd.Function):
                 )
         ctx.save_for_backward(slopes)
         ctx.mark_non_differentiable(truth)
+        ctx.set_materialize_grads(False)  # of truth there is none, and no zeros are wanted in its place
         return seen, truth
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, by_seen, _):
         (slopes,) = ctx.saved_tensors
-        return by_seen * slopes, None, None, None, None, None, None
+        by_light = None if by_seen is None else by_seen * slopes
+        return by_light, None, None, None, None, None, None

@@ -106,7 +106,7 @@ def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Re
             bounds = truth, truth - CODE / 2, truth + CODE / 2
             truth, lower, upper = (mu_law(known.decode(image), white, mu) for image in bounds)
         prediction = mu_law(light, white, mu)
-    else:
+    elif config.clipping or config.interval != "off":
         lower, upper = truth - CODE / 2, truth + CODE / 2
     plain = prediction
     if config.clipping or config.interval != "off":
