@@ -55,7 +55,8 @@ class Trainer:
         self.device = field.gaussians.means.device
         self.extent = scene_extent(scene)
         self.optimizer = make_optimizer(field, config, self.extent)
-        self.densification = make_densification(config, self.extent)
+        pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
+        self.densification = make_densification(config, self.extent, pixels)
         self._views = scene.train_views
         # Where light is compared, by a curve that stays: encoding the photo, some twenty operations, waits until asked for.
         self._encoded = not compares_light(config.loss, field) or isinstance(field.response, RefinedResponse)
