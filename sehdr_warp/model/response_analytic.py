@@ -5,6 +5,7 @@ import math
 import torch
 
 from ..errors import SehdrError
+from ..splatting.response_curves import FormulaCurve
 from .response_curve import HALF_CODE, Response
 
 
@@ -35,6 +36,9 @@ class PowerLaw(AnalyticResponse):
         self.name = name
         self._exponent, self._offset, self._toe_slope, self._toe_end = exponent, offset, toe_slope, toe_end
 
+    def formula(self):
+        return FormulaCurve((self._exponent, self._offset, self._toe_slope, self._toe_end))
+
     def _evaluate(self, exposure, with_slope):
         line_slope = torch.full_like(exposure, self._toe_slope) if with_slope else None
         if self._toe_end >= 1.0:
@@ -57,6 +61,7 @@ class Reinhard:
     """y = x / (1 + x), which approaches 1 and never reaches it (Reinhard et al. 2002)."""
 
     clip_exposure = math.inf
+    kind, numbers = "reinhard", ()
 
     def evaluate(self, exposure, with_slope):
         # As 1 / (1 + 1/x): exact at both ends in float32, also for x = 0 and infinity.
@@ -75,6 +80,7 @@ class Filmic:
         x = clip_exposure
         peak = (a * x * x + b * x) / (d * x * x + e * x + g)
         self._a, self._b, self._d, self._e, self._g = a / peak, b / peak, d, e, g
+        self.kind, self.numbers = "filmic", (self._a, self._b, d, e, g)
 
     def evaluate(self, exposure, with_slope):
         above = exposure * (self._a * exposure + self._b)
@@ -100,6 +106,7 @@ class Knee:
 
     def __init__(self, start: float, softness: float):
         self._start, self._softness = start, softness
+        self.kind, self.numbers = "knee", (start, softness)
         self.clip_exposure = start + softness * math.expm1((1.0 - start) / softness)
 
     def evaluate(self, exposure, with_slope):
@@ -119,6 +126,10 @@ class ToneMapped(AnalyticResponse):
         self.name = name
         self.clip_exposure = tone.clip_exposure
         self._tone, self._display = tone, display
+
+    def formula(self):
+        law = self._display.formula().power_law
+        return FormulaCurve(law, self._tone.kind, self._tone.numbers, self.clip_exposure)
 
     def _evaluate(self, exposure, with_slope):
         light, tone_slope = self._tone.evaluate(exposure, with_slope)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ..errors import SehdrError
+from ..splatting.response_curves import FormulaCurve, encode_with_slope
 
 # Half of one 8-bit code value: an encoded value nearer to white than this is stored as 255.
 HALF_CODE = 0.5 / 255
@@ -72,6 +73,10 @@ class Response(ABC):
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise SehdrError(f"response: the stored {kind} curve is damaged ({error!r:.200})") from error
 
+    def formula(self) -> FormulaCurve | None:
+        """The curve as a GPU evaluates it in one launch; None where there is no such kernel."""
+        return None
+
     @property
     def clips(self) -> bool:
         """True if every exposure beyond some finite one gives the same value."""
@@ -129,6 +134,10 @@ class _Encode(torch.autograd.Function):
     def forward(ctx, exposure, response, extension_slope):
         differentiate = ctx.needs_input_grad[0]
         clip = response.clip_exposure
+        if differentiate and exposure.device.type == "cuda" and (formula := response.formula()) is not None:
+            value, slope = encode_with_slope(exposure, formula, extension_slope or 0.0)
+            ctx.save_for_backward(slope)
+            return value
         inside = exposure.clamp(0.0, clip if response.clips else None)
         value, slope = response._evaluate(inside, differentiate)
         if response.clips and extension_slope is not None:

@@ -1,0 +1,67 @@
+"""The kernel of the responses that have a formula, against their own torch operations and finite differences."""
+
+import math
+
+import pytest
+import torch
+
+from sehdr_warp.model.response import response_by_name, response_names
+from sehdr_warp.splatting.response_curves import encode_with_slope
+
+from .scenes import relative_error
+
+NAMES = [*response_names(), "gamma-3"]
+
+
+def exposures(response):
+    """From black to far above white, and both sides of the toe's end and of the clip point."""
+    top = response.clip_exposure if response.clips else 50.0
+    even = torch.linspace(0.0, 1.5 * top, 500, dtype=torch.float64)
+    return torch.cat([even, torch.logspace(-9, 3, 500, dtype=torch.float64) * top, torch.tensor([-1.0, -1e-9])])
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
+@pytest.mark.parametrize("extension", [0.0, 0.05])
+def test_values_and_slopes_are_those_of_torch(device, name, dtype, bound, extension):
+    response = response_by_name(name)
+    given = exposures(response)
+    # Where the slope jumps or is infinite, rounding decides on which side of the place a float32 falls.
+    given = given[(given - response.clip_exposure).abs() > 1e-5 * min(response.clip_exposure, 1e3)]
+    truth_given = given.clone().requires_grad_()
+    truth = response.encode_extended(truth_given, slope=extension) if extension else response.encode(truth_given)
+    truth.sum().backward()
+    value, slope = encode_with_slope(given.to(device, dtype), response.formula(), extension)
+    assert (value.cpu().double() - truth.detach()).abs().max() < bound
+    finite = truth_given.grad.isfinite()
+    assert relative_error(slope[finite.to(device)], truth_given.grad[finite]) < 10 * bound
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_slopes_match_finite_differences(device, name):
+    response = response_by_name(name)
+    top = response.clip_exposure if response.clips else 20.0
+    x = torch.linspace(0.1 * top, 0.95 * top, 50, dtype=torch.float64, device=device)
+    step = 1e-6 * top
+    above, below = (encode_with_slope(x + side * step, response.formula(), 0.05)[0] for side in (1, -1))
+    _, slope = encode_with_slope(x, response.formula(), 0.05)
+    torch.testing.assert_close(slope, (above - below) / (2 * step), rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_differentiable_encoding_is_the_same_on_every_device(device, name):
+    response = response_by_name(name)
+    given = exposures(response).float()
+    with torch.no_grad():
+        plain = response.encode_extended(given)
+    leaf = given.to(device).requires_grad_()
+    assert (response.encode_extended(leaf).detach().cpu() - plain).abs().max() < 1e-5
+
+
+def test_poison_stays_and_black_is_black(device):
+    given = torch.tensor([math.nan, 0.0, math.inf], device=device)
+    for name in NAMES:
+        value, slope = encode_with_slope(given, response_by_name(name).formula(), 0.0)
+        assert value[0].isnan() and slope[0].isnan()
+        assert value[1] == 0
+        assert value[2] > 1 - 1e-6
