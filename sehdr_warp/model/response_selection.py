@@ -1,4 +1,4 @@
-"""A response from photos: by colour mixtures at edges, clipped light and a prior; or by the paper's score."""
+"""A response from photos: by colour mixtures at edges, clipped light, range and a prior; or by the paper's score."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,10 +24,15 @@ LEAST_SHARE, MOST_SHARE = 0.15, 0.85
 CODE_VARIANCE = 1 / 12 + 0.05
 # Student's t: an edge that no mixture explains (a third surface, a highlight) costs a logarithm, not a square.
 EDGE_FREEDOM = 2.0
-# Edges of one photo share what is wrong with them: this many count as one.
-EDGES_PER_FACT = 40.0
-# Radiance falls off above white by this natural log per stop, within a factor of e (one standard deviation).
-HIGHLIGHT_RATE, HIGHLIGHT_SPREAD, HIGHLIGHT_FLOOR = 0.4, 1.0, 0.002
+# How far edges lie off their line is not known beforehand (texture, denoised or compressed images): the variance is
+# this many times that of rounding, whichever is likeliest under a candidate.
+EDGE_MISFITS = 2.0 ** np.arange(0, 8.5, 0.5)
+# Edges of one set of photos share what is wrong with them: this many count as one.
+EDGES_PER_FACT = 160.0
+# Radiance falls off above white by this natural log per stop, within a factor of 2.2 (one standard deviation).
+HIGHLIGHT_RATE, HIGHLIGHT_SPREAD, HIGHLIGHT_FLOOR = 0.4, 0.8, 0.002
+# Standard deviation of ln exposure over the values that are neither black nor white: 1.35, within a factor of 1.4.
+SPAN, SPAN_SPREAD = 0.3, 0.35
 # Minus log prior, up to a constant. Of photos that say nothing about where they come from ...
 PRIOR = {"camera": 0.5, "srgb": 0.5, "rec709": 1.0, "gamma-2.2": 1.0, "reinhard-gamma": 1.0, "filmic": 2.0, "aces": 2.0}
 # ... and of a camera's own JPEG, which is sharpened and cleaned of noise: its edges mislead (docs/response.md).
@@ -54,7 +59,8 @@ class ResponseScore:
     edges: mean over edges of minus the log likelihood, nats, that the middle colour is a mixture of its two sides in
         linear light, every share as likely; smaller is better; NaN if the photos have fewer than 50 usable edges.
     highlights: minus the log likelihood, nats, of the pixels at the brightest code beside those just below it.
-    prior: minus the log prior, nats. posterior: the sum of the three, edges counted as EDGES_PER_FACT says.
+    span: minus the log likelihood, nats, of how far the decoded values spread.
+    prior: minus the log prior, nats. posterior: the sum of the four, edges counted as EDGES_PER_FACT says.
     """
 
     response: Response
@@ -63,6 +69,7 @@ class ResponseScore:
     paper_score: float
     edges: float
     highlights: float
+    span: float
     prior: float
     posterior: float
 
@@ -101,7 +108,8 @@ def select_response(
         "edges" is after Lin et al. 2004 (Radiometric calibration from a single image): at an edge between two evenly
         coloured regions a pixel is a mixture of both in linear light, so decoded colours lie on a line. Falls back to
         "paper", and says so in `method`, where the photo has fewer than 50 such edges.
-        "posterior" adds a prior and what the clipped pixels tell; it needs no edges, and no well-exposed pixels.
+        "posterior" adds a prior, what the clipped pixels tell, and how many stops scenes span; it needs no edges,
+        and no well-exposed pixels.
         Without `candidates`, and for photos that are not a camera's own, a smooth family of cameras' curves stands
         beside the bank. A formula with a quarter of the posterior is taken; else the response is the posterior's
         mean of log exposure at each code, a table that is none of the candidates.
@@ -126,46 +134,49 @@ def select_response(
     edges = np.concatenate([_edge_colours(*band) for bands in photos for band in bands])
     if len(edges) > MAX_EDGES:
         edges = edges[np.random.default_rng(seed).choice(len(edges), MAX_EDGES, replace=False)]
-    bright = _highlight_shares([values for bands in photos for values, _ in bands])
+    values = [values for bands in photos for values, _ in bands]
+    bright, shares = _highlight_shares(values), _code_shares(values)
     points, rows = _edge_points(edges), []
-    for each in candidates:
+    known = np.stack([np.log(each.decode(np.maximum(CODES, each.black + CODE))) for each in candidates])
+    spans = _span_surprise(shares, known)
+    for each, span in zip(candidates, spans, strict=True):
         stops = np.log2(float(each.decode(1 - CODE / 2)) / float(each.decode(1 - 9.5 * CODE)))
         surprise, highlights, prior = (
             _edge_surprise(points, each),
             _highlights(bright, stops),
             _prior(each, from_camera),
         )
-        posterior = np.nan_to_num(surprise) * len(edges) / EDGES_PER_FACT + highlights + prior
+        posterior = np.nan_to_num(surprise) * len(edges) / EDGES_PER_FACT + highlights + span + prior
         rows.append((*_range_and_roughness(fullest, each), surprise, highlights, prior, posterior))
     ranges, roughnesses, surprises, highlights, priors, posteriors = np.array(rows, dtype=np.float64).T
     paper = _relative(ranges) - _relative(roughnesses)
     if method == "edges" and np.isnan(surprises).all():
         method = "paper"
     goodness = {"paper": paper, "edges": -np.nan_to_num(surprises, nan=np.inf), "posterior": -posteriors}[method]
-    columns = (ranges, roughnesses, paper, surprises, highlights, priors, posteriors)
+    columns = (ranges, roughnesses, paper, surprises, highlights, spans, priors, posteriors)
     scores = [ResponseScore(each, *map(float, row)) for each, row in zip(candidates, np.stack(columns, 1), strict=True)]
     order = np.argsort(-goodness, kind="stable")
     ranked, best = tuple(scores[index] for index in order), candidates[order[0]]
     if not beside:
         return ResponseSelection(best, method, len(edges), ranked)
-    chances, logs = _beside_family(points, bright, candidates, priors, posteriors)
+    chances, logs = _beside_family(points, bright, shares, known, priors, posteriors)
     none_fits = float(chances[len(candidates) :].sum())
     if chances[order[0]] < DECISIVE:
         best = _mean_response(chances, logs)
     return ResponseSelection(best, method, len(edges), ranked, none_fits)
 
 
-def _beside_family(points, bright, candidates, priors, posteriors):
+def _beside_family(points, bright, shares, known, priors, posteriors):
     """Probabilities [K + 512] of the candidates and of the family's members, and their log exposures [K + 512, 256]."""
     logs, rises = family_logs()
     surprise = _family_surprise(points, logs, rises)
     stops = (logs[:, 254:].mean(1) - logs[:, 245:247].mean(1)) / np.log(2)
     members = np.array([_highlights(bright, each) for each in stops])
-    members += np.nan_to_num(surprise) * len(points) / EDGES_PER_FACT + np.log(len(logs) / NO_FORMULA)
+    members += np.nan_to_num(surprise) * len(points) / EDGES_PER_FACT + _span_surprise(shares, logs)
+    members += np.log(len(logs) / NO_FORMULA)
     named = posteriors + np.log(np.exp(-priors).sum() / (1 - NO_FORMULA))
     costs = np.concatenate([named, members])
     chances = np.exp(costs.min() - costs)
-    known = np.stack([np.log(each.decode(np.maximum(CODES, each.black + CODE))) for each in candidates])
     return chances / chances.sum(), np.concatenate([known, logs])
 
 
@@ -217,6 +228,29 @@ def _highlights(shares: tuple[float, float], stops: float) -> float:
     rate = np.log1p(near / white) / max(stops, 1e-6)
     spread = HIGHLIGHT_SPREAD**2 + HIGHLIGHT_FLOOR / (sum(shares) + 1e-9)
     return float(0.5 * np.log(rate / HIGHLIGHT_RATE) ** 2 / spread)
+
+
+def _code_shares(images) -> np.ndarray:
+    """[256] share of the values at each 8-bit code."""
+    counts = sum(
+        np.bincount(np.rint(255 * image.clip(0, 1)).astype(np.int64).ravel(), minlength=256) for image in images
+    )
+    return counts / counts.sum()
+
+
+def _span_surprise(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
+    """[K] minus the log likelihood of the spread of ln exposure, from natural logs [K, 256] of the exposures at the codes.
+
+    Scenes span alike many stops, and a wrong curve stretches or squeezes them: above all one that never clips for one
+    that does. The standard deviation is log-normal; its weight is the share of values between black and white.
+    """
+    inside, logs = shares[1:255].sum(), logs[:, 1:255]
+    if inside <= 0:
+        return np.zeros(len(logs))
+    weights = shares[1:255] / inside
+    variance = np.square(logs - (logs @ weights)[:, None]) @ weights
+    off = 0.5 * np.log(np.maximum(variance, np.exp(-6.0))) - SPAN
+    return 0.5 * inside * (off / SPAN_SPREAD) ** 2
 
 
 def _relative(values: np.ndarray) -> np.ndarray:
@@ -327,4 +361,6 @@ def _mixture_surprise(exposures, slopes):
     spread = (
         0.5 * (variance.log().sum(-1) + weighted.log()) + ((high - low) / (end - begin)).abs().clamp_min(1e-3).log()
     )
-    return ((EDGE_FREEDOM + 2) / 2 * (distance / EDGE_FREEDOM).log1p() + spread).mean(-1)
+    tail = (EDGE_FREEDOM + 2) / 2
+    costs = [tail * (distance / (EDGE_FREEDOM * misfit)).log1p().mean(-1) + np.log(misfit) for misfit in EDGE_MISFITS]
+    return torch.stack(costs).amin(0) + spread.mean(-1)

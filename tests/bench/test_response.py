@@ -74,7 +74,8 @@ def test_report_over_a_stack_and_the_embedded_scene(tmp_path):
     # EXIF says that a camera made them, and there is no edge to say otherwise.
     assert rows["stack", "posterior"]["chosen"] == "camera 4"
     assert ("stack", "posterior without prior") in rows and rows["stack", "posterior without edges"]["trials"] == 4
+    assert rows["scene", "posterior without span"]["trials"] == 2
     scene = rows["scenes", "posterior"]
     assert scene["trials"] == 2 and scene["mean_error"] <= scene["worst_error"]
     assert scene["aligned_db"] <= scene["aligned_known_db"] + 0.1
-    assert len(report["trials"]) == (len(TIMES) + 2) * 9
+    assert len(report["trials"]) == (len(TIMES) + 2) * 10

@@ -95,6 +95,42 @@ def test_highlights_tell_a_curve_that_clips_from_one_that_does_not():
         assert right.highlights < wrong.highlights - 0.5
 
 
+def test_span_tells_a_curve_that_never_clips():
+    """Light of 1.35 nats without edges or whites: under most others it spans a third or half of that."""
+    light = np.exp(np.random.default_rng(0).normal(1.5, 1.35, (64, 64, 1))) * np.ones(3)
+    truth = response_by_name("reinhard-gamma")
+    photo = np.round(truth.encode(light) * 255) / 255
+    scores = {s.response.name: s for s in select_response(photo, method="posterior").scores}
+    assert scores["reinhard-gamma"].span < 0.2
+    assert all(score.span > 1 for name, score in scores.items() if name in ("srgb", "rec709", "camera", "filmic"))
+    # Nothing between black and white: no curve is told from another.
+    nothing = select_response(np.ones((32, 32, 3)), method="posterior", from_camera=True).scores
+    assert {score.span for score in nothing} == {0.0}
+
+
+def test_edges_that_no_curve_explains_say_little():
+    """Boundaries mixed in encoded values, with noise on the mixed pixels: what is left must not look certain."""
+    truth = response_by_name("srgb")
+    rng = np.random.default_rng(0)
+    clean = [np.round(truth.encode(mosaic(seed)) * 255) / 255 for seed in range(4)]
+    spoilt = [
+        np.round((photo + rng.normal(0, 6 / 255, photo.shape) * rough(photo)).clip(0, 1) * 255) / 255 for photo in clean
+    ]
+    few = [response_by_name(name) for name in ("srgb", "reinhard-gamma", "camera")]
+
+    def certainty(photos):
+        scores = select_response(photos, few).scores
+        return scores[1].edges - scores[0].edges
+
+    assert 0 < certainty(spoilt) < 0.5 * certainty(clean)
+
+
+def rough(photo):
+    """1 at the mixed pixels of a mosaic, 0 within its tiles. [H, W, 1]."""
+    step = sum(np.abs(photo - np.roll(photo, shift, axis)).max(2) for shift in (1, -1) for axis in (0, 1))
+    return (step > 2 / 255)[..., None] * 1.0
+
+
 def test_prior_of_cameras_decides_where_nothing_else_does():
     ramp = np.linspace(0.1, 0.9, 64)[None, :, None] * np.ones((64, 1, 3))
     selection = select_response(ramp, method="posterior", from_camera=True)
