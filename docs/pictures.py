@@ -15,8 +15,6 @@ def main(report: Path, images: Path) -> None:
             picture = picture.convert("RGB")
             picture.thumbnail((width, 10 * width))
             picture.save(images / f"{name}.jpg", quality=82, optimize=True)
-    with Image.open(report / "training.png") as plot:
-        plot.convert("RGB").quantize(64).save(images / "training.png", optimize=True)
 
 
 if __name__ == "__main__":
