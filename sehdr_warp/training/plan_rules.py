@@ -108,8 +108,10 @@ def _densification(facts: SceneFacts, config: Config) -> Decision:
     options = config.densification
     if options.strategy == "relocation":
         most = gaussian_budget(options, facts.pixels)
-        reason = f"{options.budget:g} times the square root of {facts.pixels} pixels, below {options.max_gaussians}"
-        return Decision("densification", {}, f"at most {most} Gaussians", reason)
+        reason = f"densification.max_gaussians = {options.max_gaussians}"
+        if options.budget:
+            reason = f"{options.budget:g} times the square root of {facts.pixels} pixels, below {options.max_gaussians}"
+        return Decision("densification", {}, f"relocation grows to at most {most}", reason)
     unknowns = GEOMETRY_UNKNOWNS + 3 * (config.model.harmonics_degree + 1) ** 2
     determined = 3 * facts.pixels // unknowns
     budget = min(config.densification.max_gaussians, max(FEWEST_GAUSSIANS, determined, 2 * facts.points))
@@ -146,7 +148,11 @@ def _levels(count: int) -> str:
 def _background(facts: SceneFacts, config: Config) -> Decision:
     count, fields = config.model.far_points, {}
     if facts.sky >= LEAST_SKY and not count:
-        count = max(100, round(SKY_PART * min(config.densification.max_gaussians, MOST_FOR_SKY)))
+        options = config.densification
+        budget = options.max_gaussians
+        if options.strategy == "relocation":
+            budget = gaussian_budget(options, facts.pixels)
+        count = max(100, round(SKY_PART * min(budget, MOST_FOR_SKY)))
         fields["model.far_points"] = count
     return Decision(
         "background",

@@ -76,7 +76,9 @@ def test_a_plan_decides_everything_once_with_figures(scene):
         ("harmonics", {"photos": 16}, "model.harmonics_degree", 1, 3),
         ("densification", {"pixels": 10**7}, "densification.max_gaussians", 20_000, 508_474),
         ("resolution", {"width": 1200}, "schedule.coarse_levels", None, 2),
-        ("background", {"sky": 0.3}, "model.far_points", None, 20_000),
+        ("background", {"sky": 0.3, "pixels": 10**8}, "model.far_points", None, 20_000),
+        # A twentieth of relocation's budget, 120 times the square root of 10^6.
+        ("background", {"sky": 0.3, "pixels": 10**6}, "model.far_points", None, 6000),
         ("optimizer", {"visible": 0.2}, "optimizer.visible_only", False, True),
         ("early-stop", {"photos": 10_000}, "schedule.early_stop", 3, None),
     ],
