@@ -55,6 +55,15 @@ def test_paper_preset_is_the_papers():
     assert (config.model.radiance, config.model.tone_map) == ("linear", "gaussian")
 
 
+@pytest.mark.parametrize("name", preset_names())
+def test_presets_keep_the_densification_of_their_method(name):
+    """The default's relocation goes with its opacity weight; what builds on 3DGS or is short has neither."""
+    config = load_config(name)
+    found = config.densification.strategy, config.loss.opacity_weight
+    relocates = name in ("default", "truth", "predicted")
+    assert found == (("relocation", 0.01) if relocates else ("gradient", 0.0))
+
+
 @pytest.mark.parametrize("path,item", list(leaves()), ids=[path for path, _ in leaves()])
 def test_every_field_is_documented_and_read(path, item):
     assert item.metadata["doc"]

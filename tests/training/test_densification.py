@@ -188,7 +188,7 @@ def test_none_changes_nothing():
     strategy = make_densification(load_config("default", {"densification.strategy": "none"}), EXTENT, 1)
     gaussians = cloud(4)
     before = gaussians.means.detach().clone()
-    strategy.perturb(gaussians, 1.0, torch.Generator())
+    strategy.perturb(600, gaussians, 1.0)
     assert not strategy.needs_gradients(600) and not strategy.change(600, gaussians, None, None)
     assert torch.equal(before, gaussians.means)
 

@@ -39,7 +39,7 @@ train(toy_scene(), sys.argv[2], configuration(sys.argv[3]), device="cpu", quiet=
 
 def configuration(strategy):
     preset = "paper" if strategy == "paper" else "default"
-    strategies = {"densification.strategy": "relocation"} if strategy == "relocation" else {}
+    strategies = {} if strategy == "paper" else {"densification.strategy": strategy}
     fixed = {"schedule.iterations": 120, "schedule.stated_for": 120, "densification.every": 25, "response.name": "srgb"}
     return load_config(preset, QUICK | fixed | strategies)
 
