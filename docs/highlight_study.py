@@ -2,9 +2,9 @@
 
     python docs/highlight_study.py
 
-Prints the table of docs/highlights.md. No training: what a photo does not clip counts as known up to an error of 38 dB,
-about that of a training on the truth, and every clipped channel of the held-out photos is set to white times 2^estimate.
-A gain is that of the mu-law PSNR (gt-max) over an estimate of 0, which is white.
+Prints the table of docs/highlights.md. No training: what a photo does not clip counts as known up to an error of 38
+dB, about that of a training on the truth, and every clipped channel of the held-out photos is set to white times
+2^estimate. A gain is that of the mu-law PSNR (gt-max) over an estimate of 0, which is white.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Makes the README's pictures of a report's: `python docs/pictures.py runs/demo/report`. Small enough for a repository."""
+"""Makes the README's pictures of a report's, small: `python docs/pictures.py runs/demo/report`."""
 
 import sys
 from pathlib import Path

@@ -24,7 +24,7 @@ def explore(
     strength: float,
     means: wp.array(dtype=_vec3),
 ):
-    """means += strength * sigmoid(100 (0.005 - opacity)) * R S S R^T * normal noise, of the seed and the index alone."""
+    """means += strength * sigmoid(100 (0.005 - opacity)) * R S S R^T * normal noise, of seed and index alone."""
     i = first + wp.tid()
     opacity = 1.0 / (1.0 + wp.exp(-opacity_logits[i]))
     faintness = 1.0 / (1.0 + wp.exp(-SHARPNESS * (1.0 - opacity - CENTRE)))

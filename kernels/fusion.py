@@ -1,7 +1,8 @@
 """Neural exposure fusion (SeHDR, section 3.3) at given encoded brackets, and its adjoint by what it learns.
 
-P brackets of M colours, Q = P M points of each of the three channels, in the order [3, P, M]. The perceptron of a channel
-has H hidden units: its terms of a point are read by all threads of a warp at once, or a warp's threads are its units.
+P brackets of M colours, Q = P M points of each of the three channels, in the order [3, P, M]. The perceptron of a
+channel has H hidden units: its terms of a point are read by all threads of a warp at once, or a warp's threads are its
+units.
 """
 
 from functools import cache
@@ -17,8 +18,8 @@ POINTS_PER_THREAD = 64
 def fusion_kernels(dtype) -> SimpleNamespace:
     """perceptrons, mix, mix_adjoint, unit_adjoint and point_adjoint for one scalar type.
 
-    encoded, exposedness, outputs and what is made of them: [3, Q]; inner [3, 2, H], inner_bias, outer [3, H], outer_bias
-    [3]: the perceptrons' weights; log_sigma: [3]; results: [M, 3].
+    encoded, exposedness, outputs and what is made of them: [3, Q]; inner [3, 2, H], inner_bias, outer [3, H],
+    outer_bias [3]: the perceptrons' weights; log_sigma: [3]; results: [M, 3].
     """
     real = dtype
 

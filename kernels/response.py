@@ -25,8 +25,8 @@ def encode_kernel(dtype, tone: int):
         values: wp.array(dtype=real),
         slopes: wp.array(dtype=real),
     ):
-        """power_law: exponent, offset, slope and end of the toe; tone_numbers: Filmic's a, b, d, e, g or Knee's start and
-        softness; clip: the clip point, infinite for none; extension_slope: of the rise by log exposure beyond it."""
+        """power_law: exponent, offset, slope and end of the toe; tone_numbers: Filmic's a, b, d, e, g or Knee's start
+        and softness; clip: the clip point, infinite for none; extension_slope: of the rise by log exposure beyond."""
         i = wp.tid()
         exposure = exposures[i]
         x = wp.clamp(exposure, real(0.0), clip)

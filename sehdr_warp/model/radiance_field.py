@@ -191,8 +191,8 @@ class RadianceField(nn.Module):
         return torch.where(alpha > 1e-3, mean, torch.zeros_like(mean))
 
     def weighted_sums(self, camera: CameraTensors, images: Tensor) -> Tensor:
-        """[N, C]: for each Gaussian the sum over a view's pixels of its blending weight times images [H, W, C]. Blending is
-        linear in the features, so this is the adjoint of a render."""
+        """[N, C]: for each Gaussian the sum over a view's pixels of its blending weight times images [H, W, C].
+        Blending is linear in the features, so this is the adjoint of a render."""
         with torch.enable_grad():
             features = images.new_zeros(self.gaussians.count, images.shape[2]).requires_grad_()
             blended = self._rasterize(camera, features).image

@@ -6,9 +6,9 @@ import numpy as np
 
 from .response_analytic import analytic_response
 
-# x(z) = z^p (z + TOE)^q (1 + SHOULDER - z)^-r up to scale, z the encoded value: p and p + q are the log-log slopes below
-# and above the toe, r the roll-off into white. Least squares in log x over codes 10 to 245 leaves 0.02 stops on average
-# of DoRF's curves (Grossberg and Nayar 2004).
+# x(z) = z^p (z + TOE)^q (1 + SHOULDER - z)^-r up to scale, z the encoded value: p and p + q are the log-log slopes
+# below and above the toe, r the roll-off into white. Least squares in log x over codes 10 to 245 leaves 0.02 stops on
+# average of DoRF's curves (Grossberg and Nayar 2004).
 TOE, SHOULDER = 0.08, 0.1
 # Mean of (p, q, r) over 181 of DoRF's 201 curves fitted so, and the lower Cholesky factor of their covariance.
 # The 20 others are those of docs/response.md.

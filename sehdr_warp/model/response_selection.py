@@ -222,8 +222,8 @@ def _highlight_shares(images) -> tuple[float, float]:
 
 def _highlights(shares: tuple[float, float], stops: float) -> float:
     """Minus the log likelihood of those shares. If log radiance falls off as exp(-rate stops), the nine codes span
-    S `stops` and white holds all beyond them, then near / (at + near) = 1 - exp(-rate S): a clipping camera piles values
-    up at 255, a curve that never clips spreads the same light over the codes below. The rate is log-normal."""
+    S `stops` and white holds all beyond them, then near / (at + near) = 1 - exp(-rate S): a clipping camera piles
+    values up at 255, a curve that never clips spreads the same light over the codes below. The rate is log-normal."""
     white, near = (share + HIGHLIGHT_FLOOR / 2 for share in shares)
     rate = np.log1p(near / white) / max(stops, 1e-6)
     spread = HIGHLIGHT_SPREAD**2 + HIGHLIGHT_FLOOR / (sum(shares) + 1e-9)
@@ -239,7 +239,7 @@ def _code_shares(images) -> np.ndarray:
 
 
 def _span_surprise(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
-    """[K] minus the log likelihood of the spread of ln exposure, from natural logs [K, 256] of the exposures at the codes.
+    """[K] minus the log likelihood of the spread of ln exposure, from the codes' natural log exposures [K, 256].
 
     Scenes span alike many stops, and a wrong curve stretches or squeezes them: above all one that never clips for one
     that does. The standard deviation is log-normal; its weight is the share of values between black and white.

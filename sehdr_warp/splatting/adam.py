@@ -36,7 +36,8 @@ def adam_step(
     for name, tensor in {"gradient": gradient, "first moment": first_moment, "second moment": second_moment}.items():
         if tensor.shape != parameter.shape or tensor.dtype != torch.float32 or not tensor.is_contiguous():
             raise ValueError(
-                f"the {name} is {tensor.dtype} {list(tensor.shape)}, expected contiguous float32 {list(parameter.shape)}"
+                f"the {name} is {tensor.dtype} {list(tensor.shape)}, expected contiguous float32 "
+                f"{list(parameter.shape)}"
             )
     if not parameter.numel():
         return

@@ -23,9 +23,9 @@ def add_exploration_noise(
     """Adds to means, in place, the noise of 3DGS-MCMC's equation 8: normal, shaped by each Gaussian's covariance, and
     faded out where opacities are above some hundredths.
 
-    means, log_scales: [N, 3]; quaternions: [N, 4], any length; opacity_logits: [N]; all contiguous float32 on one device.
-    strength: times the covariance, in world units the standard deviation; seed: of this call, an int32; the same one
-    gives the same noise on every device and with any number of threads.
+    means, log_scales: [N, 3]; quaternions: [N, 4], any length; opacity_logits: [N]; all contiguous float32 on one
+    device. strength: times the covariance, in world units the standard deviation; seed: of this call, an int32; the
+    same one gives the same noise on every device and with any number of threads.
     """
     count = means.shape[0]
     if not count:

@@ -19,9 +19,9 @@ def note_image_gradients(
     gradient_sum: torch.Tensor,
     seen: torch.Tensor,
 ) -> None:
-    """Adds to gradient_sum [N] the lengths of gradients [N, 2] by the projected centres, in normalised screen units (the
-    screen is 2 wide), times weights [N] if given, and to seen [N] 1, where radii [N] are above 0; nothing where the scalar
-    usable is 0. width, height: of the image in pixels. All contiguous float32 on one device."""
+    """Adds to gradient_sum [N] the lengths of gradients [N, 2] by the projected centres, in normalised screen units
+    (the screen is 2 wide), times weights [N] if given, and to seen [N] 1, where radii [N] are above 0; nothing where
+    the scalar usable is 0. width, height: of the image in pixels. All contiguous float32 on one device."""
     if not len(radii):
         return
     with torch_stream(radii.device):

@@ -22,9 +22,10 @@ def seen_by_photo(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """What a photo can tell of simulated exposures, and what it tells, both as log(1 + mu x / white) / log(1 + mu).
 
-    light, photo_light: [...] exposures x, simulated and of the photo; clipped, black: [...] bool or None, where the photo
-    is saturated. There the first result equals the second as soon as it is above (clipped) or below (black) it, or within
-    half_codes of it: (below white, above black), in the results' domain. Differentiable once with respect to light.
+    light, photo_light: [...] exposures x, simulated and of the photo; clipped, black: [...] bool or None, where the
+    photo is saturated. There the first result equals the second as soon as it is above (clipped) or below (black) it,
+    or within half_codes of it: (below white, above black), in the results' domain. Differentiable once with respect to
+    light.
     light and photo_light share a type, float32 or float64; all share one shape and device. Raises ValueError otherwise.
     """
     others = {"photo_light": (photo_light, light.dtype), "clipped": (clipped, torch.bool), "black": (black, torch.bool)}

@@ -15,8 +15,8 @@ TONES = {"none": NO_TONE, "reinhard": REINHARD, "filmic": FILMIC, "knee": KNEE}
 
 @dataclass(frozen=True)
 class FormulaCurve:
-    """power_law: exponent, offset, slope and end of the toe, as model.response_analytic's PowerLaw takes them; tone: the
-    curve before it, a name in TONES, with its numbers; clip: the clip point, infinite for none."""
+    """power_law: exponent, offset, slope and end of the toe, as model.response_analytic's PowerLaw takes them; tone:
+    the curve before it, a name in TONES, with its numbers; clip: the clip point, infinite for none."""
 
     power_law: tuple[float, float, float, float]
     tone: str = "none"
@@ -28,8 +28,8 @@ class FormulaCurve:
 def encode_with_slope(
     exposure: torch.Tensor, curve: FormulaCurve, extension_slope: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The encoded values of exposures [...], float32 or float64, with extension_slope log(x / clip) added beyond the clip
-    point, and their derivatives by exposure: 0 below 0, NaN for NaN."""
+    """The encoded values of exposures [...], float32 or float64, with extension_slope log(x / clip) added beyond the
+    clip point, and their derivatives by exposure: 0 below 0, NaN for NaN."""
     exposure = exposure.contiguous()
     values, slopes = torch.empty_like(exposure), torch.empty_like(exposure)
     scalar = warp_scalar(exposure.dtype)

@@ -152,8 +152,8 @@ class _Runs:
         self.device = wp.device_from_torch(image.device)
 
     def padded(self, count: int) -> torch.Tensor:
-        """[count, rows, ...] uninitialised rows with the zeros that the horizontal blur finds beyond the border; with one
-        lane the kernels that fill the rows write those too."""
+        """[count, rows, ...] uninitialised rows with the zeros that the horizontal blur finds beyond the border; with
+        one lane the kernels that fill the rows write those too."""
         margin = RADIUS * self.channels
         buffer = self.like.new_empty(count, self.rows, self.length + 2 * margin)
         if self.lanes > 1:

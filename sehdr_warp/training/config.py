@@ -73,7 +73,8 @@ class ResponseConfig:
     )
     form: str = option(
         "curve",
-        "curve: the named response; mlp: none, but a perceptron for each channel that is learned with the scene (HDR-GS)",
+        "curve: the named response; mlp: none, but a perceptron for each channel that is learned with the scene "
+        "(HDR-GS)",
         choices=("curve", "mlp"),
     )
     width: int = option(128, "mlp: hidden units of each channel's perceptron", low=1, high=4096)
@@ -138,7 +139,8 @@ class LossConfig:
     )
     interval: str = option(
         "off",
-        "a code z says `between z - 1/2 and z + 1/2`, and inside nothing pulls; difference: in L1; all: in SSIM as well",
+        "a code z says `between z - 1/2 and z + 1/2`, and inside nothing pulls; difference: in L1; all: in SSIM as "
+        "well",
         choices=("off", "difference", "all"),
     )
     domain: str = option(
@@ -168,8 +170,8 @@ class LossConfig:
     )
     highlight_expected: str = option(
         "photos",
-        "fixed: highlight_stops at every clipped pixel; photos: less where few channels of it clip, and where much light "
-        "lies just below white",
+        "fixed: highlight_stops at every clipped pixel; photos: less where few channels of it clip, and where much "
+        "light lies just below white",
         choices=("fixed", "photos"),
     )
     harmonics_weight: float = option(
@@ -275,8 +277,8 @@ class ScheduleConfig:
     )
     harmonics_gain: float = option(
         0.0,
-        "decibels by which a degree must lower the loss over training photos after its first harmonics_every iterations; "
-        "with less it is taken out again, and no higher one is added; 0: none is",
+        "decibels by which a degree must lower the loss over training photos after its first harmonics_every "
+        "iterations; with less it is taken out again, and no higher one is added; 0: none is",
         low=0.0,
         high=10.0,
     )
@@ -296,8 +298,8 @@ class ScheduleConfig:
     early_stop_gain: float = option(0.02, "decibels over the best look so far that count as a gain", low=0.0, high=10.0)
     early_stop_on: str = option(
         "held-in",
-        "held-in: the mean loss of the steps since the last look, as an amplitude; held-out: PSNR of the held-out photos, "
-        "which then are no fair test any more",
+        "held-in: the mean loss of the steps since the last look, as an amplitude; held-out: PSNR of the held-out "
+        "photos, which then are no fair test any more",
         choices=("held-in", "held-out"),
     )
     recorded: bool = option(True, "on a GPU, replay training steps as CUDA graphs; off, launch each: much slower")

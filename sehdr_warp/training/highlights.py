@@ -11,8 +11,9 @@ from .config import LossConfig
 from .losses import CODE
 
 CHANNEL_PARTS = (0.39, 0.61, 1.0)
-"""Of loss.highlight_stops, where one, two and three channels of a pixel clip: a channel that clips alone is seldom far
-above white. Fitted, together with the default of highlight_stops, to four of the embedded scenes (docs/highlights.md)."""
+"""Of loss.highlight_stops, where one, two and three channels of a pixel clip: a channel that clips alone is seldom
+far above white. Fitted, together with the default of highlight_stops, to four of the embedded scenes
+(docs/highlights.md)."""
 LONG_TAIL = 2.0
 """Stops; a tail that is longer says no more. Chosen with CHANNEL_PARTS."""
 
@@ -22,8 +23,8 @@ def expected_excess(views: Sequence[View], response: Response, loss: LossConfig)
 
     views: the training photos; response: the curve that decodes them.
 
-    loss.highlight_stops times CHANNEL_PARTS, and shorter in proportion where tail_stops is below LONG_TAIL: a wall that is
-    just too bright clips much, but hardly. None where the prior has no weight, or nothing clips; with
+    loss.highlight_stops times CHANNEL_PARTS, and shorter in proportion where tail_stops is below LONG_TAIL: a wall that
+    is just too bright clips much, but hardly. None where the prior has no weight, or nothing clips; with
     loss.highlight_expected "fixed", highlight_stops for all three.
     """
     if loss.highlight_weight == 0:

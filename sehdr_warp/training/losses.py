@@ -30,8 +30,8 @@ class Target:
     encoded: [H, W, 3] in [0, 1]; clipped, black: [H, W, 3] bool, or None where the photo has none of them;
     mask: [H, W, 1] in [0, 1] or None; exposure_truth: [H, W, 3] true radiance times the base time, or None;
     light: [H, W, 3] exposures decoded from the photo, where they are kept for every step; None: decode them.
-    highlights: [4] stops over white that light is expected at where none (unused), one, two and three channels of a pixel
-    clip; None: nothing is expected.
+    highlights: [4] stops over white that light is expected at where none (unused), one, two and three channels of a
+    pixel clip; None: nothing is expected.
     """
 
     encoded: Tensor

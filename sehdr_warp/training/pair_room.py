@@ -13,7 +13,7 @@ ROOM_SEEN = 1.25
 """And afterwards: for what 100 steps change. Of photos beyond 100 the greatest may be among those not yet seen."""
 PHOTOS_SEEN = 100
 KEPT = 0.97
-"""What a change of the Gaussians keeps at least of the room: after a reset of the opacities pairs are few for a while."""
+"""What a change of the Gaussians keeps of the room at least: after a reset of opacities pairs are few for a while."""
 LEAST_ROOM = 1 << 14
 
 

@@ -29,8 +29,8 @@ class TrainingView:
 class ViewStack:
     """V training views of one size in shared memory: [i] is view i; at() takes the view whose number is on the device.
 
-    cameras: [V, 24], each view's pose [4, 4], intrinsics [4], position [3] and a 0; times: exposure times in seconds [V],
-    float32, or one float where all are equal; the rest as in Target, each [V, ...] or None.
+    cameras: [V, 24], each view's pose [4, 4], intrinsics [4], position [3] and a 0; times: exposure times in seconds
+    [V], float32, or one float where all are equal; the rest as in Target, each [V, ...] or None.
     """
 
     width: int
@@ -126,10 +126,10 @@ def training_views(
     light: Response | None = None,
     highlights: Sequence[float] | None = None,
 ) -> list[TrainingView]:
-    """The views at 1 / 2^level of their size. truth: also upload HDR truth; light: keep the exposures that this response
-    decodes from the photos; highlights: stops over white that light is expected at where one, two and three channels of
-    a pixel clip. Photos are averaged as exposures, since light adds up and encoded values do not; a pixel with a clipped
-    part stays a lower bound."""
+    """The views at 1 / 2^level of their size. truth: also upload HDR truth; light: keep the exposures that this
+    response decodes from the photos; highlights: stops over white that light is expected at where one, two and three
+    channels of a pixel clip. Photos are averaged as exposures, since light adds up and encoded values do not; a pixel
+    with a clipped part stays a lower bound."""
     expected = None if highlights is None else torch.tensor((0.0, *highlights), device=device)
     made = []
     for view in views:

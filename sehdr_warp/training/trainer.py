@@ -36,7 +36,7 @@ from .thinning import contributing, degree_gain
 CHECK_EVERY = 20
 """Iterations between looks at the count of skipped steps, each of which waits for the device."""
 DECODED_PIXELS = 1 << 27
-"""Photos of so many pixels in all are kept decoded as well, in 1.6 GB at most; those of more are decoded in each step."""
+"""Photos of so many pixels in all are kept decoded as well, in 1.6 GB at most; more are decoded in each step."""
 
 
 class Trainer:
@@ -58,7 +58,7 @@ class Trainer:
         pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
         self.densification = make_densification(config, self.extent, pixels)
         self._views = scene.train_views
-        # Where light is compared, by a curve that stays: encoding the photo, some twenty operations, waits until asked for.
+        # Where light is compared, by a curve that stays, encoding the photo waits until it is asked for.
         self._encoded = not compares_light(config.loss, field) or isinstance(field.response, RefinedResponse)
         self._largest_truth = largest_truth(scene, config.loss) * field.base_time
         self._highlights = expected_excess(self._views, known_response(field.response), config.loss)
@@ -83,7 +83,7 @@ class Trainer:
 
     @property
     def degree(self) -> int:
-        """The degree of the harmonics at this iteration: one more every harmonics_every iterations, as long as they gain."""
+        """The degree of the harmonics at this iteration: one more every harmonics_every, as long as they gain."""
         return min(self._degree_limit, self.iteration // self._degree_every)
 
     @property
