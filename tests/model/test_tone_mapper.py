@@ -107,3 +107,13 @@ def test_a_field_photographs_through_it_and_teaches_it(tone_map, device):
     photo.encoded.sum().backward()
     assert all(bool(parameter.grad.any()) for parameter in field.response.parameters())
     assert bool(field.gaussians.harmonics_dc.grad.any())
+
+
+def test_its_gradients_call_no_matrix_product():
+    mapper, exposures = ToneMapper(width=8), torch.rand(5000, 3)
+    with torch.profiler.profile() as profile:
+        mapper.encode(exposures).sum().backward()
+    called = {event.name for event in profile.events()}
+    assert "aten::addcmul" in called
+    assert not {name for name in called if name.endswith(("mm", "mv", "matmul", "bmm"))}
+    assert all(parameter.grad.abs().sum() > 0 for parameter in mapper.parameters())
