@@ -17,6 +17,7 @@ from torch.utils.checkpoint import checkpoint
 from ..errors import SehdrError
 from ..splatting.exposure_fusion import fuse_exposures
 from ..splatting.interpolation import interpolate
+from ..splatting.recording import is_recording
 from .exposure import bracket_log_radiance, exposure_times
 from .response_curve import Response
 
@@ -158,7 +159,8 @@ class NeuralExposureFusion(nn.Module):
         # One node more at either end gives every cell its four.
         grid = torch.arange(-1, self.nodes + 1, dtype=like.dtype, device=like.device) * step + self._low
         encoded = self._encode(grid[:, None].expand(-1, 3))
-        if not isinstance(self.response, nn.Module):
+        # What is made while a step is recorded has no content before the first replay, and dies with the recording.
+        if not isinstance(self.response, nn.Module) and not is_recording(like.device):
             self._kept_nodes = key, encoded
         return encoded
 

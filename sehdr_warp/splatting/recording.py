@@ -5,6 +5,7 @@ long as the GPU. Recorded once and replayed, the GPU sets the pace.
 """
 
 import gc
+import weakref
 from collections.abc import Callable
 from contextlib import contextmanager, suppress
 
@@ -27,6 +28,24 @@ def _no_collection():
             gc.enable()
 
 
+def is_recording(device: torch.device) -> bool:
+    """Whether what is launched on a device now is recorded instead of done."""
+    return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+
+
+_idle_streams: dict[torch.device, list[torch.cuda.Stream]] = {}
+
+
+def _own_stream(owner, device: torch.device) -> torch.cuda.Stream:
+    """A stream on which nothing else records for as long as its owner lives. torch hands out 32 in turn, and the end of one
+    recording frees the cuBLAS workspace of every other on the same stream, whose replay is then an illegal access
+    (pytorch issue 193402)."""
+    idle = _idle_streams.setdefault(device, [])
+    stream = idle.pop() if idle else torch.cuda.Stream(device)
+    weakref.finalize(owner, idle.append, stream).atexit = False
+    return stream
+
+
 class GraphRecorder:
     """Records a function of no arguments, its torch operations and Warp launches alike, and replays it.
 
@@ -45,7 +64,7 @@ class GraphRecorder:
         self._key = None
         self._graph: torch.cuda.CUDAGraph | None = None
         self._modules = self._result = None
-        self.stream = stream or torch.cuda.Stream(self.device)
+        self.stream = stream or _own_stream(self, self.device)
         self._pool = torch.cuda.graph_pool_handle()
         # Keeps the pool's memory between recordings: freed with the last graph of the pool, it would be allocated anew.
         self._anchor = self._record(lambda: torch.zeros(1, device=self.device))

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sehdr_warp.splatting import GraphRecorder, rasterize
+from sehdr_warp.splatting import GraphRecorder, rasterize, recording
 
 from .scenes import random_scene, relative_error
 
@@ -13,6 +13,22 @@ needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graph
 def test_a_device_without_cuda_graphs_is_refused():
     with pytest.raises(ValueError, match="device cpu has no CUDA graphs"):
         GraphRecorder("cpu")
+
+
+def test_no_two_recorders_alive_record_on_one_stream(monkeypatch):
+    class Owner:
+        pass
+
+    taken = iter(range(3))
+    monkeypatch.setattr(recording, "_idle_streams", {})
+    monkeypatch.setattr(torch.cuda, "Stream", lambda device: (device, next(taken)))
+    device = torch.device("cuda:0")
+    first, second, third = Owner(), Owner(), Owner()
+    streams = [recording._own_stream(owner, device) for owner in (first, second)]
+    assert streams[0] != streams[1]
+    del first
+    assert recording._own_stream(third, device) == streams[0]
+    assert recording._own_stream(Owner(), device) == (device, 2), "taken anew, as both others are in use"
 
 
 @needs_gpu
