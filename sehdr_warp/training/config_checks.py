@@ -40,6 +40,12 @@ def check_together(config: "Config") -> None:
             f"model.far_points = {model.far_points} leaves no room below densification.max_gaussians = "
             f"{config.densification.max_gaussians}"
         )
+    if config.densification.strategy != "gradient":
+        for name in ("slope_corrected", "revised_opacity"):
+            if getattr(config.densification, name):
+                raise ConfigError(
+                    f'densification.{name} = true is for nothing: needs densification.strategy = "gradient"'
+                )
     if loss.hdr_weight > 0 and model.radiance == "display":
         raise ConfigError(f'loss.hdr_weight = {loss.hdr_weight} needs radiance: model.radiance = "display" has none')
     if loss.ldr_weight == loss.hdr_weight == loss.linear_weight == 0:

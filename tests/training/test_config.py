@@ -130,6 +130,10 @@ def test_contradictions_are_refused():
         Config(model=ModelConfig(radiance="display"), fusion=FusionConfig(enabled=True))
     with pytest.raises(ConfigError, match="two or more"):
         Config(fusion=FusionConfig(enabled=True, exposures=("1",)))
+    for name in ("slope_corrected", "revised_opacity"):
+        with pytest.raises(InputError, match=rf"densification\.{name} = true is for nothing: needs .* = \"gradient\""):
+            load_config("default", {f"densification.{name}": True})
+        assert load_config("default", {"densification.strategy": "gradient", f"densification.{name}": True})
 
 
 def test_iteration_numbers_scale():

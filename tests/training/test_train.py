@@ -45,9 +45,7 @@ def quick(preset="default", **options):
 
 VARIANTS = {
     "default": quick(),
-    "relocation": quick(
-        **{"densification.strategy": "relocation", "loss.opacity_weight": 0.01, "loss.scale_weight": 0.01}
-    ),
+    "gradient": quick(**{"densification.strategy": "gradient", "loss.opacity_weight": 0.0, "loss.scale_weight": 0.01}),
     "coarse": quick(**{"schedule.coarse_levels": 1, "schedule.coarse_every": 50}),
     "3dgs": quick("3dgs", **{"optimizer.harmonics_dc": 0.01}),
     "paper": quick("paper", **{"response.name": "srgb", "optimizer.harmonics_dc": 0.05, "optimizer.fusion": 0.01}),
@@ -70,6 +68,7 @@ VARIANTS = {
             "loss.domain": "mu-law",
             "loss.highlight_weight": 0.01,
             "loss.harmonics_weight": 0.01,
+            "densification.strategy": "gradient",
             "densification.slope_corrected": True,
             "optimizer.final_factor": 0.3,
         }
@@ -288,7 +287,7 @@ def test_a_step_that_cannot_be_recorded_ends_the_training_with_a_way_out(scene, 
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
-@pytest.mark.parametrize("variant", ["default", "climb"])
+@pytest.mark.parametrize("variant", ["default", "gradient", "climb"])
 def test_recorded_steps_train_like_launched_ones(variant):
     check_recorded_like_launched(toy_scene(), VARIANTS[variant], 100)
 
