@@ -81,7 +81,7 @@ class NeuralExposureFusion(nn.Module):
         self.weights, self.biases = _channel_layers([2, *[width] * hidden_layers, 1], seed)
         brackets = [math.log(time / self.base_time) for time in self.times]
         self._low = math.log(response.decode(response.black + DARKEST_VALUE)) - max(brackets)
-        self._kept_nodes = None
+        self._kept_nodes = {}
         self._high = math.log(response.white) + OCTAVES_ABOVE_WHITE * math.log(2) - min(brackets)
 
     def forward(self, log_base: torch.Tensor) -> torch.Tensor:
@@ -152,16 +152,16 @@ class NeuralExposureFusion(nn.Module):
         return self.radiance_scale * (self._weights(encoded) * encoded).sum(dim=0)
 
     def _encoded_at_nodes(self, like, step):
-        """[n, nodes + 2, 3] the encoded brackets at the table's nodes; kept, as long as the curve is not itself learned."""
+        """[n, nodes + 2, 3] the encoded brackets at the table's nodes; kept, unless the curve is itself learned."""
         key = self.response, like.device, like.dtype
-        if self._kept_nodes is not None and self._kept_nodes[0] == key:
-            return self._kept_nodes[1]
+        if key in self._kept_nodes:
+            return self._kept_nodes[key]
         # One node more at either end gives every cell its four.
         grid = torch.arange(-1, self.nodes + 1, dtype=like.dtype, device=like.device) * step + self._low
         encoded = self._encode(grid[:, None].expand(-1, 3))
         # What is made while a step is recorded has no content before the first replay, and dies with the recording.
         if not isinstance(self.response, nn.Module) and not is_recording(like.device):
-            self._kept_nodes = key, encoded
+            self._kept_nodes[key] = encoded
         return encoded
 
 

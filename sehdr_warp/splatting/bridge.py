@@ -137,8 +137,8 @@ class Program:
         self.tape.record_func(adjoint, arrays=[])
 
     def record_adjoint(self, adjoint) -> None:
-        """Put a hand-written adjoint on the tape: it reads .grad of what was written, adds to .grad of what was read and
-        sets what hand_over() gave.
+        """Put a hand-written adjoint on the tape: it reads .grad of what was written, adds to .grad of what was read
+        and sets what hand_over() gave.
 
         .grad of an array is None where no gradient is asked for.
         """

@@ -20,7 +20,7 @@ def fuse_exposures(
     log_sigma_limit: float,
     deviation_limit: float,
 ) -> torch.Tensor:
-    """[M, 3]: scale times the encoded brackets [P, M, 3], weighted by the softmax over P of MLP_c(gamma, encoded) gamma.
+    """[M, 3]: scale times the encoded brackets [P, M, 3], weighted by the softmax over P of MLP(gamma, encoded) gamma.
 
     gamma = exp(-d^2 / 2), d = (encoded - 0.5) / exp(log_sigma), with log_sigma [3] and d held within their limits. The
     perceptrons, one a channel: inner [3, 2, H], inner_bias [3, 1, H], ReLU, outer [3, H, 1], outer_bias [3, 1, 1].

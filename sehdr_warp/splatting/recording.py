@@ -37,9 +37,9 @@ _idle_streams: dict[torch.device, list[torch.cuda.Stream]] = {}
 
 
 def _own_stream(owner, device: torch.device) -> torch.cuda.Stream:
-    """A stream on which nothing else records for as long as its owner lives. torch hands out 32 in turn, and the end of one
-    recording frees the cuBLAS workspace of every other on the same stream, whose replay is then an illegal access
-    (pytorch issue 193402)."""
+    """A stream on which nothing else records for as long as its owner lives. torch hands out 32 in turn, and in some of
+    its versions the end of one recording frees the cuBLAS workspace of every other on the same stream, whose replay is
+    then an illegal access (pytorch issue 193402)."""
     idle = _idle_streams.setdefault(device, [])
     stream = idle.pop() if idle else torch.cuda.Stream(device)
     weakref.finalize(owner, idle.append, stream).atexit = False
@@ -53,8 +53,8 @@ class GraphRecorder:
     It must neither wait for the device nor copy from the host, and every kernel in it must have run once before. Its
     result must be tensors (or tuples of them), which the next replay overwrites.
 
-    device: a CUDA device; raises ValueError for another. stream: to record on, by default one of its own; what continues
-    another recording's work, as a backward pass does, must be recorded on the same.
+    device: a CUDA device; raises ValueError for another. stream: to record on, by default one of its own; what
+    continues another recording's work, as a backward pass does, must be recorded on the same.
     """
 
     def __init__(self, device: torch.device | str, stream: torch.cuda.Stream | None = None):

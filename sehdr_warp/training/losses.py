@@ -236,7 +236,15 @@ def needed_colours(config: LossConfig, has_truth: bool) -> frozenset[str]:
 def total_loss(
     field: RadianceField, photo: Photograph, target: Target, config: LossConfig, largest_truth: float = 1.0
 ) -> Tensor:
-    """L_LDR + beta L_linear (equation 13), the HDR loss, and priors and regularisers, each where it has a weight."""
+    """data_loss() and the regularisers."""
+    return regularised(data_loss(field, photo, target, config, largest_truth), field, config)
+
+
+def data_loss(
+    field: RadianceField, photo: Photograph, target: Target, config: LossConfig, largest_truth: float = 1.0
+) -> Tensor:
+    """L_LDR + beta L_linear (equation 13), the HDR loss, and priors on light, each where it has a weight: what compares
+    a view, and what trainings and their parts are judged by."""
     loss = ldr_loss(photo, target, config, field.response) if config.ldr_weight > 0 else 0.0
     if config.ldr_weight not in (0, 1):
         loss = config.ldr_weight * loss
@@ -251,6 +259,11 @@ def total_loss(
         loss = loss + config.highlight_weight * prior
     if config.anchor_weight > 0:
         loss = loss + config.anchor_weight * anchor_loss(field.response, config.anchor_value)
+    return loss
+
+
+def regularised(loss: Tensor, field: RadianceField, config: LossConfig) -> Tensor:
+    """The loss and what the Gaussians themselves cost, whatever the view: harmonics, opacities, sizes."""
     if config.harmonics_weight > 0:
         loss = loss + config.harmonics_weight * field.gaussians.harmonics_rest.square().mean()
     if config.opacity_weight > 0:

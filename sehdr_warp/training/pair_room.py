@@ -22,6 +22,7 @@ class PairRoom:
 
     def __init__(self, device: torch.device | str):
         self._needed = torch.zeros((), dtype=torch.int64, device=device)
+        self._lacked = torch.zeros((), dtype=torch.int64, device=device)
         self._pairs = 0
         self._steps = 0
         self._given = 0
@@ -35,9 +36,15 @@ class PairRoom:
         """A step was launched with exactly so many pairs."""
         self._pairs = max(self._pairs, pairs)
 
-    def note(self, pairs: Tensor) -> None:
-        """Part of a recorded step: the pairs [] that it would have needed, int64."""
+    def note(self, pairs: Tensor, overflow: Tensor) -> None:
+        """Part of a recorded step: the pairs it would have needed, int64 [], and whether it lacked room, bool []."""
         torch.maximum(self._needed, pairs, out=self._needed)
+        self._lacked += overflow
+
+    @property
+    def lacked(self) -> int:
+        """Steps that lacked room so far. Waits for the device."""
+        return int(self._lacked)
 
     def capacity(self, photos: int) -> int:
         """The room for pairs of the step that is recorded or replayed now; stays until one of the calls below."""

@@ -35,7 +35,7 @@ class Relocation(Densification):
         dead = gaussians.opacities() <= self.options.prune_opacity
         self._relocate(gaussians, dead, optimizer, generator)
         count = gaussians.count
-        target = min(self._most, int((1 + self.options.growth) * count))
+        target = min(self._most, math.ceil((1 + self.options.growth) * count))
         if target > count:
             self._add(gaussians, target - count, optimizer, generator)
         return target > count

@@ -1,14 +1,13 @@
 """What a training can do without, measured while it runs: degrees of the harmonics, and Gaussians that add nothing."""
 
 import math
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from ..model.radiance_field import RadianceField
 from .config import LossConfig
-from .losses import needed_colours, total_loss
+from .losses import data_loss, needed_colours
 from .targets import TrainingView, ViewStack
 
 MOST_VIEWS = 32
@@ -28,7 +27,6 @@ def degree_gain(
     """How many decibels the loss over training views, as an amplitude, is lower with the harmonics of a degree than
     without them, regularisers left out. What they gain here is the most that they can gain in views that were not
     trained on."""
-    loss = replace(loss, opacity_weight=0.0, scale_weight=0.0, harmonics_weight=0.0)
     chosen = [views[index] for index in range(0, len(views), -(-len(views) // MOST_VIEWS))]
     sums = []
     for used in (degree - 1, degree):
@@ -36,7 +34,7 @@ def degree_gain(
         for view in chosen:
             also = needed_colours(loss, view.target.exposure_truth is not None)
             photo = field.photograph(view.camera, view.exposure_time, degree=used, also=also)
-            total += float(total_loss(field, photo, view.target, loss, largest_truth))
+            total += float(data_loss(field, photo, view.target, loss, largest_truth))
         sums.append(max(total, 1e-12))
     return 20 * math.log10(sums[0] / sums[1])
 

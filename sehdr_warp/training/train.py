@@ -283,6 +283,7 @@ class _Loop:
                 "train_seconds": round(self.seconds, 3),
                 "gaussians": self._gaussians().count,
                 "skipped_steps": trainer.skipped_steps,
+                "steps_without_room": trainer.steps_without_room,
                 "device": device_name(trainer.device),
                 **peak_memory(trainer.device),
             },

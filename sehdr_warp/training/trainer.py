@@ -9,6 +9,7 @@ from torch import Tensor
 from ..errors import SehdrError
 from ..model.radiance_field import RadianceField
 from ..model.response import RefinedResponse
+from ..model.tone_mapper import EXACT_BELOW
 from ..scene import Scene
 from ..splatting import GraphRecorder
 from ..splatting.memory import bytes_asked_for
@@ -18,7 +19,7 @@ from .early_stop import EarlyStop
 from .heldout import evaluate_views
 from .highlights import expected_excess
 from .initialization import scene_extent
-from .losses import compares_light, known_response, needed_colours, total_loss
+from .losses import compares_light, data_loss, known_response, needed_colours, regularised
 from .optimizer import (
     DECAY_EVERY,
     decay_rates,
@@ -120,6 +121,11 @@ class Trainer:
         """Steps that were left out because the loss or a gradient was not finite."""
         return int(self._skipped)
 
+    @property
+    def steps_without_room(self) -> int:
+        """Recorded steps of this process that were left out because a photo needed more room than they had."""
+        return self._room.lacked
+
     def step(self) -> None:
         """One photo, one step. Raises SehdrError if more than schedule.nonfinite_limit steps had to be skipped."""
         self.iteration += 1
@@ -135,7 +141,8 @@ class Trainer:
         if self.iteration % DECAY_EVERY == 0:
             decay_rates(self.optimizer, self.config, self.iteration)
         self._draw_presence()
-        kind = (self.degree, self.level, watched, self._hold_response())
+        # The last: a learned response encodes few exposures otherwise, by kernels of its own.
+        kind = (self.degree, self.level, watched, self._hold_response(), gaussians.count < EXACT_BELOW)
         if self._can_record(views, kind):
             self._last = self._replay(views, index, watched, kind)
         else:
@@ -170,7 +177,8 @@ class Trainer:
         )
         if watched:
             photo.rendering.means2d.retain_grad()
-        loss = total_loss(self.field, photo, view.target, self.config.loss, self._largest_truth)
+        compared = data_loss(self.field, photo, view.target, self.config.loss, self._largest_truth)
+        loss = regularised(compared, self.field, self.config.loss)
         if isinstance(self.field.response, RefinedResponse) and self.field.response.refining:
             loss = loss + self.config.response.refine_weight * self.field.response.penalty()
         loss.backward()
@@ -185,11 +193,11 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         self._skipped += nonfinite
         if self._early_stop.patience:
-            self._loss_sum += loss.detach()
+            self._loss_sum += compared.detach()
         if capacity is None:
             self._room.launched(photo.rendering.entry_count)
         else:
-            self._room.note(photo.rendering.pair_count)
+            self._room.note(photo.rendering.pair_count, photo.rendering.overflow)
         return loss.detach(), (photo.encoded if self._encoded else photo.light).detach(), view.target.encoded
 
     def _hold_response(self) -> bool:

@@ -12,7 +12,8 @@ def replay(room, pairs, photos=3):
     """Recorded steps that need so many pairs each; the room that they were given."""
     for needed in pairs:
         given = room.capacity(photos)
-        room.note(torch.tensor(needed, device=room._needed.device))
+        overflow = torch.tensor(needed > given, device=room._needed.device)
+        room.note(torch.tensor(needed, device=room._needed.device), overflow)
     return given
 
 
@@ -36,6 +37,7 @@ def test_a_lack_of_room_is_noticed_and_mended(device):
     room = PairRoom(device)
     room.launched(MANY)
     replay(room, [MANY, 5 * MANY, MANY])
+    assert room.lacked == 1
     assert room.look()
     assert replay(room, [5 * MANY]) == ROOM_SEEN * 5 * MANY
     assert not room.look()
