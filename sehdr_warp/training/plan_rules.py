@@ -23,7 +23,7 @@ LEAST_SKY = 0.03
 """Part of the pixels from which on a sky gets Gaussians of its own."""
 SKY_PART, MOST_FOR_SKY = 0.05, 400_000
 """Of the budget, up to this many, for the sky."""
-PASSES = 400
+PASSES = 900
 """Steps on each photo. A second look at the same photos teaches less and less, and in the end their noise."""
 FEWEST_ITERATIONS = 3000
 LEAST_CONTRIBUTION = 0.1

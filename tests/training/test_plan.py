@@ -72,7 +72,7 @@ def test_a_plan_decides_everything_once_with_figures(scene):
 @pytest.mark.parametrize(
     "name,change,field,few,many",
     [
-        ("iterations", {"photos": 200}, "schedule.iterations", 3000, 30_000),
+        ("iterations", {"photos": 200}, "schedule.iterations", 5400, 30_000),
         ("harmonics", {"photos": 16}, "model.harmonics_degree", 1, 3),
         ("densification", {"pixels": 10**7}, "densification.max_gaussians", 20_000, 508_474),
         ("resolution", {"width": 1200}, "schedule.coarse_levels", None, 2),
@@ -213,7 +213,7 @@ def test_plan_only_prints_and_trains_nothing(tmp_path, capsys, monkeypatch):
     with pytest.raises(SystemExit):
         cli.main(arguments)
     table = capsys.readouterr().out
-    assert "schedule.iterations = 7200" in table and "400 steps on each of 18 photos" in table
+    assert "schedule.iterations = 16200" in table and "900 steps on each of 18 photos" in table
     with pytest.raises(SystemExit) as refused:
         cli.main(arguments[:2])
     assert refused.value.code == 1 and "--out" in capsys.readouterr().err
