@@ -319,7 +319,6 @@ DECISIONS = (
     "iterations",
     "early-stop",
     "pruning",
-    "optimizer",
     "confidence",
 )
 """What a plan decides, in this order."""

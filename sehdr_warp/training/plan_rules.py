@@ -28,8 +28,6 @@ PASSES = 900
 FEWEST_ITERATIONS = 3000
 LEAST_CONTRIBUTION = 0.1
 """Pixels' worth in the photo that shows it best below which a Gaussian is taken away."""
-MOST_VISIBLE = 0.6
-"""Part of the Gaussians in a photo above which skipping the others saves little."""
 EARLY_STOP = 3
 """Looks without gain."""
 PASSES_A_LOOK = 5
@@ -216,17 +214,6 @@ def _pruning(facts: SceneFacts, config: Config) -> Decision:
     )
 
 
-def _optimizer(facts: SceneFacts, config: Config) -> Decision:
-    only = facts.visible <= MOST_VISIBLE
-    return Decision(
-        "optimizer",
-        {"optimizer.visible_only": only},
-        "what is visible" if only else "all",
-        f"a photo's field of view holds {facts.visible:.0%} of the places; skipping the others pays up to "
-        f"{MOST_VISIBLE:.0%}",
-    )
-
-
 def _confidence(facts: SceneFacts, config: Config) -> Decision:
     unsure = facts.clipped + facts.black
     return Decision(
@@ -248,7 +235,6 @@ RULES: dict[str, Callable[[SceneFacts, Config], Decision]] = {
     "iterations": _iterations,
     "early-stop": _early_stop,
     "pruning": _pruning,
-    "optimizer": _optimizer,
     "confidence": _confidence,
 }
 """A rule for each of config.DECISIONS."""

@@ -29,7 +29,6 @@ class SceneFacts:
     files. truths: photos with HDR truth. points: sparse points.
     seen: mean number of photos whose field of view holds a probe (what stands in the way is not known).
     spread: degrees, the median over probes of the angle of the cone of directions they are seen from.
-    visible: mean part of the probes in a photo's field of view.
     overlap: part of the probes, or of places along the cameras' rays if that is more, that two photos show.
     clipped, black: part of the pixels with a channel at 255, with all channels at 0. contrast: standard deviation of
     all codes. sky: part of the pixels in flat, bright cells without sparse points that reach the upper border.
@@ -47,7 +46,6 @@ class SceneFacts:
     points: int
     seen: float
     spread: float
-    visible: float
     overlap: float
     clipped: float
     black: float
@@ -84,7 +82,6 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         points=len(scene.points),
         seen=_mean_where(shown.sum(0), shown.any(0)),
         spread=_spread(probes, views, shown),
-        visible=float(shown.mean()),
         overlap=max(float((other.sum(0) >= 2).mean()) for other in (shown, visibility(drawn, views))),
         clipped=clipped,
         black=black,

@@ -79,12 +79,11 @@ def test_a_plan_decides_everything_once_with_figures(scene):
         ("background", {"sky": 0.3, "pixels": 10**8}, "model.far_points", None, 20_000),
         # A twentieth of relocation's budget, 120 times the square root of 10^6.
         ("background", {"sky": 0.3, "pixels": 10**6}, "model.far_points", None, 6000),
-        ("optimizer", {"visible": 0.2}, "optimizer.visible_only", False, True),
         ("early-stop", {"photos": 10_000}, "schedule.early_stop", 3, None),
     ],
 )
 def test_decisions_follow_their_figures(facts, name, change, field, few, many):
-    small = {"photos": 6, "seen": 3.0, "spread": 20.0, "pixels": 6144, "width": 32, "sky": 0.0, "visible": 0.9}
+    small = {"photos": 6, "seen": 3.0, "spread": 20.0, "pixels": 6144, "width": 32, "sky": 0.0}
     # Relocation has a budget of its own.
     config = config_of(**({"densification__strategy": "gradient"} if name == "densification" else {}))
     assert RULES[name](replace(facts, **small), config).fields.get(field) == few
