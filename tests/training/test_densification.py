@@ -50,7 +50,8 @@ def rendering_with(gradient, visible):
 
 
 def gradient_strategy(**options):
-    values = {f"densification.{name}": value for name, value in options.items()}
+    values = {"densification.strategy": "gradient"}
+    values |= {f"densification.{name}": value for name, value in options.items()}
     return GradientDensification(load_config("default", values), EXTENT)
 
 
