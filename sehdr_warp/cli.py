@@ -115,7 +115,8 @@ Command = (
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Runs a command line and exits: 0 done, 1 an error the user can act on, 2 wrong usage, 130 interrupted."""
+    """Runs a command line and exits: 0 done, 1 an error the user can act on, 2 wrong usage, 130 interrupted, 141 nobody
+    reads its output any more."""
     # torch's OpenMP threads spin while they wait, which on a processor shared with other programs costs a training on
     # the CPU most of its time; read once, when torch is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -136,6 +137,7 @@ def main(arguments: list[str] | None = None) -> None:
     )
     try:
         _COMMANDS[type(command)](command)
+        sys.stdout.flush()
     except SehdrError as error:
         if debug:
             traceback.print_exc()
@@ -144,6 +146,10 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("sehdr-warp: interrupted", file=sys.stderr)
         sys.exit(130)
+    except BrokenPipeError:
+        # As of `sehdr-warp ... | head`; Python would complain again when it closes what nobody reads.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
     sys.exit(0)
 
 

@@ -30,6 +30,14 @@ def run(tmp_path_factory):
     return out
 
 
+def test_output_that_nobody_reads_ends_quietly():
+    command = [sys.executable, "-m", "sehdr_warp", "check", "--cases", "needle"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    assert process.stderr.read() == b"" and process.wait() == 141
+    process.stderr.close()
+
+
 def test_version_and_help(capsys):
     assert call("--version") == 0
     assert capsys.readouterr().out == f"sehdr-warp {__version__}\n"
