@@ -5,6 +5,7 @@ Torch would make some twenty launches of it in every step.
 
 import warp as wp
 
+from .constants import LOG_SCALE_MAX
 from .geometry import geometry, vector
 
 SHARPNESS, CENTRE = 100.0, 0.995
@@ -33,7 +34,8 @@ def explore(
     rotation = _g.rotation_from_quaternion(quaternions[i])
     along = wp.transpose(rotation) * noise
     scale = log_scales[i]
-    shaped = _vec3(
-        along[0] * wp.exp(2.0 * scale[0]), along[1] * wp.exp(2.0 * scale[1]), along[2] * wp.exp(2.0 * scale[2])
-    )
+    shaped = _vec3()
+    for axis in range(3):
+        # Bounded as in the projection: for an opaque one the rest is 0, and 0 times infinity is no position.
+        shaped[axis] = along[axis] * wp.exp(2.0 * wp.clamp(scale[axis], -LOG_SCALE_MAX, LOG_SCALE_MAX))
     means[i] = means[i] + rotation * shaped

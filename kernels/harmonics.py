@@ -12,6 +12,23 @@ from .geometry import geometry
 
 
 @cache
+def _inverse_length(dtype):
+    """A function: 1 / length of an offset, and 0 at the camera, where there is no direction."""
+    g = geometry(dtype)
+    real, vec3 = g.real, g.vec3
+
+    @wp.func
+    def inverse_length_of(offset: vec3) -> real:
+        square = wp.dot(offset, offset)
+        result = real(0.0)
+        if square > real(1.0e-30):
+            result = real(1.0) / wp.sqrt(square)
+        return result
+
+    return inverse_length_of
+
+
+@cache
 def harmonics_kernel(dtype, degree: int):
     """values[i] = sum over l <= degree and m of coefficient[i, l, m] * Y_l^m(direction), three channels at once.
 
@@ -19,6 +36,7 @@ def harmonics_kernel(dtype, degree: int):
     """
     g = geometry(dtype)
     real, vec3 = g.real, g.vec3
+    inverse_length_of = _inverse_length(dtype)
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def evaluate_harmonics(
@@ -33,13 +51,10 @@ def harmonics_kernel(dtype, degree: int):
         value = real(0.28209479177387814) * constant[i, 0]
         if wp.static(degree > 0):
             offset = means[i] - camera_position[0]
-            square = wp.dot(offset, offset)
-            away = square > real(1.0e-30)
-            # At the camera there is no direction; sqrt's infinite derivative at 0 must not be met there.
-            inverse_length = wp.where(away, real(1.0) / wp.sqrt(wp.where(away, square, real(1.0))), real(0.0))
-            x = offset[0] * inverse_length
-            y = offset[1] * inverse_length
-            z = offset[2] * inverse_length
+            d = offset * inverse_length_of(offset)
+            x = d[0]
+            y = d[1]
+            z = d[2]
             c1 = real(0.4886025119029199)
             value += (-c1 * y) * rest[i, 0] + (c1 * z) * rest[i, 1] + (-c1 * x) * rest[i, 2]
             if wp.static(degree > 1):
@@ -55,9 +70,9 @@ def harmonics_kernel(dtype, degree: int):
                     value += (real(-0.5900435899266435) * y * (real(3.0) * xx - yy)) * rest[i, 8]
                     value += (real(2.890611442640554) * x * y * z) * rest[i, 9]
                     value += (real(-0.4570457994644658) * y * (real(4.0) * zz - xx - yy)) * rest[i, 10]
-                    value += (real(0.3731763325901154) * z * (real(2.0) * zz - real(3.0) * xx - real(3.0) * yy)) * rest[
-                        i, 11
-                    ]
+                    value += (
+                        real(0.3731763325901154) * z * (real(2.0) * zz - real(3.0) * xx - real(3.0) * yy)
+                    ) * rest[i, 11]
                     value += (real(-0.4570457994644658) * x * (real(4.0) * zz - xx - yy)) * rest[i, 12]
                     value += (real(1.445305721320277) * z * (xx - yy)) * rest[i, 13]
                     value += (real(-0.5900435899266435) * x * (xx - real(3.0) * yy)) * rest[i, 14]
@@ -75,6 +90,7 @@ def harmonics_adjoint_kernel(dtype, degree: int):
     """
     g = geometry(dtype)
     real, vec3 = g.real, g.vec3
+    inverse_length_of = _inverse_length(dtype)
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def harmonics_adjoint(
@@ -93,9 +109,7 @@ def harmonics_adjoint_kernel(dtype, degree: int):
         by_mean = vec3()
         if wp.static(degree > 0):
             offset = means[i] - camera_position[0]
-            square = wp.dot(offset, offset)
-            away = square > real(1.0e-30)
-            inverse_length = wp.where(away, real(1.0) / wp.sqrt(wp.where(away, square, real(1.0))), real(0.0))
+            inverse_length = inverse_length_of(offset)
             d = offset * inverse_length
             x = d[0]
             y = d[1]

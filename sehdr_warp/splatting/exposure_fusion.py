@@ -1,9 +1,9 @@
-"""Neural exposure fusion of given brackets as a torch operation (kernels/fusion.py)."""
+"""Neural exposure fusion of given brackets as a torch operation (kernels/exposure_fusion.py)."""
 
 import torch
 import warp as wp
 
-from ..kernels.fusion import POINTS_PER_THREAD, fusion_kernels
+from ..kernels.exposure_fusion import POINTS_PER_THREAD, fusion_kernels
 from .arrays import view, warp_scalar
 from .bridge import torch_stream
 

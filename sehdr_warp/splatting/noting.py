@@ -1,9 +1,9 @@
-"""What a training notes of each Gaussian at every step, in one launch (kernels/densification.py)."""
+"""What a training notes of each Gaussian at every step, in one launch (kernels/noting.py)."""
 
 import torch
 import warp as wp
 
-from ..kernels.densification import note_gradients
+from ..kernels.noting import note_gradients
 from .arrays import view
 from .bridge import torch_stream
 

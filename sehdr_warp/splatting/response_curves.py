@@ -1,4 +1,4 @@
-"""Camera responses that have a formula, evaluated with their derivative in one launch (kernels/response.py)."""
+"""Camera responses that have a formula, evaluated with their derivative in one launch (kernels/response_curves.py)."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import torch
 import warp as wp
 
 from ..kernels.geometry import vector
-from ..kernels.response import FILMIC, KNEE, NO_TONE, REINHARD, encode_kernel
+from ..kernels.response_curves import FILMIC, KNEE, NO_TONE, REINHARD, encode_kernel
 from .arrays import view, warp_scalar
 from .bridge import torch_stream
 

@@ -41,6 +41,7 @@ def test_it_turns_with_the_gaussian(device):
 
 def test_the_opaque_stay(device):
     assert noise(device, 0.5).abs().max() < 1e-12
+    assert noise(device, 1 - 1e-7, scales=(1e30, 1.0, 1e-30)).abs().max() == 0
 
 
 def test_it_repeats_with_the_seed_whatever_the_threads(device, monkeypatch):

@@ -24,9 +24,23 @@ def fusion_kernels(dtype) -> SimpleNamespace:
     real = dtype
 
     @wp.func
-    def deviation_of(encoded: real, log_sigma: real, most_log: real, most: real) -> real:
-        sigma = wp.exp(wp.clamp(log_sigma, -most_log, most_log))
-        return wp.clamp((encoded - real(0.5)) / sigma, -most, most)
+    def deviation_of(encoded: real, log_sigma: real, most_log: real) -> real:
+        return (encoded - real(0.5)) / wp.exp(wp.clamp(log_sigma, -most_log, most_log))
+
+    @wp.func
+    def largest_logit(
+        outputs: wp.array2d(dtype=real),
+        exposedness: wp.array2d(dtype=real),
+        channel: int,
+        place: int,
+        count: int,
+        brackets: int,
+    ) -> real:
+        """What softmax subtracts from the logits of one colour's brackets, so that its exponentials stay finite."""
+        largest = outputs[channel, place] * exposedness[channel, place]
+        for p in range(1, brackets):
+            largest = wp.max(largest, outputs[channel, p * count + place] * exposedness[channel, p * count + place])
+        return largest
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def perceptrons(
@@ -44,7 +58,7 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         """exposedness: exp(-d^2 / 2) of the deviations from mid grey; outputs: of the perceptron of both."""
         channel, point = wp.tid()
         x = encoded[channel, point]
-        deviation = deviation_of(x, log_sigma[channel], most_log, most)
+        deviation = wp.clamp(deviation_of(x, log_sigma[channel], most_log), -most, most)
         near = wp.exp(real(-0.5) * deviation * deviation)
         output = outer_bias[channel]
         for unit in range(outer.shape[1]):
@@ -65,9 +79,7 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         """scale times the mean of the encoded brackets, weighted by the softmax of outputs times exposedness."""
         place, channel = wp.tid()
         count = results.shape[0]
-        largest = outputs[channel, place] * exposedness[channel, place]
-        for p in range(1, brackets):
-            largest = wp.max(largest, outputs[channel, p * count + place] * exposedness[channel, p * count + place])
+        largest = largest_logit(outputs, exposedness, channel, place, count, brackets)
         total = real(0.0)
         weighted = real(0.0)
         for p in range(brackets):
@@ -92,9 +104,7 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         """by_exposedness: through the logits alone."""
         place, channel = wp.tid()
         count = results.shape[0]
-        largest = outputs[channel, place] * exposedness[channel, place]
-        for p in range(1, brackets):
-            largest = wp.max(largest, outputs[channel, p * count + place] * exposedness[channel, p * count + place])
+        largest = largest_logit(outputs, exposedness, channel, place, count, brackets)
         total = real(0.0)
         for p in range(brackets):
             q = p * count + place
@@ -176,7 +186,7 @@ def fusion_kernels(dtype) -> SimpleNamespace:
                 through += outer[channel, unit] * weight
         gradient = by_exposedness[channel, point] + by_output[channel, point] * through
         log = log_sigma[channel]
-        deviation = (x - real(0.5)) / wp.exp(wp.clamp(log, -most_log, most_log))
+        deviation = deviation_of(x, log, most_log)
         result = real(0.0)
         if wp.abs(log) <= most_log and wp.abs(deviation) <= most:
             result = gradient * near * deviation * deviation
