@@ -106,10 +106,12 @@ def _densification(facts: SceneFacts, config: Config) -> Decision:
     options = config.densification
     if options.strategy == "relocation":
         most = gaussian_budget(options, facts.pixels)
+        start = facts.points or config.model.initial_count
+        choice = f"relocation grows to at most {most}" if start < most else "relocation without growth"
         reason = f"densification.max_gaussians = {options.max_gaussians}"
         if options.budget:
             reason = f"{options.budget:g} times the square root of {facts.pixels} pixels, below {options.max_gaussians}"
-        return Decision("densification", {}, f"relocation grows to at most {most}", reason)
+        return Decision("densification", {}, choice, f"{reason}; {start} to start with")
     unknowns = GEOMETRY_UNKNOWNS + 3 * (config.model.harmonics_degree + 1) ** 2
     determined = 3 * facts.pixels // unknowns
     budget = min(config.densification.max_gaussians, max(FEWEST_GAUSSIANS, determined, 2 * facts.points))

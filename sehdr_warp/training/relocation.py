@@ -21,11 +21,14 @@ SEED_STEP = 1_000_003
 
 
 class Relocation(Densification):
-    """Relocation, growth and noise; see the module. pixels: of all training photos, for the budget."""
+    """Relocation, growth and noise; see the module. pixels: of all training photos, for the budget.
+
+    most: the budget. A start with more Gaussians keeps its count: they move, and none are added.
+    """
 
     def __init__(self, config: Config, extent: float, pixels: int):
         super().__init__(config, extent)
-        self._most = gaussian_budget(self.options, pixels)
+        self.most = gaussian_budget(self.options, pixels)
         self._sums = _relocation_sums()
 
     @torch.no_grad()
@@ -35,7 +38,7 @@ class Relocation(Densification):
         dead = gaussians.opacities() <= self.options.prune_opacity
         self._relocate(gaussians, dead, optimizer, generator)
         count = gaussians.count
-        target = min(self._most, math.ceil((1 + self.options.growth) * count))
+        target = min(self.most, math.ceil((1 + self.options.growth) * count))
         if target > count:
             self._add(gaussians, target - count, optimizer, generator)
         return target > count

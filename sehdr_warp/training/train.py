@@ -6,6 +6,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from .initialization import choose_response, make_field
 from .plan import PLAN, apply_plan, format_plan, read_plan
 from .prediction import predicted_scene
 from .progress import Progress
+from .relocation import Relocation
 from .run import (
     CHECKPOINTS,
     CONFIG,
@@ -84,6 +86,8 @@ def train(
         _torch_settings(trainer.config),
     ):
         progress.note(f"response {trainer.field.response.name}, {trainer.field.gaussians.count} Gaussians on {device}")
+        for line in _crowded(scene, trainer):
+            progress.note(line)
         if plan := read_plan(out):
             progress.note(format_plan(plan))
         loop.run(progress)
@@ -114,6 +118,18 @@ def _sizes(scene: Scene, trainer: Trainer | None = None) -> tuple[int, int, int]
     """Gaussians, and width and height of the largest photo."""
     camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
     return len(scene.points) if trainer is None else trainer.field.gaussians.count, camera.width, camera.height
+
+
+def _crowded(scene: Scene, trainer: Trainer) -> Iterator[str]:
+    """What to know of a training with more start points than it may have, or may add to."""
+    count, strategy = trainer.field.gaussians.count, trainer.densification
+    if trainer.iteration == 0 and len(scene.points) > count:
+        yield f"{len(scene.points)} start points: drawn from, for densification.max_gaussians = {count}"
+    if isinstance(strategy, Relocation) and count > strategy.most:
+        yield (
+            f"{count} Gaussians are more than relocation's budget of {strategy.most} for these photos: they move, and "
+            "none are added; densification.budget=0 lets them grow to densification.max_gaussians"
+        )
 
 
 def with_predictions(scene: Scene, config: Config, response: Response) -> Scene:

@@ -90,6 +90,13 @@ def test_decisions_follow_their_figures(facts, name, change, field, few, many):
     assert RULES[name](replace(facts, **small | change), config).fields.get(field) == many
 
 
+@pytest.mark.parametrize("points,choice", [(0, "without growth"), (3000, "at most 9406"), (10_000, "without growth")])
+def test_a_plan_says_whether_relocation_has_room(facts, points, choice):
+    """120 times the square root of 6144 pixels; without points of its own a scene starts with the preset's 50 000."""
+    decision = RULES["densification"](replace(facts, pixels=6144, points=points), config_of())
+    assert choice in decision.choice and f"{points or 50_000} to start with" in decision.reason
+
+
 def test_one_decision_alone_changes_its_own_fields(scene):
     plan = make_plan(scene, config_of(plan__decisions=["iterations"]))
     before, after = flat(config_of()), flat(plan.config)

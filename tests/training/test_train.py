@@ -103,6 +103,17 @@ def test_a_scene_without_points_starts_from_drawn_ones(tmp_path):
     assert run.metrics()[-1]["psnr_ldr"] > 20
 
 
+@pytest.mark.parametrize("options", [{}, {"densification.budget": 0.1}, {"densification.max_gaussians": 50}])
+def test_more_start_points_than_the_budget_stay_as_many_and_are_told(scene, tmp_path, capsys, options):
+    """60 points; 0.1 times the square root of six photos of 32 x 32 pixels is 7."""
+    config = quick(**{"schedule.iterations": 50, "densification.growth": 0.5} | options)
+    run = train(scene, tmp_path / "run", config, device="cpu")
+    told = capsys.readouterr().err
+    assert ("60 Gaussians are more than relocation's budget of 7" in told) == ("densification.budget" in options)
+    assert ("60 start points: drawn from" in told) == ("densification.max_gaussians" in options)
+    assert run.gaussian_count == options.get("densification.max_gaussians", 60 if options else 90)
+
+
 def test_run_folder_is_complete_and_loads_without_photos(scene, tmp_path):
     out = tmp_path / "run"
     run = train(scene, out, quick(), device="cpu", quiet=True, data={"path": "somewhere"})
