@@ -11,7 +11,7 @@ from ..kernels.constants import ALPHA_THRESHOLD, TILE_SIZE
 from ..splatting.blending import blend
 from ..splatting.tile_lists import TileLists
 from .splats import Size, SplatScene
-from .stages import prepare
+from .stages import Prepared, prepare
 from .timing import Variant, time_variants
 
 BLEND_THREADS = (1, 2)
@@ -25,7 +25,7 @@ def blend_rows(scene: SplatScene, name: str, repetitions: int, budget: float) ->
     """
     prepared = prepare(scene)
     lists, inputs, options = prepared.lists, prepared.blend_inputs, prepared.options
-    pairs, counted = listed_pairs(lists, scene.size), counted_pairs(lists, scene.size)
+    pairs, counted = listed_pairs(lists, scene.size), counted_pairs(prepared, scene.size)
     cotangent = scene.cotangent()
     variants = {}
     for threads in BLEND_THREADS:
@@ -82,9 +82,10 @@ def listed_pairs(lists: TileLists, size: Size) -> int:
     return int((entries * down[:, None] * across[None, :]).sum())
 
 
-def counted_pairs(lists: TileLists, size: Size) -> int:
+def counted_pairs(prepared: Prepared, size: Size) -> int:
     """Of listed_pairs(), those where alpha reaches the threshold: what no algorithm may leave out (but behind pixels
     that are finished)."""
+    lists, (shapes, ellipses) = prepared.lists, prepared.options["records"]
     tiles = torch.repeat_interleave(
         torch.arange(lists.ranges.shape[0]), (lists.ranges[:, 1] - lists.ranges[:, 0]).long()
     )
@@ -93,7 +94,7 @@ def counted_pairs(lists: TileLists, size: Size) -> int:
     for tile, gaussian in zip(tiles.split(20_000), lists.gaussians.long().split(20_000)):
         x = (tile % lists.columns * TILE_SIZE)[:, None, None] + offsets[None, None, :]
         y = (tile // lists.columns * TILE_SIZE)[:, None, None] + offsets[None, :, None]
-        shape, ellipse = lists.shapes[gaussian].T[:, :, None, None], lists.ellipses[gaussian].T[:, :, None, None]
+        shape, ellipse = shapes[gaussian].T[:, :, None, None], ellipses[gaussian].T[:, :, None, None]
         dx, dy = shape[0] - x, shape[1] - y
         exponent = -0.5 * (ellipse[0] * dx * dx + ellipse[2] * dy * dy) - ellipse[1] * dx * dy
         reached = shape[2] * exponent.clamp(max=0.0).exp() >= ALPHA_THRESHOLD

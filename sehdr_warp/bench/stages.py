@@ -8,8 +8,8 @@ import torch
 from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR
 from ..splatting.blending import blend
 from ..splatting.projection import project
-from ..splatting.tile_lists import TileLists, build_tile_lists, depth_order
-from .splats import SplatScene
+from ..splatting.tile_lists import TileLists, build_tile_lists, depth_order, pack_records
+from .splats import Size, SplatScene
 from .timing import Variant
 
 STAGES = ("project", "project backward", "order", "order and lists", "blend forward", "blend backward")
@@ -41,23 +41,36 @@ def project_scene(scene: SplatScene) -> tuple[torch.Tensor, ...]:
     )
 
 
+def list_tiles(projected: tuple[torch.Tensor, ...], size: Size) -> tuple[tuple[torch.Tensor, ...], TileLists]:
+    """pack_records()'s records and the tile lists."""
+    means2d, conics, depths, opacities, extents = projected
+    records = pack_records(means2d, conics, opacities, extents, ALPHA_THRESHOLD)
+    return records, build_tile_lists(records, depths, extents, size.width, size.height)
+
+
 def prepare(scene: SplatScene) -> Prepared:
     """Project and list once, so that each stage can be run alone."""
     size = scene.size
     with torch.no_grad():
         projected = project_scene(scene)
-        lists = build_tile_lists(*projected, size.width, size.height, ALPHA_THRESHOLD)
-    means2d, conics, _, opacities, _ = projected
+        records, lists = list_tiles(projected, size)
+    means2d, conics, _, opacities, extents = projected
     inputs = tuple(
         tensor.detach().clone().requires_grad_() for tensor in (means2d, conics, opacities, scene.leaves[-1])
     )
-    options = {"lists": lists, "width": size.width, "height": size.height, "alpha_threshold": ALPHA_THRESHOLD}
+    options = {
+        "lists": lists,
+        "records": records,
+        "extents": extents,
+        "width": size.width,
+        "height": size.height,
+        "alpha_threshold": ALPHA_THRESHOLD,
+    }
     return Prepared(projected, lists, inputs, options)
 
 
 def stage_variants(scene: SplatScene, prepared: Prepared) -> dict[str, Variant]:
     """One variant for each of STAGES. Each is called as rasterize() calls it, host time included."""
-    size = scene.size
     cotangent = scene.cotangent()
     means2d, conics, depths, opacities, extents = prepared.projected
     generator = torch.Generator().manual_seed(2)
@@ -84,11 +97,7 @@ def stage_variants(scene: SplatScene, prepared: Prepared) -> dict[str, Variant]:
         "project": Variant(projected),
         "project backward": Variant(lambda outputs: torch.autograd.backward(outputs, sent_back), project_forward),
         "order": Variant(lambda _: depth_order(depths, extents)),
-        "order and lists": Variant(
-            lambda _: build_tile_lists(
-                means2d, conics, depths, opacities, extents, size.width, size.height, ALPHA_THRESHOLD
-            )
-        ),
+        "order and lists": Variant(lambda _: list_tiles(prepared.projected, scene.size)),
         "blend forward": Variant(blended),
         "blend backward": Variant(lambda image: image.backward(cotangent), blend_forward),
     }

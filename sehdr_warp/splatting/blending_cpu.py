@@ -16,10 +16,11 @@ from .gathering import gather_by_gaussian
 from .tile_lists import TileLists
 
 
-def blend_on_cpu(device, features, lists: TileLists, image, alpha, alpha_threshold: float, style: BlendStyle):
+def blend_on_cpu(device, features, lists: TileLists, records, image, alpha, alpha_threshold: float, style: BlendStyle):
     """Fill image [H, W, C] and alpha [H, W]; return the backward pass.
 
-    It takes the gradients of image and alpha and gives [N, C + 6]: by feature, conic a b c, x, y, opacity.
+    It takes the records made again and the gradients of image and alpha, and gives [N, C + 6]: by feature, conic a b c,
+    x, y, opacity.
     """
     scalar = warp_scalar(features.dtype)
     height, width, channels = image.shape
@@ -34,7 +35,6 @@ def blend_on_cpu(device, features, lists: TileLists, image, alpha, alpha_thresho
     pieces = balanced_pieces(lists)
     iota = view(torch.arange(TILE_SIZE, dtype=features.dtype).reshape(1, TILE_SIZE), dtype=row)
     ranges, entries = view(lists.ranges, dtype=wp.vec2i), view(lists.gaussians)
-    records = [view(lists.shapes, dtype=vec4), view(lists.ellipses, dtype=vec4)]
     colours = view(features)
     frame = [lists.columns, width, height, alpha_threshold, iota]
     transmittance, last = rows(TILE_SIZE), rows(TILE_SIZE)
@@ -44,7 +44,7 @@ def blend_on_cpu(device, features, lists: TileLists, image, alpha, alpha_thresho
         [
             ranges,
             entries,
-            *records,
+            *(view(record, dtype=vec4) for record in records),
             colours,
             *frame,
             transmittance,
@@ -56,7 +56,7 @@ def blend_on_cpu(device, features, lists: TileLists, image, alpha, alpha_thresho
         device,
     )
 
-    def backward(image_gradient: torch.Tensor, alpha_gradient: torch.Tensor) -> torch.Tensor:
+    def backward(records, image_gradient: torch.Tensor, alpha_gradient: torch.Tensor) -> torch.Tensor:
         entry_gradients = features.new_empty(lists.entry_count, channels + 6)
         threads.launch_ranges(
             blend_cpu.backward_kernel(scalar, channels, halvings, degree),
@@ -65,7 +65,7 @@ def blend_on_cpu(device, features, lists: TileLists, image, alpha, alpha_thresho
                 ranges,
                 entries,
                 view(lists.emission),
-                *records,
+                *(view(record, dtype=vec4) for record in records),
                 colours,
                 *frame,
                 transmittance,

@@ -11,16 +11,16 @@ from .gathering import gather_by_gaussian
 from .tile_lists import TileLists
 
 
-def blend_on_cuda(device, features, lists: TileLists, image, alpha, alpha_threshold: float, style: BlendStyle):
+def blend_on_cuda(device, features, lists: TileLists, records, image, alpha, alpha_threshold: float, style: BlendStyle):
     """Fill image [H, W, C] and alpha [H, W]; return the backward pass.
 
-    It takes the gradients of image and alpha and gives [N, C + 6]: by feature, conic a b c, x, y, opacity.
+    It takes the records made again and the gradients of image and alpha, and gives [N, C + 6]: by feature, conic a b c,
+    x, y, opacity.
     """
     scalar = warp_scalar(features.dtype)
     height, width, channels = image.shape
     vec4, pixel = vector(4, scalar), vector(channels, scalar)
     padding = blend_cuda.padded_channels(channels) - channels
-    padded = torch.nn.functional.pad(features, (0, padding)) if padding else features
     transmittance = features.new_empty(height * width)
     last = torch.empty(height * width, dtype=torch.int32, device=features.device)
     tile_count = lists.columns * lists.rows
@@ -28,16 +28,19 @@ def blend_on_cuda(device, features, lists: TileLists, image, alpha, alpha_thresh
     def pixels(tensor):
         return view(tensor.view(-1, channels), dtype=pixel)
 
-    def launch(kernel, blocks_per_tile, arguments):
+    def rows_of_four(records):
+        # Of padded features too the backward pass makes its own: they are larger than the features.
+        padded = torch.nn.functional.pad(features, (0, padding)) if padding else features
+        return [view(rows, dtype=vec4) for rows in (*records, padded.reshape(-1, 4))]
+
+    def launch(kernel, blocks_per_tile, by_gaussian, arguments):
         wp.launch(
             kernel,
             dim=tile_count * blocks_per_tile * blend_cuda.BLOCK_DIM,
             inputs=[
                 view(lists.ranges, dtype=wp.vec2i),
                 view(lists.gaussians),
-                view(lists.shapes, dtype=vec4),
-                view(lists.ellipses, dtype=vec4),
-                view(padded.reshape(-1, 4), dtype=vec4),
+                *by_gaussian,
                 lists.columns,
                 width,
                 height,
@@ -52,13 +55,15 @@ def blend_on_cuda(device, features, lists: TileLists, image, alpha, alpha_thresh
     launch(
         blend_cuda.forward_kernel(scalar, channels, style.transmittance_min, style.fast_math),
         blend_cuda.BLOCKS_PER_TILE,
+        rows_of_four(records),
         [pixels(image), view(alpha.view(-1)), view(transmittance), view(last)],
     )
 
-    def add_gradients(kernel, blocks_per_tile, image_gradient, alpha_gradient, corner, rows_of, gradients):
+    def add_gradients(kernel, blocks_per_tile, by_gaussian, image_gradient, alpha_gradient, corner, rows_of, gradients):
         launch(
             kernel,
             blocks_per_tile,
+            by_gaussian,
             [
                 view(transmittance),
                 view(last),
@@ -72,16 +77,17 @@ def blend_on_cuda(device, features, lists: TileLists, image, alpha, alpha_thresh
             ],
         )
 
-    def backward(image_gradient: torch.Tensor, alpha_gradient: torch.Tensor) -> torch.Tensor:
+    def backward(records, image_gradient: torch.Tensor, alpha_gradient: torch.Tensor) -> torch.Tensor:
+        incoming = rows_of_four(records), image_gradient, alpha_gradient
         kernel = blend_cuda_adjoint.backward_kernel(scalar, channels, style.fast_math, style.deterministic)
         corners = blend_cuda_adjoint.BLOCKS_PER_TILE
         if not style.deterministic:
             gathered = features.new_zeros(features.shape[0], channels + 6)
-            add_gradients(kernel, corners, image_gradient, alpha_gradient, 0, lists.gaussians, gathered)
+            add_gradients(kernel, corners, *incoming, 0, lists.gaussians, gathered)
             return gathered
         by_entry = features.new_zeros(lists.entry_count, channels + 6)
         for corner in range(corners):
-            add_gradients(kernel, 1, image_gradient, alpha_gradient, corner, lists.emission, by_entry)
+            add_gradients(kernel, 1, *incoming, corner, lists.emission, by_entry)
         return gather_by_gaussian(lists, by_entry)
 
     return backward

@@ -10,7 +10,7 @@ from .blend_style import DEFAULT_STYLE, BlendStyle
 from .blending import blend
 from .memory import tells_sizes
 from .projection import project
-from .tile_lists import LARGEST_CAPACITY, build_tile_lists
+from .tile_lists import LARGEST_CAPACITY, build_tile_lists, pack_records
 
 
 @dataclass(frozen=True)
@@ -97,13 +97,16 @@ def rasterize(
         antialiased=antialiased,
     )
     features = features.contiguous()
+    records = pack_records(
+        *(tensor.detach() for tensor in (means2d, conics, opacities2d)), extents, alpha_threshold, features.detach()
+    )
     lists = build_tile_lists(
-        *(tensor.detach() for tensor in (means2d, conics, depths, opacities2d, extents)),
+        records,
+        depths.detach(),
+        extents,
         width,
         height,
-        alpha_threshold,
         capacity,
-        features=features.detach(),
         emission=means.device.type == "cpu" or style.deterministic,
     )
     image, alpha = blend(
@@ -112,6 +115,8 @@ def rasterize(
         opacities2d,
         features,
         lists=lists,
+        records=records,
+        extents=extents,
         width=width,
         height=height,
         alpha_threshold=alpha_threshold,

@@ -1,4 +1,5 @@
-"""The middle stages of a render: depth order, and for each tile the list of Gaussians that touch it, front to back."""
+"""The middle stages of a render: records of the projected Gaussians, depth order, and for each tile the list of those
+that touch it, front to back."""
 
 from dataclasses import dataclass
 
@@ -26,8 +27,6 @@ class TileLists:
     gaussians: [M] the Gaussian of each entry, by tile and then front to back.
     emission: [M] the entry's position before the sort by tile: entries of one Gaussian are neighbours there. None
         where it was not asked for.
-    shapes: [N, 4] x, y, opacity, half-height; ellipses: [N, 4] conic a, b, c and the level where alpha meets the
-        threshold.
     columns, rows: tiles across and down.
     overflow: scalar bool, whether a given capacity was too small for all entries; None without a capacity.
     total: scalar int64, how many entries there are, with or without room for them.
@@ -38,8 +37,6 @@ class TileLists:
     ranges: torch.Tensor
     gaussians: torch.Tensor
     emission: torch.Tensor | None
-    shapes: torch.Tensor
-    ellipses: torch.Tensor
     columns: int
     rows: int
     overflow: torch.Tensor | None
@@ -53,41 +50,28 @@ class TileLists:
 
 @torch.no_grad()
 def build_tile_lists(
-    means2d,
-    conics,
-    depths,
-    opacities,
-    extents,
-    width: int,
-    height: int,
-    alpha_threshold: float,
-    capacity: int | None = None,
-    *,
-    features=None,
-    emission: bool = True,
+    records, depths, extents, width: int, height: int, capacity: int | None = None, *, emission: bool = True
 ) -> TileLists:
     """Order the projected Gaussians by depth and list, for each tile, those whose ellipse touches it.
 
-    The arguments are project()'s results; nothing here is differentiable.
+    records: pack_records()'s; depths, extents: project()'s. Nothing here is differentiable.
     capacity: room for this many entries. The host then never waits for the device to learn how many there are; entries
     beyond it are left out, and TileLists.overflow says so.
-    features: [N, C]; a Gaussian with one that is not finite is culled: its extents are set to 0.
     emission: also tell where entries came from, which adjoints need that sum by Gaussian in a fixed order.
     Raises SehdrError if the lists would need more than 2^31 - 1 entries.
     """
     columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
     tile_count = columns * rows
-    shapes, ellipses = pack_records(means2d, conics, opacities, extents, features, alpha_threshold)
     order = depth_order(depths, extents)
-    counts = count_entries(order, shapes, ellipses, extents, columns, rows)
+    counts = count_entries(order, *records, extents, columns, rows)
     total = counts.sum(dtype=torch.int64)
     overflow = None if capacity is None else total > capacity
     room = _exact_room(int(total), order.shape[0], columns, rows) if capacity is None else capacity
     ends = counts.cumsum(0, dtype=torch.int32)
-    tiles, gaussians = emit_entries(order, shapes, ellipses, extents, columns, rows, ends, room, capacity is not None)
+    tiles, gaussians = emit_entries(order, *records, extents, columns, rows, ends, room, capacity is not None)
     tiles, gaussians, places = sort_by_tile(tiles, gaussians, room, tile_count, emission)
     ranges = find_ranges(tiles, tile_count)
-    return TileLists(order, ends, ranges, gaussians, places, shapes, ellipses, columns, rows, overflow, total)
+    return TileLists(order, ends, ranges, gaussians, places, columns, rows, overflow, total)
 
 
 def _exact_room(total: int, gaussian_count: int, columns: int, rows: int) -> int:
@@ -99,8 +83,14 @@ def _exact_room(total: int, gaussian_count: int, columns: int, rows: int) -> int
     return total
 
 
-def pack_records(means2d, conics, opacities, extents, features, alpha_threshold: float):
-    """[N] records of four numbers each: see TileLists.shapes and TileLists.ellipses."""
+def pack_records(means2d, conics, opacities, extents, alpha_threshold: float, features=None):
+    """What is drawn of each projected Gaussian, in rows of four: shapes and ellipses.
+
+    shapes: [N, 4] x, y, opacity, half-height; ellipses: [N, 4] conic a, b, c and the level where alpha meets the
+    threshold, -1 where culled.
+    features: [N, C]; a Gaussian with one that is not finite is culled: its extents are set to 0. Packed again from the
+    same extents, with or without the features, the records are the same bits.
+    """
     scalar = warp_scalar(means2d.dtype)
     vec2, vec3, vec4 = (vector(n, scalar) for n in (2, 3, 4))
     count = means2d.shape[0]

@@ -37,8 +37,7 @@ def test_the_depth_of_layers_does_not_depend_on_the_size():
     depths = []
     for size in (large, small):
         scene = make_splat_scene(size, 3)
-        lists = prepare(scene).lists
-        depths.append(counted_pairs(lists, size) / (size.width * size.height))
+        depths.append(counted_pairs(prepare(scene), size) / (size.width * size.height))
     assert depths[0] == pytest.approx(depths[1], rel=0.1)
     assert depths[0] > 5
 
@@ -52,7 +51,7 @@ def test_pairs_are_those_of_a_dense_count():
     dx, dy = (means2d[:, k, None, None] - axis for k, axis in ((0, x), (1, y)))
     a, b, c = conics.T[:, :, None, None]
     alpha = opacities[:, None, None] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-    assert counted_pairs(lists, size) == pytest.approx(int((alpha >= 1 / 255).sum()), abs=2)
+    assert counted_pairs(prepared, size) == pytest.approx(int((alpha >= 1 / 255).sum()), abs=2)
     entries = torch.zeros(37, 50, dtype=torch.long)
     for tile, (first, last) in enumerate(lists.ranges.tolist()):
         top, left = tile // lists.columns * 16, tile % lists.columns * 16
@@ -62,8 +61,8 @@ def test_pairs_are_those_of_a_dense_count():
 
 def test_every_pixel_counts_for_every_covering_gaussian():
     size = Size(200, 128, 112)
-    lists = prepare(make_covering_scene(size, 3)).lists
-    assert listed_pairs(lists, size) == counted_pairs(lists, size) == 200 * 128 * 112
+    prepared = prepare(make_covering_scene(size, 3))
+    assert listed_pairs(prepared.lists, size) == counted_pairs(prepared, size) == 200 * 128 * 112
 
 
 def test_variants_take_turns_and_slow_ones_run_less_often():

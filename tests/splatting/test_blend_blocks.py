@@ -1,14 +1,17 @@
 """The CUDA block kernels run on CPU fibers, so that a machine without a GPU tests their logic."""
 
+import weakref
+
 import pytest
 import torch
 import warp as wp
+from torch.profiler import ProfilerActivity, profile
 
 from sehdr_warp.splatting import BlendStyle
 from sehdr_warp.splatting.blending import blend
 from sehdr_warp.splatting.projection import project
 from sehdr_warp.splatting.reference import blend_reference
-from sehdr_warp.splatting.tile_lists import build_tile_lists
+from sehdr_warp.splatting.tile_lists import build_tile_lists, pack_records
 
 from .scenes import random_like, random_scene, relative_error
 
@@ -53,7 +56,9 @@ def test_block_kernels_match_the_reference(fibers, dtype, channels, deterministi
         true_geometry = projected(scene.to(torch.float64), threshold)
     inputs = [t.detach().requires_grad_() for t in (geometry[0], geometry[1], geometry[3])]
     features = scene.tensors[4].to(dtype, copy=True).requires_grad_()
-    lists = build_tile_lists(*(t.detach() for t in geometry), scene.width, scene.height, threshold)
+    means2d, conics, depths, opacities, extents = (t.detach() for t in geometry)
+    records = pack_records(means2d, conics, opacities, extents, threshold)
+    lists = build_tile_lists(records, depths, extents, scene.width, scene.height)
     assert int((lists.ranges[:, 1] - lists.ranges[:, 0]).max()) > 64
 
     def forward():
@@ -61,6 +66,8 @@ def test_block_kernels_match_the_reference(fibers, dtype, channels, deterministi
             *inputs,
             features,
             lists=lists,
+            records=records,
+            extents=extents,
             width=scene.width,
             height=scene.height,
             alpha_threshold=threshold,
@@ -83,3 +90,22 @@ def test_block_kernels_match_the_reference(fibers, dtype, channels, deterministi
     ((true_image * random_like(true_image, 1)).sum() + (true_alpha * random_like(true_alpha, 2)).sum()).backward()
     for ours, truth in zip([*inputs, features], [*true_inputs, true_features]):
         assert relative_error(ours.grad, truth.grad) < gradient_bound
+
+
+def test_nothing_by_gaussian_is_kept_for_the_backward_pass(fibers, monkeypatch):
+    monkeypatch.setenv("KINETO_LOG_LEVEL", "99")  # the profiler's own messages
+    scene = random_scene(count=600, channels=3, width=44, height=26, seed=2).to(torch.float32, "cpu")
+    with torch.no_grad():
+        means2d, conics, depths, opacities, extents = projected(scene, 1 / 255)
+    records = pack_records(means2d, conics, opacities, extents, 1 / 255)
+    inputs = [tensor.requires_grad_() for tensor in (means2d, conics, opacities, scene.tensors[4])]
+    options = {"lists": build_tile_lists(records, depths, extents, 44, 26), "records": records, "extents": extents}
+    options |= {"width": 44, "height": 26, "alpha_threshold": 1 / 255, "block_kernels": True}
+    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
+        image = fibers(lambda: blend(*inputs, **options))[0]
+    kept = sum(event.nbytes() for event in recorded.profiler.kineto_results.events() if event.name() == "[memory]")
+    by_pixel = 3 + 1 + 1 + 1  # image, alpha, transmittance and the last Gaussian drawn
+    assert image.requires_grad and kept == 4 * by_pixel * 44 * 26
+    given = [weakref.ref(record) for record in records]
+    del records, options["records"]
+    assert [record() for record in given] == [None, None]

@@ -201,6 +201,11 @@ def test_gaussians_that_are_not_finite_are_culled(device, which):
     ours, without = rasterize(*scene.arguments), rasterize(*rest.arguments)
     assert not ours.visible[7]
     assert torch.equal(ours.image, without.image)
+    backward(ours)
+    backward(without)
+    others = torch.arange(150) != 7
+    for tensor, same in zip(scene.tensors[:5], rest.tensors[:5]):
+        assert relative_error(tensor.grad[others], same.grad[others]) < 1e-5
 
 
 @pytest.mark.parametrize("which", [5, 6], ids=NAMES[5:])

@@ -20,7 +20,7 @@ def counted(device, count=20000):
         width=16 * COLUMNS, height=16 * ROWS, near=0.01, low_pass=0.3, alpha_threshold=THRESHOLD, antialiased=False,
     )  # fmt: skip
     means2d, conics, depths, opacities2d, extents = projected
-    shapes, ellipses = pack_records(means2d, conics, opacities2d, extents, None, THRESHOLD)
+    shapes, ellipses = pack_records(means2d, conics, opacities2d, extents, THRESHOLD)
     order = depth_order(depths, extents)
     counts = count_entries(order, shapes, ellipses, extents, COLUMNS, ROWS)
     return (order, shapes, ellipses, extents, COLUMNS, ROWS), counts
