@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from sehdr_warp.output.gaussian_file import read_gaussians
 from sehdr_warp.output.ply import without_unseen_degrees, write_ply
 from sehdr_warp.output.render_views import render_views
 
-from .helpers import AnalyticRun
+from .helpers import AnalyticRun, read_gaussians
 from .test_ply import StoredRun, evaluate_colors, gaussians, sphere_directions
 
 
