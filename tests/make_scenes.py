@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image
 
 from sehdr_warp.scene import Camera
-from sehdr_warp.scene.hdr_nerf_layout import RadianceView, centred_exposures, reinhard_gamma, write_hdr_nerf_scene
+from sehdr_warp.scene.hdr_nerf_layout import RadianceView, reinhard_gamma, write_hdr_nerf_scene
 from sehdr_warp.scene.images import read_hdr
 from sehdr_warp.scene.resample import area_average
 
@@ -108,16 +108,30 @@ def room_views(
     return views
 
 
-def write_room(folder: Path, shared: Path, *, points: bool = True, exposures=None, **options) -> list[float]:
-    """An HDR-NeRF synthetic set of the rendered room in `folder`; returns its five exposure times.
+def reinhard_gamma_inverse(value):
+    """The exposure x >= 0 of an encoded value in [0, 1); see reinhard_gamma."""
+    linear = np.asarray(value, dtype=np.float64) ** 2.2
+    return linear / (1.0 - linear)
+
+
+def write_reinhard(folder: Path, views: list[RadianceView], times, **options) -> None:
+    """An HDR-NeRF synthetic set of views in `folder`, its photos at `times` seconds by HDR-NeRF's response."""
+    photos = [[reinhard_gamma(view.radiance * time) for view in views] for time in times]
+    write_hdr_nerf_scene(folder, views, times, photos, **options)
+
+
+def write_room(folder: Path, shared: Path, *, points: bool = True, **options) -> list[float]:
+    """An HDR-NeRF synthetic set of the rendered room in `folder`; returns its five exposure times, each four times the
+    last, whose middle encodes the median luminance as 0.5.
 
     options: as room_views takes them. points: with the room's own sparse points.
     """
     views = room_views(shared, **options)
-    times = centred_exposures([view.radiance for view in views])
+    median = np.median(np.concatenate([(view.radiance @ [0.2126, 0.7152, 0.0722]).ravel() for view in views]))
+    times = [float(reinhard_gamma_inverse(0.5) / median * 4.0**k) for k in range(-2, 3)]
     cloud = None
     if points:
         with np.load(shared / "data" / options.get("room", "room") / "points_hdr.npz") as stored:
             cloud = stored["xyz"], reinhard_gamma(stored["radiance"] * times[2])
-    write_hdr_nerf_scene(folder, views, times, exposures=exposures, points=cloud)
+    write_reinhard(folder, views, times, points=cloud)
     return times

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,36 +34,18 @@ def reinhard_gamma(exposure: np.ndarray) -> np.ndarray:
     return (exposure / (1.0 + exposure)) ** (1 / 2.2)
 
 
-def reinhard_gamma_inverse(value: np.ndarray) -> np.ndarray:
-    """The exposure x >= 0 of an encoded value in [0, 1]; infinite at 1."""
-    with np.errstate(divide="ignore"):
-        linear = np.asarray(value, dtype=np.float64) ** 2.2
-        return linear / (1.0 - linear)
-
-
-def centred_exposures(radiance: Iterable[np.ndarray], count: int = 5, ratio: float = 4.0) -> list[float]:
-    """`count` times, each `ratio` times the last, whose middle brings the median luminance to x = 0.28 (encoded 0.5
-    by HDR-NeRF's response)."""
-    weights = np.array([0.2126, 0.7152, 0.0722])
-    median = float(np.median(np.concatenate([(image @ weights).ravel() for image in radiance])))
-    middle = reinhard_gamma_inverse(np.array(0.5)) / median
-    return [float(middle * ratio ** (k - (count - 1) / 2)) for k in range(count)]
-
-
 def write_hdr_nerf_scene(
     folder: Path | str,
     views: Sequence[RadianceView],
     exposure_times: Sequence[float],
-    encode: Callable[[np.ndarray], np.ndarray] = reinhard_gamma,
+    photos: Sequence[Sequence[np.ndarray]],
     *,
-    exposures: Sequence[int] | None = None,
     points: tuple[np.ndarray, np.ndarray] | None = None,
     half: bool = True,
 ) -> None:
     """Write a set that load_scene reads, with HDR-NeRF's file names, into a folder that may exist but gets new files.
 
-    exposure_times: seconds; photo k of a view is encode(radiance * exposure_times[k]) in 8 bits, rounded to nearest.
-    exposures: the numbers k to write; None writes all.
+    exposure_times: seconds. photos: at each time one of each view, [H, W, 3] encoded in [0, 1], stored in 8 bits.
     points: ([P, 3] places, [P, 3] colours in [0, 1]) for `sparse/0/points3D.txt`; None writes none.
     half: the truth as half floats (values up to 65504), otherwise as floats.
     Raises ValueError for a camera that the layout cannot hold, cameras that differ, or radiance beyond the format.
@@ -75,16 +57,17 @@ def write_hdr_nerf_scene(
     if len(angles) != 1:
         raise ValueError(f"HDR-NeRF sets have one camera_angle_x, the views have {sorted(angles)[:4]}")
     for split in ("train", "test"):
-        chosen = [view for view in views if view.split == split]
+        chosen = [index for index, view in enumerate(views) if view.split == split]
         frames, times = [], {}
         (folder / split).mkdir(parents=True, exist_ok=True)
         (folder / f"{split}_hdr").mkdir(exist_ok=True)
-        for place, view in enumerate(chosen):
+        for place, index in enumerate(chosen):
+            view = views[index]
             stem = f"./{split}/{view.name}"
-            for k in range(len(exposure_times)) if exposures is None else exposures:
-                value = np.clip(encode(view.radiance * exposure_times[k]), 0.0, 1.0)
-                Image.fromarray((value * 255 + 0.5).astype(np.uint8)).save(folder / f"{stem}_{k}.png", optimize=True)
-                times[f"{stem}_{k}.png"] = float(exposure_times[k])
+            for k, (time, taken) in enumerate(zip(exposure_times, photos, strict=True)):
+                code = (np.clip(taken[index], 0.0, 1.0) * 255 + 0.5).astype(np.uint8)
+                Image.fromarray(code).save(folder / f"{stem}_{k}.png")
+                times[f"{stem}_{k}.png"] = float(time)
             if half and view.radiance.max() > 65504:
                 raise ValueError(f"radiance {view.radiance.max():g} of {view.name} does not fit half floats")
             pixels = np.ascontiguousarray(view.radiance, dtype=np.float16 if half else np.float32)

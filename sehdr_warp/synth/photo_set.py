@@ -1,12 +1,10 @@
 """A whole HDR-NeRF synthetic set of a scene with truth: photos at several exposures through any response."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import InputError
 from ..output.files import atomic_folder
-from ..output.images import quantize, write_png
 from ..scene import Scene
 from ..scene.hdr_nerf_layout import RadianceView, write_hdr_nerf_scene
 from .expose import Curve, SensorNoise, expose
@@ -36,15 +34,7 @@ def write_photo_set(
     points = (scene.points, exposed[len(times) // 2].point_colors) if len(scene.points) else None
     with atomic_folder(out, overwrite) as folder:
         try:
-            write_hdr_nerf_scene(folder, views, times, exposures=(), points=points, half=half)
+            photos = [[view.image for view in photographed.views] for photographed in exposed]
+            write_hdr_nerf_scene(folder, views, times, photos, points=points, half=half)
         except ValueError as error:
             raise InputError(scene.name, str(error), "expose a set in HDR-NeRF's layout") from None
-        for split in ("train", "test"):
-            stated = {}
-            for k, photographed in enumerate(exposed):
-                for view in photographed.views:
-                    if view.split == split:
-                        name = f"./{split}/{view.name}_{k}.png"
-                        write_png(folder / name, quantize(view.image))
-                        stated[name] = float(times[k])
-            (folder / f"exposure_{split}.json").write_text(json.dumps(stated, indent=1))

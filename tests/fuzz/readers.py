@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.make_scenes import pattern, write_blender, write_colmap
+from tests.make_scenes import pattern, write_blender, write_colmap, write_reinhard
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ def _read_transforms(folder: Path):
 
 
 def _hdr_nerf(folder: Path) -> None:
-    from sehdr_warp.scene.hdr_nerf_layout import RadianceView, write_hdr_nerf_scene
+    from sehdr_warp.scene.hdr_nerf_layout import RadianceView
     from tests.training.toy import orbit_camera
 
     view = orbit_camera(0.0, 16)
     views = [
         RadianceView(f"r_{i}", view, np.full((16, 16, 3), 0.1 * i + 0.1), ("train", "test")[i % 2]) for i in (0, 1)
     ]
-    write_hdr_nerf_scene(folder, views, [0.5, 2.0], points=(np.eye(3), np.eye(3)))
+    write_reinhard(folder, views, [0.5, 2.0], points=(np.eye(3), np.eye(3)))
 
 
 def _load_scene(folder: Path):
@@ -94,20 +94,6 @@ def _read_points(folder: Path):
     from sehdr_warp.scene.colmap_model import read_ply_points
 
     return each(folder, "*.ply", read_ply_points)
-
-
-def _gaussians(folder: Path) -> None:
-    from sehdr_warp.output.gaussian_file import GaussianArrays, write_gaussians
-
-    rng = np.random.default_rng(0)
-    arrays = [rng.normal(size=shape).astype(np.float32) for shape in ((5, 3), (5, 3), (5, 4), (5,), (5, 4, 3))]
-    write_gaussians(folder / "g.ply", GaussianArrays(*arrays, "log", 0.5))
-
-
-def _read_gaussians(folder: Path):
-    from sehdr_warp.output.gaussian_file import read_gaussians
-
-    return read_gaussians(folder / "g.ply")
 
 
 def _exr(folder: Path) -> None:
@@ -170,10 +156,10 @@ def _read_photos(folder: Path):
 
 
 def _config(folder: Path) -> None:
-    from sehdr_warp.training.config_files import config_to_toml, load_config
+    from importlib import resources
 
     (folder / "own.toml").write_text('base = "paper"\nseed = 3\n[schedule]\niterations = 100\nevaluate_at = [1, 2]\n')
-    (folder / "all.toml").write_text(config_to_toml(load_config("fast")))
+    (folder / "all.toml").write_text((resources.files("sehdr_warp.configs") / "default.toml").read_text())
 
 
 def _read_config(folder: Path):
@@ -299,7 +285,6 @@ READERS = {
     "scene": Reader(_transforms, ("transforms.json", "images/*"), _load_scene, text=True),
     "llff": Reader(_llff, ("poses_bounds.npy",), _read_llff),
     "ply-points": Reader(_points, ("*.ply",), _read_points, text=True),
-    "ply-gaussians": Reader(_gaussians, ("g.ply",), _read_gaussians, text=True),
     "exr": Reader(_exr, ("*.exr",), _read_exr),
     "radiance": Reader(_radiance, ("*.hdr",), _read_radiance),
     "photos": Reader(_photos, ("*",), _read_photos),

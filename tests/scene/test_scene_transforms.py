@@ -8,8 +8,16 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_cameras, load_scene
-from sehdr_warp.scene.hdr_nerf_layout import reinhard_gamma, reinhard_gamma_inverse
-from tests.make_scenes import arc_poses, pattern, room_views, write_blender, write_colmap, write_room
+from sehdr_warp.scene.hdr_nerf_layout import reinhard_gamma
+from tests.make_scenes import (
+    arc_poses,
+    pattern,
+    reinhard_gamma_inverse,
+    room_views,
+    write_blender,
+    write_colmap,
+    write_room,
+)
 
 
 def _edit(folder, **fields):
@@ -155,7 +163,7 @@ def test_photos_are_averaged_as_light(room):
 def test_points_are_triangulated_and_cached(tmp_path, shared):
     from scipy.spatial import cKDTree
 
-    write_room(tmp_path, shared, points=False, exposures=[2])
+    write_room(tmp_path, shared, points=False)
     messages = []
     scene = load_scene(tmp_path, cache=tmp_path / "cache", progress=messages.append)
     truth = np.load(shared / "data" / "room" / "points_hdr.npz")["xyz"]
