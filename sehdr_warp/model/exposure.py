@@ -15,16 +15,6 @@ from ..errors import SehdrError
 PAPER_BRACKETS = ("1/8", "1/4", "1", "8", "16")
 
 
-def time_from_ev(ev: float, base_time: float) -> float:
-    """The exposure time in seconds that is `ev` stops from `base_time`: positive is longer and brighter."""
-    return _positive(base_time, "base_time") * 2.0**ev
-
-
-def ev_from_time(exposure_time: float, base_time: float) -> float:
-    """How many stops `exposure_time` is from `base_time` (both in seconds, positive): log2 of their ratio."""
-    return math.log2(_positive(exposure_time, "exposure_time") / _positive(base_time, "base_time"))
-
-
 def exposure_times(base_time: float, spec: str | Sequence[str | float] = PAPER_BRACKETS) -> tuple[float, ...]:
     """The exposure times in seconds of a bracket, ascending, from a description.
 

@@ -7,9 +7,7 @@ from ..errors import SehdrError
 from .response_curve import EXTENSION_SLOPE, HALF_CODE, Response
 
 CELLS = 8
-"""Cells of the warp over the encoded values [0, 1]; the anchor lies between two of them."""
-ANCHOR = 0.5
-"""The encoded value that keeps its exposure, so that the radiance of the scene cannot drift."""
+"""Cells of the warp over the encoded values [0, 1]; one half, which keeps its exposure, lies between two of them."""
 SHARPEST = 3.0
 """Log densities are held within this: of one half of the values, no slope is more than e^6 = 403 times another."""
 

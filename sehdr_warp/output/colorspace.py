@@ -53,11 +53,6 @@ _ALIASES = {
 }
 
 
-def color_space_names() -> list[str]:
-    """The names that color_space takes, without aliases."""
-    return list(_SPACES)
-
-
 def color_space(name: str) -> ColorSpace:
     """The space of a name or alias (`ap0`, `ap1`, `bt709`, `bt2020`, ...), in any case; SehdrError if unknown."""
     key = name.strip().lower()

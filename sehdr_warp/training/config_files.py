@@ -2,7 +2,6 @@
 
 import json
 import reprlib
-import textwrap
 import tomllib
 import types
 import typing
@@ -68,22 +67,6 @@ def config_to_dict(config: Config) -> dict:
 def config_from_dict(values: dict, source: Path | str = "config") -> Config:
     """The config that config_to_dict described; `source` names it in errors. Raises InputError."""
     return _build(source, values)
-
-
-def config_to_toml(config: Config) -> str:
-    """A commented TOML file that states every field of a config; load_config reads it back exactly."""
-    lines = [_toml_field(config, item) for item in fields(config) if not is_dataclass(getattr(config, item.name))]
-    for part in fields(config):
-        table = getattr(config, part.name)
-        if is_dataclass(table):
-            lines += [f"\n[{part.name}]", *(_toml_field(table, item) for item in fields(table))]
-    return "\n".join(lines) + "\n"
-
-
-def _toml_field(node, item) -> str:
-    comment = textwrap.wrap(item.metadata["doc"], 116, initial_indent="# ", subsequent_indent="# ")
-    # JSON's strings, numbers, booleans and lists are TOML's as well.
-    return "\n".join([*comment, f"{item.name} = {json.dumps(getattr(node, item.name))}"])
 
 
 def read_config_json(path: Path) -> Config:
