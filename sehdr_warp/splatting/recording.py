@@ -69,6 +69,19 @@ class GraphRecorder:
         # Keeps the pool's memory between recordings: freed with the last graph of the pool, it would be allocated anew.
         self._anchor = self._record(lambda: torch.zeros(1, device=self.device))
 
+    @contextmanager
+    def launching(self):
+        """Launches within this block go to the stream of the recordings, after and before what is launched around it.
+
+        For work that is recorded later: torch keeps the stream on which a parameter's gradient was first summed for as
+        long as any graph of it lives, and a recording that meets another stream than its own is spoilt.
+        """
+        current = torch.cuda.current_stream(self.device)
+        self.stream.wait_stream(current)
+        with torch.cuda.stream(self.stream):
+            yield
+        current.wait_stream(self.stream)
+
     def invalidate(self) -> None:
         """Forget the recording: something that it holds fixed has changed."""
         self._key = self._modules = self._result = None

@@ -30,7 +30,8 @@ class ViewStack:
     """V training views of one size in shared memory: [i] is view i; at() takes the view whose number is on the device.
 
     cameras: [V, 24], each view's pose [4, 4], intrinsics [4], position [3] and a 0; times: exposure times in seconds
-    [V], float32, or one float where all are equal; the rest as in Target, each [V, ...] or None.
+    [V], float32, or one float where all are equal; images: as in Target, each [V, ...] or None, encoded values as uint8
+    where all of them are whole codes of 255.
     """
 
     width: int
@@ -55,6 +56,7 @@ class ViewStack:
                 empty = torch.ones_like(given) if name == "mask" else torch.zeros_like(given)
                 given = torch.stack([empty if value is None else value for value in values])
             images[name] = given
+        images["encoded"] = _codes(images["encoded"])
         times = [view.exposure_time for view in views]
         cameras = [view.camera for view in views]
         return ViewStack(
@@ -78,17 +80,35 @@ class ViewStack:
         return self._view(lambda values: values[index], time)
 
     def at(self, index: Tensor) -> TrainingView:
-        """The view whose number is in index [1], int64, on the views' device; its exposure time may be a tensor."""
+        """The view whose number is in index [1], int64, on the views' device; its exposure time may be a tensor.
+
+        Everything is copied, so encoded values only where light is not kept, which losses then compare."""
 
         def take(values: Tensor) -> Tensor:
             return values.index_select(0, index)[0]
 
-        return self._view(take, self.times if isinstance(self.times, float) else take(self.times))
+        left_out = () if self.images["light"] is None else ("encoded",)
+        return self._view(take, self.times if isinstance(self.times, float) else take(self.times), left_out)
 
-    def _view(self, take, time) -> TrainingView:
+    def _view(self, take, time, left_out=()) -> TrainingView:
         pose, intrinsics, position = take(self.cameras)[:23].split((16, 4, 3))
         camera = CameraTensors(self.width, self.height, pose.view(4, 4), intrinsics, position)
-        return TrainingView(camera, time, Target(**{k: None if v is None else take(v) for k, v in self.images.items()}))
+        images = {k: None if v is None or k in left_out else take(v) for k, v in self.images.items()}
+        if images["encoded"] is not None:
+            images["encoded"] = _values(images["encoded"])
+        return TrainingView(camera, time, Target(**images))
+
+
+def _codes(encoded: Tensor) -> Tensor:
+    """Encoded values as uint8 where _values() gives them back bit for bit: photos take a quarter of the memory."""
+    codes = (255 * encoded).round().clamp(0, 255).to(torch.uint8)
+    exact = all(torch.equal(_values(mine), image) for mine, image in zip(codes, encoded, strict=True))
+    return codes if exact else encoded
+
+
+def _values(encoded: Tensor) -> Tensor:
+    # By a tensor: torch's division by a number on a GPU is a product with its reciprocal, which rounds differently.
+    return encoded if encoded.dtype != torch.uint8 else encoded / torch.full((), 255.0, device=encoded.device)
 
 
 def largest_truth(scene: Scene, loss: LossConfig) -> float:
@@ -123,19 +143,22 @@ def training_views(
     device,
     *,
     truth: bool,
+    bounds: bool = True,
     light: Response | None = None,
     highlights: Sequence[float] | None = None,
 ) -> list[TrainingView]:
-    """The views at 1 / 2^level of their size. truth: also upload HDR truth; light: keep the exposures that this
-    response decodes from the photos; highlights: stops over white that light is expected at where one, two and three
-    channels of a pixel clip. Photos are averaged as exposures, since light adds up and encoded values do not; a pixel
-    with a clipped part stays a lower bound."""
+    """The views at 1 / 2^level of their size. truth: also upload HDR truth; bounds: note where they are clipped and
+    black; light: keep the exposures that this response decodes from the photos; highlights: stops over white that light
+    is expected at where one, two and three channels of a pixel clip. Photos are averaged as exposures, since light adds
+    up and encoded values do not; a pixel with a clipped part stays a lower bound."""
     expected = None if highlights is None else torch.tensor((0.0, *highlights), device=device)
     made = []
     for view in views:
         width, height = (max(1, round(size / 2**level)) for size in (view.camera.width, view.camera.height))
         camera: Camera = view.camera.resized(width, height) if level else view.camera
         target = _target(view, (height, width), response, base_time, device, truth)
+        if not bounds:
+            target = replace(target, clipped=None, black=None)
         if light is not None:
             target = replace(target, light=light.decode(target.encoded))
         if expected is not None:

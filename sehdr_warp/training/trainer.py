@@ -2,6 +2,7 @@
 
 import math
 import operator
+from contextlib import nullcontext
 
 import torch
 from torch import Tensor
@@ -73,7 +74,8 @@ class Trainer:
         self._recorder = GraphRecorder(self.device) if recorded else None
         self._launched: set = set()
         self._room = PairRoom(self.device)
-        self._last: tuple[Tensor, Tensor, Tensor] | None = None
+        self._last: tuple[Tensor, Tensor] | None = None
+        self._last_view: tuple[ViewStack | list[TrainingView], int] | None = None
         self._presence: Tensor | None = None
         self._degree_limit = config.model.harmonics_degree
         self._early_stop = EarlyStop(config)
@@ -111,7 +113,8 @@ class Trainer:
         """PSNR of the last step's simulated photo against the photo, dB."""
         if self._last is None:
             return float("nan")
-        _, prediction, truth = self._last
+        prediction, (views, index) = self._last[1], self._last_view
+        truth = views[index].target.encoded
         if not self._encoded:
             prediction = self.field.response.encode_extended(prediction)
         return float(-10 * (prediction.clamp(0, 1) - truth).square().mean().clamp_min(1e-10).log10())
@@ -143,10 +146,12 @@ class Trainer:
         self._draw_presence()
         # The last: a learned response encodes few exposures otherwise, by kernels of its own.
         kind = (self.degree, self.level, watched, self._hold_response(), gaussians.count < EXACT_BELOW)
+        # The last step's photo would be one more image in this one's memory.
+        self._last, self._last_view = None, (views, index)
         if self._can_record(views, kind):
             self._last = self._replay(views, index, watched, kind)
         else:
-            self._last = self._optimise(views[index], watched)
+            self._last = self._launch(views[index], watched)
         self.densification.perturb(self.iteration, gaussians, rate)
         count = gaussians.count
         if self.densification.change(self.iteration, gaussians, self.optimizer, self._generator):
@@ -158,11 +163,9 @@ class Trainer:
         if self.iteration % CHECK_EVERY == 0:
             self.check()
 
-    def _optimise(
-        self, view: TrainingView, watched: bool, capacity: int | None = None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Photograph, compare, differentiate, step. Returns the loss, the simulated photo (its exposures, where encoded
-        values are not needed) and the photo.
+    def _optimise(self, view: TrainingView, watched: bool, capacity: int | None = None) -> tuple[Tensor, Tensor]:
+        """Photograph, compare, differentiate, step. Returns the loss and the simulated photo (its exposures, where
+        encoded values are not needed).
 
         With a capacity all of it works on fixed memory and nothing waits for the device.
         """
@@ -181,7 +184,9 @@ class Trainer:
         loss = regularised(compared, self.field, self.config.loss)
         if isinstance(self.field.response, RefinedResponse) and self.field.response.refining:
             loss = loss + self.config.response.refine_weight * self.field.response.penalty()
-        loss.backward()
+        # On this thread: one of torch's own would let go of the graph some time later, in mid-recording too.
+        with torch.autograd.set_multithreading_enabled(False):
+            loss.backward()
         if self.config.optimizer.visible_only:
             self.optimizer.visible = photo.rendering.visible
         nonfinite, made = guarded_step(self.optimizer, loss, photo.rendering.overflow)
@@ -198,7 +203,7 @@ class Trainer:
             self._room.launched(photo.rendering.entry_count)
         else:
             self._room.note(photo.rendering.pair_count, photo.rendering.overflow)
-        return loss.detach(), (photo.encoded if self._encoded else photo.light).detach(), view.target.encoded
+        return loss.detach(), (photo.encoded if self._encoded else photo.light).detach()
 
     def _hold_response(self) -> bool:
         """Whether the response is corrected in this step; before response.refine_after its gradient is held back."""
@@ -266,7 +271,11 @@ class Trainer:
         self._launched.add(kind)
         return ready
 
-    def _replay(self, views: ViewStack, index: int, watched: bool, kind) -> tuple[Tensor, Tensor, Tensor]:
+    def _launch(self, view: TrainingView, watched: bool) -> tuple[Tensor, Tensor]:
+        with nullcontext() if self._recorder is None else self._recorder.launching():
+            return self._optimise(view, watched)
+
+    def _replay(self, views: ViewStack, index: int, watched: bool, kind) -> tuple[Tensor, Tensor]:
         capacity = self._room.capacity(len(views))
         self._index.fill_(index)
         try:
@@ -360,7 +369,7 @@ class Trainer:
     def _upload(self, level: int) -> list[TrainingView]:
         loss, field = self.config.loss, self.field
         pixels = sum(view.camera.width * view.camera.height for view in self._views) // 4**level
-        kept = compares_light(loss, field) and pixels <= DECODED_PIXELS
+        kept = compares_light(loss, field) and loss.interval == "off" and pixels <= DECODED_PIXELS
         return training_views(
             self._views,
             level,
@@ -368,6 +377,7 @@ class Trainer:
             field.base_time,
             self.device,
             truth=loss.uses_hdr,
+            bounds=loss.clipping or loss.highlight_weight > 0,
             light=known_response(field.response) if kept else None,
             highlights=self._highlights,
         )

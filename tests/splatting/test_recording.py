@@ -55,6 +55,24 @@ def test_a_recorded_render_and_its_gradients_follow_their_inputs():
 
 
 @needs_gpu
+def test_a_launched_graph_that_lives_on_spoils_no_recording():
+    recorder = GraphRecorder("cuda:0")
+    values = torch.ones(4, device="cuda:0", requires_grad=True)
+
+    def step():
+        values.grad = None
+        loss = values.square().sum()
+        with torch.autograd.set_multithreading_enabled(False):
+            loss.backward()
+        return loss, values.grad
+
+    with recorder.launching():
+        kept, _ = step()
+    assert recorder.run("step", lambda: step()[1]).tolist() == [2.0] * 4
+    assert kept.requires_grad
+
+
+@needs_gpu
 def test_garbage_with_a_recording_in_it_is_not_collected_during_another():
     class Holder:
         def __init__(self):

@@ -45,3 +45,31 @@ def test_equal_times_stay_numbers_and_differing_sizes_do_not_stack(device):
     views = views_of(toy_scene(), device)
     assert ViewStack.of(views).times == EXPOSURE_TIME
     assert ViewStack.of(views + views_of(toy_scene(size=16), device)) is None
+
+
+def test_photos_of_whole_codes_are_stacked_in_a_byte_each_and_come_back_exactly(device):
+    every = (np.arange(32 * 32 * 3) % 256).reshape(32, 32, 3).astype(np.float32) / np.float32(255)
+    scene = toy_scene()
+    for values, dtype in ((every, torch.uint8), (every * np.float32(0.999), torch.float32)):
+        views = views_of(dataclasses.replace(scene, views=(dataclasses.replace(scene.views[0], image=values),)), device)
+        stack = ViewStack.of(views)
+        assert stack.images["encoded"].dtype == dtype
+        for taken in (stack[0], stack.at(torch.zeros(1, dtype=torch.int64, device=device))):
+            assert np.array_equal(taken.target.encoded.cpu().numpy(), values)
+
+
+def test_a_view_taken_on_the_device_has_either_light_or_encoded_values(device):
+    srgb = response_by_name("srgb")
+    views = training_views(toy_scene().train_views, 0, srgb, EXPOSURE_TIME, device, truth=False, light=srgb)
+    stack, index = ViewStack.of(views), torch.tensor([1], device=device)
+    taken = stack.at(index).target
+    assert taken.encoded is None and torch.equal(taken.light, views[1].target.light)
+    assert torch.equal(stack[1].target.encoded, views[1].target.encoded)
+
+
+def test_bounds_are_noted_where_asked_for(device):
+    scene = toy_scene()
+    dark = dataclasses.replace(scene.views[0], image=np.zeros((32, 32, 3), np.float32))
+    for bounds in (True, False):
+        views = training_views((dark,), 0, response_by_name("srgb"), 1.0, device, truth=False, bounds=bounds)
+        assert (views[0].target.black is not None) == bounds

@@ -5,6 +5,7 @@ import json
 import signal
 import sys
 import threading
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -285,6 +286,9 @@ def test_unknown_device_is_refused(scene, tmp_path):
 
 def test_a_step_that_cannot_be_recorded_ends_the_training_with_a_way_out(scene, monkeypatch):
     class BrokenRecorder:
+        def launching(self):
+            return nullcontext()
+
         def run(self, key, function):
             raise RuntimeError("operation not permitted when stream is capturing\nmore")
 
