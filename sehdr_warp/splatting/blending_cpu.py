@@ -64,7 +64,7 @@ def blend_on_cpu(device, features, lists: TileLists, records, image, alpha, alph
             [
                 ranges,
                 entries,
-                view(lists.emission),
+                view(lists.emission.places),
                 *(view(record, dtype=vec4) for record in records),
                 colours,
                 *frame,
@@ -80,7 +80,7 @@ def blend_on_cpu(device, features, lists: TileLists, records, image, alpha, alph
             ],
             device,
         )
-        return gather_by_gaussian(lists, entry_gradients)
+        return gather_by_gaussian(lists.emission, entry_gradients)
 
     return backward
 

@@ -87,7 +87,7 @@ def blend_on_cuda(device, features, lists: TileLists, records, image, alpha, alp
             return gathered
         by_entry = features.new_zeros(lists.entry_count, channels + 6)
         for corner in range(corners):
-            add_gradients(kernel, 1, *incoming, corner, lists.emission, by_entry)
-        return gather_by_gaussian(lists, by_entry)
+            add_gradients(kernel, 1, *incoming, corner, lists.emission.places, by_entry)
+        return gather_by_gaussian(lists.emission, by_entry)
 
     return backward

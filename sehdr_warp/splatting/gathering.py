@@ -7,23 +7,23 @@ from ..kernels.gather import gather_kernel
 from . import threads
 from .arrays import view, warp_scalar
 from .bridge import torch_stream
-from .tile_lists import TileLists
+from .tile_lists import Emission
 
 
-def gather_by_gaussian(lists: TileLists, by_entry: torch.Tensor) -> torch.Tensor:
+def gather_by_gaussian(emission: Emission, by_entry: torch.Tensor) -> torch.Tensor:
     """[N, columns]: for each Gaussian the sum of its rows of by_entry [M, columns], front tile to last.
 
-    by_entry: rows in the order of lists.emission, that is as entries were before the sort by tile.
+    by_entry: rows in the order in which entries were before the sort by tile.
     """
-    columns = by_entry.shape[1]
-    count = lists.order.shape[0]
+    entry_count, columns = by_entry.shape
+    count = emission.order.shape[0]
     gathered = by_entry.new_zeros(count, columns)
-    if not lists.entry_count:
+    if not entry_count:
         return gathered
     device = wp.device_from_torch(by_entry.device)
     arguments = [
-        view(lists.order),
-        view(lists.ends.clamp(0, lists.entry_count)),  # beyond a capacity there are no rows
+        view(emission.order),
+        view(emission.ends.clamp(0, entry_count)),  # beyond a capacity there are no rows
         view(by_entry),
         columns,
         view(gathered),

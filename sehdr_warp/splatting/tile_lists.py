@@ -18,25 +18,34 @@ LARGEST_CAPACITY = 2**31 - 1
 
 
 @dataclass(frozen=True)
-class TileLists:
-    """Who is drawn where, in which order. All tensors on the render's device, all indices int32.
+class Emission:
+    """Where entries stood before the sort by tile, those of one Gaussian side by side. All indices int32.
 
     order: [N] Gaussians by depth, nearest first (ties by index; culled ones last).
     ends: [N] running number of entries, by place in `order`.
+    places: [M] each entry's place then.
+    """
+
+    order: torch.Tensor
+    ends: torch.Tensor
+    places: torch.Tensor
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """Who is drawn where, in which order. All tensors on the render's device, all indices int32.
+
     ranges: [tiles, 2] first and one past the last entry of each tile.
     gaussians: [M] the Gaussian of each entry, by tile and then front to back.
-    emission: [M] the entry's position before the sort by tile: entries of one Gaussian are neighbours there. None
-        where it was not asked for.
+    emission: how the entries stood by Gaussian; None where it was not asked for.
     columns, rows: tiles across and down.
     overflow: scalar bool, whether a given capacity was too small for all entries; None without a capacity.
     total: scalar int64, how many entries there are, with or without room for them.
     """
 
-    order: torch.Tensor
-    ends: torch.Tensor
     ranges: torch.Tensor
     gaussians: torch.Tensor
-    emission: torch.Tensor | None
+    emission: Emission | None
     columns: int
     rows: int
     overflow: torch.Tensor | None
@@ -71,7 +80,8 @@ def build_tile_lists(
     tiles, gaussians = emit_entries(order, *records, extents, columns, rows, ends, room, capacity is not None)
     tiles, gaussians, places = sort_by_tile(tiles, gaussians, room, tile_count, emission)
     ranges = find_ranges(tiles, tile_count)
-    return TileLists(order, ends, ranges, gaussians, places, columns, rows, overflow, total)
+    by_gaussian = Emission(order, ends, places) if emission else None
+    return TileLists(ranges, gaussians, by_gaussian, columns, rows, overflow, total)
 
 
 def _exact_room(total: int, gaussian_count: int, columns: int, rows: int) -> int:
@@ -117,14 +127,14 @@ def pack_records(means2d, conics, opacities, extents, alpha_threshold: float, fe
 def depth_order(depths, extents):
     """[N] int32: Gaussians nearest first, culled ones last; equal depths keep the order of their indices."""
     count = depths.shape[0]
-    # The sort needs room for twice as many.
+    # The sort needs room for twice as many; what is returned does not hold on to it.
     keys = depths.new_empty(2 * count)
     places = torch.empty(2 * count, dtype=torch.int32, device=depths.device)
     scalar = warp_scalar(depths.dtype)
     arguments = [view(depths), view(extents, vector(2, scalar)), view(keys), view(places)]
     _launch(tile_kernels(scalar)[3], count, arguments, depths.device)
     _sort_pairs(keys, places, count, None)
-    return places[:count]
+    return places[:count].clone()
 
 
 def count_entries(order, shapes, ellipses, extents, columns: int, rows: int):
@@ -176,17 +186,18 @@ def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends
 def sort_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: bool):
     """Stable sort of the entries by tile: tiles [M], Gaussians [M], and where each entry stood before [M] or None.
 
-    tiles, gaussians: as by emit_entries(); what is sorted is in the same memory.
+    tiles, gaussians: as by emit_entries(); the tiles are sorted within the same memory; the rest is copied out of it, because
+    it is kept and the sort's memory is twice as much.
     """
     bits = tile_count.bit_length()
     if emission:
         places = torch.empty(2 * entry_count, dtype=torch.int32, device=tiles.device)
         torch.arange(entry_count, dtype=torch.int32, device=tiles.device, out=places[:entry_count])
         _sort_pairs(tiles, places, entry_count, bits)
-        places = places[:entry_count]
+        places = places[:entry_count].clone()
         return tiles[:entry_count], gaussians[:entry_count][places] if entry_count else gaussians, places
     _sort_pairs(tiles, gaussians, entry_count, bits)
-    return tiles[:entry_count], gaussians[:entry_count], None
+    return tiles[:entry_count], gaussians[:entry_count].clone(), None
 
 
 def find_ranges(tiles, tile_count: int):

@@ -1,9 +1,19 @@
 """The lists of the tiles: every entry that was counted is written, whatever the two kernels make of a border case."""
 
+from dataclasses import fields
+
+import pytest
 import torch
 
 from sehdr_warp.splatting.projection import project
-from sehdr_warp.splatting.tile_lists import count_entries, depth_order, emit_entries, find_ranges, pack_records
+from sehdr_warp.splatting.tile_lists import (
+    build_tile_lists,
+    count_entries,
+    depth_order,
+    emit_entries,
+    find_ranges,
+    pack_records,
+)
 
 from .scenes import random_scene
 
@@ -11,8 +21,8 @@ COLUMNS, ROWS, UNWRITTEN = 20, 15, -7
 THRESHOLD = 1 / 255
 
 
-def counted(device, count=20000):
-    """Records and counts of a scene dense enough that many ellipses end just at a tile's border."""
+def packed(device, count=20000):
+    """Records, depths and extents of a scene dense enough that many ellipses end just at a tile's border."""
     scene = random_scene(count=count, width=16 * COLUMNS, height=16 * ROWS).to(torch.float32, device)
     means, log_scales, quaternions, opacities, _, pose, intrinsics = (tensor.detach() for tensor in scene.tensors)
     projected = project(
@@ -20,10 +30,14 @@ def counted(device, count=20000):
         width=16 * COLUMNS, height=16 * ROWS, near=0.01, low_pass=0.3, alpha_threshold=THRESHOLD, antialiased=False,
     )  # fmt: skip
     means2d, conics, depths, opacities2d, extents = projected
-    shapes, ellipses = pack_records(means2d, conics, opacities2d, extents, THRESHOLD)
-    order = depth_order(depths, extents)
-    counts = count_entries(order, shapes, ellipses, extents, COLUMNS, ROWS)
-    return (order, shapes, ellipses, extents, COLUMNS, ROWS), counts
+    return pack_records(means2d, conics, opacities2d, extents, THRESHOLD), depths, extents
+
+
+def counted(*scene):
+    """What emit_entries() reads, and the counts."""
+    records, depths, extents = packed(*scene)
+    listed = depth_order(depths, extents), *records, extents, COLUMNS, ROWS
+    return listed, count_entries(*listed)
 
 
 def emit(records, counts, monkeypatch):
@@ -62,3 +76,25 @@ def test_an_entry_counted_too_much_is_no_tiles_and_one_too_few_costs_its_own_gau
     assert torch.equal(tiles[~unused], torch.cat([true_tiles[:dropped], true_tiles[dropped + 1 :]]))
     ranges = find_ranges(tiles.sort().values, COLUMNS * ROWS)
     assert int((ranges[:, 1] - ranges[:, 0]).sum()) == len(tiles) - 2
+
+
+def kept_bytes(holder):
+    """Of the memory behind a dataclass's tensors, and of the dataclasses in it."""
+    values = [getattr(holder, field.name) for field in fields(holder)]
+    tensors = [value for value in values if isinstance(value, torch.Tensor)]
+    inner = [value for value in values if hasattr(value, "__dataclass_fields__")]
+    return sum(tensor.untyped_storage().nbytes() for tensor in tensors) + sum(kept_bytes(value) for value in inner)
+
+
+@pytest.mark.parametrize("spare", [None, 7])
+@pytest.mark.parametrize("emission", [False, True])
+def test_lists_keep_no_more_memory_than_they_use(device, emission, spare):
+    scene = packed(device, 500)
+    size = 16 * COLUMNS, 16 * ROWS
+    exact = build_tile_lists(*scene, *size, emission=emission)
+    lists = exact if spare is None else build_tile_lists(*scene, *size, exact.entry_count + spare, emission=emission)
+    entries = exact.entry_count + (spare or 0)
+    assert torch.equal(lists.gaussians[: exact.entry_count], exact.gaussians)
+    total_and_overflow = 8 + (spare is not None)
+    by_gaussian = entries + 2 * 500 if emission else 0
+    assert kept_bytes(lists) == 4 * (2 * COLUMNS * ROWS + entries + by_gaussian) + total_and_overflow
