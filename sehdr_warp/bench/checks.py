@@ -36,12 +36,11 @@ class Check:
         return asdict(self) | {"passed": self.passed}
 
 
-def check_against_reference(name: str, render, scene: SplatScene, against: str = "float64 reference") -> list[Check]:
+def check_against_reference(name: str, render, scene: SplatScene) -> list[Check]:
     """render(scene) -> [H, W, C], its gradients, and both again by the reference in float64 on the CPU."""
     truth = scene.to("cpu", torch.float64)
-    return compare(
-        name, against, scene, image_and_gradients(render, scene), image_and_gradients(render_reference, truth)
-    )
+    given = image_and_gradients(render, scene), image_and_gradients(render_reference, truth)
+    return compare(name, "float64 reference", scene, *given)
 
 
 def compare(name: str, against: str, scene: SplatScene, ours, truth) -> list[Check]:

@@ -8,7 +8,7 @@ by hand); positions are brought into [-1, 1] by a common shift and scale before 
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -247,7 +247,6 @@ def train_hdr_nerf(
     seed: int = 0,
     settings: HdrNerfSettings | None = None,
     evaluate_at: Iterable[int] = (),
-    progress: Callable[[str], None] = lambda line: None,
 ) -> HdrNerfRun:
     """Trains HDR-NeRF on the photos of the training views; their HDR truth is not looked at.
 
@@ -279,9 +278,9 @@ def train_hdr_nerf(
             _wait(device)
         run.train_seconds += time.perf_counter() - started
         if run.iterations in evaluate_at:
-            _evaluate(run, scene, progress)
+            _evaluate(run, scene)
     if not run.history or run.history[-1]["iteration"] != run.iterations:
-        _evaluate(run, scene, progress)
+        _evaluate(run, scene)
     return run
 
 
@@ -323,7 +322,7 @@ def _finished(run: HdrNerfRun, iterations: int | None, seconds: float | None) ->
 
 
 @torch.no_grad()
-def _evaluate(run: HdrNerfRun, scene: Scene, progress: Callable[[str], None]) -> None:
+def _evaluate(run: HdrNerfRun, scene: Scene) -> None:
     """Adds a line to the history: means over the held-out views, as the trainings of Gaussians report them."""
     scores: dict[str, list[float]] = {}
     for view in scene.test_views:
@@ -337,7 +336,6 @@ def _evaluate(run: HdrNerfRun, scene: Scene, progress: Callable[[str], None]) ->
     line = {"iteration": run.iterations, "seconds": round(run.train_seconds, 3), "split": "test"}
     line |= {name: round(sum(values) / len(values), 4) for name, values in scores.items()} | {"gaussians": 0}
     run.history.append(line)
-    progress(f"HDR-NeRF iteration {run.iterations}: {line}")
 
 
 def _wait(device: torch.device) -> None:

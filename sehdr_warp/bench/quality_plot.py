@@ -13,14 +13,14 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#1
 FRONT = "#b7bcc2"
 
 
-def error_over_time(rows: Sequence[dict], key: str = "psnr_mu", count: int = 60) -> tuple[np.ndarray, np.ndarray]:
+def error_over_time(rows: Sequence[dict], count: int = 60) -> tuple[np.ndarray, np.ndarray]:
     """(seconds, mean held-out PSNR in dB) of the trainings of one method, `count` times evenly on a log scale.
 
     Between two tests the PSNR is interpolated over the logarithm of time; before its first test a training has none, so
     the mean starts when all have one; a training that has ended keeps its last figure.
     """
-    curves = [[(line["seconds"], line[key]) for line in row["curve"] if line.get(key) is not None] for row in rows]
-    curves = [np.array(curve, float).T for curve in curves if curve]
+    tests = [[line for line in row["curve"] if line.get("psnr_mu") is not None] for row in rows]
+    curves = [np.array([(line["seconds"], line["psnr_mu"]) for line in lines], float).T for lines in tests if lines]
     if not curves:
         return np.empty(0), np.empty(0)
     first, last = max(curve[0, 0] for curve in curves), max(curve[0, -1] for curve in curves)

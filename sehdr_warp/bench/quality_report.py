@@ -123,8 +123,8 @@ def _hdr(name: str, key: str) -> Callable[[dict], float | None]:
     return lambda row: row["figures"]["protocol"][name].get(key)
 
 
-def _region(region: str, protocol: str = "aligned") -> Callable[[dict], float | None]:
-    return lambda row: row["figures"]["regions"][region]["psnr_mu"].get(protocol)
+def _region(region: str) -> Callable[[dict], float | None]:
+    return lambda row: row["figures"]["regions"][region]["psnr_mu"].get("aligned")
 
 
 def _figure(*keys: str) -> Callable[[dict], float | None]:

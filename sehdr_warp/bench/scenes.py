@@ -13,13 +13,13 @@ EXPOSURE_TIME = 0.25
 BALLS = 24
 
 
-def make_photo_scene(size: Size, views: int = 18, seed: int = 0, device: str | torch.device = "cpu") -> Scene:
+def make_photo_scene(size: Size, views: int = 18, device: str | torch.device = "cpu") -> Scene:
     """Photos, all for training, of coloured balls on a floor, from a circle around them; 8 bit, sRGB.
 
     size.gaussians points lie on the surfaces, as those of a trained scene do; the photos show them as Gaussians, so
     some pixels are clipped and some black. device: where they are rendered.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     points, log_exposure = _surfaces(size.gaussians, rng)
     response = response_by_name("srgb")
     gaussians = Gaussians.from_points(

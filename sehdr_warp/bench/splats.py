@@ -94,9 +94,9 @@ class SplatScene:
         for leaf in self.leaves:
             leaf.grad = None
 
-    def cotangent(self, seed: int = 1) -> torch.Tensor:
+    def cotangent(self) -> torch.Tensor:
         """[H, W, C] in [0, 1), the gradient that a loss would send back; the same on every device and dtype."""
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(1)
         values = torch.rand(self.size.height, self.size.width, self.channels, generator=generator)
         return values.to(self.leaves[0])
 
@@ -127,11 +127,11 @@ def make_splat_scene(size: Size, channels: int, seed: int = 0) -> SplatScene:
     return SplatScene(leaves, torch.eye(4), intrinsics, size).to()
 
 
-def make_covering_scene(size: Size, channels: int, seed: int = 0) -> SplatScene:
+def make_covering_scene(size: Size, channels: int) -> SplatScene:
     """As make_splat_scene(), but every Gaussian covers the whole image, and so thinly that none is hidden: each pixel
     of each tile counts for each Gaussian (up to some 400 of them)."""
-    scene = make_splat_scene(size, channels, seed)
-    generator = torch.Generator().manual_seed(seed + 1)
+    scene = make_splat_scene(size, channels)
+    generator = torch.Generator().manual_seed(1)
     means, _, _, _, features = (leaf.detach() for leaf in scene.leaves)
     log_deviation = (2 * max(size.width, size.height) / scene.intrinsics[0] * means[:, 2:]).log()
     opacities = 0.01 + 0.01 * torch.rand(size.gaussians, generator=generator)

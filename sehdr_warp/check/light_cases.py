@@ -96,9 +96,9 @@ def _zero_radiance(device):
     return [count("not finite in fusion", wrong), count("not finite in the start's logarithm", not_finite(floored))]
 
 
-def _fusion(sigma: float, evaluation: str = "exact") -> NeuralExposureFusion:
+def _fusion(sigma: float) -> NeuralExposureFusion:
     return NeuralExposureFusion(
-        response_by_name("srgb"), (1 / 8, 1 / 4, 1.0, 8.0, 16.0), 1.0, width=16, sigma=sigma, evaluation=evaluation
+        response_by_name("srgb"), (1 / 8, 1 / 4, 1.0, 8.0, 16.0), 1.0, width=16, sigma=sigma, evaluation="exact"
     )
 
 

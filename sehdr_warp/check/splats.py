@@ -43,9 +43,7 @@ class Splats:
         return [tensor.to(device, torch.float32) for tensor in self.tensors.values()]
 
 
-def compare_splat(
-    splats: Splats, device: torch.device, *, gradients: tuple[str, ...] = GRADIENTS, ties: bool = False, **options
-) -> list[Reading]:
+def compare_splat(splats: Splats, device: torch.device, *, ties: bool = False, **options) -> list[Reading]:
     """Image, alpha and gradients of rasterize() against the float64 reference.
 
     ties: depths are equal, and their order is by index: they are not disturbed. options: as compare() takes them.
@@ -67,7 +65,7 @@ def compare_splat(
         means2d, conics, depths, opacities2d, extents = project_reference(
             means, log_scales, quaternions, opacities, pose, intrinsics, width, height, *given.values()
         )
-        image, alpha = blend_reference(
+        image, transmittance = blend_reference(
             disturb(means2d),
             disturb(conics),
             disturb(opacities2d),
@@ -78,6 +76,6 @@ def compare_splat(
             height,
             given["alpha_threshold"],
         )
-        return {"image": image, "alpha": alpha}
+        return {"image": image, "alpha": 1.0 - transmittance}
 
-    return compare(ours, truth, splats.tensors, device, gradients=gradients, **options)
+    return compare(ours, truth, splats.tensors, device, gradients=GRADIENTS, **options)

@@ -114,7 +114,7 @@ class _Evaluation:
             "protocol": hdr,
             "pu21": pu21 | self.pu21_mapping,
             "ldr": ldr,
-            "regions": {region: errors.result(self.names, missing) for region, errors in self.regions.items()},
+            "regions": {region: errors.result(missing) for region, errors in self.regions.items()},
             "confidence": self.ranking.result() | ({"reason": missing} if missing else {}),
             "views": rows,
             "lpips_backbone": BACKBONE if self.lpips else None,
@@ -233,7 +233,7 @@ class _RegionErrors:
         before = self.hdr[name]
         self.hdr[name] = (before[0] + float(error.mean()), before[1] + total)
 
-    def result(self, names, missing: str | None) -> dict:
+    def result(self, missing: str | None) -> dict:
         figures = {
             "fraction": self.weight / self.pixels,
             "psnr_ldr": metrics.decibels(self.ldr / self.weight if self.weight else math.nan),

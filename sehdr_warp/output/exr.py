@@ -85,26 +85,24 @@ def write_exr(
 ) -> str:
     """Writes a single-part file with ZIP compression; returns the pixel type of its colours, "half" or "float".
 
-    Parameters and errors as write_multipart_exr, for one part.
+    Parameters and errors as write_multipart_exr, for one part; with overwrite a file at `path` is replaced.
     """
     return _write(Path(path), [Part(channels, header or {})], pixel, overwrite)
 
 
-def write_multipart_exr(
-    path: Path | str, parts: Sequence[Part], *, pixel: str = "half", overwrite: bool = False
-) -> str:
+def write_multipart_exr(path: Path | str, parts: Sequence[Part], *, pixel: str = "half") -> str:
     """Writes a file of several named parts with ZIP compression; returns the pixel type of the colours.
 
     pixel: "half" or "float". Numbers are rounded once, to the nearest. Where half cannot hold a value (above 65504 in
     size), all channels of the file are float instead, and each part's `sehdr:pixelType` says so: nothing is clipped.
     Depth (`Z`, or a layer's `.Z`) is always float: half's 11 bits are too few for it.
 
-    Raises InputError where a value is NaN or infinite (with channel and place) or `path` exists (unless overwrite);
-    SehdrError where the file cannot be written; ValueError for an unknown pixel type, unequal shapes or names.
+    Raises InputError where a value is NaN or infinite (with channel and place) or `path` exists; SehdrError where the
+    file cannot be written; ValueError for an unknown pixel type, unequal shapes or names.
     """
     if not parts or any(not part.name for part in parts) or len({part.name for part in parts}) < len(parts):
         raise ValueError("parts need one name each, all different")
-    return _write(Path(path), parts, pixel, overwrite)
+    return _write(Path(path), parts, pixel)
 
 
 def read_exr(path: Path | str, *, max_pixels: int = MAX_PIXELS) -> tuple[np.ndarray, tuple[str, ...], dict[str, Any]]:
@@ -127,7 +125,7 @@ def stored_pixel_type(arrays: Sequence[np.ndarray], pixel: str = "half") -> str:
     return "float" if pixel == "float" or any(_largest(array) > HALF_MAX for array in arrays) else "half"
 
 
-def _write(path: Path, parts: Sequence[Part], pixel: str, overwrite: bool) -> str:
+def _write(path: Path, parts: Sequence[Part], pixel: str, overwrite: bool = False) -> str:
     import OpenEXR
 
     for part in parts:

@@ -45,30 +45,28 @@ def exposure_exif(exposure_time: float, *, bias: float | None = None, captured: 
     return exif
 
 
-def write_png(path: Path | str, codes: np.ndarray, *, exif: Image.Exif | None = None, overwrite: bool = False) -> None:
+def write_png(path: Path | str, codes: np.ndarray, *, exif: Image.Exif | None = None) -> None:
     """Writes [H, W] grey or [H, W, 3] RGB code values, uint8 or uint16.
 
     Raises InputError and SehdrError as atomic_path does, ValueError for another shape or type.
     """
     _check(codes, (np.uint8, np.uint16))
-    with atomic_path(path, overwrite) as temporary:
+    with atomic_path(path) as temporary:
         if codes.dtype == np.uint8:
             Image.fromarray(codes).save(temporary, format="PNG", exif=exif)
         else:
             temporary.write_bytes(_png16(codes, exif))
 
 
-def write_jpeg(
-    path: Path | str, codes: np.ndarray, *, quality: int = 98, exif: Image.Exif | None = None, overwrite: bool = False
-) -> None:
+def write_jpeg(path: Path | str, codes: np.ndarray, *, exif: Image.Exif | None = None) -> None:
     """Writes [H, W] grey or [H, W, 3] RGB uint8 code values, without chroma subsampling.
 
     Raises InputError and SehdrError as atomic_path does, ValueError for another shape or type.
     """
     _check(codes, (np.uint8,))
-    with atomic_path(path, overwrite) as temporary:
+    with atomic_path(path) as temporary:
         options = {} if exif is None else {"exif": exif}
-        Image.fromarray(codes).save(temporary, format="JPEG", quality=quality, subsampling=0, **options)
+        Image.fromarray(codes).save(temporary, format="JPEG", quality=98, subsampling=0, **options)
 
 
 def _check(codes: np.ndarray, dtypes: tuple) -> None:

@@ -72,7 +72,7 @@ def write_report(run, scene: Scene, out: Path | str, *, view_count: int = 3, ove
     views = _chosen(scene.test_views or scene.train_views, view_count)
     comparisons = [_compare(run, view) for view in views]
     figures = [
-        comparison_figure(comparisons, _caption(run, views, metrics, held_out), held_out=held_out),
+        comparison_figure(comparisons, _caption(views, metrics, held_out), held_out=held_out),
         stops_figure(comparisons[len(comparisons) // 2], views[len(views) // 2].exposure_time),
     ] + ([training_figure(metrics)] if metrics else [])
     with ExitStack() as stack:
@@ -108,7 +108,7 @@ def comparison_figure(comparisons: Sequence[Comparison], caption: str, *, held_o
     return _grid(rows, titles, [c.name for c in comparisons], caption, cell=2.9)
 
 
-def stops_figure(comparison: Comparison, exposure_time: float, stops: Sequence[float] = STOPS):
+def stops_figure(comparison: Comparison, exposure_time: float):
     """A matplotlib Figure: one view at several exposures, as radiance on a plain sRGB display: no tone map.
 
     The first row holds the photo as it is and re-exposed alone: what it clipped stays white or black. Beside the HDR
@@ -116,9 +116,9 @@ def stops_figure(comparison: Comparison, exposure_time: float, stops: Sequence[f
     """
     sources = {"Photo alone": comparison.from_photo, "HDR scene": comparison.hdr, "Truth": comparison.truth}
     sources = {name: radiance for name, radiance in sources.items() if radiance is not None}
-    rows = [[None, *(expose(radiance, stop, scale=exposure_time) for stop in stops)] for radiance in sources.values()]
+    rows = [[None, *(expose(radiance, stop, scale=exposure_time) for stop in STOPS)] for radiance in sources.values()]
     rows[0][0] = comparison.photo
-    titles = ["Photo"] + [f"{stop:+g} EV".replace("-", "\N{MINUS SIGN}") if stop else "0 EV" for stop in stops]
+    titles = ["Photo"] + [f"{stop:+g} EV".replace("-", "\N{MINUS SIGN}") if stop else "0 EV" for stop in STOPS]
     caption = (
         f"View {comparison.name}, re-exposed from {_seconds(exposure_time)} (0 EV) and shown on a plain sRGB display. "
         "What the photo clipped stays flat."
@@ -253,7 +253,7 @@ def _array(value) -> np.ndarray:
     return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
 
 
-def _caption(run, views: Sequence[View], metrics: Sequence[dict], held_out: bool) -> str:
+def _caption(views: Sequence[View], metrics: Sequence[dict], held_out: bool) -> str:
     times = sorted({view.exposure_time for view in views})
     text = f"Photos at {' and '.join(map(_seconds, times)) if len(times) < 3 else 'several exposures'}"
     text += ", none of them trained on." if held_out else ", all of them trained on: the scene has no test views."

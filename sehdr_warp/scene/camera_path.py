@@ -15,11 +15,11 @@ from .paths import read_json
 from .read_transforms import frame_lens, frame_pose, frames_of
 
 
-def load_cameras(path: Path | str, *, size: tuple[int, int] | None = None) -> list[tuple[str, Camera]]:
+def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
     """Named cameras from a JSON file, in its order, without distortion.
 
     Accepted: {"cameras": [{"name": ..., **Camera.to_dict()}, ...]} (each entry may also keep its values under
-    "camera"), nerfstudio's camera_path.json, and transforms.json. size: (width, height) for files that state none.
+    "camera"), nerfstudio's camera_path.json, and transforms.json.
     Raises InputError where the file is damaged, a pose or size cannot be, or two cameras share a name.
     """
     path = Path(path)
@@ -29,8 +29,6 @@ def load_cameras(path: Path | str, *, size: tuple[int, int] | None = None) -> li
     elif isinstance(values.get("camera_path"), list):
         cameras = [_nerfstudio(entry, i, values, path) for i, entry in enumerate(values["camera_path"])]
     elif "frames" in values:
-        if size is not None:
-            values = {"w": size[0], "h": size[1], **values}
         cameras = [
             (Path(name).stem, frame_lens(values, frame, None, path).pinhole(frame_pose(frame, path, name)))
             for name, frame in frames_of(values, path)

@@ -42,7 +42,7 @@ class Denoiser:
 
     def __init__(self, mi, items: dict, scene):
         self.mi, self.scene = mi, scene
-        self.guides_of = mi.load_dict(guide_items(mi, items))
+        self.guides_of = mi.load_dict(guide_items(items))
         self.guides = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,facing:sh_normal"})
         self.straight = mi.load_dict({"type": "path", "max_depth": 1})
 
@@ -74,7 +74,7 @@ def denoise(radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray, straig
     return np.where(lit[..., None], radiance, np.maximum(found, 0)).astype(np.float32)
 
 
-def guide_items(mi, items: dict) -> dict:
+def guide_items(items: dict) -> dict:
     """A scene for albedo and normals: every surface diffuse, of its own albedo or white; the sky a white ball."""
     made = {}
     for name, item in items.items():

@@ -240,7 +240,7 @@ def overcast(stage: Stage) -> None:
         stage.varnished(textures.fabric(rng, (0.2, 0.3, 0.5), (0.5, 0.55, 0.6)), 0.35, (8, 1)),
         20,
     )
-    for k in range(14):
+    for _ in range(14):
         place = [rng.uniform(-2.8, 2.8), rng.uniform(-0.4, 2.8)]
         radius = rng.uniform(0.06, 0.16)
         stage.ball(

@@ -60,7 +60,7 @@ def table(stage: Stage, centre, half, height: float = 0.72) -> float:
     return height
 
 
-def shelf(stage: Stage, centre, half_width: float, depth: float, levels: int, turn: float = 0.0) -> None:
+def shelf(stage: Stage, centre, half_width: float, depth: float, levels: int) -> None:
     """A bookcase standing at (x, y), open towards -y, full of books; its depths are dark."""
     rng, (x, y), gap = stage.rng, centre, 0.42
     boards = stage.varnished(textures.wood(rng, 2, (0.05, 0.03, 0.02), (0.20, 0.12, 0.07)), 0.3)

@@ -83,10 +83,10 @@ def write_mesh(path: Path, surface: Surface, columns: int, rows: int) -> None:
     path.write_bytes(header.encode() + vertices.tobytes() + faces.tobytes())
 
 
-def _smooth(profile, count: int = 160) -> np.ndarray:
-    """[count, 2] along the Catmull-Rom curve through the points."""
+def _smooth(profile) -> np.ndarray:
+    """[160, 2] along the Catmull-Rom curve through the points."""
     points = np.asarray(profile, float)
-    place = np.linspace(0, len(points) - 1, count)
+    place = np.linspace(0, len(points) - 1, 160)
     first = np.clip(np.floor(place).astype(int), 0, len(points) - 2)
     t = (place - first)[:, None]
     a, b, c, d = (points[np.clip(first + k, 0, len(points) - 1)] for k in (-1, 0, 1, 2))

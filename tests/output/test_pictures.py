@@ -20,8 +20,9 @@ def test_other_readers_see_16_bits(tmp_path):
     cv2 = pytest.importorskip("cv2")
     for shape in ((7, 5, 3), (7, 5)):
         codes = np.random.default_rng(0).integers(0, 2**16, shape).astype(np.uint16)
-        write_png(tmp_path / "a.png", codes, exif=exposure_exif(2.0), overwrite=True)
-        found = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
+        file = tmp_path / f"{codes.ndim}.png"
+        write_png(file, codes, exif=exposure_exif(2.0))
+        found = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(found[..., ::-1] if codes.ndim == 3 else found, codes)
 
 

@@ -30,7 +30,7 @@ def test_guides_see_albedo_and_white_for_what_has_none(tmp_path):
     stage.add(type="envmap", sampling_weight=1.0)
     stage.sun((0, 0, -1), (1, 1, 1))
     matt, varnished, metal, glass, lamp, sky = [
-        item for item in denoise.guide_items(None, stage.items).values() if isinstance(item, dict)
+        item for item in denoise.guide_items(stage.items).values() if isinstance(item, dict)
     ]
     assert reflectance(matt) == reflectance(varnished) == paint and matt["radius"] == 2.0
     assert all(reflectance(item)["value"] == white for item in (metal, glass, lamp, sky))
