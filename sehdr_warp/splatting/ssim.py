@@ -36,7 +36,7 @@ def ssim_map(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def image_distance(a: torch.Tensor, b: torch.Tensor, distance_weight: float, dissimilarity_weight: float):
-    """distance_weight mean |a - b| + dissimilarity_weight (1 - ssim(a, b)), in as few launches as ssim() takes.
+    """distance_weight mean |a - b| + dissimilarity_weight (1 - ssim(a, b)), in one launch more than ssim() takes.
 
     a, b: as for ssim(), with its errors. Returns a scalar, differentiable once with respect to a.
     """
@@ -48,15 +48,17 @@ class _Distance(torch.autograd.Function):
     def forward(ctx, a, b, distance_weight, dissimilarity_weight):
         _check(a, b)
         a, b = a.detach().contiguous(), b.detach().contiguous()
-        ctx.weights = distance_weight / a.numel(), dissimilarity_weight / a.numel()
-        terms, derivatives = _compare(a, b, ctx.weights)
-        ctx.save_for_backward(a, b, derivatives)
+        weights = distance_weight / a.numel(), dissimilarity_weight / a.numel()
+        terms, derivatives = _compare(a, b, weights)
+        if ctx.needs_input_grad[0]:
+            # Made at once: it takes a fifth of the memory of what it is made of.
+            ctx.save_for_backward(_gradient(a, b, derivatives, _one(a.dtype, a.device), weights))
         return terms.sum() if a.device.type == "cuda" else terms.flatten(1).sum(1).sum()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, upstream):
-        return _gradient(*ctx.saved_tensors, upstream, ctx.weights), None, None, None
+        return ctx.saved_tensors[0] * upstream, None, None, None
 
 
 class _Similarity(torch.autograd.Function):
@@ -186,3 +188,8 @@ class _Runs:
 @cache
 def _weights(dtype: torch.dtype, device: torch.device) -> torch.Tensor:
     return torch.tensor(window(), dtype=dtype, device=device)
+
+
+@cache
+def _one(dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    return torch.ones((), dtype=dtype, device=device)
