@@ -6,8 +6,8 @@ from typing import Annotated
 
 import tyro
 
-from ..arguments import say
-from ..errors import SehdrError
+from ..arguments import numbers, positive, say
+from ..errors import InputError
 from .quality_command import Quality, run_quality
 from .response_command import Responses, run_responses
 
@@ -131,7 +131,7 @@ def run_bench(command: Bench) -> None:
         run_quality(asked)
         return
     if isinstance(asked, Responses):
-        run_responses(asked, say)
+        run_responses(asked)
         return
     check_writable(type(asked).__name__.lower(), asked.json, asked.out, asked.overwrite)
     report = _MEASURES[type(asked)](asked, pick_device(asked.device))
@@ -146,11 +146,11 @@ def _kernels(asked: Kernels, device) -> dict:
 
     return bench_kernels(
         parse_sizes(asked.sizes, device.type),
-        _channels(asked.channels),
+        numbers("--channels", asked.channels, int, least=1),
         device,
         peers=asked.peers,
-        repetitions=_positive("--repetitions", asked.repetitions),
-        budget=_positive("--budget", asked.budget),
+        repetitions=positive("--repetitions", asked.repetitions),
+        budget=positive("--budget", asked.budget),
         progress=say,
     )
 
@@ -164,8 +164,8 @@ def _step(asked: Step, device) -> dict:
         parse_size(default if asked.size is None else asked.size, device.type),
         device,
         preset=asked.preset,
-        repetitions=_positive("--repetitions", asked.repetitions),
-        budget=_positive("--budget", asked.budget),
+        repetitions=positive("--repetitions", asked.repetitions),
+        budget=positive("--budget", asked.budget),
         progress=say,
     )
 
@@ -181,7 +181,7 @@ def _training(asked: Training, device) -> dict:
     return bench_training(
         scene,
         device,
-        iterations=_positive("--iterations", asked.iterations),
+        iterations=positive("--iterations", asked.iterations),
         seed=asked.seed,
         released=asked.released,
         out=asked.out,
@@ -198,8 +198,8 @@ def _scale(asked: Scale, device) -> dict:
         device,
         peers=asked.peers,
         steps=not asked.no_steps,
-        repetitions=_positive("--repetitions", asked.repetitions),
-        budget=_positive("--budget", asked.budget),
+        repetitions=positive("--repetitions", asked.repetitions),
+        budget=positive("--budget", asked.budget),
         progress=say,
     )
 
@@ -209,31 +209,16 @@ def _choices(asked: Choices, device) -> dict:
     from .splats import parse_size
 
     if asked.iterations < 0:
-        raise SehdrError(f"--iterations {asked.iterations}: must not be negative")
+        raise InputError(f"--iterations {asked.iterations}", "negative", "give 0 or more")
     default = {"cuda": "200k@800x800", "cpu": "5k@200x200"}[device.type]
     return bench_choices(
         parse_size(default if asked.size is None else asked.size, device.type),
         device,
         iterations=asked.iterations,
-        repetitions=_positive("--repetitions", asked.repetitions),
-        budget=_positive("--budget", asked.budget),
+        repetitions=positive("--repetitions", asked.repetitions),
+        budget=positive("--budget", asked.budget),
         progress=say,
     )
 
 
 _MEASURES = {Kernels: _kernels, Step: _step, Training: _training, Scale: _scale, Choices: _choices}
-
-
-def _channels(text: str) -> list[int]:
-    items = text.split(",")
-    if not all(item.strip().isdecimal() and int(item) > 0 for item in items):
-        raise SehdrError(
-            f"--channels {text}: not positive numbers separated by commas; write for example --channels 3,9"
-        )
-    return [int(item) for item in items]
-
-
-def _positive(flag: str, value):
-    if value <= 0:
-        raise SehdrError(f"{flag} {value}: must be positive")
-    return value

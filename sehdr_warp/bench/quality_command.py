@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from ..arguments import say
+from ..arguments import numbers, positive, say
 from ..errors import InputError, SehdrError
 
 
@@ -92,8 +92,8 @@ def run_quality(asked: Quality) -> None:
 
     if asked.launcher not in LAUNCHERS:
         raise SehdrError(f"--launcher {asked.launcher}: not one of {', '.join(LAUNCHERS)}")
-    if asked.nerf_seconds is not None and not asked.nerf_seconds > 0:
-        raise SehdrError(f"--nerf-seconds {asked.nerf_seconds}: must be positive")
+    if asked.nerf_seconds is not None:
+        positive("--nerf-seconds", asked.nerf_seconds)
     device, gpus = _devices(asked)
     lpips = asked.lpips or (os.environ.get("SEHDR_LPIPS") or None)
     settings = Settings(
@@ -114,11 +114,8 @@ def run_quality(asked: Quality) -> None:
         flip=asked.flip,
         device=device,
     )
-    count = len(gpus) or 1 if asked.workers is None else asked.workers
-    if count < 1:
-        raise SehdrError(f"--workers {count}: must be positive")
     workers = Workers(
-        count=count,
+        count=len(gpus) or 1 if asked.workers is None else positive("--workers", asked.workers),
         gpus=gpus,
         lpips=None if lpips is None else str(Path(lpips).absolute()),
         keep_runs=asked.keep_runs,
@@ -137,7 +134,7 @@ def _devices(asked: Quality) -> tuple[str, tuple[int, ...]]:
         raise SehdrError(f"--device {asked.device}: not cpu or cuda; choose among GPUs with --gpus")
     if asked.device == "cpu":
         if asked.gpus is not None:
-            raise SehdrError(f"--gpus {asked.gpus}: there are none with --device cpu")
+            raise InputError(f"--gpus {asked.gpus}", "there are none with --device cpu", "leave one of the two out")
         return "cpu", ()
     import torch
 
@@ -147,7 +144,7 @@ def _devices(asked: Quality) -> tuple[str, tuple[int, ...]]:
     gpus = tuple(range(there)) if asked.gpus is None else _whole("--gpus", asked.gpus)
     for gpu in gpus:
         if gpu >= there:
-            raise SehdrError(f"--gpus {asked.gpus}: torch sees {there} GPU(s), numbered from 0")
+            raise InputError(f"--gpus {asked.gpus}", f"torch sees {there} GPU(s)", "give some of them, numbered from 0")
     return ("cuda", gpus) if there else ("cpu", ())
 
 
@@ -156,10 +153,7 @@ def _words(text: str) -> tuple[str, ...]:
 
 
 def _whole(flag: str, text: str) -> tuple[int, ...]:
-    items = _words(text)
-    if not items or not all(item.isdecimal() for item in items):
-        raise SehdrError(f"{flag} {text}: not whole numbers separated by commas")
-    return tuple(map(int, items))
+    return tuple(dict.fromkeys(numbers(flag, text, int, least=0)))
 
 
 def _noise(text: str | None) -> tuple[float, float] | None:
@@ -170,12 +164,16 @@ def _noise(text: str | None) -> tuple[float, float] | None:
     try:
         noise = SensorNoise(*(float(item) for item in text.split(",")))
     except (TypeError, ValueError):
-        raise SehdrError(f"--noise {text}: not one or two numbers of electrons, such as 20000,5") from None
+        raise InputError(
+            f"--noise {text}", "not one or two numbers of electrons", "write for example --noise 20000,5"
+        ) from None
     return noise.full_well, noise.read_noise
 
 
 def _pairs(text: str | None) -> dict[str, str]:
     pairs = [item.partition("=") for item in _words(text or "")]
     if not all(name and equals for name, equals, _ in pairs):
-        raise SehdrError(f"--slurm {text}: not name=value pairs separated by commas")
+        raise InputError(
+            f"--slurm {text}", "not name=value pairs separated by commas", "write for example --slurm partition=gpu"
+        )
     return {name: value for name, _, value in pairs}

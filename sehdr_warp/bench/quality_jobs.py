@@ -166,7 +166,7 @@ def plan_jobs(settings: Settings) -> list[Job]:
             )
         )
     if not jobs:
-        raise SehdrError("there is nothing to run: none of the methods makes sense without the response")
+        raise SehdrError("none of the methods makes sense without the response; add known to --responses")
     return jobs
 
 

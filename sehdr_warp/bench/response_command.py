@@ -5,7 +5,7 @@ from pathlib import Path
 
 import tyro
 
-from ..errors import SehdrError
+from ..arguments import positive, say
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,19 +32,17 @@ class Responses:
     """Replace files that exist."""
 
 
-def run_responses(asked: Responses, say) -> None:
+def run_responses(asked: Responses) -> None:
     """Measures, prints the table and writes what was asked for."""
     from .report import check_writable, format_report, write_report
     from .response import CURVES, bench_response
 
-    if asked.exposures < 1:
-        raise SehdrError(f"--exposures {asked.exposures}: must be positive")
     curves = CURVES if asked.curves is None else tuple(filter(None, map(str.strip, asked.curves.split(","))))
     check_writable("response", asked.json, asked.out, asked.overwrite)
     report = bench_response(
         asked.data,
         curves,
-        exposures=asked.exposures,
+        exposures=positive("--exposures", asked.exposures),
         single=asked.single,
         max_size=asked.max_size,
         seed=asked.seed,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from ..errors import SehdrError
+from ..errors import InputError
 from ..scene import Scene
 from ..training.config import Config
 from ..training.config_files import config_to_dict, load_config
@@ -39,7 +39,7 @@ def bench_training(
     Both sides have the same photos, split, start points and colours, losses, learning rates and iterations, and 3DGS's
     thresholds as they stand, whatever the number of iterations. released: also train gsplat as version 1.5.3 does,
     which never resets opacities. out: keep our run in out/run; by default it is thrown away.
-    Raises SehdrError for a scene on which the terms would not be equal.
+    Raises InputError for a scene on which the terms would not be equal.
     """
     _check_equal_terms(scene)
     config = plain_config(iterations, seed)
@@ -80,12 +80,11 @@ def plain_config(iterations: int, seed: int) -> Config:
 
 def _check_equal_terms(scene: Scene) -> None:
     if not len(scene.points):
-        raise SehdrError(f"{scene.name} has no points; the comparison starts both sides from the same ones")
+        raise InputError(scene.name, "has no points, from which both sides start", "take one with sparse points")
     times = sorted({view.exposure_time for view in scene.views})
     if times[0] != times[-1]:
-        raise SehdrError(
-            f"{scene.name} has exposure times from {times[0]:g} to {times[-1]:g} s; gsplat knows none: use one exposure"
-        )
+        problem = f"has exposure times from {times[0]:g} to {times[-1]:g} s, and gsplat knows none"
+        raise InputError(scene.name, problem, "use one exposure")
 
 
 def _ours(scene: Scene, config: Config, device: torch.device, folder: Path, overwrite: bool) -> dict:

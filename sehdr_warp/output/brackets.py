@@ -67,7 +67,7 @@ class BracketOptions:
         if self.ldr is not None and self.ldr not in LDR_FORMATS:
             raise SehdrError(f"LDR brackets {self.ldr!r} are not one of {', '.join(LDR_FORMATS)}")
         if self.ldr is not None and self.response is None:
-            raise SehdrError("LDR brackets need a camera response")
+            raise SehdrError("LDR brackets need a camera response; give one, or leave out ldr")
 
 
 def bracket_exposures(
@@ -80,29 +80,28 @@ def bracket_exposures(
     outside 1e-6 to 1e6 seconds, or comes twice.
     """
     if (evs is None) == (exposures is None):
-        raise SehdrError(
-            f"brackets need evs or exposures, {'not both' if evs is not None else 'and neither was given'}"
-        )
+        count = "both were given" if evs is not None else "neither was given"
+        raise SehdrError(f"brackets need evs or exposures, and {count}; give one of them")
     if not (math.isfinite(base_time) and base_time > 0):
-        raise SehdrError(f"base exposure time {base_time} is not a positive number of seconds")
+        raise SehdrError(f"base exposure time {base_time} is not positive and finite; give seconds")
     given, field = (evs, "evs") if evs is not None else (exposures, "exposures")
     if not len(given):
         raise SehdrError(f"{field} is empty; give at least one value")
     made = []
     for value in map(float, given):
         if not math.isfinite(value):
-            raise SehdrError(f"{field}: {value} is not finite")
+            raise SehdrError(f"{field}: {value} is not finite; give a number")
         if field == "exposures" and value <= 0:
-            raise SehdrError(f"exposures: {value:g} is not a positive number of seconds")
+            raise SehdrError(f"exposures: {value:g} is not positive; give seconds")
         # Scaling by whole stops is exact; absurd stops would overflow before the range refuses them.
         time = base_time * 2.0**value if field == "evs" and abs(value) < 64 else value
         if field == "evs" and abs(value) >= 64 or not _SHORTEST <= time <= _LONGEST:
-            raise SehdrError(f"{field}: {value:g} is outside {_SHORTEST:g} to {_LONGEST:g} seconds")
+            raise SehdrError(f"{field}: {value:g} is outside {_SHORTEST:g} to {_LONGEST:g} seconds; stay inside")
         made.append(Exposure(time, value if field == "evs" else math.log2(value / base_time)))
     made.sort(key=lambda exposure: exposure.time)
     for first, second in pairwise(made):
         if first.time == second.time:
-            raise SehdrError(f"{field}: {first.ev if field == 'evs' else first.time:g} is given twice")
+            raise SehdrError(f"{field}: {first.ev if field == 'evs' else first.time:g} is given twice; leave one out")
     return tuple(made)
 
 

@@ -97,7 +97,7 @@ def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
 
 def _check(cameras: Sequence[Camera], count: int) -> None:
     if not cameras:
-        raise SehdrError("a camera path needs at least one camera of the run")
+        raise SehdrError("the run has no training views, and a camera path follows theirs; give a JSON file of cameras")
     if not 1 <= count <= _LONGEST:
         raise SehdrError(f"a camera path of {count} views cannot be; ask for a count of 1 to {_LONGEST}")
 

@@ -99,7 +99,7 @@ def ldr_gaussians(run, exposure_time: float | None = None) -> GaussianArrays:
     """
     time = run.exposure_time if exposure_time is None else float(exposure_time)
     if not (np.isfinite(time) and time > 0):
-        raise SehdrError(f"exposure time {time:g} is not a positive number of seconds")
+        raise SehdrError(f"exposure time {time:g} is not positive and finite; give seconds")
     stored, to_radiance = _stored(run)
     if stored.color_model == "display" and time == run.exposure_time:
         return stored

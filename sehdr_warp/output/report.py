@@ -236,7 +236,7 @@ def _percent_ticks(axis, limits: tuple[float, float]) -> None:
 
 def _chosen(views: Sequence[View], count: int) -> list[View]:
     if not views:
-        raise SehdrError("the scene has no views to report on")
+        raise SehdrError("the scene has no views to report on; check its splits")
     return [views[i] for i in sorted({round(i) for i in np.linspace(0, len(views) - 1, max(count, 1))})]
 
 

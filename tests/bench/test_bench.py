@@ -104,10 +104,10 @@ def test_files_in_the_way_are_named_before_anything_is_measured(tmp_path, capsys
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--channels", "3,x"], "--channels 3,x: not positive numbers"),
-        (["--channels", "0"], "--channels 0: not positive numbers"),
+        (["--channels", "3,x"], "--channels 3,x: not whole numbers from 1"),
+        (["--channels", "0"], "--channels 0: not whole numbers from 1"),
         (["--sizes", "9@9"], "size 9@9: not a size"),
-        (["--repetitions", "0"], "--repetitions 0: must be positive"),
+        (["--repetitions", "0"], "--repetitions 0: not positive"),
     ],
 )
 def test_arguments_that_do_not_fit_are_named(arguments, message, capsys):

@@ -120,7 +120,7 @@ def test_seconds_to_final_is_the_first_time_that_stays_within_a_tenth(psnr, expe
         ("--scenes nowhere", "nowhere: no such folder"),
         ("--scenes embedded:nowhere", "embedded:nowhere: no such scene"),
         ("--curves kodachrome", "kodachrome"),
-        ("--workers 0", "--workers 0: must be positive"),
+        ("--workers 0", "--workers 0: not positive"),
         ("--launcher ship", "--launcher ship: not one of auto, slurm, local, process"),
         ("--noise loud", "--noise loud: not one or two numbers"),
         ("--gpus 0", "there are none with --device cpu"),

@@ -31,13 +31,13 @@ def test_exposures_are_seconds():
 @pytest.mark.parametrize(
     "given, message",
     [
-        ({"evs": [0], "exposures": [1]}, "not both"),
+        ({"evs": [0], "exposures": [1]}, "both were given"),
         ({}, "neither was given"),
         ({"evs": []}, "evs is empty"),
         ({"evs": [0, float("nan")]}, "evs: nan is not finite"),
         ({"exposures": [1, float("inf")]}, "exposures: inf is not finite"),
-        ({"exposures": [0.5, 0]}, "exposures: 0 is not a positive"),
-        ({"exposures": [-2]}, "exposures: -2 is not a positive"),
+        ({"exposures": [0.5, 0]}, "exposures: 0 is not positive"),
+        ({"exposures": [-2]}, "exposures: -2 is not positive"),
         ({"exposures": [2, 1, 2]}, "exposures: 2 is given twice"),
         ({"evs": [1, 1.0]}, "evs: 1 is given twice"),
         ({"evs": [1e9]}, "evs: 1e[+]09 is outside"),
