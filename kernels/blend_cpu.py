@@ -120,7 +120,7 @@ def forward_kernel(
     shapes: [N] (x, y, opacity, half-height); ellipses: [N] (conic a, b, c, level); features: [N, C]
     columns: tiles across; width, height: of the image; iota: one row, 0 to 15
     transmittance, accumulated, last: scratch of [tiles, 16] rows, [tiles, C, 16] rows and [tiles, 16] rows
-    image: [H W, C]; alpha: [H W]
+    image: [H W, C]; left_over: [H W], the transmittance behind everything
     """
     row, spread, step, exponential = row_functions(dtype, halvings, degree)
     g = geometry(dtype)
@@ -144,7 +144,7 @@ def forward_kernel(
         accumulated: wp.array3d(dtype=row),
         last: wp.array2d(dtype=row),
         image: wp.array2d(dtype=real),
-        alpha: wp.array(dtype=real),
+        left_over: wp.array(dtype=real),
     ):
         tile = first + wp.tid()
         bounds = ranges[tile]
@@ -196,7 +196,7 @@ def forward_kernel(
             t = transmittance[tile, j]
             for i in range(wp.min(size, width - x0)):
                 pixel = (y0 + j) * width + x0 + i
-                alpha[pixel] = real(1.0) - wp.abs(t[i])
+                left_over[pixel] = wp.abs(t[i])
                 for channel in range(wp.static(channels)):
                     image[pixel, channel] = accumulated[tile, channel, j][i]
 
@@ -209,7 +209,7 @@ def backward_kernel(dtype, channels: int, halvings: int, degree: int = EXPONENTI
 
     emission: [M] each entry's row in entry_gradients
     transmittance, last: as the forward left them (transmittance is used up)
-    image_gradient: [H W, C]; alpha_gradient: [H W]
+    image_gradient: [H W, C]; left_over_gradient: [H W]
     behind, weights, slopes: scratch of [tiles, 16] rows; incoming: scratch of [tiles, C, 16] rows
     entry_gradients: [M, C + 6], in the order of emission: features, conic a b c, x, y, opacity
     """
@@ -235,7 +235,7 @@ def backward_kernel(dtype, channels: int, halvings: int, degree: int = EXPONENTI
         transmittance: wp.array2d(dtype=row),
         last: wp.array2d(dtype=row),
         image_gradient: wp.array2d(dtype=real),
-        alpha_gradient: wp.array(dtype=real),
+        left_over_gradient: wp.array(dtype=real),
         behind: wp.array2d(dtype=row),
         incoming: wp.array3d(dtype=row),
         weights: wp.array2d(dtype=row),
@@ -253,16 +253,16 @@ def backward_kernel(dtype, channels: int, halvings: int, degree: int = EXPONENTI
             t = wp.max(transmittance[tile, j], transmittance[tile, j] * real(-1.0))
             transmittance[tile, j] = t
             furthest = wp.max(furthest, last[tile, j])
-            from_alpha = spread(real(0.0))
+            from_left_over = spread(real(0.0))
             for channel in range(wp.static(channels)):
                 incoming[tile, channel, j] = spread(real(0.0))
             if y0 + j < height:
                 for i in range(wp.min(size, width - x0)):
                     pixel = (y0 + j) * width + x0 + i
-                    from_alpha[i] = alpha_gradient[pixel]
+                    from_left_over[i] = left_over_gradient[pixel]
                     for channel in range(wp.static(channels)):
                         incoming[tile, channel, j][i] = image_gradient[pixel, channel]
-            behind[tile, j] = wp.cw_mul(t, from_alpha) * real(-1.0)
+            behind[tile, j] = wp.cw_mul(t, from_left_over)
 
         drawn = int(wp.max(furthest))
         for k in range(bounds[0] + drawn, bounds[1]):

@@ -40,7 +40,7 @@ def forward_kernel(dtype, channels: int, transmittance_min: float = TRANSMITTANC
 
     ranges: [tiles] first and one past the last entry; entries: [M] Gaussians; shapes: [N] (x, y, opacity, -);
     ellipses: [N] (conic a, b, c, level); features: [N padded_channels / 4] rows of four, flat
-    image: [H W] vectors of C; alpha, transmittance: [H W]; last: [H W] 1 + list place of the last Gaussian drawn
+    image: [H W] vectors of C; transmittance: [H W]; last: [H W] 1 + list place of the last Gaussian drawn
     """
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4
@@ -66,7 +66,6 @@ def forward_kernel(dtype, channels: int, transmittance_min: float = TRANSMITTANC
         height: int,
         alpha_threshold: real,
         image: wp.array(dtype=vec_image),
-        alpha: wp.array(dtype=real),
         transmittance: wp.array(dtype=real),
         last: wp.array(dtype=wp.int32),
     ):
@@ -221,13 +220,11 @@ def forward_kernel(dtype, channels: int, transmittance_min: float = TRANSMITTANC
         if upper_inside:
             pixel = py * width + px
             image[pixel] = upper_image
-            alpha[pixel] = real(1.0) - upper_t
             transmittance[pixel] = upper_t
             last[pixel] = upper_last
         if lower_inside:
             pixel = (py + 4) * width + px
             image[pixel] = lower_image
-            alpha[pixel] = real(1.0) - lower_t
             transmittance[pixel] = lower_t
             last[pixel] = lower_last
 

@@ -23,7 +23,7 @@ ROWS = 4
 def backward_kernel(dtype, channels: int, fast_math: bool = True, ordered: bool = False):
     """blend_backward over tiles x BLOCKS_PER_TILE x 32 threads.
 
-    As blend_cuda.forward_kernel, and image_gradient: [H W] vectors of C; alpha_gradient: [H W];
+    As blend_cuda.forward_kernel, and image_gradient: [H W] vectors of C; transmittance_gradient: [H W];
     rows: ROWS and gradient_count: C + 6, as arguments so that their loops stay loops;
     gradients: [N (C + 6)], flat rows (features, conic a b c, x, y, opacity), added to
 
@@ -60,7 +60,7 @@ def backward_kernel(dtype, channels: int, fast_math: bool = True, ordered: bool 
         transmittance: wp.array(dtype=real),
         last: wp.array(dtype=wp.int32),
         image_gradient: wp.array(dtype=vec_image),
-        alpha_gradient: wp.array(dtype=real),
+        transmittance_gradient: wp.array(dtype=real),
         rows: int,
         gradient_count: int,
         only_corner: int,
@@ -96,7 +96,7 @@ def backward_kernel(dtype, channels: int, fast_math: bool = True, ordered: bool 
         count = most_drawn[0]
         t = transmittance[pixel]
         pixel_gradient = image_gradient[pixel]
-        behind = -t * alpha_gradient[pixel]
+        behind = t * transmittance_gradient[pixel]
         incoming = vec_padded()
         for channel in range(wp.static(channels)):
             incoming[channel] = pixel_gradient[channel]

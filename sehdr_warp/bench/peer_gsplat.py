@@ -5,6 +5,7 @@ and DefaultStrategy at 3DGS's settings. gsplat needs CUDA and is not a dependenc
 """
 
 import time
+from dataclasses import dataclass
 
 import torch
 
@@ -156,6 +157,13 @@ def _upload(view, device):
     return pose, intrinsics, torch.tensor(view.image, device=device), mask
 
 
+@dataclass(frozen=True)
+class GsplatRendering(Rendering):
+    """Has gsplat's alpha, and None for the transmittance: one more image would count as gsplat's memory."""
+
+    alpha: torch.Tensor | None = None
+
+
 def rasterize_with_gsplat(
     means,
     log_scales,
@@ -196,4 +204,5 @@ def rasterize_with_gsplat(
     # gsplat 1.5 gives two radii, its forerunners one.
     radii = info["radii"][0]
     radii = radii.amax(-1) if radii.ndim == 2 else radii
-    return Rendering(image[0], alpha[0, ..., 0], info["means2d"][0], info["depths"][0], radii, 0)
+    means2d, depths = info["means2d"][0], info["depths"][0]
+    return GsplatRendering(image[0], None, means2d, depths, radii, 0, alpha=alpha[0, ..., 0])

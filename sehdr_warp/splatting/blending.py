@@ -26,7 +26,7 @@ def blend(
     block_kernels: bool | None = None,
     style: BlendStyle = DEFAULT_STYLE,
 ):
-    """Blend features [N, C] over the tile lists: image [H, W, C] and alpha [H, W].
+    """Blend features [N, C] over the tile lists: image [H, W, C] and the transmittance left [H, W].
 
     Differentiable with respect to means2d [N, 2], conics [N, 3], opacities [N] and features. Which entries count is
     decided by the lists and by alpha_threshold, and taken as given in the derivative.
@@ -39,11 +39,18 @@ def blend(
     gradients = [program.hand_over(tensor) for tensor in (features, conics, means2d, opacities)]
     channels = features.shape[1]
     image = program.write((height, width, channels), features.dtype)
-    alpha = program.write((height, width), features.dtype)
+    transmittance = program.write((height, width), features.dtype)
     on_blocks = not program.is_cpu if block_kernels is None else block_kernels
     backend = blend_on_cuda if on_blocks else blend_on_cpu
     backward = backend(
-        program.device, features, lists, records, program.tensor(image), program.tensor(alpha), alpha_threshold, style
+        program.device,
+        features,
+        lists,
+        records,
+        program.tensor(image),
+        program.tensor(transmittance),
+        alpha_threshold,
+        style,
     )
 
     def adjoint():
@@ -51,11 +58,11 @@ def blend(
         gathered = backward(
             pack_records(means2d, conics, opacities, extents, alpha_threshold),
             wp.to_torch(image.grad, requires_grad=False),
-            wp.to_torch(alpha.grad, requires_grad=False),
+            wp.to_torch(transmittance.grad, requires_grad=False),
         )
         parts = gathered.split((channels, 3, 2, 1), dim=1)
         for gradient, part in zip(gradients, (*parts[:3], parts[3][:, 0]), strict=True):
             gradient.value = part if gradient.wanted else None
 
     program.record_adjoint(adjoint)
-    return image, alpha
+    return image, transmittance

@@ -16,10 +16,12 @@ from .gathering import gather_by_gaussian
 from .tile_lists import TileLists
 
 
-def blend_on_cpu(device, features, lists: TileLists, records, image, alpha, alpha_threshold: float, style: BlendStyle):
-    """Fill image [H, W, C] and alpha [H, W]; return the backward pass.
+def blend_on_cpu(
+    device, features, lists: TileLists, records, image, left_over, alpha_threshold: float, style: BlendStyle
+):
+    """Fill image [H, W, C] and left_over [H, W], the transmittance; return the backward pass.
 
-    It takes the records made again and the gradients of image and alpha, and gives [N, C + 6]: by feature, conic a b c,
+    It takes the records made again and the gradients of both, and gives [N, C + 6]: by feature, conic a b c,
     x, y, opacity.
     """
     scalar = warp_scalar(features.dtype)
@@ -51,12 +53,12 @@ def blend_on_cpu(device, features, lists: TileLists, records, image, alpha, alph
             rows(channels, TILE_SIZE),
             last,
             view(image.view(-1, channels)),
-            view(alpha.view(-1)),
+            view(left_over.view(-1)),
         ],
         device,
     )
 
-    def backward(records, image_gradient: torch.Tensor, alpha_gradient: torch.Tensor) -> torch.Tensor:
+    def backward(records, image_gradient: torch.Tensor, left_over_gradient: torch.Tensor) -> torch.Tensor:
         entry_gradients = features.new_empty(lists.entry_count, channels + 6)
         threads.launch_ranges(
             blend_cpu.backward_kernel(scalar, channels, halvings, degree),
@@ -71,7 +73,7 @@ def blend_on_cpu(device, features, lists: TileLists, records, image, alpha, alph
                 transmittance,
                 last,
                 view(image_gradient.view(-1, channels)),
-                view(alpha_gradient.view(-1)),
+                view(left_over_gradient.view(-1)),
                 rows(TILE_SIZE),
                 rows(channels, TILE_SIZE),
                 rows(TILE_SIZE),

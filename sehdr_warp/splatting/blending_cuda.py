@@ -11,17 +11,18 @@ from .gathering import gather_by_gaussian
 from .tile_lists import TileLists
 
 
-def blend_on_cuda(device, features, lists: TileLists, records, image, alpha, alpha_threshold: float, style: BlendStyle):
-    """Fill image [H, W, C] and alpha [H, W]; return the backward pass.
+def blend_on_cuda(
+    device, features, lists: TileLists, records, image, transmittance, alpha_threshold: float, style: BlendStyle
+):
+    """Fill image [H, W, C] and transmittance [H, W]; return the backward pass.
 
-    It takes the records made again and the gradients of image and alpha, and gives [N, C + 6]: by feature, conic a b c,
+    It takes the records made again and the gradients of both, and gives [N, C + 6]: by feature, conic a b c,
     x, y, opacity.
     """
     scalar = warp_scalar(features.dtype)
     height, width, channels = image.shape
     vec4, pixel = vector(4, scalar), vector(channels, scalar)
     padding = blend_cuda.padded_channels(channels) - channels
-    transmittance = features.new_empty(height * width)
     last = torch.empty(height * width, dtype=torch.int32, device=features.device)
     tile_count = lists.columns * lists.rows
 
@@ -56,19 +57,21 @@ def blend_on_cuda(device, features, lists: TileLists, records, image, alpha, alp
         blend_cuda.forward_kernel(scalar, channels, style.transmittance_min, style.fast_math),
         blend_cuda.BLOCKS_PER_TILE,
         rows_of_four(records),
-        [pixels(image), view(alpha.view(-1)), view(transmittance), view(last)],
+        [pixels(image), view(transmittance.view(-1)), view(last)],
     )
 
-    def add_gradients(kernel, blocks_per_tile, by_gaussian, image_gradient, alpha_gradient, corner, rows_of, gradients):
+    def add_gradients(
+        kernel, blocks_per_tile, by_gaussian, image_gradient, transmittance_gradient, corner, rows_of, gradients
+    ):
         launch(
             kernel,
             blocks_per_tile,
             by_gaussian,
             [
-                view(transmittance),
+                view(transmittance.view(-1)),
                 view(last),
                 pixels(image_gradient),
-                view(alpha_gradient.view(-1)),
+                view(transmittance_gradient.view(-1)),
                 blend_cuda_adjoint.ROWS,
                 channels + 6,
                 corner,
@@ -77,8 +80,8 @@ def blend_on_cuda(device, features, lists: TileLists, records, image, alpha, alp
             ],
         )
 
-    def backward(records, image_gradient: torch.Tensor, alpha_gradient: torch.Tensor) -> torch.Tensor:
-        incoming = rows_of_four(records), image_gradient, alpha_gradient
+    def backward(records, image_gradient: torch.Tensor, transmittance_gradient: torch.Tensor) -> torch.Tensor:
+        incoming = rows_of_four(records), image_gradient, transmittance_gradient
         kernel = blend_cuda_adjoint.backward_kernel(scalar, channels, style.fast_math, style.deterministic)
         corners = blend_cuda_adjoint.BLOCKS_PER_TILE
         if not style.deterministic:

@@ -17,8 +17,9 @@ from .tile_lists import LARGEST_CAPACITY, build_tile_lists, pack_records
 class Rendering:
     """One rendered view of N Gaussians.
 
-    image: [H, W, C] blended features over zero; add (1 - alpha) * background for another background.
-    alpha: [H, W] in [0, 1], how much of each pixel the Gaussians cover.
+    image: [H, W, C] blended features over zero; add transmittance * background for another background.
+    transmittance: [H, W] in [0, 1], how much of each pixel's background is seen. The backward pass reads it: do not
+        write to it.
     means2d: [N, 2] centres in pixels; part of the graph, so means2d.retain_grad() gives densification its signal.
     depths: [N] along the camera's axis, in scene units; 0 where culled.
     radii: [N] the longer half-extent in pixels within which a Gaussian counts; 0 where culled.
@@ -28,13 +29,18 @@ class Rendering:
     """
 
     image: torch.Tensor
-    alpha: torch.Tensor
+    transmittance: torch.Tensor
     means2d: torch.Tensor
     depths: torch.Tensor
     radii: torch.Tensor
     entry_count: int
     overflow: torch.Tensor | None = None
     pair_count: torch.Tensor | None = None
+
+    @property
+    def alpha(self) -> torch.Tensor:
+        """[H, W] in [0, 1], how much of each pixel the Gaussians cover; made anew whenever it is asked for."""
+        return 1.0 - self.transmittance
 
     @property
     def visible(self) -> torch.Tensor:
@@ -109,7 +115,7 @@ def rasterize(
         capacity,
         emission=means.device.type == "cpu" or style.deterministic,
     )
-    image, alpha = blend(
+    image, transmittance = blend(
         means2d,
         conics,
         opacities2d,
@@ -123,7 +129,7 @@ def rasterize(
         style=style,
     )
     radii = extents.amax(dim=1)
-    return Rendering(image, alpha, means2d, depths, radii, lists.entry_count, lists.overflow, lists.total)
+    return Rendering(image, transmittance, means2d, depths, radii, lists.entry_count, lists.overflow, lists.total)
 
 
 def _check_tensors(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics) -> None:

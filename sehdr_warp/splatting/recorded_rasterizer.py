@@ -51,12 +51,12 @@ class RecordedRasterizer:
         key = (tuple((tensor.shape, tensor.dtype) for tensor in tensors), wanted, size, tuple(sorted(options.items())))
         if key != self._key:
             self._record(key, tensors, wanted, size, options)
-        image, alpha = _Replay.apply(self, *tensors)
+        image, transmittance = _Replay.apply(self, *tensors)
         if self._rendering.overflow:
             # These arguments need more room than those that were recorded.
             self._record(key, tensors, wanted, size, options)
-            image, alpha = _Replay.apply(self, *tensors)
-        return replace(self._rendering, image=image, alpha=alpha)
+            image, transmittance = _Replay.apply(self, *tensors)
+        return replace(self._rendering, image=image, transmittance=transmittance)
 
     def _record(self, key, tensors, wanted, size, options) -> None:
         self._key = None
@@ -68,13 +68,15 @@ class RecordedRasterizer:
                 return rasterize(*self._arguments, *size, capacity=capacity, **options)
 
         def backward(rendering):
-            return torch.autograd.grad([rendering.image, rendering.alpha], leaves, self._upstream, allow_unused=True)
+            return torch.autograd.grad(
+                [rendering.image, rendering.transmittance], leaves, self._upstream, allow_unused=True
+            )
 
         # Launched once: nothing may be compiled or loaded during a recording, and it tells how much room is needed.
         launched = forward()
         capacity = max(LEAST_ROOM, int(ROOM * launched.entry_count))
         if leaves:
-            self._upstream = [torch.zeros_like(launched.image), torch.zeros_like(launched.alpha)]
+            self._upstream = [torch.zeros_like(launched.image), torch.zeros_like(launched.transmittance)]
             backward(launched)
         del launched
         for recorder in (self._forward, self._backward):
@@ -86,7 +88,7 @@ class RecordedRasterizer:
         self._rendering = replace(
             rendering,
             image=rendering.image.detach(),
-            alpha=rendering.alpha.detach(),
+            transmittance=rendering.transmittance.detach(),
             means2d=rendering.means2d.detach(),
             depths=rendering.depths.detach(),
         )
@@ -101,7 +103,7 @@ class _Replay(torch.autograd.Function):
         torch._foreach_copy_([argument.detach() for argument in owner._arguments], [t.detach() for t in tensors])
         owner._forward.replay()
         ctx.set_materialize_grads(False)
-        return owner._rendering.image.detach(), owner._rendering.alpha.detach()
+        return owner._rendering.image.detach(), owner._rendering.transmittance.detach()
 
     @staticmethod
     @torch.autograd.function.once_differentiable

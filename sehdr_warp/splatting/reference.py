@@ -72,13 +72,13 @@ def blend_reference(
     means2d, conics, opacities, features, depths, extents, width, height, alpha_threshold,
     transmittance_min=TRANSMITTANCE_MIN,
 ):
-    """Front-to-back blending in torch: image [H, W, C] and alpha [H, W]."""
+    """Front-to-back blending in torch: image [H, W, C] and the transmittance left [H, W]."""
     device, dtype = means2d.device, means2d.dtype
-    image_rows, alpha_rows = [], []
+    image_rows, left_over_rows = [], []
     order = torch.where(extents[:, 0] > 0, depths, math.inf).argsort(stable=True)
     order = order[: int((extents[:, 0] > 0).sum())]
     for top in range(0, height, TILE_SIZE):
-        image_tiles, alpha_tiles = [], []
+        image_tiles, left_over_tiles = [], []
         for left in range(0, width, TILE_SIZE):
             right, bottom = min(left + TILE_SIZE, width), min(top + TILE_SIZE, height)
             near_x = (means2d[order, 0] + extents[order, 0] > left) & (means2d[order, 0] - extents[order, 0] < right)
@@ -103,10 +103,10 @@ def blend_reference(
             tile = torch.einsum("gp,gc->pc", value * before, features[here])
             left_over = after[-1] if len(here) else torch.ones_like(x.reshape(-1))
             image_tiles.append(tile.reshape(bottom - top, right - left, -1))
-            alpha_tiles.append((1 - left_over).reshape(bottom - top, right - left))
+            left_over_tiles.append(left_over.reshape(bottom - top, right - left))
         image_rows.append(torch.cat(image_tiles, 1))
-        alpha_rows.append(torch.cat(alpha_tiles, 1))
-    return torch.cat(image_rows, 0), torch.cat(alpha_rows, 0)
+        left_over_rows.append(torch.cat(left_over_tiles, 1))
+    return torch.cat(image_rows, 0), torch.cat(left_over_rows, 0)
 
 
 def rasterize_reference(
@@ -122,7 +122,7 @@ def rasterize_reference(
         means, log_scales, quaternions, opacities, world_to_camera, intrinsics, width, height, near, low_pass,
         alpha_threshold, antialiased,
     )
-    image, alpha = blend_reference(
+    image, transmittance = blend_reference(
         means2d, conics, opacities, features, depths, extents, width, height, alpha_threshold, transmittance_min
     )
-    return Rendering(image, alpha, means2d, depths, extents.amax(1), 0)
+    return Rendering(image, transmittance, means2d, depths, extents.amax(1), 0)

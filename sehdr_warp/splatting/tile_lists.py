@@ -186,8 +186,8 @@ def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends
 def sort_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: bool):
     """Stable sort of the entries by tile: tiles [M], Gaussians [M], and where each entry stood before [M] or None.
 
-    tiles, gaussians: as by emit_entries(); the tiles are sorted within the same memory; the rest is copied out of it, because
-    it is kept and the sort's memory is twice as much.
+    tiles, gaussians: as by emit_entries(). The sorted tiles are in the same memory; the rest, which is kept, is copied
+    out of it.
     """
     bits = tile_count.bit_length()
     if emission:

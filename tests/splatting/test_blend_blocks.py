@@ -75,19 +75,21 @@ def test_block_kernels_match_the_reference(fibers, dtype, channels, deterministi
             style=BlendStyle(deterministic=deterministic),
         )
 
-    image, alpha = fibers(forward)
+    image, transmittance = fibers(forward)
     true_inputs = [t.detach().requires_grad_() for t in (true_geometry[0], true_geometry[1], true_geometry[3])]
     true_features = scene.tensors[4].clone().requires_grad_()
-    true_image, true_alpha = blend_reference(
+    true_image, true_transmittance = blend_reference(
         *true_inputs, true_features, true_geometry[2], true_geometry[4], scene.width, scene.height, threshold
     )
-    assert (true_alpha > 0.999).any()
+    assert (true_transmittance < 0.001).any()
     value_bound, gradient_bound = BOUNDS[dtype]
     assert relative_error(image, true_image) < value_bound
-    assert relative_error(alpha, true_alpha) < value_bound
-    loss = (image * random_like(image, 1)).sum() + (alpha * random_like(alpha, 2)).sum()
+    assert relative_error(transmittance, true_transmittance) < value_bound
+    assert relative_error(1 - transmittance, 1 - true_transmittance) < value_bound
+    loss = (image * random_like(image, 1)).sum() + (transmittance * random_like(transmittance, 2)).sum()
     fibers(loss.backward)
-    ((true_image * random_like(true_image, 1)).sum() + (true_alpha * random_like(true_alpha, 2)).sum()).backward()
+    truth = (true_transmittance * random_like(true_transmittance, 2)).sum()
+    (truth + (true_image * random_like(true_image, 1)).sum()).backward()
     for ours, truth in zip([*inputs, features], [*true_inputs, true_features]):
         assert relative_error(ours.grad, truth.grad) < gradient_bound
 
@@ -104,7 +106,7 @@ def test_nothing_by_gaussian_is_kept_for_the_backward_pass(fibers, monkeypatch):
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
         image = fibers(lambda: blend(*inputs, **options))[0]
     kept = sum(event.nbytes() for event in recorded.profiler.kineto_results.events() if event.name() == "[memory]")
-    by_pixel = 3 + 1 + 1 + 1  # image, alpha, transmittance and the last Gaussian drawn
+    by_pixel = 3 + 1 + 1  # image, transmittance and the last Gaussian drawn
     assert image.requires_grad and kept == 4 * by_pixel * 44 * 26
     given = [weakref.ref(record) for record in records]
     del records, options["records"]

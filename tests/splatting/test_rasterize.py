@@ -40,6 +40,18 @@ def test_matches_the_reference(device, dtype, channels, antialiased):
         assert relative_error(tensor.grad, true.grad) < gradient_bound, name
 
 
+def test_transmittance_keeps_its_digits_where_little_is_left(device):
+    scene = random_scene(count=600, channels=1, width=44, height=26, spread=1.6, seed=2).to(torch.float32, device)
+    with torch.no_grad():
+        ours = rasterize(*scene.arguments)
+        truth = rasterize_reference(*scene.to(torch.float64).arguments).transmittance
+    faint = truth < 1e-3
+    assert faint.sum() > 500
+    # 1 - alpha would be wrong by 8e-5 here.
+    assert relative_error(ours.transmittance[faint], truth[faint]) < 3e-5
+    assert torch.equal(ours.alpha, 1 - ours.transmittance)
+
+
 @pytest.mark.parametrize("which", range(len(NAMES)), ids=NAMES)
 def test_gradients_match_finite_differences(device, which):
     # Few, wide Gaussians and a tiny threshold keep every pixel away from the cut-offs, where no derivative exists.
