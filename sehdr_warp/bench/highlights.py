@@ -1,6 +1,6 @@
 """How far above white clipped light is: estimates from the photos alone, judged on the embedded scenes.
 
-    python docs/highlight_study.py
+    python -m sehdr_warp.bench.highlights
 
 Prints the table of docs/highlights.md. No training: what a photo does not clip counts as known up to an error of 38
 dB, about that of a training on the truth, and every clipped channel of the held-out photos is set to white times
@@ -9,17 +9,18 @@ dB, about that of a training on the truth, and every clipped channel of the held
 
 import math
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import norm
 
-from sehdr_warp.model.response import response_by_name
-from sehdr_warp.scene import load_scene
-from sehdr_warp.synth.expose import expose, exposure_ladder
-from sehdr_warp.training.config import LossConfig
-from sehdr_warp.training.highlights import CHANNEL_PARTS, expected_excess, tail_stops
-from sehdr_warp.training.prediction import kovaleski_oliveira
+from ..model.response import response_by_name
+from ..scene import load_scene
+from ..synth.expose import expose, exposure_ladder
+from ..training.config import LossConfig
+from ..training.highlights import CHANNEL_PARTS, expected_excess, tail_stops
+from ..training.prediction import kovaleski_oliveira
 
 TUNED_ON = ("study", "lamps", "metal", "night")
 OTHERS = ("glass", "sunlit", "window", "overcast")
@@ -41,7 +42,9 @@ class Case:
             truths[part].append(view.hdr * np.float32(view.exposure_time / response.white))
         self.truths = [np.stack(images) for images in truths]
         self.clipped = [np.stack(images) >= FULL for images in self.photos]
-        self.excess = [np.log2(np.maximum(truth[clipped], 1e-9)) for truth, clipped in zip(self.truths, self.clipped)]
+        self.excess = [
+            np.log2(np.maximum(truth[clipped], 1e-9)) for truth, clipped in zip(self.truths, self.clipped, strict=True)
+        ]
         self.counts = [clipped.sum(-1, keepdims=True).repeat(3, -1)[clipped] for clipped in self.clipped]
         self.tail = tail_stops(self.train_views, response)
         self.share = float(self.clipped[0].mean())
@@ -59,6 +62,7 @@ def mu_law(relative: np.ndarray) -> np.ndarray:
     return np.log1p(5000 * np.clip(relative, 0, 1)) / math.log(5001)
 
 
+@cache
 def tobit(case: Case) -> tuple[float, float]:
     """Mean and median excess of a normal distribution of log2 exposure, censored at black and white (Tobin 1958)."""
     photos = np.stack(case.photos[0])
@@ -135,10 +139,8 @@ def main() -> None:
     row("best constant of each case, from the truth", lambda c: max(CONSTANTS, key=c.psnr))
     for stops in (1.0, 1.5, 2.0, 3.0):
         row(f"{stops:g} stops", lambda c, stops=stops: stops)
-    fits = {key: tobit(case) for key, case in cases.items()}
-    places = {id(case): key for key, case in cases.items()}
-    row("censored normal, mean", lambda c: fits[places[id(c)]][0])
-    row("censored normal, median", lambda c: fits[places[id(c)]][1])
+    row("censored normal, mean", lambda c: tobit(c)[0])
+    row("censored normal, median", lambda c: tobit(c)[1])
     row("exponential tail, at most 8 stops", lambda c: min(c.tail, 8))
     row("exponential tail, at most 3 stops", lambda c: min(c.tail, 3))
     for spread in (1.0, 2.0, 3.0):
