@@ -6,21 +6,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from sehdr_warp.scene import Camera
+from sehdr_warp.scene import Camera, look_at
 from sehdr_warp.scene.hdr_nerf_layout import RadianceView, reinhard_gamma, write_hdr_nerf_scene
 from sehdr_warp.scene.images import read_hdr
 from sehdr_warp.scene.resample import area_average
-
-
-def look_at(position, target=(0.0, 0.0, 0.0)) -> np.ndarray:
-    """[4, 4] world_to_camera (OpenCV axes) of a camera at `position` that looks at `target`, world z up."""
-    forward = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ position
-    return pose
 
 
 def arc_poses(count: int) -> list[np.ndarray]:

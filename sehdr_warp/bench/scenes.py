@@ -6,7 +6,7 @@ import torch
 from ..model.gaussians import Gaussians
 from ..model.radiance_field import RadianceField
 from ..model.response import response_by_name
-from ..scene import Camera, Scene, View
+from ..scene import Camera, Scene, View, look_at
 from .splats import Size
 
 EXPOSURE_TIME = 0.25
@@ -55,13 +55,6 @@ def _surfaces(count: int, rng) -> tuple[np.ndarray, np.ndarray]:
 
 def _camera(angle: float, size: Size, radius: float = 3.5) -> Camera:
     """On a circle at height 1.6, looking at the middle of the balls."""
-    position = np.array([radius * np.cos(angle), radius * np.sin(angle), 1.6])
-    forward = np.array([0.0, 0.0, 0.4]) - position
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
+    pose = look_at([radius * np.cos(angle), radius * np.sin(angle), 1.6], (0.0, 0.0, 0.4))
     focal = 1.1 * size.width
     return Camera(size.width, size.height, focal, focal, size.width / 2, size.height / 2, pose)

@@ -8,7 +8,7 @@ import torch
 from ..model.gaussians import Gaussians
 from ..model.radiance_field import RadianceField
 from ..model.response import response_by_name
-from ..scene import Camera, Scene, View
+from ..scene import Camera, Scene, View, look_at
 
 SIZE, VIEWS, EXPOSURE_TIME = 32, 6, 0.25
 
@@ -36,11 +36,5 @@ def toy_scene(clipped: float = 0.0) -> Scene:
 
 
 def _orbit(angle: float) -> Camera:
-    position = np.array([4 * np.cos(angle), 4 * np.sin(angle), 0.8])
-    forward = -position / np.linalg.norm(position)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ position
+    pose = look_at([4 * np.cos(angle), 4 * np.sin(angle), 0.8])
     return Camera(SIZE, SIZE, 1.2 * SIZE, 1.2 * SIZE, SIZE / 2, SIZE / 2, pose)

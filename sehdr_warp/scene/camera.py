@@ -5,6 +5,18 @@ from dataclasses import dataclass
 import numpy as np
 
 
+def look_at(position, target=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0)) -> np.ndarray:
+    """[4, 4] world_to_camera of a camera at `position` that looks at `target`, upright where `up` is not along that."""
+    position = np.asarray(position, float)
+    forward = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ position
+    return pose
+
+
 @dataclass(frozen=True)
 class Camera:
     """An undistorted pinhole camera in COLMAP's (OpenCV's) convention: +x right, +y down, +z into the scene.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..scene import Camera
+from ..scene import Camera, look_at
 
 COLUMNS, ROWS = 7, 5
 VIEWS = COLUMNS * ROWS
@@ -26,11 +26,14 @@ class Grid:
     field_of_view: float = 50.0
 
     def poses(self) -> list[np.ndarray]:
-        right, down, forward = _axes(np.subtract(self.target, self.centre))
-        return [
-            _pose(np.add(self.centre, right * self.width * s + down * self.height * t), right, down, forward)
-            for s, t in _places()
-        ]
+        middle = look_at(self.centre, self.target)
+        right, down = middle[:2, :3]
+        poses = []
+        for s, t in _places():
+            pose = middle.copy()
+            pose[:3, 3] = -pose[:3, :3] @ (self.centre + right * self.width * s + down * self.height * t)
+            poses.append(pose)
+        return poses
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class Arc:
             low, high = self.elevation
             rise = math.radians(0.5 * (low + high) - (high - low) * t)
             away = np.array([math.sin(turn) * math.cos(rise), -math.cos(turn) * math.cos(rise), math.sin(rise)])
-            poses.append(_pose(self.target + self.radius * away, *_axes(-away)))
+            poses.append(look_at(self.target + self.radius * away, self.target))
         return poses
 
 
@@ -72,18 +75,3 @@ def split_of(index: int) -> str:
 def _places() -> list[tuple[float, float]]:
     """(across, down) of each view, both from -0.5 to 0.5."""
     return [(i / (COLUMNS - 1) - 0.5, j / (ROWS - 1) - 0.5) for j in range(ROWS) for i in range(COLUMNS)]
-
-
-def _axes(forward) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit vectors right, down and forward of an upright camera (OpenCV axes)."""
-    forward = np.asarray(forward, float) / np.linalg.norm(forward)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    return right, np.cross(forward, right), forward
-
-
-def _pose(position, right, down, forward) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, down, forward])
-    pose[:3, 3] = -pose[:3, :3] @ position
-    return pose

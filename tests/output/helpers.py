@@ -6,7 +6,7 @@ import numpy as np
 from plyfile import PlyData
 
 from sehdr_warp.output.gaussian_file import GaussianArrays
-from sehdr_warp.scene import Camera
+from sehdr_warp.scene import Camera, look_at
 
 
 def radiance(height=24, width=32, seed=0):
@@ -17,14 +17,7 @@ def radiance(height=24, width=32, seed=0):
 
 def camera(width=32, height=24, position=(0.0, 0.0, -3.0), target=(0.0, 0.0, 0.0)):
     """A camera that looks at a target, y down."""
-    position, forward = np.array(position, float), np.array(target, float) - np.array(position, float)
-    forward /= np.linalg.norm(forward)
-    right = np.cross([0.0, 1, 0], forward)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ position
-    return Camera(width, height, 40.0, 44.0, width / 2 + 1, height / 2 - 2, pose)
+    return Camera(width, height, 40.0, 44.0, width / 2 + 1, height / 2 - 2, look_at(position, target, up=(0, -1, 0)))
 
 
 @dataclass

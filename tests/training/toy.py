@@ -6,20 +6,14 @@ import torch
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.model.response import response_by_name
-from sehdr_warp.scene import Camera, Scene, View
+from sehdr_warp.scene import Camera, Scene, View, look_at
 
 EXPOSURE_TIME = 0.25
 
 
 def orbit_camera(angle: float, size: int = 32, radius: float = 4.0) -> Camera:
     """A camera on a circle in the plane z = 0.8, looking at the origin."""
-    position = np.array([radius * np.cos(angle), radius * np.sin(angle), 0.8])
-    forward = -position / np.linalg.norm(position)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
+    pose = look_at([radius * np.cos(angle), radius * np.sin(angle), 0.8])
     return Camera(size, size, 1.2 * size, 1.2 * size, size / 2, size / 2, pose)
 
 
