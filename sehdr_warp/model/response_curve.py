@@ -127,7 +127,17 @@ class Response(ABC):
         return f"{type(self).__name__}({self.name!r})"
 
 
-class _Encode(torch.autograd.Function):
+class _Pointwise(torch.autograd.Function):
+    """forward saves the slope."""
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient):
+        (slope,) = ctx.saved_tensors
+        return gradient * slope, None, None
+
+
+class _Encode(_Pointwise):
     """The curve with the derivative it states itself: one saved tensor, and no NaN from an unused branch."""
 
     @staticmethod
@@ -150,12 +160,6 @@ class _Encode(torch.autograd.Function):
             ctx.save_for_backward(slope)
         return value
 
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, gradient):
-        (slope,) = ctx.saved_tensors
-        return gradient * slope, None, None
-
 
 class _Slope:
     """The derivative, called as the two functions beside it are."""
@@ -168,7 +172,7 @@ class _Slope:
         return torch.where((exposure < 0) | (exposure > clip), 0.0, slope)
 
 
-class _Decode(torch.autograd.Function):
+class _Decode(_Pointwise):
     @staticmethod
     def forward(ctx, value, response, _):
         limit = response.peak if response.clips else response.peak - HALF_CODE
@@ -177,9 +181,3 @@ class _Decode(torch.autograd.Function):
             _, slope = response._evaluate(exposure, True)
             ctx.save_for_backward(torch.where((value < response.black) | (value > limit), 0.0, 1.0 / slope))
         return exposure
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, gradient):
-        (slope,) = ctx.saved_tensors
-        return gradient * slope, None, None
