@@ -13,12 +13,7 @@ from sehdr_warp.model.response import RefinedResponse, response_by_name
 from sehdr_warp.scene.images import read_hdr, read_ldr
 from sehdr_warp.training.config import ResponseConfig
 
-
-def call(*arguments):
-    """Exit status of a command line in this process."""
-    with pytest.raises(SystemExit) as caught:
-        cli.main([str(argument) for argument in arguments])
-    return caught.value.code
+from .refusals import call
 
 
 @pytest.fixture(scope="module")

@@ -9,23 +9,17 @@ from sehdr_warp.bench import kernels, step, training
 from sehdr_warp.bench.checks import require
 from sehdr_warp.bench.splats import Size
 from sehdr_warp.bench.training import bench_training, plain_config
-from sehdr_warp.cli import main
 from sehdr_warp.errors import SehdrError
 
+from ..refusals import call
 from ..training.toy import toy_scene
 
 KERNELS = ["bench", "kernels", "--device", "cpu", "--sizes", "200@40x33", "--repetitions", "3", "--budget", "1"]
 CPU = torch.device("cpu")
 
 
-def run(*arguments) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        main(list(map(str, arguments)))
-    return exit_.value.code
-
-
 def test_kernels_report_times_checks_and_machine(tmp_path, capsys):
-    assert run(*KERNELS, "--channels", "3,4", "--peers", "--json", tmp_path / "a.json", "--out", tmp_path / "out") == 0
+    assert call(*KERNELS, "--channels", "3,4", "--peers", "--json", tmp_path / "a.json", "--out", tmp_path / "out") == 0
     report = json.loads((tmp_path / "a.json").read_text())
     assert report == json.loads((tmp_path / "out" / "kernels.json").read_text())
     assert (tmp_path / "out" / "kernels.png").read_bytes()[:4] == b"\x89PNG"
@@ -71,7 +65,7 @@ def test_a_wrong_image_is_reported_and_fails(tmp_path, monkeypatch, capsys):
         return type(rendering)(**{**vars(rendering), "image": rendering.image * 1.001})
 
     monkeypatch.setattr(kernels, "rasterize", wrong)
-    assert run(*KERNELS, "--channels", "3", "--json", tmp_path / "a.json") == 1
+    assert call(*KERNELS, "--channels", "3", "--json", tmp_path / "a.json") == 1
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert "correctness checks failed" in error
     assert "sehdr-warp on 1 threads: image" in error
@@ -94,7 +88,7 @@ def test_a_wrong_gradient_fails(monkeypatch):
 
 def test_files_in_the_way_are_named_before_anything_is_measured(tmp_path, capsys):
     (tmp_path / "a.json").write_text("mine")
-    assert run(*KERNELS, "--json", tmp_path / "a.json") == 1
+    assert call(*KERNELS, "--json", tmp_path / "a.json") == 1
     captured = capsys.readouterr()
     assert "exists already" in captured.err
     assert "ms" not in captured.out
@@ -111,13 +105,13 @@ def test_files_in_the_way_are_named_before_anything_is_measured(tmp_path, capsys
     ],
 )
 def test_arguments_that_do_not_fit_are_named(arguments, message, capsys):
-    assert run("bench", "kernels", "--device", "cpu", *arguments) == 1
+    assert call("bench", "kernels", "--device", "cpu", *arguments) == 1
     assert message in capsys.readouterr().err
 
 
 def test_step_times_whole_steps_and_checks_their_loss(tmp_path, capsys):
     command = ["bench", "step", "--device", "cpu", "--size", "400@40x32", "--repetitions", "3", "--budget", "1"]
-    assert run(*command, "--json", tmp_path / "a.json") == 0
+    assert call(*command, "--json", tmp_path / "a.json") == 0
     report = json.loads((tmp_path / "a.json").read_text())
     ours, plain = report["rows"]
     assert (ours["implementation"], plain["implementation"]) == ("sehdr-warp", "plain torch")

@@ -17,10 +17,10 @@ from sehdr_warp.bench.quality_jobs import RESULT, Settings, plan_jobs, read_fail
 from sehdr_warp.bench.quality_plot import error_over_time, pareto_front
 from sehdr_warp.bench.quality_pool import Workers, run_jobs, slurm_parameters
 from sehdr_warp.bench.quality_report import RESULTS, write_quality_report
-from sehdr_warp.cli import main
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.files import write_json
 
+from ..refusals import call
 from . import quality_stub as stub
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -305,16 +305,13 @@ def test_each_exposure_has_its_difference_to_the_upper_bound(tmp_path):
 def test_tables_of_chosen_scenes_alone(tmp_path, capsys):
     for scene, psnr in (("embedded:study", 30.0), ("embedded:night", 20.0), ("embedded:glass", 10.0)):
         results_in(tmp_path, (METHODS["default"], psnr, 2.0, {"scenes": (scene,)}))
-    asked = ["bench", "quality", "--out", str(tmp_path), "--report-only", "--report-scenes"]
-    with pytest.raises(SystemExit) as done:
-        main([*asked, "study,embedded:night"])
-    assert done.value.code == 0
+    asked = ["bench", "quality", "--out", tmp_path, "--report-only", "--report-scenes"]
+    assert call(*asked, "study,embedded:night") == 0
     text = (tmp_path / "quality-study-night.md").read_text()
     assert capsys.readouterr().out == text
     assert table(text, "gt-max")[1]["default"][1:4] == ["2", "25.00", "20.00"]
     assert "2 scenes (embedded:night, embedded:study)" in text and not (tmp_path / RESULTS).exists()
-    with pytest.raises(SystemExit):
-        main([*asked, "study,attic"])
+    assert call(*asked, "study,attic") == 1
     known = "choose from embedded:glass, embedded:night, embedded:study"
     assert f"has no result of scene attic; {known}" in capsys.readouterr().err
 

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sehdr_warp.evaluation.metrics import mu_law, psnr, region_masks, ssim
+from sehdr_warp.evaluation.metrics import psnr
 from sehdr_warp.evaluation.protocols import PROTOCOLS, fit_scale, tone_map
 
 values = st.floats(width=32, allow_nan=True, allow_infinity=True)
@@ -32,12 +32,9 @@ def test_any_prediction_has_a_figure(numbers, protocol):
 
 @pytest.mark.parametrize("poison", [math.nan, math.inf, 3e38])
 def test_a_poisoned_pixel_outside_the_mask_changes_nothing(poison):
-    image, truth = torch.rand(20, 20, 3), torch.rand(20, 20, 3)
+    image, truth = torch.rand(2, 20, 20, 3, generator=torch.Generator().manual_seed(0))
     mask = torch.ones(20, 20)
     mask[0, 0] = 0
     spoiled = image.clone()
     spoiled[0, 0] = poison
-    assert psnr(spoiled, truth, mask) == pytest.approx(psnr(image, truth, mask))
-    assert region_masks(truth)["dark"].shape == (20, 20)
-    assert math.isfinite(float(mu_law(torch.tensor(3e38))))
-    assert math.isfinite(ssim(image, truth, mask))
+    assert psnr(spoiled, truth, mask) == psnr(image, truth, mask)

@@ -1,6 +1,7 @@
 """Work spread over threads: all of it is done once, whoever asks, and exceptions come back."""
 
 import threading
+import time
 
 import pytest
 
@@ -43,17 +44,20 @@ def test_several_threads_may_spread_work_at_once():
 
 
 @pytest.mark.parametrize("guilty", [0, 9])
-def test_an_exception_comes_back_after_the_rest_is_done(guilty):
+def test_an_exception_comes_back_once_nobody_works_any_more(guilty):
     done = []
 
     def task(i):
         if i == guilty:
             raise KeyError("the task's own")
+        time.sleep(0.02)
         done.append(i)
 
     with pytest.raises(KeyError, match="the task's own"):
         threads.run_parallel(task, range(10))
     after = list(done)
+    time.sleep(0.1)
+    assert done == after
     threads.run_parallel(done.append, range(3))
     assert sorted(done[len(after) :]) == [0, 1, 2]
 

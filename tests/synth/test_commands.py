@@ -1,26 +1,16 @@
 """`sehdr-warp synth`, as typed."""
 
 import numpy as np
-import pytest
 
-from sehdr_warp import cli
 from sehdr_warp.model.response import response_by_name
 from sehdr_warp.scene import load_scene
 from sehdr_warp.synth import expose, mitsuba_variant
-
-
-def call(*arguments):
-    with pytest.raises(SystemExit) as caught:
-        cli.main([str(argument) for argument in arguments])
-    return caught.value.code
+from tests import refusals
+from tests.refusals import call
 
 
 def refused(capfd, *arguments):
-    capfd.readouterr()
-    assert call("synth", *arguments) == 1
-    *told, line = capfd.readouterr().err.strip().splitlines()
-    assert line.startswith("sehdr-warp: ") and all(other.startswith("reading views") for other in told)
-    return line
+    return refusals.refused(capfd, "synth", *arguments)
 
 
 def test_expose_writes_a_set_of_five_exposures(truth, tmp_path, capfd):

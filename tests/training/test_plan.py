@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sehdr_warp import cli
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import Camera
 from sehdr_warp.training.config import DECISIONS
@@ -16,6 +15,7 @@ from sehdr_warp.training.plan_rules import RULES
 from sehdr_warp.training.plan_scene import measure_scene
 from sehdr_warp.training.train import train
 
+from ..refusals import call
 from .toy import orbit_camera, toy_scene
 
 
@@ -211,16 +211,11 @@ def test_settings_are_written_as_in_toml():
 def test_plan_only_prints_and_trains_nothing(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     arguments = ["train", "embedded", "--plan-only", "--max-size", "48", "--response", "hdr-nerf"]
-    with pytest.raises(SystemExit) as done:
-        cli.main([*arguments, "--json", "--set", "schedule.iterations=500", "--set", "seed=4"])
-    assert done.value.code == 0
+    assert call(*arguments, "--json", "--set", "schedule.iterations=500", "--set", "seed=4") == 0
     plan = json.loads(capsys.readouterr().out)
     assert plan["kept"] == {"schedule.iterations": 500} and plan["facts"]["photos"] == 18
-    with pytest.raises(SystemExit):
-        cli.main(arguments)
+    assert call(*arguments) == 0
     table = capsys.readouterr().out
     assert "schedule.iterations = 16200" in table and "900 steps on each of 18 photos" in table
-    with pytest.raises(SystemExit) as refused:
-        cli.main(arguments[:2])
-    assert refused.value.code == 1 and "--out" in capsys.readouterr().err
+    assert call(*arguments[:2]) == 1 and "--out" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
