@@ -36,14 +36,6 @@ with silent_stderr():
     wp.init()
 
 
-class HandedGradient:
-    """Where a hand-written adjoint leaves the whole gradient of one tensor. wanted: whether anyone asks for it."""
-
-    def __init__(self):
-        self.wanted = False
-        self.value: torch.Tensor | None = None
-
-
 class Program:
     """What a program sees while it runs: arrays over torch memory, and a tape that takes its launches."""
 
@@ -53,28 +45,16 @@ class Program:
         self.tape = wp.Tape() if recording else None
         self.inputs: list[tuple[torch.Tensor, wp.array]] = []
         self.outputs: dict[int, tuple[torch.Tensor, wp.array, bool]] = {}
-        self.handed: list[tuple[torch.Tensor, HandedGradient]] = []
 
     @property
     def is_cpu(self) -> bool:
         return self.device.is_cpu
-
-    @property
-    def recording(self) -> bool:
-        return self.tape is not None
 
     def read(self, tensor: torch.Tensor, dtype=None) -> wp.array:
         """The tensor's memory as a Warp array; a vector or matrix dtype takes up the last one or two dimensions."""
         array = _array(tensor, dtype)
         self.inputs.append((tensor, array))
         return array
-
-    def hand_over(self, tensor: torch.Tensor) -> HandedGradient:
-        """For an input whose gradient record_adjoint()'s function makes as one tensor (any strides): nothing is zeroed
-        and nothing added to. It sets .value where .wanted."""
-        gradient = HandedGradient()
-        self.handed.append((tensor, gradient))
-        return gradient
 
     def write(self, shape, dtype, *, zero: bool = False, differentiable: bool = True) -> wp.array:
         """A new array over torch memory. `shape` is the tensor's, with the components of a vector dtype last."""
@@ -84,28 +64,24 @@ class Program:
         self.outputs[id(array)] = (tensor, array, differentiable)
         return array
 
-    def tensor(self, array: wp.array) -> torch.Tensor:
-        """A torch tensor of the memory behind an array made by write(). An adjoint may keep it."""
-        return self.outputs[id(array)][0].detach()
-
-    def launch(self, kernel, dim, inputs, outputs=(), *, block_dim: int = 256, recorded: bool = True) -> None:
-        """Launch a kernel; its generated adjoint runs in the backward pass unless recorded is False."""
-        with self.tape if recorded and self.tape is not None else nullcontext():
+    def launch(self, kernel, dim, inputs, outputs=(), *, block_dim: int = 256) -> None:
+        """Launch a kernel; its generated adjoint runs in the backward pass."""
+        with nullcontext() if self.tape is None else self.tape:
             wp.launch(kernel, dim, list(inputs), list(outputs), device=self.device, block_dim=block_dim)
 
-    def launch_ranges(self, kernel, count: int, inputs, outputs, *, recorded: bool = True) -> None:
+    def launch_ranges(self, kernel, count: int, inputs, outputs) -> None:
         """Launch `kernel(first, *inputs, *outputs)` for `count` items; on the CPU spread over threads, adjoint too.
 
         The kernel adds the argument `first` to its thread index and writes only what belongs to that item; an input
         that several items share must not ask for a gradient here when threads run side by side, so the adjoint of
-        such a launch is left to one thread. recorded: as in launch().
+        such a launch is left to one thread.
         """
         if not self.is_cpu:
-            self.launch(kernel, count, [0, *inputs], outputs, recorded=recorded)
+            self.launch(kernel, count, [0, *inputs], outputs)
             return
         arguments = [*inputs, *outputs]
         threads.launch_ranges(kernel, threads.even_ranges(count), arguments, self.device)
-        if self.tape is None or not recorded:
+        if self.tape is None:
             return
         # The tape holds the adjoint. If that held the program or the tape, memory would wait for the garbage collector.
         device = self.device
@@ -135,15 +111,6 @@ class Program:
             threads.run_parallel(launch, ranges)
 
         self.tape.record_func(adjoint, arrays=[])
-
-    def record_adjoint(self, adjoint) -> None:
-        """Put a hand-written adjoint on the tape: it reads .grad of what was written, adds to .grad of what was read
-        and sets what hand_over() gave.
-
-        .grad of an array is None where no gradient is asked for.
-        """
-        if self.tape is not None:
-            self.tape.record_func(adjoint, arrays=[])
 
 
 def _scalar(dtype) -> torch.dtype:
@@ -213,13 +180,7 @@ class _ProgramFunction(torch.autograd.Function):
                 array.retain_grad = True  # the gradient is torch's: adjoint kernels must not clear it
             results = [None] * len(plain)
             by_memory = {}
-            handed = {id(tensor): gradient for tensor, gradient in program.handed}
-            wanted = []
-            for position, (tensor, needed) in enumerate(zip(plain, ctx.needs_input_grad[2:], strict=True)):
-                if id(tensor) in handed:
-                    handed[id(tensor)].wanted = needed
-                elif needed:
-                    wanted.append(position)
+            wanted = [position for position, needed in enumerate(ctx.needs_input_grad[2:]) if needed]
             for position, zeros in zip(wanted, _zeros_like([plain[position] for position in wanted]), strict=True):
                 results[position] = zeros
                 by_memory[id(plain[position])] = zeros
@@ -231,9 +192,6 @@ class _ProgramFunction(torch.autograd.Function):
                         gradient = gradient.as_strided(tensor.shape, tensor.stride())
                     array.grad = _array(gradient, array.dtype)
             program.tape.backward()
-            for position, tensor in enumerate(plain):
-                if id(tensor) in handed:
-                    results[position], handed[id(tensor)].value = handed[id(tensor)].value, None
         return (None, None, *results)
 
 

@@ -1,12 +1,13 @@
 """View-dependent values from spherical harmonics."""
 
 import torch
+import warp as wp
 
 from ..kernels.geometry import vector
 from ..kernels.harmonics import harmonics_adjoint_kernel, harmonics_kernel
 from . import threads
 from .arrays import view, warp_scalar
-from .bridge import differentiable
+from .bridge import torch_stream
 
 MAX_DEGREE = 3
 
@@ -30,9 +31,7 @@ def spherical_harmonics(degree: int, coefficients, means, camera_position):
     _check(constant, rest, means, camera_position)
     if rest.shape[1] < (degree + 1) ** 2 - 1:
         raise ValueError(f"degree {degree} needs {(degree + 1) ** 2} coefficients, not {1 + rest.shape[1]}")
-    return _evaluate(
-        constant.contiguous(), rest.contiguous(), means.contiguous(), camera_position.contiguous(), degree=degree
-    )
+    return _Evaluation.apply(degree, *(t.contiguous() for t in (constant, rest, means, camera_position)))
 
 
 def _check(constant, rest, means, camera_position) -> None:
@@ -50,33 +49,33 @@ def _check(constant, rest, means, camera_position) -> None:
             raise ValueError(f"{name}: {tensor.dtype} on {tensor.device}, but means is {means.dtype} on {means.device}")
 
 
-@differentiable
-def _evaluate(program, constant, rest, means, camera_position, *, degree):
+class _Evaluation(torch.autograd.Function):
+    """The adjoint is by hand: the generated one adds to zeros, number by number, which for 48 numbers a Gaussian takes
+    several times as long as to write them."""
+
+    @staticmethod
+    def forward(ctx, degree, constant, rest, means, camera_position):
+        ctx.degree = degree
+        values = torch.empty_like(means)
+        _launch(harmonics_kernel, degree, means, [constant, rest, means, camera_position, values])
+        ctx.save_for_backward(constant, rest, means, camera_position)
+        return values
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient):
+        constant, *read = ctx.saved_tensors
+        made = [torch.empty_like(tensor) for tensor in (constant, *read[:2])]
+        _launch(harmonics_adjoint_kernel, ctx.degree, read[1], [*read, gradient.contiguous(), *made])
+        by_camera = -made[2].sum(0) if ctx.needs_input_grad[4] else None
+        wanted = (part if needed else None for part, needed in zip(made, ctx.needs_input_grad[1:], strict=False))
+        return None, *wanted, by_camera
+
+
+def _launch(kernel, degree: int, means, tensors) -> None:
+    """Launch for each Gaussian a kernel of tensors of three-vectors."""
     scalar = warp_scalar(means.dtype)
-    vec3 = vector(3, scalar)
-    gradients = [program.hand_over(tensor) for tensor in (constant, rest, means, camera_position)]
-    values = program.write(means.shape, vec3)
-    rest3, means3, camera3 = (program.read(tensor, vec3) for tensor in (rest, means, camera_position))
-    kernel = harmonics_kernel(scalar, degree)
-    arguments = [program.read(constant, vec3), rest3, means3, camera3]
-    program.launch_ranges(kernel, means.shape[0], arguments, [values], recorded=False)
-
-    device, is_cpu = program.device, program.is_cpu  # the tape holds the adjoint, which must not hold the program
-
-    def adjoint():
-        """By hand: the generated one adds to zeros, number by number, which for 48 numbers a Gaussian takes several
-        times as long as to write them."""
-        made = [torch.empty_like(tensor) for tensor in (constant, rest, means)]
-        threads.launch_ranges(
-            harmonics_adjoint_kernel(scalar, degree),
-            threads.even_ranges(len(means)) if is_cpu else [(0, len(means))],
-            [rest3, means3, camera3, values.grad, *(view(tensor, vec3) for tensor in made)],
-            device,
-        )
-        for gradient, value in zip(gradients, made, strict=False):
-            gradient.value = value if gradient.wanted else None
-        if gradients[3].wanted:
-            gradients[3].value = -made[2].sum(0)
-
-    program.record_adjoint(adjoint)
-    return values
+    views = [view(tensor.detach(), vector(3, scalar)) for tensor in tensors]
+    ranges = threads.even_ranges(len(means)) if means.device.type == "cpu" else [(0, len(means))]
+    with torch_stream(means.device):
+        threads.launch_ranges(kernel(scalar, degree), ranges, views, wp.device_from_torch(means.device))

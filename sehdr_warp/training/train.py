@@ -248,7 +248,7 @@ class _Loop:
         trainer, gaussians = self.trainer, self._gaussians()
         per_step = (seconds - self.first_seconds) / max(1, trainer.iteration - self.first_iteration)
         left = per_step * (self.schedule.iterations - trainer.iteration)
-        loss, psnr = trainer.loss, trainer.psnr
+        loss, psnr = trainer.loss, trainer.psnr()
         progress.update(trainer.iteration, loss=loss, psnr=psnr, count=gaussians.count, seconds_left=left)
         self._log("train", trainer.iteration, {"loss": loss, "psnr": psnr, "gaussians": gaussians.count})
 

@@ -3,6 +3,7 @@
 import math
 import operator
 from contextlib import nullcontext
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -44,7 +45,7 @@ DECODED_PIXELS = 1 << 27
 class Trainer:
     """Field, optimizer, densification, random generators and view order of a training, and how they advance.
 
-    iteration: steps done. loss, psnr: of the last step, read from the device on demand.
+    iteration: steps done. loss: of the last step, read from the device on demand.
 
     Everything that decides the next step is in state(): a trainer that load_state()s it continues bit for bit on the
     CPU. No global random state is used.
@@ -60,7 +61,7 @@ class Trainer:
         pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
         self.densification = make_densification(config, self.extent, pixels)
         self._views = scene.train_views
-        # Where light is compared, by a curve that stays, encoding the photo waits until it is asked for.
+        # Where light is compared, by a curve that stays, nothing needs the photo encoded.
         self._encoded = not compares_light(config.loss, field) or isinstance(field.response, RefinedResponse)
         self._largest_truth = largest_truth(scene, config.loss) * field.base_time
         self._highlights = expected_excess(self._views, known_response(field.response), config.loss)
@@ -74,8 +75,8 @@ class Trainer:
         self._recorder = GraphRecorder(self.device) if recorded else None
         self._launched: set = set()
         self._room = PairRoom(self.device)
-        self._last: tuple[Tensor, Tensor] | None = None
-        self._last_view: tuple[ViewStack | list[TrainingView], int] | None = None
+        self._loss: Tensor | None = None
+        self._last_index = 0
         self._presence: Tensor | None = None
         self._degree_limit = config.model.harmonics_degree
         self._early_stop = EarlyStop(config)
@@ -106,18 +107,14 @@ class Trainer:
 
     @property
     def loss(self) -> float:
-        return float("nan") if self._last is None else float(self._last[0])
+        return float("nan") if self._loss is None else float(self._loss)
 
-    @property
+    @torch.no_grad()
     def psnr(self) -> float:
-        """PSNR of the last step's simulated photo against the photo, dB."""
-        if self._last is None:
-            return float("nan")
-        prediction, (views, index) = self._last[1], self._last_view
-        truth = views[index].target.encoded
-        if not self._encoded:
-            prediction = self.field.response.encode_extended(prediction)
-        return float(-10 * (prediction.clamp(0, 1) - truth).square().mean().clamp_min(1e-10).log10())
+        """PSNR of the simulated photo of the last step's view, by the scene as it is now, against the photo, dB."""
+        view = self._training_views()[self._last_index]
+        photo = self.field.photograph(view.camera, view.exposure_time, degree=self.degree).encoded
+        return float(-10 * (photo.clamp(0, 1) - view.target.encoded).square().mean().clamp_min(1e-10).log10())
 
     @property
     def skipped_steps(self) -> int:
@@ -146,12 +143,11 @@ class Trainer:
         self._draw_presence()
         # The last: a learned response encodes few exposures otherwise, by kernels of its own.
         kind = (self.degree, self.level, watched, self._hold_response(), gaussians.count < EXACT_BELOW)
-        # The last step's photo would be one more image in this one's memory.
-        self._last, self._last_view = None, (views, index)
+        self._last_index = index
         if self._can_record(views, kind):
-            self._last = self._replay(views, index, watched, kind)
+            self._loss = self._replay(views, index, watched, kind)
         else:
-            self._last = self._launch(views[index], watched)
+            self._loss = self._launch(views[index], watched)
         self.densification.perturb(self.iteration, gaussians, rate)
         count = gaussians.count
         if self.densification.change(self.iteration, gaussians, self.optimizer, self._generator):
@@ -163,9 +159,8 @@ class Trainer:
         if self.iteration % CHECK_EVERY == 0:
             self.check()
 
-    def _optimise(self, view: TrainingView, watched: bool, capacity: int | None = None) -> tuple[Tensor, Tensor]:
-        """Photograph, compare, differentiate, step. Returns the loss and the simulated photo (its exposures, where
-        encoded values are not needed).
+    def _optimise(self, view: TrainingView, watched: bool, capacity: int | None = None) -> Tensor:
+        """Photograph, compare, differentiate, step. Returns the loss.
 
         With a capacity all of it works on fixed memory and nothing waits for the device.
         """
@@ -178,9 +173,13 @@ class Trainer:
             presence=self._presence,
             encode=self._encoded,
         )
+        # Images are in the backward pass's way: none is kept that it does not read.
+        rendering = replace(photo.rendering, image=None, transmittance=None)
         if watched:
-            photo.rendering.means2d.retain_grad()
+            rendering.means2d.retain_grad()
         compared = data_loss(self.field, photo, view.target, self.config.loss, self._largest_truth)
+        del photo
+        view = replace(view, target=None)
         loss = regularised(compared, self.field, self.config.loss)
         if isinstance(self.field.response, RefinedResponse) and self.field.response.refining:
             loss = loss + self.config.response.refine_weight * self.field.response.penalty()
@@ -188,22 +187,22 @@ class Trainer:
         with torch.autograd.set_multithreading_enabled(False):
             loss.backward()
         if self.config.optimizer.visible_only:
-            self.optimizer.visible = photo.rendering.visible
-        nonfinite, made = guarded_step(self.optimizer, loss, photo.rendering.overflow)
+            self.optimizer.visible = rendering.visible
+        nonfinite, made = guarded_step(self.optimizer, loss, rendering.overflow)
         if watched:
             weights = None
             if self.config.densification.slope_corrected:
                 weights = slope_weights(self.field, view.exposure_time / self.field.base_time)
-            self.densification.observe(photo.rendering, view.camera.width, view.camera.height, made, weights)
+            self.densification.observe(rendering, view.camera.width, view.camera.height, made, weights)
         self.optimizer.zero_grad(set_to_none=True)
         self._skipped += nonfinite
         if self._early_stop.patience:
             self._loss_sum += compared.detach()
         if capacity is None:
-            self._room.launched(photo.rendering.entry_count)
+            self._room.launched(rendering.entry_count)
         else:
-            self._room.note(photo.rendering.pair_count, photo.rendering.overflow)
-        return loss.detach(), (photo.encoded if self._encoded else photo.light).detach()
+            self._room.note(rendering.pair_count, rendering.overflow)
+        return loss.detach()
 
     def _hold_response(self) -> bool:
         """Whether the response is corrected in this step; before response.refine_after its gradient is held back."""
@@ -271,11 +270,11 @@ class Trainer:
         self._launched.add(kind)
         return ready
 
-    def _launch(self, view: TrainingView, watched: bool) -> tuple[Tensor, Tensor]:
+    def _launch(self, view: TrainingView, watched: bool) -> Tensor:
         with nullcontext() if self._recorder is None else self._recorder.launching():
             return self._optimise(view, watched)
 
-    def _replay(self, views: ViewStack, index: int, watched: bool, kind) -> tuple[Tensor, Tensor]:
+    def _replay(self, views: ViewStack, index: int, watched: bool, kind) -> Tensor:
         capacity = self._room.capacity(len(views))
         self._index.fill_(index)
         try:
