@@ -1,5 +1,1 @@
 """HDR scenes with truth: rendered from a seed (Mitsuba 3), and exposed as a camera would. Imports no torch."""
-
-from .expose import SensorNoise, expose, exposure_ladder
-
-__all__ = ["SensorNoise", "expose", "exposure_ladder"]

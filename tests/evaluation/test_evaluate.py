@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.evaluation import evaluate, format_table
+from sehdr_warp.evaluation.evaluate import evaluate
+from sehdr_warp.evaluation.table import format_table
 from sehdr_warp.model.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View
 

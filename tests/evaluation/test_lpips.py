@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.evaluation import load_lpips
-from sehdr_warp.evaluation.lpips import _squeezenet_features
+from sehdr_warp.evaluation.lpips import _squeezenet_features, load_lpips
 
 
 @pytest.fixture

@@ -8,8 +8,7 @@ import pytest
 import scipy.ndimage
 import torch
 
-from sehdr_warp.evaluation import mu_law, psnr, pu21_encode, pu21_metrics, region_masks, ssim
-from sehdr_warp.evaluation.metrics import percentile
+from sehdr_warp.evaluation.metrics import mu_law, percentile, psnr, pu21_encode, pu21_metrics, region_masks, ssim
 
 
 def noisy_pair(shape=(48, 61, 3), noise=0.1, seed=0):

@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 
-from sehdr_warp.evaluation import PROTOCOLS, fit_scale, normalise, tone_map
-from sehdr_warp.evaluation.protocols import tone_mapped_psnr
+from sehdr_warp.evaluation.protocols import PROTOCOLS, fit_scale, normalise, tone_map, tone_mapped_psnr
 
 
 def radiance(seed=0, shape=(40, 50, 3), decades=3.0):

@@ -8,7 +8,7 @@ import pytest
 from sehdr_warp.errors import InputError
 from sehdr_warp.model.response import response_by_name
 from sehdr_warp.scene import load_scene
-from sehdr_warp.synth import SensorNoise, expose, exposure_ladder
+from sehdr_warp.synth.expose import SensorNoise, expose, exposure_ladder
 
 
 @pytest.fixture(scope="module")
