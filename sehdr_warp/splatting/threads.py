@@ -27,8 +27,8 @@ def thread_count() -> int:
 def run_parallel(task, items) -> None:
     """Call task(item) for every item, on this thread and the pool's, and return when all are done.
 
-    An exception ends its thread's share; those at work finish the rest, then one of the exceptions is raised here. A task
-    may itself call run_parallel.
+    An exception ends its thread's share; those at work finish the rest, then one of the exceptions is raised here. A
+    task may itself call run_parallel.
     """
     global _pool, _pool_size
     items = list(items)
