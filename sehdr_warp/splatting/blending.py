@@ -67,6 +67,8 @@ class _Blend(torch.autograd.Function):
         means2d, conics, opacities, extents = ctx.saved_tensors
         height, width, channels = ctx.sizes
         by_image = means2d.new_zeros(ctx.sizes) if by_image is None else by_image.contiguous()
+        # Of an axis of length 1 torch calls any stride contiguous, and kernels do not.
+        by_image = by_image.as_strided(ctx.sizes, (width * channels, channels, 1))
         if by_transmittance is None:
             by_transmittance = means2d.new_zeros(height, width)
         with torch_stream(means2d.device):

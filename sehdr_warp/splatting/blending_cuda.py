@@ -29,8 +29,11 @@ def blend_on_cuda(
     def pixels(tensor):
         return view(tensor.view(-1, channels), dtype=pixel)
 
-    def rows_of_four(records):
-        # Of padded features too the backward pass makes its own: they are larger than the features.
+    # The backward pass takes the features from here and lets them go once they are padded: again, since what is padded
+    # is larger.
+    count, kept = len(features), [features]
+
+    def rows_of_four(features, records):
         padded = torch.nn.functional.pad(features, (0, padding)) if padding else features
         return [view(rows, dtype=vec4) for rows in (*records, padded.reshape(-1, 4))]
 
@@ -56,7 +59,7 @@ def blend_on_cuda(
     launch(
         blend_cuda.forward_kernel(scalar, channels, style.transmittance_min, style.fast_math),
         blend_cuda.BLOCKS_PER_TILE,
-        rows_of_four(records),
+        rows_of_four(features, records),
         [pixels(image), view(transmittance.view(-1)), view(last)],
     )
 
@@ -81,14 +84,14 @@ def blend_on_cuda(
         )
 
     def backward(records, image_gradient: torch.Tensor, transmittance_gradient: torch.Tensor) -> torch.Tensor:
-        incoming = rows_of_four(records), image_gradient, transmittance_gradient
+        incoming = rows_of_four(kept.pop(), records), image_gradient, transmittance_gradient
         kernel = blend_cuda_adjoint.backward_kernel(scalar, channels, style.fast_math, style.deterministic)
         corners = blend_cuda_adjoint.BLOCKS_PER_TILE
         if not style.deterministic:
-            gathered = features.new_zeros(features.shape[0], channels + 6)
+            gathered = transmittance.new_zeros(count, channels + 6)
             add_gradients(kernel, corners, *incoming, 0, lists.gaussians, gathered)
             return gathered
-        by_entry = features.new_zeros(lists.entry_count, channels + 6)
+        by_entry = transmittance.new_zeros(lists.entry_count, channels + 6)
         for corner in range(corners):
             add_gradients(kernel, 1, *incoming, corner, lists.emission.places, by_entry)
         return gather_by_gaussian(lists.emission, by_entry)

@@ -5,13 +5,9 @@ import math
 import torch
 from torch import Tensor
 
-ROOM_UNSEEN = 1.5
-"""Room in multiples of the most pairs seen, while fewer steps were replayed than there are photos. In the nine embedded
-scenes, trained for 150 to 300 steps on a CPU, the photo with most pairs had 1.02 to 1.32 times those of the one with
-fewest."""
-ROOM_SEEN = 1.25
-"""And afterwards: for what 100 steps change. Of photos beyond 100 the greatest may be among those not yet seen."""
-PHOTOS_SEEN = 100
+ROOM = 1.25
+"""Room in multiples of the most pairs seen. In the nine embedded scenes, trained for 150 to 300 steps on a CPU, the
+photo with most pairs had 1.02 to 1.32 times those of the one with fewest; in 100 steps pairs change by less."""
 KEPT = 0.97
 """What a change of the Gaussians keeps of the room at least: after a reset of opacities pairs are few for a while."""
 LEAST_ROOM = 1 << 14
@@ -24,7 +20,6 @@ class PairRoom:
         self._needed = torch.zeros((), dtype=torch.int64, device=device)
         self._lacked = torch.zeros((), dtype=torch.int64, device=device)
         self._pairs = 0
-        self._steps = 0
         self._given = 0
 
     @property
@@ -46,12 +41,9 @@ class PairRoom:
         """Steps that lacked room so far. Waits for the device."""
         return int(self._lacked)
 
-    def capacity(self, photos: int) -> int:
+    def capacity(self) -> int:
         """The room for pairs of the step that is recorded or replayed now; stays until one of the calls below."""
-        self._steps += 1
-        if not self._given:
-            factor = ROOM_SEEN if self._steps > min(photos, PHOTOS_SEEN) else ROOM_UNSEEN
-            self._given = max(LEAST_ROOM, math.ceil(factor * self._pairs))
+        self._given = self._given or max(LEAST_ROOM, math.ceil(ROOM * self._pairs))
         return self._given
 
     def look(self) -> bool:
@@ -74,4 +66,4 @@ class PairRoom:
     def resize(self) -> None:
         """The photos have another size: what was seen of them says little."""
         self._needed.zero_()
-        self._steps = self._given = 0
+        self._given = 0

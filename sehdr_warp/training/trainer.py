@@ -275,7 +275,7 @@ class Trainer:
             return self._optimise(view, watched)
 
     def _replay(self, views: ViewStack, index: int, watched: bool, kind) -> Tensor:
-        capacity = self._room.capacity(len(views))
+        capacity = self._room.capacity()
         self._index.fill_(index)
         try:
             return self._recorder.run(

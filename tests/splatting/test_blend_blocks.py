@@ -94,6 +94,19 @@ def test_block_kernels_match_the_reference(fibers, dtype, channels, deterministi
         assert relative_error(ours.grad, truth.grad) < gradient_bound
 
 
+def test_a_single_pixels_gradient_may_have_any_strides(fibers):
+    scene = random_scene(count=5, channels=1, width=1, height=1, spread=0.1, seed=2).to(torch.float32, "cpu")
+    with torch.no_grad():
+        means2d, conics, depths, opacities, extents = projected(scene, 1 / 255)
+    records = pack_records(means2d, conics, opacities, extents, 1 / 255)
+    options = {"lists": build_tile_lists(records, depths, extents, 1, 1), "records": records, "extents": extents}
+    options |= {"width": 1, "height": 1, "alpha_threshold": 1 / 255, "block_kernels": True}
+    features = scene.tensors[4].requires_grad_()
+    image = fibers(lambda: blend(means2d, conics, opacities, features, **options))[0]
+    fibers(image.sum().backward)
+    assert float(features.grad.sum()) > 0
+
+
 def test_nothing_by_gaussian_is_kept_for_the_backward_pass(fibers, monkeypatch):
     monkeypatch.setenv("KINETO_LOG_LEVEL", "99")  # the profiler's own messages
     scene = random_scene(count=600, channels=3, width=44, height=26, seed=2).to(torch.float32, "cpu")
