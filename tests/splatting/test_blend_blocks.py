@@ -95,7 +95,7 @@ def test_block_kernels_match_the_reference(fibers, dtype, channels, deterministi
 
 
 def test_a_single_pixels_gradient_may_have_any_strides(fibers):
-    scene = random_scene(count=5, channels=1, width=1, height=1, spread=0.1, seed=2).to(torch.float32, "cpu")
+    scene = random_scene(count=600, channels=1, width=1, height=1, spread=1.6, seed=2).to(torch.float32, "cpu")
     with torch.no_grad():
         means2d, conics, depths, opacities, extents = projected(scene, 1 / 255)
     records = pack_records(means2d, conics, opacities, extents, 1 / 255)
