@@ -50,13 +50,15 @@ class ViewStack:
         images = {}
         for name in ("encoded", "clipped", "black", "mask", "exposure_truth", "light", "highlights"):
             values = [getattr(view.target, name) for view in views]
+            if name == "encoded":
+                codes = [_codes(image) for image in values]
+                values = values if any(image is None for image in codes) else codes
             given = next((value for value in values if value is not None), None)
             if given is not None:
                 # A view without clipped or black pixels has none of them; one without a mask counts everywhere.
                 empty = torch.ones_like(given) if name == "mask" else torch.zeros_like(given)
                 given = torch.stack([empty if value is None else value for value in values])
             images[name] = given
-        images["encoded"] = _codes(images["encoded"])
         times = [view.exposure_time for view in views]
         cameras = [view.camera for view in views]
         return ViewStack(
@@ -99,11 +101,10 @@ class ViewStack:
         return TrainingView(camera, time, Target(**images))
 
 
-def _codes(encoded: Tensor) -> Tensor:
-    """Encoded values as uint8 where _values() gives them back bit for bit: photos take a quarter of the memory."""
-    codes = (255 * encoded).round().clamp(0, 255).to(torch.uint8)
-    exact = all(torch.equal(_values(mine), image) for mine, image in zip(codes, encoded, strict=True))
-    return codes if exact else encoded
+def _codes(encoded: Tensor) -> Tensor | None:
+    """Encoded values as uint8, a quarter of the memory, if _values() gives them back bit for bit."""
+    codes = (255 * encoded).round_().clamp_(0, 255).to(torch.uint8)
+    return codes if torch.equal(_values(codes), encoded) else None
 
 
 def _values(encoded: Tensor) -> Tensor:
