@@ -73,12 +73,13 @@ class RecordedRasterizer:
             )
 
         # Launched once: nothing may be compiled or loaded during a recording, and it tells how much room is needed.
-        launched = forward()
-        capacity = max(LEAST_ROOM, int(ROOM * launched.entry_count))
-        if leaves:
-            self._upstream = [torch.zeros_like(launched.image), torch.zeros_like(launched.transmittance)]
-            backward(launched)
-        del launched
+        with self._forward.launching():
+            launched = forward()
+            capacity = max(LEAST_ROOM, int(ROOM * launched.entry_count))
+            if leaves:
+                self._upstream = [torch.zeros_like(launched.image), torch.zeros_like(launched.transmittance)]
+                backward(launched)
+            del launched
         for recorder in (self._forward, self._backward):
             recorder.invalidate()
         # Not run(): a recording is made, not played, and the backward pass is recorded on the forward's own graph.

@@ -183,9 +183,7 @@ class Trainer:
         loss = regularised(compared, self.field, self.config.loss)
         if isinstance(self.field.response, RefinedResponse) and self.field.response.refining:
             loss = loss + self.config.response.refine_weight * self.field.response.penalty()
-        # On this thread: one of torch's own would let go of the graph some time later, in mid-recording too.
-        with torch.autograd.set_multithreading_enabled(False):
-            loss.backward()
+        loss.backward()
         if self.config.optimizer.visible_only:
             self.optimizer.visible = rendering.visible
         nonfinite, made = guarded_step(self.optimizer, loss, rendering.overflow)
