@@ -27,20 +27,32 @@ LOG_MU = 2.0**20
 class Target:
     """One training photo on the device, at one resolution.
 
-    encoded: [H, W, 3] in [0, 1]; clipped, black: [H, W, 3] bool, or None where the photo has none of them;
+    photo: [H, W, 3] encoded values in [0, 1], or uint8 codes of 255; clipped, black: [H, W, 3] bool, or None where the
+    photo has none of them;
     mask: [H, W, 1] in [0, 1] or None; exposure_truth: [H, W, 3] true radiance times the base time, or None;
     light: [H, W, 3] exposures decoded from the photo, where they are kept for every step; None: decode them.
     highlights: [4] stops over white that light is expected at where none (unused), one, two and three channels of a
     pixel clip; None: nothing is expected.
     """
 
-    encoded: Tensor
+    photo: Tensor
     clipped: Tensor | None
     black: Tensor | None
     mask: Tensor | None
     exposure_truth: Tensor | None
     light: Tensor | None = None
     highlights: Tensor | None = None
+
+    @property
+    def encoded(self) -> Tensor:
+        """[H, W, 3] in [0, 1], made of codes whenever it is asked for."""
+        return values_of(self.photo)
+
+
+def values_of(photo: Tensor) -> Tensor:
+    """Encoded values, float32, of a photo that may be stored as uint8 codes."""
+    # By a tensor: torch's division by a number on a GPU is a product with its reciprocal, which rounds differently.
+    return photo if photo.dtype != torch.uint8 else photo / torch.full((), 255.0, device=photo.device)
 
 
 def one_sided(
@@ -87,7 +99,6 @@ def image_loss(
 def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Response | None = None) -> Tensor:
     """The photo against the simulated one, L_LDR: of encoded values, or with domain "mu-law" of exposures, for which
     the response is needed. With `clipping` one-sided where the camera saturated; see also LossConfig.interval."""
-    prediction, truth = photo.encoded, target.encoded
     if config.domain == "mu-law" or (config.domain == "auto" and _is_decodable(photo, response)):
         known = known_response(response)
         white, mu = known.white, mu_of_knee(known, config.knee)
@@ -95,7 +106,7 @@ def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Re
         if config.interval == "off":
             # Bounds count at white and at black alone, and there half a code is the same everywhere.
             half_codes = _half_codes(known, mu)
-            photo_light = known.decode(truth) if target.light is None else target.light
+            photo_light = known.decode(target.encoded) if target.light is None else target.light
             if config.clipping and light.device.type == "cuda":
                 masks = target.clipped, target.black
                 seen, truth = seen_by_photo(light, photo_light, *masks, white=white, mu=mu, half_codes=half_codes)
@@ -103,10 +114,12 @@ def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Re
             truth = mu_law(photo_light, white, mu)
             lower, upper = truth - half_codes[0], truth + half_codes[1]
         else:
-            bounds = truth, truth - CODE / 2, truth + CODE / 2
+            encoded = target.encoded
+            bounds = encoded, encoded - CODE / 2, encoded + CODE / 2
             truth, lower, upper = (mu_law(known.decode(image), white, mu) for image in bounds)
         prediction = mu_law(light, white, mu)
-    elif config.clipping or config.interval != "off":
+    else:
+        prediction, truth = photo.encoded, target.encoded
         lower, upper = truth - CODE / 2, truth + CODE / 2
     plain = prediction
     if config.clipping or config.interval != "off":

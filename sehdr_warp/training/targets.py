@@ -1,7 +1,7 @@
 """The training photos on the device, at every resolution of the schedule, uploaded once."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -13,16 +13,34 @@ from ..model.radiance_field import CameraTensors
 from ..model.response import Response
 from ..scene import Camera, Scene, View
 from .config import LossConfig
-from .losses import CODE, Target
+from .losses import CODE, Target, values_of
 
 
 @dataclass(frozen=True)
 class TrainingView:
-    """A photo to train on: camera, exposure time in seconds, and the target at the camera's size."""
+    """A photo to train on: camera, exposure time in seconds, and what its target at the camera's size is made of.
+
+    images: as in Target, as it is stored. photo: uint8 where all values are whole codes; clipped and black: bool in the
+    place of a mask says whether any value is 255, or 0, and then the codes tell where.
+    """
 
     camera: CameraTensors
     exposure_time: float | Tensor
-    target: Target
+    images: dict[str, Tensor | bool | None]
+
+    @property
+    def target(self) -> Target:
+        """Made anew whenever it is asked for."""
+        return Target(**self.images | {name: self._mask(name, code) for name, code in MASKS.items()})
+
+    def _mask(self, name: str, code: int) -> Tensor | None:
+        noted = self.images[name]
+        return (self.images["photo"] == code if noted else None) if isinstance(noted, bool) else noted
+
+
+MASKS = {"clipped": 255, "black": 0}
+"""The codes that masks mark."""
+STORED = tuple(field.name for field in fields(Target))
 
 
 @dataclass(frozen=True)
@@ -30,39 +48,29 @@ class ViewStack:
     """V training views of one size in shared memory: [i] is view i; at() takes the view whose number is on the device.
 
     cameras: [V, 24], each view's pose [4, 4], intrinsics [4], position [3] and a 0; times: exposure times in seconds
-    [V], float32, or one float where all are equal; images: as in Target, each [V, ...] or None, encoded values as uint8
-    where all of them are whole codes of 255.
+    [V], float32, or one float where all are equal; images: as in TrainingView, each [V, ...], bool or None.
     """
 
     width: int
     height: int
     cameras: Tensor
     times: Tensor | float
-    images: dict[str, Tensor | None]
+    images: dict[str, Tensor | bool | None]
 
     @staticmethod
     def of(views: list[TrainingView]) -> "ViewStack | None":
         """The views stacked; None where their sizes differ or only some have HDR truth."""
-        sizes = {(view.camera.width, view.camera.height) for view in views}
-        truths = {view.target.exposure_truth is None for view in views}
-        if len(sizes) > 1 or len(truths) > 1:
+        kinds = {(view.camera.width, view.camera.height, view.images["exposure_truth"] is None) for view in views}
+        if len(kinds) > 1:
             return None
-        images = {}
-        for name in ("encoded", "clipped", "black", "mask", "exposure_truth", "light", "highlights"):
-            values = [getattr(view.target, name) for view in views]
-            if name == "encoded":
-                codes = [_codes(image) for image in values]
-                values = values if any(image is None for image in codes) else codes
-            given = next((value for value in values if value is not None), None)
-            if given is not None:
-                # A view without clipped or black pixels has none of them; one without a mask counts everywhere.
-                empty = torch.ones_like(given) if name == "mask" else torch.zeros_like(given)
-                given = torch.stack([empty if value is None else value for value in values])
-            images[name] = given
+        as_codes = all(view.images["photo"].dtype == torch.uint8 for view in views)
+        stored = [view.images if as_codes else _decoded(view) for view in views]
+        images = {name: _stacked(name, [image[name] for image in stored]) for name in STORED}
         times = [view.exposure_time for view in views]
         cameras = [view.camera for view in views]
         return ViewStack(
-            *sizes.pop(),
+            cameras[0].width,
+            cameras[0].height,
             # A multiple of 16 bytes each: kernels may read four numbers at once.
             torch.stack(
                 [
@@ -82,34 +90,32 @@ class ViewStack:
         return self._view(lambda values: values[index], time)
 
     def at(self, index: Tensor) -> TrainingView:
-        """The view whose number is in index [1], int64, on the views' device; its exposure time may be a tensor.
-
-        Everything is copied, so encoded values only where light is not kept, which losses then compare."""
+        """The view whose number is in index [1], int64, on the views' device; its exposure time may be a tensor."""
 
         def take(values: Tensor) -> Tensor:
             return values.index_select(0, index)[0]
 
-        left_out = () if self.images["light"] is None else ("encoded",)
-        return self._view(take, self.times if isinstance(self.times, float) else take(self.times), left_out)
+        return self._view(take, self.times if isinstance(self.times, float) else take(self.times))
 
-    def _view(self, take, time, left_out=()) -> TrainingView:
+    def _view(self, take, time) -> TrainingView:
         pose, intrinsics, position = take(self.cameras)[:23].split((16, 4, 3))
         camera = CameraTensors(self.width, self.height, pose.view(4, 4), intrinsics, position)
-        images = {k: None if v is None or k in left_out else take(v) for k, v in self.images.items()}
-        if images["encoded"] is not None:
-            images["encoded"] = _values(images["encoded"])
-        return TrainingView(camera, time, Target(**images))
+        images = {name: take(v) if isinstance(v, Tensor) else v for name, v in self.images.items()}
+        return TrainingView(camera, time, images)
 
 
-def _codes(encoded: Tensor) -> Tensor | None:
-    """Encoded values as uint8, a quarter of the memory, if _values() gives them back bit for bit."""
-    codes = (255 * encoded).round_().clamp_(0, 255).to(torch.uint8)
-    return codes if torch.equal(_values(codes), encoded) else None
+def _decoded(view: TrainingView) -> dict[str, Tensor | None]:
+    target = view.target
+    return {name: getattr(target, name) for name in STORED} | {"photo": target.encoded}
 
 
-def _values(encoded: Tensor) -> Tensor:
-    # By a tensor: torch's division by a number on a GPU is a product with its reciprocal, which rounds differently.
-    return encoded if encoded.dtype != torch.uint8 else encoded / torch.full((), 255.0, device=encoded.device)
+def _stacked(name: str, values: list[Tensor | bool | None]) -> Tensor | bool | None:
+    given = next((value for value in values if isinstance(value, Tensor)), None)
+    if given is None:
+        return any(values) if name in MASKS else None
+    # A view without clipped or black pixels has none of them; one without a mask counts everywhere.
+    empty = torch.ones_like(given) if name == "mask" else torch.zeros_like(given)
+    return torch.stack([value if isinstance(value, Tensor) else empty for value in values])
 
 
 def largest_truth(scene: Scene, loss: LossConfig) -> float:
@@ -157,18 +163,16 @@ def training_views(
     for view in views:
         width, height = (max(1, round(size / 2**level)) for size in (view.camera.width, view.camera.height))
         camera: Camera = view.camera.resized(width, height) if level else view.camera
-        target = _target(view, (height, width), response, base_time, device, truth)
+        images = _images(view, (height, width), response, base_time, device, truth)
         if not bounds:
-            target = replace(target, clipped=None, black=None)
-        if light is not None:
-            target = replace(target, light=light.decode(target.encoded))
-        if expected is not None:
-            target = replace(target, highlights=expected)
-        made.append(TrainingView(CameraTensors.of(camera, device), view.exposure_time, target))
+            images |= dict.fromkeys(MASKS, False)
+        images["light"] = None if light is None else light.decode(values_of(images["photo"]))
+        images["highlights"] = expected
+        made.append(TrainingView(CameraTensors.of(camera, device), view.exposure_time, images))
     return made
 
 
-def _target(view: View, size: tuple[int, int], response: Response, base_time: float, device, truth: bool) -> Target:
+def _images(view: View, size: tuple[int, int], response: Response, base_time: float, device, truth: bool) -> dict:
     encoded = _upload(view.image, device)
     clipped, black = encoded >= 1 - CODE / 2, encoded <= CODE / 2
     mask = None if view.mask is None else _upload(view.mask[..., None], device)
@@ -178,13 +182,15 @@ def _target(view: View, size: tuple[int, int], response: Response, base_time: fl
         clipped, black = _shrink(clipped.float(), size) > 0, _shrink(black.float(), size) == 1
         mask = None if mask is None else _shrink(mask, size)
         exposure_truth = None if exposure_truth is None else _shrink(exposure_truth, size)
-    return Target(
-        encoded,
-        clipped if bool(clipped.any()) else None,
-        black if bool(black.any()) else None,
-        mask,
-        exposure_truth,
-    )
+    codes = (255 * encoded).round_().clamp_(0, 255).to(torch.uint8)
+    masks = {"clipped": clipped, "black": black}
+    if torch.equal(values_of(codes), encoded) and all(
+        torch.equal(masks[k], codes == code) for k, code in MASKS.items()
+    ):
+        encoded, masks = codes, {name: bool(mask.any()) for name, mask in masks.items()}
+    else:
+        masks = {name: mask if bool(mask.any()) else False for name, mask in masks.items()}
+    return {"photo": encoded, **masks, "mask": mask, "exposure_truth": exposure_truth}
 
 
 def _upload(array: np.ndarray, device) -> Tensor:

@@ -32,9 +32,10 @@ def degree_gain(
     for used in (degree - 1, degree):
         total = 0.0
         for view in chosen:
-            also = needed_colours(loss, view.target.exposure_truth is not None)
+            target = view.target
+            also = needed_colours(loss, target.exposure_truth is not None)
             photo = field.photograph(view.camera, view.exposure_time, degree=used, also=also)
-            total += float(data_loss(field, photo, view.target, loss, largest_truth))
+            total += float(data_loss(field, photo, target, loss, largest_truth))
         sums.append(max(total, 1e-12))
     return 20 * math.log10(sums[0] / sums[1])
 

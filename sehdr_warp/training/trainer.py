@@ -164,11 +164,12 @@ class Trainer:
 
         With a capacity all of it works on fixed memory and nothing waits for the device.
         """
+        target = view.target
         photo = self.field.photograph(
             view.camera,
             view.exposure_time,
             degree=self.degree,
-            also=needed_colours(self.config.loss, view.target.exposure_truth is not None),
+            also=needed_colours(self.config.loss, target.exposure_truth is not None),
             capacity=capacity,
             presence=self._presence,
             encode=self._encoded,
@@ -177,9 +178,8 @@ class Trainer:
         rendering = replace(photo.rendering, image=None, transmittance=None)
         if watched:
             rendering.means2d.retain_grad()
-        compared = data_loss(self.field, photo, view.target, self.config.loss, self._largest_truth)
-        del photo
-        view = replace(view, target=None)
+        compared = data_loss(self.field, photo, target, self.config.loss, self._largest_truth)
+        del photo, target
         loss = regularised(compared, self.field, self.config.loss)
         if isinstance(self.field.response, RefinedResponse) and self.field.response.refining:
             loss = loss + self.config.response.refine_weight * self.field.response.penalty()

@@ -53,18 +53,26 @@ def test_photos_of_whole_codes_are_stacked_in_a_byte_each_and_come_back_exactly(
     for values, dtype in ((every, torch.uint8), (every * np.float32(0.999), torch.float32)):
         views = views_of(dataclasses.replace(scene, views=(dataclasses.replace(scene.views[0], image=values),)), device)
         stack = ViewStack.of(views)
-        assert stack.images["encoded"].dtype == dtype
+        assert stack.images["photo"].dtype == dtype
         for taken in (stack[0], stack.at(torch.zeros(1, dtype=torch.int64, device=device))):
             assert np.array_equal(taken.target.encoded.cpu().numpy(), values)
 
 
-def test_a_view_taken_on_the_device_has_either_light_or_encoded_values(device):
-    srgb = response_by_name("srgb")
-    views = training_views(toy_scene().train_views, 0, srgb, EXPOSURE_TIME, device, truth=False, light=srgb)
-    stack, index = ViewStack.of(views), torch.tensor([1], device=device)
-    taken = stack.at(index).target
-    assert taken.encoded is None and torch.equal(taken.light, views[1].target.light)
-    assert torch.equal(stack[1].target.encoded, views[1].target.encoded)
+def test_masks_of_codes_are_made_when_they_are_asked_for(device):
+    values = np.zeros((32, 32, 3), np.float32)
+    values[:16], values[16:, :8] = 1.0, np.float32(7 / 255)
+    scene = toy_scene()
+    whole = dataclasses.replace(scene.views[0], image=values)
+    broken = dataclasses.replace(whole, image=values * np.float32(0.99))
+    alone, mixed = (
+        ViewStack.of(views_of(dataclasses.replace(scene, views=views), device)) for views in ((whole,), (whole, broken))
+    )
+    assert alone.images["clipped"] is True and mixed.images["photo"].dtype == torch.float32
+    for stack in (alone, mixed):
+        target = stack[0].target
+        assert np.array_equal(target.clipped.cpu().numpy(), values == 1)
+        assert np.array_equal(target.black.cpu().numpy(), values == 0)
+    assert not bool(mixed[1].target.clipped.any())
 
 
 def test_bounds_are_noted_where_asked_for(device):
