@@ -74,6 +74,8 @@ class _Evaluation(torch.autograd.Function):
 
 def _launch(kernel, degree: int, means, tensors) -> None:
     """Launch for each Gaussian a kernel of tensors of three-vectors."""
+    if not len(means):
+        return  # of no elements torch calls any strides contiguous, and a view of three-vectors does not
     scalar = warp_scalar(means.dtype)
     views = [view(tensor.detach(), vector(3, scalar)) for tensor in tensors]
     ranges = threads.even_ranges(len(means)) if means.device.type == "cpu" else [(0, len(means))]

@@ -80,6 +80,13 @@ def test_a_gaussian_at_the_camera_has_its_constant_colour(device):
     assert torch.isfinite(values).all()
 
 
+def test_no_gaussians_have_gradients_of_their_shapes(device):
+    leaves = [tensor.to(device).requires_grad_() for tensor in inputs(count=0)]
+    spherical_harmonics(3, *leaves).sum().backward()
+    assert [leaf.grad.shape for leaf in leaves] == [leaf.shape for leaf in leaves]
+    assert not leaves[2].grad.any()
+
+
 @pytest.mark.parametrize(("degree", "message"), [(4, "not in 0..3"), (-1, "not in 0..3"), (3, "needs 16 coefficients")])
 def test_degrees_out_of_range_are_refused(degree, message):
     coefficients, means, camera = inputs(terms=9)
