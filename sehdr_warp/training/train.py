@@ -122,9 +122,10 @@ def _sizes(scene: Scene, trainer: Trainer | None = None) -> tuple[int, int, int]
 
 def _crowded(scene: Scene, trainer: Trainer) -> Iterator[str]:
     """What to know of a training with more start points than it may have, or may add to."""
-    count, strategy = trainer.field.gaussians.count, trainer.densification
-    if trainer.iteration == 0 and len(scene.points) > count:
-        yield f"{len(scene.points)} start points: drawn from, for densification.max_gaussians = {count}"
+    count, strategy, config = trainer.field.gaussians.count, trainer.densification, trainer.config
+    most = config.densification.max_gaussians
+    if trainer.iteration == 0 and len(scene.points) > most - config.model.far_points:
+        yield f"{len(scene.points)} start points: drawn from, for densification.max_gaussians = {most}"
     if isinstance(strategy, Relocation) and count > strategy.most:
         yield (
             f"{count} Gaussians are more than relocation's budget of {strategy.most} for these photos: they move, and "

@@ -104,7 +104,15 @@ def test_a_scene_without_points_starts_from_drawn_ones(tmp_path):
     assert run.metrics()[-1]["psnr_ldr"] > 20
 
 
-@pytest.mark.parametrize("options", [{}, {"densification.budget": 0.1}, {"densification.max_gaussians": 50}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"densification.budget": 0.1},
+        {"densification.max_gaussians": 50},
+        {"densification.max_gaussians": 65, "model.far_points": 10},
+    ],
+)
 def test_more_start_points_than_the_budget_stay_as_many_and_are_told(scene, tmp_path, capsys, options):
     """60 points; 0.1 times the square root of six photos of 32 x 32 pixels is 7."""
     config = quick(**{"schedule.iterations": 50, "densification.growth": 0.5} | options)
