@@ -11,10 +11,6 @@ from .relocation import gaussian_budget
 LEAST_GAIN = 0.05
 """Decibels on training photos that a degree of the harmonics is kept for; of it a fifth to three fifths show
 in other photos."""
-GEOMETRY_UNKNOWNS = 11
-"""Of a Gaussian besides its colour: place, sizes, rotation, opacity."""
-FEWEST_GAUSSIANS = 20_000
-"""A budget is never less: small photos of a room use as many."""
 COARSE_SIDE = 400
 """Photos are halved for a start as long as their longer side is above this many pixels."""
 COARSE_PART = 0.05
@@ -104,27 +100,20 @@ def _harmonics(facts: SceneFacts, config: Config) -> Decision:
 
 def _densification(facts: SceneFacts, config: Config) -> Decision:
     options = config.densification
+    most = gaussian_budget(options, facts.pixels)
+    reason = f"densification.max_gaussians = {options.max_gaussians}"
+    if options.budget:
+        reason = f"{options.budget:g} times the square root of {facts.pixels} pixels, below {options.max_gaussians}"
     if options.strategy == "relocation":
-        most = gaussian_budget(options, facts.pixels)
         start = facts.points or config.model.initial_count
         choice = f"relocation grows to at most {most}" if start < most else "relocation without growth"
-        reason = f"densification.max_gaussians = {options.max_gaussians}"
-        if options.budget:
-            reason = f"{options.budget:g} times the square root of {facts.pixels} pixels, below {options.max_gaussians}"
         return Decision("densification", {}, choice, f"{reason}; {start} to start with")
-    unknowns = GEOMETRY_UNKNOWNS + 3 * (config.model.harmonics_degree + 1) ** 2
-    determined = 3 * facts.pixels // unknowns
-    budget = min(config.densification.max_gaussians, max(FEWEST_GAUSSIANS, determined, 2 * facts.points))
-    fields = {"densification.max_gaussians": budget}
-    if config.model.initial_count > budget // 2 and not facts.points:
-        fields["model.initial_count"] = max(100, budget // 2)
-    return Decision(
-        "densification",
-        fields,
-        f"{budget} Gaussians",
-        f"{3 * facts.pixels} numbers in {facts.photos} photos determine {determined} Gaussians of {unknowns} unknowns; "
-        f"{facts.points} points to start from",
-    )
+    # Relocation has this budget by itself; densification by gradients stops nowhere.
+    most = min(options.max_gaussians, max(most, 2 * facts.points))
+    fields = {"densification.max_gaussians": most}
+    if config.model.initial_count > most // 2 and not facts.points:
+        fields["model.initial_count"] = max(100, most // 2)
+    return Decision("densification", fields, f"{most} Gaussians", f"{reason}; {facts.points} points to start from")
 
 
 def _resolution(facts: SceneFacts, config: Config) -> Decision:

@@ -113,7 +113,8 @@ class Trainer:
     def psnr(self) -> float:
         """PSNR of the simulated photo of the last step's view, by the scene as it is now, against the photo, dB."""
         view = self._training_views()[self._last_index]
-        photo = self.field.photograph(view.camera, view.exposure_time, degree=self.degree).encoded
+        with self._launching():
+            photo = self.field.photograph(view.camera, view.exposure_time, degree=self.degree).encoded
         return float(-10 * (photo.clamp(0, 1) - view.target.encoded).square().mean().clamp_min(1e-10).log10())
 
     @property
@@ -147,7 +148,8 @@ class Trainer:
         if self._can_record(views, kind):
             self._loss = self._replay(views, index, watched, kind)
         else:
-            self._loss = self._launch(views[index], watched)
+            with self._launching():
+                self._loss = self._optimise(views[index], watched)
         self.densification.perturb(self.iteration, gaussians, rate)
         count = gaussians.count
         if self.densification.change(self.iteration, gaussians, self.optimizer, self._generator):
@@ -268,9 +270,9 @@ class Trainer:
         self._launched.add(kind)
         return ready
 
-    def _launch(self, view: TrainingView, watched: bool) -> Tensor:
-        with nullcontext() if self._recorder is None else self._recorder.launching():
-            return self._optimise(view, watched)
+    def _launching(self):
+        """Launched work shares stream and memory with recorded steps."""
+        return nullcontext() if self._recorder is None else self._recorder.launching()
 
     def _replay(self, views: ViewStack, index: int, watched: bool, kind) -> Tensor:
         capacity = self._room.capacity()

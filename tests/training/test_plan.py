@@ -74,7 +74,8 @@ def test_a_plan_decides_everything_once_with_figures(scene):
     [
         ("iterations", {"photos": 200}, "schedule.iterations", 5400, 30_000),
         ("harmonics", {"photos": 16}, "model.harmonics_degree", 1, 3),
-        ("densification", {"pixels": 10**7}, "densification.max_gaussians", 20_000, 508_474),
+        # Relocation's budget: 120 times the square root of 6144, and of 10^6.
+        ("densification", {"pixels": 10**6}, "densification.max_gaussians", 9406, 120_000),
         ("resolution", {"width": 1200}, "schedule.coarse_levels", None, 2),
         ("background", {"sky": 0.3, "pixels": 10**8}, "model.far_points", None, 20_000),
         # A twentieth of relocation's budget, 120 times the square root of 10^6.
