@@ -22,7 +22,7 @@ SKY_PART, MOST_FOR_SKY = 0.05, 400_000
 PASSES = 900
 """Steps on each photo. A second look at the same photos teaches less and less, and in the end their noise."""
 FEWEST_ITERATIONS = 3000
-LEAST_CONTRIBUTION = 0.1
+LEAST_CONTRIBUTION = 0.03
 """Pixels' worth in the photo that shows it best below which a Gaussian is taken away."""
 EARLY_STOP = 3
 """Looks without gain."""
