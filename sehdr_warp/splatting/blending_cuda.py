@@ -63,37 +63,36 @@ def blend_on_cuda(
         [pixels(image), view(transmittance.view(-1)), view(last)],
     )
 
-    def add_gradients(
-        kernel, blocks_per_tile, by_gaussian, image_gradient, transmittance_gradient, corner, rows_of, gradients
-    ):
-        launch(
-            kernel,
-            blocks_per_tile,
-            by_gaussian,
-            [
-                view(transmittance.view(-1)),
-                view(last),
-                pixels(image_gradient),
-                view(transmittance_gradient.view(-1)),
-                blend_cuda_adjoint.ROWS,
-                channels + 6,
-                corner,
-                view(rows_of),
-                view(gradients.view(-1)),
-            ],
-        )
-
     def backward(records, image_gradient: torch.Tensor, transmittance_gradient: torch.Tensor) -> torch.Tensor:
-        incoming = rows_of_four(kept.pop(), records), image_gradient, transmittance_gradient
+        by_gaussian = rows_of_four(kept.pop(), records)
         kernel = blend_cuda_adjoint.backward_kernel(scalar, channels, style.fast_math, style.deterministic)
         corners = blend_cuda_adjoint.BLOCKS_PER_TILE
+
+        def add_gradients(blocks_per_tile, corner, rows_of, gradients):
+            launch(
+                kernel,
+                blocks_per_tile,
+                by_gaussian,
+                [
+                    view(transmittance.view(-1)),
+                    view(last),
+                    pixels(image_gradient),
+                    view(transmittance_gradient.view(-1)),
+                    blend_cuda_adjoint.ROWS,
+                    channels + 6,
+                    corner,
+                    view(rows_of),
+                    view(gradients.view(-1)),
+                ],
+            )
+
         if not style.deterministic:
             gathered = transmittance.new_zeros(count, channels + 6)
-            add_gradients(kernel, corners, *incoming, 0, lists.gaussians, gathered)
+            add_gradients(corners, 0, lists.gaussians, gathered)
             return gathered
         by_entry = transmittance.new_zeros(lists.entry_count, channels + 6)
         for corner in range(corners):
-            add_gradients(kernel, 1, *incoming, corner, lists.emission.places, by_entry)
+            add_gradients(1, corner, lists.emission.places, by_entry)
         return gather_by_gaussian(lists.emission, by_entry)
 
     return backward

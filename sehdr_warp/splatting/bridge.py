@@ -56,10 +56,9 @@ class Program:
         self.inputs.append((tensor, array))
         return array
 
-    def write(self, shape, dtype, *, zero: bool = False, differentiable: bool = True) -> wp.array:
+    def write(self, shape, dtype, *, differentiable: bool = True) -> wp.array:
         """A new array over torch memory. `shape` is the tensor's, with the components of a vector dtype last."""
-        make = torch.zeros if zero else torch.empty
-        tensor = make(tuple(shape), dtype=_scalar(dtype), device=self.torch_device)
+        tensor = torch.empty(tuple(shape), dtype=_scalar(dtype), device=self.torch_device)
         array = _array(tensor, dtype)
         self.outputs[id(array)] = (tensor, array, differentiable)
         return array

@@ -182,15 +182,12 @@ def _images(view: View, size: tuple[int, int], response: Response, base_time: fl
         clipped, black = _shrink(clipped.float(), size) > 0, _shrink(black.float(), size) == 1
         mask = None if mask is None else _shrink(mask, size)
         exposure_truth = None if exposure_truth is None else _shrink(exposure_truth, size)
-    codes = (255 * encoded).round_().clamp_(0, 255).to(torch.uint8)
-    masks = {"clipped": clipped, "black": black}
-    if torch.equal(values_of(codes), encoded) and all(
-        torch.equal(masks[k], codes == code) for k, code in MASKS.items()
-    ):
-        encoded, masks = codes, {name: bool(mask.any()) for name, mask in masks.items()}
-    else:
-        masks = {name: mask if bool(mask.any()) else False for name, mask in masks.items()}
-    return {"photo": encoded, **masks, "mask": mask, "exposure_truth": exposure_truth}
+    codes, masks = (255 * encoded).round_().clamp_(0, 255).to(torch.uint8), {"clipped": clipped, "black": black}
+    told = all(torch.equal(noted, codes == MASKS[name]) for name, noted in masks.items())
+    photo = codes if told and torch.equal(values_of(codes), encoded) else encoded
+    # As TrainingView has them: False where there are none, and True in the place of a mask that the codes tell.
+    masks = {name: bool(noted.any()) and (photo is codes or noted) for name, noted in masks.items()}
+    return {"photo": photo, **masks, "mask": mask, "exposure_truth": exposure_truth}
 
 
 def _upload(array: np.ndarray, device) -> Tensor:
