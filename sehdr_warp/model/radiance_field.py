@@ -198,13 +198,6 @@ class RadianceField(nn.Module):
             blended = self._rasterize(camera, features).image
             return torch.autograd.grad(blended, features, images)[0]
 
-    @torch.no_grad()
-    def radiance_from(self, position: Tensor, *, degree: int | None = None) -> Tensor:
-        """[N, 3] scene-linear radiance of each Gaussian seen from a position [3] (E, not times an exposure)."""
-        tensors = CameraTensors(0, 0, position, position, position)
-        colours = self._inference_colours(tensors, degree)
-        return (self.response.decode(colours.clamp(0, 1)) if self.radiance == "display" else colours) / self.base_time
-
     def _inference_colours(self, camera: CameraTensors, degree: int | None) -> Tensor:
         if self.radiance == "display":
             return self._harmonics(camera, degree).add(0.5).clamp_min(0)
