@@ -163,31 +163,30 @@ def training_views(
     for view in views:
         width, height = (max(1, round(size / 2**level)) for size in (view.camera.width, view.camera.height))
         camera: Camera = view.camera.resized(width, height) if level else view.camera
-        images = _images(view, (height, width), response, base_time, device, truth)
-        if not bounds:
-            images |= dict.fromkeys(MASKS, False)
+        images = _images(view, (height, width), response, base_time, device, truth, bounds)
         images["light"] = None if light is None else light.decode(values_of(images["photo"]))
         images["highlights"] = expected
         made.append(TrainingView(CameraTensors.of(camera, device), view.exposure_time, images))
     return made
 
 
-def _images(view: View, size: tuple[int, int], response: Response, base_time: float, device, truth: bool) -> dict:
-    encoded = _upload(view.image, device)
-    clipped, black = encoded >= 1 - CODE / 2, encoded <= CODE / 2
-    mask = None if view.mask is None else _upload(view.mask[..., None], device)
-    exposure_truth = _upload(view.hdr, device) * base_time if truth and view.hdr is not None else None
-    if tuple(encoded.shape[:2]) != size:
-        encoded = response.encode(_shrink(response.decode(encoded), size))
-        clipped, black = _shrink(clipped.float(), size) > 0, _shrink(black.float(), size) == 1
-        mask = None if mask is None else _shrink(mask, size)
-        exposure_truth = None if exposure_truth is None else _shrink(exposure_truth, size)
-    codes, masks = (255 * encoded).round_().clamp_(0, 255).to(torch.uint8), {"clipped": clipped, "black": black}
+def _images(
+    view: View, size: tuple[int, int], response: Response, base_time: float, device, truth: bool, bounds: bool
+) -> dict:
+    given = _upload(view.image, device)
+    encoded = given if tuple(given.shape[:2]) == size else response.encode(_shrink(response.decode(given), size))
+    masks = {}
+    if bounds:
+        masks["clipped"] = _shrink((given >= 1 - CODE / 2).float(), size) > 0
+        masks["black"] = _shrink((given <= CODE / 2).float(), size) == 1
+    mask = None if view.mask is None else _shrink(_upload(view.mask[..., None], device), size)
+    exposure_truth = _shrink(_upload(view.hdr, device) * base_time, size) if truth and view.hdr is not None else None
+    codes = (255 * encoded).round_().clamp_(0, 255).to(torch.uint8)
     told = all(torch.equal(noted, codes == MASKS[name]) for name, noted in masks.items())
     photo = codes if told and torch.equal(values_of(codes), encoded) else encoded
     # As TrainingView has them: False where there are none, and True in the place of a mask that the codes tell.
     masks = {name: bool(noted.any()) and (photo is codes or noted) for name, noted in masks.items()}
-    return {"photo": photo, **masks, "mask": mask, "exposure_truth": exposure_truth}
+    return {"photo": photo, **dict.fromkeys(MASKS, False), **masks, "mask": mask, "exposure_truth": exposure_truth}
 
 
 def _upload(array: np.ndarray, device) -> Tensor:
@@ -195,5 +194,7 @@ def _upload(array: np.ndarray, device) -> Tensor:
 
 
 def _shrink(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """[H, W, C] averaged over areas to [*size, C]."""
+    """[H, W, C] averaged over areas to [*size, C]; the image itself where it has that size."""
+    if tuple(image.shape[:2]) == size:
+        return image
     return functional.interpolate(image.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0).contiguous()
