@@ -27,8 +27,9 @@ class RecordedRasterizer:
         loss(rendering.image).backward()
 
     What a call returns is overwritten by the next call, and its backward pass must have run before that: RuntimeError
-    otherwise. Other shapes, options or tensors that ask for gradients make a new recording in the place of
-    the old. Rendering.means2d is no part of the graph; densification by its gradient needs rasterize().
+    otherwise. It is the recording's own memory, which that pass reads: do not write to it. Other shapes, options or
+    tensors that ask for gradients make a new recording in the place of the old. Rendering.means2d is no part of the
+    graph; densification by its gradient needs rasterize().
 
     device: a CUDA device; raises ValueError for another. Besides what rasterize() needs, a recording keeps copies of
     the arguments and of the gradients.
