@@ -48,13 +48,18 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
     run = wp.types.vector(length=lanes, dtype=dtype)
     taps = wp.constant(2 * RADIUS + 1)
     radius = wp.constant(RADIUS)
+    # Pixels on both sides that the blurs write too.
+    border = wp.constant(RADIUS if lanes == 1 else 0)
     c1, c2 = wp.constant(real(C1)), wp.constant(real(C2))
     options = {"enable_backward": False}
 
     @wp.func
-    def start_of(block: int, length: int) -> int:
-        # The last run of a row overlaps the one before it and writes the same values again.
-        return wp.min(block * wp.static(lanes), length - wp.static(lanes))
+    def place_of(index: int, length: int, margin: int):
+        """Row of a thread's run and its start there, from -margin. The last run of a row overlaps the one before it and
+        writes the same values again."""
+        span = length + 2 * margin
+        blocks = (span + wp.static(lanes - 1)) // wp.static(lanes)
+        return index // blocks, wp.min(index % blocks * wp.static(lanes), span - wp.static(lanes)) - margin
 
     @wp.kernel(module="unique", module_options=options)
     def blur_columns(
@@ -66,20 +71,12 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
         channels: int,
         moments: wp.array3d(dtype=run),
     ):
-        index = first + wp.tid()
-        if wp.static(lanes == 1):
-            margin = radius * channels
-            span = length + 2 * margin
-            y = index // span
-            i = index % span - margin
-            if i < 0 or i >= length:
-                for k in range(4):
-                    moments[k, y, i + margin] = run(real(0.0))
-                return
-        else:
-            blocks = (length + wp.static(lanes - 1)) // wp.static(lanes)
-            y = index // blocks
-            i = start_of(index % blocks, length)
+        margin = radius * channels
+        y, i = place_of(first + wp.tid(), length, border * channels)
+        if wp.static(lanes == 1) and (i < 0 or i >= length):
+            for k in range(4):
+                moments[k, y, i + margin] = run(real(0.0))
+            return
         s1 = run(real(0.0))
         d1 = run(real(0.0))
         s2 = run(real(0.0))
@@ -94,7 +91,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
             d1 += d * weight
             s2 += wp.cw_mul(s, s) * weight
             d2 += wp.cw_mul(d, d) * weight
-        i += radius * channels
+        i += margin
         moments[0, y, i] = s1
         moments[1, y, i] = d1
         moments[2, y, i] = s2
@@ -114,10 +111,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
         similarity: wp.array2d(dtype=run),
         derivatives: wp.array3d(dtype=run),
     ):
-        blocks = (length + wp.static(lanes - 1)) // wp.static(lanes)
-        index = first + wp.tid()
-        y = index // blocks
-        i = start_of(index % blocks, length)
+        y, i = place_of(first + wp.tid(), length, 0)
         ms = run(real(0.0))
         md = run(real(0.0))
         ss = run(real(0.0))
@@ -165,20 +159,12 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
         channels: int,
         blurred: wp.array3d(dtype=run),
     ):
-        index = first + wp.tid()
-        if wp.static(lanes == 1):
-            margin = radius * channels
-            span = length + 2 * margin
-            y = index // span
-            i = index % span - margin
-            if i < 0 or i >= length:
-                for k in range(3):
-                    blurred[k, y, i + margin] = run(real(0.0))
-                return
-        else:
-            blocks = (length + wp.static(lanes - 1)) // wp.static(lanes)
-            y = index // blocks
-            i = start_of(index % blocks, length)
+        margin = radius * channels
+        y, i = place_of(first + wp.tid(), length, border * channels)
+        if wp.static(lanes == 1) and (i < 0 or i >= length):
+            for k in range(3):
+                blurred[k, y, i + margin] = run(real(0.0))
+            return
         sd = run(real(0.0))
         ss = run(real(0.0))
         dd = run(real(0.0))
@@ -187,7 +173,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
             sd += derivatives[0, row, i] * weight
             ss += derivatives[1, row, i] * weight
             dd += derivatives[2, row, i] * weight
-        i += radius * channels
+        i += margin
         blurred[0, y, i] = sd
         blurred[1, y, i] = ss
         blurred[2, y, i] = dd
@@ -206,10 +192,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
         dissimilarity_weight: real,
         adjoint_a: wp.array2d(dtype=run),
     ):
-        blocks = (length + wp.static(lanes - 1)) // wp.static(lanes)
-        index = first + wp.tid()
-        y = index // blocks
-        i = start_of(index % blocks, length)
+        y, i = place_of(first + wp.tid(), length, 0)
         sd = run(real(0.0))
         ss = run(real(0.0))
         dd = run(real(0.0))
