@@ -73,13 +73,6 @@ class Gaussians(nn.Module):
         """[N] in (0, 1)."""
         return torch.sigmoid(self.opacity_logits)
 
-    def harmonics(self, degree: int | None = None) -> Tensor:
-        """[N, (degree + 1)^2, 3] coefficients up to a degree, by default all."""
-        degree = self.degree if degree is None else min(degree, self.degree)
-        if degree == 0:
-            return self.harmonics_dc
-        return torch.cat([self.harmonics_dc, self.harmonics_rest[:, : (degree + 1) ** 2 - 1]], dim=1)
-
     def tensors(self) -> dict[str, Tensor]:
         """Name to detached parameter, in the order of PARAMETER_NAMES."""
         return {name: getattr(self, name).detach() for name in PARAMETER_NAMES}

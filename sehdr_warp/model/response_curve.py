@@ -27,7 +27,6 @@ class Response(ABC):
     black: f(0), in [0, 1).
     peak: the largest value that the curve takes or approaches, at most 1.
     clip_exposure: the smallest exposure with f = peak; infinity for a curve that only approaches it.
-    notes: one line each on what was repaired when the curve was read.
 
     encode, encode_extended and decode take a torch tensor (float32 or float64, any shape, any device; differentiable
     once) and return one like it, or a NumPy array or number and return a NumPy array. NaN stays NaN.
@@ -37,7 +36,6 @@ class Response(ABC):
     black: float
     peak: float
     clip_exposure: float
-    notes: tuple[str, ...] = ()
     _kinds: ClassVar[dict[str, type["Response"]]] = {}
 
     def __init_subclass__(cls, *, kind: str | None = None, **options):
@@ -91,13 +89,13 @@ class Response(ABC):
         """f(x), in [black, peak]. Exposures below 0 count as 0; the gradient is 0 there and beyond the clip point."""
         return self._through(_Encode, exposure, None)
 
-    def encode_extended(self, exposure, *, slope: float = EXTENSION_SLOPE):
-        """f(x) up to the clip point; beyond it f(clip) + slope log(x / clip), so that a gradient is left there.
+    def encode_extended(self, exposure):
+        """f(x) up to the clip point; beyond it f(clip) + s log(x / clip), s = EXTENSION_SLOPE, which leaves a gradient.
 
-        Continuous; the derivative jumps at the clip point and is at most slope / clip beyond it. A loss can compare
+        Continuous; the derivative jumps at the clip point and is at most s / clip beyond it. A loss can compare
         the surplus over 1 with a clipped target through a hinge. Equals encode for a curve that never clips.
         """
-        return self._through(_Encode, exposure, slope)
+        return self._through(_Encode, exposure, EXTENSION_SLOPE)
 
     def decode(self, value):
         """The exposure whose encoded value this is: decode(encode(x)) = x for 0 <= x <= clip_exposure.

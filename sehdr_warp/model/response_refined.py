@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import SehdrError
-from .response_curve import EXTENSION_SLOPE, HALF_CODE, Response
+from .response_curve import HALF_CODE, Response
 
 CELLS = 8
 """Cells of the warp over the encoded values [0, 1]; one half, which keeps its exposure, lies between two of them."""
@@ -36,19 +36,14 @@ class RefinedResponse(nn.Module, Response, kind="refined"):
         self.refining = True
         self.log_densities = nn.Parameter(torch.zeros(2 * (CELLS // 2 + 1)))
         self.name = f"{start.name} refined"
-        self.black, self.peak, self.clip_exposure, self.notes = (
-            start.black,
-            start.peak,
-            start.clip_exposure,
-            start.notes,
-        )
+        self.black, self.peak, self.clip_exposure = start.black, start.peak, start.clip_exposure
         self._offset, self._rise = start.black, start.peak - start.black
 
-    def encode_extended(self, exposure, *, slope: float = EXTENSION_SLOPE):
+    def encode_extended(self, exposure):
         """As Response.encode_extended; a tensor's gradient also reaches the warp while `refining`."""
         if not isinstance(exposure, Tensor):
-            return Response.encode_extended(self, exposure, slope=slope)
-        value = self.start.encode_extended(exposure, slope=slope)
+            return Response.encode_extended(self, exposure)
+        value = self.start.encode_extended(exposure)
         inside = (value - self._offset) / self._rise
         over = (inside - 1).clamp_min(0)
         return self._offset + self._rise * (self._warp(inside.clamp(0, 1)) + over)

@@ -76,16 +76,12 @@ class ResponseScore:
 
 @dataclass(frozen=True)
 class ResponseSelection:
-    """The chosen response, by which score, and every candidate's scores, best first.
-
-    none_fits: the posterior probability that the curve is none of the candidates; 0 where this was not asked.
-    """
+    """The chosen response, by which score, and every candidate's scores, best first."""
 
     response: Response
     method: str
     edge_count: int
     scores: tuple[ResponseScore, ...]
-    none_fits: float = 0.0
 
 
 def select_response(
@@ -157,13 +153,11 @@ def select_response(
     scores = [ResponseScore(each, *map(float, row)) for each, row in zip(candidates, np.stack(columns, 1), strict=True)]
     order = np.argsort(-goodness, kind="stable")
     ranked, best = tuple(scores[index] for index in order), candidates[order[0]]
-    if not beside:
-        return ResponseSelection(best, method, len(edges), ranked)
-    chances, logs = _beside_family(points, bright, shares, known, priors, posteriors)
-    none_fits = float(chances[len(candidates) :].sum())
-    if chances[order[0]] < DECISIVE:
-        best = _mean_response(chances, logs)
-    return ResponseSelection(best, method, len(edges), ranked, none_fits)
+    if beside:
+        chances, logs = _beside_family(points, bright, shares, known, priors, posteriors)
+        if chances[order[0]] < DECISIVE:
+            best = _mean_response(chances, logs)
+    return ResponseSelection(best, method, len(edges), ranked)
 
 
 def _beside_family(points, bright, shares, known, priors, posteriors):

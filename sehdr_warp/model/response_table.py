@@ -27,7 +27,7 @@ class TabulatedResponse(Response, kind="table"):
     exposures: [K] >= 0, increasing, in the file's own unit; values: [K] in [0, 1]. At least 3 samples.
     Sampled curves are given up to scale: `white` of a DoRF curve is 1 or less, and radiance is then relative to it.
 
-    What is repaired, with a note each: samples out of order are sorted, equal exposures averaged, a decrease is
+    What is repaired, with one of `notes` each: samples out of order are sorted, equal exposures averaged, a decrease is
     replaced by the nearest monotone curve (least squares). What is always done: a curve that starts above exposure 0
     is continued to (0, 0) by a line; a flat part within the curve is tilted about its centre by 2^-14, so that its
     value decodes to the middle of the part (at black: rises from it); a flat part at the top is the clipped range.

@@ -37,7 +37,6 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
 
     name = "mlp"
     black, peak, clip_exposure = 0.0, 1.0, math.inf
-    notes = ()
 
     def __init__(self, width: int = 128, seed: int = 0):
         super().__init__()
@@ -57,7 +56,7 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
             return self.encode_log((exposure.clamp_min(0) + EXPOSURE_FLOOR).log())
         return self._with_arrays(self.encode, exposure)
 
-    def encode_extended(self, exposure, *, slope: float | None = None):
+    def encode_extended(self, exposure):
         """As encode: the sigmoid approaches 1 and leaves a gradient everywhere, so there is nothing to extend."""
         return self.encode(exposure)
 
