@@ -22,7 +22,6 @@ def blend(
     width: int,
     height: int,
     alpha_threshold: float,
-    block_kernels: bool | None = None,
     style: BlendStyle = DEFAULT_STYLE,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Blend features [N, C] over the tile lists: image [H, W, C] and the transmittance left [H, W].
@@ -32,12 +31,11 @@ def blend(
 
     records: pack_records()'s of these means2d, conics, opacities and extents, and of alpha_threshold. They are as large
     as what they are made of, so the backward pass makes them again instead of keeping them.
-    block_kernels: use the CUDA kernels; None means on CUDA only. On the CPU they need wp.config.enable_cpu_blocks and
-    serve tests. style: what trades accuracy for speed beside the threshold.
+    style: what trades accuracy for speed beside the threshold.
     """
-    on_blocks = features.device.type == "cuda" if block_kernels is None else block_kernels
-    options = blend_on_cuda if on_blocks else blend_on_cpu, lists, records, width, height, alpha_threshold, style
-    return _Blend.apply(means2d, conics, opacities, features, extents, *options)
+    backend = blend_on_cuda if features.device.type == "cuda" else blend_on_cpu
+    options = lists, records, width, height, alpha_threshold, style
+    return _Blend.apply(means2d, conics, opacities, features, extents, backend, *options)
 
 
 class _Blend(torch.autograd.Function):

@@ -246,11 +246,9 @@ def needed_colours(config: LossConfig, has_truth: bool) -> frozenset[str]:
     return frozenset(wanted)
 
 
-def total_loss(
-    field: RadianceField, photo: Photograph, target: Target, config: LossConfig, largest_truth: float = 1.0
-) -> Tensor:
+def total_loss(field: RadianceField, photo: Photograph, target: Target, config: LossConfig) -> Tensor:
     """data_loss() and the regularisers."""
-    return regularised(data_loss(field, photo, target, config, largest_truth), field, config)
+    return regularised(data_loss(field, photo, target, config), field, config)
 
 
 def data_loss(

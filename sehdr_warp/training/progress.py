@@ -11,15 +11,15 @@ of these seconds or more, they are so many more, up to PLAIN_EVERY."""
 
 
 class Progress:
-    """Reports on a training of `total` iterations to a stream, by default standard error.
+    """Reports on a training of `total` iterations on standard error.
 
     enabled: False says nothing at all. Use as a context manager; ask is_due() before what a report takes,
     then update().
     """
 
-    def __init__(self, total: int, *, enabled: bool = True, stream=None):
+    def __init__(self, total: int, *, enabled: bool = True):
         self.total = total
-        self.stream = stream or sys.stderr
+        self.stream = sys.stderr
         self.enabled = enabled
         self._bar = self._task = None
         self._last_line = self._asked = self._cost = 0.0

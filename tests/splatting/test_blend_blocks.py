@@ -7,8 +7,9 @@ import torch
 import warp as wp
 from torch.profiler import ProfilerActivity, profile
 
-from sehdr_warp.splatting import BlendStyle
+from sehdr_warp.splatting import BlendStyle, blending
 from sehdr_warp.splatting.blending import blend
+from sehdr_warp.splatting.blending_cuda import blend_on_cuda
 from sehdr_warp.splatting.projection import project
 from sehdr_warp.splatting.reference import blend_reference
 from sehdr_warp.splatting.tile_lists import build_tile_lists, pack_records
@@ -34,6 +35,7 @@ def projected(scene, threshold):
 @pytest.fixture
 def fibers(monkeypatch):
     """Switches block kernels on the CPU on; off again, because ordinary kernels must not run in blocks."""
+    monkeypatch.setattr(blending, "blend_on_cpu", blend_on_cuda)
 
     def run(task):
         monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
@@ -71,7 +73,6 @@ def test_block_kernels_match_the_reference(fibers, dtype, channels, deterministi
             width=scene.width,
             height=scene.height,
             alpha_threshold=threshold,
-            block_kernels=True,
             style=BlendStyle(deterministic=deterministic),
         )
 
@@ -100,7 +101,7 @@ def test_a_single_pixels_gradient_may_have_any_strides(fibers):
         means2d, conics, depths, opacities, extents = projected(scene, 1 / 255)
     records = pack_records(means2d, conics, opacities, extents, 1 / 255)
     options = {"lists": build_tile_lists(records, depths, extents, 1, 1), "records": records, "extents": extents}
-    options |= {"width": 1, "height": 1, "alpha_threshold": 1 / 255, "block_kernels": True}
+    options |= {"width": 1, "height": 1, "alpha_threshold": 1 / 255}
     features = scene.tensors[4].requires_grad_()
     image = fibers(lambda: blend(means2d, conics, opacities, features, **options))[0]
     fibers(image.sum().backward)
@@ -115,7 +116,7 @@ def test_nothing_by_gaussian_is_kept_for_the_backward_pass(fibers, monkeypatch):
     records = pack_records(means2d, conics, opacities, extents, 1 / 255)
     inputs = [tensor.requires_grad_() for tensor in (means2d, conics, opacities, scene.tensors[4])]
     options = {"lists": build_tile_lists(records, depths, extents, 44, 26), "records": records, "extents": extents}
-    options |= {"width": 44, "height": 26, "alpha_threshold": 1 / 255, "block_kernels": True}
+    options |= {"width": 44, "height": 26, "alpha_threshold": 1 / 255}
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
         image = fibers(lambda: blend(*inputs, **options))[0]
     kept = sum(event.nbytes() for event in recorded.profiler.kineto_results.events() if event.name() == "[memory]")

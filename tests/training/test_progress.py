@@ -20,7 +20,8 @@ class Terminal(io.StringIO):
 def test_reports_that_cost_more_come_less_often(stream, cost, interval, monkeypatch):
     now = 100.0
     monkeypatch.setattr(module.time, "monotonic", lambda: now)
-    with Progress(100, stream=stream()) as progress:
+    monkeypatch.setattr(module.sys, "stderr", stream())
+    with Progress(100) as progress:
         assert progress.is_due(1)
         now += cost
         progress.update(1, loss=0.1, psnr=20.0, count=5, seconds_left=9.0)

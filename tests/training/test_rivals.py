@@ -14,7 +14,7 @@ from sehdr_warp.splatting.ssim import ssim
 from sehdr_warp.training.config import Config, ConfigError, LossConfig, ModelConfig, ResponseConfig
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.initialization import choose_response, make_field, start_colours
-from sehdr_warp.training.losses import Target, anchor_loss, hdr_loss, total_loss
+from sehdr_warp.training.losses import Target, anchor_loss, data_loss, hdr_loss
 from sehdr_warp.training.run import load_run
 from sehdr_warp.training.targets import largest_truth
 from sehdr_warp.training.train import train
@@ -110,7 +110,7 @@ def test_weights_mix_photos_and_truth(scene):
     field = trainer_of(scene, quick()).field
 
     def loss(**weights):
-        return float(total_loss(field, photo, target, LossConfig(clipping=False, opacity_weight=0.0, **weights), 4.0))
+        return float(data_loss(field, photo, target, LossConfig(clipping=False, **weights), 4.0))
 
     ldr, hdr = loss(), loss(ldr_weight=0.0, hdr_weight=1.0)
     assert loss(ldr_weight=2.0, hdr_weight=0.6) == pytest.approx(2 * ldr + 0.6 * hdr, rel=1e-5)
