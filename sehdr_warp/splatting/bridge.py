@@ -126,8 +126,8 @@ def _array(tensor: torch.Tensor, dtype=None) -> wp.array:
 
 
 def _zeros_like(tensors: list[torch.Tensor]) -> list[torch.Tensor]:
-    """Contiguous zeros of the tensors' shapes. On a GPU those of one type share memory, filled by a single launch."""
-    if not tensors or tensors[0].device.type == "cpu" or len({tensor.dtype for tensor in tensors}) > 1:
+    """Contiguous zeros of the tensors' shapes, in one memory that a single launch fills."""
+    if len(tensors) < 2 or len({tensor.dtype for tensor in tensors}) > 1:
         return [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in tensors]
     # Each starts at a multiple of 64 numbers, as memory of its own would.
     sizes = [tensor.numel() for tensor in tensors]
@@ -156,6 +156,7 @@ class _ProgramFunction(torch.autograd.Function):
         if recording:
             # The tape holds the arrays, hence the memory, until torch frees this node.
             ctx.program, ctx.arrays, ctx.plain = program, arrays, plain
+            ctx.leaves = [tensor.is_leaf for tensor in tensors]
         return outputs if isinstance(result, tuple) else outputs[0]
 
     @staticmethod
@@ -180,9 +181,12 @@ class _ProgramFunction(torch.autograd.Function):
             results = [None] * len(plain)
             by_memory = {}
             wanted = [position for position, needed in enumerate(ctx.needs_input_grad[2:]) if needed]
-            for position, zeros in zip(wanted, _zeros_like([plain[position] for position in wanted]), strict=True):
-                results[position] = zeros
-                by_memory[id(plain[position])] = zeros
+            # On a GPU leaves, whose gradients stay, have them in one memory; others' are soon let go, each by itself.
+            together = [p for p in wanted if ctx.leaves[p] and program.torch_device.type != "cpu"]
+            for group in (together, *([p] for p in wanted if p not in together)):
+                for position, zeros in zip(group, _zeros_like([plain[p] for p in group]), strict=True):
+                    results[position] = zeros
+                    by_memory[id(plain[position])] = zeros
             for tensor, array in program.inputs:
                 if id(tensor) in by_memory:
                     gradient = by_memory[id(tensor)]

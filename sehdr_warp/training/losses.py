@@ -33,6 +33,7 @@ class Target:
     light: [H, W, 3] exposures decoded from the photo, where they are kept for every step; None: decode them.
     highlights: [4] stops over white that light is expected at where none (unused), one, two and three channels of a
     pixel clip; None: nothing is expected.
+    index: [1], int64, on the device; then photo is a stack [V, H, W, 3] that has the photo at this place.
     """
 
     photo: Tensor
@@ -42,11 +43,17 @@ class Target:
     exposure_truth: Tensor | None
     light: Tensor | None = None
     highlights: Tensor | None = None
+    index: Tensor | None = None
 
     @property
     def encoded(self) -> Tensor:
         """[H, W, 3] in [0, 1], made of codes whenever it is asked for."""
-        return values_of(self.photo)
+        return values_of(one_of(self.photo, self.index))
+
+
+def one_of(stack: Tensor, index: Tensor | None) -> Tensor:
+    """A copy of the one of a stack [V, ...] that is at index [1], on its device; without an index the tensor itself."""
+    return stack if index is None else stack.index_select(0, index)[0]
 
 
 def values_of(photo: Tensor) -> Tensor:
@@ -99,6 +106,7 @@ def image_loss(
 def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Response | None = None) -> Tensor:
     """The photo against the simulated one, L_LDR: of encoded values, or with domain "mu-law" of exposures, for which
     the response is needed. With `clipping` one-sided where the camera saturated; see also LossConfig.interval."""
+    bounds = None
     if config.domain == "mu-law" or (config.domain == "auto" and _is_decodable(photo, response)):
         known = known_response(response)
         white, mu = known.white, mu_of_knee(known, config.knee)
@@ -112,24 +120,23 @@ def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Re
                 seen, truth = seen_by_photo(light, photo_light, *masks, white=white, mu=mu, half_codes=half_codes)
                 return image_loss(seen, truth, target.mask, config.form, config.ssim_weight)
             truth = mu_law(photo_light, white, mu)
-            lower, upper = truth - half_codes[0], truth + half_codes[1]
         else:
             encoded = target.encoded
-            bounds = encoded, encoded - CODE / 2, encoded + CODE / 2
-            truth, lower, upper = (mu_law(known.decode(image), white, mu) for image in bounds)
+            codes = encoded, encoded - CODE / 2, encoded + CODE / 2
+            truth, *bounds = (mu_law(known.decode(image), white, mu) for image in codes)
         prediction = mu_law(light, white, mu)
     else:
-        prediction, truth = photo.encoded, target.encoded
-        lower, upper = truth - CODE / 2, truth + CODE / 2
-    plain = prediction
-    if config.clipping or config.interval != "off":
-        bounded = target if config.clipping else replace(target, clipped=None, black=None)
-        prediction = one_sided(prediction, truth, bounded, lower, upper, config.interval != "off")
-    if config.interval != "difference" or config.ssim_weight == 0:
+        prediction, truth, half_codes = photo.encoded, target.encoded, (CODE / 2, CODE / 2)
+    if not config.clipping and config.interval == "off":
         return image_loss(prediction, truth, target.mask, config.form, config.ssim_weight)
-    if config.clipping:
-        plain = one_sided(plain, truth, target, lower, upper, False)
-    return image_loss(prediction, truth, target.mask, config.form, config.ssim_weight, similar=plain)
+    if bounds is None:
+        bounds = truth - half_codes[0], truth + half_codes[1]
+    bounded = target if config.clipping else replace(target, clipped=None, black=None)
+    seen = one_sided(prediction, truth, bounded, *bounds, config.interval != "off")
+    if config.interval != "difference" or config.ssim_weight == 0:
+        return image_loss(seen, truth, target.mask, config.form, config.ssim_weight)
+    similar = one_sided(prediction, truth, target, *bounds, False) if config.clipping else prediction
+    return image_loss(seen, truth, target.mask, config.form, config.ssim_weight, similar=similar)
 
 
 def compares_light(config: LossConfig, field: RadianceField) -> bool:

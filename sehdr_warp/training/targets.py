@@ -1,7 +1,7 @@
 """The training photos on the device, at every resolution of the schedule, uploaded once."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from ..model.radiance_field import CameraTensors
 from ..model.response import Response
 from ..scene import Camera, Scene, View
 from .config import LossConfig
-from .losses import CODE, Target, values_of
+from .losses import CODE, Target, one_of, values_of
 
 
 @dataclass(frozen=True)
@@ -22,25 +22,26 @@ class TrainingView:
 
     images: as in Target, as it is stored. photo: uint8 where all values are whole codes; clipped and black: bool in the
     place of a mask says whether any value is 255, or 0, and then the codes tell where.
+    index: as in Target, of a photo that is still one of a stack.
     """
 
     camera: CameraTensors
     exposure_time: float | Tensor
     images: dict[str, Tensor | bool | None]
+    index: Tensor | None = None
 
     @property
     def target(self) -> Target:
         """Made anew whenever it is asked for."""
-        return Target(**self.images | {name: self._mask(name, code) for name, code in MASKS.items()})
-
-    def _mask(self, name: str, code: int) -> Tensor | None:
-        noted = self.images[name]
-        return (self.images["photo"] == code if noted else None) if isinstance(noted, bool) else noted
+        told = {name: noted for name in MASKS if isinstance(noted := self.images[name], bool)}
+        codes = one_of(self.images["photo"], self.index) if any(told.values()) else None
+        masks = {name: codes == MASKS[name] if noted else None for name, noted in told.items()}
+        return Target(**self.images | masks, index=self.index)
 
 
 MASKS = {"clipped": 255, "black": 0}
 """The codes that masks mark."""
-STORED = tuple(field.name for field in fields(Target))
+STORED = tuple(field.name for field in fields(Target) if field.name != "index")
 
 
 @dataclass(frozen=True)
@@ -90,17 +91,16 @@ class ViewStack:
         return self._view(lambda values: values[index], time)
 
     def at(self, index: Tensor) -> TrainingView:
-        """The view whose number is in index [1], int64, on the views' device; its exposure time may be a tensor."""
+        """The view whose number is in index [1], int64, on the views' device; its exposure time may be a tensor. The
+        photo stays in the stack until it is asked for: here taking is copying."""
+        time = self.times if isinstance(self.times, float) else one_of(self.times, index)
+        return replace(self._view(lambda values: one_of(values, index), time, {"photo"}), index=index)
 
-        def take(values: Tensor) -> Tensor:
-            return values.index_select(0, index)[0]
-
-        return self._view(take, self.times if isinstance(self.times, float) else take(self.times))
-
-    def _view(self, take, time) -> TrainingView:
+    def _view(self, take, time, left: Collection[str] = ()) -> TrainingView:
+        """take: gives one of a tensor [V, ...]; left: images that it is not asked for."""
         pose, intrinsics, position = take(self.cameras)[:23].split((16, 4, 3))
         camera = CameraTensors(self.width, self.height, pose.view(4, 4), intrinsics, position)
-        images = {name: take(v) if isinstance(v, Tensor) else v for name, v in self.images.items()}
+        images = {name: take(v) if isinstance(v, Tensor) and name not in left else v for name, v in self.images.items()}
         return TrainingView(camera, time, images)
 
 

@@ -176,8 +176,10 @@ class Trainer:
             presence=self._presence,
             encode=self._encoded,
         )
-        # Images are in the backward pass's way: none is kept that it does not read.
-        rendering = replace(photo.rendering, image=None, transmittance=None)
+        # What the backward pass does not read is in its way.
+        unread = {"image", "transmittance", "depths"} | (set() if watched else {"means2d"})
+        unread |= set() if watched or self.config.optimizer.visible_only else {"radii"}
+        rendering = replace(photo.rendering, **dict.fromkeys(unread))
         if watched:
             rendering.means2d.retain_grad()
         compared = data_loss(self.field, photo, target, self.config.loss, self._largest_truth)
