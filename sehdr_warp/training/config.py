@@ -318,7 +318,6 @@ DECISIONS = (
     "background",
     "iterations",
     "early-stop",
-    "pruning",
     "confidence",
 )
 """What a plan decides, in this order."""

@@ -190,18 +190,18 @@ def mu_law(exposure: Tensor, white: float, mu: float = MU) -> Tensor:
 def highlight_prior(
     light: Tensor, clipped: Tensor | None, white: float, stops: Tensor | None, mask: Tensor | None = None
 ) -> Tensor:
-    """Mean over the image of |stops over white - expected ones| at clipped pixels brighter than white, 0 at the others.
+    """Mean over the image of the stops that clipped pixels brighter than white lack to what is expected; 0 at others.
 
     light: [H, W, 3] exposures; clipped: [H, W, 3] bool; stops: [4], as Target.highlights, by how many channels of the
-    pixel clip; mask: [H, W, 1] or None: pixels outside count nothing. The photo says `at least white` there and nothing
-    else does.
+    pixel clip; mask: [H, W, 1] or None: pixels outside count nothing. The photo says `at least white` there. What goes
+    beyond the expected stops is let be: the edges of small lights, where they mix with what is known, tell of more.
     """
     if clipped is None or stops is None:
         return light.new_zeros(())
     expected = stops[clipped.sum(dim=-1, keepdim=True)]
     excess = torch.log2(light.clamp_min(white) / white)
-    distance = torch.where(clipped & (light > white), (excess - expected).abs(), 0.0)
-    return distance.mean() if mask is None else (distance * mask).mean() / mask.mean().clamp_min(1e-6)
+    lacking = torch.where(clipped & (light > white), (expected - excess).clamp_min(0), 0.0)
+    return lacking.mean() if mask is None else (lacking * mask).mean() / mask.mean().clamp_min(1e-6)
 
 
 def anchor_loss(mapper: ToneMapper, value: float) -> Tensor:

@@ -8,9 +8,6 @@ from .config import Config
 from .plan_scene import SceneFacts
 from .relocation import gaussian_budget
 
-LEAST_GAIN = 0.05
-"""Decibels on training photos that a degree of the harmonics is kept for; of it a fifth to three fifths show
-in other photos."""
 COARSE_SIDE = 400
 """Photos are halved for a start as long as their longer side is above this many pixels."""
 COARSE_PART = 0.05
@@ -22,10 +19,8 @@ SKY_PART, MOST_FOR_SKY = 0.05, 400_000
 PASSES = 900
 """Steps on each photo. A second look at the same photos teaches less and less, and in the end their noise."""
 FEWEST_ITERATIONS = 3000
-LEAST_CONTRIBUTION = 0.03
-"""Pixels' worth in the photo that shows it best below which a Gaussian is taken away."""
-EARLY_STOP = 3
-"""Looks without gain."""
+EARLY_STOP, LOOK_GAIN = 3, 0.1
+"""Looks that gain less than so many decibels."""
 PASSES_A_LOOK = 5
 LOOKS = 30
 """Looks in a whole training."""
@@ -85,16 +80,12 @@ def _linear_loss(facts: SceneFacts, config: Config) -> Decision:
 
 def _harmonics(facts: SceneFacts, config: Config) -> Decision:
     degree = min(config.model.harmonics_degree, math.isqrt(facts.photos) - 1)
-    fields: dict[str, object] = {"model.harmonics_degree": degree, "schedule.harmonics_gain": LEAST_GAIN}
-    if config.loss.harmonics_weight == 0:
-        fields["schedule.harmonics_on_demand"] = True
     return Decision(
         "harmonics",
-        fields,
+        {"model.harmonics_degree": degree},
         f"degree {degree}",
         f"its {(degree + 1) ** 2} unknowns a channel are no more than the {facts.photos} photos; a place is seen by "
-        f"{facts.seen:.1f} of them within {facts.spread:.0f} degrees; each degree goes again if it gains less than "
-        f"{LEAST_GAIN:g} dB",
+        f"{facts.seen:.1f} of them within {facts.spread:.0f} degrees",
     )
 
 
@@ -179,29 +170,12 @@ def _early_stop(facts: SceneFacts, config: Config) -> Decision:
         "early-stop",
         {
             "schedule.early_stop": EARLY_STOP,
+            "schedule.early_stop_gain": LOOK_GAIN,
             "schedule.early_stop_every": every,
             "schedule.early_stop_on": "held-in",
         },
-        f"after {EARLY_STOP} looks",
+        f"after {EARLY_STOP} looks with less than {LOOK_GAIN:g} dB",
         f"a look every {steps} steps, {passes:.0f} passes over the photos; on training photos alone",
-    )
-
-
-def _pruning(facts: SceneFacts, config: Config) -> Decision:
-    if config.densification.strategy == "relocation":
-        return Decision(
-            "pruning",
-            {},
-            "none",
-            f"relocation moves what fades below {config.densification.prune_opacity:g} to where it is of use",
-        )
-    stated = config.schedule.stated_for
-    stages = [max(1, round(part * stated)) for part in (0.29, 0.39, 0.5, 0.66)]
-    return Decision(
-        "pruning",
-        {"densification.contribution": LEAST_CONTRIBUTION, "densification.contribution_at": stages},
-        f"below {LEAST_CONTRIBUTION:g} pixels",
-        f"each of {len(stages)} times costs {facts.photos} renders; what adds less to every photo is not seen there",
     )
 
 
@@ -225,7 +199,6 @@ RULES: dict[str, Callable[[SceneFacts, Config], Decision]] = {
     "background": _background,
     "iterations": _iterations,
     "early-stop": _early_stop,
-    "pruning": _pruning,
     "confidence": _confidence,
 }
 """A rule for each of config.DECISIONS."""
