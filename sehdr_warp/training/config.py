@@ -317,7 +317,6 @@ DECISIONS = (
     "resolution",
     "background",
     "iterations",
-    "early-stop",
     "confidence",
 )
 """What a plan decides, in this order."""

@@ -19,11 +19,6 @@ SKY_PART, MOST_FOR_SKY = 0.05, 400_000
 PASSES = 900
 """Steps on each photo. A second look at the same photos teaches less and less, and in the end their noise."""
 FEWEST_ITERATIONS = 3000
-EARLY_STOP, LOOK_GAIN = 3, 0.1
-"""Looks that gain less than so many decibels."""
-PASSES_A_LOOK = 5
-LOOKS = 30
-"""Looks in a whole training."""
 
 
 @dataclass(frozen=True)
@@ -154,31 +149,6 @@ def _iterations(facts: SceneFacts, config: Config) -> Decision:
     )
 
 
-def _early_stop(facts: SceneFacts, config: Config) -> Decision:
-    every = max(1, config.schedule.stated_for // LOOKS)
-    steps = config.scaled(every)
-    passes = steps / facts.photos
-    if passes < PASSES_A_LOOK:
-        return Decision(
-            "early-stop",
-            {},
-            "off",
-            f"{steps} steps between looks are {passes:.1f} passes over the {facts.photos} photos, and their mean loss "
-            f"is steady from {PASSES_A_LOOK} on",
-        )
-    return Decision(
-        "early-stop",
-        {
-            "schedule.early_stop": EARLY_STOP,
-            "schedule.early_stop_gain": LOOK_GAIN,
-            "schedule.early_stop_every": every,
-            "schedule.early_stop_on": "held-in",
-        },
-        f"after {EARLY_STOP} looks with less than {LOOK_GAIN:g} dB",
-        f"a look every {steps} steps, {passes:.0f} passes over the photos; on training photos alone",
-    )
-
-
 def _confidence(facts: SceneFacts, config: Config) -> Decision:
     unsure = facts.clipped + facts.black
     return Decision(
@@ -198,7 +168,6 @@ RULES: dict[str, Callable[[SceneFacts, Config], Decision]] = {
     "resolution": _resolution,
     "background": _background,
     "iterations": _iterations,
-    "early-stop": _early_stop,
     "confidence": _confidence,
 }
 """A rule for each of config.DECISIONS."""

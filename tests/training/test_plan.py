@@ -80,7 +80,6 @@ def test_a_plan_decides_everything_once_with_figures(scene):
         ("background", {"sky": 0.3, "pixels": 10**8}, "model.far_points", None, 20_000),
         # A twentieth of relocation's budget, 120 times the square root of 10^6.
         ("background", {"sky": 0.3, "pixels": 10**6}, "model.far_points", None, 6000),
-        ("early-stop", {"photos": 10_000}, "schedule.early_stop", 3, None),
     ],
 )
 def test_decisions_follow_their_figures(facts, name, change, field, few, many):
