@@ -314,8 +314,6 @@ DECISIONS = (
     "linear-loss",
     "harmonics",
     "densification",
-    "resolution",
-    "background",
     "iterations",
     "confidence",
 )

@@ -8,14 +8,6 @@ from .config import Config
 from .plan_scene import SceneFacts
 from .relocation import gaussian_budget
 
-COARSE_SIDE = 400
-"""Photos are halved for a start as long as their longer side is above this many pixels."""
-COARSE_PART = 0.05
-"""Part of a training that each halved level takes."""
-LEAST_SKY = 0.03
-"""Part of the pixels from which on a sky gets Gaussians of its own."""
-SKY_PART, MOST_FOR_SKY = 0.05, 400_000
-"""Of the budget, up to this many, for the sky."""
 PASSES = 900
 """Steps on each photo. A second look at the same photos teaches less and less, and in the end their noise."""
 FEWEST_ITERATIONS = 3000
@@ -102,41 +94,6 @@ def _densification(facts: SceneFacts, config: Config) -> Decision:
     return Decision("densification", fields, f"{most} Gaussians", f"{reason}; {facts.points} points to start from")
 
 
-def _resolution(facts: SceneFacts, config: Config) -> Decision:
-    side = max(facts.width, facts.height)
-    levels = 0 if side <= COARSE_SIDE else min(2, math.ceil(math.log2(side / COARSE_SIDE)))
-    if config.response.form == "mlp":
-        return Decision("resolution", {}, "full size", "a learned response cannot average photos as light")
-    reason = f"the longer side has {side} pixels; halved as long as it has more than {COARSE_SIDE}"
-    if levels <= config.schedule.coarse_levels:
-        given = config.schedule.coarse_levels
-        return Decision("resolution", {}, _levels(given), reason)
-    every = max(1, round(COARSE_PART * config.schedule.stated_for))
-    fields = {"schedule.coarse_levels": levels, "schedule.coarse_every": every}
-    return Decision("resolution", fields, _levels(levels), reason)
-
-
-def _levels(count: int) -> str:
-    return f"{count} coarse level{'s' if count > 1 else ''}" if count else "full size"
-
-
-def _background(facts: SceneFacts, config: Config) -> Decision:
-    count, fields = config.model.far_points, {}
-    if facts.sky >= LEAST_SKY and not count:
-        options = config.densification
-        budget = options.max_gaussians
-        if options.strategy == "relocation":
-            budget = gaussian_budget(options, facts.pixels)
-        count = max(100, round(SKY_PART * min(budget, MOST_FOR_SKY)))
-        fields["model.far_points"] = count
-    return Decision(
-        "background",
-        fields,
-        f"{count} far points" if count else "none",
-        f"{facts.sky:.1%} of the pixels are bright, flat, without points, and reach the upper border",
-    )
-
-
 def _iterations(facts: SceneFacts, config: Config) -> Decision:
     wanted = max(FEWEST_ITERATIONS, PASSES * facts.photos)
     count = min(config.schedule.iterations, math.ceil(wanted / 100) * 100)
@@ -165,8 +122,6 @@ RULES: dict[str, Callable[[SceneFacts, Config], Decision]] = {
     "linear-loss": _linear_loss,
     "harmonics": _harmonics,
     "densification": _densification,
-    "resolution": _resolution,
-    "background": _background,
     "iterations": _iterations,
     "confidence": _confidence,
 }

@@ -12,10 +12,6 @@ PROBES = 2000
 """Places at which overlap, parallax and visibility are measured."""
 FEWEST_POINTS = 100
 """With fewer sparse points places along the cameras' rays serve as probes."""
-CELL = 16
-"""Cells a photo is divided into, along its longer side, in the search for skies."""
-FLAT = 0.02
-"""Standard deviation of codes (of 1) within a cell, below which it shows no structure."""
 MOST_VIEWS = 64
 """Photos that codes are read from, evenly spread; geometry is of all."""
 
@@ -31,7 +27,7 @@ class SceneFacts:
     spread: degrees, the median over probes of the angle of the cone of directions they are seen from.
     overlap: part of the probes, or of places along the cameras' rays if that is more, that two photos show.
     clipped, black: part of the pixels with a channel at 255, with all channels at 0. contrast: standard deviation of
-    all codes. sky: part of the pixels in flat, bright cells without sparse points that reach the upper border.
+    all codes.
     """
 
     photos: int
@@ -50,7 +46,6 @@ class SceneFacts:
     clipped: float
     black: float
     contrast: float
-    sky: float
 
 
 def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
@@ -86,7 +81,6 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         clipped=clipped,
         black=black,
         contrast=float(np.sqrt(np.mean([image.var() for image in codes]) + np.var([image.mean() for image in codes]))),
-        sky=_sky(scene),
     )
 
 
@@ -124,25 +118,3 @@ def _spread(probes: np.ndarray, views: tuple[View, ...], shown: np.ndarray) -> f
     angles = 2 * np.degrees(np.arccos(np.clip(cosines, -1, 1)))
     seen = shown.sum(0) >= 2
     return float(np.median(angles[seen])) if seen.any() else 0.0
-
-
-def _sky(scene: Scene) -> float:
-    """Part of the pixels that may be sky: cells without structure, brighter than their photo's median, without sparse
-    points, joined to the upper border by such cells above them."""
-    if len(scene.points) < FEWEST_POINTS:
-        return 0.0
-    parts = []
-    for view in scene.train_views[:: -(-len(scene.train_views) // MOST_VIEWS)]:
-        grey = view.image.mean(2)
-        size = max(1, max(grey.shape) // CELL)
-        rows, columns = grey.shape[0] // size, grey.shape[1] // size
-        cells = grey[: rows * size, : columns * size].reshape(rows, size, columns, size).swapaxes(1, 2)
-        cells = cells.reshape(rows, columns, -1)
-        x, y, depth = _project(scene.points, view)
-        row, column = (y // size).astype(int), (x // size).astype(int)
-        inside = (depth > 0) & (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        empty = np.ones((rows, columns), bool)
-        empty[row[inside], column[inside]] = False
-        plain = empty & (cells.std(2) < FLAT) & (cells.mean(2) > np.median(grey))
-        parts.append(float(np.logical_and.accumulate(plain, axis=0).mean()))
-    return float(np.mean(parts))
