@@ -166,24 +166,24 @@ class Trainer:
 
         With a capacity all of it works on fixed memory and nothing waits for the device.
         """
-        target = view.target
+        target, camera, exposure_time = view.target, view.camera, view.exposure_time
         photo = self.field.photograph(
-            view.camera,
-            view.exposure_time,
+            camera,
+            exposure_time,
             degree=self.degree,
             also=needed_colours(self.config.loss, target.exposure_truth is not None),
             capacity=capacity,
             presence=self._presence,
             encode=self._encoded,
         )
-        # What the backward pass does not read is in its way.
-        unread = {"image", "transmittance", "depths"} | (set() if watched else {"means2d"})
-        unread |= set() if watched or self.config.optimizer.visible_only else {"radii"}
+        # What the backward pass does not read, or only its first part does, must not stay until the end of the step.
+        kept = {"means2d", "radii"} if watched else {"radii"} if self.config.optimizer.visible_only else set()
+        unread = {"image", "transmittance", "depths", "means2d", "radii"} - kept
         rendering = replace(photo.rendering, **dict.fromkeys(unread))
         if watched:
             rendering.means2d.retain_grad()
         compared = data_loss(self.field, photo, target, self.config.loss, self._largest_truth)
-        del photo, target
+        del photo, target, view
         loss = regularised(compared, self.field, self.config.loss)
         if isinstance(self.field.response, RefinedResponse) and self.field.response.refining:
             loss = loss + self.config.response.refine_weight * self.field.response.penalty()
@@ -194,8 +194,8 @@ class Trainer:
         if watched:
             weights = None
             if self.config.densification.slope_corrected:
-                weights = slope_weights(self.field, view.exposure_time / self.field.base_time)
-            self.densification.observe(rendering, view.camera.width, view.camera.height, made, weights)
+                weights = slope_weights(self.field, exposure_time / self.field.base_time)
+            self.densification.observe(rendering, camera.width, camera.height, made, weights)
         self.optimizer.zero_grad(set_to_none=True)
         self._skipped += nonfinite
         if self._early_stop.patience:
