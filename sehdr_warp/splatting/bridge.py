@@ -126,7 +126,7 @@ def _array(tensor: torch.Tensor, dtype=None) -> wp.array:
 
 
 def _zeros_like(tensors: list[torch.Tensor]) -> list[torch.Tensor]:
-    """Contiguous zeros of the tensors' shapes, in one memory that a single launch fills."""
+    """Contiguous zeros of the tensors' shapes; where all are of one type in one memory, filled by a single launch."""
     if len(tensors) < 2 or len({tensor.dtype for tensor in tensors}) > 1:
         return [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in tensors]
     # Each starts at a multiple of 64 numbers, as memory of its own would.
