@@ -98,7 +98,7 @@ def config_of(**fields):
     return load_config("demo", {"densification.strategy": "none", **dotted})
 
 
-def test_a_training_puts_clipped_light_where_it_is_expected(tmp_path):
+def test_a_training_lifts_clipped_light_as_far_as_is_expected(tmp_path):
     scene = clipped_scene()
     reached = []
     for stops in (0.3, 3.0):
