@@ -5,7 +5,6 @@ and DefaultStrategy at 3DGS's settings. gsplat needs CUDA and is not a dependenc
 """
 
 import time
-from dataclasses import dataclass
 
 import torch
 
@@ -157,13 +156,6 @@ def _upload(view, device):
     return pose, intrinsics, torch.tensor(view.image, device=device), mask
 
 
-@dataclass(frozen=True)
-class GsplatRendering(Rendering):
-    """Has gsplat's alpha, and None for the transmittance: one more image would count as gsplat's memory."""
-
-    alpha: torch.Tensor | None = None
-
-
 def rasterize_with_gsplat(
     means,
     log_scales,
@@ -181,13 +173,14 @@ def rasterize_with_gsplat(
     style: object = None,
 ) -> Rendering:
     """rasterize() by gsplat, for a training step of ours on its kernels. capacity, style: have no meaning there. Its
-    centres in the image are not those that the gradient passes, so densification cannot watch them."""
+    centres in the image are not those that the gradient passes, so densification cannot watch them. There is no
+    transmittance: a step reads none, and one more image would count as gsplat's memory."""
     from gsplat import rasterization
 
     fx, fy, cx, cy = intrinsics
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
     matrix = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).reshape(1, 3, 3)
-    image, alpha, info = rasterization(
+    image, _, info = rasterization(
         means,
         quaternions,
         log_scales.exp(),
@@ -205,4 +198,4 @@ def rasterize_with_gsplat(
     radii = info["radii"][0]
     radii = radii.amax(-1) if radii.ndim == 2 else radii
     means2d, depths = info["means2d"][0], info["depths"][0]
-    return GsplatRendering(image[0], None, means2d, depths, radii, 0, alpha=alpha[0, ..., 0])
+    return Rendering(image[0], None, means2d, depths, radii, 0)
