@@ -312,7 +312,6 @@ DECISIONS = (
     "response",
     "brackets",
     "linear-loss",
-    "harmonics",
     "densification",
     "iterations",
     "confidence",

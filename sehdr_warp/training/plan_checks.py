@@ -59,14 +59,6 @@ def check_fields(scene: Scene, facts: SceneFacts, config: Config, given: Collect
             refuse("loss.hdr_truth", True, none, remedy)
         if config.loss.hdr_weight > 0 and not predicted:
             refuse("loss.hdr_weight", config.loss.hdr_weight, none, remedy)
-    degree = config.model.harmonics_degree
-    if "model.harmonics_degree" in given and (degree + 1) ** 2 > facts.photos:
-        refuse(
-            "model.harmonics_degree",
-            degree,
-            f"its {(degree + 1) ** 2} unknowns a channel are more than the {facts.photos} photos",
-            f"use {int(facts.photos**0.5) - 1} or less",
-        )
     budget = config.densification.max_gaussians
     if "densification.max_gaussians" in given and budget < facts.points:
         refuse(

@@ -65,17 +65,6 @@ def _linear_loss(facts: SceneFacts, config: Config) -> Decision:
     )
 
 
-def _harmonics(facts: SceneFacts, config: Config) -> Decision:
-    degree = min(config.model.harmonics_degree, math.isqrt(facts.photos) - 1)
-    return Decision(
-        "harmonics",
-        {"model.harmonics_degree": degree},
-        f"degree {degree}",
-        f"its {(degree + 1) ** 2} unknowns a channel are no more than the {facts.photos} photos; a place is seen by "
-        f"{facts.seen:.1f} of them within {facts.spread:.0f} degrees",
-    )
-
-
 def _densification(facts: SceneFacts, config: Config) -> Decision:
     options = config.densification
     most = gaussian_budget(options, facts.pixels)
@@ -120,7 +109,6 @@ RULES: dict[str, Callable[[SceneFacts, Config], Decision]] = {
     "response": _response,
     "brackets": _brackets,
     "linear-loss": _linear_loss,
-    "harmonics": _harmonics,
     "densification": _densification,
     "iterations": _iterations,
     "confidence": _confidence,

@@ -24,7 +24,6 @@ class SceneFacts:
     exposure_times: how many differ. times_known: whether files state them. from_camera: whether a camera made the
     files. truths: photos with HDR truth. points: sparse points.
     seen: mean number of photos whose field of view holds a probe (what stands in the way is not known).
-    spread: degrees, the median over probes of the angle of the cone of directions they are seen from.
     overlap: part of the probes, or of places along the cameras' rays if that is more, that two photos show.
     clipped, black: part of the pixels with a channel at 255, with all channels at 0. contrast: standard deviation of
     all codes.
@@ -41,7 +40,6 @@ class SceneFacts:
     truths: int
     points: int
     seen: float
-    spread: float
     overlap: float
     clipped: float
     black: float
@@ -76,7 +74,6 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         truths=sum(view.hdr is not None for view in views),
         points=len(scene.points),
         seen=_mean_where(shown.sum(0), shown.any(0)),
-        spread=_spread(probes, views, shown),
         overlap=max(float((other.sum(0) >= 2).mean()) for other in (shown, visibility(drawn, views))),
         clipped=clipped,
         black=black,
@@ -105,16 +102,3 @@ def _project(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray, np
 
 def _mean_where(values: np.ndarray, chosen: np.ndarray) -> float:
     return float(values[chosen].mean()) if chosen.any() else 0.0
-
-
-def _spread(probes: np.ndarray, views: tuple[View, ...], shown: np.ndarray) -> float:
-    """Twice the angle between a probe's mean direction to the cameras that show it and the farthest of them."""
-    positions = np.stack([view.camera.position for view in views])
-    directions = positions[:, None] - probes[None]
-    directions /= np.maximum(np.linalg.norm(directions, axis=2, keepdims=True), 1e-12)
-    mean = np.where(shown[..., None], directions, 0.0).sum(0)
-    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-    cosines = np.where(shown, (directions * mean[None]).sum(2), 1.0).min(0)
-    angles = 2 * np.degrees(np.arccos(np.clip(cosines, -1, 1)))
-    seen = shown.sum(0) >= 2
-    return float(np.median(angles[seen])) if seen.any() else 0.0
