@@ -163,7 +163,10 @@ class LossConfig:
     )
     hdr_truth: bool = option(False, "compare the base colour with HDR truth in the linear loss, where a view has it")
     highlight_weight: float = option(
-        0.0, "weight of the mean number of stops that clipped pixels lack to what is expected", low=0.0, high=10.0
+        0.0,
+        "weight of the mean number of stops that clipped pixels lack to what is expected, or a tenth of what is beyond",
+        low=0.0,
+        high=10.0,
     )
     highlight_stops: float = option(
         1.8, "stops over white that light at clipped pixels is expected at, at most", low=0.0, high=20.0

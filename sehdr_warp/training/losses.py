@@ -187,21 +187,27 @@ def mu_law(exposure: Tensor, white: float, mu: float = MU) -> Tensor:
     return torch.log1p(exposure * (mu / white)) / math.log1p(mu)
 
 
+PULL_DOWN = 0.1
+"""How strongly the prior on clipped light pulls down, in parts of how it lifts. The edges of small lights, where they
+mix with what is known, tell of more than is expected; but without any hold light runs away (docs/highlights.md)."""
+
+
 def highlight_prior(
     light: Tensor, clipped: Tensor | None, white: float, stops: Tensor | None, mask: Tensor | None = None
 ) -> Tensor:
-    """Mean over the image of the stops that clipped pixels brighter than white lack to what is expected; 0 at others.
+    """Mean over the image of what clipped pixels brighter than white lack to the expected stops, and of PULL_DOWN of
+    what they have beyond; 0 at others.
 
     light: [H, W, 3] exposures; clipped: [H, W, 3] bool; stops: [4], as Target.highlights, by how many channels of the
-    pixel clip; mask: [H, W, 1] or None: pixels outside count nothing. The photo says `at least white` there. What goes
-    beyond the expected stops is let be: the edges of small lights, where they mix with what is known, tell of more.
+    pixel clip; mask: [H, W, 1] or None: pixels outside count nothing. The photo says `at least white` there.
     """
     if clipped is None or stops is None:
         return light.new_zeros(())
     expected = stops[clipped.sum(dim=-1, keepdim=True)]
     excess = torch.log2(light.clamp_min(white) / white)
-    lacking = torch.where(clipped & (light > white), (expected - excess).clamp_min(0), 0.0)
-    return lacking.mean() if mask is None else (lacking * mask).mean() / mask.mean().clamp_min(1e-6)
+    lacking = expected - excess
+    off = torch.where(clipped & (light > white), torch.maximum(lacking, -PULL_DOWN * lacking), 0.0)
+    return off.mean() if mask is None else (off * mask).mean() / mask.mean().clamp_min(1e-6)
 
 
 def anchor_loss(mapper: ToneMapper, value: float) -> Tensor:

@@ -208,15 +208,17 @@ def test_the_mu_law_weighs_shadows_as_the_metric_does():
     assert shares[0] > 2 * shares[1] > 0
 
 
-def test_the_highlight_prior_lifts_clipped_pixels_to_what_is_expected():
+def test_the_highlight_prior_lifts_clipped_pixels_and_hardly_holds_them_down():
     light = torch.tensor([0.5, 1.5, 4.0, 4.0]).double().reshape(1, 4, 1).expand(1, 4, 3).clone().requires_grad_()
     clipped = torch.tensor([True, True, True, False]).reshape(1, 4, 1).expand(1, 4, 3)
     loss = highlight_prior(light, clipped, 1.0, torch.tensor([9.0, 9.0, 9.0, 1.0]))
-    # 1 - log2(1.5) stops short of one stop over white; what is a stop beyond stays there.
-    assert loss.item() == pytest.approx(0.4150375 / 4, rel=1e-6)
+    # 1 - log2(1.5) stops short of one stop over white, and one stop beyond it, which counts a tenth.
+    assert loss.item() == pytest.approx((0.4150375 + 0.1) / 4, rel=1e-6)
     loss.backward()
     gradient = light.grad[0, :, 0]
-    assert gradient[1] < 0 and bool((gradient[[0, 2, 3]] == 0).all())
+    assert gradient[0] == 0 and gradient[3] == 0
+    # A stop is ln 2 times the exposure: 1.5 and 4.
+    assert float(gradient[2] / -gradient[1]) == pytest.approx(0.1 * 1.5 / 4)
     assert highlight_prior(light, None, 1.0, torch.ones(4)) == 0
     assert highlight_prior(light, clipped, 1.0, None) == 0
 
