@@ -61,6 +61,15 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
         blocks = (span + wp.static(lanes - 1)) // wp.static(lanes)
         return index // blocks, wp.min(index % blocks * wp.static(lanes), span - wp.static(lanes)) - margin
 
+    @wp.func
+    def is_border(planes: wp.array3d(dtype=run), y: int, i: int, margin: int, length: int) -> bool:
+        """Whether a blur's run lies beyond the image; then it is zero, and written here."""
+        if wp.static(lanes == 1) and (i < 0 or i >= length):
+            for k in range(planes.shape[0]):
+                planes[k, y, i + margin] = run(real(0.0))
+            return True
+        return False
+
     @wp.kernel(module="unique", module_options=options)
     def blur_columns(
         first: int,
@@ -73,9 +82,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
     ):
         margin = radius * channels
         y, i = place_of(first + wp.tid(), length, border * channels)
-        if wp.static(lanes == 1) and (i < 0 or i >= length):
-            for k in range(4):
-                moments[k, y, i + margin] = run(real(0.0))
+        if is_border(moments, y, i, margin, length):
             return
         s1 = run(real(0.0))
         d1 = run(real(0.0))
@@ -161,9 +168,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
     ):
         margin = radius * channels
         y, i = place_of(first + wp.tid(), length, border * channels)
-        if wp.static(lanes == 1) and (i < 0 or i >= length):
-            for k in range(3):
-                blurred[k, y, i + margin] = run(real(0.0))
+        if is_border(blurred, y, i, margin, length):
             return
         sd = run(real(0.0))
         ss = run(real(0.0))
