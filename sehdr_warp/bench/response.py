@@ -120,7 +120,7 @@ def _choices(images, from_camera: bool, seed: int):
         scores, edge_count = selection.scores, selection.edge_count
         yield "posterior", selection.response
         yield "posterior, formulae only", scores[0].response
-        for part in ("edges", "highlights", "span", "prior"):
+        for part in ("edges", "density", "highlights", "span", "prior"):
             without = min(scores, key=lambda score, part=part: score.posterior - _weighted(score, part, edge_count))
             yield f"posterior without {part}", without.response
         paper = max(scores, key=lambda score: score.paper_score).response

@@ -1,4 +1,4 @@
-"""A response from photos: by colour mixtures at edges, clipped light, range and a prior; or by the paper's score."""
+"""A response from photos: by colour mixtures at edges, the histogram and a prior; or by the paper's score."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,6 +33,13 @@ EDGES_PER_FACT = 160.0
 HIGHLIGHT_RATE, HIGHLIGHT_SPREAD, HIGHLIGHT_FLOOR = 0.4, 0.8, 0.002
 # Standard deviation of ln exposure over the values that are neither black nor white: 1.35, within a factor of 1.4.
 SPAN, SPAN_SPREAD = 0.3, 0.35
+# The density of log exposure, in bins of eight codes from 5.5 to 253.5. From one bin to the next ln density changes by
+# DENSITY_SLOPE times their distance in stops, and by DENSITY_JUMP at any distance; the tails are Student's t. A bin
+# with less than about DENSITY_SHARE of the values counts less.
+DENSITY_EDGES = np.arange(6, 255, 8)
+DENSITY_SLOPE, DENSITY_JUMP, DENSITY_FREEDOM, DENSITY_SHARE = 0.9, 0.1, 5.0, 1e-3
+# Neighbouring bins share what is unusual about a scene: this many count as one.
+BINS_PER_FACT = 4.0
 # Minus log prior, up to a constant. Of photos that say nothing about where they come from ...
 PRIOR = {"camera": 0.5, "srgb": 0.5, "rec709": 1.0, "gamma-2.2": 1.0, "reinhard-gamma": 1.0, "filmic": 2.0, "aces": 2.0}
 # ... and of a camera's own JPEG, which is sharpened and cleaned of noise: its edges mislead (docs/response.md).
@@ -60,7 +67,8 @@ class ResponseScore:
         linear light, every share as likely; smaller is better; NaN if the photos have fewer than 50 usable edges.
     highlights: minus the log likelihood, nats, of the pixels at the brightest code beside those just below it.
     span: minus the log likelihood, nats, of how far the decoded values spread.
-    prior: minus the log prior, nats. posterior: the sum of the four, edges counted as EDGES_PER_FACT says.
+    density: minus the log likelihood, nats, of how evenly the decoded values are spread over log exposure.
+    prior: minus the log prior, nats. posterior: the sum of the five, edges counted as EDGES_PER_FACT says.
     """
 
     response: Response
@@ -70,6 +78,7 @@ class ResponseScore:
     edges: float
     highlights: float
     span: float
+    density: float
     prior: float
     posterior: float
 
@@ -104,8 +113,8 @@ def select_response(
         "edges" is after Lin et al. 2004 (Radiometric calibration from a single image): at an edge between two evenly
         coloured regions a pixel is a mixture of both in linear light, so decoded colours lie on a line. Falls back to
         "paper", and says so in `method`, where the photo has fewer than 50 such edges.
-        "posterior" adds a prior, what the clipped pixels tell, and how many stops scenes span; it needs no edges,
-        and no well-exposed pixels.
+        "posterior" adds a prior, what the clipped pixels tell, how many stops scenes span, and how smoothly their light
+        is spread over them; it needs no edges, and no well-exposed pixels.
         Without `candidates`, and for photos that are not a camera's own, a smooth family of cameras' curves stands
         beside the bank. A formula with a quarter of the posterior is taken; else the response is the posterior's
         mean of log exposure at each code, a table that is none of the candidates.
@@ -134,22 +143,22 @@ def select_response(
     bright, shares = _highlight_shares(values), _code_shares(values)
     points, rows = _edge_points(edges), []
     known = np.stack([np.log(each.decode(np.maximum(CODES, each.black + CODE))) for each in candidates])
-    spans = _span_surprise(shares, known)
-    for each, span in zip(candidates, spans, strict=True):
+    spans, densities = _span_surprise(shares, known), _density_surprise(shares, known)
+    for each, of_shares in zip(candidates, spans + densities, strict=True):
         stops = np.log2(float(each.decode(1 - CODE / 2)) / float(each.decode(1 - 9.5 * CODE)))
         surprise, highlights, prior = (
             _edge_surprise(points, each),
             _highlights(bright, stops),
             _prior(each, from_camera),
         )
-        posterior = np.nan_to_num(surprise) * len(edges) / EDGES_PER_FACT + highlights + span + prior
+        posterior = np.nan_to_num(surprise) * len(edges) / EDGES_PER_FACT + highlights + of_shares + prior
         rows.append((*_range_and_roughness(fullest, each), surprise, highlights, prior, posterior))
     ranges, roughnesses, surprises, highlights, priors, posteriors = np.array(rows, dtype=np.float64).T
     paper = _relative(ranges) - _relative(roughnesses)
     if method == "edges" and np.isnan(surprises).all():
         method = "paper"
     goodness = {"paper": paper, "edges": -np.nan_to_num(surprises, nan=np.inf), "posterior": -posteriors}[method]
-    columns = (ranges, roughnesses, paper, surprises, highlights, spans, priors, posteriors)
+    columns = (ranges, roughnesses, paper, surprises, highlights, spans, densities, priors, posteriors)
     scores = [ResponseScore(each, *map(float, row)) for each, row in zip(candidates, np.stack(columns, 1), strict=True)]
     order = np.argsort(-goodness, kind="stable")
     ranked, best = tuple(scores[index] for index in order), candidates[order[0]]
@@ -167,6 +176,7 @@ def _beside_family(points, bright, shares, known, priors, posteriors):
     stops = (logs[:, 254:].mean(1) - logs[:, 245:247].mean(1)) / np.log(2)
     members = np.array([_highlights(bright, each) for each in stops])
     members += np.nan_to_num(surprise) * len(points) / EDGES_PER_FACT + _span_surprise(shares, logs)
+    members += _density_surprise(shares, logs)
     members += np.log(len(logs) / NO_FORMULA)
     named = posteriors + np.log(np.exp(-priors).sum() / (1 - NO_FORMULA))
     costs = np.concatenate([named, members])
@@ -245,6 +255,24 @@ def _span_surprise(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
     variance = np.square(logs - (logs @ weights)[:, None]) @ weights
     off = 0.5 * np.log(np.maximum(variance, np.exp(-6.0))) - SPAN
     return 0.5 * inside * (off / SPAN_SPREAD) ** 2
+
+
+def _density_surprise(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
+    """[K] minus the log likelihood of the density of log exposure, from the codes' natural log exposures [K, 256].
+
+    A scene's light is spread smoothly over its stops; a wrong curve, which squeezes some codes together and pulls
+    others apart, heaps it up or thins it out.
+    """
+    edges = 0.5 * (logs[:, DENSITY_EDGES - 1] + logs[:, DENSITY_EDGES]) / np.log(2)
+    widths = np.maximum(np.diff(edges), 1e-6)
+    counts = np.add.reduceat(shares, DENSITY_EDGES)[:-1]
+    change = np.diff(np.log(counts + 0.01 * DENSITY_SHARE) - np.log(widths))
+    apart = 0.5 * (widths[:, 1:] + widths[:, :-1])
+    variance = (DENSITY_SLOPE * apart) ** 2 + DENSITY_JUMP**2
+    least = np.minimum(counts[1:], counts[:-1])
+    tail = (DENSITY_FREEDOM + 1) / 2
+    costs = tail * np.log1p(change**2 / (DENSITY_FREEDOM * variance)) + 0.5 * np.log(variance)
+    return costs @ (least / (least + DENSITY_SHARE)) / BINS_PER_FACT
 
 
 def _relative(values: np.ndarray) -> np.ndarray:

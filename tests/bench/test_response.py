@@ -78,4 +78,4 @@ def test_report_over_a_stack_and_the_embedded_scene(tmp_path):
     scene = rows["scenes", "posterior"]
     assert scene["trials"] == 2 and scene["mean_error"] <= scene["worst_error"]
     assert scene["aligned_db"] <= scene["aligned_known_db"] + 0.1
-    assert len(report["trials"]) == (len(TIMES) + 2) * 10
+    assert len(report["trials"]) == (len(TIMES) + 2) * 11

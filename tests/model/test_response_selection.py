@@ -109,6 +109,18 @@ def test_span_tells_a_curve_that_never_clips():
     assert {score.span for score in nothing} == {0.0}
 
 
+def test_density_tells_curves_that_heap_light_up():
+    """Log-normal light without edges: under the true curve its density is smooth, the other bends the bright end."""
+    light = np.exp(np.random.default_rng(0).normal(-1.2, 1.0, (96, 96, 3)))
+    for name, other in (("camera", "reinhard-gamma"), ("reinhard-gamma", "camera")):
+        truth = response_by_name(name)
+        photo = np.round(np.clip(truth.encode(light), 0, 1) * 255) / 255
+        density = {s.response.name: s.density for s in select_response(photo, method="posterior").scores}
+        assert density[name] < density[other] - 0.8
+    blank = select_response(np.ones((32, 32, 3)), method="posterior", from_camera=True).scores
+    assert {score.density for score in blank} == {0.0}
+
+
 def test_edges_that_no_curve_explains_say_little(monkeypatch):
     """Noise on the mixed pixels alone: how large it is must be found, not taken for what rounding does."""
     truth, rng = response_by_name("srgb"), np.random.default_rng(0)
