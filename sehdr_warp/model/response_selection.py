@@ -31,8 +31,8 @@ EDGE_MISFITS = 2.0 ** np.arange(0, 8.5, 0.5)
 EDGES_PER_FACT = 160.0
 # Radiance falls off above white by this natural log per stop, within a factor of 2.2 (one standard deviation).
 HIGHLIGHT_RATE, HIGHLIGHT_SPREAD, HIGHLIGHT_FLOOR = 0.4, 0.8, 0.002
-# Standard deviation of ln exposure over the values that are neither black nor white: 1.35, within a factor of 1.4.
-SPAN, SPAN_SPREAD = 0.3, 0.35
+# Standard deviation of ln exposure over the values that are neither black nor white: 1.35, within a factor of 1.5.
+SPAN, SPAN_SPREAD = 0.3, 0.4
 # The density of log exposure, in bins of eight codes from 5.5 to 253.5. From one bin to the next ln density changes by
 # DENSITY_SLOPE times their distance in stops, and by DENSITY_JUMP at any distance; the tails are Student's t. A bin
 # with less than about DENSITY_SHARE of the values counts less.
