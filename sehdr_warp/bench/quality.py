@@ -17,7 +17,7 @@ def bench_quality(
 
     Raises SehdrError for settings that cannot be run, before anything runs.
     """
-    jobs = plan_jobs(settings)
+    jobs = plan_jobs(settings, progress=progress)
     try:
         run_jobs(jobs, out, workers, settings.device, progress)
     except BaseException:

@@ -4,6 +4,7 @@ import hashlib
 import itertools
 import json
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
 from importlib import resources
@@ -94,9 +95,9 @@ class Job:
         return f"{re.sub(r'[^A-Za-z0-9.]+', '-', self.label)[:100].strip('-')}-{self.key}"
 
 
-def plan_jobs(settings: Settings) -> list[Job]:
+def plan_jobs(settings: Settings, *, progress: Callable[[str], None] = lambda line: None) -> list[Job]:
     """Every job of the settings, scene by scene. Blind jobs of methods that cannot be blind are left out; methods that
-    learn the response have one job for known and blind together.
+    learn the response have one job for known and blind together. What was repaired in a curve's file is told.
 
     Raises InputError or SehdrError for a preset, field, curve or folder that cannot be used, before anything runs.
     """
@@ -105,7 +106,8 @@ def plan_jobs(settings: Settings) -> list[Job]:
     scenes = {place: {"name": _scene_name(place), **_digest(place)} for place in dict.fromkeys(settings.scenes)}
     _check_names_differ(scenes)
     for curve in settings.curves:
-        response_by_name(curve)
+        for note in response_by_name(curve).notes:
+            progress(note)
     configs = {
         (method.name, iterations, seed): _config(method, iterations, seed)
         for method, iterations, seed in itertools.product(settings.methods, settings.iterations, settings.seeds)

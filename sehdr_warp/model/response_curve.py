@@ -27,6 +27,7 @@ class Response(ABC):
     black: f(0), in [0, 1).
     peak: the largest value that the curve takes or approaches, at most 1.
     clip_exposure: the smallest exposure with f = peak; infinity for a curve that only approaches it.
+    notes: one line each on what was repaired in measured samples; empty for most.
 
     encode, encode_extended and decode take a torch tensor (float32 or float64, any shape, any device; differentiable
     once) and return one like it, or a NumPy array or number and return a NumPy array. NaN stays NaN.
@@ -36,6 +37,7 @@ class Response(ABC):
     black: float
     peak: float
     clip_exposure: float
+    notes: tuple[str, ...] = ()
     _kinds: ClassVar[dict[str, type["Response"]]] = {}
 
     def __init_subclass__(cls, *, kind: str | None = None, **options):

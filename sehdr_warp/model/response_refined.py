@@ -35,7 +35,7 @@ class RefinedResponse(nn.Module, Response, kind="refined"):
         self.start = start
         self.refining = True
         self.log_densities = nn.Parameter(torch.zeros(2 * (CELLS // 2 + 1)))
-        self.name = f"{start.name} refined"
+        self.name, self.notes = f"{start.name} refined", start.notes
         self.black, self.peak, self.clip_exposure = start.black, start.peak, start.clip_exposure
         self._offset, self._rise = start.black, start.peak - start.black
 

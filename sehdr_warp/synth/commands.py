@@ -109,6 +109,8 @@ def _expose(asked: ExposeTruth) -> None:
     from .photo_set import write_photo_set
 
     response = response_by_name(asked.response)
+    for note in response.notes:
+        say(note)
     noise = None
     if asked.noise is not None:
         figures = numbers("--noise", asked.noise)

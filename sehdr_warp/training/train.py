@@ -86,7 +86,7 @@ def train(
         _torch_settings(trainer.config),
     ):
         progress.note(f"response {trainer.field.response.name}, {trainer.field.gaussians.count} Gaussians on {device}")
-        for line in _crowded(scene, trainer):
+        for line in (*trainer.field.response.notes, *_crowded(scene, trainer)):
             progress.note(line)
         if plan := read_plan(out):
             progress.note(format_plan(plan))

@@ -38,6 +38,13 @@ def test_expose_takes_times_and_noise(truth, tmp_path):
     assert 0.5 / 255 < np.abs(clean.views[0].image - noisy.views[0].image).mean() < 0.2
 
 
+def test_expose_tells_what_was_repaired_in_a_response_file(truth, tmp_path, capfd):
+    path = tmp_path / "camera.csv"
+    path.write_text("0 0\n0.5 0.6\n0.5 0.8\n1 1\n")
+    assert call("synth", "expose", truth[0], "--out", tmp_path / "photos", "--response", path, "--exposures", "1") == 0
+    assert f"{path}: exposures were not increasing; sorted" in capfd.readouterr().err
+
+
 def test_expose_refuses_in_a_line(truth, tmp_path, capfd):
     folder, _, _ = truth
     out = tmp_path / "photos"

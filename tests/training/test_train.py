@@ -123,6 +123,16 @@ def test_more_start_points_than_the_budget_stay_as_many_and_are_told(scene, tmp_
     assert run.gaussian_count == options.get("densification.max_gaussians", 60 if options else 90)
 
 
+@pytest.mark.parametrize("refine", [False, True])
+def test_what_was_repaired_in_a_response_file_is_told(scene, tmp_path, capsys, refine):
+    path = tmp_path / "camera.csv"
+    path.write_text("0 0\n0.2 0.5\n0.4 0.7\n0.6 0.6\n1 1\n")
+    config = quick(**{"schedule.iterations": 2, "response.name": str(path), "response.refine": refine})
+    for resume in (False, True):
+        train(scene, tmp_path / "run", config, device="cpu", resume=resume)
+        assert capsys.readouterr().err.count(f"{path}: 1 of 5 values fall, by up to 0.1; made monotone\n") == 1
+
+
 def test_run_folder_is_complete_and_loads_without_photos(scene, tmp_path):
     out = tmp_path / "run"
     run = train(scene, out, quick(), device="cpu", quiet=True, data={"path": "somewhere"})
