@@ -9,7 +9,7 @@ from ..model.response import response_by_name
 from ..training.config import Config
 from ..training.config_files import load_config
 from ..training.initialization import make_field
-from ..training.losses import total_loss
+from ..training.losses import data_loss, regularised
 from ..training.targets import training_views
 from ..training.trainer import Trainer
 from .case import Case, Reading, count, not_finite
@@ -59,8 +59,7 @@ def _learning_rates(device):
 
 def _gradient_norms(device):
     """The norm of each loss term's gradient by each parameter: finite, and none drowns the photo's by 1e4."""
-    trainer = _trainer(device)
-    field = trainer.field
+    field = _trainer(device).field
     view = training_views(toy_scene().train_views, 0, field.response, field.base_time, device, truth=False)[0]
     plain = {"loss.ssim_weight": 0.0}
     terms = {
@@ -72,10 +71,10 @@ def _gradient_norms(device):
     norms, broken = {}, 0
     for name, changes in terms.items():
         config = load_config("default", changes).loss
-        photo = trainer.field.photograph(view.camera, view.exposure_time)
-        trainer.field.zero_grad(set_to_none=True)
-        total_loss(trainer.field, photo, view.target, config).backward()
-        gradients = [p.grad for p in trainer.field.gaussians.parameters() if p.grad is not None]
+        photo = field.photograph(view.camera, view.exposure_time)
+        field.zero_grad(set_to_none=True)
+        regularised(data_loss(field, photo, view.target, config), field, config).backward()
+        gradients = [p.grad for p in field.gaussians.parameters() if p.grad is not None]
         broken += not_finite(*gradients)
         norms[name] = math.sqrt(sum(float(gradient.square().sum()) for gradient in gradients))
     readings = [Reading(f"{name}: gradient / L1's", norm / norms["L1"], 1e4) for name, norm in norms.items()]

@@ -249,7 +249,7 @@ def hdr_loss(photo: Photograph, target: Target, config: LossConfig, largest: flo
 
 
 def needed_colours(config: LossConfig, has_truth: bool) -> frozenset[str]:
-    """What RadianceField.photograph must render besides the photo for total_loss of a view with or without HDR truth:
+    """What RadianceField.photograph must render besides the photo for data_loss of a view with or without HDR truth:
     a colour set that nothing is compared with costs channels of every blend."""
     wanted = set()
     if config.hdr_weight > 0 and has_truth:
@@ -257,11 +257,6 @@ def needed_colours(config: LossConfig, has_truth: bool) -> frozenset[str]:
     if config.linear_weight > 0:
         wanted |= {"base"} if config.hdr_truth and has_truth else {"base", "exposure"}
     return frozenset(wanted)
-
-
-def total_loss(field: RadianceField, photo: Photograph, target: Target, config: LossConfig) -> Tensor:
-    """data_loss() and the regularisers."""
-    return regularised(data_loss(field, photo, target, config), field, config)
 
 
 def data_loss(

@@ -13,6 +13,7 @@ from sehdr_warp.training.config import LossConfig
 from sehdr_warp.training.losses import (
     CODE,
     Target,
+    data_loss,
     highlight_prior,
     image_loss,
     ldr_loss,
@@ -20,7 +21,7 @@ from sehdr_warp.training.losses import (
     mu_law,
     mu_of_knee,
     one_sided,
-    total_loss,
+    regularised,
 )
 
 from .toy import orbit_camera, toy_field
@@ -242,7 +243,8 @@ def test_priors_and_regularisers_add_what_they_weigh():
     target = replace(target_of(photo.encoded.detach().clamp(0, 1)), highlights=expected)
 
     def loss(**weights):
-        return total_loss(field, photo, target, LossConfig(**weights)).item()
+        config = LossConfig(**weights)
+        return regularised(data_loss(field, photo, target, config), field, config).item()
 
     plain = loss()
     assert loss(harmonics_weight=2.0) - plain == pytest.approx(0.5, rel=1e-4)
