@@ -103,7 +103,7 @@ class Trainer:
     def level(self) -> int:
         """How often the photos are halved at this iteration."""
         every = self.config.scaled(self.config.schedule.coarse_every)
-        return max(0, self.config.schedule.coarse_levels - (self.iteration - 1) // every)
+        return max(0, self.config.schedule.coarse_levels - max(0, self.iteration - 1) // every)
 
     @property
     def loss(self) -> float:

@@ -240,6 +240,17 @@ def test_steps_that_compare_light_do_not_encode_it_and_report_the_same(scene):
     assert trainers[0].psnr() == trainers[1].psnr() > 0
 
 
+@pytest.mark.parametrize("levels", [0, 1])
+def test_photos_are_coarse_as_long_as_asked_for_and_before_the_first_step(scene, levels):
+    config = quick(**{"schedule.coarse_levels": levels, "schedule.coarse_every": 2})
+    trainer = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cpu"))
+    seen = [trainer.level]
+    for _ in range(3):
+        trainer.step()
+        seen.append(trainer.level)
+    assert seen == [levels, levels, levels, 0]
+
+
 def test_non_finite_steps_are_skipped_and_then_stop(scene):
     config = quick(**{"schedule.nonfinite_limit": 20, "densification.noise": 0.0})
     field = make_field(scene, config, choose_response(scene, config), "cpu")
