@@ -66,6 +66,9 @@ def bench_response(
         {"data": list(data), "curves": list(curves), "exposures": exposures, "factor": factor, "single": single},
     )
     truths = {name: response_by_name(name) for name in curves}
+    for truth in truths.values():
+        for note in truth.notes:
+            progress(note)
     trials = []
     for place in data:
         if (Path(place) / "exposures.json").is_file():
