@@ -155,7 +155,8 @@ def _decoded_psnr(views, response: Response, time: float) -> tuple[float, float]
     """PSNR in dB of the photos' decoded radiance, gt-max and aligned."""
     truths = [torch.from_numpy(view.hdr).double() for view in views]
     decoded = [torch.from_numpy(np.asarray(response.decode(view.image.astype(np.float64)) / time)) for view in views]
-    scale = fit_scale((a, b, None) for a, b in zip(decoded, truths, strict=True)) or 1.0
+    photos = [torch.from_numpy(view.image) for view in views]
+    scale = fit_scale((a, b, None, photo) for a, b, photo in zip(decoded, truths, photos, strict=True)) or 1.0
     largest = max(float(truth.max()) for truth in truths)
     result = []
     for factor in (1.0, scale):

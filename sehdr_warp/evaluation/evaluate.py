@@ -133,7 +133,7 @@ class _Evaluation:
             return None, "no training view holds HDR truth to fit the scale on"
         if progress:
             progress(f"fitting the scale on {len(views)} training views")
-        scale = fit_scale((*self._render(view), self._tensor(view.mask)) for view in views)
+        scale = fit_scale((*self._render(view), self._tensor(view.mask), self._tensor(view.image)) for view in views)
         return scale, None if scale else "the renders of the training views hold no light to fit the scale on"
 
     def _render(self, view: View) -> tuple[torch.Tensor, torch.Tensor | None]:

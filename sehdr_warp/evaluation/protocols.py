@@ -8,15 +8,16 @@ gt-max    HDR-NeRF (xhuangcv/hdr-nerf, eval_hdr.py): prediction and truth are bo
 self-max  HDR-GS (caiyuanhao1998/HDR-GS, train_synthetic.py and scene/dataset_readers.py), Mono-HDR-GS: each image is
           divided by its own maximum; the tone-mapped truth is cut down to whole codes of 8 bits (floor(255 M) / 255),
           the prediction is not; PSNR is the mean of the three channels' PSNR (utils/image_utils.py).
-aligned   ours: the prediction is first multiplied by one factor for the whole scene, fitted on the training views in
-          log radiance; then as gt-max. It tells what is left once the unknowable global scale is taken out.
+aligned   ours: the prediction is first multiplied by one factor for the whole scene, fitted in log radiance on what the
+          training photos show well exposed; then as gt-max. It tells what is left once the unknowable global scale is
+          taken out.
 """
 
 from collections.abc import Iterable
 
 import torch
 
-from .metrics import mu_law, psnr
+from .metrics import mu_law, psnr, region_masks
 
 PROTOCOLS = ("gt-max", "self-max", "aligned")
 # Values below this fraction of a view's maximum do not vote on the scale: the mu-law (mu = 5000) shows next to nothing
@@ -72,27 +73,36 @@ def tone_mapped_psnr(
     return psnr(prediction, truth, mask, channels_apart=protocol == "self-max")
 
 
-def fit_scale(pairs: Iterable[tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]]) -> float | None:
+def fit_scale(
+    views: Iterable[tuple[torch.Tensor, torch.Tensor, torch.Tensor | None, torch.Tensor | None]],
+) -> float | None:
     """The factor that takes predictions to the truth: exp of the median of log(truth / prediction).
 
-    pairs: (prediction, truth, mask or None) of the training views; images [H, W, 3] scene-linear radiance. Every
-    channel of every pixel votes whose truth is above 1e-4 of the view's maximum and whose prediction is not black; a
-    median stands up to clipped, empty and wrong regions of up to half the votes.
+    views: (prediction, truth, mask or None, photo or None) of the training views; prediction and truth [H, W, 3]
+    scene-linear radiance, photo [H, W, 3] encoded. Every channel of every pixel votes whose truth is above 1e-4 of the
+    view's maximum, whose prediction is not black, and which the photo shows well exposed (region_masks): of clipped
+    light it tells no scale, and where most of a scene clips the median would be that of a guess. Where nothing is well
+    exposed all others vote. A median stands up to empty and wrong regions of up to half the votes.
 
     Returns None if nothing can vote (an empty prediction, or no view with truth).
     """
-    votes = []
-    for prediction, truth, mask in pairs:
+    votes, others = [], []
+    for prediction, truth, mask, photo in views:
         prediction, truth = prediction.double(), truth.double()
         valid = truth > VOTING_FLOOR * _maximum(truth, mask)
         # No floor for the prediction: its scale is what is sought, and one wild highlight would set its maximum.
         valid &= prediction > 0
         if mask is not None:
             valid &= (mask > 0.5)[..., None]
-        ratios = (truth[valid] / prediction[valid]).log()
-        votes.append(ratios[:: max(1, -(-len(ratios) // VOTES_PER_VIEW))].cpu())
-    joined = torch.cat(votes) if votes else torch.zeros(0)
-    return float(joined.median().exp()) if len(joined) else None
+        seen = torch.ones_like(valid) if photo is None else region_masks(photo)["well-exposed"][..., None]
+        for kept, chosen in ((votes, valid & seen), (others, valid & ~seen)):
+            ratios = (truth[chosen] / prediction[chosen]).log()
+            kept.append(ratios[:: max(1, -(-len(ratios) // VOTES_PER_VIEW))].cpu())
+    for kept in (votes, others):
+        joined = torch.cat(kept) if kept else torch.zeros(0)
+        if len(joined):
+            return float(joined.median().exp())
+    return None
 
 
 def _maximum(image: torch.Tensor, mask: torch.Tensor | None) -> float:

@@ -52,7 +52,7 @@ def test_what_each_protocol_forgives():
     for factor in (0.01, 3.0):
         scaled = prediction * factor
         assert figure("self-max", scaled, truth) == pytest.approx(figure("self-max", prediction, truth), abs=1e-9)
-        scale, before = fit_scale([(scaled, truth, None)]), fit_scale([(prediction, truth, None)])
+        scale, before = fit_scale([(scaled, truth, None, None)]), fit_scale([(prediction, truth, None, None)])
         assert figure("aligned", scaled, truth, scale) == pytest.approx(
             figure("aligned", prediction, truth, before), abs=1e-6
         )
@@ -72,13 +72,22 @@ def test_the_scale_stands_up_to_a_third_of_wrong_pixels():
     prediction = truth / 2.5 * torch.exp(0.02 * torch.randn(truth.shape, dtype=torch.float64))
     prediction[:13] = truth[:13].clamp(max=0.5)
     prediction[13:15] = 0
-    assert fit_scale([(prediction, truth, None)]) == pytest.approx(2.5, rel=0.02)
+    assert fit_scale([(prediction, truth, None, None)]) == pytest.approx(2.5, rel=0.02)
 
 
 def test_one_scale_serves_the_whole_scene():
-    views = [(radiance(seed) / 3, radiance(seed), None) for seed in range(3)]
-    views[2] = (views[2][0] * 10, views[2][1], None)
+    views = [(radiance(seed) / 3, radiance(seed), None, None) for seed in range(3)]
+    views[2] = (views[2][0] * 10, *views[2][1:])
     assert fit_scale(views) == pytest.approx(3.0)
+
+
+def test_clipped_pixels_vote_where_nothing_else_can():
+    """Four fifths of the picture clip, and their light is guessed four times too low: the rest tells the scale."""
+    truth = radiance(9)
+    prediction, photo = truth / 2, torch.full((40, 50, 3), 0.5)
+    prediction[:32], photo[:32] = truth[:32] / 8, 1.0
+    assert fit_scale([(prediction, truth, None, photo)]) == pytest.approx(2.0)
+    assert fit_scale([(prediction, truth, None, torch.ones_like(photo))]) == pytest.approx(8.0)
 
 
 def test_masked_pixels_have_no_vote_and_no_maximum():
@@ -86,7 +95,7 @@ def test_masked_pixels_have_no_vote_and_no_maximum():
     prediction = truth / 2
     truth, prediction = truth.clone(), prediction.clone()
     truth[:30], mask[:30] = 1e6, 0
-    assert fit_scale([(prediction, truth, mask)]) == pytest.approx(2.0)
+    assert fit_scale([(prediction, truth, mask, None)]) == pytest.approx(2.0)
     for protocol in PROTOCOLS:
         a, b = normalise(protocol, prediction, truth, mask)
         assert b[30:].max().item() == 1.0
@@ -99,7 +108,7 @@ def test_black_images_stay_black():
         for prediction, target in ((black, truth), (truth, black), (black, black)):
             a, b = tone_map(protocol, prediction, target)
             assert torch.isfinite(a).all() and torch.isfinite(b).all()
-    assert fit_scale([(black, truth, None)]) is None and fit_scale([]) is None
+    assert fit_scale([(black, truth, None, None)]) is None and fit_scale([]) is None
 
 
 def test_unknown_protocols_are_refused():
