@@ -9,7 +9,7 @@ self-max  HDR-GS (caiyuanhao1998/HDR-GS, train_synthetic.py and scene/dataset_re
           divided by its own maximum; the tone-mapped truth is cut down to whole codes of 8 bits (floor(255 M) / 255),
           the prediction is not; PSNR is the mean of the three channels' PSNR (utils/image_utils.py).
 aligned   ours: the prediction is first multiplied by one factor for the whole scene, fitted in log radiance on what the
-          training photos show well exposed; then as gt-max. It tells what is left once the unknowable global scale is
+          training photos do not show clipped; then as gt-max. It tells what is left once the unknowable global scale is
           taken out.
 """
 
@@ -25,6 +25,7 @@ PROTOCOLS = ("gt-max", "self-max", "aligned")
 VOTING_FLOOR = 1e-4
 # Votes taken from one view; evenly spaced pixels, so that large photos cost no memory.
 VOTES_PER_VIEW = 65536
+LEAST_VOTES = 100
 
 
 def normalise(
@@ -80,13 +81,13 @@ def fit_scale(
 
     views: (prediction, truth, mask or None, photo or None) of the training views; prediction and truth [H, W, 3]
     scene-linear radiance, photo [H, W, 3] encoded. Every channel of every pixel votes whose truth is above 1e-4 of the
-    view's maximum, whose prediction is not black, and which the photo shows well exposed (region_masks): of clipped
-    light it tells no scale, and where most of a scene clips the median would be that of a guess. Where nothing is well
-    exposed all others vote. A median stands up to empty and wrong regions of up to half the votes.
+    view's maximum, whose prediction is not black, and which the photo does not show clipped (region_masks): it does not
+    tell such light, and where most of a scene clips the median would be that of a guess. Clipped pixels vote where
+    fewer than LEAST_VOTES others do. A median stands up to empty and wrong regions of up to half the votes.
 
     Returns None if nothing can vote (an empty prediction, or no view with truth).
     """
-    votes, others = [], []
+    votes, guesses = [], []
     for prediction, truth, mask, photo in views:
         prediction, truth = prediction.double(), truth.double()
         valid = truth > VOTING_FLOOR * _maximum(truth, mask)
@@ -94,15 +95,19 @@ def fit_scale(
         valid &= prediction > 0
         if mask is not None:
             valid &= (mask > 0.5)[..., None]
-        seen = torch.ones_like(valid) if photo is None else region_masks(photo)["well-exposed"][..., None]
-        for kept, chosen in ((votes, valid & seen), (others, valid & ~seen)):
-            ratios = (truth[chosen] / prediction[chosen]).log()
-            kept.append(ratios[:: max(1, -(-len(ratios) // VOTES_PER_VIEW))].cpu())
-    for kept in (votes, others):
-        joined = torch.cat(kept) if kept else torch.zeros(0)
-        if len(joined):
-            return float(joined.median().exp())
-    return None
+        clipped = torch.zeros_like(valid) if photo is None else region_masks(photo)["clipped"][..., None]
+        votes.append(_log_ratios(prediction, truth, valid & ~clipped))
+        if sum(map(len, votes)) < LEAST_VOTES:
+            guesses.append(_log_ratios(prediction, truth, valid & clipped))
+    if sum(map(len, votes)) < LEAST_VOTES:
+        votes += guesses
+    joined = torch.cat(votes) if votes else torch.zeros(0)
+    return float(joined.median().exp()) if len(joined) else None
+
+
+def _log_ratios(prediction: torch.Tensor, truth: torch.Tensor, chosen: torch.Tensor) -> torch.Tensor:
+    ratios = (truth[chosen] / prediction[chosen]).log()
+    return ratios[:: max(1, -(-len(ratios) // VOTES_PER_VIEW))].cpu()
 
 
 def _maximum(image: torch.Tensor, mask: torch.Tensor | None) -> float:

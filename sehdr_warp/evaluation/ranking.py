@@ -44,8 +44,7 @@ class ErrorRanking:
         log2    |log2((scale prediction + black) / (truth + black))|, black = scale darkest, stops
         mu      |mu-law(scale prediction) - mu-law(truth)|, both over the largest truth of the view
 
-        scale takes the renders to the truth by the median over well-exposed pixels. That of the protocol `aligned`
-        counts clipped pixels too; where they are the majority it would move their error into all others.
+        scale takes the renders to the truth by the median over the well-exposed pixels that are ranked.
         """
         figures = dict.fromkeys(("spearman_log2", "spearman_mu", "mean", "scale")) | {"pixels": 0}
         confidence = torch.cat([view[0] for view in self._views]) if self._views else torch.zeros(0)

@@ -47,7 +47,7 @@ def _notes(result: dict) -> list[str]:
     notes = [f"PU21: the {white} of each view's truth is shown at {pu21['peak_luminance']:g} cd/m^2."] * has_truth
     scale = result["protocol"].get("aligned", {}).get("scale")
     if scale is not None:
-        notes.append(f"aligned: radiance times {scale:.4g}, fitted on the training views.")
+        notes.append(f"aligned: radiance times {scale:.4g}, fitted on what the training photos do not show clipped.")
     if result["lpips_backbone"]:
         notes.append(f"LPIPS: {result['lpips_backbone']}.")
     if result["split"] == "train":

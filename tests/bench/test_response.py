@@ -1,13 +1,14 @@
 """Finding responses, measured: the error, the truth from a stack, and the whole command."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from sehdr_warp.bench.exposure_stack import read_stack, stack_curve
-from sehdr_warp.bench.response import CODES, bench_response, curve_stops, response_error
+from sehdr_warp.bench.response import CODES, _decoded_psnr, bench_response, curve_stops, response_error
 from sehdr_warp.errors import InputError
 from sehdr_warp.model.response import response_by_name
 
@@ -79,3 +80,13 @@ def test_report_over_a_stack_and_the_embedded_scene(tmp_path):
     assert scene["trials"] == 2 and scene["mean_error"] <= scene["worst_error"]
     assert scene["aligned_db"] <= scene["aligned_known_db"] + 0.1
     assert len(report["trials"]) == (len(TIMES) + 2) * 11
+
+
+def test_clipped_light_does_not_scale_what_is_decoded():
+    """The true curve needs no factor, though most of the photo clips."""
+    truth = response_by_name("camera")
+    hdr = np.exp(np.random.default_rng(0).normal(1.5, 1.5, (60, 60, 3))).astype(np.float32)
+    image = (np.round(truth.encode(hdr) * 255) / 255).astype(np.float32)
+    assert 0.6 < (image == 1).mean() < 0.9
+    plain, aligned = _decoded_psnr([SimpleNamespace(hdr=hdr, image=image)], truth, 1.0)
+    assert aligned == pytest.approx(plain, abs=0.1)

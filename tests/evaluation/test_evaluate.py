@@ -56,6 +56,21 @@ def no_weights(monkeypatch):
 VIEWS = [view(0, "train"), view(1, "train"), view(2, "test"), view(3, "test")]
 
 
+def test_what_training_photos_show_clipped_does_not_decide_the_scale():
+    photo = np.ones((24, 30, 3), np.float32)
+    photo[20:] = 0.5
+
+    def change(hdr):
+        changed = hdr / 2.1
+        changed[:20] /= 3
+        return changed
+
+    views = [view(0, "train", photo=photo), *VIEWS[2:]]
+    assert evaluate(run(change), scene(views))["protocol"]["aligned"]["scale"] == pytest.approx(2.1)
+    plain = [view(0, "train", photo=np.full_like(photo, 0.5)), *VIEWS[2:]]
+    assert evaluate(run(change), scene(plain))["protocol"]["aligned"]["scale"] == pytest.approx(6.3)
+
+
 def test_a_render_that_is_too_dark():
     lines = []
     result = evaluate(run(lambda hdr: hdr / 2.1), scene(VIEWS), progress=lines.append)

@@ -87,7 +87,12 @@ def test_clipped_pixels_vote_where_nothing_else_can():
     prediction, photo = truth / 2, torch.full((40, 50, 3), 0.5)
     prediction[:32], photo[:32] = truth[:32] / 8, 1.0
     assert fit_scale([(prediction, truth, None, photo)]) == pytest.approx(2.0)
-    assert fit_scale([(prediction, truth, None, torch.ones_like(photo))]) == pytest.approx(8.0)
+    # Ten pixels are too few to decide alone; neither are a mask's holes.
+    photo[32:], photo[39, 40:] = 1.0, 0.5
+    assert fit_scale([(prediction, truth, None, photo)]) == pytest.approx(8.0)
+    mask = torch.zeros(40, 50)
+    mask[39] = 1
+    assert fit_scale([(prediction, truth, mask, photo)]) == pytest.approx(2.0)
 
 
 def test_masked_pixels_have_no_vote_and_no_maximum():
