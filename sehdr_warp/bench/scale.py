@@ -186,6 +186,7 @@ def _step_rows(name: str, size: Size, device, with_gsplat: bool, repetitions: in
         row = _row(name, size, COMPARED_CHANNELS, who, WHOLE_STEP) | timing.to_dict()
         if device.type == "cuda":
             row["peak_memory_bytes"] = torch.cuda.max_memory_allocated(device)
+            row["requested_memory_bytes"] = torch.cuda.memory_stats(device)["requested_bytes.all.peak"]
             if who == OURS:
                 row["peak_memory_bytes"] += held_by_warp(device)
                 row["warp_memory_bytes"] = held_by_warp(device)
