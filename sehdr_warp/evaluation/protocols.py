@@ -25,6 +25,7 @@ PROTOCOLS = ("gt-max", "self-max", "aligned")
 VOTING_FLOOR = 1e-4
 # Votes taken from one view; evenly spaced pixels, so that large photos cost no memory.
 VOTES_PER_VIEW = 65536
+# Fewer than these, such as a few mixed pixels at the border of a white photo, decide nothing alone.
 LEAST_VOTES = 100
 
 
