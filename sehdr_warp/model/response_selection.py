@@ -67,7 +67,7 @@ class ResponseScore:
         linear light, every share as likely; smaller is better; NaN if the photos have fewer than 50 usable edges.
     highlights: minus the log likelihood, nats, of the pixels at the brightest code beside those just below it.
     span: minus the log likelihood, nats, of how far the decoded values spread.
-    density: minus the log likelihood, nats, of how evenly the decoded values are spread over log exposure.
+    density: minus the log likelihood, nats, of how smoothly the decoded values are spread over log exposure.
     prior: minus the log prior, nats. posterior: the sum of the five, edges counted as EDGES_PER_FACT says.
     """
 

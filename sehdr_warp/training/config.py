@@ -61,9 +61,9 @@ class ResponseConfig:
     name: str = option("auto", "a response's name, a file, or auto: the one that fits the photos best", nonempty=True)
     method: str = option(
         "posterior",
-        "how auto chooses; posterior: colours across edges mix linearly (Lin et al. 2004), light is spread smoothly over "
-        "as many stops as scenes usually have, and cameras' own JPEGs are known to have a camera's curve; edges: the "
-        "first of these alone; paper: dynamic range and smoothness on one random training photo",
+        "how auto chooses; posterior: colours across edges mix linearly (Lin et al. 2004), light is spread smoothly "
+        "over as many stops as scenes usually have, and cameras' own JPEGs are known to have a camera's curve; edges: "
+        "the first of these alone; paper: dynamic range and smoothness on one random training photo",
         choices=("posterior", "edges", "paper"),
     )
     candidates: tuple[str, ...] = option(
