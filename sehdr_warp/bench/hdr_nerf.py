@@ -3,12 +3,14 @@
 Source: Huang et al., HDR-NeRF: High Dynamic Range Neural Radiance Fields (CVPR 2022), on NeRF (Mildenhall et al., ECCV
 2020). Sizes, rates and weights are those of the paper and its configs. Assumed here: depths are uniform between bounds
 taken from the scene's points, or from where the cameras look (the authors use normalised device coordinates, or bounds
-by hand); positions are brought into [-1, 1] by a common shift and scale before they are encoded.
+by hand); positions are brought into [-1, 1] by a common shift and scale before they are encoded. On a GPU products of
+matrices round their factors to TF32, as torch did unasked at the time.
 """
 
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -198,9 +200,10 @@ class HdrNerfRun:
         origins, directions = (torch.tensor(rays, device=self.device) for rays in camera_rays(camera))
         log_time = torch.full((len(origins), 1), math.log(exposure_time), device=self.device)
         step, rows = self.fields[0].settings.rays_at_once, []
-        for start in range(0, len(origins), step):
-            part = slice(start, start + step)
-            rows.append(self.trace(origins[part], directions[part], log_time[part], None)[-1])
+        with _tf32():
+            for start in range(0, len(origins), step):
+                part = slice(start, start + step)
+                rows.append(self.trace(origins[part], directions[part], log_time[part], None)[-1])
         hdr, encoded, alpha, depth = (torch.cat(values) for values in zip(*rows, strict=True))
         size = camera.height, camera.width
         ahead = torch.tensor(camera.world_to_camera[2, :3], dtype=torch.float32, device=self.device)
@@ -271,7 +274,8 @@ def train_hdr_nerf(
     evaluate_at = set(evaluate_at)
     while not _finished(run, iterations, seconds):
         started = time.perf_counter()
-        loss = _step(run, rays, optimizer, generator)
+        with _tf32():
+            loss = _step(run, rays, optimizer, generator)
         if run.iterations % 100 == 0 and not math.isfinite(float(loss)):
             raise SehdrError(f"HDR-NeRF diverged by iteration {run.iterations}; lower its rate or check the cameras")
         if seconds is not None or run.iterations in evaluate_at or run.iterations == iterations:
@@ -341,3 +345,14 @@ def _evaluate(run: HdrNerfRun, scene: Scene) -> None:
 def _wait(device: torch.device) -> None:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
+
+
+@contextmanager
+def _tf32() -> Iterator[None]:
+    """Within the block products of float32 matrices may round their factors to TF32 where the device has it."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)

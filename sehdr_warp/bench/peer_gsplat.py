@@ -199,3 +199,11 @@ def rasterize_with_gsplat(
     radii = radii.amax(-1) if radii.ndim == 2 else radii
     means2d, depths = info["means2d"][0], info["depths"][0]
     return Rendering(image[0], None, means2d, depths, radii, 0)
+
+
+def spherical_harmonics_with_gsplat(degree: int, coefficients, means, camera_position):
+    """spherical_harmonics() by gsplat, which takes directions, and all coefficients in one tensor."""
+    from gsplat import spherical_harmonics
+
+    joined = coefficients if isinstance(coefficients, torch.Tensor) else torch.cat(coefficients, dim=1)
+    return spherical_harmonics(degree, means - camera_position, joined)

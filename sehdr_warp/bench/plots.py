@@ -36,6 +36,7 @@ def plot_scale(report: dict, path: Path) -> None:
     names = list(dict.fromkeys(row["sweep"] for row in rows))
     labels = list(dict.fromkeys((row["implementation"], row["what"]) for row in rows))
     colors = {what: f"C{place}" for place, what in enumerate(dict.fromkeys(what for _, what in labels))}
+    styles = dict(zip(dict.fromkeys(who for who, _ in labels), ("-", "--", ":")))
     figure, panels = _panels(2, len(names))
     lines = {}
     for panel_row, field, unit, scale in zip(
@@ -49,7 +50,7 @@ def plot_scale(report: dict, path: Path) -> None:
                     if (row["sweep"], row["implementation"], row["what"]) == (name, who, what) and row.get(field)
                 ]
                 if chosen:
-                    style = "--" if who == "gsplat" else "-"
+                    style = styles[who]
                     lines[f"{who}: {what}"] = axes.plot(*zip(*chosen), style, color=colors[what], marker="o", ms=3)[0]
             axes.set(xlabel=name, ylabel=unit, xscale="log", yscale="log")
             axes.grid(True, which="major", alpha=0.3)

@@ -2,7 +2,7 @@
 
 import gc
 from collections.abc import Callable
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from unittest.mock import patch
 
@@ -16,7 +16,7 @@ from ..training.config import Config
 from ..training.config_files import load_config
 from . import checks
 from .kernels import OURS
-from .peer_gsplat import rasterize_with_gsplat
+from .peer_gsplat import rasterize_with_gsplat, spherical_harmonics_with_gsplat
 from .peers import Peer, find_peers
 from .report import new_report
 from .scenes import make_photo_scene
@@ -32,6 +32,9 @@ STEP_VIEWS = 2
 STEP_PRESET = "paper"
 """The preset with three colour sets, nine channels in one pass."""
 WHOLE_STEP, WHOLE_SPLAT = "training step", "splat, forward + backward"
+GSPLAT, GSPLAT_AND_HARMONICS = "gsplat", "gsplat and its harmonics"
+"""Steps with gsplat's rasterizer in place of ours, all else alike; and with its spherical harmonics too, as whoever
+builds on gsplat would take them."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,7 @@ def bench_scale(
     settings = {"device": str(device), "repetitions": repetitions, "cpu_seconds_per_variant": budget}
     report = new_report("scale", device, settings | {"sweeps": [sweep.name for sweep in chosen]})
     found, notes = find_peers(device) if peers else ([], ["gsplat not compared: not asked for (--peers)"])
-    gsplat = next((peer for peer in found if peer.name == "gsplat"), None)
+    gsplat = next((peer for peer in found if peer.name == GSPLAT), None)
     report["notes"] += [note for note in notes if note.startswith("gsplat")]
     checked: set[int] = set()
     for sweep in chosen:
@@ -102,7 +105,7 @@ def bench_scale(
             del scene
             _empty(device)
             if steps and sweep.name != "channels":
-                report["rows"] += _step_rows(sweep.name, size, device, beside is not None, repetitions, budget)
+                report["rows"] += _step_rows(sweep.name, size, device, beside, repetitions, budget, report)
                 _empty(device)
             progress(_line(sweep.name, size, channels, report["rows"]))
     slopes = fit_slopes(report["rows"])
@@ -145,9 +148,9 @@ def _splat_rows(name, scene: SplatScene, gsplat: Peer | None, repetitions, budge
     prepared = prepare(scene)
     renderers = {OURS: lambda: _render(scene)}
     if gsplat is not None:
-        renderers["gsplat"] = gsplat.renderer(scene)
+        renderers[GSPLAT] = gsplat.renderer(scene)
         with torch.no_grad():
-            difference = checks.differs(renderers["gsplat"](), _render(scene))
+            difference = checks.differs(renderers[GSPLAT](), _render(scene))
         found = checks.Check("gsplat: image", OURS, str(scene.size), scene.channels, difference, gsplat.bound)
         report["checks"].append(found.to_dict())
     variants = {(OURS, stage): variant for stage, variant in stage_variants(scene, prepared).items()}
@@ -169,18 +172,19 @@ def _splat_rows(name, scene: SplatScene, gsplat: Peer | None, repetitions, budge
     return rows
 
 
-def _step_rows(name: str, size: Size, device, with_gsplat: bool, repetitions: int, budget: float) -> list[dict]:
+def _step_rows(name: str, size: Size, device, gsplat: Peer | None, repetitions, budget, report) -> list[dict]:
     """Whole training steps of the preset on photos of this size; peak memory is all that is held on a GPU, photos,
     parameters and optimiser included."""
     scene = make_photo_scene(size, views=STEP_VIEWS, device=device)
     first = thick_of_training(_step_config(OURS, size))
-    rows = []
-    for who in (OURS, "gsplat") if with_gsplat else (OURS,):
+    rows, losses = [], {}
+    for who in (OURS,) if gsplat is None else (OURS, GSPLAT, GSPLAT_AND_HARMONICS):
         _empty(device)
-        with _rasterizer_of(who):
+        with _kernels_of(who):
             trainer = make_trainer(scene, _step_config(who, size), device, first)
             variant = Variant(lambda _, t=trainer: t.step(), prepare=lambda t=trainer: between_changes(t, first))
             variant.once()
+            losses[who] = trainer.loss
             # One variant: turns would only add untimed runs.
             timing = time_variants({who: variant}, device, repetitions=repetitions, budget=budget)[who]
         row = _row(name, size, COMPARED_CHANNELS, who, WHOLE_STEP) | timing.to_dict()
@@ -194,6 +198,10 @@ def _step_rows(name: str, size: Size, device, with_gsplat: bool, repetitions: in
             row["peak_memory_bytes"] = peak_memory(variant, device)
         rows.append(row)
         del trainer, variant
+        if who != OURS:
+            difference = abs(losses[who] - losses[OURS]) / abs(losses[OURS])
+            found = checks.Check(f"{who}: loss", OURS, str(size), COMPARED_CHANNELS, difference, gsplat.bound)
+            report["checks"].append(found.to_dict())
     return rows
 
 
@@ -211,12 +219,13 @@ def _step_config(who: str, size: Size) -> Config:
 
 
 @contextmanager
-def _rasterizer_of(who: str):
-    """Within the block training steps are drawn by ours or by gsplat."""
-    if who == OURS:
-        yield
-        return
-    with patch.object(radiance_field, "rasterize", rasterize_with_gsplat):
+def _kernels_of(who: str):
+    """Within the block training steps run on our kernels, or on gsplat's where it has them."""
+    with ExitStack() as replaced:
+        if who != OURS:
+            replaced.enter_context(patch.object(radiance_field, "rasterize", rasterize_with_gsplat))
+        if who == GSPLAT_AND_HARMONICS:
+            replaced.enter_context(patch.object(radiance_field, "spherical_harmonics", spherical_harmonics_with_gsplat))
         yield
 
 

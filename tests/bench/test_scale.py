@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sehdr_warp.bench import commands, scale
-from sehdr_warp.bench.peer_gsplat import rasterize_with_gsplat
+from sehdr_warp.bench.peer_gsplat import rasterize_with_gsplat, spherical_harmonics_with_gsplat
 from sehdr_warp.bench.peers import Peer
 from sehdr_warp.bench.report import format_report, write_report
 from sehdr_warp.bench.scale import Sweep, bench_scale, parse_sweeps, verdict
@@ -16,7 +16,7 @@ from sehdr_warp.bench.slopes import fit_slopes
 from sehdr_warp.bench.splats import Size, make_splat_scene
 from sehdr_warp.bench.stages import STAGES
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.splatting import rasterize
+from sehdr_warp.splatting import rasterize, spherical_harmonics
 
 CPU = torch.device("cpu")
 
@@ -61,7 +61,11 @@ def fake_gsplat(monkeypatch):
         info = {"means2d": drawn.means2d[None], "radii": radii, "depths": drawn.depths[None]}
         return drawn.image[None], drawn.alpha[None, ..., None], info
 
-    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
+    def harmonics(degrees_to_use, dirs, coeffs):
+        return spherical_harmonics(degrees_to_use, coeffs, dirs, dirs.new_zeros(3))
+
+    fake = SimpleNamespace(rasterization=rasterization, spherical_harmonics=harmonics)
+    monkeypatch.setitem(sys.modules, "gsplat", fake)
 
 
 def test_gsplat_draws_what_a_training_step_of_ours_asks_for(monkeypatch):
@@ -74,6 +78,18 @@ def test_gsplat_draws_what_a_training_step_of_ours_asks_for(monkeypatch):
     gradients = [torch.autograd.grad(drawn.image.square().sum(), scene.leaves) for drawn in (ours, theirs)]
     for mine, other in zip(*gradients, strict=True):
         torch.testing.assert_close(other, mine, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("joined", [True, False])
+def test_gsplat_evaluates_the_harmonics_that_a_training_step_of_ours_asks_for(monkeypatch, joined):
+    fake_gsplat(monkeypatch)
+    torch.manual_seed(3)
+    coefficients, means, position = torch.randn(20, 9, 3), torch.randn(20, 3), torch.randn(3)
+    given = coefficients if joined else (coefficients[:, :1], coefficients[:, 1:])
+    ours, theirs = (
+        evaluate(2, given, means, position) for evaluate in (spherical_harmonics, spherical_harmonics_with_gsplat)
+    )
+    torch.testing.assert_close(theirs, ours)
 
 
 @pytest.mark.parametrize("who", ["sehdr-warp", "gsplat"])
@@ -96,18 +112,25 @@ def test_points_have_stages_memory_steps_and_gsplat(monkeypatch, tmp_path):
     rows = [row for row in report["rows"] if row["stage"] == "scale"]
     ours = [row["what"] for row in rows if row["implementation"] == "sehdr-warp" and row["varied"] == 200]
     assert ours == [*STAGES, scale.WHOLE_SPLAT, scale.WHOLE_STEP]
-    assert [row["what"] for row in rows if row["implementation"] == "gsplat"] == [
-        scale.WHOLE_SPLAT,
-        scale.WHOLE_STEP,
-    ] * 2
+    theirs = [(row["implementation"], row["what"]) for row in rows if row["implementation"].startswith("gsplat")]
+    assert (
+        theirs
+        == [
+            (scale.GSPLAT, scale.WHOLE_SPLAT),
+            (scale.GSPLAT, scale.WHOLE_STEP),
+            (scale.GSPLAT_AND_HARMONICS, scale.WHOLE_STEP),
+        ]
+        * 2
+    )
     assert all(row["median_ms"] > 0 for row in rows)
     weighed = [row for row in rows if row["what"] in (scale.WHOLE_SPLAT, scale.WHOLE_STEP)]
     assert all(row["peak_memory_bytes"] > 48 * 40 * 9 * 4 for row in weighed)
     slopes = [row for row in report["rows"] if row["stage"] == "slope"]
-    # Time of each stage and of four wholes, memory of the wholes.
-    assert len(slopes) == len(STAGES) + 4 + 4
+    # Time of each stage and of five wholes, memory of the wholes.
+    assert len(slopes) == len(STAGES) + 5 + 5
     assert report["notes"][-1] == verdict(slopes)
     assert [check["what"] for check in report["checks"]].count("gsplat: image") == 2
+    assert sum(check["what"].endswith(": loss") for check in report["checks"]) == 2 * 2
     assert all(check["passed"] for check in report["checks"])
     write_report(report, out=tmp_path)
     assert (tmp_path / "scale.png").read_bytes()[:4] == b"\x89PNG"
