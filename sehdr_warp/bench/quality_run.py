@@ -113,6 +113,7 @@ class Runner:
     def _forget_peaks(self) -> None:
         gc.collect()
         if self.device.startswith("cuda"):
+            torch.cuda.init()  # before a first use torch has no peaks to forget, and says so by an error
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats(self.device)
         # Linux: 5 resets the process's peak; elsewhere the peak is that of all jobs so far, and is left out.
