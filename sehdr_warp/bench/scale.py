@@ -191,6 +191,7 @@ def _step_rows(name: str, size: Size, device, gsplat: Peer | None, repetitions, 
         if device.type == "cuda":
             row["peak_memory_bytes"] = torch.cuda.max_memory_allocated(device)
             row["requested_memory_bytes"] = torch.cuda.memory_stats(device)["requested_bytes.all.peak"]
+            row["reserved_memory_bytes"] = torch.cuda.max_memory_reserved(device)
             if who == OURS:
                 row["peak_memory_bytes"] += held_by_warp(device)
                 row["warp_memory_bytes"] = held_by_warp(device)

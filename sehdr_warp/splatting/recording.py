@@ -14,6 +14,10 @@ import warp as wp
 
 from .bridge import torch_stream
 
+IDLE_BYTES = 256 << 20
+"""More of torch's memory than this that is not in use is given back before a recording is made, which has memory of its
+own and could not use it; while one is made torch gives nothing back."""
+
 
 @contextmanager
 def _no_collection():
@@ -122,6 +126,8 @@ class GraphRecorder:
         return self._result
 
     def _record(self, function: Callable):
+        if torch.cuda.memory_reserved(self.device) - torch.cuda.memory_allocated(self.device) > IDLE_BYTES:
+            torch.cuda.empty_cache()
         graph = torch.cuda.CUDAGraph()
         current = torch.cuda.current_stream(self.device)
         self.stream.wait_stream(current)

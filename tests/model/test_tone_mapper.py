@@ -95,6 +95,14 @@ def test_seeds_differ_and_descriptions_keep_the_shape():
         Response.from_dict({"kind": "mlp"})
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_every_channel_starts_rising_in_the_dark_and_in_the_light(seed):
+    log_exposure = torch.tensor([-12.0, -8.0, 8.0, 12.0])[:, None].expand(-1, 3)
+    with torch.no_grad():
+        darkest, dark, light, lightest = ToneMapper(16, seed).encode_log(log_exposure).logit()
+    assert (dark > darkest).all() and (lightest > light).all()
+
+
 @pytest.mark.parametrize("tone_map", ["pixel", "gaussian"])
 def test_a_field_photographs_through_it_and_teaches_it(tone_map, device):
     gaussians = Gaussians.from_points(torch.tensor([[0.0, 0.0, 3.0]]), torch.full((1, 3), -1.0), 0, opacity=0.99)

@@ -107,3 +107,13 @@ def test_an_invalidated_recording_is_made_again():
     assert recorder.run("b", step).tolist() == [3.0] * 4
     recorder.invalidate()
     assert recorder.run(None, step).tolist() == [3.0] * 4
+
+
+@needs_gpu
+def test_a_recording_leaves_the_device_what_launches_no_longer_use():
+    large = torch.zeros(2 * recording.IDLE_BYTES, dtype=torch.uint8, device="cuda")
+    held = torch.cuda.memory_reserved()
+    del large
+    assert torch.cuda.memory_reserved() == held
+    GraphRecorder("cuda:0")
+    assert torch.cuda.memory_reserved() <= held - 2 * recording.IDLE_BYTES + (4 << 20)
