@@ -11,7 +11,7 @@ from ..errors import SehdrError
 from ..evaluation.metrics import decibels, mu_law
 from ..evaluation.protocols import fit_scale
 from ..model.response import Response, response_by_name
-from ..model.response_selection import EDGES_PER_FACT, ResponseScore, select_response
+from ..model.response_selection import ResponseScore, edge_facts, select_response
 from ..scene import Scene, load_scene
 from ..scene.exposure import made_by_camera
 from ..synth.expose import expose, exposure_ladder
@@ -135,7 +135,7 @@ def _choices(images, from_camera: bool, seed: int):
 def _weighted(score: ResponseScore, part: str, edge_count: int) -> float:
     """What a part adds to the posterior."""
     if part == "edges":
-        return 0.0 if np.isnan(score.edges) else score.edges * edge_count / EDGES_PER_FACT
+        return 0.0 if np.isnan(score.edges) else score.edges * edge_facts(edge_count)
     return getattr(score, part)
 
 

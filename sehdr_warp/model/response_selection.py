@@ -17,7 +17,7 @@ CODE = 1.0 / 255
 EDGE_REACH, FLAT_CODES, EDGE_CODES = 2, 3, 20
 # The two ends' encoded colours must not be one grey scaled: angle between them, in radians.
 EDGE_ANGLE = 0.05
-MAX_EDGES, MIN_EDGES = 3000, 50
+MAX_EDGES, MIN_EDGES = 12_000, 50
 # The middle lies between these shares of the way from one side to the other, in encoded values.
 LEAST_SHARE, MOST_SHARE = 0.15, 0.85
 # Variance of a stored value in codes^2: rounding, and a little for what two evenly coloured sides still hide.
@@ -27,8 +27,8 @@ EDGE_FREEDOM = 2.0
 # How far edges lie off their line is not known beforehand (texture, denoised or compressed images): the variance is
 # this many times that of rounding, whichever is likeliest under a candidate.
 EDGE_MISFITS = 2.0 ** np.arange(0, 8.5, 0.5)
-# Edges of one set of photos share what is wrong with them: this many count as one.
-EDGES_PER_FACT = 160.0
+# Edges of one set of photos share what is wrong with them: this many count as one, and all as no more than so many.
+EDGES_PER_FACT, MOST_FACTS = 160.0, 18.75
 # Radiance falls off above white by this natural log per stop, within a factor of 2.2 (one standard deviation).
 HIGHLIGHT_RATE, HIGHLIGHT_SPREAD, HIGHLIGHT_FLOOR = 0.4, 0.8, 0.002
 # Standard deviation of ln exposure over the values that are neither black nor white: 1.35, within a factor of 1.5.
@@ -68,7 +68,7 @@ class ResponseScore:
     highlights: minus the log likelihood, nats, of the pixels at the brightest code beside those just below it.
     span: minus the log likelihood, nats, of how far the decoded values spread.
     density: minus the log likelihood, nats, of how smoothly the decoded values are spread over log exposure.
-    prior: minus the log prior, nats. posterior: the sum of the five, edges counted as EDGES_PER_FACT says.
+    prior: minus the log prior, nats. posterior: the sum of the five, edges times edge_facts(their number).
     """
 
     response: Response
@@ -119,7 +119,7 @@ def select_response(
         beside the bank. A formula with a quarter of the posterior is taken; else the response is the posterior's
         mean of log exposure at each code, a table that is none of the candidates.
     from_camera: the photos are a camera's own JPEGs: the prior is then that of cameras.
-    seed: of the sample of edges where there are more than 3000.
+    seed: of the sample of edges where there are more than 12 000.
 
     All find a curve only up to the exposure's scale, and none is calibration: docs/response.md has measured errors.
     Raises SehdrError for an unknown method, no candidates, an image of another shape or with NaN, or, but for the
@@ -151,7 +151,7 @@ def select_response(
             _highlights(bright, stops),
             _prior(each, from_camera),
         )
-        posterior = np.nan_to_num(surprise) * len(edges) / EDGES_PER_FACT + highlights + of_shares + prior
+        posterior = np.nan_to_num(surprise) * edge_facts(len(edges)) + highlights + of_shares + prior
         rows.append((*_range_and_roughness(fullest, each), surprise, highlights, prior, posterior))
     ranges, roughnesses, surprises, highlights, priors, posteriors = np.array(rows, dtype=np.float64).T
     paper = _relative(ranges) - _relative(roughnesses)
@@ -169,13 +169,18 @@ def select_response(
     return ResponseSelection(best, method, len(edges), ranked)
 
 
+def edge_facts(count: int) -> float:
+    """How many independent observations so many edges of one set of photos count as."""
+    return min(count / EDGES_PER_FACT, MOST_FACTS)
+
+
 def _beside_family(points, bright, shares, known, priors, posteriors):
     """Probabilities [K + 512] of the candidates and of the family's members, and their log exposures [K + 512, 256]."""
     logs, rises = family_logs()
     surprise = _family_surprise(points, logs, rises)
     stops = (logs[:, 254:].mean(1) - logs[:, 245:247].mean(1)) / np.log(2)
     members = np.array([_highlights(bright, each) for each in stops])
-    members += np.nan_to_num(surprise) * len(points) / EDGES_PER_FACT + _span_surprise(shares, logs)
+    members += np.nan_to_num(surprise) * edge_facts(len(points)) + _span_surprise(shares, logs)
     members += _density_surprise(shares, logs)
     members += np.log(len(logs) / NO_FORMULA)
     named = posteriors + np.log(np.exp(-priors).sum() / (1 - NO_FORMULA))

@@ -14,7 +14,7 @@ import warp as wp
 
 from .bridge import torch_stream
 
-IDLE_BYTES = 256 << 20
+IDLE_BYTES = 1 << 30
 """More of torch's memory than this that is not in use is given back before a recording is made, which has memory of its
 own and could not use it; while one is made torch gives nothing back."""
 

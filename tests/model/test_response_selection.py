@@ -8,7 +8,7 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.model import response_selection
 from sehdr_warp.model.response import Response, response_by_name, response_names
 from sehdr_warp.model.response_family import family_logs
-from sehdr_warp.model.response_selection import select_response
+from sehdr_warp.model.response_selection import edge_facts, select_response
 from sehdr_warp.model.response_table import TabulatedResponse
 
 
@@ -45,6 +45,18 @@ def test_papers_score_orders_by_range_and_smoothness():
     assert linear.dynamic_range == pytest.approx(
         np.log2(np.percentile(clear, 99.9) / np.percentile(clear, 0.1)), rel=1e-3
     )
+
+
+def test_thousands_of_edges_are_all_looked_at_and_count_as_few_facts():
+    photos = [np.round(response_by_name("srgb").encode(mosaic(seed)) * 255) / 255 for seed in range(8)]
+    few = [response_by_name(name) for name in ("srgb", "filmic")]
+    selection, again = (select_response(photos, few, method="posterior", seed=seed) for seed in (0, 1))
+    assert 3000 < selection.edge_count < 12_000
+    assert [score.posterior for score in selection.scores] == [score.posterior for score in again.scores]
+    assert edge_facts(1600) == 10 and edge_facts(selection.edge_count) == edge_facts(10**6) == 18.75
+    for score in selection.scores:
+        rest = score.highlights + score.span + score.density + score.prior
+        assert score.posterior == pytest.approx(18.75 * score.edges + rest)
 
 
 def test_tensor_array_and_candidates():
