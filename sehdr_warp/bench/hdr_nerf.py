@@ -3,8 +3,8 @@
 Source: Huang et al., HDR-NeRF: High Dynamic Range Neural Radiance Fields (CVPR 2022), on NeRF (Mildenhall et al., ECCV
 2020). Sizes, rates and weights are those of the paper and its configs. Assumed here: depths are uniform between bounds
 taken from the scene's points, or from where the cameras look (the authors use normalised device coordinates, or bounds
-by hand); positions are brought into [-1, 1] by a common shift and scale before they are encoded. On a GPU products of
-matrices round their factors to TF32, as torch did unasked at the time.
+by hand); positions are brought into [-1, 1] by a common shift and scale before they are encoded; the tone mappers
+start rising. On a GPU products of matrices round their factors to TF32, as the authors' torch 1.9 did by default.
 """
 
 import math
@@ -349,10 +349,12 @@ def _wait(device: torch.device) -> None:
 
 @contextmanager
 def _tf32() -> Iterator[None]:
-    """Within the block products of float32 matrices may round their factors to TF32 where the device has it."""
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("high")
+    """Within the block products of float32 matrices on a GPU round their factors to TF32, in the whole process."""
+    matmul = torch.backends.cuda.matmul
+    name, value = ("fp32_precision", "tf32") if hasattr(matmul, "fp32_precision") else ("allow_tf32", True)
+    before = getattr(matmul, name)
+    setattr(matmul, name, value)
     try:
         yield
     finally:
-        torch.set_float32_matmul_precision(before)
+        setattr(matmul, name, before)

@@ -17,7 +17,8 @@ class Peer:
 
     renderer(scene) prepares what does not change and returns a function of no arguments that renders [H, W, C],
     differentiable in the scene's leaves. channels: the channel counts it has, None for any.
-    bound: largest relative difference of its image from ours; beyond, it does other work than we do.
+    bound: largest relative difference of its image, or of a step's loss with it, from ours; beyond, it does other work
+        than we do.
     """
 
     name: str

@@ -1,5 +1,6 @@
 """A benchmark's result as a picture."""
 
+from itertools import cycle
 from pathlib import Path
 
 
@@ -36,7 +37,7 @@ def plot_scale(report: dict, path: Path) -> None:
     names = list(dict.fromkeys(row["sweep"] for row in rows))
     labels = list(dict.fromkeys((row["implementation"], row["what"]) for row in rows))
     colors = {what: f"C{place}" for place, what in enumerate(dict.fromkeys(what for _, what in labels))}
-    styles = dict(zip(dict.fromkeys(who for who, _ in labels), ("-", "--", ":")))
+    styles = dict(zip(dict.fromkeys(who for who, _ in labels), cycle(("-", "--", ":"))))
     figure, panels = _panels(2, len(names))
     lines = {}
     for panel_row, field, unit, scale in zip(

@@ -201,7 +201,9 @@ def _step_rows(name: str, size: Size, device, gsplat: Peer | None, repetitions, 
         del trainer, variant
         if who != OURS:
             difference = abs(losses[who] - losses[OURS]) / abs(losses[OURS])
-            found = checks.Check(f"{who}: loss", OURS, str(size), COMPARED_CHANNELS, difference, gsplat.bound)
+            found = checks.Check(
+                f"{who}: loss of the first step", OURS, str(size), COMPARED_CHANNELS, difference, gsplat.bound
+            )
             report["checks"].append(found.to_dict())
     return rows
 

@@ -27,8 +27,8 @@ EDGE_FREEDOM = 2.0
 # How far edges lie off their line is not known beforehand (texture, denoised or compressed images): the variance is
 # this many times that of rounding, whichever is likeliest under a candidate.
 EDGE_MISFITS = 2.0 ** np.arange(0, 8.5, 0.5)
-# Edges of one set of photos share what is wrong with them: this many count as one, and all as no more than so many.
-EDGES_PER_FACT, MOST_FACTS = 160.0, 18.75
+# Edges of one set of photos share what is wrong with them: this many count as one, and more than 3000 count as 3000.
+EDGES_PER_FACT, MOST_FACTS = 160.0, 3000 / 160.0
 # Radiance falls off above white by this natural log per stop, within a factor of 2.2 (one standard deviation).
 HIGHLIGHT_RATE, HIGHLIGHT_SPREAD, HIGHLIGHT_FLOOR = 0.4, 0.8, 0.002
 # Standard deviation of ln exposure over the values that are neither black nor white: 1.35, within a factor of 1.5.

@@ -25,8 +25,8 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
     """f_c(x) = sigmoid(MLP_c(log x)) for the channels c: exposure x = E dt to an encoded value, learned with the scene.
 
     Source: HDR-GS (Cai et al., NeurIPS 2024): log exposure in, one hidden layer of 128 with ReLU, a sigmoid at the end,
-    weights as torch.nn.Linear starts them, turned so that the function rises at first, which is not HDR-GS's. Nothing
-    keeps it rising, and nothing in photos of one exposure tells its scale.
+    weights as torch.nn.Linear starts them, turned so that the function rises at first but for a few bends, which is not
+    HDR-GS's. Nothing keeps it rising, and nothing in photos of one exposure tells its scale.
 
     width: hidden units, at least 1; seed: of the start weights.
 
@@ -53,12 +53,13 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
 
     @torch.no_grad()
     def _start_rising(self) -> None:
-        """Far below log x = 0 only units with a negative weight are active, far above only those with a positive one:
-        the half whose slope was drawn negative is turned over."""
-        inner, outer = self.weights[0].mT, self.weights[1]
-        for half in (inner < 0, inner > 0):
-            falls = (inner * outer * half).sum(1, keepdim=True) < 0
-            outer[half & falls] *= -1
+        """Turns over what was drawn falling: of the units that are active towards dark or towards light, already at
+        log x = 0 or only further on, each of the four groups whose slope is below 0."""
+        inner, bias, outer = self.weights[0].mT, self.biases[0].mT, self.weights[1]
+        for towards in (inner < 0, inner > 0):
+            for group in (towards & (bias < 0), towards & (bias >= 0)):
+                falls = (inner * outer * group).sum(1, keepdim=True) < 0
+                outer[group & falls] *= -1
 
     def encode(self, exposure):
         """Encoded values in (0, 1) of exposures [..., 3]; a tensor for a tensor, else a NumPy array."""

@@ -15,8 +15,8 @@ import warp as wp
 from .bridge import torch_stream
 
 IDLE_BYTES = 1 << 30
-"""More of torch's memory than this that is not in use is given back before a recording is made, which has memory of its
-own and could not use it; while one is made torch gives nothing back."""
+"""If more of torch's memory than this lies idle, it is given back before a recording is made: a recording has memory of
+its own, and while it is made torch can give nothing back."""
 
 
 @contextmanager
@@ -76,6 +76,7 @@ class GraphRecorder:
         self._modules = self._result = None
         self.stream = stream or _own_stream(self, self.device)
         self._pool = torch.cuda.graph_pool_handle()
+        self._kept = 0
         # Keeps the pool's memory between recordings: freed with the last graph of the pool, it would be allocated anew.
         self._anchor = self._record(lambda: torch.zeros(1, device=self.device))
 
@@ -126,8 +127,9 @@ class GraphRecorder:
         return self._result
 
     def _record(self, function: Callable):
-        if torch.cuda.memory_reserved(self.device) - torch.cuda.memory_allocated(self.device) > IDLE_BYTES:
-            torch.cuda.empty_cache()
+        if self._idle() > self._kept + IDLE_BYTES:
+            with suppress(RuntimeError):  # some versions of torch refuse while another thread records
+                torch.cuda.empty_cache()
         graph = torch.cuda.CUDAGraph()
         current = torch.cuda.current_stream(self.device)
         self.stream.wait_stream(current)
@@ -147,5 +149,11 @@ class GraphRecorder:
             launched = wp.capture_end(stream=stream)
             graph.capture_end()
         current.wait_stream(self.stream)
+        # What recordings leave idle stays theirs.
+        self._kept = self._idle()
         # Warp's part of the recording is empty but for the modules that it launched, which must stay loaded.
         return graph, launched, result
+
+    def _idle(self) -> int:
+        """Bytes of the device that torch holds without using them."""
+        return torch.cuda.memory_reserved(self.device) - torch.cuda.memory_allocated(self.device)

@@ -35,7 +35,7 @@ FAR_RADIUS = 5.0
 
 
 MOST_JUDGED = 24
-"""Photos that a response is chosen from, evenly spread: their edges are more than can be used."""
+"""Photos that a response is chosen from, evenly spread: they give about as many edges as are looked at."""
 
 
 def base_exposure_time(scene: Scene) -> float:

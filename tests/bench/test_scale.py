@@ -130,7 +130,7 @@ def test_points_have_stages_memory_steps_and_gsplat(monkeypatch, tmp_path):
     assert len(slopes) == len(STAGES) + 5 + 5
     assert report["notes"][-1] == verdict(slopes)
     assert [check["what"] for check in report["checks"]].count("gsplat: image") == 2
-    assert sum(check["what"].endswith(": loss") for check in report["checks"]) == 2 * 2
+    assert sum(check["what"].endswith(": loss of the first step") for check in report["checks"]) == 2 * 2
     assert all(check["passed"] for check in report["checks"])
     write_report(report, out=tmp_path)
     assert (tmp_path / "scale.png").read_bytes()[:4] == b"\x89PNG"
