@@ -179,7 +179,7 @@ def _render(command: Render) -> None:
 def _evaluate(command: Evaluate) -> None:
     from .evaluation.evaluate import evaluate
     from .evaluation.table import format_table
-    from .output.files import check_absent, write_json
+    from .files import check_absent, write_json
     from .training.confidence import ensure_confidence
 
     if command.json is not None:

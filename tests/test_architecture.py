@@ -1,7 +1,6 @@
 """docs/architecture.md, held: which room may import which, and how large a file may be."""
 
 import ast
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,38 +10,32 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "sehdr_warp"
 
-# What each room may import of the others. Imports go down the line scene -> model -> splatting -> kernels; training
-# drives all four, and takes two leaves of the rooms that read a trained model.
+# What each room may import of the others: training -> field -> response -> splatting -> kernels, and below them all what
+# any room may use. Rooms that read a trained scene take it as an object with named methods.
+ANY = {"errors", "quiet", "arguments", "files"}
 ALLOWED = {
     "kernels": set(),
     "errors": set(),
     "quiet": set(),
+    "files": {"errors"},
     "arguments": {"errors"},
-    "scene": {"errors", "quiet"},
-    "splatting": {"errors", "quiet", "kernels"},
-    "model": {"errors", "scene", "splatting"},
-    "training": {
-        "errors",
-        "arguments",
-        "scene",
-        "model",
-        "splatting",
-        "output.files",
-        "evaluation.metrics",
-        "evaluation.protocols",
-    },
-    "output": {"errors", "scene"},
-    "evaluation": {"errors", "scene", "splatting.ssim"},
-    "synth": {"errors", "arguments", "scene", "model.response", "output.exr", "output.files", "output.images"},
-    "check": {"errors", "arguments", "kernels.constants", "scene", "splatting", "model", "training", "output.files"},
-    "bench": {
-        "errors",
-        "arguments",
+    "splatting": ANY | {"kernels"},
+    "response": ANY | {"splatting"},
+    "scene": ANY | {"response"},
+    "field": ANY | {"scene", "response", "splatting"},
+    "output": ANY | {"scene"},
+    "evaluation": ANY | {"scene", "splatting.ssim"},
+    "training": ANY | {"scene", "response", "field", "splatting", "evaluation.metrics", "evaluation.protocols"},
+    "synth": ANY | {"scene", "response", "output.exr", "output.images"},
+    "check": ANY | {"kernels.constants", "scene", "response", "field", "splatting", "training"},
+    "bench": ANY
+    | {
         "synth.expose",
         "kernels.constants",
         "scene",
+        "response",
+        "field",
         "splatting",
-        "model",
         "training",
         "output",
         "evaluation",
@@ -50,7 +43,7 @@ ALLOWED = {
 }
 # Packages that only some rooms may import.
 ONLY_IN = {
-    "torch": {"model", "splatting", "training", "output", "evaluation", "bench", "check"},
+    "torch": {"response", "field", "splatting", "training", "output", "evaluation", "bench", "check"},
     "warp": {"kernels", "splatting"},
 }
 LARGEST_FILE = 400
@@ -100,20 +93,6 @@ def test_kernels_import_warp_only():
 @pytest.mark.parametrize("path,_", list(sources()))
 def test_no_file_is_too_long_to_read_at_once(path, _):
     assert len(path.read_text().splitlines()) <= LARGEST_FILE
-
-
-def test_the_page_names_every_file():
-    """In the folder's own lines of the tree; `_table.py` behind `response_analytic.py` means `response_table.py`."""
-    tree = (ROOT / "docs" / "architecture.md").read_text().split("```")[1]
-    folders = re.split(r"^(?:    )?(\w+)/", tree, flags=re.MULTILINE)
-    lines = dict(zip(folders[1::2], folders[2::2], strict=True))
-    for path in [*PACKAGE.rglob("*.py"), *(ROOT / "kernels").glob("*.py")]:
-        if path.name == "__init__.py" and path.parent != PACKAGE:
-            continue
-        first, _, last = path.stem.rpartition("_")
-        short = rf"\b{first}\w*\.py[^\n]* \(?_{last}\b"
-        named = re.search(rf"(?<!\w){path.stem}\.py|{short}", lines[path.parent.name])
-        assert named, f"docs/architecture.md does not name {path.relative_to(ROOT)}"
 
 
 def test_every_file_says_what_it_is():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp import __version__, cli
-from sehdr_warp.model.response import RefinedResponse, response_by_name
+from sehdr_warp.response import RefinedResponse, response_by_name
 from sehdr_warp.scene.images import read_hdr, read_ldr
 from sehdr_warp.training.config import ResponseConfig
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from ..model.radiance_field import CameraTensors, RadianceField
+from ..field.radiance_field import CameraTensors, RadianceField
 from ..scene import load_scene
 from ..splatting import GraphRecorder
 from ..training.config_files import load_config

@@ -21,8 +21,8 @@ from torch.nn import functional
 from ..errors import InputError, SehdrError
 from ..evaluation.metrics import psnr
 from ..evaluation.protocols import tone_map
-from ..model.radiance_field import LOG_EXPOSURE_LIMIT, RenderedView
-from ..model.response import ToneMapper, response_by_name
+from ..field.radiance_field import LOG_EXPOSURE_LIMIT, RenderedView
+from ..response import ToneMapper, response_by_name
 from ..scene import Camera, Scene
 from ..training.initialization import DEPTH_RANGE, check_scene, focus_distance
 

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import norm
 
-from ..model.response import response_by_name
+from ..response import response_by_name
 from ..scene import load_scene
 from ..synth.expose import expose, exposure_ladder
 from ..training.config import LossConfig

@@ -10,8 +10,8 @@ import torch
 
 from ..errors import SehdrError
 from ..evaluation.metrics import psnr
+from ..field.gaussians import Gaussians
 from ..kernels.constants import LOW_PASS
-from ..model.gaussians import Gaussians
 from ..scene import Scene
 from ..splatting import Rendering
 from ..training.config import Config

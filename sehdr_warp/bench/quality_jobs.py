@@ -11,7 +11,7 @@ from importlib import resources
 from pathlib import Path
 
 from ..errors import InputError, SehdrError
-from ..output.files import write_json
+from ..files import write_json
 from ..scene.load import embedded_names, is_embedded
 from ..training.config import Config
 from ..training.config_files import config_to_dict, load_config, override_config
@@ -101,7 +101,7 @@ def plan_jobs(settings: Settings, *, progress: Callable[[str], None] = lambda li
 
     Raises InputError or SehdrError for a preset, field, curve or folder that cannot be used, before anything runs.
     """
-    from ..model.response import response_by_name
+    from ..response import response_by_name
 
     scenes = {place: {"name": _scene_name(place), **_digest(place)} for place in dict.fromkeys(settings.scenes)}
     _check_names_differ(scenes)

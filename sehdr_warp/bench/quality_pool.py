@@ -18,7 +18,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from ..errors import InputError, SehdrError
-from ..output.files import write_json
+from ..files import write_json
 from .quality_jobs import ATTEMPT, Job, read_attempt, read_failure, read_result, write_failure, write_job
 from .quality_worker import PLAN, RUN_LOCK, JobLock, is_open, work
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from statistics import fmean
 
 from ..errors import InputError
-from ..output.files import atomic_path
+from ..files import atomic_path
 from .methods import METHODS, UPPER_BOUND
 from .quality_jobs import LEARNED
 from .quality_plot import plot_error_over_time

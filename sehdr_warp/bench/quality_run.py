@@ -13,7 +13,7 @@ import torch
 
 from ..errors import InputError
 from ..evaluation.evaluate import evaluate
-from ..model.response import response_by_name
+from ..response import response_by_name
 from ..scene import Scene, load_scene
 from ..synth.expose import SensorNoise, expose, exposure_ladder
 from ..training.config import Config

@@ -13,7 +13,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from ..errors import SehdrError
-from ..output.files import write_json
+from ..files import write_json
 from .quality_jobs import (
     ATTEMPT,
     FAILURE,

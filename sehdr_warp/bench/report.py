@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from ..output.files import atomic_path, check_absent, write_json
+from ..files import atomic_path, check_absent, write_json
 from .machine import command_line, describe_machine, now
 from .plots import PLOTS
 

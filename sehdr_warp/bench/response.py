@@ -10,8 +10,8 @@ import torch
 from ..errors import SehdrError
 from ..evaluation.metrics import decibels, mu_law
 from ..evaluation.protocols import fit_scale
-from ..model.response import Response, response_by_name
-from ..model.response_selection import ResponseScore, edge_facts, select_response
+from ..response import Response, response_by_name
+from ..response.selection import ResponseScore, edge_facts, select_response
 from ..scene import Scene, load_scene
 from ..scene.exposure import made_by_camera
 from ..synth.expose import expose, exposure_ladder

@@ -9,7 +9,7 @@ from unittest.mock import patch
 import torch
 
 from ..errors import SehdrError
-from ..model import radiance_field
+from ..field import radiance_field
 from ..splatting.memory import held_by_warp
 from ..splatting.rasterization import rasterize
 from ..training.config import Config

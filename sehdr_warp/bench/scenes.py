@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
-from ..model.gaussians import Gaussians
-from ..model.radiance_field import RadianceField
-from ..model.response import response_by_name
+from ..field.gaussians import Gaussians
+from ..field.radiance_field import RadianceField
+from ..response import response_by_name
 from ..scene import Camera, Scene, View, look_at
 from .splats import Size
 

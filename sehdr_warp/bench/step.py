@@ -12,8 +12,8 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 from ..errors import SehdrError
+from ..field import radiance_field
 from ..kernels.constants import TILE_SIZE
-from ..model import radiance_field
 from ..scene import Scene
 from ..splatting.reference import rasterize_reference
 from ..training.config import Config

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from ..errors import SehdrError
-from ..output.files import write_json
+from ..files import write_json
 from .case import Case, Reading
 from .light_cases import CASES as LIGHT_CASES
 from .poison_cases import CASES as POISON_CASES

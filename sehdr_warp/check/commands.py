@@ -29,7 +29,7 @@ class Check:
 def run_check(command: Check) -> None:
     """Measures, prints the table and writes what was asked for; raises SehdrError if a bound failed, after everything
     was written."""
-    from ..output.files import check_absent
+    from ..files import check_absent
     from ..training.train import pick_device
     from .catalogue import choose_cases, run_cases, write_result
 

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from ..model.fusion import NeuralExposureFusion
-from ..model.response import Response, response_by_name
-from ..model.response_table import TabulatedResponse
+from ..field.fusion import NeuralExposureFusion
+from ..response import Response, response_by_name
+from ..response.table import TabulatedResponse
 from ..splatting import ssim
 from ..training.config import LossConfig
 from ..training.losses import CODE, Target, ldr_loss
@@ -83,7 +83,7 @@ def _extremes(device):
 
 def _zero_radiance(device):
     """The logarithm of zero radiance: a black photo as a start, and fusion of log 0 = -infinity."""
-    from ..model.radiance_field import EXPOSURE_FLOOR
+    from ..field.radiance_field import EXPOSURE_FLOOR
 
     fusion = _fusion(0.2)
     logs = torch.tensor([[-math.inf] * 3, [-200.0] * 3, [math.log(EXPOSURE_FLOOR)] * 3])

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import torch
 
-from ..model.response import response_by_name
-from ..output.files import atomic_path, check_absent, write_json
+from ..files import atomic_path, check_absent, write_json
+from ..response import response_by_name
 from .case import ROUNDINGS, UNIT, Reading, compare
 from .splats import Splats, compare_splat
 

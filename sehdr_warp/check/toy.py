@@ -5,9 +5,9 @@ from functools import cache
 import numpy as np
 import torch
 
-from ..model.gaussians import Gaussians
-from ..model.radiance_field import RadianceField
-from ..model.response import response_by_name
+from ..field.gaussians import Gaussians
+from ..field.radiance_field import RadianceField
+from ..response import response_by_name
 from ..scene import Camera, Scene, View, look_at
 
 SIZE, VIEWS, EXPOSURE_TIME = 32, 6, 0.25

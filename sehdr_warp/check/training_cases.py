@@ -5,7 +5,7 @@ import math
 import numpy as np
 import torch
 
-from ..model.response import response_by_name
+from ..response import response_by_name
 from ..training.config import Config
 from ..training.config_files import load_config
 from ..training.initialization import make_field

@@ -14,9 +14,9 @@ import numpy as np
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.scene import Camera
 
+from ..files import atomic_folder, atomic_path, write_json
 from .colorspace import color_space, from_rec709
 from .exr import Part, exr_header, stored_pixel_type, write_exr, write_multipart_exr
-from .files import atomic_folder, atomic_path, write_json
 from .images import exposure_exif, quantize, write_jpeg, write_png
 from .names import safe_names
 

@@ -18,8 +18,8 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.images import MAX_PIXELS, read_exr_channels
 
+from ..files import atomic_path
 from .colorspace import chromaticities, color_space
-from .files import atomic_path
 
 HALF_MAX = 65504.0
 """The largest value of a 16-bit float (IEEE 754 binary16)."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from sehdr_warp.errors import InputError
 
-from .files import atomic_path
+from ..files import atomic_path
 
 COLOR_MODELS = ("display", "log", "linear")
 """What the sum of harmonics over a viewing direction d means, per channel:

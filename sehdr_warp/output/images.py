@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from .files import atomic_path
+from ..files import atomic_path
 
 # EXIF 2.32, table 8: rationals are two unsigned 32-bit integers.
 _RATIONAL_LIMIT = 2**32 - 1

@@ -7,8 +7,8 @@ import numpy as np
 
 from sehdr_warp.errors import SehdrError
 
+from ..files import check_absent
 from .bake import bake
-from .files import check_absent
 from .gaussian_file import GaussianArrays, write_gaussians
 
 KINDS = ("hdr", "ldr")

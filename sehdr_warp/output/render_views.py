@@ -11,11 +11,11 @@ import numpy as np
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera, load_cameras
 
+from ..files import atomic_folder
 from .brackets import BracketFolder, BracketOptions, bracket_exposures
 from .camera_paths import interpolate, orbit
 from .colorspace import from_rec709
 from .exr import exr_header, write_exr
-from .files import atomic_folder
 from .images import quantize, write_png
 from .names import safe_names
 from .tonemap import ToneMap, fit_tone_map

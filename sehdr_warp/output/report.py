@@ -11,7 +11,7 @@ import numpy as np
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Scene, View
 
-from .files import atomic_path, check_absent
+from ..files import atomic_path, check_absent
 from .tonemap import expose, fit_tone_map
 
 STOPS = (-4, -2, 0, 2, 4)

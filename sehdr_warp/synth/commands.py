@@ -102,8 +102,8 @@ def _render(asked: RenderTruth) -> None:
 
 
 def _expose(asked: ExposeTruth) -> None:
-    from ..model.response import response_by_name
-    from ..output.files import check_absent_folder
+    from ..files import check_absent_folder
+    from ..response import response_by_name
     from ..scene import load_scene
     from .expose import SensorNoise, exposure_ladder
     from .photo_set import write_photo_set

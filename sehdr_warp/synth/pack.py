@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from ..output.files import atomic_folder, write_json
+from ..files import atomic_folder, write_json
 from ..scene.images import read_hdr
 from .truth_set import read_making
 

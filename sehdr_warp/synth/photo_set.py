@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import InputError
-from ..output.files import atomic_folder
+from ..files import atomic_folder
 from ..scene import Scene
 from ..scene.hdr_nerf_layout import RadianceView, write_hdr_nerf_scene
 from .expose import Curve, SensorNoise, expose

@@ -11,8 +11,8 @@ import numpy as np
 
 from .. import __version__
 from ..errors import InputError, SehdrError
+from ..files import atomic_path, write_json
 from ..output.exr import exr_header, read_exr, write_exr
-from ..output.files import atomic_path, write_json
 from ..scene import Camera
 from ..scene.hdr_nerf_layout import RadianceView
 from .cameras import VIEWS, make_cameras, split_of

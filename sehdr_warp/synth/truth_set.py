@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from ..output.files import atomic_path, write_json
+from ..files import atomic_path, write_json
 from ..scene import Scene, View
 from ..scene.hdr_nerf_layout import DERIVED_PHOTOS, RadianceView, reinhard_gamma
 from .expose import exposure_ladder

@@ -15,7 +15,7 @@ from pathlib import Path
 from torch import Tensor
 
 from ..errors import InputError
-from ..output.files import atomic_folder
+from ..files import atomic_folder
 
 FORMAT = 1
 """Version of the layout; a reader refuses others."""

@@ -146,7 +146,7 @@ def known_curves(response: str) -> dict:
     """load_scene's decode and encode for a response that is known before the photos are read."""
     if response == "auto":
         return {}
-    from ..model.response import response_by_name
+    from ..response import response_by_name
 
     curve = response_by_name(response)
     return {"decode": curve.decode, "encode": curve.encode}

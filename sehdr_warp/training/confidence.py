@@ -10,8 +10,8 @@ from pathlib import Path
 from torch import Tensor
 
 from ..errors import InputError, SehdrError
-from ..model.confidence import Evidence, gather_evidence
-from ..output.files import atomic_path
+from ..field.confidence import Evidence, gather_evidence
+from ..files import atomic_path
 from ..scene import Scene
 from .checkpoint import Checkpoint, first_not_finite
 

@@ -9,8 +9,8 @@ import math
 import torch
 from torch import Tensor
 
-from ..model.gaussians import Gaussians
-from ..model.radiance_field import RadianceField
+from ..field.gaussians import Gaussians
+from ..field.radiance_field import RadianceField
 from ..splatting import Rendering
 from ..splatting.noting import note_image_gradients
 from .config import Config

@@ -4,7 +4,7 @@ import torch
 
 from ..evaluation.metrics import psnr
 from ..evaluation.protocols import tone_map
-from ..model.radiance_field import RadianceField
+from ..field.radiance_field import RadianceField
 from ..scene import View
 
 BEST = 100.0

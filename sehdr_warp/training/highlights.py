@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..model.response import Response
+from ..response import Response
 from ..scene import View
 from .config import LossConfig
 from .losses import CODE

@@ -6,18 +6,18 @@ import numpy as np
 import torch
 
 from ..errors import InputError, SehdrError
-from ..model.exposure import exposure_times
-from ..model.fusion import NeuralExposureFusion
-from ..model.gaussians import Gaussians
-from ..model.radiance_field import EXPOSURE_FLOOR, RadianceField
-from ..model.response import (
+from ..field.exposure import exposure_times
+from ..field.fusion import NeuralExposureFusion
+from ..field.gaussians import Gaussians
+from ..field.radiance_field import EXPOSURE_FLOOR, RadianceField
+from ..response import (
     RefinedResponse,
     Response,
     ToneMapper,
     response_by_name,
     responses_in_file,
 )
-from ..model.response_selection import select_response
+from ..response.selection import select_response
 from ..scene import Scene, View
 from ..scene.exposure import made_by_camera
 from ..splatting import BlendStyle

@@ -7,10 +7,10 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from ..model.radiance_field import Photograph, RadianceField
-from ..model.response import Response, ToneMapper
-from ..model.response_curve import EXTENSION_SLOPE
-from ..model.response_refined import RefinedResponse
+from ..field.radiance_field import Photograph, RadianceField
+from ..response import Response, ToneMapper
+from ..response.curve import EXTENSION_SLOPE
+from ..response.refined import RefinedResponse
 from ..splatting.one_sided import seen_by_photo
 from ..splatting.ssim import image_distance, ssim
 from .config import LossConfig

@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor
 
-from ..model.gaussians import PARAMETER_NAMES
-from ..model.radiance_field import RadianceField
-from ..model.response import RefinedResponse, ToneMapper
+from ..field.gaussians import PARAMETER_NAMES
+from ..field.radiance_field import RadianceField
+from ..response import RefinedResponse, ToneMapper
 from ..splatting.adam import adam_step, judge
 from .config import Config
 

@@ -4,7 +4,7 @@ import json
 from collections.abc import Collection
 
 from ..errors import InputError
-from ..model.exposure import exposure_times
+from ..field.exposure import exposure_times
 from ..scene import Scene
 from .config import Config
 from .initialization import base_exposure_time

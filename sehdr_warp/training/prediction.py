@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError, SehdrError
-from ..model.response import Response, ToneMapper, response_by_name
+from ..response import Response, ToneMapper, response_by_name
 from ..scene import Scene, View
 from ..scene.images import HDR_SUFFIXES, read_hdr
 

@@ -9,7 +9,7 @@ import math
 import torch
 from torch import Tensor
 
-from ..model.gaussians import Gaussians
+from ..field.gaussians import Gaussians
 from ..splatting import add_exploration_noise
 from .config import Config, DensificationConfig
 from .densification import Densification

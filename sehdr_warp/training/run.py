@@ -21,10 +21,10 @@ import torch
 from torch import Tensor
 
 from ..errors import InputError, SehdrError
-from ..model.gaussians import PARAMETER_NAMES, Gaussians
-from ..model.radiance_field import RadianceField, RenderedView
-from ..model.response import Response
-from ..output.files import atomic_path, write_json, writing
+from ..field.gaussians import PARAMETER_NAMES, Gaussians
+from ..field.radiance_field import RadianceField, RenderedView
+from ..files import atomic_path, write_json, writing
+from ..response import Response
 from ..scene import Camera, Scene
 from ..scene.images import MAX_PIXELS
 from .checkpoint import Checkpoint, newest_checkpoint

@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from ..errors import InputError
-from ..model.radiance_field import CameraTensors
-from ..model.response import Response
+from ..field.radiance_field import CameraTensors
+from ..response import Response
 from ..scene import Camera, Scene, View
 from .config import LossConfig
 from .losses import CODE, Target, one_of, values_of

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from ..model.radiance_field import RadianceField
+from ..field.radiance_field import RadianceField
 from .config import LossConfig
 from .losses import data_loss, needed_colours
 from .targets import TrainingView, ViewStack

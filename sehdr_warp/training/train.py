@@ -13,9 +13,9 @@ from pathlib import Path
 import torch
 
 from ..errors import InputError, SehdrError
-from ..model.gaussians import Gaussians
-from ..model.response import Response
-from ..output.files import write_json
+from ..field.gaussians import Gaussians
+from ..files import write_json
+from ..response import Response
 from ..scene import Scene
 from ..splatting.memory import memory_told
 from ..splatting.threads import thread_count

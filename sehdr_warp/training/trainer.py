@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from ..errors import SehdrError
-from ..model.radiance_field import RadianceField
-from ..model.response import RefinedResponse
-from ..model.tone_mapper import EXACT_BELOW
+from ..field.radiance_field import RadianceField
+from ..response import RefinedResponse
+from ..response.learned import EXACT_BELOW
 from ..scene import Scene
 from ..splatting import GraphRecorder
 from ..splatting.memory import bytes_asked_for

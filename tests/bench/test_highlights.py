@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp.bench.highlights import Case, fitted_by_count, of_share, tobit
-from sehdr_warp.model.response import response_by_name
+from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import View
 from tests.training.toy import orbit_camera
 

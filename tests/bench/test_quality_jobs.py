@@ -18,7 +18,7 @@ from sehdr_warp.bench.quality_plot import error_over_time, pareto_front
 from sehdr_warp.bench.quality_pool import Workers, run_jobs, slurm_parameters
 from sehdr_warp.bench.quality_report import RESULTS, write_quality_report
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.output.files import write_json
+from sehdr_warp.files import write_json
 
 from ..refusals import call
 from . import quality_stub as stub

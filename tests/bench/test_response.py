@@ -10,7 +10,7 @@ from PIL import Image
 from sehdr_warp.bench.exposure_stack import read_stack, stack_curve
 from sehdr_warp.bench.response import CODES, _decoded_psnr, bench_response, curve_stops, response_error
 from sehdr_warp.errors import InputError
-from sehdr_warp.model.response import response_by_name
+from sehdr_warp.response import response_by_name
 
 TIMES = (0.02, 0.08, 0.32, 1.28)
 

@@ -10,7 +10,7 @@ import torch
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.evaluation.evaluate import evaluate
 from sehdr_warp.evaluation.table import format_table
-from sehdr_warp.model.response import response_by_name
+from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View
 
 RESPONSE = response_by_name("hdr-nerf")

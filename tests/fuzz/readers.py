@@ -171,8 +171,8 @@ def _read_config(folder: Path):
 def _run(folder: Path) -> None:
     import torch
 
-    from sehdr_warp.model.gaussians import Gaussians
-    from sehdr_warp.model.response import response_by_name
+    from sehdr_warp.field.gaussians import Gaussians
+    from sehdr_warp.response import response_by_name
     from sehdr_warp.training.checkpoint import write_checkpoint
     from sehdr_warp.training.config_files import load_config
     from sehdr_warp.training.initialization import assemble_field
@@ -236,7 +236,7 @@ def _responses(folder: Path) -> None:
 
 
 def _read_responses(folder: Path):
-    from sehdr_warp.model.response import response_by_name
+    from sehdr_warp.response import response_by_name
 
     selectors = {"dorf.txt": ":1", "emor.txt": ":0.1", "m.mat": ":0"}
 

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from sehdr_warp.model.fusion import MAX_DEVIATION, MAX_LOG_SIGMA, NeuralExposureFusion
-from sehdr_warp.model.response import response_by_name
+from sehdr_warp.field.fusion import MAX_DEVIATION, MAX_LOG_SIGMA, NeuralExposureFusion
+from sehdr_warp.response import response_by_name
 from sehdr_warp.splatting.exposure_fusion import fuse_exposures
 
 from .scenes import relative_error

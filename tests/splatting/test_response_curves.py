@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from sehdr_warp.model.response import response_by_name, response_names
-from sehdr_warp.model.response_curve import EXTENSION_SLOPE
+from sehdr_warp.response import response_by_name, response_names
+from sehdr_warp.response.curve import EXTENSION_SLOPE
 from sehdr_warp.splatting.response_curves import encode_with_slope
 
 from .scenes import relative_error

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sehdr_warp.model.response import response_by_name
+from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
 from sehdr_warp.synth import mitsuba_variant
 from sehdr_warp.synth.expose import expose

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.model.response import response_by_name
+from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
 from sehdr_warp.synth.expose import SensorNoise, expose, exposure_ladder
 

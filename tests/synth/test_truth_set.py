@@ -8,7 +8,7 @@ import pytest
 
 import sehdr_warp
 from sehdr_warp.errors import InputError
-from sehdr_warp.model.response import response_by_name
+from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import embedded_names, load_scene
 from sehdr_warp.synth.pack import pack_truth
 from sehdr_warp.synth.scenes import RECIPES

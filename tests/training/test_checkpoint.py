@@ -90,7 +90,7 @@ def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):
     def refuse(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("sehdr_warp.output.files.os.fsync", refuse)
+    monkeypatch.setattr("sehdr_warp.files.os.fsync", refuse)
     with pytest.raises(SehdrError, match="No space"):
         write_checkpoint(tmp_path, *state(2), kept=1)
     monkeypatch.undo()

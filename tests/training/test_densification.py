@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from sehdr_warp.model.gaussians import HARMONIC_0, PARAMETER_NAMES, Gaussians
-from sehdr_warp.model.response import response_by_name
+from sehdr_warp.field.gaussians import HARMONIC_0, PARAMETER_NAMES, Gaussians
+from sehdr_warp.response import response_by_name
 from sehdr_warp.splatting import rasterize
 from sehdr_warp.splatting.noting import note_image_gradients
 from sehdr_warp.training.config_files import load_config

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.model.response import response_by_name
+from sehdr_warp.response import response_by_name
 from sehdr_warp.training.config import LossConfig
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.highlights import CHANNEL_PARTS, expected_excess, tail_stops

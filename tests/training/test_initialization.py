@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.model.response import response_by_name
+from sehdr_warp.response import response_by_name
 from sehdr_warp.training.config import ConfigError
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.initialization import (

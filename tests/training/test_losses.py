@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sehdr_warp.model.radiance_field import CameraTensors, Photograph
-from sehdr_warp.model.response import ToneMapper, response_by_name
-from sehdr_warp.model.response_refined import RefinedResponse
+from sehdr_warp.field.radiance_field import CameraTensors, Photograph
+from sehdr_warp.response import ToneMapper, response_by_name
+from sehdr_warp.response.refined import RefinedResponse
 from sehdr_warp.splatting.ssim import ssim
 from sehdr_warp.training.config import LossConfig
 from sehdr_warp.training.losses import (

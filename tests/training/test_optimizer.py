@@ -6,7 +6,7 @@ from math import inf, nan
 import pytest
 import torch
 
-from sehdr_warp.model.gaussians import PARAMETER_NAMES
+from sehdr_warp.field.gaussians import PARAMETER_NAMES
 from sehdr_warp.splatting.adam import judge
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.optimizer import (

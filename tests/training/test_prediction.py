@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.model.response import ToneMapper, response_by_name
+from sehdr_warp.response import ToneMapper, response_by_name
 from sehdr_warp.training.prediction import cross_bilateral, kovaleski_oliveira, predicted_scene
 from sehdr_warp.training.train import train
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.model.response import RefinedResponse
+from sehdr_warp.response import RefinedResponse
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.initialization import choose_response, make_field
 from sehdr_warp.training.run import load_run

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.model.radiance_field import Photograph
-from sehdr_warp.model.response import ToneMapper, response_by_name
+from sehdr_warp.field.radiance_field import Photograph
+from sehdr_warp.response import ToneMapper, response_by_name
 from sehdr_warp.splatting.ssim import ssim
 from sehdr_warp.training.config import Config, ConfigError, LossConfig, ModelConfig, ResponseConfig
 from sehdr_warp.training.config_files import load_config

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import torch
 
-from sehdr_warp.model.response import response_by_name
+from sehdr_warp.response import response_by_name
 from sehdr_warp.training.targets import STORED, ViewStack, training_views
 
 from .toy import EXPOSURE_TIME, toy_scene

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sehdr_warp.model.radiance_field import CameraTensors
+from sehdr_warp.field.radiance_field import CameraTensors
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.early_stop import EarlyStop
 from sehdr_warp.training.initialization import choose_response, make_field
@@ -187,7 +187,7 @@ def test_contributions_are_sums_of_blend_weights():
     ],
 )
 def test_colours_without_a_loss_are_not_rendered(scene, preset, channels, monkeypatch):
-    from sehdr_warp.model import radiance_field
+    from sehdr_warp.field import radiance_field
 
     widths, rasterize = [], radiance_field.rasterize
 

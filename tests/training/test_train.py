@@ -155,7 +155,7 @@ def test_run_folder_is_complete_and_loads_without_photos(scene, tmp_path):
 def test_views_of_differing_exposure_agree(tmp_path):
     """The same scene photographed at twice the time: one radiance explains both."""
     base = toy_scene()
-    from sehdr_warp.model.response import response_by_name
+    from sehdr_warp.response import response_by_name
 
     srgb, views = response_by_name("srgb"), []
     for index, view in enumerate(base.views):

@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
-from sehdr_warp.model.gaussians import Gaussians
-from sehdr_warp.model.radiance_field import RadianceField
-from sehdr_warp.model.response import response_by_name
+from sehdr_warp.field.gaussians import Gaussians
+from sehdr_warp.field.radiance_field import RadianceField
+from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View, look_at
 
 EXPOSURE_TIME = 0.25

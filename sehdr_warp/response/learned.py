@@ -8,7 +8,7 @@ from torch import nn
 
 from ..errors import SehdrError
 from ..splatting.interpolation import interpolate
-from .response_curve import HALF_CODE, Response
+from .curve import HALF_CODE, Response
 
 EXPOSURE_FLOOR = 1e-6
 """Added to exposures before the logarithm: black stays finite, and what is 100 times darker than 8-bit black in sRGB

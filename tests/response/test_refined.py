@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.model.response import RefinedResponse, Response, ToneMapper, response_by_name
-from sehdr_warp.model.response_table import TabulatedResponse
+from sehdr_warp.response import RefinedResponse, Response, ToneMapper, response_by_name
+from sehdr_warp.response.table import TabulatedResponse
 
 STARTS = {
     "srgb": lambda: response_by_name("srgb"),

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from .response_analytic import analytic_names, analytic_response
-from .response_curve import Response
-from .response_files import colour_response, response_from_file, responses_in_file
-from .response_refined import RefinedResponse
-from .tone_mapper import ToneMapper
+from .analytic import analytic_names, analytic_response
+from .curve import Response
+from .files import colour_response, response_from_file, responses_in_file
+from .learned import ToneMapper
+from .refined import RefinedResponse
 
 __all__ = ["RefinedResponse", "Response", "ToneMapper", "response_by_name", "response_names", "responses_in_file"]
 

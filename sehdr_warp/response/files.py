@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError, SehdrError
+from .curve import Response
 from .mat_file import read_matrices
-from .response_curve import Response
-from .response_table import TabulatedResponse
+from .table import TabulatedResponse
 
 # The largest file read here (all of DoRF as text has 5 MB).
 MAX_BYTES = 64 * 2**20

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.model.gaussians import Gaussians
-from sehdr_warp.model.radiance_field import CameraTensors, RadianceField
-from sehdr_warp.model.response import Response, ToneMapper, response_by_name
-from sehdr_warp.model.tone_mapper import EXACT_BELOW
+from sehdr_warp.field.gaussians import Gaussians
+from sehdr_warp.field.radiance_field import CameraTensors, RadianceField
+from sehdr_warp.response import Response, ToneMapper, response_by_name
+from sehdr_warp.response.learned import EXACT_BELOW
 from sehdr_warp.scene import Camera
 
 CAMERA = Camera(16, 12, 15.0, 15.0, 8.0, 6.0, np.eye(4))

@@ -15,11 +15,11 @@ from torch import nn
 from torch.utils.checkpoint import checkpoint
 
 from ..errors import SehdrError
+from ..response.curve import Response
 from ..splatting.exposure_fusion import fuse_exposures
 from ..splatting.interpolation import interpolate
 from ..splatting.recording import is_recording
 from .exposure import bracket_log_radiance, exposure_times
-from .response_curve import Response
 
 # The table spans, for every bracket, exposures from where the encoded value is this far above black (a four-hundredth
 # of an 8-bit code) to this many octaves above white, where only the response's extension is left: a line in the log.

@@ -8,8 +8,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.model.response import response_by_name, responses_in_file
-from sehdr_warp.model.response_table import FLAT_TILT, TabulatedResponse
+from sehdr_warp.response import response_by_name, responses_in_file
+from sehdr_warp.response.table import FLAT_TILT, TabulatedResponse
 
 
 def dorf_text(curves: dict[str, np.ndarray]) -> str:

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from sehdr_warp.response import selection as response_selection
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.model import response_selection
-from sehdr_warp.model.response import Response, response_by_name, response_names
-from sehdr_warp.model.response_family import family_logs
-from sehdr_warp.model.response_selection import edge_facts, select_response
-from sehdr_warp.model.response_table import TabulatedResponse
+from sehdr_warp.response import Response, response_by_name, response_names
+from sehdr_warp.response.family import family_logs
+from sehdr_warp.response.selection import edge_facts, select_response
+from sehdr_warp.response.table import TabulatedResponse
 
 
 def mosaic(seed=0, size=96, tile=12) -> np.ndarray:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..response import Response
 from ..scene import View
 from .radiance_field import CameraTensors, RadianceField
-from .response import Response
 
 CLIPPED_STOPS = 1.0
 """Uncertainty of a pixel that is clipped in all channels, which is known to be white or brighter and no more."""

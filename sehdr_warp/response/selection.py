@@ -7,10 +7,10 @@ import numpy as np
 import torch
 
 from ..errors import SehdrError
-from .response import response_by_name, response_names
-from .response_curve import Response
-from .response_family import CODES, family_logs
-from .response_table import TabulatedResponse
+from . import response_by_name, response_names
+from .curve import Response
+from .family import CODES, family_logs
+from .table import TabulatedResponse
 
 CODE = 1.0 / 255
 # Edges: pixel pairs this far from the middle one; each end must be flat to 3 codes and 20 codes apart from the other.

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.model.exposure import exposure_times
-from sehdr_warp.model.fusion import NeuralExposureFusion
-from sehdr_warp.model.gaussians import HARMONIC_0, Gaussians
-from sehdr_warp.model.radiance_field import CameraTensors, RadianceField
-from sehdr_warp.model.response import response_by_name
+from sehdr_warp.field.exposure import exposure_times
+from sehdr_warp.field.fusion import NeuralExposureFusion
+from sehdr_warp.field.gaussians import HARMONIC_0, Gaussians
+from sehdr_warp.field.radiance_field import CameraTensors, RadianceField
+from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera
 
 TIME = 0.25
@@ -81,7 +81,7 @@ def fusion_of():
 @pytest.mark.parametrize("tone_map,channels", [("pixel", 6), ("gaussian", 9)])
 def test_brackets_share_one_rasterisation(tone_map, channels, monkeypatch):
     calls = []
-    from sehdr_warp.model import radiance_field
+    from sehdr_warp.field import radiance_field
 
     original = radiance_field.rasterize
 

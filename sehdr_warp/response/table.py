@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from ..errors import InputError
-from .response_curve import HALF_CODE, Response
+from .curve import HALF_CODE, Response
 
 # Samples this dense and evenly spaced are joined by straight lines, exactly as stored (DoRF and EMoR have 1024).
 DENSE_SAMPLES = 256

@@ -6,7 +6,7 @@ import torch
 
 from ..errors import SehdrError
 from ..splatting.response_curves import FormulaCurve
-from .response_curve import HALF_CODE, Response
+from .curve import HALF_CODE, Response
 
 
 class AnalyticResponse(Response, kind="analytic"):

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.model.exposure import exposure_times
-from sehdr_warp.model.fusion import NeuralExposureFusion
-from sehdr_warp.model.response import response_by_name
+from sehdr_warp.field.exposure import exposure_times
+from sehdr_warp.field.fusion import NeuralExposureFusion
+from sehdr_warp.response import response_by_name
 
 BASE_TIME = 2.0
 RESPONSES = ("gamma-2.2", "reinhard-gamma", "linear", "colour:S-Log3")
@@ -139,10 +139,10 @@ def test_table_matches_exact(name):
 
 def test_nodes_made_while_a_step_is_recorded_are_not_kept(monkeypatch):
     fusion, colours = make_fusion(evaluation="tabulated"), torch.zeros(4, 3, dtype=torch.float64)
-    monkeypatch.setattr("sehdr_warp.model.fusion.is_recording", lambda device: True)
+    monkeypatch.setattr("sehdr_warp.field.fusion.is_recording", lambda device: True)
     recorded = fusion(colours)
     assert not fusion._kept_nodes
-    monkeypatch.setattr("sehdr_warp.model.fusion.is_recording", lambda device: False)
+    monkeypatch.setattr("sehdr_warp.field.fusion.is_recording", lambda device: False)
     torch.testing.assert_close(fusion(colours), recorded, rtol=0, atol=0)
     assert len(fusion._kept_nodes) == 1
 
@@ -166,7 +166,7 @@ def test_highlights_keep_a_gradient():
 
 
 def test_chunks_do_not_change_the_result(monkeypatch):
-    from sehdr_warp.model import fusion as module
+    from sehdr_warp.field import fusion as module
 
     whole = make_fusion(evaluation="exact")
     log_base = log_radiance(whole, 101).requires_grad_()

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import hardtanh
 
+from ..response import Response
 from ..scene import Camera
 from ..splatting import BlendStyle, Rendering, rasterize, spherical_harmonics
 from .fusion import NeuralExposureFusion
 from .gaussians import HARMONIC_0, Gaussians
-from .response import Response
 
 EXPOSURE_FLOOR = 1e-6
 """Least exposure of a Gaussian with radiance "linear": keeps logarithms finite, 100 times below 8-bit black in sRGB."""

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.model.exposure import bracket_log_radiance, exposure_times
+from sehdr_warp.field.exposure import bracket_log_radiance, exposure_times
 
 
 def test_brackets_are_scalings(device):

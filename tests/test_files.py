@@ -7,9 +7,9 @@ import sys
 import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.output.files import atomic_folder, atomic_path, write_json
+from sehdr_warp.files import atomic_folder, atomic_path, write_json
 
-from ..full_disk import full_disk
+from .full_disk import full_disk
 
 
 def listing(folder):
@@ -130,7 +130,7 @@ def test_json_has_no_nan(tmp_path):
 
 def killed(code, folder):
     """Runs code in a process that is killed where it says so; the names it left."""
-    head = "import os, signal; from pathlib import Path; from sehdr_warp.output import files\n"
+    head = "import os, signal; from pathlib import Path; from sehdr_warp import files\n"
     die = "def die(*_, **__): os.kill(os.getpid(), signal.SIGKILL)\n"
     result = subprocess.run([sys.executable, "-c", head + die + code], cwd=folder, timeout=60, check=False)
     assert result.returncode == -signal.SIGKILL
@@ -183,7 +183,7 @@ with files.atomic_path(Path("a.txt"), overwrite=True) as file:
     print(flush=True)
     input()
 """
-    head = "from pathlib import Path; from sehdr_warp.output import files\n"
+    head = "from pathlib import Path; from sehdr_warp import files\n"
     with subprocess.Popen(
         [sys.executable, "-c", head + code], cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as other:

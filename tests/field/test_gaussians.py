@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from sehdr_warp.model.gaussians import HARMONIC_0, PARAMETER_NAMES, Gaussians
+from sehdr_warp.field.gaussians import HARMONIC_0, PARAMETER_NAMES, Gaussians
 
 
 def grid(side=3):

@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 
-from .response_analytic import analytic_response
+from .analytic import analytic_response
 
 # x(z) = z^p (z + TOE)^q (1 + SHOULDER - z)^-r up to scale, z the encoded value: p and p + q are the log-log slopes
 # below and above the toe, r the roll-off into white. Least squares in log x over codes 10 to 245 leaves 0.02 stops on

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.model.confidence import (
+from sehdr_warp.field.confidence import (
     CLIPPED_STOPS,
     LEAST_SEEN,
     MOST_STOPS,
@@ -13,9 +13,9 @@ from sehdr_warp.model.confidence import (
     gather_evidence,
     pixel_uncertainty,
 )
-from sehdr_warp.model.gaussians import Gaussians
-from sehdr_warp.model.radiance_field import CameraTensors, RadianceField
-from sehdr_warp.model.response import response_by_name
+from sehdr_warp.field.gaussians import Gaussians
+from sehdr_warp.field.radiance_field import CameraTensors, RadianceField
+from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, View
 
 SRGB = response_by_name("srgb")

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.model.response import Response, response_by_name, response_names
-from sehdr_warp.model.response_curve import EXTENSION_SLOPE, HALF_CODE
-from sehdr_warp.model.response_table import TabulatedResponse
+from sehdr_warp.response import Response, response_by_name, response_names
+from sehdr_warp.response.curve import EXTENSION_SLOPE, HALF_CODE
+from sehdr_warp.response.table import TabulatedResponse
 
 EXTREMES = [0.0, 1e-12, 1e-6, 1e-3, 0.18, 0.999, 1.0, 1.001, 11.2, 1e3, 1e9]
 

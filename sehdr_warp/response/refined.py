@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import SehdrError
-from .response_curve import HALF_CODE, Response
+from .curve import HALF_CODE, Response
 
 CELLS = 8
 """Cells of the warp over the encoded values [0, 1]; one half, which keeps its exposure, lies between two of them."""

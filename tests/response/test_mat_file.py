@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.io import loadmat, savemat
 
-from sehdr_warp.model.mat_file import read_matrices
+from sehdr_warp.response.mat_file import read_matrices
 
 
 @pytest.mark.parametrize("compressed", [False, True])
