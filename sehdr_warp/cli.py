@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from . import __version__
-from .arguments import numbers, say
+from .arguments import say
 from .bench.commands import Bench, run_bench
 from .check.commands import Check, run_check
 from .errors import InputError, SehdrError
@@ -35,9 +35,9 @@ class Render:
     count: int = 60
     """Views of an orbit or interpolation."""
     evs: str | None = None
-    """Exposure brackets in stops from the photos' exposure, such as --evs=-4,-2,0,2,4."""
+    """Brackets in stops from the photos' exposure, such as --evs=-4,-2,0,2,4."""
     exposures: str | None = None
-    """Exposure brackets in seconds, such as 0.125,0.5,2,8,32."""
+    """Brackets as seconds (1/125), multiples of the photos' exposure (1/8x) or stops from it (-2ev): 1/125,1/30,1x."""
     multipart: bool = False
     """One multi-part EXR file for all exposures of a view."""
     ldr_brackets: Literal["jpeg", "png", "png16"] | None = None
@@ -161,8 +161,8 @@ def _render(command: Render) -> None:
         command.out,
         cameras=command.cameras,
         count=command.count,
-        evs=numbers("--evs", command.evs),
-        exposures=numbers("--exposures", command.exposures),
+        evs=command.evs,
+        exposures=command.exposures,
         multipart=command.multipart,
         colorspace=command.colorspace,
         pixel=command.pixel,

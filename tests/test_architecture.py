@@ -23,10 +23,10 @@ ALLOWED = {
     "response": ANY | {"splatting"},
     "scene": ANY | {"response"},
     "field": ANY | {"scene", "response", "splatting"},
-    "output": ANY | {"scene"},
+    "output": ANY | {"scene", "field.exposure"},
     "evaluation": ANY | {"scene", "splatting.ssim"},
     "training": ANY | {"scene", "response", "field", "splatting", "evaluation.metrics", "evaluation.protocols"},
-    "synth": ANY | {"scene", "response", "output.exr", "output.images"},
+    "synth": ANY | {"scene", "response", "output.exr", "output.images", "field.exposure"},
     "check": ANY | {"kernels.constants", "scene", "response", "field", "splatting", "training"},
     "bench": ANY
     | {

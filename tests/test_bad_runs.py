@@ -187,7 +187,7 @@ def test_camera_files(trained, tmp_path, capfd, case):
 @pytest.mark.parametrize(
     "flags, words",
     [
-        (("--evs=",), "--evs"),
+        (("--evs=",), "evs: the list is empty"),
         (("--evs=nan",), "nan"),
         (("--evs=0,0",), "twice"),
         (("--evs=900",), "900"),

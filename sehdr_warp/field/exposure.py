@@ -1,56 +1,101 @@
-"""Exposure brackets: which times, and what a radiance becomes at each of them."""
+"""The one grammar of exposures, used wherever exposures are named, and what a radiance becomes at each of them.
+
+1/125, 0.008, 1/125s    seconds; a number in Python is seconds too
+-2ev, +1ev              stops from the photos' exposure
+1/8x, 8x                multiples of it
+base                    the photos' exposure itself
+"""
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 from itertools import pairwise
-
-import torch
+from typing import TYPE_CHECKING
 
 from ..errors import SehdrError
 
+if TYPE_CHECKING:
+    import torch
+
+Items = str | Sequence[str | float]
+
 # The interior figure of the paper writes {1/8, 1/4, dt_1, 8, 16}; read as multiples of dt_1, so that it also serves a
 # photo of 1/1000 s.
-PAPER_BRACKETS = ("1/8", "1/4", "1", "8", "16")
+PAPER_BRACKETS = ("1/8x", "1/4x", "1x", "8x", "16x")
+_FORMS = "seconds (1/125), stops (-2ev), multiples (1/8x) or base"
 
 
-def exposure_times(base_time: float, spec: str | Sequence[str | float] = PAPER_BRACKETS) -> tuple[float, ...]:
-    """The exposure times in seconds of a bracket, ascending, from a description.
+@dataclass(frozen=True)
+class Exposure:
+    """One exposure. time: seconds. ev: stops above the base exposure, log2(time / base)."""
 
-    base_time: dt_1 of the photos, seconds, positive.
-    spec: items, or one string of them separated by commas. A number or fraction is a multiple of base_time (`1/8`,
-        `16`); with `ev` it is in stops from it (`-2ev`); with `s` it is a time (`1/125s`); `base` is base_time itself.
+    time: float
+    ev: float
 
-    Raises SehdrError, with the item, for one that is not a number, not positive or not finite, and for a time that
-    occurs twice (its weight would count double).
+    @property
+    def label(self) -> str:
+        """`ev-4.0`, with one decimal and always a sign."""
+        # Adding zero turns -0.0 into 0.0.
+        return f"ev{round(self.ev, 1) + 0.0:+.1f}"
+
+
+def read_exposures(items: Items, base_time: float | None, field: str = "exposures") -> tuple[Exposure, ...]:
+    """Exposures, ascending, from items of the grammar above.
+
+    Args:
+        items: a sequence, or one string of items separated by commas.
+        base_time: the photos' exposure, seconds; None where there are no photos and only seconds can be meant (`ev` is
+            then relative to 1 s).
+        field: what the items are called in errors.
+
+    Raises:
+        SehdrError: with the item, for one in no known form, not positive or not finite, or given twice.
     """
-    base_time = _positive(base_time, "base_time")
-    items = spec.split(",") if isinstance(spec, str) else list(spec)
-    times = sorted(_bracket_time(base_time, item) for item in items)
-    if not times:
-        raise SehdrError("exposures: the list is empty; give at least one, such as 'base'")
-    for first, second in pairwise(times):
-        if second <= first * (1 + 1e-9):
-            raise SehdrError(f"exposures: {first:.6g} s occurs twice in {spec!r}; leave one out")
-    return tuple(times)
+    if base_time is not None:
+        base_time = _positive(base_time, "base exposure time")
+    items = [item for item in items.split(",") if item.strip()] if isinstance(items, str) else list(items)
+    if not items:
+        raise SehdrError(f"{field}: the list is empty; give {_FORMS}")
+    made = sorted((_exposure(item, base_time, field) for item in items), key=lambda exposure: exposure.time)
+    for first, second in pairwise(made):
+        if second.time <= first.time * (1 + 1e-9):
+            raise SehdrError(f"{field}: {first.time:.6g} s is given twice; leave one out")
+    return tuple(made)
 
 
-def _bracket_time(base_time: float, item: str | float) -> float:
+def exposure_times(base_time: float, items: Items = PAPER_BRACKETS) -> tuple[float, ...]:
+    """The times of read_exposures, seconds."""
+    return tuple(exposure.time for exposure in read_exposures(items, base_time))
+
+
+def is_seconds(item: str | float) -> bool:
+    """Whether an item is a time of its own, not relative to the photos' exposure."""
     text = str(item).strip().lower()
-    if text == "base":
-        return base_time
-    in_stops, in_seconds = text.endswith("ev"), text.endswith("s")
+    return not (text == "base" or text.endswith(("ev", "x")))
+
+
+def _exposure(item: str | float, base_time: float | None, field: str) -> Exposure:
+    text = str(item).strip().lower()
+    if base_time is None and not is_seconds(text):
+        raise SehdrError(f"{field}: {item!r} is relative to photos, and there are none; give seconds, such as 1/125")
+    base = 1.0 if base_time is None else base_time
     try:
-        number = float(Fraction(text.removesuffix("ev").removesuffix("s").strip()))
-        time = 2.0**number * base_time if in_stops else number if in_seconds else number * base_time
+        if text == "base":
+            return Exposure(base, 0.0)
+        if text.endswith("ev"):
+            ev = float(Fraction(text.removesuffix("ev").strip()))
+            made = Exposure(base * 2.0**ev, ev)
+        else:
+            number = float(Fraction(text.removesuffix("x").removesuffix("s").strip()))
+            time = number * base if text.endswith("x") else number
+            made = Exposure(time, math.log2(time / base))
     except (ValueError, ZeroDivisionError, OverflowError):
-        time = math.nan
-    if not (math.isfinite(time) and time > 0):
-        raise SehdrError(
-            f"exposures: {item!r} is no time above 0; write a multiple (1/8), stops (-3ev), seconds (1/125s) or base"
-        )
-    return time
+        made = Exposure(math.nan, math.nan)
+    if not (math.isfinite(made.time) and made.time > 0):
+        raise SehdrError(f"{field}: {item!r} is no exposure above 0; write {_FORMS}")
+    return made
 
 
 def _positive(time: float, field: str) -> float:
@@ -60,12 +105,18 @@ def _positive(time: float, field: str) -> float:
     return time
 
 
-def bracket_log_radiance(log_base: torch.Tensor, times: Sequence[float], base_time: float) -> torch.Tensor:
+def bracket_log_radiance(log_base: "torch.Tensor", times: Sequence[float], base_time: float) -> "torch.Tensor":
     """log c^{l_j} = log c^{l_1} + log dt_j - log dt_1 (SeHDR, section 3.2, natural logarithm).
 
-    log_base: [...] log of the linear radiance at the input exposure, c^{l_1} = E dt_1; any shape, such as [N, 3].
-    times: n exposure times dt_j, and base_time dt_1, in seconds.
-    Returns [n, ...]: exp of it is the linear radiance at each exposure. SehdrError for a time that is not positive.
+    Args:
+        log_base: [...] log of the linear radiance at the input exposure, c^{l_1} = E dt_1; any shape, such as [N, 3].
+        times: n exposure times dt_j, and base_time dt_1, in seconds.
+
+    Returns:
+        [n, ...]: exp of it is the linear radiance at each exposure.
+
+    Raises:
+        SehdrError: for a time that is not positive.
     """
     shifts = [math.log(_positive(time, "times")) - math.log(_positive(base_time, "base_time")) for time in times]
     offsets = _on_device(tuple(shifts), log_base.dtype, log_base.device)
@@ -73,6 +124,8 @@ def bracket_log_radiance(log_base: torch.Tensor, times: Sequence[float], base_ti
 
 
 @lru_cache(maxsize=64)
-def _on_device(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+def _on_device(values: tuple[float, ...], dtype: "torch.dtype", device: "torch.device") -> "torch.Tensor":
     """Copied once: a copy from the host cannot be part of a recorded training step."""
+    import torch
+
     return torch.tensor(values, dtype=dtype, device=device)

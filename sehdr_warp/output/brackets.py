@@ -1,11 +1,9 @@
 """Exposure brackets of HDR views: scene-linear EXR files whose ratios are exact, and simulated photos of them."""
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import datetime
-from itertools import pairwise
 from pathlib import Path
 from typing import Self
 
@@ -14,6 +12,7 @@ import numpy as np
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.scene import Camera
 
+from ..field.exposure import Exposure, Items, read_exposures
 from ..files import atomic_folder, atomic_path, write_json
 from .colorspace import color_space, from_rec709
 from .exr import Part, exr_header, stored_pixel_type, write_exr, write_multipart_exr
@@ -25,20 +24,6 @@ MANIFEST_FORMAT = 1
 
 # EXIF rationals and 32-bit expTime hold these; real shutters lie far inside.
 _SHORTEST, _LONGEST = 1e-6, 1e6
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """One exposure of a bracket. time: seconds. ev: stops above the base exposure, log2(time / base)."""
-
-    time: float
-    ev: float
-
-    @property
-    def label(self) -> str:
-        """`ev-4.0`, with one decimal and always a sign."""
-        # Adding zero turns -0.0 into 0.0.
-        return f"ev{round(self.ev, 1) + 0.0:+.1f}"
 
 
 @dataclass(frozen=True)
@@ -71,38 +56,35 @@ class BracketOptions:
 
 
 def bracket_exposures(
-    base_time: float, *, evs: Sequence[float] | None = None, exposures: Sequence[float] | None = None
+    base_time: float, *, evs: Items | None = None, exposures: Items | None = None
 ) -> tuple[Exposure, ...]:
     """The exposures of a bracket, ascending.
 
-    evs: stops, time = base_time 2^ev; or exposures: seconds. Exactly one of them.
-    Raises SehdrError naming the value where both or none are given, a value is zero, negative (a time), not finite,
-    outside 1e-6 to 1e6 seconds, or comes twice.
+    Args:
+        base_time: seconds at 0 EV.
+        exposures: items of field/exposure.py's grammar, such as "1/125, -2ev, 8x"; numbers are seconds.
+        evs: shorthand for stops, such as "-4,-2,0" or [-4, -2, 0]. Exactly one of both.
+
+    Raises:
+        SehdrError: naming the value, where both or none are given, an item cannot be read or comes twice, or a time is
+            outside 1e-6 to 1e6 seconds.
     """
     if (evs is None) == (exposures is None):
         count = "both were given" if evs is not None else "neither was given"
         raise SehdrError(f"brackets need evs or exposures, and {count}; give one of them")
-    if not (math.isfinite(base_time) and base_time > 0):
-        raise SehdrError(f"base exposure time {base_time} is not positive and finite; give seconds")
-    given, field = (evs, "evs") if evs is not None else (exposures, "exposures")
-    if not len(given):
-        raise SehdrError(f"{field} is empty; give at least one value")
-    made = []
-    for value in map(float, given):
-        if not math.isfinite(value):
-            raise SehdrError(f"{field}: {value} is not finite; give a number")
-        if field == "exposures" and value <= 0:
-            raise SehdrError(f"exposures: {value:g} is not positive; give seconds")
-        # Scaling by whole stops is exact; absurd stops would overflow before the range refuses them.
-        time = base_time * 2.0**value if field == "evs" and abs(value) < 64 else value
-        if field == "evs" and abs(value) >= 64 or not _SHORTEST <= time <= _LONGEST:
-            raise SehdrError(f"{field}: {value:g} is outside {_SHORTEST:g} to {_LONGEST:g} seconds; stay inside")
-        made.append(Exposure(time, value if field == "evs" else math.log2(value / base_time)))
-    made.sort(key=lambda exposure: exposure.time)
-    for first, second in pairwise(made):
-        if first.time == second.time:
-            raise SehdrError(f"{field}: {first.ev if field == 'evs' else first.time:g} is given twice; leave one out")
-    return tuple(made)
+    field = "exposures" if evs is None else "evs"
+    items = exposures if evs is None else [f"{str(ev).strip()}ev" for ev in _items(evs)]
+    made = read_exposures(items, base_time, field)
+    for exposure in made:
+        if not _SHORTEST <= exposure.time <= _LONGEST:
+            raise SehdrError(
+                f"{field}: {exposure.time:.6g} s ({exposure.ev:+g} EV) is outside {_SHORTEST:g} to {_LONGEST:g} seconds; stay inside"
+            )
+    return made
+
+
+def _items(given: Items) -> list:
+    return [item for item in given.split(",") if item.strip()] if isinstance(given, str) else list(given)
 
 
 def write_brackets(
@@ -110,8 +92,8 @@ def write_brackets(
     views: Mapping[str, np.ndarray] | Iterable[tuple[str, np.ndarray]],
     base_time: float,
     *,
-    evs: Sequence[float] | None = None,
-    exposures: Sequence[float] | None = None,
+    evs: Items | None = None,
+    exposures: Items | None = None,
     cameras: Mapping[str, Camera] | None = None,
     colorspace: str = "rec709",
     pixel: str = "half",

@@ -11,6 +11,7 @@ import numpy as np
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera, load_cameras
 
+from ..field.exposure import Items
 from ..files import atomic_folder
 from .brackets import BracketFolder, BracketOptions, bracket_exposures
 from .camera_paths import interpolate, orbit
@@ -47,8 +48,8 @@ def render_views(
     *,
     cameras: str | Path = "test",
     count: int = 60,
-    evs: Sequence[float] | None = None,
-    exposures: Sequence[float] | None = None,
+    evs: Items | None = None,
+    exposures: Items | None = None,
     multipart: bool = False,
     colorspace: str = "rec709",
     pixel: str = "half",

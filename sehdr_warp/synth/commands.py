@@ -46,7 +46,7 @@ class ExposeTruth:
     response: str = "hdr-nerf"
     """Camera response: a name (srgb, gamma-2.2, hdr-nerf ...) or a file."""
     exposures: str | None = None
-    """Times in seconds, such as 0.02,0.08,0.32; by default five, four times apart, around a well exposed one."""
+    """Times in seconds, such as 1/50,0.08,0.32; by default five, four times apart, around a well exposed one."""
     noise: str | None = None
     """Sensor noise as FULL_WELL,READ_NOISE in electrons, such as 20000,5; by default none."""
     seed: int = 0
@@ -102,6 +102,7 @@ def _render(asked: RenderTruth) -> None:
 
 
 def _expose(asked: ExposeTruth) -> None:
+    from ..field.exposure import read_exposures
     from ..files import check_absent_folder
     from ..response import response_by_name
     from ..scene import load_scene
@@ -117,7 +118,7 @@ def _expose(asked: ExposeTruth) -> None:
         if len(figures) != 2:
             raise SehdrError(f"--noise {asked.noise}: give two numbers, full well and read noise in electrons")
         noise = SensorNoise(*figures)
-    times = numbers("--exposures", asked.exposures)
+    times = asked.exposures and [exposure.time for exposure in read_exposures(asked.exposures, None, "--exposures")]
     check_absent_folder(asked.out, asked.overwrite)
     scene = load_scene(asked.truth, progress=say)
     times = times or exposure_ladder(scene, response)

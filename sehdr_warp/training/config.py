@@ -91,8 +91,8 @@ class FusionConfig:
 
     enabled: bool = option(False, "fuse exposure brackets into the HDR colour; off, the base colour is the HDR colour")
     exposures: tuple[str, ...] = option(
-        ("1/8", "1/4", "1", "8", "16"),
-        "exposures of the brackets: multiples of the photos' own (1/8), stops from it (-3ev) or times (1/125s)",
+        ("1/8x", "1/4x", "1x", "8x", "16x"),
+        "exposures of the brackets: multiples of the photos' own (1/8x), stops from it (-3ev) or seconds (1/125)",
         nonempty=True,
     )
     radiance_scale: str = option(

@@ -4,7 +4,7 @@ import json
 from collections.abc import Collection
 
 from ..errors import InputError
-from ..field.exposure import exposure_times
+from ..field.exposure import exposure_times, is_seconds
 from ..scene import Scene
 from .config import Config
 from .initialization import base_exposure_time
@@ -79,13 +79,13 @@ def check_fields(scene: Scene, facts: SceneFacts, config: Config, given: Collect
 
 def _check_exposures(scene: Scene, config: Config, refuse) -> None:
     exposures, base = list(config.fusion.exposures), base_exposure_time(scene)
-    timed = [item for item in exposures if item.strip().endswith("s") and item.strip() != "base"]
+    timed = [item for item in exposures if is_seconds(item)]
     if timed and not scene.exposure_times_known:
         refuse(
             "fusion.exposures",
             exposures,
             f"{timed[0]} is a time and the photos state none",
-            "write multiples of the photos' exposure (1/8) or stops from it (-3ev)",
+            "write multiples of the photos' exposure (1/8x) or stops from it (-3ev)",
         )
     for time in exposure_times(base, exposures):
         if not 1 / REACH <= time / base <= REACH:

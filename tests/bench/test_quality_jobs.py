@@ -110,12 +110,12 @@ def test_methods_that_cannot_be_are_refused_in_one_line(names, variants, message
 
 
 def test_variants_from_the_command_line_and_from_a_file(tmp_path):
-    (tmp_path / "v.toml").write_text('[calm]\nbase = "paper"\nloss.ssim_weight = 0.5\nfusion.exposures = ["1", "4"]\n')
-    given = 'sure:default:fusion.exposures=["1/8", "8"],response.method=paper'
+    (tmp_path / "v.toml").write_text('[calm]\nbase = "paper"\nloss.ssim_weight = 0.5\nfusion.exposures = ["1x", "4x"]\n')
+    given = 'sure:default:fusion.exposures=["1/8x", "8x"],response.method=paper'
     sure, calm = choose_methods([], [given], tmp_path / "v.toml")
     assert sure == Method("sure", "default", base="default",
-                          overrides={"fusion.exposures": ["1/8", "8"], "response.method": "paper"})  # fmt: skip
-    assert (calm.base, calm.overrides) == ("paper", {"loss.ssim_weight": 0.5, "fusion.exposures": ["1", "4"]})
+                          overrides={"fusion.exposures": ["1/8x", "8x"], "response.method": "paper"})  # fmt: skip
+    assert (calm.base, calm.overrides) == ("paper", {"loss.ssim_weight": 0.5, "fusion.exposures": ["1x", "4x"]})
     with pytest.raises(InputError, match="loss.clip"):
         plan_jobs(settings(methods=tuple(choose_methods([], ["odd:default:loss.clip=true"]))))
 

@@ -74,7 +74,7 @@ def test_black_pixels_have_finite_gradients():
 
 
 def fusion_of():
-    times = exposure_times(TIME, ("1/8", "1", "8"))
+    times = exposure_times(TIME, ("1/8x", "1x", "8x"))
     return NeuralExposureFusion(SRGB, times, TIME, width=8, evaluation="exact", radiance_scale=1 / TIME)
 
 

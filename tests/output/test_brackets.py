@@ -22,9 +22,10 @@ def test_evs_are_stops_above_the_base_and_ascend():
     assert [(e.time, e.ev, e.label) for e in made] == [(1 / 32, -4, "ev-4.0"), (0.5, 0, "ev+0.0"), (2, 2, "ev+2.0")]
 
 
-def test_exposures_are_seconds():
-    made = bracket_exposures(0.5, exposures=[8, 0.125])
-    assert [(e.time, e.ev) for e in made] == [(0.125, -2), (8, 4)]
+def test_exposures_are_of_the_one_grammar():
+    for given in ([8, 0.125], "1/8, 8s", "1/4x,+4ev"):
+        assert [(e.time, e.ev) for e in bracket_exposures(0.5, exposures=given)] == [(0.125, -2), (8, 4)]
+    assert bracket_exposures(0.5, evs="-2,4") == bracket_exposures(0.5, evs=[4, -2])
     assert bracket_exposures(1.0, evs=[-0.01])[0].label == "ev+0.0"
 
 
@@ -33,21 +34,22 @@ def test_exposures_are_seconds():
     [
         ({"evs": [0], "exposures": [1]}, "both were given"),
         ({}, "neither was given"),
-        ({"evs": []}, "evs is empty"),
-        ({"evs": [0, float("nan")]}, "evs: nan is not finite"),
-        ({"exposures": [1, float("inf")]}, "exposures: inf is not finite"),
-        ({"exposures": [0.5, 0]}, "exposures: 0 is not positive"),
-        ({"exposures": [-2]}, "exposures: -2 is not positive"),
-        ({"exposures": [2, 1, 2]}, "exposures: 2 is given twice"),
-        ({"evs": [1, 1.0]}, "evs: 1 is given twice"),
-        ({"evs": [1e9]}, "evs: 1e[+]09 is outside"),
-        ({"exposures": [1e-30]}, "exposures: 1e-30 is outside"),
+        ({"evs": []}, "evs: the list is empty"),
+        ({"evs": [0, float("nan")]}, "evs: 'nanev' is no exposure"),
+        ({"exposures": [1, float("inf")]}, "exposures: inf is no exposure"),
+        ({"exposures": [0.5, 0]}, "exposures: 0 is no exposure above 0"),
+        ({"exposures": "-2"}, "exposures: '-2' is no exposure above 0"),
+        ({"exposures": [2, 1, "4x"]}, "exposures: 2 s is given twice"),
+        ({"evs": [1, 1.0]}, "evs: 1 s is given twice"),
+        ({"evs": [1e9]}, "evs: '1000000000.0ev' is no exposure"),
+        ({"evs": "0,two"}, "evs: 'twoev' is no exposure"),
+        ({"exposures": [1e-30]}, "exposures: 1e-30 s .* is outside"),
     ],
 )
 def test_unusable_exposures_name_the_value(given, message):
     with pytest.raises(SehdrError, match=message):
         bracket_exposures(0.5, **given)
-    with pytest.raises(SehdrError, match="base exposure time -1"):
+    with pytest.raises(SehdrError, match="base exposure time = -1"):
         bracket_exposures(-1, evs=[0])
 
 

@@ -49,7 +49,7 @@ def test_expose_refuses_in_a_line(truth, tmp_path, capfd):
     folder, _, _ = truth
     out = tmp_path / "photos"
     assert "--exposures" in refused(capfd, "expose", folder, "--out", out, "--exposures", "fast")
-    assert "exposure time" in refused(capfd, "expose", folder, "--out", out, "--exposures", "0")
+    assert "no exposure above 0" in refused(capfd, "expose", folder, "--out", out, "--exposures", "0")
     assert "--noise" in refused(capfd, "expose", folder, "--out", out, "--noise", "100")
     assert "kodak" in refused(capfd, "expose", folder, "--out", out, "--response", "kodak")
     assert "not found" in refused(capfd, "expose", tmp_path / "none", "--out", out)

@@ -65,7 +65,7 @@ def test_default_preset_states_every_field_with_its_meaning():
 
 def test_paper_preset_is_the_papers():
     config = load_config("paper")
-    assert config.fusion.enabled and config.fusion.exposures == ("1/8", "1/4", "1", "8", "16")
+    assert config.fusion.enabled and config.fusion.exposures == ("1/8x", "1/4x", "1x", "8x", "16x")
     assert (config.fusion.sigma, config.loss.linear_weight, config.loss.form) == (0.2, 0.5, "sum")
     assert (config.model.radiance, config.model.tone_map) == ("linear", "gaussian")
 

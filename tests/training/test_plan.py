@@ -155,11 +155,11 @@ def test_scenes_without_a_plan_get_one_line(scene, spoil, words):
         ({"loss.hdr_truth": True, "loss.linear_weight": 0.5}, "hdr", ["hdr_truth = true", "0 of 6"]),
         ({"schedule.coarse_levels": 3}, None, ["coarse_levels = 3", "32 x 32", "4"]),
         (
-            {"fusion.enabled": True, "fusion.exposures": ["1", "1/125s"]},
+            {"fusion.enabled": True, "fusion.exposures": ["1x", "1/125s"]},
             "times",
             ["fusion.exposures", "1/125s", "state none"],
         ),
-        ({"fusion.enabled": True, "fusion.exposures": ["1", "30ev"]}, None, ["fusion.exposures", "1.07e+09 times"]),
+        ({"fusion.enabled": True, "fusion.exposures": ["1x", "30ev"]}, None, ["fusion.exposures", "1.07e+09 times"]),
     ],
 )
 def test_values_that_the_scene_contradicts_are_refused_with_both(scene, changes, spoil, words):
@@ -195,7 +195,7 @@ def test_a_training_follows_its_plan_and_keeps_it(scene, tmp_path):
 
 def test_settings_are_written_as_in_toml():
     assert parse_setting("loss.clipping = false") == ("loss.clipping", False)
-    assert parse_setting("fusion.exposures=['1', '2ev']") == ("fusion.exposures", ["1", "2ev"])
+    assert parse_setting("fusion.exposures=['1x', '2ev']") == ("fusion.exposures", ["1x", "2ev"])
     assert parse_setting("response.name=gamma-2.2") == ("response.name", "gamma-2.2")
     with pytest.raises(InputError, match="--set seed: is not field=value"):
         parse_setting("seed")
