@@ -7,7 +7,6 @@ from typing import Annotated
 import tyro
 
 from ..arguments import numbers, positive, say
-from ..errors import InputError
 from .quality_command import Quality, run_quality
 from .response_command import Responses, run_responses
 
@@ -90,30 +89,15 @@ class Scale(Output):
     """Seconds that one variant may take on the CPU."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Choices(Output):
-    """Error against run time of each choice that trades one for the other."""
-
-    size: str | None = None
-    """Gaussians@WIDTHxHEIGHT; by default 200k@800x800 on a GPU and 5k@200x200 on the CPU."""
-    iterations: int = 500
-    """Training steps of the small model on which degrees of the harmonics are compared; 0 leaves them out."""
-    repetitions: int = 30
-    """Timed runs of each variant; slow ones have fewer on the CPU."""
-    budget: float = 3.0
-    """Seconds that one variant may take on the CPU."""
-
-
 @dataclass(frozen=True)
 class Bench:
-    """Measure speed: splats, training steps, trainings, growth with size, and what accuracy costs."""
+    """Measure speed: splats, training steps, trainings, growth with size, quality."""
 
     benchmark: (
         Annotated[Kernels, tyro.conf.subcommand("kernels")]
         | Annotated[Step, tyro.conf.subcommand("step")]
         | Annotated[Training, tyro.conf.subcommand("training")]
         | Annotated[Scale, tyro.conf.subcommand("scale")]
-        | Annotated[Choices, tyro.conf.subcommand("choices")]
         | Annotated[Quality, tyro.conf.subcommand("quality")]
         | Annotated[Responses, tyro.conf.subcommand("response")]
     )
@@ -204,21 +188,4 @@ def _scale(asked: Scale, device) -> dict:
     )
 
 
-def _choices(asked: Choices, device) -> dict:
-    from .choices import bench_choices
-    from .splats import parse_size
-
-    if asked.iterations < 0:
-        raise InputError(f"--iterations {asked.iterations}", "negative", "give 0 or more")
-    default = {"cuda": "200k@800x800", "cpu": "5k@200x200"}[device.type]
-    return bench_choices(
-        parse_size(default if asked.size is None else asked.size, device.type),
-        device,
-        iterations=asked.iterations,
-        repetitions=positive("--repetitions", asked.repetitions),
-        budget=positive("--budget", asked.budget),
-        progress=say,
-    )
-
-
-_MEASURES = {Kernels: _kernels, Step: _step, Training: _training, Scale: _scale, Choices: _choices}
+_MEASURES = {Kernels: _kernels, Step: _step, Training: _training, Scale: _scale}

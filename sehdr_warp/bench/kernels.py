@@ -1,4 +1,4 @@
-"""`bench kernels`: the whole differentiable splat (project, order, bin, blend; colours given), and the CPU's blend."""
+"""`bench kernels`: the whole differentiable splat (project, order, bin, blend; colours given)."""
 
 from collections.abc import Callable
 
@@ -9,11 +9,10 @@ from ..splatting.rasterization import rasterize
 from ..splatting.recorded_rasterizer import RecordedRasterizer
 from ..splatting.recording import GraphRecorder
 from . import checks
-from .cpu_blend import BLEND_THREADS, blend_rows, using_threads
 from .machine import package_version
 from .peers import Peer, differs, find_peers
 from .report import new_report
-from .splats import Size, SplatScene, make_covering_scene, make_splat_scene
+from .splats import Size, SplatScene, make_splat_scene
 from .timing import Variant, peak_memory, time_variants
 
 OURS = "sehdr-warp"
@@ -25,8 +24,6 @@ recorded training step."""
 PLAIN_TORCH = "plain torch"
 PLAIN_TORCH_BYTES = 4 << 30
 """The plain torch rasterizer keeps about 16 numbers for each pixel-Gaussian pair; beyond this it is left out."""
-COVERING_SIZE = Size(200, 128, 128)
-"""Every Gaussian reaches every pixel there: what a pair costs that is really computed."""
 
 
 def bench_kernels(
@@ -39,7 +36,7 @@ def bench_kernels(
     budget: float = 20.0,
     progress: Callable[[str], None] = lambda line: None,
 ) -> dict:
-    """Time and check; returns the report, docs/benchmarks.md says what is in it.
+    """Time and check; returns the report.
 
     sizes, channels: every combination is measured. peers: compare with the peers that import.
     repetitions, budget: see time_variants.
@@ -54,16 +51,10 @@ def bench_kernels(
             usable = [peer for peer in found if peer.supports(count)]
             report["checks"] += [check.to_dict() for check in _checks(scene, usable)]
             report["rows"] += _splat_rows(scene, usable, repetitions, budget, report["notes"])
-            if device.type == "cpu":
-                report["rows"] += blend_rows(scene, "random", repetitions, budget)
             best = next(
                 row for row in report["rows"][::-1] if row["implementation"] == OURS and row["stage"] == "splat"
             )
             progress(f"{size}, {count} channels: {best['pass']} {best['median_ms']:.3f} ms")
-    if device.type == "cpu":
-        for count in channels:
-            covering = make_covering_scene(COVERING_SIZE, count)
-            report["rows"] += blend_rows(covering, "covering", repetitions, budget)
     report["notes"] = list(dict.fromkeys(report["notes"]))
     return report
 
@@ -109,9 +100,7 @@ def _checks(scene: SplatScene, peers: list[Peer]) -> list[checks.Check]:
         made += checks.compare(OURS_RECORDED, "CPU kernels", scene, _recorded(scene, scene.cotangent())(), cpu)
     else:
         made += checks.check_against_reference(PLAIN_TORCH, checks.render_reference, small)
-        for threads in BLEND_THREADS:
-            with using_threads(threads):
-                made += checks.check_against_reference(f"{OURS} on {threads} threads", _render, small)
+        made += checks.check_against_reference(OURS, _render, small)
     if peers:
         with torch.no_grad():
             image = _render(scene)

@@ -14,8 +14,7 @@ from ..training.config_files import toml_value
 class Method:
     """What is trained, and on what.
 
-    name: in tables and on the command line. preset: of load_config. kind: "gaussians" trains the preset, "hdr-nerf"
-        HDR-NeRF's fields.
+    name: in tables and on the command line. preset: of load_config.
     truth: it gets the HDR truth of the training views; all others never see it.
     blind: whether a run without the response makes sense (one that takes nothing from the photos has no use for it).
     base: the method this is a variant of; overrides: dotted fields of the config and their values, on top of the
@@ -24,7 +23,6 @@ class Method:
 
     name: str
     preset: str
-    kind: str = "gaussians"
     truth: bool = False
     blind: bool = True
     base: str | None = None
@@ -42,7 +40,6 @@ METHODS = {
         Method("gauss-hdr", "gauss-hdr"),
         Method("3dgs", "3dgs"),
         Method("predicted", "predicted"),
-        Method("hdr-nerf", "default", kind="hdr-nerf"),
         Method("truth", "truth", truth=True, blind=False),
     )
 }
@@ -122,6 +119,4 @@ def _flat(table: dict, prefix: str = ""):
 
 def _variant(name: str, base: str, overrides: dict) -> Method:
     method = method_by_name(base)
-    if method.kind == "hdr-nerf":
-        raise SehdrError(f"variant {name}: hdr-nerf has no preset to change; take another base")
     return replace(method, name=name, base=method.name, overrides=method.overrides | overrides)

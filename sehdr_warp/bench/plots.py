@@ -59,32 +59,6 @@ def plot_scale(report: dict, path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
-def plot_choices(report: dict, path: Path) -> None:
-    """Own image and gradient error over run time as a multiple of the default's, a column for each kind of features, a
-    line for each choice."""
-    rows = [row for row in report["rows"] if row["stage"] == "choice"]
-    kinds = list(dict.fromkeys(row["features"] for row in rows))
-    choices = list(dict.fromkeys(row["choice"] for row in rows))
-    figure, panels = _panels(2, len(kinds))
-    for panel_row, field, label in zip(
-        panels, ("own_image_error", "own_gradient_error"), ("own image error", "own gradient error")
-    ):
-        for axes, kind in zip(panel_row, kinds):
-            for choice in choices:
-                chosen = [row for row in rows if (row["choice"], row["features"]) == (choice, kind)]
-                chosen = [row for row in chosen if row["times_default"] and row[field]]
-                if not chosen:
-                    continue
-                points = [(row["times_default"], row[field]) for row in chosen]
-                (line,) = axes.plot(*zip(*points), marker="o", markersize=4, linewidth=0.8, label=choice)
-                for point, row in zip(points, chosen):
-                    axes.annotate(row["value"], point, fontsize=5, color=line.get_color())
-            axes.set(title=f"{kind} features", xlabel="time / default's", ylabel=label, xscale="log", yscale="log")
-            axes.grid(True, which="both", alpha=0.3)
-            axes.legend(fontsize="xx-small")
-    figure.savefig(path, dpi=120)
-
-
 def _panels(rows: int, columns: int):
     """A figure that needs no display, and its axes [rows][columns]."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -95,5 +69,5 @@ def _panels(rows: int, columns: int):
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-PLOTS = {"kernels": plot_kernels, "scale": plot_scale, "choices": plot_choices}
+PLOTS = {"kernels": plot_kernels, "scale": plot_scale}
 """Which benchmarks have a picture, and what draws it."""

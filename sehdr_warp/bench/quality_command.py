@@ -20,7 +20,7 @@ class Quality:
     scenes: str = "embedded"
     """Folders with HDR truth in all views, embedded or embedded:NAME, separated by commas."""
     methods: str = "default,paper,hdr-gs,3dgs,truth"
-    """default, paper, paper-truth, hdr-gs, hdr-gs-truth, gauss-hdr, 3dgs, predicted, hdr-nerf, truth, other presets or
+    """default, paper, paper-truth, hdr-gs, hdr-gs-truth, gauss-hdr, 3dgs, predicted, truth, other presets or
     TOML files, separated by commas; empty for variants alone."""
     variant: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """A method with other values, NAME:BASE:field=value,field=value, such as no-clip:default:loss.clipping=false; may
@@ -48,8 +48,6 @@ class Quality:
     predictor: str | None = None
     """For the method predicted: what makes HDR of a single photo, a name, a folder or a network; {scene} and {exposure}
     in it stand for the job's."""
-    nerf_seconds: float | None = None
-    """For the method hdr-nerf: stop after so many seconds if its iterations are not done before."""
     lpips: Path | None = None
     """Folder with LPIPS weights; by default that of SEHDR_LPIPS, and LPIPS is null without."""
     flip: bool = False
@@ -92,8 +90,6 @@ def run_quality(asked: Quality) -> None:
 
     if asked.launcher not in LAUNCHERS:
         raise SehdrError(f"--launcher {asked.launcher}: not one of {', '.join(LAUNCHERS)}")
-    if asked.nerf_seconds is not None:
-        positive("--nerf-seconds", asked.nerf_seconds)
     device, gpus = _devices(asked)
     lpips = asked.lpips or (os.environ.get("SEHDR_LPIPS") or None)
     settings = Settings(
@@ -109,7 +105,6 @@ def run_quality(asked: Quality) -> None:
         exposure_factor=asked.exposure_factor,
         noise=_noise(asked.noise),
         predictor=asked.predictor,
-        nerf_seconds=asked.nerf_seconds,
         lpips=lpips is not None,
         flip=asked.flip,
         device=device,

@@ -35,7 +35,7 @@ class Settings:
     the truth. exposures: places in a ladder of exposure_count times, each exposure_factor times the last.
     responses: out of RESPONSES. iterations: None is the preset's own. noise: (full well, read noise) in electrons.
     predictor: replaces that of methods which predict HDR from single photos; {scene} and {exposure} stand for the
-    job's. nerf_seconds: HDR-NeRF stops after so many, if its iterations are not done before. lpips: whether weights are
+    job's. lpips: whether weights are
     there. device: "cpu" or "cuda".
     """
 
@@ -51,7 +51,6 @@ class Settings:
     exposure_factor: float = 4.0
     noise: tuple[float, float] | None = None
     predictor: str | None = None
-    nerf_seconds: float | None = None
     lpips: bool = False
     flip: bool = False
     device: str = "cpu"
@@ -150,12 +149,10 @@ def plan_jobs(settings: Settings, *, progress: Callable[[str], None] = lambda li
                     },
                     "method": {
                         "name": method.name,
-                        "kind": method.kind,
                         "truth": method.truth,
                         "base": method.base,
                         "overrides": method.overrides,
                         **files,
-                        **({"seconds": settings.nerf_seconds} if method.kind == "hdr-nerf" else {}),
                     },
                     "response": response,
                     "seed": seed,

@@ -46,7 +46,7 @@ class Runner:
         self._machine: dict | None = None
 
     def run(self, job: Job, folder: Path) -> dict:
-        """Trains, evaluates and returns the result as it is to be written; see docs/benchmarks.md.
+        """Trains, evaluates and returns the result as it is to be written.
 
         Raises SehdrError where the scene has no truth, the training diverges, or a file cannot be used.
         """
@@ -90,15 +90,13 @@ class Runner:
         }
 
     def _train(self, method: dict, scene: Scene, config: Config, out: Path):
-        if method["kind"] == "hdr-nerf":
-            return _hdr_nerf(scene, config, method["seconds"], self.device)
         return train(scene, out, config, device=self.device, quiet=True)
 
     def _warm_up(self, method: dict, scene: Scene, config: Config, folder: Path) -> None:
         # What is compiled depends on the shape of the computation, not on seeds, rates or lengths.
         parts = config.model, config.response.form, config.fusion, config.loss, config.densification.strategy
         shape = repr((*parts, config.optimizer.visible_only, config.densification.contribution > 0))
-        if shape in self._warm or method["kind"] == "hdr-nerf":
+        if shape in self._warm:
             return
         count = min(WARM_UP_ITERATIONS, config.schedule.iterations)
         overrides = {"schedule.iterations": count, "schedule.evaluate_at": [config.schedule.stated_for]}
@@ -147,22 +145,6 @@ class Runner:
     def _wait(self) -> None:
         if self.device.startswith("cuda"):
             torch.cuda.synchronize(self.device)
-
-
-def _hdr_nerf(scene: Scene, config: Config, seconds: float | None, device: str):
-    """HDR-NeRF for the config's iterations, or until the seconds are over."""
-    from .hdr_nerf import HdrNerfSettings, train_hdr_nerf, unit_value
-
-    return train_hdr_nerf(
-        scene,
-        iterations=config.schedule.iterations,
-        seconds=seconds,
-        device=device,
-        seed=config.seed,
-        settings=HdrNerfSettings(unit_value=unit_value(config.response.name)),
-        # A test renders every view with hundreds of samples a pixel: a quarter of them will do.
-        evaluate_at=[config.scaled(number) for number in config.schedule.evaluate_at[::-4]],
-    )
 
 
 def photos(job: Job) -> tuple[Scene, Scene]:

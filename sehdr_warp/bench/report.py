@@ -16,11 +16,6 @@ _SIZE = (
     ("width", "width", "d"),
     ("height", "height", "d"),
 )
-_AGAINST_DEFAULT = (
-    ("median ms", "median_ms", ".3f"),
-    ("times the default", "times_default", ".2f"),
-    ("n", "repetitions", "d"),
-)
 _JUDGED = (
     ("method", "method", "s"),
     ("n", "trials", "d"),
@@ -47,22 +42,6 @@ COLUMNS = {
             ("n", "repetitions", "d"),
             ("peak MiB", "peak_memory_bytes", "MiB"),
             ("ours / this", "ours_over_this", ".3f"),
-        ),
-        "blend": (
-            ("scene", "scene", "s"),
-            *_SIZE,
-            ("C", "channels", "d"),
-            ("pass", "pass", "s"),
-            ("threads", "threads", "d"),
-            ("median ms", "median_ms", ".3f"),
-            ("n", "repetitions", "d"),
-            ("Mpairs", "pairs", "M"),
-            ("ns / pair", "ns_per_pair", ".2f"),
-            ("least", "least_ns_per_pair", ".2f"),
-            ("of processor time", "cpu_ns_per_pair", ".2f"),
-            ("counted Mpairs", "counted_pairs", "M"),
-            ("ns / counted pair", "ns_per_counted_pair", ".2f"),
-            ("x one thread", "speedup_over_one_thread", ".2f"),
         ),
     },
     "step": {
@@ -101,27 +80,6 @@ COLUMNS = {
             ("to", "to", ",d"),
             ("at the large end", "slope_large", ".2f"),
             ("from ", "large_from", ",d"),
-        ),
-    },
-    "choices": {
-        "choice": (
-            ("choice", "choice", "s"),
-            ("value", "value", "s"),
-            ("features", "features", "s"),
-            *_AGAINST_DEFAULT,
-            ("image error", "image_error", ".1e"),
-            ("99 % of pixels", "pixel_error_p99", ".1e"),
-            ("gradient error", "gradient_error", ".1e"),
-            ("worst gradient", "worst_gradient", "s"),
-            ("own image error", "own_image_error", ".1e"),
-            ("own gradient error", "own_gradient_error", ".1e"),
-        ),
-        "harmonics": (
-            ("degree", "value", "s"),
-            ("HDR PSNR dB", "psnr_hdr", ".2f"),
-            ("LDR PSNR dB", "psnr_ldr", ".2f"),
-            ("image error", "image_error", ".1e"),
-            *_AGAINST_DEFAULT,
         ),
     },
     "training": {

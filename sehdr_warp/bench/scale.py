@@ -83,7 +83,7 @@ def bench_scale(
     budget: float = 5.0,
     progress: Callable[[str], None] = lambda line: None,
 ) -> dict:
-    """Time, weigh and check; returns the report, docs/benchmarks.md says what is in it.
+    """Time, weigh and check; returns the report.
 
     peers: gsplat beside ours at nine channels, where it imports. steps: also whole training steps, in the sweeps over
     Gaussians and pixels. repetitions, budget: see time_variants.

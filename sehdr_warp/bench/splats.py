@@ -125,18 +125,3 @@ def make_splat_scene(size: Size, channels: int, seed: int = 0) -> SplatScene:
     leaves = (means, log_scales, quaternions, opacities, uniform(count, channels))
     intrinsics = torch.tensor([focal, focal, width / 2, height / 2])
     return SplatScene(leaves, torch.eye(4), intrinsics, size).to()
-
-
-def make_covering_scene(size: Size, channels: int) -> SplatScene:
-    """As make_splat_scene(), but every Gaussian covers the whole image, and so thinly that none is hidden: each pixel
-    of each tile counts for each Gaussian (up to some 400 of them)."""
-    scene = make_splat_scene(size, channels)
-    generator = torch.Generator().manual_seed(1)
-    means, _, _, _, features = (leaf.detach() for leaf in scene.leaves)
-    log_deviation = (2 * max(size.width, size.height) / scene.intrinsics[0] * means[:, 2:]).log()
-    opacities = 0.01 + 0.01 * torch.rand(size.gaussians, generator=generator)
-    # Flat discs that face the camera: their depth adds nothing to their shape in the image.
-    flat = torch.cat([log_deviation, log_deviation, log_deviation - 3.0], dim=1)
-    upright = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(size.gaussians, 1)
-    leaves = (means * torch.tensor([0.1, 0.1, 1.0]), flat, upright, opacities, features)
-    return SplatScene(leaves, scene.world_to_camera, scene.intrinsics, size).to()

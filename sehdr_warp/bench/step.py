@@ -46,7 +46,7 @@ def bench_step(
     plain_torch: bool = True,
     progress: Callable[[str], None] = lambda line: None,
 ) -> dict:
-    """Time and check; returns the report, docs/benchmarks.md says what is in it.
+    """Time and check; returns the report.
 
     The training is taken in its thick: all degrees of the harmonics, full size, densification going on. plain_torch:
     on the CPU, compare with the same step on the plain torch rasterizer in float32. repetitions, budget: see

@@ -34,7 +34,7 @@ def bench_training(
     overwrite: bool = False,
     progress: Callable[[str], None] = lambda line: None,
 ) -> dict:
-    """Train both sides and measure; returns the report, docs/benchmarks.md says what is in it.
+    """Train both sides and measure; returns the report.
 
     Both sides have the same photos, split, start points and colours, losses, learning rates and iterations, and 3DGS's
     thresholds as they stand, whatever the number of iterations. released: also train gsplat as version 1.5.3 does,

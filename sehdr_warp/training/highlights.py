@@ -12,8 +12,7 @@ from .losses import CODE
 
 CHANNEL_PARTS = (0.39, 0.61, 1.0)
 """Of loss.highlight_stops, where one, two and three channels of a pixel clip: a channel that clips alone is seldom
-far above white. Fitted, together with the default of highlight_stops, to four of the embedded scenes
-(docs/highlights.md)."""
+far above white. Fitted, together with the default of highlight_stops, to four of the embedded scenes."""
 LONG_TAIL = 2.0
 """Stops; a tail that is longer says no more. Chosen with CHANNEL_PARTS."""
 

@@ -189,7 +189,7 @@ def mu_law(exposure: Tensor, white: float, mu: float = MU) -> Tensor:
 
 PULL_DOWN = 0.1
 """How strongly the prior on clipped light pulls down, in parts of how it lifts. The edges of small lights, where they
-mix with what is known, tell of more than is expected; but without any hold light runs away (docs/highlights.md)."""
+mix with what is known, tell of more than is expected; but without any hold light runs away."""
 
 
 def highlight_prior(

@@ -10,9 +10,7 @@ import pytest
 import torch
 
 from sehdr_warp.bench import peers
-from sehdr_warp.bench.cpu_blend import counted_pairs, listed_pairs
-from sehdr_warp.bench.splats import Size, make_covering_scene, make_splat_scene, parse_sizes
-from sehdr_warp.bench.stages import prepare
+from sehdr_warp.bench.splats import Size, make_splat_scene, parse_sizes
 from sehdr_warp.bench.timing import Variant, peak_memory, time_variants
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.splatting import rasterize
@@ -27,42 +25,6 @@ def test_sizes_are_read_by_name_and_by_number():
     for bad in ("tiny", "0@4x4", "5@4", "5@0x4", ""):
         with pytest.raises(SehdrError, match="not a size"):
             parse_sizes(bad or ",", "cpu")
-
-
-def test_the_depth_of_layers_does_not_depend_on_the_size():
-    """A reduced scene stands for the large one only if each pixel is covered by as many Gaussians in both."""
-    large = Size(8000, 240, 160)
-    small = large.reduced(2000)
-    assert small == Size(2000, 120, 80)
-    depths = []
-    for size in (large, small):
-        scene = make_splat_scene(size, 3)
-        depths.append(counted_pairs(prepare(scene), size) / (size.width * size.height))
-    assert depths[0] == pytest.approx(depths[1], rel=0.1)
-    assert depths[0] > 5
-
-
-def test_pairs_are_those_of_a_dense_count():
-    size = Size(120, 50, 37)
-    scene = make_splat_scene(size, 1)
-    prepared = prepare(scene)
-    lists, (means2d, conics, opacities, _) = prepared.lists, prepared.blend_inputs
-    y, x = torch.meshgrid(torch.arange(37) + 0.5, torch.arange(50) + 0.5, indexing="ij")
-    dx, dy = (means2d[:, k, None, None] - axis for k, axis in ((0, x), (1, y)))
-    a, b, c = conics.T[:, :, None, None]
-    alpha = opacities[:, None, None] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-    assert counted_pairs(prepared, size) == pytest.approx(int((alpha >= 1 / 255).sum()), abs=2)
-    entries = torch.zeros(37, 50, dtype=torch.long)
-    for tile, (first, last) in enumerate(lists.ranges.tolist()):
-        top, left = tile // lists.columns * 16, tile % lists.columns * 16
-        entries[top : top + 16, left : left + 16] = last - first
-    assert listed_pairs(lists, size) == int(entries.sum())
-
-
-def test_every_pixel_counts_for_every_covering_gaussian():
-    size = Size(200, 128, 112)
-    prepared = prepare(make_covering_scene(size, 3))
-    assert listed_pairs(prepared.lists, size) == counted_pairs(prepared, size) == 200 * 128 * 112
 
 
 def test_variants_take_turns_and_slow_ones_run_less_often():

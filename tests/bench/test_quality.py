@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sehdr_warp.bench import hdr_nerf, quality_run
+from sehdr_warp.bench import quality_run
 from sehdr_warp.bench.methods import METHODS, choose_methods
 from sehdr_warp.bench.quality_jobs import Settings, plan_jobs
 from sehdr_warp.bench.quality_run import Runner, photos, seconds_to_final, without_training_truth
@@ -59,25 +59,9 @@ def test_only_methods_with_truth_see_that_of_training_views(tmp_path, monkeypatc
 
     monkeypatch.setattr(quality_run, "train", look)
     for name, method in METHODS.items():
-        if method.kind == "gaussians":
-            with pytest.raises(SehdrError, match="seen enough"):
-                Runner("cpu").run(job(name), tmp_path)
-            assert set(seen["train"]) == {method.truth} and all(seen["test"]), name
-
-
-def test_hdr_nerf_gets_its_seconds_and_few_tests(tmp_path, monkeypatch):
-    given = {}
-
-    def look(scene, **options):
-        given.update(options, truth=[view.hdr is not None for view in scene.train_views])
-        raise SehdrError("seen enough")
-
-    monkeypatch.setattr(hdr_nerf, "train_hdr_nerf", look)
-    with pytest.raises(SehdrError, match="seen enough"):
-        Runner("cpu").run(job("hdr-nerf", nerf_seconds=7.0, iterations=(1600,)), tmp_path)
-    assert (given["seconds"], given["iterations"], given["device"]) == (7.0, 1600, "cpu")
-    assert not any(given["truth"])
-    assert len(given["evaluate_at"]) == 4 and max(given["evaluate_at"]) == 1600
+        with pytest.raises(SehdrError, match="seen enough"):
+            Runner("cpu").run(job(name), tmp_path)
+        assert set(seen["train"]) == {method.truth} and all(seen["test"]), name
 
 
 def test_a_scene_without_truth_and_a_training_that_diverges_end_in_one_line(tmp_path):
