@@ -1,48 +1,67 @@
-# Two commands that need nothing but Python >= 3.11 and this checkout. No compiler, no GPU.
+# Needs nothing but Python >= 3.11 and this checkout. No compiler, no GPU.
 #
-#   make demo    train the embedded scene, evaluate it, write exposure brackets and pictures into runs/demo
+#   make demo    train the embedded scene, evaluate it, write exposure brackets and a report to runs/demo
 #   make test    run the tests
+#   make lint    ruff and pyright
+#   make docs    build the pages into site/
 #
-# Both make a virtual environment in VENV and install the versions of constraints.txt there, once.
+# Each makes a virtual environment in VENV once, with the versions of constraints.txt.
 
 PYTHON ?= python3
 VENV ?= .venv
 DEMO ?= runs/demo
-DATA ?= embedded
-RESPONSE ?= hdr-nerf
-EVS ?= -4,-2,0,2,4
-PYTEST ?= -q
+PYTEST ?= -q -n auto
 
-PIP = $(VENV)/bin/python -m pip --disable-pip-version-check install -qq --constraint constraints.txt
-SEHDR = $(VENV)/bin/sehdr-warp
+BIN = $(VENV)/bin
+PIP = $(BIN)/python -m pip --disable-pip-version-check install -qq --constraint constraints.txt
+
+# Editable as one plain line in site-packages, which editors and type checkers can follow; setuptools' default is an import
+# hook, which they cannot. The links sehdr_warp/kernels and sehdr_warp/configs complete the package in a checkout.
+EDITABLE = $(PIP) --no-build-isolation --config-settings editable_mode=compat --editable
 
 # torch's CPU build, a tenth of the size of the CUDA build that PyPI has for Linux: from wherever pip is set up to
 # look, else from PyTorch's own index (on macOS the build has no +cpu in its version).
 TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
-.PHONY: demo test pictures
+.PHONY: demo test lint docs pictures
 
 demo: $(VENV)/installed
-	$(SEHDR) train $(DATA) --out $(DEMO)/run --preset demo --response $(RESPONSE) --device cpu --overwrite
-	$(SEHDR) eval $(DEMO)/run --json $(DEMO)/eval.json --device cpu --overwrite
-	$(SEHDR) render $(DEMO)/run --out $(DEMO)/views --evs=$(EVS) --device cpu --overwrite
-	$(SEHDR) report $(DEMO)/run --out $(DEMO)/report --device cpu --overwrite
+	$(BIN)/sehdr-warp train embedded --out $(DEMO)/run --preset demo --response hdr-nerf --device cpu --overwrite
+	$(BIN)/sehdr-warp eval $(DEMO)/run --json $(DEMO)/eval.json --device cpu --overwrite
+	$(BIN)/sehdr-warp render $(DEMO)/run --out $(DEMO)/views --evs=-4,-2,0,2,4 --device cpu --overwrite
+	$(BIN)/sehdr-warp report $(DEMO)/run --out $(DEMO)/report --device cpu --overwrite
+	@echo
+	@echo "Made: a trained HDR scene in $(DEMO)/run, its figures in $(DEMO)/eval.json."
+	@echo "Open: $(DEMO)/report/stops.png (the scene at five exposures), $(DEMO)/views/brackets (OpenEXR)."
+	@echo "Next: source $(BIN)/activate, then sehdr-warp --help"
 
 test: $(VENV)/installed-test
-	$(VENV)/bin/python -m pytest $(PYTEST)
+	$(BIN)/python -m pytest $(PYTEST)
 
-# The README's pictures, from the demo's report.
+lint: $(VENV)/installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+docs: $(VENV)/installed-dev
+	$(BIN)/mkdocs build --strict --quiet
+
+# The README's picture: trains a scene that clips, a few minutes on two cores.
 pictures: $(VENV)/installed
-	$(VENV)/bin/python docs/pictures.py $(DEMO)/report
+	$(BIN)/python docs/pictures.py
 
 $(VENV)/installed: pyproject.toml constraints.txt
-	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(PIP) torch==$(TORCH)+cpu 2>/dev/null || $(PIP) torch==$(TORCH) --extra-index-url $(TORCH_INDEX)
 	$(PIP) setuptools wheel
-	$(PIP) --no-build-isolation --editable .
+	$(EDITABLE) .
 	touch $@
 
 $(VENV)/installed-test: $(VENV)/installed
-	$(PIP) --no-build-isolation --editable '.[test]'
+	$(EDITABLE) '.[test]'
+	touch $@
+
+$(VENV)/installed-dev: $(VENV)/installed
+	$(EDITABLE) '.[dev]'
 	touch $@

@@ -3,44 +3,42 @@
     import sehdr_warp as sw
 
     scene = sw.load_scene("photos/")
-    run = sw.train(scene, "run/", sw.load_config("fast"))
+    run = sw.train(scene, "run/")
     sw.render_views(run, "renders/", cameras="test", evs=(-4, -2, 0, 2, 4))
 
-Names load their modules when they are first used, so importing the package costs next to nothing.
+Names load their modules when they are first used, so importing the package costs next to nothing. `__init__.pyi` states
+the same names for editors and type checkers.
 """
 
 from importlib import import_module
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOMES = {
-    "Camera": "scene",
-    "View": "scene",
-    "Scene": "scene",
-    "load_scene": "scene",
-    "Config": "training.config",
-    "load_config": "training.config_files",
-    "train": "training.train",
-    "Run": "training.run",
-    "load_run": "training.run",
-    "render_views": "output.render_views",
-    "write_brackets": "output.brackets",
-    "evaluate": "evaluation.evaluate",
-    "rasterize": "splatting",
-    "SehdrError": "errors",
-    "InputError": "errors",
+    "errors": ("InputError", "SehdrError"),
+    "evaluation.evaluate": ("evaluate",),
+    "output.brackets": ("write_brackets",),
+    "output.render_views": ("render_views",),
+    "output.report": ("write_report",),
+    "response": ("Response", "response_by_name", "response_names"),
+    "scene": ("Camera", "Scene", "View", "load_cameras", "load_scene"),
+    "splatting": ("Rendering", "differentiable", "rasterize", "spherical_harmonics", "ssim"),
+    "training.config": ("Config",),
+    "training.config_files": ("load_config",),
+    "training.run": ("Run", "load_run"),
+    "training.train": ("train",),
 }
-
-__all__ = sorted(_HOMES)  # noqa: PLE0605
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+__all__ = sorted(_HOME_OF)  # noqa: PLE0605
 
 
 def __getattr__(name: str):
-    if name not in _HOMES:
+    if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    value = getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *_HOME_OF})

@@ -144,7 +144,7 @@ def writing(path: Path | str) -> Iterator[None]:
     except OSError as error:
         if error.errno not in _WRITE_ERRORS and not isinstance(error, FileExistsError):
             raise
-        reason = os.strerror(error.errno)
+        reason = os.strerror(error.errno or 0)
         raise SehdrError(f"{path}: cannot be written ({reason}); free space or choose another folder") from error
 
 

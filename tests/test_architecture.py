@@ -10,8 +10,8 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "sehdr_warp"
 
-# What each room may import of the others: training -> field -> response -> splatting -> kernels, and below them all what
-# any room may use. Rooms that read a trained scene take it as an object with named methods.
+# What each room may import of the others: training -> field -> response -> splatting -> kernels, and below them all
+# what any room may use. Rooms that read a trained scene take it as an object with named methods.
 ANY = {"errors", "quiet", "arguments", "files"}
 ALLOWED = {
     "kernels": set(),

@@ -102,7 +102,7 @@ class RadianceField(nn.Module):
         fusion: NeuralExposureFusion | None = None,
         antialiased: bool = False,
         low_pass: float = 0.3,
-        style: BlendStyle = BlendStyle(),  # noqa: B008, frozen
+        style: BlendStyle = BlendStyle(),
     ):
         super().__init__()
         self.gaussians = gaussians

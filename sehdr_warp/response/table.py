@@ -149,7 +149,7 @@ def _check(exposures: np.ndarray, values: np.ndarray, source: str):
     if exposures.min() < 0:
         raise InputError(source, f"exposure {exposures.min():.6g} is negative", remedy)
     steps = np.diff(np.unique(np.concatenate([[0.0], exposures])))
-    if exposures.max() > 1e30 or len(steps) and steps.min() < 1e-30:
+    if exposures.max() > 1e30 or (len(steps) and steps.min() < 1e-30):
         worst = exposures.max() if exposures.max() > 1e30 else steps.min()
         raise InputError(
             source, f"exposures of {worst:.3g} apart cannot be computed with", "divide them by the largest"

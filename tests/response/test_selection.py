@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from sehdr_warp.response import selection as response_selection
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.response import Response, response_by_name, response_names
+from sehdr_warp.response import selection as response_selection
 from sehdr_warp.response.family import family_logs
 from sehdr_warp.response.selection import edge_facts, select_response
 from sehdr_warp.response.table import TabulatedResponse

@@ -20,7 +20,7 @@ BOUNDS = {torch.float64: (1e-12, 1e-12), torch.float32: (1e-5, 1e-5)}
 
 
 def projected(scene, threshold):
-    tensors = [t for t in scene.tensors[:4]] + scene.tensors[5:]
+    tensors = list(scene.tensors[:4]) + scene.tensors[5:]
     return project(
         *tensors,
         width=scene.width,

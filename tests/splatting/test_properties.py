@@ -53,7 +53,7 @@ def test_any_modest_gaussians_match_the_reference(means, log_scales, quaternions
     truth = rasterize_reference(*(t.double() for t in tensors), 18, 14, alpha_threshold=1e-5)
     largest = float(features.abs().max())
     assert float((ours.image - truth.image).abs().max()) <= (1e-4 + (COUNT + 1) * 1e-4) * largest
-    assert 0 <= float(ours.alpha.min()) and float(ours.alpha.max()) <= 1
+    assert float(ours.alpha.min()) >= 0 and float(ours.alpha.max()) <= 1
 
 
 @SETTINGS

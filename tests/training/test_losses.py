@@ -66,7 +66,7 @@ def test_one_sided_keeps_the_black_hinge_continuous():
     target = target_of(torch.zeros(1, 1, 3))
     half = torch.full((1, 1, 3), CODE / 2)
     just_above = one_sided(half + 1e-6, target.encoded, target, -half, half, False)
-    assert 0 <= just_above.min() and just_above.max() < 2e-6
+    assert just_above.min() >= 0 and just_above.max() < 2e-6
 
 
 def test_masked_pixels_cost_nothing():

@@ -1,0 +1,43 @@
+"""The public names, for editors and type checkers; __init__.py loads them when they are first used."""
+
+from .errors import InputError, SehdrError
+from .evaluation.evaluate import evaluate
+from .output.brackets import write_brackets
+from .output.render_views import render_views
+from .output.report import write_report
+from .response import Response, response_by_name, response_names
+from .scene import Camera, Scene, View, load_cameras, load_scene
+from .splatting import Rendering, differentiable, rasterize, spherical_harmonics, ssim
+from .training.config import Config
+from .training.config_files import load_config
+from .training.run import Run, load_run
+from .training.train import train
+
+__all__ = [
+    "Camera",
+    "Config",
+    "InputError",
+    "Rendering",
+    "Response",
+    "Run",
+    "Scene",
+    "SehdrError",
+    "View",
+    "differentiable",
+    "evaluate",
+    "load_cameras",
+    "load_config",
+    "load_run",
+    "load_scene",
+    "rasterize",
+    "render_views",
+    "response_by_name",
+    "response_names",
+    "spherical_harmonics",
+    "ssim",
+    "train",
+    "write_brackets",
+    "write_report",
+]
+
+__version__: str
