@@ -170,7 +170,9 @@ def test_constraints_pin_what_the_package_needs():
     pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
     for need in map(Requirement, sum(PROJECT["optional-dependencies"].values(), PROJECT["dependencies"])):
         name = need.name.lower().replace("_", "-")
-        assert name == PROJECT["name"] or (name in pins and need.specifier.contains(pins[name])), f"{need} against {pins.get(name)}"
+        assert name == PROJECT["name"] or (name in pins and need.specifier.contains(pins[name])), (
+            f"{need} against {pins.get(name)}"
+        )
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not here")

@@ -110,7 +110,9 @@ def test_methods_that_cannot_be_are_refused_in_one_line(names, variants, message
 
 
 def test_variants_from_the_command_line_and_from_a_file(tmp_path):
-    (tmp_path / "v.toml").write_text('[calm]\nbase = "paper"\nloss.ssim_weight = 0.5\nfusion.exposures = ["1x", "4x"]\n')
+    (tmp_path / "v.toml").write_text(
+        '[calm]\nbase = "paper"\nloss.ssim_weight = 0.5\nfusion.exposures = ["1x", "4x"]\n'
+    )
     given = 'sure:default:fusion.exposures=["1/8x", "8x"],response.method=paper'
     sure, calm = choose_methods([], [given], tmp_path / "v.toml")
     assert sure == Method("sure", "default", base="default",

@@ -1,0 +1,44 @@
+"""The examples, run at small sizes."""
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+
+
+def example(name):
+    """The variables of an example, run as a file, since Warp reads the source of its kernels."""
+    return runpy.run_path(str(EXAMPLES / f"{name}.py"))
+
+
+def test_quickstart_and_hand_off(tmp_path):
+    import OpenEXR
+
+    run = example("quickstart")["main"](tmp_path / "first", max_size=32, iterations=20)
+    assert run.iterations == 20
+    assert len(list((tmp_path / "first" / "views" / "brackets").rglob("*.exr"))) == 5 * len(
+        [entry for entry in run.cameras if entry.split == "test"]
+    )
+    files = example("hand_off")["main"](tmp_path / "first" / "run", tmp_path / "second")
+    brackets = [OpenEXR.File(str(file)) for file in files if "brackets" in file.parts]
+    times = [file.header()["expTime"] for file in brackets]
+    np.testing.assert_allclose(np.array(times) / times[0], [1, 8, 64], rtol=1e-6)
+    first, last = np.stack([file.channels()["RGB"].pixels for file in (brackets[0], brackets[-1])]).astype(float)
+    assert first.shape == (16, 16, 3) and first.max() > 0
+    np.testing.assert_allclose(last, 64 * first, rtol=1e-6)
+
+
+def test_own_loop():
+    losses = example("own_loop")["main"](steps=60, max_size=48)
+    assert losses[-1] < 0.5 * losses[0]
+
+
+def test_own_kernel():
+    assert abs(example("own_kernel")["main"]() - 0.35) < 0.005
+
+
+def test_every_example_is_run_here():
+    text = Path(__file__).read_text()
+    assert all(f'example("{path.stem}")' in text for path in EXAMPLES.glob("*.py"))
