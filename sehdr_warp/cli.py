@@ -17,7 +17,7 @@ from .check.commands import Check, run_check
 from .errors import InputError, SehdrError
 from .quiet import silence_exit
 from .synth.commands import Synth, run_synth
-from .training.commands import Train, cache_beside, known_curves, run_train
+from .training.commands import Train, run_train
 
 Positional = tyro.conf.Positional
 
@@ -244,20 +244,16 @@ def _scene_of(run, data: str | None):
         place,
         exposure_index=run.data.get("exposure_index"),
         max_size=run.data.get("max_size"),
-        cache=cache_beside(run.path),
-        **_curves_of(run),
-        progress=say,
+        response=_curve_of(run),
     )
 
 
-def _curves_of(run) -> dict:
-    """load_scene's decode and encode as the training had them: a run is judged by the photos that it was trained on,
-    and these were scaled before a response was chosen, corrected or learned."""
+def _curve_of(run):
+    """The response that the photos of the training were developed with: a learned one was not known then."""
     options = run.config.response
-    if options.name == "auto" or options.form == "mlp":
-        return known_curves(options.name)
-    known = run.response.start if options.refine else run.response
-    return {"decode": known.decode, "encode": known.encode}
+    if options.form == "mlp":
+        return "learned"
+    return run.response.start if options.refine else run.response
 
 
 if __name__ == "__main__":

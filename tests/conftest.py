@@ -23,6 +23,12 @@ def pytest_generate_tests(metafunc):
         metafunc.parametrize("device", available_devices())
 
 
+@pytest.fixture(autouse=True, scope="session")
+def own_cache(tmp_path_factory):
+    """Structure from motion keeps its results for the session, not in the user's cache."""
+    os.environ["SEHDR_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """Larger real data (photos, rendered rooms, response curves), which the repository does not carry."""

@@ -6,10 +6,15 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from sehdr_warp.scene import Camera, look_at
+from sehdr_warp.scene import Camera, Scene, load_scene, look_at
 from sehdr_warp.scene.hdr_nerf_layout import RadianceView, reinhard_gamma, write_hdr_nerf_scene
 from sehdr_warp.scene.images import read_hdr
 from sehdr_warp.scene.resample import area_average
+
+
+def load(path, response="srgb", **options) -> Scene:
+    """load_scene by a response that need not be chosen, which takes seconds."""
+    return load_scene(path, response=response, **options)
 
 
 def arc_poses(count: int) -> list[np.ndarray]:

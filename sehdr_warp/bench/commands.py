@@ -158,10 +158,7 @@ def _training(asked: Training, device) -> dict:
     from ..scene import load_scene
     from .training import bench_training
 
-    cache = None if asked.out is None else asked.out / "cache"
-    scene = load_scene(
-        asked.data, exposure_index=asked.exposure_index, max_size=asked.max_size, cache=cache, progress=say
-    )
+    scene = load_scene(asked.data, exposure_index=asked.exposure_index, max_size=asked.max_size)
     return bench_training(
         scene,
         device,

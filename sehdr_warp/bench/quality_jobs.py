@@ -7,12 +7,11 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
-from importlib import resources
 from pathlib import Path
 
 from ..errors import InputError, SehdrError
 from ..files import write_json
-from ..scene.load import embedded_names, is_embedded
+from ..scene import embedded_folder, is_embedded
 from ..training.config import Config
 from ..training.config_files import config_to_dict, load_config, override_config
 from .methods import Method
@@ -258,10 +257,7 @@ def _check_names_differ(scenes: dict[str, dict]) -> None:
 def _digest(place: str) -> dict:
     """What tells this scene from others, wherever it lies: a hash of all its files."""
     if is_embedded(place):
-        name = place.partition(":")[2]
-        if name and name not in embedded_names():
-            raise InputError(place, "no such scene", f"take embedded or embedded:NAME, {', '.join(embedded_names())}")
-        return {"sha256": _path_digest(str(resources.files("sehdr_warp.embedded") / (name or "room")))}
+        return {"sha256": _path_digest(str(embedded_folder(place)))}
     if not Path(place).is_dir():
         raise InputError(place, "no such folder", "give folders with HDR truth, or embedded")
     return {"sha256": _path_digest(place)}

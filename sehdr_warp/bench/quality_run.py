@@ -182,7 +182,7 @@ def _photos(place, max_size, curve, exposure, count, factor, noise, seed) -> tup
 @lru_cache(maxsize=4)
 def true_scene(place: str, max_size: int | None) -> Scene:
     """A scene with HDR truth in every view; raises InputError for one without."""
-    scene = load_scene(place, max_size=max_size)
+    scene = load_scene(place, max_size=max_size, response="srgb")
     for view in scene.views:
         if view.hdr is None:
             raise InputError(

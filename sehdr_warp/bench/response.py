@@ -74,7 +74,7 @@ def bench_response(
         if (Path(place) / "exposures.json").is_file():
             trials += _stack_trials(Path(place), seed)
         else:
-            scene = load_scene(place, max_size=max_size, progress=progress)
+            scene = load_scene(place, max_size=max_size, response="srgb")
             for name, truth in truths.items():
                 trials += _scene_trials(scene, name, truth, exposures, factor, single, seed)
                 progress(f"{scene.name}: exposed by {name}")
@@ -101,7 +101,7 @@ def _scene_trials(scene: Scene, name: str, truth: Response, count: int, factor: 
     trials = []
     for index, time in enumerate(exposure_ladder(scene, truth, count, factor)):
         views = expose(scene, truth, time).train_views[: 1 if single else None]
-        images = [view.image for view in views]
+        images = [view.codes for view in views]
         known = _decoded_psnr(views, truth, time)
         # A rendered photo is not a camera's file, whatever the data came as.
         for method, response in _choices(images, False, seed):

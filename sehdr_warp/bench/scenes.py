@@ -6,7 +6,7 @@ import torch
 from ..field.gaussians import Gaussians
 from ..field.radiance_field import RadianceField
 from ..response import response_by_name
-from ..scene import Camera, Scene, View, look_at
+from ..scene import Camera, Scene, View, codes_of, look_at
 from .splats import Size
 
 EXPOSURE_TIME = 0.25
@@ -33,7 +33,7 @@ def make_photo_scene(size: Size, views: int = 18, device: str | torch.device = "
     for index in range(views):
         camera = _camera(2 * np.pi * index / views, size)
         photo = np.round(field.render_ldr(camera).cpu().numpy() * 255) / 255
-        photos.append(View(f"v_{index}", photo.astype(np.float32), camera, EXPOSURE_TIME, "train"))
+        photos.append(View(f"v_{index}", codes_of(photo, 8), camera, EXPOSURE_TIME, "train"))
     colours = np.asarray(response.encode(np.exp(log_exposure)), dtype=np.float32)
     return Scene(f"synthetic {size}", "transforms", tuple(photos), points, colours)
 

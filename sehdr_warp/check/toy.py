@@ -8,7 +8,7 @@ import torch
 from ..field.gaussians import Gaussians
 from ..field.radiance_field import RadianceField
 from ..response import response_by_name
-from ..scene import Camera, Scene, View, look_at
+from ..scene import Camera, Scene, View, codes_of, look_at
 
 SIZE, VIEWS, EXPOSURE_TIME = 32, 6, 0.25
 
@@ -30,7 +30,7 @@ def toy_scene(clipped: float = 0.0) -> Scene:
         camera = _orbit(2 * np.pi * index / VIEWS)
         photo = np.round(field.render_ldr(camera).numpy() * 255) / 255
         photo[: round(clipped * SIZE)] = 1.0
-        views.append(View(f"v_{index}", photo.astype(np.float32), camera, EXPOSURE_TIME, "train"))
+        views.append(View(f"v_{index}", codes_of(photo, 8), camera, EXPOSURE_TIME, "train"))
     points = field.gaussians.means.detach().numpy().astype(np.float64)
     return Scene("toy", "transforms", tuple(views), points, np.full((len(points), 3), 0.5, np.float32))
 

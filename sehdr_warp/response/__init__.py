@@ -2,13 +2,22 @@
 
 from pathlib import Path
 
+from ..errors import InputError
 from .analytic import analytic_names, analytic_response
 from .curve import Response
 from .files import colour_response, response_from_file, responses_in_file
 from .learned import ToneMapper
 from .refined import RefinedResponse
 
-__all__ = ["RefinedResponse", "Response", "ToneMapper", "response_by_name", "response_names", "responses_in_file"]
+__all__ = [
+    "RefinedResponse",
+    "Response",
+    "ToneMapper",
+    "response_by_name",
+    "response_names",
+    "responses_in_file",
+    "responses_named",
+]
 
 
 def response_names() -> list[str]:
@@ -33,6 +42,16 @@ def response_by_name(text: str | Path) -> Response:
         if candidate and _is_file(candidate):
             return response_from_file(Path(candidate), chosen)
     return analytic_response(text)
+
+
+def responses_named(text: str | Path) -> list[Response]:
+    """Every curve of a file that holds many, or the one that response_by_name gives."""
+    if _is_file(str(text)):
+        try:
+            return responses_in_file(text)
+        except InputError:
+            pass  # A file of one curve: response_by_name reads it, or says what is wrong with it.
+    return [response_by_name(text)]
 
 
 def _is_file(text: str) -> bool:

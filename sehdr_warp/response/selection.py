@@ -103,8 +103,8 @@ def select_response(
 ) -> ResponseSelection:
     """The candidate under which a photo looks most like linear light.
 
-    image: [H, W, 3] encoded values in [0, 1], NumPy array or tensor, as photographed: resampling in encoded values
-        mixes colours in them, and the edges then tell of the resampling. Or a list of such images of one camera: their
+    image: [H, W, 3] uint8 or uint16 codes, or encoded values in [0, 1], array or tensor, as photographed:
+        resampling in encoded values mixes colours in them. Or a list of such images of one camera: their
         edges are pooled, and the paper's statistics are of the one with the most pixels neither black nor clipped.
     candidates: responses, of which one is taken; by default the analytic bank. A DoRF file's are
         responses_in_file(path).
@@ -132,7 +132,7 @@ def select_response(
         candidates = [response_by_name(name) for name in response_names()]
     if not candidates:
         raise SehdrError("select_response: there are no candidates; give at least one response")
-    photos = [_bands(_checked(each)) for each in (image if isinstance(image, list | tuple) else [image])]
+    photos = [_bands(each) for each in (image if isinstance(image, list | tuple) else [image])]
     fullest = max(photos, key=lambda bands: sum(clear.sum() for _, clear in bands))
     if method != "posterior" and sum(clear.sum() for _, clear in fullest) < 100:
         raise SehdrError("select_response: under 100 pixels are neither black nor clipped; name a response instead")
@@ -195,20 +195,22 @@ def _mean_response(chances, logs) -> TabulatedResponse:
     return TabulatedResponse("posterior mean", exposures, CODES)
 
 
-def _checked(image) -> np.ndarray:
+def _bands(image) -> list[tuple[np.ndarray, np.ndarray]]:
+    """A photo, or evenly spaced bands of a large one, each [h, W, 3] float64 with where it is neither black nor
+    clipped; codes become encoded values."""
     image = np.asarray(image.detach().cpu() if isinstance(image, torch.Tensor) else image)
-    if image.ndim != 3 or image.shape[2] != 3 or not np.isfinite(image).all():
-        raise SehdrError(f"select_response: an image of shape {list(image.shape)} is not [H, W, 3] of finite values")
-    return image.astype(np.float64)
-
-
-def _bands(image: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """A photo, or evenly spaced bands of a large one, each [h, W, 3] with where it is neither black nor clipped."""
+    if image.ndim != 3 or image.shape[2] != 3:
+        raise SehdrError(f"select_response: an image of shape {list(image.shape)} is not [H, W, 3]")
     rows, columns = image.shape[:2]
     bands = [image]
     if rows * columns > MOST_PIXELS:
         starts = np.linspace(0, rows - BAND_ROWS, max(1, MOST_PIXELS // (BAND_ROWS * columns)))
         bands = [image[int(start) : int(start) + BAND_ROWS] for start in starts]
+    if image.dtype in (np.uint8, np.uint16):
+        bands = [each.astype(np.float32) / np.float32(np.iinfo(image.dtype).max) for each in bands]
+    if not all(np.isfinite(each).all() for each in bands):
+        raise SehdrError("select_response: an image holds values that are not finite")
+    bands = [each.astype(np.float64) for each in bands]
     return [(each, ((each > 1.5 * CODE) & (each < 1 - 4.5 * CODE)).all(axis=2)) for each in bands]
 
 

@@ -2,7 +2,24 @@
 
 from .camera import Camera, look_at
 from .camera_path import load_cameras
-from .load import embedded_names, is_embedded, load_scene
-from .types import Scene, View
+from .develop import develop
+from .embedded import embedded_folder, embedded_scenes, is_embedded
+from .load import choose_response, load_scene, read_capture
+from .types import Scene, View, codes_of, encoded_values
 
-__all__ = ["Camera", "Scene", "View", "embedded_names", "is_embedded", "load_cameras", "load_scene", "look_at"]
+__all__ = [
+    "Camera",
+    "Scene",
+    "View",
+    "choose_response",
+    "codes_of",
+    "develop",
+    "embedded_folder",
+    "embedded_scenes",
+    "encoded_values",
+    "is_embedded",
+    "load_cameras",
+    "load_scene",
+    "look_at",
+    "read_capture",
+]

@@ -44,9 +44,11 @@ class Capture:
 
     format: as Scene.format.
     alpha: what transparency means: "background" (nothing there: composite over black light) or "mask" (not observed).
-    holdout: the layout's own habit where no split is stated: every so many views is a test view, from offset on;
-        None takes the caller's.
+    holdout: (every so many views, from this one) is held out in the protocol that the layout is published with; None
+        for a layout without one.
     points: [P, 3] float64; point_colors: [P, 3] float32 in [0, 1].
+    name, folder: what was asked for, and where it lies.
+    times_known: False where no file stated exposure times.
     """
 
     format: str
@@ -56,6 +58,13 @@ class Capture:
     points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     point_colors: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     notes: tuple[str, ...] = ()
+    name: str = ""
+    folder: Path = Path()
+    times_known: bool = True
+
+    @property
+    def training(self) -> tuple[Shot, ...]:
+        return tuple(shot for shot in self.shots if shot.split == "train")
 
 
 def pose_from_quaternion(quaternion, translation, source: Path, name: str) -> np.ndarray:

@@ -1,30 +1,81 @@
-"""From shots to views: decode, orient, undistort and scale, every average taken over light."""
+"""From shots to views: decode, orient, undistort and scale, every average taken over light by one response."""
 
+import logging
+from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sehdr_warp.errors import InputError
-
+from ..errors import InputError
 from .camera import Camera
-from .capture import Shot
+from .capture import Capture, Shot
 from .hdr_nerf_layout import reinhard_gamma
-from .images import image_sizes, read_hdr, read_ldr, read_mask
+from .images import EncodedImage, image_sizes, read_hdr, read_ldr, read_mask
 from .lens import Lens, Undistortion
-from .resample import Curve, area_average, light_table, limited_size, restore_clipping
-from .types import View
+from .names import unique_names
+from .resample import area_average, limited_size, restore_clipping
+from .types import Scene, View, codes_of
+
+if TYPE_CHECKING:
+    from ..response import Response
+
+_log = logging.getLogger("sehdr_warp.scene")
 
 
-class Developer:
-    """Makes views of shots under one choice of size and response.
+def develop(capture: Capture, response: "Response", max_size: int | None = None) -> Scene:
+    """The scene of a capture: each photo undistorted and averaged to size, in the light that `response` decodes.
 
-    max_size: longest side in pixels, None keeps each photo's.
-    decode, encode: encoded [0, 1] -> linear exposure, and back.
-    alpha: "background" (transparent pixels show black) or "mask" (they were not observed).
+    max_size: longest side of the views in pixels, None keeps the photos'. A photo that is neither bent nor averaged
+    keeps its codes; others become uint16.
+    Raises InputError where a file is damaged, sizes disagree, or the photos show nothing but black or white.
     """
+    developer, views = _Developer(max_size, response, capture.alpha), []
+    for i, (shot, name) in enumerate(zip(capture.shots, unique_names(capture.shots), strict=True)):
+        if i % 10 == 0:
+            _log.info("reading views %d to %d of %d", i + 1, min(i + 10, len(capture.shots)), len(capture.shots))
+        views.append(developer.view(shot, name))
+    check_content(((view.codes, view.mask) for view in views if view.split == "train"), capture.folder)
+    return Scene(capture.name, capture.format, tuple(views), capture.points, capture.point_colors,
+                 capture.times_known, capture.notes, response=response)  # fmt: skip
 
-    def __init__(self, max_size: int | None, decode: Curve, encode: Curve, alpha: str):
-        self.max_size, self.decode, self.encode, self.alpha = max_size, decode, encode, alpha
+
+def check_content(photos: Iterable[tuple[np.ndarray, np.ndarray | None]], folder: Path) -> None:
+    """Refuse sets that show nothing: fewer than one sample in a thousand between black and white.
+
+    photos: codes and mask of each. Large photos are looked at on a grid of about a million pixels.
+    """
+    shown = total = 0
+    light = 0.0
+    for codes, mask in photos:
+        step = max(1, round((codes.shape[0] * codes.shape[1] / 1e6) ** 0.5))
+        values, white = codes[::step, ::step], np.iinfo(codes.dtype).max
+        values = values if mask is None else values[mask[::step, ::step] > 0.5]
+        shown += int(((values > white * 1.5 / 255) & (values < white * (1 - 1.5 / 255))).sum())
+        total, light = total + values.size, light + float(values.sum(dtype=np.float64)) / white
+    if shown < total * 1e-3 or total == 0:
+        mean = light / max(total, 1)
+        state = "masked out" if total == 0 else f"black or white in {100 - 100 * shown / total:.1f} % (mean {mean:.3f})"
+        raise InputError(folder, f"the training photos are {state}", "expose them so that the scene shows, "
+                         "or choose another exposure index")  # fmt: skip
+
+
+def as_photographed(shot: Shot, *, oriented: bool = False) -> EncodedImage:
+    """A shot's codes before anything is undistorted or averaged; of a set of truth alone, HDR-NeRF's photo of it."""
+    if not shot.derived:
+        return read_ldr(shot.image, oriented=oriented)
+    return EncodedImage(_photo_of_truth(read_hdr(shot.image), shot.exposure_time), None)
+
+
+def _photo_of_truth(hdr: np.ndarray, exposure_time: float) -> np.ndarray:
+    return codes_of(reinhard_gamma(hdr * exposure_time), 8)
+
+
+class _Developer:
+    """Makes views of shots under one choice of size and response."""
+
+    def __init__(self, max_size: int | None, response: "Response", alpha: str):
+        self.max_size, self.response, self.alpha = max_size, response, alpha
         self._tables: dict[int, np.ndarray] = {}
         self._last: tuple[Lens, Undistortion] | None = None
 
@@ -32,38 +83,36 @@ class Developer:
         """The shot's view; raises InputError where a file is damaged or its size disagrees with the camera's."""
         if shot.derived:
             return self._derived(shot, name)
-        lens, oriented = _fitted_lens(shot)
+        lens, oriented = fitted_lens(shot)
         working = lens if lens.is_pinhole else _working_lens(lens, self.max_size)
         undistortion = None if lens.is_pinhole else self._undistortion(working)
         full = lens.pinhole(shot.world_to_camera) if undistortion is None else undistortion.camera(shot.world_to_camera)
         camera = full.resized(*limited_size(full.width, full.height, self.max_size))
 
-        encoded = read_ldr(shot.image, oriented=oriented)
-        pixels, alpha = encoded.pixels, encoded.alpha
+        encoded = as_photographed(shot, oriented=oriented)
+        codes, alpha = encoded.pixels, encoded.alpha
         masks = [] if undistortion is None or undistortion.outside is None else [_shrunk(~undistortion.outside, camera)]
         if shot.mask is not None:
             masks.append(_warped(_fitted_mask(shot.mask, lens, oriented), working, undistortion, camera))
         if alpha is not None and self.alpha == "mask":
             masks.append(_warped(alpha, working, undistortion, camera))
             alpha = None
-        if undistortion is None and alpha is None and (camera.width, camera.height) == (lens.width, lens.height):
-            image = pixels.astype(np.float32) / np.float32(encoded.levels)
-        else:
-            image = self._resampled(pixels, encoded.levels, alpha, working, undistortion, camera)
+        if undistortion is not None or alpha is not None or (camera.width, camera.height) != (lens.width, lens.height):
+            codes = self._resampled(codes, alpha, working, undistortion, camera)
         mask = None
         if masks:
             mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32)
             mask = None if mask.min() >= 1 - 1e-6 else mask
         hdr = None if shot.hdr is None else _truth(shot.hdr, lens, working, undistortion, camera)
-        return View(name, image, camera, shot.exposure_time, shot.split, mask, hdr, Path(shot.image))
+        return View(name, codes, camera, shot.exposure_time, shot.split, mask, hdr, Path(shot.image))
 
     def _derived(self, shot: Shot, name: str) -> View:
         """A view of truth alone; its photo is HDR-NeRF's, in 8 bits, at the final size."""
         camera = shot.lens.pinhole(shot.world_to_camera)
         camera = camera.resized(*limited_size(camera.width, camera.height, self.max_size))
         hdr = _truth(shot.hdr, shot.lens, shot.lens, None, camera)
-        image = (np.round(reinhard_gamma(hdr * shot.exposure_time) * 255) / 255).astype(np.float32)
-        return View(name, image, camera, shot.exposure_time, shot.split, None, hdr, Path(shot.image))
+        codes = _photo_of_truth(hdr, shot.exposure_time)
+        return View(name, codes, camera, shot.exposure_time, shot.split, None, hdr, Path(shot.image))
 
     def _undistortion(self, lens: Lens) -> Undistortion:
         # Sets mostly share one lens; its map is as large as an image, so only the last one is kept.
@@ -71,15 +120,17 @@ class Developer:
             self._last = lens, Undistortion(lens)
         return self._last[1]
 
-    def _resampled(self, pixels, levels: int, alpha, working: Lens, undistortion, camera: Camera) -> np.ndarray:
+    def _resampled(self, codes, alpha, working: Lens, undistortion, camera: Camera) -> np.ndarray:
+        levels = int(np.iinfo(codes.dtype).max)
         if levels not in self._tables:
-            self._tables[levels] = light_table(levels, self.decode)
-        light = self._tables[levels][pixels]
-        clipped = (pixels == levels).astype(np.float32)
+            light = self.response.decode(np.arange(levels + 1, dtype=np.float64) / levels)
+            self._tables[levels] = np.maximum(light, 0.0).astype(np.float32)
+        light = self._tables[levels][codes]
+        clipped = (codes == levels).astype(np.float32)
         if alpha is not None:
             light, clipped = light * alpha[:, :, None], clipped * alpha[:, :, None]
-        image = np.asarray(self.encode(_warped(light, working, undistortion, camera)), dtype=np.float32)
-        return restore_clipping(np.clip(image, 0.0, 1.0), _warped(clipped, working, undistortion, camera))
+        image = self.response.encode(_warped(light, working, undistortion, camera))
+        return codes_of(restore_clipping(image, _warped(clipped, working, undistortion, camera)), 16)
 
 
 def _working_lens(lens: Lens, max_size: int | None) -> Lens:
@@ -114,7 +165,7 @@ def _truth(path: Path, lens: Lens, working: Lens, undistortion: Undistortion | N
     return _warped(read_hdr(path), working, undistortion, camera)
 
 
-def _fitted_lens(shot: Shot) -> tuple[Lens, bool]:
+def fitted_lens(shot: Shot) -> tuple[Lens, bool]:
     """The lens at the file's size, and whether the pixels are to be turned as EXIF says.
 
     COLMAP ignores the EXIF orientation, other tools follow it: the size that agrees with the camera's tells which,

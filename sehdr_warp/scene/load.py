@@ -1,117 +1,147 @@
-"""One call for every layout: find out what a folder holds, read it, and make a scene of it."""
+"""One call for every layout: read what was photographed, choose the response, develop the scene."""
 
-from collections.abc import Callable
+import logging
+from collections.abc import Sequence
 from dataclasses import replace
-from importlib import resources
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sehdr_warp.errors import InputError
-
+from ..errors import InputError
 from .capture import Capture, Shot
 from .colmap_model import find_model
-from .develop import Developer
-from .exposure import choose_exposure, with_exposure_times
-from .names import unique_names
+from .develop import as_photographed, check_content, develop
+from .embedded import embedded_folder, is_embedded
+from .exposure import choose_exposure, made_by_camera, with_exposure_times
 from .read_colmap import image_folder, is_hdr_gs, read_colmap, read_hdr_gs
 from .read_llff import read_hdr_nerf_real, read_llff
 from .read_photos import read_photos
 from .read_transforms import has_transforms, is_hdr_nerf, read_hdr_nerf, read_transforms
-from .resample import Curve, srgb_decode, srgb_encode
 from .sfm import triangulate
-from .types import Scene, View
+from .types import Scene
 
-# Every eighth view is held out: the habit of LLFF, Mip-NeRF 360 and 3DGS.
+if TYPE_CHECKING:
+    from ..response import Response
+
+_log = logging.getLogger("sehdr_warp.scene")
 _HOLDOUT = 8
-_EMBEDDED = Path(str(resources.files("sehdr_warp.embedded")))
-# Below this many views none can be spared for testing.
+"""Every eighth view is held out: the habit of LLFF, Mip-NeRF 360 and 3DGS."""
 _FEWEST_FOR_TEST = 5
+"""Below this many views none can be spared for testing."""
+_MOST_JUDGED = 24
+"""Photos that a response is chosen from, evenly spread: they give about as many edges as are looked at."""
 
 
 def load_scene(
     path: Path | str,
     *,
+    response: "str | Path | Response" = "auto",
+    method: str = "posterior",
+    candidates: Sequence[str] = (),
     exposure_index: int | None = None,
     max_size: int | None = None,
     holdout: int | None = None,
     cache: Path | str | None = None,
-    decode: Curve | None = None,
-    encode: Curve | None = None,
-    progress: Callable[[str], None] | None = None,
 ) -> Scene:
-    """Read a folder of posed or bare photos, whatever its layout.
+    """Read a folder of posed or bare photos, whatever its layout, and develop it.
 
     path: a folder (COLMAP, transforms.json, HDR-NeRF synthetic or real, HDR-GS, LLFF, or bare photos), "embedded"
-        for the room that comes with the package, or "embedded:NAME" for another of its scenes (embedded_names()).
+        for the room that comes with the package, or "embedded:NAME" for another of embedded_scenes().
+    response: the camera's: a name, a file or an object; "auto" chooses it from the training photos' codes by `method`
+        among `candidates` (names and files; none: the built-in ones), see response.selection; "learned" stands for
+        sRGB here.
     exposure_index: the number of the exposure to take where each view has several (the k of `<view>_<k>.png`); None
         takes the middle one and says so in the notes.
     max_size: longest side of the views in pixels; None keeps the photos' sizes. Averages are exact areas, of light
         for photos and of values for truth and masks; a value of 1 stays 1 where half of its area was clipped.
-    holdout: every so many views is held out where the set states no split, 0 for none; None is 8, and every second
-        view (odd ones) for HDR-GS and HDR-NeRF's real sets. Sets of fewer than 5 views have no test view.
-    cache: a folder where structure from motion keeps its results, so that a second call reuses them.
-    decode, encode: the response, encoded [0, 1] -> linear exposure and back, as numpy functions; sRGB by default.
-        Only scaling, undistortion and transparency need it.
-    progress: is told one line about each long step.
+    holdout: every so many views is held out, 0 for none, whatever the set states; None keeps the set's split, or the
+        protocol of its layout, or takes the middle of every eight. Sets of fewer than 5 views have no test view.
+    cache: a folder where structure from motion keeps its results; None is the user's ($SEHDR_CACHE).
 
     Returns a Scene in the set's own world coordinates. Points come from the set; where it has poses alone they are
     triangulated from the training views, and where that finds nothing there are none, with a note.
     Raises InputError where a file is missing, damaged or hostile, sizes disagree, an exposure is impossible, fewer
     than two training views remain, or the photos show nothing but black or white.
     """
-    progress = progress or (lambda message: None)
-    if (decode is None) != (encode is None):
-        raise ValueError("decode and encode go together")
     if max_size is not None and max_size < 1:
         raise InputError(path, f"longest side of {max_size} pixels asked for", "give at least 1 pixel")
+    capture = read_capture(path, exposure_index=exposure_index, holdout=holdout, cache=cache)
+    chosen_by = (method, tuple(map(str, candidates))) if isinstance(response, str) and response == "auto" else None
+    curve = choose_response(capture, method, candidates) if chosen_by else _named(response)
+    scene = develop(capture, curve, max_size)
+    if len(scene.points):
+        return replace(scene, chosen_by=chosen_by)
+    points, colors = triangulate(capture, cache)
+    found = f"triangulated {len(points)} from the training views" if len(points) else "none could be triangulated"
+    note = f"the set has no points; {found}"
+    return replace(scene, points=points, point_colors=colors, notes=(*scene.notes, note), chosen_by=chosen_by)
+
+
+def read_capture(
+    path: Path | str,
+    *,
+    exposure_index: int | None = None,
+    holdout: int | None = None,
+    cache: Path | str | None = None,
+) -> Capture:
+    """Cameras, files, exposure times and splits of a data folder; no pixels. Arguments and errors as load_scene's."""
     if holdout is not None and holdout < 0:
         raise InputError(path, f"every {holdout}th view asked for as test view", "give 0 (none) or more")
     folder = _folder(path)
-    cache = None if cache is None else Path(cache)
-    capture = _read(folder, cache, progress)
+    capture = _read(folder, cache)
     if not capture.shots:
         raise InputError(folder, "has no views", "check the data folder")
-
     shots, notes = choose_exposure(capture.shots, exposure_index, folder)
     shots, times_known, more = with_exposure_times(shots, folder)
-    notes = [*capture.notes, *notes, *more]
-    shots, more = _with_splits(shots, capture, holdout)
-    notes += more
+    shots, split = _with_splits(shots, capture, holdout)
     training = sum(shot.split == "train" for shot in shots)
     if training < 2:
         found = f"{len(shots)} view{'s' * (len(shots) != 1)}, {training} for training"
         raise InputError(folder, f"has {found}; one view does not show depth", "add views from other places")
-
-    developer = Developer(max_size, decode or srgb_decode, encode or srgb_encode, capture.alpha)
-    views = []
-    for i, (shot, name) in enumerate(zip(shots, unique_names(shots), strict=True)):
-        if i % 10 == 0:
-            progress(f"reading views {i + 1} to {min(i + 10, len(shots))} of {len(shots)}")
-        views.append(developer.view(shot, name))
-    _require_content(views, folder)
-    points, colors, more = _with_points(capture, views, cache, progress)
+    notes = (*capture.notes, *notes, *more, *split)
     name = str(path) if is_embedded(path) else folder.resolve().name
-    return Scene(name, capture.format, tuple(views), points, colors, times_known, (*notes, *more))
+    return replace(capture, shots=tuple(shots), notes=notes, name=name, folder=folder, times_known=times_known)
 
 
-def is_embedded(path: Path | str) -> bool:
-    """Whether this names a scene of the package, known or not, rather than a folder."""
-    return str(path) == "embedded" or str(path).startswith("embedded:")
+def choose_response(capture: Capture, method: str = "posterior", candidates: Sequence[str] = ()) -> "Response":
+    """The response that fits the training photos best, from their codes as photographed.
+
+    Photos are up to 24 of the training views, evenly spread; for method "paper" a random one. candidates: names, and
+    files of one curve or of many; none: the built-in ones. Raises InputError where photos show nothing.
+    """
+    from ..response import responses_named
+    from ..response.selection import select_response
+
+    shots = capture.training
+    judged = shots[:: -(-len(shots) // _MOST_JUDGED)]
+    if method == "paper":
+        judged = (shots[int(np.random.default_rng(0).integers(len(shots)))],)
+    _log.info("choosing the response from %d photos", len(judged))
+    photos = []
+    for shot in judged:
+        image = as_photographed(shot)
+        if image.alpha is not None:  # What is not there has no colour.
+            image.pixels[image.alpha < 1] = 0
+        photos.append(image.pixels)
+    check_content(((codes, None) for codes in photos), capture.folder)
+    known = [response for name in candidates for response in responses_named(name)] or None
+    camera = made_by_camera([None if shot.derived else shot.image for shot in shots])
+    return select_response(photos, known, method=method, from_camera=camera).response
 
 
-def embedded_names() -> tuple[str, ...]:
-    """The scenes that come with the package, for load_scene("embedded:NAME")."""
-    return tuple(sorted(folder.name for folder in _EMBEDDED.iterdir() if (folder / "transforms_train.json").is_file()))
+def _named(response: "str | Path | Response") -> "Response":
+    """The curve to develop by; a learned one is not known yet."""
+    from ..response import response_by_name
+
+    if not isinstance(response, str | Path):
+        return response
+    return response_by_name("srgb" if response == "learned" else response)
 
 
 def _folder(path: Path | str) -> Path:
     if is_embedded(path):
-        _, _, name = str(path).partition(":")
-        if name and name not in embedded_names():
-            known = ", ".join(f"embedded:{known}" for known in embedded_names())
-            raise InputError(path, "is no scene of the package", f"take one of {known}")
-        return _EMBEDDED / (name or "room")
+        return embedded_folder(str(path))
     folder = Path(path)
     if not folder.exists():
         raise InputError(folder, "not found", "give a folder of photos, or 'embedded'")
@@ -126,7 +156,7 @@ def _folder(path: Path | str) -> Path:
     return folder
 
 
-def _read(folder: Path, cache: Path | None, progress: Callable[[str], None]) -> Capture:
+def _read(folder: Path, cache: Path | str | None) -> Capture:
     """The first layout that fits, the most telling one first."""
     if is_hdr_nerf(folder):
         return read_hdr_nerf(folder)
@@ -143,41 +173,29 @@ def _read(folder: Path, cache: Path | None, progress: Callable[[str], None]) -> 
         return read_colmap(folder)
     if (folder / "poses_bounds.npy").is_file():
         return read_llff(folder)
-    return read_photos(folder, cache, progress)
+    return read_photos(folder, cache)
 
 
-def _with_splits(shots: list[Shot], capture: Capture, holdout: int | None) -> tuple[list[Shot], list[str]]:
-    if any(shot.split for shot in shots):
-        return [replace(shot, split=shot.split or "train") for shot in shots], []
-    step, offset = (holdout, 0) if holdout is not None else capture.holdout or (_HOLDOUT, 0)
-    if step == 0 or len(shots) < _FEWEST_FOR_TEST:
-        note = "no views are held out for testing"
-        return [replace(shot, split="train") for shot in shots], [note]
-    return [replace(s, split="test" if i % step == offset else "train") for i, s in enumerate(shots)], []
+def _with_splits(shots: list[Shot], capture: Capture, holdout: int | None) -> tuple[list[Shot], tuple[str, ...]]:
+    """The shots with a split each, and a note where the set does not state it."""
+    if holdout is None and any(shot.split for shot in shots):
+        return [replace(shot, split=shot.split or "train") for shot in shots], ()
+    held = _held_out(len(shots), holdout, capture.holdout)
+    shots = [replace(shot, split="test" if i in held else "train") for i, shot in enumerate(shots)]
+    if not held:
+        return shots, ("no views are held out for testing",)
+    names = [shot.view for shot in shots if shot.split == "test"]
+    listed = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    return shots, (f"{len(names)} of {len(shots)} views are held out for testing: {listed}",)
 
 
-def _require_content(views: list[View], folder: Path) -> None:
-    """Refuse sets that show nothing: fewer than one training sample in a thousand between black and white."""
-    low, high = 1.5 / 255, 1 - 1.5 / 255
-    samples = [
-        view.image if view.mask is None else view.image[view.mask > 0.5] for view in views if view.split == "train"
-    ]
-    shown = sum(int(((image > low) & (image < high)).sum()) for image in samples)
-    total = sum(image.size for image in samples)
-    if shown < total * 1e-3 or total == 0:
-        mean = sum(float(image.sum()) for image in samples) / max(total, 1)
-        state = "masked out" if total == 0 else f"black or white in {100 - 100 * shown / total:.1f} % (mean {mean:.3f})"
-        raise InputError(folder, f"the training photos are {state}", "expose them so that the scene shows, "
-                         "or choose another exposure index")  # fmt: skip
-
-
-def _with_points(
-    capture: Capture, views: list[View], cache: Path | None, progress
-) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    if len(capture.points):
-        return capture.points, capture.point_colors, []
-    points, colors = triangulate([view for view in views if view.split == "train"], cache, progress)
-    note = f"the set has no points; triangulated {len(points)} from the training views" if len(points) else (
-        "the set has no points and none could be triangulated"
-    )  # fmt: skip
-    return points, colors, [note]
+def _held_out(count: int, step: int | None, published: tuple[int, int] | None) -> set[int]:
+    """Which of so many views test: the published protocol's, or the middle of each block, never the last view."""
+    if step == 0 or count < _FEWEST_FOR_TEST:
+        return set()
+    if published is not None:
+        every, offset = published
+        step = step or every
+        return set(range(min(offset, step - 1), count, step))
+    step = step or _HOLDOUT
+    return {i for i in range(step // 2, count, step) if i < count - 1} or {count // 2}

@@ -51,7 +51,7 @@ def read_colmap(folder: Path) -> Capture:
     notes = (
         (f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ...",) if absent else ()
     )
-    return Capture("colmap", tuple(shots), points=model.points, point_colors=model.colors, notes=notes)
+    return Capture("colmap", tuple(shots), holdout=(8, 0), points=model.points, point_colors=model.colors, notes=notes)
 
 
 def is_hdr_gs(folder: Path) -> bool:

@@ -55,7 +55,7 @@ def read_llff(folder: Path) -> Capture:
     shots = []
     for row, image in zip(rows, _images(folder / "images", path, len(rows)), strict=True):
         shots.append(Shot(image.stem, image, *_camera(row, path, image.name)))
-    return Capture("llff", tuple(shots))
+    return Capture("llff", tuple(shots), holdout=(8, 0))
 
 
 def _rows(path: Path, width: int) -> np.ndarray:

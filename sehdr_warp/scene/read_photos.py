@@ -1,6 +1,5 @@
 """A bare folder of photos: cameras, poses and points by structure from motion."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 from sehdr_warp.errors import InputError
@@ -19,7 +18,7 @@ def photo_folder(folder: Path) -> Path | None:
     return None
 
 
-def read_photos(folder: Path, cache: Path | None, progress: Callable[[str], None]) -> Capture:
+def read_photos(folder: Path, cache: Path | str | None = None) -> Capture:
     """One shot for each photo that structure from motion could place, in the natural order of the names."""
     place = photo_folder(folder)
     if place is None:
@@ -31,7 +30,7 @@ def read_photos(folder: Path, cache: Path | None, progress: Callable[[str], None
         raise InputError(photos[0], "is the only photo; one view does not show depth", "add photos from other places")
     for photo in photos:
         image_sizes(photo)
-    model = reconstruct(photos, cache, progress)
+    model = reconstruct(photos, cache)
     placed = {int(Path(image.name).stem): image for image in model.images}
     shots = [
         Shot(photo.stem, photo, model.cameras[placed[i].camera_id], placed[i].world_to_camera, oriented=True,

@@ -1,22 +1,6 @@
-"""Exact area averaging, and the LDR case of it: averages of light, not of code values."""
-
-from collections.abc import Callable
+"""Exact area averaging."""
 
 import numpy as np
-
-Curve = Callable[[np.ndarray], np.ndarray]
-
-
-def srgb_decode(value: np.ndarray) -> np.ndarray:
-    """Encoded [0, 1] -> linear [0, 1] (IEC 61966-2-1)."""
-    value = np.asarray(value)
-    return np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0.04045) + 0.055) / 1.055) ** 2.4)
-
-
-def srgb_encode(linear: np.ndarray) -> np.ndarray:
-    """Linear [0, 1] -> encoded [0, 1] (IEC 61966-2-1); values above 1 give 1."""
-    linear = np.clip(linear, 0.0, 1.0)
-    return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def limited_size(width: int, height: int, max_size: int | None) -> tuple[int, int]:
@@ -54,20 +38,6 @@ def _overlaps(source: int, target: int):
     column = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts) + np.repeat(first, counts)
     weight = np.minimum(column + 1, edges[row + 1]) - np.maximum(column, edges[row])
     return csr_array(((weight / (source / target)).astype(np.float32), (row, column)), shape=(target, source))
-
-
-def light_table(levels: int, decode: Curve) -> np.ndarray:
-    """[levels + 1] float32: the linear exposure of every code value, finite also where the curve ends at infinity.
-
-    A curve such as Reinhard's reaches 1 only at infinite exposure; the last code then stands for the exposure at the
-    code's lower edge (half a step below), the least that can have been there.
-    """
-    codes = np.arange(levels + 1, dtype=np.float64) / levels
-    with np.errstate(divide="ignore", over="ignore"):
-        light = np.asarray(decode(codes), dtype=np.float64)
-        if not np.isfinite(light[-1]):
-            light[-1] = np.asarray(decode(codes[-1:] - 0.5 / levels), dtype=np.float64)[0]
-    return np.maximum(light, 0.0).astype(np.float32)
 
 
 def restore_clipping(image: np.ndarray, clipped_share: np.ndarray) -> np.ndarray:

@@ -7,57 +7,59 @@ package's bounded reader. Results go to a cache folder under a key made of all t
 import contextlib
 import hashlib
 import json
+import logging
 import math
 import os
 import struct
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from sehdr_warp.errors import InputError, SehdrError
-
+from ..errors import InputError, SehdrError
+from .capture import Capture, Shot
 from .colmap_model import SparseModel, read_model
-from .images import open_image, read_ldr
-from .types import View
+from .develop import as_photographed, fitted_lens
+from .images import open_image, read_ldr, read_mask
+from .lens import Lens
+from .types import encoded_values
 
-Progress = Callable[[str], None]
+_log = logging.getLogger("sehdr_warp.scene")
 
 # SIFT finds little more above this size, and extraction time grows with the area.
 MAX_SIDE = 1200
 _SEED = 0
-_VERSION = 1
+_VERSION = 2
 # Up to here every pair is matched; beyond, each photo with its neighbours by name (a walk or a video).
 _EXHAUSTIVE_LIMIT = 150
 _CHUNK = 8
 
 
-def reconstruct(photos: Sequence[Path], cache: Path | None, progress: Progress) -> SparseModel:
+def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> SparseModel:
     """Cameras (SIMPLE_RADIAL, at the photos' oriented size), poses and points of a list of photos.
 
     The names in the model are the photos' indices (`00003.png` is photos[3]); photos that could not be placed are
-    missing from it. cache: a folder for results; the same photos (name, size, time of change) are not solved again.
+    missing from it. cache: a folder for results, None the user's; the same photos, wherever they lie, are solved once.
     Raises InputError where fewer than two photos can be placed.
     """
-    stamps = [(photo.name, photo.stat().st_size, photo.stat().st_mtime_ns) for photo in photos]
-    key = _key("photos", MAX_SIDE, _SEED, stamps)
+    key = _key("photos", MAX_SIDE, _SEED, [(photo.name, _digest(photo)) for photo in photos])
 
     def solve(work: Path, result: Path) -> None:
-        sizes, small = _write_photos(photos, work / "images", progress)
+        sizes, small = _write_photos(photos, work / "images")
         database = work / "database.db"
         for group in _same_camera(photos, sizes):
             focal = _focal_prior(photos[group[0]], small[group[0]])
             width, height = small[group[0]]
-            _extract(database, work / "images", [_name(i) for i in group], "SIMPLE_RADIAL",
-                     (focal, width / 2, height / 2, 0.0), progress)  # fmt: skip
-        _match(database, len(photos), progress)
-        model = _map(database, work, len(photos), photos[0].parent, progress)
+            params = (focal, width / 2, height / 2, 0.0)
+            _extract(database, work / "images", [_name(i) for i in group], "SIMPLE_RADIAL", params)
+        _match(database, len(photos))
+        model = _map(database, work, len(photos), photos[0].parent)
         model.write_binary(result)
         (result / "sizes.json").write_text(json.dumps(sizes))
 
-    with _cached(cache, f"sfm-{key}", solve, progress) as folder:
+    with _cached(cache, f"sfm-{key}", solve) as folder:
         model = read_model(folder)
         sizes = json.loads((folder / "sizes.json").read_text())
     full = {image.camera_id: sizes[int(Path(image.name).stem)] for image in model.images}
@@ -65,75 +67,105 @@ def reconstruct(photos: Sequence[Path], cache: Path | None, progress: Progress) 
     return SparseModel(cameras, model.images, model.points, model.colors)
 
 
-def triangulate(views: Sequence[View], cache: Path | None, progress: Progress) -> tuple[np.ndarray, np.ndarray]:
-    """[P, 3] points and [P, 3] colours seen in views whose cameras are known; P is 0 where no feature matches.
+def triangulate(capture: Capture, cache: Path | str | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """[P, 3] points and [P, 3] colours of the training photos, whose cameras are known; P is 0 where nothing matches.
 
-    Features are found on the views' images stretched to full range (a short exposure is nearly black as it is), at
-    no more than MAX_SIDE pixels; poses stay as they are.
+    Features are found on the photos stretched to full range (a short exposure is nearly black as it is), at no more
+    than MAX_SIDE pixels; poses stay as they are. cache: as reconstruct's.
     """
-    digest = hashlib.sha256()
-    for view in views:
-        digest.update(view.image.tobytes())
-        digest.update(json.dumps(view.camera.to_dict()).encode())
-    key = _key("points", MAX_SIDE, _SEED, digest.hexdigest())
+    shots = capture.training
+    parts = [
+        (shot.image.name, _digest(shot.image), shot.mask and _digest(shot.mask), shot.exposure_time * shot.derived,
+         shot.lens.model, shot.lens.params, shot.world_to_camera.tolist())
+        for shot in shots
+    ]  # fmt: skip
 
     def solve(work: Path, result: Path) -> None:
         import pycolmap
 
-        sizes = _write_views(views, work / "images")
+        lenses = _write_shots(shots, work / "images")
         database = work / "database.db"
-        for i, view in enumerate(views):
-            camera = view.camera.resized(*sizes[i])
-            _extract(
-                database, work / "images", [_name(i)], "PINHOLE", camera.intrinsics, progress if i == 0 else _silent
-            )
-        _match(database, len(views), progress)
-        progress("triangulating points from the known poses")
-        model = _known_poses(database, views)
+        for i, lens in enumerate(lenses):
+            if i % _CHUNK == 0:
+                _log.info("finding features in photos %d to %d of %d", i + 1, min(i + _CHUNK, len(shots)), len(shots))
+            _extract(database, work / "images", [_name(i)], lens.model, lens.params, told=False)
+        _match(database, len(shots))
+        _log.info("triangulating points from the known poses")
+        model = _known_poses(database, shots)
         options = pycolmap.IncrementalPipelineOptions()
         _seed(options)
         with _quiet():
             model = pycolmap.triangulate_points(model, database, work / "images", work / "model", options=options)
-        places, colors = _sampled_colors(model, views, sizes)
+        places, colors = _sampled_colors(model, shots, lenses)
         np.savez(result / "points.npz", points=places, colors=colors)
 
-    with _cached(cache, f"points-{key}", solve, progress) as folder, np.load(folder / "points.npz") as stored:
+    name = f"points-{_key('points', MAX_SIDE, _SEED, parts)}"
+    with _cached(cache, name, solve) as folder, np.load(folder / "points.npz") as stored:
         return stored["points"], stored["colors"]
 
 
+def user_cache() -> Path:
+    """$SEHDR_CACHE, else sehdr-warp/ in $XDG_CACHE_HOME or ~/.cache."""
+    if stated := os.environ.get("SEHDR_CACHE"):
+        return Path(stated)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sehdr-warp"
+
+
 @contextlib.contextmanager
-def _cached(cache: Path | None, name: str, solve: Callable[[Path, Path], None], progress: Progress):
-    """The folder of a finished result: the cached one, or a new one that solve(work, result) fills."""
-    if cache is not None and (cache / name).is_dir():
-        progress(f"using the cached result {cache / name}")
-        yield cache / name
+def _cached(cache: Path | str | None, name: str, solve: Callable[[Path, Path], None]) -> Iterator[Path]:
+    """The folder of a finished result: the cached one, or a new one that solve(work, result) fills.
+
+    A user's cache that cannot be written is done without; a named one is asked for.
+    """
+    folder = user_cache() if cache is None else Path(cache)
+    if (folder / name).is_dir():
+        _log.info("using the cached result %s", folder / name)
+        yield folder / name
         return
+    made = not folder.exists()
     try:
+        folder.mkdir(parents=True, exist_ok=True)
+        kept = os.access(folder, os.W_OK)
+    except OSError as error:
+        kept = False
         if cache is not None:
-            cache.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix="sehdr-sfm-", dir=cache) as work:
+            raise _unwritable(folder, error) from None
+    try:
+        with tempfile.TemporaryDirectory(prefix="sehdr-sfm-", dir=folder if kept else None) as work:
             result = Path(work) / "result"
             (Path(work) / "model").mkdir()
             result.mkdir()
             solve(Path(work), result)
-            if cache is None:
+            if not kept:
                 yield result
                 return
             try:
-                os.replace(result, cache / name)
+                os.replace(result, folder / name)
             except OSError:
                 # Another process finished the same work first; its result is as good.
-                if not (cache / name).is_dir():
+                if not (folder / name).is_dir():
                     raise
     except BaseException as error:
-        if cache is not None:
+        if made:
             with contextlib.suppress(OSError):  # Not empty, or never made.
-                cache.rmdir()
+                folder.rmdir()
         if not isinstance(error, OSError):
             raise
-        raise SehdrError(f"{cache or tempfile.gettempdir()}: structure from motion cannot write "
-                         f"({error.strerror or error}); free some space or choose another cache") from None  # fmt: skip
-    yield cache / name
+        raise _unwritable(folder, error) from None
+    yield folder / name
+
+
+def _unwritable(folder: Path, error: OSError) -> SehdrError:
+    return SehdrError(f"{folder}: structure from motion cannot write ({error.strerror or error}); "
+                      "free some space or choose another cache (SEHDR_CACHE)")  # fmt: skip
+
+
+def _digest(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "blake2b").hexdigest()[:32]
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror or error})", "check the file and its rights") from None
 
 
 def _key(*parts) -> str:
@@ -144,20 +176,14 @@ def _name(index: int) -> str:
     return f"{index:05d}.png"
 
 
-def _silent(message: str) -> None:
-    pass
-
-
-def _write_photos(photos, folder: Path, progress: Progress) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Oriented 8-bit copies of at most MAX_SIDE pixels; returns the oriented full sizes and the copies' sizes."""
     folder.mkdir()
     sizes, small, informative = [], [], False
     for i, photo in enumerate(photos):
         if i % _CHUNK == 0:
-            progress(f"reading photos {i + 1} to {min(i + _CHUNK, len(photos))} of {len(photos)}")
-        encoded = read_ldr(photo, oriented=True)
-        pixels = encoded.pixels if encoded.pixels.dtype == np.uint8 else (encoded.pixels >> 8).astype(np.uint8)
-        image = Image.fromarray(pixels)
+            _log.info("reading photos %d to %d of %d", i + 1, min(i + _CHUNK, len(photos)), len(photos))
+        image = Image.fromarray(_bytes(read_ldr(photo, oriented=True).pixels))
         sizes.append(image.size)
         image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
         small.append(image.size)
@@ -171,18 +197,28 @@ def _write_photos(photos, folder: Path, progress: Progress) -> tuple[list[tuple[
     return sizes, small
 
 
-def _write_views(views, folder: Path) -> list[tuple[int, int]]:
+def _bytes(codes: np.ndarray) -> np.ndarray:
+    return codes if codes.dtype == np.uint8 else (codes >> 8).astype(np.uint8)
+
+
+def _write_shots(shots: Sequence[Shot], folder: Path) -> list[Lens]:
+    """8-bit copies of at most MAX_SIDE pixels, stretched and masked; returns the lenses at the copies' sizes."""
     folder.mkdir()
-    sizes = []
-    for i, view in enumerate(views):
-        image = view.image / max(float(np.percentile(view.image, 99.5)), 1 / 255)
-        if view.mask is not None:
-            image = image * view.mask[:, :, None]
-        picture = Image.fromarray((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8))
-        picture.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
+    lenses = []
+    for i, shot in enumerate(shots):
+        lens, oriented = (shot.lens, False) if shot.derived else fitted_lens(shot)
+        image = as_photographed(shot, oriented=oriented)
+        light = Image.fromarray(_bytes(image.pixels))
+        light.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
+        values = encoded_values(np.asarray(light))
+        values = values / max(float(np.percentile(values, 99.5)), 1 / 255)
+        for mask in (image.alpha, None if shot.mask is None else read_mask(shot.mask, oriented=oriented)):
+            if mask is not None:
+                values *= np.asarray(Image.fromarray(mask).resize(light.size, Image.Resampling.BOX))[:, :, None]
+        picture = Image.fromarray((np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8))
         picture.save(folder / _name(i), compress_level=1)
-        sizes.append(picture.size)
-    return sizes
+        lenses.append(lens.resized(*light.size))
+    return lenses
 
 
 def _same_camera(photos, sizes) -> list[list[int]]:
@@ -212,7 +248,7 @@ def _device(photo: Path) -> tuple:
     return exif.get(0x010F), exif.get(0x0110), lens.get(0x920A), lens.get(0xA405)
 
 
-def _extract(database: Path, images: Path, names: list[str], model: str, params, progress: Progress) -> None:
+def _extract(database: Path, images: Path, names: list[str], model: str, params, told: bool = True) -> None:
     """Features of images that share one camera, a few at a time so that progress can be told."""
     import pycolmap
 
@@ -221,7 +257,8 @@ def _extract(database: Path, images: Path, names: list[str], model: str, params,
     )
     for start in range(0, len(names), _CHUNK):
         part = names[start : start + _CHUNK]
-        progress(f"finding features in images {start + 1} to {start + len(part)} of {len(names)}")
+        if told:
+            _log.info("finding features in photos %d to %d of %d", start + 1, start + len(part), len(names))
         with _quiet():
             pycolmap.extract_features(
                 database, images, part, pycolmap.CameraMode.SINGLE, reader, device=pycolmap.Device.cpu
@@ -232,12 +269,12 @@ def _extract(database: Path, images: Path, names: list[str], model: str, params,
             reader.existing_camera_id = shared
 
 
-def _match(database: Path, count: int, progress: Progress) -> None:
+def _match(database: Path, count: int) -> None:
     import pycolmap
 
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = _SEED
-    progress(f"matching features between {count} images")
+    _log.info("matching features between %d photos", count)
     with _quiet():
         if count <= _EXHAUSTIVE_LIMIT:
             pycolmap.match_exhaustive(database, verification_options=verification, device=pycolmap.Device.cpu)
@@ -253,7 +290,7 @@ def _seed(options) -> None:
     options.triangulation.random_seed = _SEED
 
 
-def _map(database: Path, work: Path, count: int, source: Path, progress: Progress):
+def _map(database: Path, work: Path, count: int, source: Path):
     """The largest reconstruction; where photos are left, after a second try with weaker conditions."""
     import pycolmap
 
@@ -266,12 +303,12 @@ def _map(database: Path, work: Path, count: int, source: Path, progress: Progres
             options.mapper.init_min_tri_angle = 4.0
             options.mapper.init_min_num_inliers = 50
             options.mapper.abs_pose_min_num_inliers = 15
-            progress("placing the photos again with weaker conditions")
+            _log.info("placing the photos again with weaker conditions")
         placed = [2]
 
         def next_image(placed=placed) -> None:
             placed[0] += 1
-            progress(f"placed {placed[0]} of {count} photos")
+            _log.info("placed %d of %d photos", placed[0], count)
 
         output = work / f"model{int(patient)}"
         output.mkdir()
@@ -290,8 +327,8 @@ def _map(database: Path, work: Path, count: int, source: Path, progress: Progres
     return best
 
 
-def _known_poses(database: Path, views):
-    """A reconstruction that holds the database's cameras and images at the views' poses, and no points."""
+def _known_poses(database: Path, shots: Sequence[Shot]):
+    """A reconstruction that holds the database's cameras and images at the shots' poses, and no points."""
     import pycolmap
 
     model = pycolmap.Reconstruction()
@@ -299,27 +336,32 @@ def _known_poses(database: Path, views):
         for camera in opened.read_all_cameras():
             model.add_camera_with_trivial_rig(camera)
         for image in opened.read_all_images():
-            pose = views[int(Path(image.name).stem)].camera.world_to_camera
+            pose = shots[int(Path(image.name).stem)].world_to_camera
             model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
     return model
 
 
-def _sampled_colors(model, views, sizes) -> tuple[np.ndarray, np.ndarray]:
-    """Places and the mean colour of the pixels where each point was seen, as encoded in the views."""
-    places, colors = [], []
-    for point in model.points3D.values():
-        seen = []
+def _sampled_colors(model, shots: Sequence[Shot], lenses: Sequence[Lens]) -> tuple[np.ndarray, np.ndarray]:
+    """Places and the mean colour of the photos' pixels where each point was seen, encoded."""
+    seen: dict[int, list[tuple[int, float, float]]] = {}
+    points = list(model.points3D.values())
+    for number, point in enumerate(points):
         for element in point.track.elements:
             image = model.images[element.image_id]
-            index = int(Path(image.name).stem)
-            pixels, (width, height) = views[index].image, sizes[index]
             x, y = image.points2D[element.point2D_idx].xy
-            row = min(max(int(y * pixels.shape[0] / height), 0), pixels.shape[0] - 1)
-            column = min(max(int(x * pixels.shape[1] / width), 0), pixels.shape[1] - 1)
-            seen.append(pixels[row, column])
-        places.append(point.xyz)
-        colors.append(np.mean(seen, axis=0))
-    return np.array(places, np.float64).reshape(-1, 3), np.array(colors, np.float32).reshape(-1, 3)
+            seen.setdefault(int(Path(image.name).stem), []).append((number, x, y))
+    total, count = np.zeros((len(points), 3)), np.zeros((len(points), 1))
+    for index, places in seen.items():
+        shot, lens = shots[index], lenses[index]
+        pixels = as_photographed(shot, oriented=not shot.derived and fitted_lens(shot)[1]).pixels
+        height, width = pixels.shape[:2]
+        for number, x, y in places:
+            row = min(max(int(y * height / lens.height), 0), height - 1)
+            column = min(max(int(x * width / lens.width), 0), width - 1)
+            total[number] += pixels[row, column] / np.iinfo(pixels.dtype).max
+            count[number] += 1
+    places = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
+    return places, (total / np.maximum(count, 1)).astype(np.float32)
 
 
 @contextlib.contextmanager

@@ -120,7 +120,7 @@ def _expose(asked: ExposeTruth) -> None:
         noise = SensorNoise(*figures)
     times = asked.exposures and [exposure.time for exposure in read_exposures(asked.exposures, None, "--exposures")]
     check_absent_folder(asked.out, asked.overwrite)
-    scene = load_scene(asked.truth, progress=say)
+    scene = load_scene(asked.truth, response="srgb")
     times = times or exposure_ladder(scene, response)
     write_photo_set(scene, asked.out, response, times, noise=noise, seed=asked.seed, overwrite=asked.overwrite)
     stated = ", ".join(f"{time:.4g}" for time in times)

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from ..errors import InputError
-from ..scene import Scene, View
+from ..scene import Scene, View, codes_of
 
 # Mertens et al. 2007, "Exposure Fusion": a value's well-exposedness is a Gaussian around one half.
 _WELL_EXPOSED_CENTRE, _WELL_EXPOSED_SIGMA = 0.5, 0.2
@@ -80,11 +80,11 @@ def expose(
     if not 1 <= bits <= 16:
         raise ValueError(f"{bits} bits are not 1 to 16")
     views = tuple(
-        replace(view, image=_photo(scene, view, response, time, noise, bits, seed), exposure_time=float(time))
+        replace(view, codes=_photo(scene, view, response, time, noise, bits, seed), exposure_time=float(time))
         for view, time in zip(scene.views, times, strict=True)
     )
     colors = _recoloured(scene, views)
-    return replace(scene, views=views, point_colors=colors, exposure_times_known=True)
+    return replace(scene, views=views, point_colors=colors, exposure_times_known=True, response=None, chosen_by=None)
 
 
 def exposure_ladder(scene: Scene, response: Curve, count: int = 5, factor: float = 4.0) -> tuple[float, ...]:
@@ -130,7 +130,7 @@ def _photo(
         rng = np.random.default_rng([seed, zlib.crc32(view.name.encode())])
         exposure = _noisy(exposure, saturation, noise, rng)
     levels = 2**bits - 1
-    return (np.round(np.clip(response.encode(exposure), 0.0, 1.0) * levels) / levels).astype(np.float32)
+    return codes_of(np.round(np.clip(response.encode(exposure), 0.0, 1.0) * levels) / levels)
 
 
 def _noisy(exposure: np.ndarray, saturation: float, noise: SensorNoise, rng: np.random.Generator) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import atomic_path, write_json
-from ..scene import Scene, View
+from ..scene import Scene, View, codes_of
 from ..scene.hdr_nerf_layout import DERIVED_PHOTOS, RadianceView, reinhard_gamma
 from .expose import exposure_ladder
 
@@ -70,7 +70,7 @@ def as_scene(name: str, views: Sequence[RadianceView]) -> Scene:
     made = tuple(
         View(
             view.name,
-            reinhard_gamma(view.radiance).astype(np.float32),
+            codes_of(reinhard_gamma(view.radiance), 16),
             view.camera,
             1.0,
             view.split,

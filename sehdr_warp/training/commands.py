@@ -109,9 +109,7 @@ def _load(command: Train, config):
         command.data,
         exposure_index=command.exposure_index,
         max_size=command.max_size,
-        cache=None if command.out is None else cache_beside(command.out),
-        progress=say,
-        **known_curves(config.response.name),
+        **developed_by(config),
     )
     for note in scene.notes:
         say(note)
@@ -142,19 +140,11 @@ def _config(command: Train, resumed: bool):
     return override_config(config, {"plan.keep": sorted(kept)})
 
 
-def known_curves(response: str) -> dict:
-    """load_scene's decode and encode for a response that is known before the photos are read."""
-    if response == "auto":
-        return {}
-    from ..response import response_by_name
-
-    curve = response_by_name(response)
-    return {"decode": curve.decode, "encode": curve.encode}
-
-
-def cache_beside(run: Path) -> Path:
-    """Where structure from motion keeps its results: beside the run, so that a second run finds them too."""
-    return run.absolute().parent / f"{run.name}.cache"
+def developed_by(config) -> dict:
+    """load_scene's choice of a response, as the config has it."""
+    options = config.response
+    name = "learned" if options.form == "mlp" else options.name
+    return {"response": name, "method": options.method, "candidates": options.candidates}
 
 
 def _absolute(data: str) -> str:

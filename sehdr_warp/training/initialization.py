@@ -1,7 +1,5 @@
 """The field a training starts from: the scene's points, or points drawn where several cameras look."""
 
-from pathlib import Path
-
 import numpy as np
 import torch
 
@@ -15,7 +13,7 @@ from ..response import (
     Response,
     ToneMapper,
     response_by_name,
-    responses_in_file,
+    responses_named,
 )
 from ..response.selection import select_response
 from ..scene import Scene, View
@@ -67,30 +65,22 @@ def choose_response(scene: Scene, config: Config) -> Response:
 
 
 def _selected(scene: Scene, config: Config) -> Response:
+    """The response that the scene was developed with, if chosen as the config asks; else one chosen from its views."""
     options = config.response
-    candidates = [response for name in options.candidates for response in _responses(name)] or None
+    if scene.response is not None and scene.chosen_by == (options.method, options.candidates):
+        return scene.response
+    candidates = [response for name in options.candidates for response in responses_named(name)] or None
     views = scene.train_views
-    images = [view.image for view in views]
+    photos = [view.codes for view in views]
     if options.method == "paper":
-        images = [images[int(np.random.default_rng(config.seed).integers(len(images)))]]
-    images = images[:: -(-len(images) // MOST_JUDGED)]
+        photos = [photos[int(np.random.default_rng(config.seed).integers(len(photos)))]]
     return select_response(
-        images,
+        photos[:: -(-len(photos) // MOST_JUDGED)],
         candidates,
         method=options.method,
         from_camera=made_by_camera([view.source for view in views]),
         seed=config.seed,
     ).response
-
-
-def _responses(name: str) -> list[Response]:
-    """Every curve of a file that holds many, or the one that a name stands for."""
-    if Path(name).is_file():
-        try:
-            return responses_in_file(name)
-        except InputError:
-            pass  # a file of one curve: response_by_name reads it, or says what is wrong with it
-    return [response_by_name(name)]
 
 
 def make_field(scene: Scene, config: Config, response: Response, device: torch.device | str) -> RadianceField:

@@ -70,8 +70,11 @@ def test_a_scene_without_truth_and_a_training_that_diverges_end_in_one_line(tmp_
         Runner("cpu").run(job("default", scenes=(str(tmp_path / "photos"),)), tmp_path)
     diverging = job("default", iterations=(30,))
     scene, judged = photos(diverging)
-    # Photos that are not a number stand in for a training that diverges: every loss is then not finite.
-    broken = replace(scene, views=tuple(replace(v, image=np.full_like(v.image, np.nan)) for v in scene.views))
+    # Exposure times beyond float32 stand in for a training that diverges: every loss is then not finite.
+    broken = replace(
+        scene,
+        views=tuple(replace(v, exposure_time=v.exposure_time * (1e45 if i else 1)) for i, v in enumerate(scene.views)),
+    )
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SehdrError, match="not finite"):
         patch.setattr(quality_run, "photos", lambda job: (broken, judged))
         Runner("cpu").run(diverging, tmp_path)
@@ -100,7 +103,7 @@ def test_seconds_to_final_is_the_first_time_that_stays_within_a_tenth(psnr, expe
         ("--responses sometimes", "response 'sometimes' is not one of known, blind"),
         ("--methods truth --responses blind", "none of the methods makes sense without the response"),
         ("--scenes nowhere", "nowhere: no such folder"),
-        ("--scenes embedded:nowhere", "embedded:nowhere: no such scene"),
+        ("--scenes embedded:nowhere", "embedded:nowhere: is not here"),
         ("--curves kodachrome", "kodachrome"),
         ("--workers 0", "--workers 0: not positive"),
         ("--launcher ship", "--launcher ship: not one of auto, slurm, local, process"),

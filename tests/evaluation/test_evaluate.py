@@ -11,7 +11,7 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.evaluation.evaluate import evaluate
 from sehdr_warp.evaluation.table import format_table
 from sehdr_warp.response import response_by_name
-from sehdr_warp.scene import Camera, Scene, View
+from sehdr_warp.scene import Camera, Scene, View, codes_of, encoded_values
 
 RESPONSE = response_by_name("hdr-nerf")
 
@@ -27,7 +27,7 @@ def view(index, split, *, truth=True, mask=None, exposure_time=2.0, photo=None):
     pose[0, 3] = index  # the camera tells the fake run which view it is
     camera = Camera(30, 24, 25.0, 25.0, 15.0, 12.0, pose)
     image = RESPONSE.encode(hdr * exposure_time) if photo is None else photo
-    return View(f"r_{index}", image, camera, exposure_time, split, mask, hdr if truth else None)
+    return View(f"r_{index}", codes_of(image, 16), camera, exposure_time, split, mask, hdr if truth else None)
 
 
 def scene(views):
@@ -42,7 +42,8 @@ def run(change=lambda hdr: hdr):
         return SimpleNamespace(hdr=change(hdr))
 
     def render_ldr(camera, seconds):
-        return RESPONSE.encode(render(camera).hdr * seconds)
+        photo = RESPONSE.encode(render(camera).hdr * seconds).numpy()
+        return torch.tensor(encoded_values(codes_of(photo, 16)))
 
     numbers = {"train_seconds": 12.5, "gaussian_count": 4321, "iterations": 700}
     return SimpleNamespace(render=render, render_ldr=render_ldr, device="cpu", **numbers)

@@ -16,7 +16,7 @@ from sehdr_warp.field.confidence import (
 from sehdr_warp.field.gaussians import Gaussians
 from sehdr_warp.field.radiance_field import CameraTensors, RadianceField
 from sehdr_warp.response import response_by_name
-from sehdr_warp.scene import Camera, View
+from sehdr_warp.scene import Camera, View, codes_of
 
 SRGB = response_by_name("srgb")
 CAMERA = Camera(20, 12, 15.0, 15.0, 10.0, 6.0, np.eye(4))
@@ -62,7 +62,7 @@ def field(device="cpu"):
 
 def view(model, mask=None):
     photo = model.render_ldr(CAMERA).cpu().numpy()
-    return View("v", np.round(photo * 255).astype(np.float32) / 255, CAMERA, 0.5, "train", mask)
+    return View("v", codes_of(photo, 8), CAMERA, 0.5, "train", mask)
 
 
 def test_weighted_sums_are_those_of_the_blend(device):
@@ -90,7 +90,7 @@ def test_clipped_and_unseen_gaussians_are_doubted(device):
 
 def test_truth_is_not_clipped():
     model = field()
-    truth = View("v", np.ones((12, 20, 3), np.float32), CAMERA, 0.5, "train", None, model.render(CAMERA).hdr.numpy())
+    truth = View("v", codes_of(np.ones((12, 20, 3))), CAMERA, 0.5, "train", None, model.render(CAMERA).hdr.numpy())
     confidence = gather_evidence(model, [truth], truth=True).confidence()
     assert confidence[:2].min() > 0.99
     assert gather_evidence(model, [truth]).confidence()[1] < 0.6

@@ -6,7 +6,7 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.report import Comparison, read_metrics, stops_figure, training_figure, write_report
-from sehdr_warp.scene import Scene, View
+from sehdr_warp.scene import Scene, View, codes_of
 
 from .helpers import AnalyticRun
 
@@ -29,7 +29,14 @@ def make(folder, *, truth=True, splits=("train", "test", "test"), metrics=METRIC
         hdr = run.render(entry.camera).hdr
         image = run.response.encode(hdr * entry.exposure_time).astype(np.float32)
         views.append(
-            View(entry.name, image, entry.camera, entry.exposure_time, entry.split, hdr=hdr if truth else None)
+            View(
+                entry.name,
+                codes_of(image, 16),
+                entry.camera,
+                entry.exposure_time,
+                entry.split,
+                hdr=hdr if truth else None,
+            )
         )
     return run, Scene("sky", "photos", tuple(views), np.zeros((0, 3)), np.zeros((0, 3), np.float32))
 

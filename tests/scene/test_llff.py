@@ -5,8 +5,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.scene import load_scene
-from tests.make_scenes import arc_poses, pattern
+from tests.make_scenes import arc_poses, load, pattern
 
 
 def write_llff(folder, count=6, size=(64, 48), focal=50.0):
@@ -25,7 +24,7 @@ def write_llff(folder, count=6, size=(64, 48), focal=50.0):
 
 def test_axes_size_and_focal_length_are_llffs(tmp_path):
     poses = write_llff(tmp_path)
-    scene = load_scene(tmp_path)
+    scene = load(tmp_path)
     assert scene.format == "llff"
     views = sorted(scene.views, key=lambda view: view.name)
     assert [view.name for view in views] == [f"{i:03d}" for i in range(6)]
@@ -47,4 +46,4 @@ def test_what_does_not_fit_is_refused(tmp_path, spoil, message):
     write_llff(tmp_path)
     np.save(tmp_path / "poses_bounds.npy", spoil(np.load(tmp_path / "poses_bounds.npy")))
     with pytest.raises(InputError, match=message):
-        load_scene(tmp_path)
+        load(tmp_path)

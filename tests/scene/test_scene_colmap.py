@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.colmap_model import read_model
 from sehdr_warp.scene.lens import CAMERA_MODELS
-from tests.make_scenes import arc_poses, pattern, write_colmap
+from tests.make_scenes import arc_poses, load, pattern, write_colmap
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -21,7 +20,7 @@ pycolmap = pytest.importorskip("pycolmap")
 def test_model_is_what_pycolmap_wrote(tmp_path, binary):
     write_colmap(tmp_path, binary=binary)
     oracle = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
-    scene = load_scene(tmp_path)
+    scene = load(tmp_path)
     assert scene.format == "colmap" and [view.name for view in scene.views] == [f"{i:03d}" for i in range(6)]
     by_name = {image.name: image for image in oracle.images.values()}
     for view in scene.views:
@@ -55,7 +54,7 @@ def test_distortion_is_undone_where_pycolmap_projects(tmp_path, model, params):
     x, y = np.meshgrid(np.arange(64), np.arange(48))
     for i in range(6):
         Image.fromarray(np.stack([x, y, 0 * x], 2).astype(np.uint8)).save(tmp_path / "images" / f"{i:03d}.png")
-    view = load_scene(tmp_path, decode=lambda v: v, encode=lambda v: v).views[2]
+    view = load(tmp_path, response="linear").views[2]
     camera, lens = view.camera, pycolmap.Camera(model=model, width=64, height=48, params=list(params))
     rows, columns = np.mgrid[2 : camera.height - 2 : 5, 2 : camera.width - 2 : 5].reshape(2, -1)
     rays = np.stack([(columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy, 0 * rows + 1.0], 1)
@@ -69,7 +68,7 @@ def test_distorted_photos_scaled_down_show_the_same_places(tmp_path):
     places = np.stack([*np.meshgrid(np.arange(640), np.arange(480)), np.zeros((480, 640))], axis=2)
     for i in range(6):
         Image.fromarray((places * 255 / 640 + 0.5).astype(np.uint8)).save(tmp_path / "images" / f"{i:03d}.png")
-    view = load_scene(tmp_path, max_size=80, decode=lambda v: v, encode=lambda v: v).views[0]
+    view = load(tmp_path, max_size=80, response="linear").views[0]
     camera, lens = view.camera, pycolmap.Camera(model="SIMPLE_RADIAL", width=640, height=480, params=list(params))
     assert camera.width == 80
     rows, columns = np.mgrid[2 : camera.height - 2 : 3, 2:78:3].reshape(2, -1)
@@ -84,7 +83,7 @@ def test_stored_pixels_or_turned_ones_as_the_camera_size_says(tmp_path):
             exif = Image.Exif()
             exif[0x0112] = 6
             Image.fromarray(pattern(64, 48, i)).save(tmp_path / name / "images" / f"{i:03d}.png", exif=exif)
-    stored, turned = (load_scene(tmp_path / name).views[1].image for name in ("stored", "turned"))
+    stored, turned = (load(tmp_path / name).views[1].image for name in ("stored", "turned"))
     np.testing.assert_array_equal(np.rot90(stored, -1), turned)
 
 
@@ -92,11 +91,11 @@ def test_reduced_images_scale_the_camera_and_others_are_refused(tmp_path):
     write_colmap(tmp_path)
     for i in range(6):
         Image.fromarray(pattern(32, 24, i)).save(tmp_path / "images" / f"{i:03d}.png")
-    view = load_scene(tmp_path).views[0]
+    view = load(tmp_path).views[0]
     assert (view.camera.width, view.camera.fx, view.camera.cy) == (32, 25.0, 12.5)
     Image.fromarray(pattern(60, 48)).save(tmp_path / "images" / "003.png")
     with pytest.raises(InputError, match=r"003.png: image is 60 x 48, its camera 64 x 48"):
-        load_scene(tmp_path)
+        load(tmp_path)
 
 
 def test_mask_and_alpha_keep_pixels_out(tmp_path):
@@ -108,7 +107,7 @@ def test_mask_and_alpha_keep_pixels_out(tmp_path):
     alpha = np.full((48, 64, 1), 255, np.uint8)
     alpha[:12] = 0
     Image.fromarray(np.concatenate([pattern(64, 48, 1), alpha], 2)).save(tmp_path / "images" / "001.png")
-    scene = load_scene(tmp_path)
+    scene = load(tmp_path)
     assert scene.views[0].mask[:, :16].max() == 0 and scene.views[0].mask[:, 16:].min() == 1
     assert scene.views[1].mask[:12].max() == 0 and scene.views[1].mask[12:].min() == 1
     np.testing.assert_array_equal(scene.views[1].image, pattern(64, 48, 1).astype(np.float32) / np.float32(255))
@@ -121,7 +120,7 @@ def test_names_that_leave_the_folder_are_refused(tmp_path, name):
     images = tmp_path / "sparse" / "0" / "images.txt"
     images.write_text(images.read_text().replace("000.png", name))
     with pytest.raises(InputError, match="absolute|'..'"):
-        load_scene(tmp_path)
+        load(tmp_path)
 
 
 def test_link_out_of_the_folder_is_refused(tmp_path):
@@ -130,7 +129,7 @@ def test_link_out_of_the_folder_is_refused(tmp_path):
     (tmp_path / "set" / "images" / "000.png").rename(secret)
     (tmp_path / "set" / "images" / "000.png").symlink_to(secret)
     with pytest.raises(InputError, match="leads outside"):
-        load_scene(tmp_path / "set")
+        load(tmp_path / "set")
 
 
 def _first_image(tmp_path) -> tuple:
@@ -159,7 +158,7 @@ def test_hostile_binary_images(tmp_path):
     ):
         path.write_bytes(bytes(data))
         with pytest.raises(InputError, match=message):
-            load_scene(tmp_path)
+            load(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +210,7 @@ def test_random_text_and_bytes_raise_only_input_errors(binary_model, tmp_path_fa
 def test_fern_is_read_as_pycolmap_reads_it(shared):
     folder = shared / "data" / "fern"
     oracle = pycolmap.Reconstruction(folder / "sparse" / "0")
-    scene = load_scene(folder, max_size=100)
+    scene = load(folder, max_size=100)
     assert [view.name for view in scene.test_views] == ["000", "008", "016"] and len(scene.views) == 20
     assert not scene.exposure_times_known and any("1 s" in note for note in scene.notes)
     assert scene.points.shape == (oracle.num_points3D(), 3)
@@ -236,7 +235,7 @@ def test_hdr_gs_layout(tmp_path):
         for k, seconds in enumerate((0.125, 0.5, 2, 8, 32)):
             code = (reinhard_gamma(truth[i] * seconds) * 255 + 0.5).astype(np.uint8)
             Image.fromarray(code).save(tmp_path / "images" / f"{i}_{k}.png")
-    scene = load_scene(tmp_path, exposure_index=3)
+    scene = load(tmp_path, exposure_index=3)
     assert scene.format == "hdr-gs" and [view.name for view in scene.test_views] == ["1", "3", "5"]
     assert {view.exposure_time for view in scene.views} == {8.0}
     for i, view in enumerate(scene.views):

@@ -14,11 +14,8 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.scene.images import image_sizes, read_hdr, read_ldr
 from sehdr_warp.scene.resample import (
     area_average,
-    light_table,
     limited_size,
     restore_clipping,
-    srgb_decode,
-    srgb_encode,
 )
 
 RNG = np.random.default_rng(1)
@@ -152,22 +149,9 @@ def test_area_average_is_exact(width, height, data):
     np.testing.assert_allclose(area_average(image, *small), expected, atol=1e-5)
 
 
-def test_light_of_a_curve_that_ends_at_infinity():
-    with np.errstate(divide="ignore"):
-        table = light_table(255, lambda v: v / (1 - v))
-    assert np.isfinite(table).all() and (np.diff(table) > 0).all() and table[-1] == pytest.approx(509, rel=1e-3)
-
-
 def test_clipping_survives_where_it_covers_half():
     share = np.array([0.0, 0.49, 0.5, 1.0])
     np.testing.assert_array_equal(restore_clipping(np.full(4, 0.7, np.float32), share), np.float32([0.7, 0.7, 1, 1]))
-
-
-def test_srgb_is_the_standard():
-    colour = pytest.importorskip("colour")
-    value = np.linspace(0, 1, 999)
-    np.testing.assert_allclose(srgb_decode(value), colour.models.eotf_sRGB(value), atol=1e-12)
-    np.testing.assert_allclose(srgb_encode(srgb_decode(value)), value, atol=1e-6)
 
 
 def test_limited_size():

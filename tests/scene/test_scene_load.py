@@ -10,12 +10,11 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.capture import Shot
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.names import natural_key, unique_names
 from sehdr_warp.scene.sfm import reconstruct
-from tests.make_scenes import pattern, write_blender, write_colmap
+from tests.make_scenes import load, pattern, write_blender, write_colmap
 
 _TIME, _NUMBER, _ISO, _APEX = 33434, 33437, 34855, 37377
 
@@ -34,7 +33,7 @@ def test_exif_times_count_sensitivity_and_aperture(tmp_path):
         name="{:03d}.jpg",
         exif={i: {_TIME: t, _ISO: iso, _NUMBER: n} for i, (t, iso, n) in enumerate(settings)},
     )
-    scene = load_scene(tmp_path)
+    scene = load(tmp_path)
     light = [t * iso / 100 * (4 / n) ** 2 for t, iso, n in settings]
     np.testing.assert_allclose([view.exposure_time for view in scene.views], light, rtol=1e-5)
     assert scene.exposure_times_known
@@ -44,33 +43,33 @@ def test_exif_times_count_sensitivity_and_aperture(tmp_path):
 
 def test_shutter_speed_stands_in_for_exposure_time(tmp_path):
     write_colmap(tmp_path, name="{:03d}.jpg", exif={i: {_APEX: 3.0} for i in range(6)})
-    assert {view.exposure_time for view in load_scene(tmp_path).views} == {0.125}
+    assert {view.exposure_time for view in load(tmp_path).views} == {0.125}
 
 
 def test_one_photo_without_time_is_refused_and_a_list_helps(tmp_path):
     write_colmap(tmp_path, name="{:03d}.jpg", exif={i: {_TIME: 0.01} for i in range(5)})
     with pytest.raises(InputError, match=r"005.jpg: exposure time is absent in 1 of 6"):
-        load_scene(tmp_path)
+        load(tmp_path)
     (tmp_path / "exposures.json").write_text(json.dumps({f"{i:03d}.jpg": 2.0 for i in range(6)}))
-    assert {view.exposure_time for view in load_scene(tmp_path).views} == {2.0}
+    assert {view.exposure_time for view in load(tmp_path).views} == {2.0}
     (tmp_path / "exposures.json").write_text(json.dumps([{"file": "000.jpg", "exposure_time": 0}]))
     with pytest.raises(InputError, match=r"exposures.json: exposure time of '000.jpg' is 0"):
-        load_scene(tmp_path)
+        load(tmp_path)
 
 
 def test_exif_time_of_zero_is_refused(tmp_path):
     write_colmap(tmp_path, name="{:03d}.jpg", exif={i: {_TIME: 0.0 if i == 2 else 0.01} for i in range(6)})
     with pytest.raises(InputError, match=r"002.jpg: EXIF exposure time is"):
-        load_scene(tmp_path)
+        load(tmp_path)
 
 
 def test_splits(tmp_path):
     write_colmap(tmp_path, 9)
-    assert [view.name for view in load_scene(tmp_path).test_views] == ["000", "008"]
-    assert [view.name for view in load_scene(tmp_path, holdout=4).test_views] == ["000", "004", "008"]
-    assert not load_scene(tmp_path, holdout=0).test_views
+    assert [view.name for view in load(tmp_path).test_views] == ["000", "008"]
+    assert [view.name for view in load(tmp_path, holdout=4).test_views] == ["000", "004", "008"]
+    assert not load(tmp_path, holdout=0).test_views
     write_colmap(tmp_path / "few", 4)
-    few = load_scene(tmp_path / "few")
+    few = load(tmp_path / "few")
     assert not few.test_views and "no views are held out for testing" in few.notes
 
 
@@ -92,16 +91,16 @@ def test_all_black_or_white_is_refused(tmp_path, value, word):
     for image in (tmp_path / "images").iterdir():
         Image.new("RGB", (40, 30), (value,) * 3).save(image)
     with pytest.raises(InputError, match=f"black or white in {word}"):
-        load_scene(tmp_path)
+        load(tmp_path)
     (tmp_path / "transforms.json").unlink()
     with pytest.raises(InputError, match="all black or all white"):
-        load_scene(tmp_path)
+        load(tmp_path)
 
 
 def test_folders_that_cannot_be_used(tmp_path):
     def refused(folder, message):
         with pytest.raises(InputError, match=message) as caught:
-            load_scene(folder)
+            load(folder)
         assert "\n" not in str(caught.value)
 
     refused(tmp_path / "none", "not found")
@@ -130,17 +129,17 @@ def test_photos_that_do_not_overlap_are_refused(tmp_path):
     for i in range(3):
         Image.fromarray(pattern(120, 90, i)).save(tmp_path / f"{i}.png")
     with pytest.raises(InputError, match="none of the 3 photos could be placed"):
-        load_scene(tmp_path)
+        load(tmp_path)
 
 
-def test_bare_photos_are_placed_undistorted_and_cached(tmp_path, shared):
+def test_bare_photos_are_placed_undistorted_and_cached(tmp_path, shared, caplog):
     """Five of the castle's photos at a fifth of their size: all placed, EXIF times kept, the second call reuses."""
     photos = sorted((shared / "data" / "castle").glob("*.JPG"))[3:8]
     for photo in photos:
         with Image.open(photo) as image:
             image.reduce(4).save(tmp_path / photo.name, exif=image.getexif(), quality=95)
-    messages = []
-    scene = load_scene(tmp_path, max_size=200, cache=tmp_path / "cache", progress=messages.append)
+    caplog.set_level("INFO", "sehdr_warp.scene")
+    scene = load(tmp_path, max_size=200, cache=tmp_path / "cache")
     assert scene.format == "photos" and len(scene.views) == 5 and len(scene.points) > 200
     assert len({view.exposure_time for view in scene.views}) > 1 and scene.exposure_times_known
     assert max(view.image.shape[1] for view in scene.views) == 200 and scene.views[0].camera.width == 200
@@ -153,9 +152,9 @@ def test_bare_photos_are_placed_undistorted_and_cached(tmp_path, shared):
         assert inside.mean() > 0.4
         colors = view.image[row[inside].astype(int), column[inside].astype(int)]
         assert np.corrcoef(colors.ravel(), scene.point_colors[inside].ravel())[0, 1] > 0.5
-    calls = len(messages)
-    again = load_scene(tmp_path, max_size=200, cache=tmp_path / "cache", progress=messages.append)
-    assert "cached" in messages[calls]
+    caplog.clear()
+    again = load(tmp_path, max_size=200, cache=tmp_path / "cache")
+    assert "cached" in caplog.messages[0]
     np.testing.assert_array_equal(again.points, scene.points)
     assert not [entry for entry in (tmp_path / "cache").iterdir() if entry.name.startswith("sehdr-sfm-")]
 
@@ -170,7 +169,7 @@ def test_turned_photos_are_placed_upright(tmp_path, shared):
         for folder, picture, tags in (("up", upright, Image.Exif()), ("side", upright.rotate(90, expand=True), exif)):
             (tmp_path / folder).mkdir(exist_ok=True)
             picture.save(tmp_path / folder / f"{photo.stem}.png", exif=tags)
-    up, side = (load_scene(tmp_path / folder, max_size=100) for folder in ("up", "side"))
+    up, side = (load(tmp_path / folder, max_size=100) for folder in ("up", "side"))
     assert len(up.views) == len(side.views) == 4
     for a, b in zip(up.views, side.views, strict=True):
         assert a.image.shape == b.image.shape
@@ -182,12 +181,12 @@ def test_photos_of_several_cameras_get_their_own_lenses(tmp_path, shared):
     for i, photo in enumerate(photos):
         with Image.open(photo) as image:
             image.reduce(4 if i < 3 else 5).save(tmp_path / photo.name, quality=95)
-    model = reconstruct(sorted(tmp_path.glob("*.JPG")), None, lambda message: None)
+    model = reconstruct(sorted(tmp_path.glob("*.JPG")), tmp_path / "cache")
     assert sorted((lens.width, lens.height) for lens in model.cameras.values()) == [(567, 426), (708, 532)]
 
 
 def test_embedded_scene_loads():
-    scene = load_scene("embedded")
+    scene = load("embedded")
     assert scene.format == "hdr-nerf" and scene.name == "embedded"
     assert len(scene.train_views) >= 10 and len(scene.test_views) >= 5 and len(scene.points) > 500
     assert all(view.hdr is not None and view.hdr.shape == view.image.shape for view in scene.views)

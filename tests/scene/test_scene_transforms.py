@@ -7,12 +7,12 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.scene import load_cameras, load_scene
+from sehdr_warp.scene import load_cameras
 from sehdr_warp.scene.hdr_nerf_layout import reinhard_gamma
 from tests.make_scenes import (
     arc_poses,
+    load,
     pattern,
-    reinhard_gamma_inverse,
     room_views,
     write_blender,
     write_colmap,
@@ -31,8 +31,8 @@ def test_blender_poses_become_opencv(tmp_path):
         "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
         "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n0 0 0 255 0 0\n1 2 3 0 0 51\n"
     )
-    scene = load_scene(tmp_path)
-    assert [view.name for view in scene.test_views] == ["r_0", "r_8"] and scene.format == "transforms"
+    scene = load(tmp_path)
+    assert [view.name for view in scene.test_views] == ["r_4"] and scene.format == "transforms"
     for view, pose in zip(scene.views, arc_poses(9), strict=True):
         np.testing.assert_allclose(view.camera.world_to_camera, pose, atol=1e-12)
         assert view.camera.fx == view.camera.fy == pytest.approx(20 / np.tan(0.4)) and view.camera.cx == 20
@@ -42,7 +42,7 @@ def test_blender_poses_become_opencv(tmp_path):
 
 def test_transparent_pixels_show_black_light(tmp_path):
     write_blender(tmp_path, rgba=True, camera_angle_x=0.7)
-    view = load_scene(tmp_path, cache=tmp_path / "cache").views[0]
+    view = load(tmp_path, cache=tmp_path / "cache").views[0]
     assert view.image[:, :20].max() == 0 and view.mask is None
     np.testing.assert_allclose(view.image[:, 20:], pattern(40, 30, 0)[:, 20:] / 255, atol=1e-6)
 
@@ -55,7 +55,7 @@ def test_frame_values_win_over_the_files(tmp_path):
         values["frames"][i] |= {"exposure_time": 0.25, "split": "train"}
     (tmp_path / "transforms.json").write_text(json.dumps(values))
     Image.fromarray(np.eye(30, 40, dtype=np.uint8) * 255).save(tmp_path / "mask.png")
-    scene = load_scene(tmp_path)
+    scene = load(tmp_path)
     first, second = scene.views[:2]
     assert tuple(first.camera.intrinsics) == (50, 50, 18, 15) and tuple(second.camera.intrinsics) == (60, 61, 18, 15)
     assert (first.exposure_time, second.exposure_time) == (0.25, 0.5) and scene.exposure_times_known
@@ -66,7 +66,7 @@ def test_frame_values_win_over_the_files(tmp_path):
 def test_nerfstudio_points_move_with_the_poses(tmp_path):
     write_blender(tmp_path, applied_transform=[[0, 1, 0, 5], [1, 0, 0, 0], [0, 0, -1, 0]])
     write_colmap(tmp_path / "colmap")
-    points = load_scene(tmp_path).points
+    points = load(tmp_path).points
     assert {tuple(p) for p in points} == {(-i / 3 + 5, i, -0.25) for i in range(5)}
 
 
@@ -86,7 +86,7 @@ def test_bad_transforms_are_refused(tmp_path, fields, message):
     write_blender(tmp_path)
     _edit(tmp_path, **fields)
     with pytest.raises(InputError, match=message):
-        load_scene(tmp_path)
+        load(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_bad_poses_are_refused(tmp_path, change, message):
     values["frames"][3]["transform_matrix"] = matrix.tolist()
     (tmp_path / "transforms.json").write_text(json.dumps(values))
     with pytest.raises(InputError, match=message):
-        load_scene(tmp_path)
+        load(tmp_path)
 
 
 def test_exr_alone_is_refused_and_beside_a_photo_is_truth(tmp_path):
@@ -118,11 +118,11 @@ def test_exr_alone_is_refused_and_beside_a_photo_is_truth(tmp_path):
         with OpenEXR.File({}, {"RGB": np.full((30, 40, 3), i + 1, np.float32)}) as file:
             file.write(str(tmp_path / frame["file_path"]))
     (tmp_path / "transforms.json").write_text(json.dumps(values))
-    scene = load_scene(tmp_path, cache=tmp_path / "cache")
+    scene = load(tmp_path, cache=tmp_path / "cache")
     assert [view.hdr.max() for view in scene.views] == [1, 2, 3, 4, 5, 6]
     (tmp_path / "images" / "r_2.png").unlink()
     with pytest.raises(InputError, match=r"r_2.exr: is the frame's only image"):
-        load_scene(tmp_path)
+        load(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +135,7 @@ def test_hdr_nerf_round_trip(room, shared):
     folder, times = room
     views = room_views(shared, size=100, count=12)
     for index, expected in ((None, 2), (0, 0), (4, 4)):
-        scene = load_scene(folder, exposure_index=index)
+        scene = load(folder, exposure_index=index)
         assert scene.format == "hdr-nerf" and len(scene.train_views) == len(scene.test_views) == 6
         assert {view.exposure_time for view in scene.views} == {times[expected]}
         read = {view.name: view for view in scene.views}
@@ -147,31 +147,31 @@ def test_hdr_nerf_round_trip(room, shared):
             np.testing.assert_allclose(read[view.name].camera.intrinsics, view.camera.intrinsics, rtol=1e-12)
     assert len(scene.points) == 21600
     with pytest.raises(InputError, match=r"index 7 asked for, but the exposures are \[0, 1, 2, 3, 4\]"):
-        load_scene(folder, exposure_index=7)
+        load(folder, exposure_index=7)
 
 
 def test_photos_are_averaged_as_light(room):
     """Half-size photos must agree with the half-size radiance that was photographed, not with averaged code values."""
     folder, _ = room
-    small = load_scene(folder, max_size=25, decode=reinhard_gamma_inverse, encode=reinhard_gamma)
+    small = load(folder, max_size=25, response="hdr-nerf")
     for view in small.views:
         exact = reinhard_gamma(view.hdr * view.exposure_time)
         assert np.percentile(np.abs(view.image - exact), 99) < 1 / 255
         assert (view.camera.width, view.camera.cx) == (25, 12.5)
 
 
-def test_points_are_triangulated_and_cached(tmp_path, shared):
+def test_points_are_triangulated_and_cached(tmp_path, shared, caplog):
     from scipy.spatial import cKDTree
 
     write_room(tmp_path, shared, points=False)
-    messages = []
-    scene = load_scene(tmp_path, cache=tmp_path / "cache", progress=messages.append)
+    caplog.set_level("INFO", "sehdr_warp.scene")
+    scene = load(tmp_path, max_size=100, cache=tmp_path / "cache")
     truth = np.load(shared / "data" / "room" / "points_hdr.npz")["xyz"]
     assert len(scene.points) > 200 and np.median(cKDTree(truth).query(scene.points)[0]) < 0.1
     assert any("triangulated" in note for note in scene.notes)
-    again = load_scene(tmp_path, cache=tmp_path / "cache", progress=messages.append)
+    again = load(tmp_path, cache=tmp_path / "cache")
     np.testing.assert_array_equal(again.points, scene.points)
-    assert "cached" in messages[-1]
+    assert "cached" in caplog.messages[-1]
 
 
 @pytest.mark.parametrize("value, message", [(0, "0"), (-1, "-1"), ("NaN", "NaN"), (None, "None")])
@@ -184,7 +184,7 @@ def test_impossible_exposures_are_refused(room, tmp_path, value, message):
     times[next(iter(times))] = value
     (folder / "exposure_train.json").write_text(json.dumps(times))
     with pytest.raises(InputError, match=f"exposure time of .* is {message}|'{message}'"):
-        load_scene(folder)
+        load(folder)
 
 
 def test_hdr_nerf_real_layout(tmp_path):
@@ -197,23 +197,23 @@ def test_hdr_nerf_real_layout(tmp_path):
             matrix = np.stack([down, right, -forward, position, [120, 160, 200]], axis=1)
             rows.append([*matrix.ravel(), 1.0, 9.0, seconds])
     np.save(tmp_path / "poses_bounds_exps.npy", np.array(rows))
-    scene = load_scene(tmp_path, exposure_index=1, cache=tmp_path / "cache")
+    scene = load(tmp_path, exposure_index=1, cache=tmp_path / "cache")
     assert scene.format == "hdr-nerf-real" and [view.name for view in scene.test_views] == ["001", "003", "005"]
     for view, pose in zip(scene.views, arc_poses(6), strict=True):
         np.testing.assert_allclose(view.camera.world_to_camera, pose, atol=1e-9)
         assert view.exposure_time == 0.4 and (view.camera.fx, view.camera.cx) == (50, 20)
     np.save(tmp_path / "poses_bounds_exps.npy", np.array(rows)[:, :17])
     with pytest.raises(InputError, match=r"not an \[n, 18\] array"):
-        load_scene(tmp_path)
+        load(tmp_path)
     with (tmp_path / "poses_bounds_exps.npy").open("wb") as file:
         np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (1 << 40, 18)})
     with pytest.raises(InputError, match=r"not an \[n, 18\] array"):
-        load_scene(tmp_path)
+        load(tmp_path)
 
 
 def test_cameras_from_every_kind_of_file(tmp_path):
     write_blender(tmp_path, w=40, h=30)
-    scene = load_scene(tmp_path, cache=tmp_path / "cache")
+    scene = load(tmp_path, cache=tmp_path / "cache")
     expected = scene.views[2].camera
     own = tmp_path / "cameras.json"
     own.write_text(

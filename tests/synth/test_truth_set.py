@@ -9,7 +9,7 @@ import pytest
 import sehdr_warp
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
-from sehdr_warp.scene import embedded_names, load_scene
+from sehdr_warp.scene import embedded_scenes, load_scene
 from sehdr_warp.synth.pack import pack_truth
 from sehdr_warp.synth.scenes import RECIPES
 from sehdr_warp.synth.truth_set import HdrNerfCurve
@@ -142,11 +142,11 @@ def test_embedded_scenes_have_truth_and_a_well_exposed_photo(name):
 
 
 def test_every_scene_of_the_generator_is_embedded():
-    assert {*embedded_names()} == {"room", *RECIPES}
+    assert {*embedded_scenes()} == {"room", *RECIPES}
 
 
 def test_a_scene_that_is_not_embedded_is_refused_with_the_names():
-    with pytest.raises(InputError, match="embedded:nowhere: is no scene of the package; take one of .*embedded:room"):
+    with pytest.raises(InputError, match="embedded:nowhere: is not here; present are .*embedded:room"):
         load_scene("embedded:nowhere")
     with pytest.raises(InputError):
         load_scene("embedded:../room")

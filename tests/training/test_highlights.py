@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from sehdr_warp.response import response_by_name
+from sehdr_warp.scene import codes_of
 from sehdr_warp.training.config import LossConfig
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.highlights import CHANNEL_PARTS, expected_excess, tail_stops
@@ -21,7 +22,7 @@ PRIOR = LossConfig(highlight_weight=0.1, highlight_stops=2.0)
 
 def views_of(*images):
     view = toy_scene(view_count=1).views[0]
-    return [replace(view, image=np.asarray(image, np.float32), hdr=None) for image in images]
+    return [replace(view, codes=codes_of(np.asarray(image, np.float32)), hdr=None) for image in images]
 
 
 def exponential_photo(response, stops, size=200, seed=0):
@@ -68,8 +69,10 @@ def test_fixed_expects_the_same_everywhere_and_masks_take_no_part():
     assert tail_stops([replace(view, mask=np.zeros((32, 32), np.float32))], response) == 0
     image = view.image.copy()
     image[:, 16:] = 1.0
-    left = replace(view, image=image, mask=np.repeat([[1.0, 0.0]], 16, axis=1).repeat(32, axis=0).astype(np.float32))
-    cut = replace(view, image=view.image[:, :16])
+    left = replace(
+        view, codes=codes_of(image), mask=np.repeat([[1.0, 0.0]], 16, axis=1).repeat(32, axis=0).astype(np.float32)
+    )
+    cut = replace(view, codes=view.codes[:, :16])
     assert (
         tail_stops([left], response) == tail_stops([cut], response) < tail_stops([replace(left, mask=None)], response)
     )
@@ -81,7 +84,9 @@ def clipped_scene(value=None):
     views = [
         np.minimum(view.image * 4, 1) if value is None else np.full_like(view.image, value) for view in scene.views
     ]
-    return replace(scene, views=tuple(replace(v, image=i, hdr=None) for v, i in zip(scene.views, views, strict=True)))
+    return replace(
+        scene, views=tuple(replace(v, codes=codes_of(i), hdr=None) for v, i in zip(scene.views, views, strict=True))
+    )
 
 
 def mean_excess(run, scene):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.scene import Camera
+from sehdr_warp.scene import Camera, codes_of
 from sehdr_warp.training.config import DECISIONS
 from sehdr_warp.training.config_files import config_to_dict, load_config, override_config, parse_setting
 from sehdr_warp.training.plan import apply_plan, make_plan, read_plan
@@ -25,7 +25,7 @@ def config_of(**changes):
 
 
 def with_images(scene, change):
-    return replace(scene, views=tuple(replace(view, image=change(view)) for view in scene.views))
+    return replace(scene, views=tuple(replace(view, codes=codes_of(change(view))) for view in scene.views))
 
 
 def fields(plan):

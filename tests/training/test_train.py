@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.scene import codes_of
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.initialization import choose_response, make_field
 from sehdr_warp.training.run import load_run
@@ -161,7 +162,7 @@ def test_views_of_differing_exposure_agree(tmp_path):
     for index, view in enumerate(base.views):
         time = EXPOSURE_TIME * (2 if index % 2 else 1)
         photo = np.round(srgb.encode(view.hdr * time) * 255).astype(np.float32) / 255
-        views.append(dataclasses.replace(view, image=photo, exposure_time=time))
+        views.append(dataclasses.replace(view, codes=codes_of(photo), exposure_time=time))
     run = train(dataclasses.replace(base, views=tuple(views)), tmp_path / "run", quick(), device="cpu", quiet=True)
     # Taken for equal, the times would leave the simulated photos a stop off: below 15 dB.
     assert run.metrics()[-1]["psnr_ldr"] > 18
@@ -170,7 +171,7 @@ def test_views_of_differing_exposure_agree(tmp_path):
 
 def test_clipped_highlights_are_not_pulled_down(scene, tmp_path):
     """Photos of more than the sensor holds: the render is white there, and not held to just white."""
-    views = tuple(dataclasses.replace(view, image=np.ones_like(view.image)) for view in scene.views)
+    views = tuple(dataclasses.replace(view, codes=np.full_like(view.codes, 255)) for view in scene.views)
     field = make_field(scene, quick(), choose_response(scene, quick()), "cpu")
     trainer = Trainer(dataclasses.replace(scene, views=views), quick(**{"loss.ssim_weight": 0.0}), field)
     with torch.no_grad():
@@ -281,7 +282,7 @@ def test_an_interrupt_leaves_a_usable_checkpoint(scene, tmp_path):
 
 @pytest.mark.parametrize("value,words", [(0.0, "black"), (1.0, "white")])
 def test_photos_without_light_or_shadow_are_refused(scene, tmp_path, value, words):
-    views = tuple(dataclasses.replace(view, image=np.full_like(view.image, value)) for view in scene.views)
+    views = tuple(dataclasses.replace(view, codes=codes_of(np.full_like(view.image, value))) for view in scene.views)
     with pytest.raises(InputError, match=words):
         train(dataclasses.replace(scene, views=views), tmp_path / "run", quick(), device="cpu", quiet=True)
 

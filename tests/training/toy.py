@@ -6,7 +6,7 @@ import torch
 from sehdr_warp.field.gaussians import Gaussians
 from sehdr_warp.field.radiance_field import RadianceField
 from sehdr_warp.response import response_by_name
-from sehdr_warp.scene import Camera, Scene, View, look_at
+from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
 
 EXPOSURE_TIME = 0.25
 
@@ -35,7 +35,7 @@ def toy_scene(view_count: int = 8, size: int = 32, with_points: bool = True) -> 
         photo = np.round(field.render_ldr(camera).numpy() * 255) / 255
         truth = field.render(camera).hdr.numpy()
         split = "test" if index % 4 == 3 else "train"
-        views.append(View(f"v_{index}", photo.astype(np.float32), camera, EXPOSURE_TIME, split, hdr=truth))
+        views.append(View(f"v_{index}", codes_of(photo, 8), camera, EXPOSURE_TIME, split, hdr=truth))
     points = field.gaussians.means.detach().numpy().astype(np.float64)
     colors = np.full((len(points), 3), 0.5, dtype=np.float32)
     chosen = slice(None) if with_points else slice(0)
