@@ -4,16 +4,17 @@ python examples/own_loop.py
 """
 
 import torch
+from scipy.spatial import cKDTree
 
 import sehdr_warp as sw
-from sehdr_warp.splatting import nearest_neighbour_distances
 
 
 def main(steps: int = 90, max_size: int = 64) -> list[float]:
     """Fits colored Gaussians to the embedded scene's photos; the loss of each step."""
     scene = sw.load_scene("embedded", max_size=max_size)
     means = torch.tensor(scene.points, dtype=torch.float32)
-    spacing = nearest_neighbour_distances(means).mean(dim=1, keepdim=True)
+    distances, _ = cKDTree(scene.points).query(scene.points, k=4)  # of each point to itself and its three nearest
+    spacing = torch.tensor(distances[:, 1:].mean(axis=1, keepdims=True), dtype=torch.float32)
     parameters = {
         "means": means,
         "log_scales": spacing.log().expand(-1, 3).clone(),

@@ -208,8 +208,8 @@ def backward_kernel(dtype, channels: int, halvings: int, degree: int = EXPONENTI
     """The adjoint of forward_kernel, whose arguments it shares.
 
     emission: [M] each entry's row in entry_gradients
-    transmittance, last: as the forward left them (transmittance is used up)
-    image_gradient: [H W, C]; left_over_gradient: [H W]
+    last: as the forward left it; image_gradient: [H W, C]; left_over_gradient: [H W]
+    transmittance: as the forward left it, and used up
     behind, weights, slopes: scratch of [tiles, 16] rows; incoming: scratch of [tiles, C, 16] rows
     entry_gradients: [M, C + 6], in the order of emission: features, conic a b c, x, y, opacity
     """
@@ -232,10 +232,10 @@ def backward_kernel(dtype, channels: int, halvings: int, degree: int = EXPONENTI
         height: int,
         alpha_threshold: real,
         iota: wp.array(dtype=row),
-        transmittance: wp.array2d(dtype=row),
         last: wp.array2d(dtype=row),
         image_gradient: wp.array2d(dtype=real),
         left_over_gradient: wp.array(dtype=real),
+        transmittance: wp.array2d(dtype=row),
         behind: wp.array2d(dtype=row),
         incoming: wp.array3d(dtype=row),
         weights: wp.array2d(dtype=row),

@@ -62,8 +62,8 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
         return index // blocks, wp.min(index % blocks * wp.static(lanes), span - wp.static(lanes)) - margin
 
     @wp.func
-    def is_border(planes: wp.array3d(dtype=run), y: int, i: int, margin: int, length: int) -> bool:
-        """Whether a blur's run lies beyond the image; then it is zero, and written here."""
+    def write_border(y: int, i: int, margin: int, length: int, planes: wp.array3d(dtype=run)) -> bool:
+        """Writes a blur's run where it lies beyond the image, zero; whether it does."""
         if wp.static(lanes == 1) and (i < 0 or i >= length):
             for k in range(planes.shape[0]):
                 planes[k, y, i + margin] = run(real(0.0))
@@ -82,7 +82,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
     ):
         margin = radius * channels
         y, i = place_of(first + wp.tid(), length, border * channels)
-        if is_border(moments, y, i, margin, length):
+        if write_border(y, i, margin, length, moments):
             return
         s1 = run(real(0.0))
         d1 = run(real(0.0))
@@ -168,7 +168,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
     ):
         margin = radius * channels
         y, i = place_of(first + wp.tid(), length, border * channels)
-        if is_border(blurred, y, i, margin, length):
+        if write_border(y, i, margin, length, blurred):
             return
         sd = run(real(0.0))
         ss = run(real(0.0))

@@ -3,10 +3,12 @@
 Gaussians come in depth order. `count_tiles` counts the tiles that each one's ellipse really touches (not its bounding
 box), a prefix sum over the counts gives every Gaussian its range of entries, and `emit_entries` fills them. A stable
 sort of the entries by tile then leaves each tile's list in depth order, because the entries were emitted in it.
-`mark_ranges` finds where each tile's list begins and ends.
+`mark_ranges` finds where each tile's list begins and ends. Adjoints sum what they write for each entry by Gaussian in
+one order, whatever runs when: `gather_entries`.
 """
 
 from functools import cache
+from types import SimpleNamespace
 
 import warp as wp
 
@@ -15,8 +17,8 @@ from .geometry import geometry
 
 
 @cache
-def tile_kernels(dtype):
-    """(pack_records, count_tiles, emit_entries, key_by_depth) for one scalar type."""
+def tile_kernels(dtype) -> SimpleNamespace:
+    """pack_records, key_by_depth, count_tiles, emit_entries and gather_entries for one scalar type."""
     g = geometry(dtype)
     real, vec2, vec3, vec4 = g.real, g.vec2, g.vec3, g.vec4
     size = float(TILE_SIZE)
@@ -39,22 +41,23 @@ def tile_kernels(dtype):
 
     @wp.kernel(module="unique", module_options=options)
     def pack_records(
+        first: int,
         means2d: wp.array(dtype=vec2),
         conics: wp.array(dtype=vec3),
         opacities: wp.array(dtype=real),
-        extents: wp.array(dtype=vec2),
         features: wp.array2d(dtype=real),
         channels: int,
         alpha_threshold: real,
+        extents: wp.array(dtype=vec2),
         shapes: wp.array(dtype=vec4),
         ellipses: wp.array(dtype=vec4),
     ):
         """shapes: (x, y, opacity, half-height); ellipses: (conic a, b, c, level at which alpha meets the threshold).
 
-        A Gaussian with a feature that is not finite gets extents of 0: the CPU blend multiplies what a pixel does not
-        see by 0, and 0 times NaN would show beside it.
+        extents: changed to 0 for a Gaussian with a feature that is not finite: the CPU blend multiplies what a pixel
+        does not see by 0, and 0 times NaN would show beside it.
         """
-        i = wp.tid()
+        i = first + wp.tid()
         for channel in range(channels):
             if not wp.isfinite(features[i, channel]):
                 extents[i] = vec2(real(0.0), real(0.0))
@@ -70,13 +73,14 @@ def tile_kernels(dtype):
 
     @wp.kernel(module="unique", module_options=options)
     def key_by_depth(
+        first: int,
         depths: wp.array(dtype=real),
         extents: wp.array(dtype=vec2),
         keys: wp.array(dtype=real),
         places: wp.array(dtype=int),
     ):
         """What sorts Gaussians nearest first, culled ones last, and their indices."""
-        i = wp.tid()
+        i = first + wp.tid()
         key = depths[i]
         if not (extents[i][0] > real(0.0)):
             key = real(wp.inf)
@@ -85,6 +89,7 @@ def tile_kernels(dtype):
 
     @wp.kernel(module="unique", module_options=options)
     def count_tiles(
+        first: int,
         order: wp.array(dtype=wp.int32),
         shapes: wp.array(dtype=vec4),
         ellipses: wp.array(dtype=vec4),
@@ -93,7 +98,7 @@ def tile_kernels(dtype):
         rows: int,
         counts: wp.array(dtype=wp.int32),
     ):
-        place = wp.tid()
+        place = first + wp.tid()
         i = order[place]
         extent = extents[i]
         touched = int(0)
@@ -110,6 +115,7 @@ def tile_kernels(dtype):
 
     @wp.kernel(module="unique", module_options=options)
     def emit_entries(
+        first: int,
         order: wp.array(dtype=wp.int32),
         shapes: wp.array(dtype=vec4),
         ellipses: wp.array(dtype=vec4),
@@ -126,7 +132,7 @@ def tile_kernels(dtype):
         Entries from `capacity` on are left out. Whatever the counts say, every entry below both is filled, by its own
         Gaussian: with columns * rows, no tile at all, where there are fewer tiles than were counted.
         """
-        place = wp.tid()
+        place = first + wp.tid()
         i = order[place]
         extent = extents[i]
         entry = int(0)
@@ -149,7 +155,35 @@ def tile_kernels(dtype):
             gaussians[entry] = i
             entry += 1
 
-    return pack_records, count_tiles, emit_entries, key_by_depth
+    @wp.kernel(module="unique", module_options=options)
+    def gather_entries(
+        first: int,
+        order: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        entry_gradients: wp.array2d(dtype=real),
+        columns: int,
+        rows: wp.array2d(dtype=real),
+    ):
+        """rows[order[place]]: the sum of entry_gradients [M, columns] over the entries of Gaussian `place`, in their
+        order, which end at ends[place]."""
+        place = first + wp.tid()
+        begin = int(0)
+        if place > 0:
+            begin = ends[place - 1]
+        i = order[place]
+        for column in range(columns):
+            total = real(0.0)
+            for entry in range(begin, ends[place]):
+                total += entry_gradients[entry, column]
+            rows[i, column] = total
+
+    return SimpleNamespace(
+        pack_records=pack_records,
+        key_by_depth=key_by_depth,
+        count_tiles=count_tiles,
+        emit_entries=emit_entries,
+        gather_entries=gather_entries,
+    )
 
 
 @wp.kernel(module="unique", module_options={"enable_backward": False})

@@ -4,9 +4,8 @@ import math
 
 import torch
 
-from ..errors import SehdrError
-from ..splatting import nearest_neighbour_distances, rasterize, spherical_harmonics, ssim_map
-from .case import Case, Reading, count, not_finite
+from ..splatting import rasterize, spherical_harmonics, ssim_map
+from .case import Case, count, not_finite
 from .splats import NAMES, Splats
 
 POISON = "poison"
@@ -63,12 +62,12 @@ def _camera(device):
 
 
 def _other_operations(device):
-    """Harmonics, similarity and neighbours: NaN stays with its own row or window, or is refused by name."""
+    """Harmonics and similarity: NaN stays with its own row or window."""
     generator = torch.Generator().manual_seed(0)
     coefficients = torch.randn(8, 16, 3, generator=generator).to(device)
     means = torch.randn(8, 3, generator=generator).to(device)
     position = torch.zeros(3, device=device)
-    rows = pixels = accepted = 0
+    rows = pixels = 0
     for value in VALUES:
         for poisoned in (0, 1):
             given = [coefficients.clone(), means.clone()]
@@ -81,38 +80,14 @@ def _other_operations(device):
         similarity = ssim_map(spoiled, image)
         # The window reaches five pixels.
         pixels += not_finite(similarity[10:], similarity[:, 10:], similarity[..., 1:])
-        if not math.isfinite(value):
-            points = means.clone()
-            points[2, 1] = value
-            try:
-                nearest_neighbour_distances(points)
-                accepted += 1
-            except SehdrError:
-                pass
     return [
         count("other rows of harmonics not finite", rows),
         count("similarity not finite beyond the window", pixels),
-        count("points accepted that are not finite", accepted),
     ]
-
-
-def _neighbours(device):
-    """Distances within and between clusters 1e-30 and 1e30 apart, and of points that coincide."""
-    base = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 0]], dtype=torch.float64)
-    readings = []
-    for scale in (1e-30, 1.0, 1e30):
-        points = (base * scale).to(device, torch.float32)
-        found = nearest_neighbour_distances(points, 3).double().cpu()
-        exact = torch.cdist(points.double().cpu() / scale, points.double().cpu() / scale)
-        exact = (exact + torch.diag(torch.full((4,), math.inf, dtype=torch.float64))).sort(1).values[:, :3] * scale
-        error = float(((found - exact).abs() / exact.clamp_min(1e-300)).max())
-        readings.append(Reading(f"distances at {scale:g}", error, 4 * 2.0**-24))
-    return readings
 
 
 CASES = (
     Case("poison-gaussians", POISON, "NaN, infinite, huge and denormal numbers in Gaussians", _gaussians),
     Case("poison-camera", POISON, "the same in the camera", _camera),
-    Case("poison-others", POISON, "the same in harmonics, similarity and neighbours", _other_operations),
-    Case("neighbours", POISON, "neighbours 1e-30 and 1e30 apart", _neighbours),
+    Case("poison-others", POISON, "the same in harmonics and similarity", _other_operations),
 )

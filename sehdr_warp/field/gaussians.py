@@ -2,10 +2,13 @@
 
 import math
 
+import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from ..splatting.neighbours import nearest_neighbour_distances
+from ..errors import SehdrError
+from ..splatting.threads import thread_count
 
 HARMONIC_0 = 0.28209479177387814
 """The value of the spherical harmonic of degree 0, 1 / (2 sqrt(pi))."""
@@ -50,7 +53,7 @@ class Gaussians(nn.Module):
         count = points.shape[0]
         extent = max(float((points - points.mean(0)).norm(dim=1).max()), 1e-6)
         if count > 3:
-            distance = nearest_neighbour_distances(points, 3).square().mean(1).sqrt()
+            distance = neighbour_distances(points).square().mean(1).sqrt().to(points)
         else:
             distance = points.new_full((count,), 0.1 * extent)
         # Points that coincide, and lone outliers, would start as specks or as clouds over the whole scene.
@@ -147,3 +150,19 @@ def _moments(optimizer, parameter: nn.Parameter) -> dict[str, Tensor]:
     """The optimizer's tensors that have one row a Gaussian: all but Adam's step counter."""
     state = {} if optimizer is None else optimizer.state.get(parameter, {})
     return {key: value for key, value in state.items() if torch.is_tensor(value) and value.shape == parameter.shape}
+
+
+def neighbour_distances(points: Tensor) -> Tensor:
+    """[N, 3] float64 on the CPU: exact distances from each point to its three nearest others; infinite where there are
+    fewer. points: [N, 3]. Raises SehdrError for a point that is not finite."""
+    positions = points.detach().double().cpu().numpy()
+    finite = np.isfinite(positions).all(1)
+    if not finite.all():
+        index = int((~finite).argmax())
+        problem = f"point {index} of {len(points)} is {positions[index].tolist()}"
+        raise SehdrError(f"{problem}: a point cloud needs finite coordinates; remove such points")
+    tree = cKDTree(positions, balanced_tree=False, compact_nodes=False)
+    distances = np.empty((len(positions), 4))
+    # In the tree's own order, in which queries that follow each other read the same nodes.
+    distances[tree.indices], _ = tree.query(positions[tree.indices], k=4, workers=thread_count())
+    return torch.from_numpy(distances[:, 1:])

@@ -1,10 +1,8 @@
 """torch <-> Warp: differentiable splatting and the bridge that makes torch operations of Warp programs."""
 
-from .blend_style import BlendStyle
+from .blending import BlendStyle
 from .bridge import Program, differentiable
-from .exploration import add_exploration_noise
 from .harmonics import spherical_harmonics
-from .neighbours import nearest_neighbour_distances
 from .rasterization import Rendering, rasterize
 from .recorded_rasterizer import RecordedRasterizer
 from .recording import GraphRecorder
@@ -16,9 +14,7 @@ __all__ = [
     "Program",
     "RecordedRasterizer",
     "Rendering",
-    "add_exploration_noise",
     "differentiable",
-    "nearest_neighbour_distances",
     "rasterize",
     "spherical_harmonics",
     "ssim",

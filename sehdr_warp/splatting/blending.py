@@ -1,24 +1,53 @@
 """The last stage of a render: blend the tile lists front to back, any number of channels in one pass."""
 
-import torch
-import warp as wp
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
 
-from .blend_style import DEFAULT_STYLE, BlendStyle
-from .blending_cpu import blend_on_cpu
-from .blending_cuda import blend_on_cuda
-from .bridge import torch_stream
-from .tile_lists import TileLists, pack_records
+import torch
+
+from ..kernels import blend_cpu, blend_cuda, blend_cuda_adjoint
+from ..kernels.constants import EXPONENTIAL_DEGREE, TILE_SIZE, TRANSMITTANCE_MIN
+from ..kernels.tiles import tile_kernels
+from . import threads
+from .launching import launch, warp_scalar
+from .tile_lists import Emission, TileLists, pack_records
+
+
+@dataclass(frozen=True)
+class BlendStyle:
+    """How exactly the blend computes, where exactness can be traded for speed. Another value compiles another kernel.
+
+    transmittance_min: a pixel is finished before its transmittance would fall to this value; 0 never stops.
+    fast_math: CUDA, float32: approximate division and exponential.
+    deterministic: CUDA: gradients are summed in a fixed order, so that the same input gives the same bits; slower, and
+        the gradients of every (Gaussian, tile) pair take memory. The CPU always sums in a fixed order.
+    exponential_degree: CPU, float32: of the polynomial behind the exponential, 3 to 5.
+    """
+
+    transmittance_min: float = TRANSMITTANCE_MIN
+    fast_math: bool = True
+    deterministic: bool = False
+    exponential_degree: int = EXPONENTIAL_DEGREE
+
+
+DEFAULT_STYLE = BlendStyle()
+
+Adjoint = Callable[[tuple[torch.Tensor, torch.Tensor], torch.Tensor, torch.Tensor], torch.Tensor]
+"""The backward pass: from the records made again, and the gradients by image and transmittance, to those by Gaussian,
+[N, C + 6]: features, conic a b c, x, y, opacity."""
 
 
 def blend(
-    means2d,
-    conics,
-    opacities,
-    features,
+    means2d: torch.Tensor,
+    conics: torch.Tensor,
+    opacities: torch.Tensor,
+    features: torch.Tensor,
     *,
     lists: TileLists,
-    records,
-    extents,
+    records: tuple[torch.Tensor, torch.Tensor],
+    extents: torch.Tensor,
     width: int,
     height: int,
     alpha_threshold: float,
@@ -33,24 +62,20 @@ def blend(
     as what they are made of, so the backward pass makes them again instead of keeping them.
     style: what trades accuracy for speed beside the threshold.
     """
-    backend = blend_on_cuda if features.device.type == "cuda" else blend_on_cpu
     options = lists, records, width, height, alpha_threshold, style
-    return _Blend.apply(means2d, conics, opacities, features, extents, backend, *options)
+    return _Blend.apply(means2d, conics, opacities, features, extents, *options)
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx, means2d, conics, opacities, features, extents, backend, lists, records, width, height, threshold, style
-    ):
+    def forward(ctx, means2d, conics, opacities, features, extents, lists, records, width, height, threshold, style):
         features = features.detach()
         image = features.new_empty(height, width, features.shape[1])
         transmittance = features.new_empty(height, width)
-        device = wp.device_from_torch(features.device)
-        with torch_stream(features.device):
-            # Not the tensors that torch makes results of: the adjoint keeps one, and with it would keep itself.
-            results = image.detach(), transmittance.detach()
-            ctx.adjoint = backend(device, features, lists, records, *results, threshold, style)
+        backend = blend_on_cuda if features.device.type == "cuda" else blend_on_cpu
+        # Not the tensors that torch makes results of: the adjoint keeps one, and with it would keep itself.
+        results = image.detach(), transmittance.detach()
+        ctx.adjoint = backend(features, lists, records, *results, threshold, style)
         ctx.save_for_backward(means2d, conics, opacities, extents)
         ctx.sizes, ctx.threshold = (height, width, features.shape[1]), threshold
         ctx.set_materialize_grads(False)
@@ -69,14 +94,123 @@ class _Blend(torch.autograd.Function):
         by_image = by_image.as_strided(ctx.sizes, (width * channels, channels, 1))
         if by_transmittance is None:
             by_transmittance = means2d.new_zeros(height, width)
-        with torch_stream(means2d.device):
-            # [N, C + 6]: by feature, conic a b c, x, y, opacity.
-            gathered = adjoint(
-                pack_records(means2d, conics, opacities, extents, ctx.threshold),
-                by_image,
-                by_transmittance.contiguous(),
-            )
+        records = pack_records(means2d, conics, opacities, extents, ctx.threshold)
+        gathered = adjoint(records, by_image, by_transmittance.contiguous())
         by_features, by_conics, by_means2d, by_opacities = gathered.split((channels, 3, 2, 1), dim=1)
         gradients = by_means2d, by_conics, by_opacities[:, 0], by_features
         wanted = (part if needed else None for part, needed in zip(gradients, ctx.needs_input_grad, strict=False))
-        return *wanted, *(None,) * 8
+        return *wanted, *(None,) * 7
+
+
+def blend_on_cpu(
+    features, lists: TileLists, records, image, left_over, alpha_threshold: float, style: BlendStyle
+) -> Adjoint:
+    """Fill image [H, W, C] and left_over [H, W], the transmittance, tile by tile: balanced pieces, one piece to a
+    thread at a time."""
+    scalar = warp_scalar(features.dtype)
+    height, width, channels = image.shape
+    halvings, degree = exponent_halvings(alpha_threshold), style.exponential_degree
+    tile_count, pieces = lists.columns * lists.rows, balanced_pieces(lists)
+
+    def rows(*shape):
+        return features.new_empty(tile_count, *shape, TILE_SIZE)
+
+    iota = torch.arange(TILE_SIZE, dtype=features.dtype)
+    frame = features, lists.columns, width, height, alpha_threshold, iota
+    transmittance, last = rows(TILE_SIZE), rows(TILE_SIZE)
+    launch(
+        blend_cpu.forward_kernel(scalar, channels, halvings, style.transmittance_min, degree),
+        tile_count,
+        *(lists.ranges, lists.gaussians, *records, *frame),
+        *(transmittance, rows(channels, TILE_SIZE), last, image.view(-1, channels), left_over),
+        ranges=pieces,
+    )
+
+    def backward(records, image_gradient: torch.Tensor, left_over_gradient: torch.Tensor) -> torch.Tensor:
+        scratch = rows(TILE_SIZE), rows(channels, TILE_SIZE), rows(TILE_SIZE), rows(TILE_SIZE)
+        entry_gradients = features.new_empty(lists.entry_count, channels + 6)
+        launch(
+            blend_cpu.backward_kernel(scalar, channels, halvings, degree),
+            tile_count,
+            *(lists.ranges, lists.gaussians, lists.emission.places, *records, *frame, last),
+            *(image_gradient.view(-1, channels), left_over_gradient, transmittance, *scratch, entry_gradients),
+            ranges=pieces,
+        )
+        return gather_by_gaussian(lists.emission, entry_gradients)
+
+    return backward
+
+
+def exponent_halvings(alpha_threshold: float) -> int:
+    """How often the polynomial exponential halves its argument to reach down to log(alpha_threshold)."""
+    return max(1, math.ceil(math.log2(-math.log(alpha_threshold) / 0.7)))
+
+
+def balanced_pieces(lists: TileLists) -> list[tuple[int, int]]:
+    """Ranges of tiles that hold about the same number of entries each, a few for every thread."""
+    tile_count = lists.ranges.shape[0]
+    work = (lists.ranges[:, 1] - lists.ranges[:, 0]).add(16).cumsum(0).double()  # 16: a tile costs something in itself
+    pieces = min(threads.thread_count() * 8, tile_count)
+    goals = torch.arange(1, pieces, dtype=torch.float64) * (float(work[-1]) / pieces)
+    bounds = sorted({0, *torch.searchsorted(work, goals).tolist(), tile_count})
+    return list(pairwise(bounds))
+
+
+def blend_on_cuda(
+    features, lists: TileLists, records, image, transmittance, alpha_threshold: float, style: BlendStyle
+) -> Adjoint:
+    """Fill image [H, W, C] and transmittance [H, W] by block kernels (also on CPU fibers, where tests ask for them)."""
+    scalar = warp_scalar(features.dtype)
+    height, width, channels = image.shape
+    padding = blend_cuda.padded_channels(channels) - channels
+    last = torch.empty(height * width, dtype=torch.int32, device=features.device)
+    tile_count = lists.columns * lists.rows
+    frame = lists.columns, width, height, alpha_threshold
+
+    # The backward pass takes the features from here and lets them go once they are padded: again, since what is padded
+    # is larger.
+    count, kept = len(features), [features]
+
+    def by_gaussian(features, records):
+        padded = torch.nn.functional.pad(features, (0, padding)) if padding else features
+        return lists.ranges, lists.gaussians, *records, padded.reshape(-1, 4), *frame
+
+    def launch_blocks(kernel, blocks_per_tile, *arguments):
+        block = blend_cuda.BLOCK_DIM
+        launch(kernel, tile_count * blocks_per_tile * block, *arguments, block_dim=block)
+
+    launch_blocks(
+        blend_cuda.forward_kernel(scalar, channels, style.transmittance_min, style.fast_math),
+        blend_cuda.BLOCKS_PER_TILE,
+        *(*by_gaussian(features, records), image, transmittance, last),
+    )
+
+    def backward(records, image_gradient: torch.Tensor, transmittance_gradient: torch.Tensor) -> torch.Tensor:
+        kernel = blend_cuda_adjoint.backward_kernel(scalar, channels, style.fast_math, style.deterministic)
+        corners, sizes = blend_cuda_adjoint.BLOCKS_PER_TILE, (blend_cuda_adjoint.ROWS, channels + 6)
+        given = *by_gaussian(kept.pop(), records), transmittance, last, image_gradient, transmittance_gradient, *sizes
+        if not style.deterministic:
+            gathered = transmittance.new_zeros(count, channels + 6)
+            launch_blocks(kernel, corners, *given, 0, lists.gaussians, gathered)
+            return gathered
+        by_entry = transmittance.new_zeros(lists.entry_count, channels + 6)
+        for corner in range(corners):
+            launch_blocks(kernel, 1, *given, corner, lists.emission.places, by_entry)
+        return gather_by_gaussian(lists.emission, by_entry)
+
+    return backward
+
+
+def gather_by_gaussian(emission: Emission, by_entry: torch.Tensor) -> torch.Tensor:
+    """[N, columns]: for each Gaussian the sum of its rows of by_entry [M, columns], front tile to last.
+
+    by_entry: rows in the order in which entries were before the sort by tile.
+    """
+    entry_count, columns = by_entry.shape
+    count = emission.order.shape[0]
+    gathered = by_entry.new_zeros(count, columns)
+    if entry_count:
+        ends = emission.ends.clamp(0, entry_count)  # beyond a capacity there are no rows
+        kernel = tile_kernels(warp_scalar(by_entry.dtype)).gather_entries
+        launch(kernel, count, emission.order, ends, by_entry, columns, gathered)
+    return gathered

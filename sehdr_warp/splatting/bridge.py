@@ -21,19 +21,18 @@ current stream; the tape is replayed when torch asks for gradients, and not reco
 Positional arguments are tensors and take part in autograd; keyword arguments are passed on as they are.
 """
 
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import wraps
+from typing import Any, Concatenate, ParamSpec, overload
 
 import torch
 import warp as wp
 
-from ..quiet import silent_stderr
 from . import threads
+from .launching import launch_ranges, parameters, torch_stream
 
-# The start-up banner, and the warning where there is no GPU, are not for a library to print.
-wp.config.log_level = wp.LOG_WARNING
-with silent_stderr():
-    wp.init()
+P = ParamSpec("P")
 
 
 class Program:
@@ -46,68 +45,65 @@ class Program:
         self.inputs: list[tuple[torch.Tensor, wp.array]] = []
         self.outputs: dict[int, tuple[torch.Tensor, wp.array, bool]] = {}
 
-    @property
-    def is_cpu(self) -> bool:
-        return self.device.is_cpu
-
-    def read(self, tensor: torch.Tensor, dtype=None) -> wp.array:
+    def read(self, tensor: torch.Tensor, dtype: Any = None) -> wp.array:
         """The tensor's memory as a Warp array; a vector or matrix dtype takes up the last one or two dimensions."""
         array = _array(tensor, dtype)
         self.inputs.append((tensor, array))
         return array
 
-    def write(self, shape, dtype, *, differentiable: bool = True) -> wp.array:
+    def write(self, shape: Sequence[int], dtype: Any, *, differentiable: bool = True) -> wp.array:
         """A new array over torch memory. `shape` is the tensor's, with the components of a vector dtype last."""
         tensor = torch.empty(tuple(shape), dtype=_scalar(dtype), device=self.torch_device)
         array = _array(tensor, dtype)
         self.outputs[id(array)] = (tensor, array, differentiable)
         return array
 
-    def launch(self, kernel, dim, inputs, outputs=(), *, block_dim: int = 256) -> None:
-        """Launch a kernel; its generated adjoint runs in the backward pass."""
-        with nullcontext() if self.tape is None else self.tape:
-            wp.launch(kernel, dim, list(inputs), list(outputs), device=self.device, block_dim=block_dim)
+    def launch(
+        self,
+        kernel: wp.Kernel,
+        dim: int | Sequence[int],
+        inputs: Sequence[Any],
+        outputs: Sequence[Any] = (),
+        *,
+        block_dim: int | None = None,
+    ) -> None:
+        """Launch a kernel; its generated adjoint runs in the backward pass.
 
-    def launch_ranges(self, kernel, count: int, inputs, outputs) -> None:
-        """Launch `kernel(first, *inputs, *outputs)` for `count` items; on the CPU spread over threads, adjoint too.
-
-        The kernel adds the argument `first` to its thread index and writes only what belongs to that item; an input
-        that several items share must not ask for a gradient here when threads run side by side, so the adjoint of
-        such a launch is left to one thread.
+        A kernel whose first parameter is an integer `first` adds it to its thread's index and writes only what belongs
+        to that item: it is given the start of a range, and on the CPU ranges run side by side, adjoint too, but for an
+        adjoint that adds to an input which items share.
         """
-        if not self.is_cpu:
-            self.launch(kernel, count, [0, *inputs], outputs)
+        ranged, _ = parameters(kernel)
+        if ranged and self.device.is_cpu:
+            self._launch_ranges(kernel, dim, [*inputs], [*outputs])
             return
+        inputs = [0, *inputs] if ranged else [*inputs]
+        with nullcontext() if self.tape is None else self.tape:
+            wp.launch(kernel, dim, inputs, [*outputs], device=self.device, block_dim=block_dim)
+
+    def _launch_ranges(self, kernel, count: int, inputs: list, outputs: list) -> None:
         arguments = [*inputs, *outputs]
-        threads.launch_ranges(kernel, threads.even_ranges(count), arguments, self.device)
+        launch_ranges(kernel, threads.even_ranges(count), arguments)
         if self.tape is None:
             return
-        # The tape holds the adjoint. If that held the program or the tape, memory would wait for the garbage collector.
-        device = self.device
 
-        def adjoint():
+        # The tape holds the adjoint. If that held the program or the tape, memory would wait for the garbage collector.
+        def adjoint() -> None:
             tape = wp.Tape()
             gradients = [tape.get_adjoint(argument) for argument in arguments]
             shared = any(
                 isinstance(argument, wp.array) and argument.grad is not None and argument.shape[0] != count
                 for argument in inputs
             )
-            ranges = [(0, count)] if shared or count == 0 else threads.even_ranges(count)
-
-            def launch(bounds):
-                wp.launch(
-                    kernel,
-                    dim=bounds[1] - bounds[0],
-                    inputs=[bounds[0], *inputs],
-                    outputs=list(outputs),
-                    adj_inputs=[None, *gradients[: len(inputs)]],
-                    adj_outputs=gradients[len(inputs) :],
-                    adjoint=True,
-                    device=device,
-                    record_tape=False,
-                )
-
-            threads.run_parallel(launch, ranges)
+            launch_ranges(
+                kernel,
+                [(0, count)] if shared or count == 0 else threads.even_ranges(count),
+                inputs,
+                outputs=outputs,
+                adj_inputs=[None, *gradients[: len(inputs)]],
+                adj_outputs=gradients[len(inputs) :],
+                adjoint=True,
+            )
 
         self.tape.record_func(adjoint, arrays=[])
 
@@ -198,22 +194,17 @@ class _ProgramFunction(torch.autograd.Function):
         return (None, None, *results)
 
 
-_streams: dict[tuple[int, int], wp.Stream] = {}
+@overload
+def differentiable(
+    body: Callable[Concatenate[Program, P], tuple[wp.array, ...]],
+) -> Callable[P, tuple[torch.Tensor, ...]]: ...
 
 
-def torch_stream(device: torch.device):
-    """Warp launches on torch's current stream for as long as this context lasts."""
-    if device.type == "cpu":
-        return nullcontext()
-    current = torch.cuda.current_stream(device)
-    # One Warp object a stream, for good: when a second one dies, Warp forgets the stream, in mid-capture too.
-    key = current.device_index, current.cuda_stream
-    if key not in _streams:
-        _streams[key] = wp.Stream(wp.device_from_torch(device), cuda_stream=current.cuda_stream)
-    return wp.ScopedStream(_streams[key], sync_enter=False, sync_exit=False)
+@overload
+def differentiable(body: Callable[Concatenate[Program, P], wp.array]) -> Callable[P, torch.Tensor]: ...
 
 
-def differentiable(body):
+def differentiable(body: Callable[..., Any]) -> Callable[..., Any]:
     """Make a torch operation of a program: body(program, *tensors, **options) -> Warp arrays made by program.write().
 
     The operation takes the tensors positionally (on one device) and the options by keyword, returns the tensors
@@ -221,7 +212,7 @@ def differentiable(body):
     """
 
     @wraps(body)
-    def operation(*tensors, **options):
+    def operation(*tensors: torch.Tensor, **options: Any) -> Any:
         return _ProgramFunction.apply(body, options, *tensors)
 
     return operation

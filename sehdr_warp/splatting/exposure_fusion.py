@@ -1,11 +1,9 @@
 """Neural exposure fusion of given brackets as a torch operation (kernels/exposure_fusion.py)."""
 
 import torch
-import warp as wp
 
 from ..kernels.exposure_fusion import POINTS_PER_THREAD, fusion_kernels
-from .arrays import view, warp_scalar
-from .bridge import torch_stream
+from .launching import launch, warp_scalar
 
 
 def fuse_exposures(
@@ -57,9 +55,10 @@ class _Fusion(torch.autograd.Function):
         log_sigma = log_sigma.detach().contiguous()
         exposedness, outputs = torch.empty_like(by_channel), torch.empty_like(by_channel)
         results = encoded.new_empty(count, 3)
-        run = _Launches(encoded)
-        run("perceptrons", by_channel.shape, by_channel, log_sigma, *limits, *_flat(weights), exposedness, outputs)
-        run("mix", results.shape, by_channel, exposedness, outputs, brackets, scale, results)
+        kernels = fusion_kernels(warp_scalar(encoded.dtype))
+        given = by_channel, log_sigma, *limits, *_flat(weights)
+        launch(kernels.perceptrons, by_channel.shape, *given, exposedness, outputs)
+        launch(kernels.mix, results.shape, by_channel, exposedness, outputs, brackets, scale, results)
         ctx.save_for_backward(by_channel, log_sigma, *weights, exposedness, outputs, results)
         ctx.numbers = brackets, scale, limits
         return results
@@ -74,18 +73,15 @@ class _Fusion(torch.autograd.Function):
         zeros = encoded.new_zeros(sum(sizes)).split(sizes)
         by_weights = [part.view(weight.shape) for part, weight in zip(zeros, weights, strict=True)]
         inner, inner_bias, outer, _ = _flat(weights)
-        run = _Launches(encoded)
-        mixed = encoded, exposedness, outputs, brackets, scale, results, gradients.contiguous()
-        run("mix_adjoint", results.shape, *mixed, by_exposedness, by_output)
-        chunks = -(-encoded.shape[1] // POINTS_PER_THREAD)
         learned = inner, inner_bias, outer
-        run(
-            "unit_adjoint",
-            (3, chunks, outer.shape[1]),
-            *(encoded, exposedness, by_output, *learned, POINTS_PER_THREAD, *_flat(by_weights)),
-        )
+        kernels = fusion_kernels(warp_scalar(encoded.dtype))
+        mixed = encoded, exposedness, outputs, brackets, scale, results, gradients.contiguous()
+        launch(kernels.mix_adjoint, results.shape, *mixed, by_exposedness, by_output)
+        units = 3, -(-encoded.shape[1] // POINTS_PER_THREAD), outer.shape[1]
+        given = encoded, exposedness, by_output, *learned, POINTS_PER_THREAD
+        launch(kernels.unit_adjoint, units, *given, *_flat(by_weights))
         points = encoded, exposedness, by_exposedness, by_output, log_sigma, *limits
-        run("point_adjoint", encoded.shape, *points, *learned, by_log_sigma)
+        launch(kernels.point_adjoint, encoded.shape, *points, *learned, by_log_sigma)
         return None, by_log_sigma.sum(1), *by_weights, None, None, None
 
 
@@ -93,18 +89,3 @@ def _flat(weights):
     """inner [3, 2, H], inner_bias [3, H], outer [3, H] and outer_bias [3]: without the axes of length 1."""
     inner, inner_bias, outer, outer_bias = weights
     return inner, inner_bias.view(3, -1), outer.view(3, -1), outer_bias.view(3)
-
-
-class _Launches:
-    """Launches of fusion_kernels where a tensor is, on torch's stream."""
-
-    def __init__(self, like: torch.Tensor):
-        self.device = like.device
-        self.kernels = fusion_kernels(warp_scalar(like.dtype))
-
-    def __call__(self, name: str, shape, *arguments) -> None:
-        inputs = [view(value) if isinstance(value, torch.Tensor) else value for value in arguments]
-        with torch_stream(self.device):
-            kernel = getattr(self.kernels, name)
-            device = wp.device_from_torch(self.device)
-            wp.launch(kernel, dim=tuple(shape), inputs=inputs, device=device, record_tape=False)

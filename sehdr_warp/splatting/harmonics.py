@@ -1,13 +1,9 @@
 """View-dependent values from spherical harmonics."""
 
 import torch
-import warp as wp
 
-from ..kernels.geometry import vector
 from ..kernels.harmonics import harmonics_adjoint_kernel, harmonics_kernel
-from . import threads
-from .arrays import view, warp_scalar
-from .bridge import torch_stream
+from .launching import launch, warp_scalar
 
 MAX_DEGREE = 3
 
@@ -57,7 +53,8 @@ class _Evaluation(torch.autograd.Function):
     def forward(ctx, degree, constant, rest, means, camera_position):
         ctx.degree = degree
         values = torch.empty_like(means)
-        _launch(harmonics_kernel, degree, means, [constant, rest, means, camera_position, values])
+        kernel = harmonics_kernel(warp_scalar(means.dtype), degree)
+        launch(kernel, len(means), constant, rest, means, camera_position, values)
         ctx.save_for_backward(constant, rest, means, camera_position)
         return values
 
@@ -66,18 +63,8 @@ class _Evaluation(torch.autograd.Function):
     def backward(ctx, gradient):
         constant, *read = ctx.saved_tensors
         made = [torch.empty_like(tensor) for tensor in (constant, *read[:2])]
-        _launch(harmonics_adjoint_kernel, ctx.degree, read[1], [*read, gradient.contiguous(), *made])
+        kernel = harmonics_adjoint_kernel(warp_scalar(gradient.dtype), ctx.degree)
+        launch(kernel, len(gradient), *read, gradient.contiguous(), *made)
         by_camera = -made[2].sum(0) if ctx.needs_input_grad[4] else None
         wanted = (part if needed else None for part, needed in zip(made, ctx.needs_input_grad[1:], strict=False))
         return None, *wanted, by_camera
-
-
-def _launch(kernel, degree: int, means, tensors) -> None:
-    """Launch for each Gaussian a kernel of tensors of three-vectors."""
-    if not len(means):
-        return  # of no elements torch calls any strides contiguous, and a view of three-vectors does not
-    scalar = warp_scalar(means.dtype)
-    views = [view(tensor.detach(), vector(3, scalar)) for tensor in tensors]
-    ranges = threads.even_ranges(len(means)) if means.device.type == "cpu" else [(0, len(means))]
-    with torch_stream(means.device):
-        threads.launch_ranges(kernel(scalar, degree), ranges, views, wp.device_from_torch(means.device))

@@ -1,11 +1,9 @@
 """Interpolation in a table of functions as a torch operation (kernels/interpolation.py)."""
 
 import torch
-import warp as wp
 
 from ..kernels import interpolation
-from .arrays import view
-from .bridge import torch_stream
+from .launching import launch
 
 
 def interpolate(table: torch.Tensor, low: float, step: float, positions: torch.Tensor) -> torch.Tensor:
@@ -31,7 +29,7 @@ class _Interpolation(torch.autograd.Function):
     def forward(ctx, table, low, step, positions):
         table, positions = table.detach().contiguous(), positions.detach().contiguous()
         values = torch.empty_like(positions)
-        _launch(interpolation.interpolate, table, low, step, positions, [values])
+        launch(interpolation.interpolate, positions.shape, table, low, 1.0 / step, positions, values)
         ctx.save_for_backward(table, positions)
         ctx.low, ctx.step = low, step
         return values
@@ -42,18 +40,6 @@ class _Interpolation(torch.autograd.Function):
         table, positions = ctx.saved_tensors
         copies = 1 if table.device.type == "cpu" else interpolation.COPIES
         by_position, by_node = torch.empty_like(positions), table.new_zeros(copies, *table.shape)
-        results = [gradients.contiguous(), by_position, by_node]
-        _launch(interpolation.interpolate_adjoint, table, ctx.low, ctx.step, positions, results)
+        given = table, ctx.low, 1.0 / ctx.step, positions, gradients.contiguous()
+        launch(interpolation.interpolate_adjoint, positions.shape, *given, by_position, by_node)
         return by_node.sum(0), None, None, by_position
-
-
-def _launch(kernel, table, low, step, positions, results) -> None:
-    if positions.numel():
-        with torch_stream(table.device):
-            wp.launch(
-                kernel,
-                dim=tuple(positions.shape),
-                inputs=[view(table), low, 1.0 / step, view(positions), *map(view, results)],
-                device=wp.device_from_torch(table.device),
-                record_tape=False,
-            )

@@ -2,8 +2,8 @@
 
 from ..kernels.geometry import matrix, vector
 from ..kernels.project import projection_kernel
-from .arrays import warp_scalar
 from .bridge import differentiable
+from .launching import warp_scalar
 
 
 @differentiable
@@ -40,7 +40,7 @@ def project(
     depths = program.write((count,), scalar)
     opacities2d = program.write((count,), scalar)
     extents = program.write((count, 2), vec2, differentiable=False)
-    program.launch_ranges(
+    program.launch(
         projection_kernel(scalar, antialiased),
         count,
         [

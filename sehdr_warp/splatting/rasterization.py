@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import torch
 
 from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR
-from .blend_style import DEFAULT_STYLE, BlendStyle
-from .blending import blend
+from .blending import DEFAULT_STYLE, BlendStyle, blend
 from .memory import tells_sizes
 from .projection import project
 from .tile_lists import LARGEST_CAPACITY, build_tile_lists, pack_records

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 import torch
 import warp as wp
 
-from .bridge import torch_stream
+from .launching import torch_stream
 
 IDLE_BYTES = 1 << 30
 """If more of torch's memory than this lies idle, it is given back before a recording is made: a recording has memory of

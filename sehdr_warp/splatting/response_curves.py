@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 import torch
-import warp as wp
 
 from ..kernels.geometry import vector
 from ..kernels.response_curves import FILMIC, KNEE, NO_TONE, REINHARD, encode_kernel
-from .arrays import view, warp_scalar
-from .bridge import torch_stream
+from .launching import launch, warp_scalar
 
 TONES = {"none": NO_TONE, "reinhard": REINHARD, "filmic": FILMIC, "knee": KNEE}
 
@@ -34,21 +32,7 @@ def encode_with_slope(
     values, slopes = torch.empty_like(exposure), torch.empty_like(exposure)
     scalar = warp_scalar(exposure.dtype)
     numbers = (*curve.tone_numbers, *[0.0] * (5 - len(curve.tone_numbers)))
-    if exposure.numel():
-        with torch_stream(exposure.device):
-            wp.launch(
-                encode_kernel(scalar, TONES[curve.tone]),
-                dim=exposure.numel(),
-                inputs=[
-                    view(exposure.view(-1)),
-                    vector(4, scalar)(*curve.power_law),
-                    vector(5, scalar)(*numbers),
-                    curve.clip,
-                    extension_slope,
-                    view(values.view(-1)),
-                    view(slopes.view(-1)),
-                ],
-                device=wp.device_from_torch(exposure.device),
-                record_tape=False,
-            )
+    kernel = encode_kernel(scalar, TONES[curve.tone])
+    constants = vector(4, scalar)(*curve.power_law), vector(5, scalar)(*numbers), curve.clip, extension_slope
+    launch(kernel, exposure.numel(), exposure, *constants, values, slopes)
     return values, slopes

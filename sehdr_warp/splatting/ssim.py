@@ -3,12 +3,9 @@
 from functools import cache
 
 import torch
-import warp as wp
 
 from ..kernels.ssim import RADIUS, ssim_kernels, window
-from . import threads
-from .arrays import view
-from .bridge import torch_stream
+from .launching import launch, warp_scalar
 
 # Numbers that one step of the CPU kernels takes: one AVX-512 register of float32.
 CPU_LANES = 16
@@ -108,10 +105,10 @@ def _compare(
     derivatives = a.new_empty(3, runs.rows, runs.length)
     buffer = runs.padded(4)
     moments = runs.view(buffer)
-    with torch_stream(a.device):
-        runs.launch("blur_columns", [runs.view(a), runs.view(b)], [moments])
-        compared = [runs.view(a), runs.view(b), *runs.weights_of_both, runs.view(similarity), runs.view(derivatives)]
-        runs.launch("compare", [moments], compared)
+    images = runs.view(a), runs.view(b)
+    runs.launch(runs.kernels.blur_columns, images, [moments], borders=True)
+    compared = *images, *runs.weights_of_both, runs.view(similarity), runs.view(derivatives)
+    runs.launch(runs.kernels.compare, [moments], compared)
     return similarity, derivatives
 
 
@@ -127,31 +124,23 @@ def _gradient(
     result = torch.empty_like(a)
     buffer = runs.padded(3)
     blurred = runs.view(buffer)
-    scale = scale.reshape(1)
-    with torch_stream(a.device):
-        runs.launch("blur_derivatives", [runs.view(derivatives)], [blurred])
-        runs.launch(
-            "gradient", [blurred, runs.view(a), runs.view(b)], [view(scale), *runs.weights_of_both, runs.view(result)]
-        )
+    runs.launch(runs.kernels.blur_derivatives, [runs.view(derivatives)], [blurred], borders=True)
+    scaled = scale, *runs.weights_of_both, runs.view(result)
+    runs.launch(runs.kernels.gradient, [blurred, runs.view(a), runs.view(b)], scaled)
     return result
 
 
 class _Runs:
-    """One image size's launches: rows of W C numbers, taken `lanes` at a time.
-
-    Kernels get bare descriptors of torch's memory, which cost the host a tenth of a wp.array; the tensors behind them
-    must live until the launches are made.
-    """
+    """One image size's launches: rows of W C numbers, taken `lanes` at a time."""
 
     def __init__(self, image: torch.Tensor, weights: tuple[float, float] | None = None):
         self.rows, width, self.channels = image.shape
         self.length = width * self.channels
         self.like = image
         self.lanes = CPU_LANES if image.device.type == "cpu" and self.length >= CPU_LANES else 1
-        self.kernels = ssim_kernels(wp.dtype_from_torch(image.dtype), self.lanes, weights is not None)
+        self.kernels = ssim_kernels(warp_scalar(image.dtype), self.lanes, weights is not None)
         self.weights_of_both = weights or (0.0, 0.0)
-        self.weights = view(_weights(image.dtype, image.device))
-        self.device = wp.device_from_torch(image.device)
+        self.weights = _weights(image.dtype, image.device)
 
     def padded(self, count: int) -> torch.Tensor:
         """[count, rows, ...] uninitialised rows with the zeros that the horizontal blur finds beyond the border; with
@@ -163,26 +152,20 @@ class _Runs:
             buffer[..., -margin:] = 0
         return buffer
 
-    def view(self, tensor: torch.Tensor):
+    def view(self, tensor: torch.Tensor) -> torch.Tensor:
         """A contiguous image [H, W, C] or stack of rows [..., H, n] as overlapping runs."""
         rows = tensor.shape[:1] if tensor.shape == self.like.shape else tensor.shape[:-1]
         length = tensor.numel() // rows.numel()
         strides = (length,) if len(rows) == 1 else (rows[1] * length, length)
-        runs = tensor.as_strided((*rows, length - self.lanes + 1, self.lanes), (*strides, 1, 1))
-        return view(runs, self.kernels.run)
+        return tensor.as_strided((*rows, length - self.lanes + 1, self.lanes), (*strides, 1, 1))
 
-    def launch(self, name: str, inputs, results) -> None:
-        """Launch a kernel over the whole image."""
-        arguments = [*inputs, self.weights, self.length, self.channels, *results]
-        kernel = getattr(self.kernels, name)
+    def launch(self, kernel, inputs, results, *, borders: bool = False) -> None:
+        """Launch a kernel over the whole image. borders: with one lane it also writes the zeros beyond the image."""
         blocks = -(-self.length // self.lanes)
-        if self.lanes == 1 and name.startswith("blur"):
+        if self.lanes == 1 and borders:
             blocks += 2 * RADIUS * self.channels
-        count = self.rows * blocks
-        if self.device.is_cpu:
-            threads.launch_ranges(kernel, threads.even_ranges(count, STEPS_PER_THREAD), arguments, self.device)
-        else:
-            wp.launch(kernel, dim=count, inputs=[0, *arguments], device=self.device)
+        arguments = *inputs, self.weights, self.length, self.channels, *results
+        launch(kernel, self.rows * blocks, *arguments, smallest=STEPS_PER_THREAD)
 
 
 @cache

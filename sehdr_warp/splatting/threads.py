@@ -1,16 +1,15 @@
 """Warp's CPU launches spread over threads.
 
 Warp runs a CPU kernel as one serial loop and releases the interpreter's lock while it does, so independent ranges of
-one launch run side by side from a thread pool. Every kernel that is launched this way takes the first index of its
-range as its first argument and writes nothing that another index writes, so results do not depend on the number of
-threads.
+one launch run side by side from a thread pool (launching.py). No range writes what another writes, so results do not
+depend on the number of threads.
 """
 
 import os
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
-
-import warp as wp
+from typing import Any
 
 _pool: ThreadPoolExecutor | None = None
 _pool_size = 0
@@ -24,7 +23,7 @@ def thread_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
-def run_parallel(task, items) -> None:
+def run_parallel(task: Callable[[Any], object], items: Iterable[Any]) -> None:
     """Call task(item) for every item, on this thread and the pool's, and return when all are done.
 
     An exception ends its thread's share; those at work finish the rest, then one of the exceptions is raised here. A
@@ -63,16 +62,3 @@ def even_ranges(count: int, smallest: int = 1024) -> list[tuple[int, int]]:
     pieces = max(1, min(thread_count() * 4, count // smallest))
     bounds = [count * k // pieces for k in range(pieces + 1)]
     return [(a, b) for a, b in pairwise(bounds) if b > a]
-
-
-def launch_ranges(kernel, ranges, arguments, device) -> None:
-    """Launch `kernel(first, *arguments)` over each [first, last) range, side by side on the CPU."""
-    if not ranges:
-        return
-    if len(ranges) > 1:
-        wp.load_module(kernel.module, device=device)  # compiling is not safe from two threads at once
-
-    def launch(bounds):
-        wp.launch(kernel, dim=bounds[1] - bounds[0], inputs=[bounds[0], *arguments], device=device, record_tape=False)
-
-    run_parallel(launch, ranges)

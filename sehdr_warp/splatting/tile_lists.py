@@ -8,10 +8,8 @@ import warp as wp
 
 from ..errors import SehdrError
 from ..kernels.constants import TILE_SIZE
-from ..kernels.geometry import vector
 from ..kernels.tiles import mark_ranges, tile_kernels
-from .arrays import view, warp_scalar
-from .bridge import torch_stream
+from .launching import launch, torch_stream, warp_scalar
 
 LARGEST_CAPACITY = 2**31 - 1
 """Entries are counted in int32."""
@@ -101,26 +99,10 @@ def pack_records(means2d, conics, opacities, extents, alpha_threshold: float, fe
     features: [N, C]; a Gaussian with one that is not finite is culled: its extents are set to 0. Packed again from the
     same extents, with or without the features, the records are the same bits.
     """
-    scalar = warp_scalar(means2d.dtype)
-    vec2, vec3, vec4 = (vector(n, scalar) for n in (2, 3, 4))
-    count = means2d.shape[0]
-    shapes, ellipses = means2d.new_empty(count, 4), means2d.new_empty(count, 4)
-    _launch(
-        tile_kernels(scalar)[0],
-        count,
-        [
-            view(means2d, vec2),
-            view(conics, vec3),
-            view(opacities),
-            view(extents, vec2),
-            view(means2d if features is None else features),
-            0 if features is None else features.shape[1],
-            alpha_threshold,
-            view(shapes, vec4),
-            view(ellipses, vec4),
-        ],
-        means2d.device,
-    )
+    shapes, ellipses = means2d.new_empty(len(means2d), 4), means2d.new_empty(len(means2d), 4)
+    given = (means2d, 0) if features is None else (features, features.shape[1])
+    kernel = tile_kernels(warp_scalar(means2d.dtype)).pack_records
+    launch(kernel, len(means2d), means2d, conics, opacities, *given, alpha_threshold, extents, shapes, ellipses)
     return shapes, ellipses
 
 
@@ -130,9 +112,7 @@ def depth_order(depths, extents):
     # The sort needs room for twice as many; what is returned does not hold on to it.
     keys = depths.new_empty(2 * count)
     places = torch.empty(2 * count, dtype=torch.int32, device=depths.device)
-    scalar = warp_scalar(depths.dtype)
-    arguments = [view(depths), view(extents, vector(2, scalar)), view(keys), view(places)]
-    _launch(tile_kernels(scalar)[3], count, arguments, depths.device)
+    launch(tile_kernels(warp_scalar(depths.dtype)).key_by_depth, count, depths, extents, keys, places)
     _sort_pairs(keys, places, count, None)
     return places[:count].clone()
 
@@ -140,13 +120,8 @@ def depth_order(depths, extents):
 def count_entries(order, shapes, ellipses, extents, columns: int, rows: int):
     """[N] int32: how many tiles each Gaussian touches, by place in `order`."""
     counts = torch.empty_like(order)
-    vec2, vec4 = vector(2, warp_scalar(shapes.dtype)), vector(4, warp_scalar(shapes.dtype))
-    _launch(
-        tile_kernels(warp_scalar(shapes.dtype))[1],
-        order.shape[0],
-        [view(order), view(shapes, vec4), view(ellipses, vec4), view(extents, vec2), columns, rows, view(counts)],
-        order.device,
-    )
+    kernel = tile_kernels(warp_scalar(shapes.dtype)).count_tiles
+    launch(kernel, len(order), order, shapes, ellipses, extents, columns, rows, counts)
     return counts
 
 
@@ -161,25 +136,10 @@ def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends
     if padded:
         tiles[:room] = columns * rows
         gaussians[:room] = 0
-    vec2, vec4 = vector(2, warp_scalar(shapes.dtype)), vector(4, warp_scalar(shapes.dtype))
     if room:
-        _launch(
-            tile_kernels(warp_scalar(shapes.dtype))[2],
-            order.shape[0],
-            [
-                view(order),
-                view(shapes, vec4),
-                view(ellipses, vec4),
-                view(extents, vec2),
-                columns,
-                rows,
-                view(ends),
-                room,
-                view(tiles),
-                view(gaussians),
-            ],
-            order.device,
-        )
+        kernel = tile_kernels(warp_scalar(shapes.dtype)).emit_entries
+        touched = order, shapes, ellipses, extents, columns, rows
+        launch(kernel, len(order), *touched, ends, room, tiles, gaussians)
     return tiles, gaussians
 
 
@@ -203,9 +163,7 @@ def sort_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: 
 def find_ranges(tiles, tile_count: int):
     """[tiles, 2] int32: first and one past the last entry of each tile, (0, 0) for an untouched one."""
     ranges = torch.zeros(tile_count, 2, dtype=torch.int32, device=tiles.device)
-    if tiles.shape[0]:
-        arguments = [view(tiles), tiles.shape[0], tile_count, view(ranges, wp.vec2i)]
-        _launch(mark_ranges, tiles.shape[0], arguments, tiles.device)
+    launch(mark_ranges, len(tiles), tiles, len(tiles), tile_count, ranges)
     return ranges
 
 
@@ -214,8 +172,3 @@ def _sort_pairs(keys, values, count: int, bits: int | None) -> None:
     if count:
         with torch_stream(keys.device):
             wp.utils.radix_sort_pairs(wp.from_torch(keys), wp.from_torch(values), count, end_bit=bits)
-
-
-def _launch(kernel, count: int, arguments, device) -> None:
-    with torch_stream(device):
-        wp.launch(kernel, dim=count, inputs=arguments, device=wp.device_from_torch(device), record_tape=False)

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..field.gaussians import Gaussians
 from ..field.radiance_field import RadianceField
 from ..splatting import Rendering
-from ..splatting.noting import note_image_gradients
+from ..splatting.training_step import add_gradient_statistics
 from .config import Config
 
 SPLIT_SHRINK = 1.6
@@ -95,18 +95,9 @@ class GradientDensification(Densification):
         self, rendering: Rendering, width: int, height: int, usable: Tensor, weights: Tensor | None = None
     ) -> None:
         gradient = rendering.means2d.grad
-        if gradient.device.type == "cuda":
-            note_image_gradients(
-                gradient, rendering.radii, usable, weights, width, height, self.gradient_sum, self.seen
-            )
-            return
-        # In normalised screen units: the screen is 2 wide, so a pixel's gradient counts width / 2 times.
-        norm = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2))
-        if weights is not None:
-            norm = norm * weights
-        counted = rendering.visible & usable.bool()
-        self.gradient_sum += torch.where(counted, norm, 0.0)
-        self.seen += counted
+        gradient = gradient if weights is None else gradient * weights[:, None]
+        statistics = self.gradient_sum, self.seen
+        add_gradient_statistics(gradient, rendering.radii, usable, width, height, *statistics)
 
     def change(self, iteration: int, gaussians: Gaussians, optimizer: torch.optim.Optimizer, generator) -> bool:
         changed = False

@@ -6,7 +6,7 @@ from torch import Tensor
 from ..field.gaussians import PARAMETER_NAMES
 from ..field.radiance_field import RadianceField
 from ..response import RefinedResponse, ToneMapper
-from ..splatting.adam import adam_step, judge
+from ..splatting.training_step import adam_step, judge_step
 from .config import Config
 
 EPSILON = 1e-15
@@ -16,22 +16,16 @@ DECAY_EVERY = 10
 
 
 class Adam(torch.optim.Adam):
-    """torch's Adam with the steps of a GPU's parameters made by our kernel: the same numbers and the same state.
+    """torch's Adam with its state, its steps made by splatting.training_step.
 
     found_inf: scalar tensor, 1 where the next step is to change nothing; the attribute of torch's gradient scaler.
-    visible: [N] bool, which Gaussians the next step changes, with their moments; None: all. That saves the memory
-        traffic of the others. It is not Adam: what is unseen keeps its momentum and is not moved by it.
     """
 
-    visible: Tensor | None = None
     made: Tensor | None = None
     """1 - found_inf, where that is at hand."""
 
     def step(self) -> None:
         parameters = [p for group in self.param_groups for p in group["params"] if p.grad is not None]
-        if self.visible is None and all(p.device.type == "cpu" for p in parameters):
-            super().step()
-            return
         skipped = getattr(self, "found_inf", None)
         if skipped is None:
             skipped = parameters[0].new_zeros(())
@@ -45,11 +39,7 @@ class Adam(torch.optim.Adam):
         # With lists on both sides: to add one tensor to many, torch reads it on the host, which no recording allows.
         made = 1 - skipped if self.made is None else self.made
         torch._foreach_add_([self.state[p]["step"] for p in parameters], [made] * len(parameters))
-        on_device = all(isinstance(group["lr"], Tensor) for group in self.param_groups)
-        one = None if on_device else torch.ones_like(skipped)
         for group in self.param_groups:
-            rate = group["lr"]
-            visible = self.visible if group["name"] in PARAMETER_NAMES else None
             for parameter in group["params"]:
                 if parameter.grad is None:
                     continue
@@ -61,11 +51,9 @@ class Adam(torch.optim.Adam):
                     state["exp_avg_sq"],
                     state["step"],
                     skipped,
-                    rate=rate if isinstance(rate, Tensor) else one,
-                    rate_factor=1.0 if isinstance(rate, Tensor) else rate,
+                    rate=group["lr"],
                     betas=group["betas"],
                     epsilon=group["eps"],
-                    visible=visible,
                 )
 
 
@@ -138,21 +126,11 @@ def guarded_step(optimizer: torch.optim.Adam, loss: Tensor, incomplete: Tensor |
     """
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
     norms = torch.stack(torch._foreach_norm(gradients))
-    if loss.device.type == "cuda":
-        nonfinite, skipped, made = judge(loss, norms, incomplete)
-    else:
-        nonfinite, skipped, made = judge_in_torch(loss, norms, incomplete)
+    nonfinite, skipped, made = judge_step(loss, norms, incomplete)
     # The hook of torch's gradient scaler: parameters, moments and step count stay as they are where it is 1.
     optimizer.found_inf, optimizer.made = skipped, made
     optimizer.step()
     return nonfinite, made
-
-
-def judge_in_torch(loss: Tensor, norms: Tensor, incomplete: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-    """splatting.adam's judge() by torch's own operations, a dozen of them."""
-    nonfinite = (~(torch.isfinite(norms).all() & torch.isfinite(loss.detach()))).float()
-    skipped = nonfinite if incomplete is None else torch.maximum(nonfinite, incomplete.float())
-    return nonfinite, skipped, 1 - skipped
 
 
 def optimizer_tensors(optimizer: torch.optim.Adam) -> dict[str, Tensor]:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..field.gaussians import Gaussians
-from ..splatting import add_exploration_noise
+from ..splatting.training_step import add_position_noise
 from .config import Config, DensificationConfig
 from .densification import Densification
 
@@ -46,7 +46,7 @@ class Relocation(Densification):
     def perturb(self, iteration: int, gaussians: Gaussians, means_rate: float) -> None:
         if self.options.noise == 0:
             return
-        add_exploration_noise(
+        add_position_noise(
             gaussians.means,
             gaussians.log_scales,
             gaussians.quaternions,

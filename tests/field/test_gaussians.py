@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from sehdr_warp.errors import SehdrError
 from sehdr_warp.field.gaussians import HARMONIC_0, PARAMETER_NAMES, Gaussians
 
 
@@ -47,6 +48,13 @@ def test_few_and_coinciding_points_have_finite_sizes(count):
         torch.cat([torch.zeros(count, 3), torch.full((1, 3), 1e6)]), torch.zeros(count + 1, 3), 0
     )
     assert torch.isfinite(spread.log_scales).all()
+
+
+def test_points_that_are_not_finite_are_named():
+    points = grid()
+    points[4, 1] = math.nan
+    with pytest.raises(SehdrError, match="point 4 of 27 .* needs finite coordinates"):
+        Gaussians.from_points(points, torch.zeros(27, 3), 0)
 
 
 def test_keep_and_append_carry_adams_state():

@@ -8,8 +8,7 @@ import warp as wp
 from torch.profiler import ProfilerActivity, profile
 
 from sehdr_warp.splatting import BlendStyle, blending
-from sehdr_warp.splatting.blending import blend
-from sehdr_warp.splatting.blending_cuda import blend_on_cuda
+from sehdr_warp.splatting.blending import blend, blend_on_cuda
 from sehdr_warp.splatting.projection import project
 from sehdr_warp.splatting.reference import blend_reference
 from sehdr_warp.splatting.tile_lists import build_tile_lists, pack_records

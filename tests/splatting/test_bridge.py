@@ -113,9 +113,7 @@ def test_gradients_of_gradients_are_refused(device):
 @differentiable
 def scale_in_ranges(program, values, gain):
     scaled = program.write(values.shape, wp.vec3)
-    program.launch_ranges(
-        ranged_scale_kernel, len(values), [program.read(values, wp.vec3), program.read(gain)], [scaled]
-    )
+    program.launch(ranged_scale_kernel, len(values), [program.read(values, wp.vec3), program.read(gain)], [scaled])
     ALIVE.append(weakref.ref(program))
     return scaled
 

@@ -1,14 +1,10 @@
 """Public operations under any numbers (hypothesis): a right result, a documented culling, or an error by name."""
 
-import math
-
-import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sehdr_warp.errors import SehdrError
-from sehdr_warp.splatting import nearest_neighbour_distances, rasterize, spherical_harmonics, ssim_map
+from sehdr_warp.splatting import rasterize, spherical_harmonics, ssim_map
 from sehdr_warp.splatting.reference import rasterize_reference
 
 from .scenes import relative_error
@@ -88,23 +84,6 @@ def test_harmonics_keep_each_row_to_itself(means, degree):
         assert torch.equal(together[i].nan_to_num(7.0), alone[0].nan_to_num(7.0))
         if 1e-15 < float(means[i].norm()) < 1e15:
             assert bool(alone.isfinite().all())
-
-
-@SETTINGS
-@given(rows(anything, 3, 9), st.integers(1, 4))
-def test_neighbours_are_exact_or_refused(points, k):
-    if not bool(points.isfinite().all()):
-        with pytest.raises(SehdrError, match="finite coordinates"):
-            nearest_neighbour_distances(points, k)
-        return
-    found = nearest_neighbour_distances(points, k).double()
-    wide = points.double()
-    exact = (wide[:, None] - wide[None]).norm(dim=2)
-    exact.fill_diagonal_(math.inf)
-    exact = exact.sort(1).values[:, :k]
-    inside = exact < 3e38
-    assert bool((found[~inside] > 3e38).all()) or bool(inside.all())
-    torch.testing.assert_close(found[inside], exact[inside], rtol=1e-6, atol=1e-44)
 
 
 @SETTINGS

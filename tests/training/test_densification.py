@@ -9,7 +9,6 @@ import torch
 from sehdr_warp.field.gaussians import HARMONIC_0, PARAMETER_NAMES, Gaussians
 from sehdr_warp.response import response_by_name
 from sehdr_warp.splatting import rasterize
-from sehdr_warp.splatting.noting import note_image_gradients
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.densification import (
     MOST_WEIGHT,
@@ -46,7 +45,7 @@ def adam(gaussians):
 def rendering_with(gradient, visible):
     means2d = torch.zeros_like(gradient)
     means2d.grad = gradient
-    return SimpleNamespace(means2d=means2d, visible=visible)
+    return SimpleNamespace(means2d=means2d, radii=visible.float())
 
 
 def gradient_strategy(**options):
@@ -70,26 +69,6 @@ def test_statistics_are_means_over_the_photos_that_show_it():
     strategy.observe(rendering_with(gradient * float("nan"), torch.tensor([True, True])), 200, 100, torch.tensor(0.0))
     strategy.observe(rendering_with(gradient, torch.tensor([True, False])), 200, 100, torch.tensor(1.0))
     assert strategy.gradient_sum.tolist() == [600.0, 200.0] and strategy.seen.tolist() == [2.0, 1.0]
-
-
-@pytest.mark.parametrize("usable", [0.0, 1.0])
-@pytest.mark.parametrize("weighted", [False, True])
-def test_the_kernel_notes_what_torch_does(device, usable, weighted):
-    generator = torch.Generator().manual_seed(2)
-    gradient = torch.randn(500, 2, generator=generator) * 10.0 ** (-30 * torch.rand(500, 1, generator=generator))
-    gradient[:4] = torch.tensor([[0.0, 0.0], [1e-30, 0.0], [0.0, -1e-25], [3e-24, 4e-24]])
-    radii = torch.randint(0, 3, (500,), generator=generator).float()
-    weights = torch.rand(500, generator=generator) if weighted else None
-    strategy = gradient_strategy()
-    strategy.prepare(500, "cpu")
-    strategy.gradient_sum += 0.5
-    sums = strategy.gradient_sum.to(device, copy=True), strategy.seen.to(device, copy=True)
-    strategy.observe(rendering_with(gradient, radii > 0), 200, 100, torch.tensor(usable), weights)
-    given = gradient, radii, torch.tensor(usable)
-    weights = None if weights is None else weights.to(device)
-    note_image_gradients(*(t.to(device) for t in given), weights, 200, 100, *sums)
-    torch.testing.assert_close(sums[0].cpu(), strategy.gradient_sum, rtol=1e-6, atol=0)
-    assert torch.equal(sums[1].cpu(), strategy.seen)
 
 
 def test_small_are_cloned_and_large_are_split():

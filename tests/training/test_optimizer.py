@@ -1,19 +1,16 @@
 """Learning rates over a training."""
 
-from itertools import product
-from math import inf, nan
+from math import nan
 
 import pytest
 import torch
 
 from sehdr_warp.field.gaussians import PARAMETER_NAMES
-from sehdr_warp.splatting.adam import judge
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.optimizer import (
     DECAY_EVERY,
     decay_rates,
     guarded_step,
-    judge_in_torch,
     make_optimizer,
     set_means_rate,
 )
@@ -47,15 +44,6 @@ def test_a_resumed_training_has_the_rates_of_the_last_change():
 def test_rates_stay_without_a_final_factor():
     plain = load_config("default").optimizer
     assert rates(1000, **{"optimizer.final_factor": 1.0})["harmonics_dc"] == plain.harmonics_dc
-
-
-def test_steps_are_judged_as_torch_would(device):
-    some = [0.0, 3.0, inf, nan]
-    for loss, norm, incomplete in product(some, some, (None, False, True)):
-        given = torch.tensor(loss), torch.tensor([1.0, norm, 2.0])
-        told = None if incomplete is None else torch.tensor(incomplete)
-        ours = judge(*(t.to(device) for t in given), None if told is None else told.to(device))
-        assert [float(t) for t in ours] == [float(t) for t in judge_in_torch(*given, told)], (loss, norm, incomplete)
 
 
 @pytest.mark.parametrize("incomplete", [None, False, True])

@@ -1,0 +1,134 @@
+"""What a training does beside rendering: Adam, the judgement of a step, gradient statistics, position noise."""
+
+import math
+from itertools import product
+
+import pytest
+import torch
+
+from sehdr_warp.splatting import training_step
+from sehdr_warp.splatting.training_step import adam_step, add_gradient_statistics, add_position_noise, judge_step
+
+OPTIONS = {"betas": (0.9, 0.999), "epsilon": 1e-15}
+COUNT, STRENGTH = 200_000, 0.5
+
+
+def run_adam(step_function, parameter, gradients, rate, skip=()):
+    one = torch.ones((), device=parameter.device)
+    first, second, step = torch.zeros_like(parameter), torch.zeros_like(parameter), 0 * one
+    for number, gradient in enumerate(gradients):
+        skipped = one * (number in skip)
+        step += 1 - skipped
+        step_function(parameter, gradient, first, second, step, skipped, rate=one * rate, **OPTIONS)
+    return first, second, step
+
+
+@pytest.mark.parametrize("function", [adam_step, training_step._step_by_kernel])
+@pytest.mark.parametrize("scale", [1.0, 1e-12, 1e12])
+def test_many_steps_are_torchs_in_float64(device, scale, function):
+    generator = torch.Generator().manual_seed(0)
+    start = torch.randn(37, 3, generator=generator)
+    gradients = [scale * torch.randn(37, 3, generator=generator) for _ in range(40)]
+    truth = torch.nn.Parameter(start.double())
+    optimizer = torch.optim.Adam([truth], lr=0.01, eps=1e-15)
+    for gradient in gradients:
+        truth.grad = gradient.double()
+        optimizer.step()
+    ours = start.to(device, copy=True)
+    first, second, _ = run_adam(function, ours, [gradient.to(device) for gradient in gradients], 0.01)
+    assert (ours.cpu() - truth).abs().max() < 1e-5 * 0.4
+    state = optimizer.state[truth]
+    for moment, true_moment in ((first, state["exp_avg"]), (second, state["exp_avg_sq"])):
+        assert ((moment.cpu() - true_moment).norm() / true_moment.norm()) < 1e-6
+
+
+@pytest.mark.parametrize("function", [adam_step, training_step._step_by_kernel])
+def test_a_skipped_step_changes_nothing(device, function):
+    gradients = [torch.full((5,), value, device=device) for value in (1.0, float("nan"), -0.5)]
+    with_skip, without = torch.zeros(5, device=device), torch.zeros(5, device=device)
+    *moments, step = run_adam(function, with_skip, gradients, 0.1, skip={1})
+    run_adam(function, without, [gradients[0], gradients[2]], 0.1)
+    assert step == 2
+    assert torch.equal(with_skip, without)
+    assert all(moment.isfinite().all() for moment in moments)
+
+
+def test_no_numbers_are_no_work_and_another_layout_is_refused(device):
+    empty, one = torch.zeros(0, 3, device=device), torch.ones((), device=device)
+    adam_step(empty, empty, empty, empty, one, one, rate=one, **OPTIONS)
+    square = torch.zeros(4, 4, device=device)
+    with pytest.raises(ValueError, match="gradient is torch.float32"):
+        adam_step(square, torch.zeros(3, device=device), square, square, one, one, rate=0.1, **OPTIONS)
+    with pytest.raises(ValueError, match="second moment is torch.float64"):
+        adam_step(square, square, square, square.double(), one, one, rate=0.1, **OPTIONS)
+
+
+def test_a_step_is_skipped_where_something_is_not_finite_or_incomplete(device):
+    for loss, norm, incomplete in product(
+        [0.0, 3.0, math.inf, math.nan], [0.0, math.inf, math.nan], (None, False, True)
+    ):
+        told = None if incomplete is None else torch.tensor(incomplete, device=device)
+        norms = torch.tensor([1.0, norm, 2.0], device=device)
+        nonfinite = not (math.isfinite(loss) and math.isfinite(norm))
+        skipped = nonfinite or bool(incomplete)
+        found = judge_step(torch.tensor(loss, device=device), norms, told)
+        assert [float(value) for value in found] == [nonfinite, skipped, not skipped]
+
+
+@pytest.mark.parametrize("usable", [0.0, 1.0])
+def test_gradient_statistics_are_lengths_on_a_screen_of_two(device, usable):
+    generator = torch.Generator().manual_seed(2)
+    gradient = torch.randn(500, 2, generator=generator) * 10.0 ** (-30 * torch.rand(500, 1, generator=generator))
+    gradient[:4] = torch.tensor([[0.0, 0.0], [1e-30, 0.0], [0.0, -1e-25], [3e-24, 4e-24]])
+    radii = torch.randint(0, 3, (500,), generator=generator).float()
+    sums = torch.full((500,), 0.5, device=device), torch.zeros(500, device=device)
+    given = gradient.to(device), radii.to(device), torch.tensor(usable, device=device)
+    add_gradient_statistics(*given, 200, 100, *sums)
+    length = torch.hypot(gradient[:, 0] * 100, gradient[:, 1] * 50)
+    counted = (radii > 0) * usable
+    torch.testing.assert_close(sums[0].cpu(), 0.5 + counted * length, rtol=1e-6, atol=0)
+    assert torch.equal(sums[1].cpu(), counted)
+
+
+def noise(device, opacity, seed=3, quaternion=(1.0, 0.0, 0.0, 0.0), scales=(0.3, 0.1, 0.02)):
+    """[COUNT, 3] what is added to positions at the origin."""
+    means = torch.zeros(COUNT, 3, device=device)
+    add_position_noise(
+        means,
+        torch.tensor(scales, device=device).log().repeat(COUNT, 1),
+        torch.tensor(quaternion, device=device).repeat(COUNT, 1),
+        torch.full((COUNT,), math.log(opacity / (1 - opacity)), device=device),
+        strength=STRENGTH,
+        seed=seed,
+    )
+    return means.cpu()
+
+
+def test_noise_is_normal_and_shaped_by_the_covariance(device):
+    drawn = noise(device, 0.001)
+    # Equation 8: the sigmoid of 100 (0.005 - 0.001), times R S S R^T.
+    expected = STRENGTH / (1 + math.exp(-0.4)) * torch.tensor([0.09, 0.01, 0.0004])
+    torch.testing.assert_close(drawn.std(0), expected, rtol=0.02, atol=0)
+    assert (drawn.mean(0).abs() < 5 * expected / COUNT**0.5).all()
+    unit = drawn / drawn.std(0)
+    assert abs(float((unit**4).mean()) - 3) < 0.1 and (unit.T @ unit / COUNT - torch.eye(3)).abs().max() < 0.02
+
+
+def test_noise_turns_with_the_gaussian(device):
+    half = math.sqrt(0.5)
+    turned = noise(device, 0.001, quaternion=(2 * half, 0.0, 0.0, 2 * half))  # a quarter turn about z, of length 2
+    torch.testing.assert_close(turned.std(0), noise(device, 0.001).std(0)[[1, 0, 2]], rtol=0.02, atol=0)
+
+
+def test_noise_leaves_the_opaque(device):
+    assert noise(device, 0.5).abs().max() < 1e-12
+    assert noise(device, 1 - 1e-7, scales=(1e30, 1.0, 1e-30)).abs().max() == 0
+
+
+def test_noise_repeats_with_the_seed_whatever_the_threads(device, monkeypatch):
+    monkeypatch.setenv("SEHDR_THREADS", "1")
+    one = noise(device, 0.002)
+    monkeypatch.setenv("SEHDR_THREADS", "3")
+    assert torch.equal(one, noise(device, 0.002))
+    torch.testing.assert_close(one, noise("cpu", 0.002), rtol=1e-4, atol=1e-7)
+    assert not torch.equal(one, noise(device, 0.002, seed=4))
