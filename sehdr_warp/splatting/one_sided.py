@@ -3,11 +3,9 @@
 import math
 
 import torch
-import warp as wp
 
 from ..kernels.one_sided import one_sided_kernel
-from .arrays import view, warp_scalar
-from .bridge import torch_stream
+from .launching import launch, warp_scalar
 
 
 def seen_by_photo(
@@ -43,21 +41,8 @@ class _SeenByPhoto(torch.autograd.Function):
         none = torch.empty(0, dtype=torch.bool, device=light.device)
         given = [light, photo_light.detach().contiguous()]
         given += [none if mask is None else mask.contiguous() for mask in (clipped, black)]
-        if light.numel():
-            with torch_stream(light.device):
-                wp.launch(
-                    one_sided_kernel(warp_scalar(light.dtype)),
-                    dim=light.numel(),
-                    inputs=[
-                        *(view(tensor.view(-1)) for tensor in given),
-                        scale,
-                        gain,
-                        *half_codes,
-                        *(view(tensor.view(-1)) for tensor in (seen, slopes, truth)),
-                    ],
-                    device=wp.device_from_torch(light.device),
-                    record_tape=False,
-                )
+        kernel = one_sided_kernel(warp_scalar(light.dtype))
+        launch(kernel, light.numel(), *given, scale, gain, *half_codes, seen, slopes, truth)
         ctx.save_for_backward(slopes)
         ctx.mark_non_differentiable(truth)
         ctx.set_materialize_grads(False)  # of truth there is none, and no zeros are wanted in its place
