@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import sehdr_warp
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import embedded_scenes, load_scene
@@ -16,7 +15,7 @@ from sehdr_warp.synth.truth_set import HdrNerfCurve
 
 from .conftest import write_truth
 
-EMBEDDED = Path(sehdr_warp.__file__).parent / "embedded"
+SCENES = Path(__file__).resolve().parents[2] / "scenes"
 
 
 def test_the_curve_without_torch_is_the_models():
@@ -133,16 +132,23 @@ def test_embedded_scenes_have_truth_and_a_well_exposed_photo(name):
     for view in scene.views:
         assert view.hdr.shape == view.image.shape == (200, 200, 3)
         assert np.isfinite(view.hdr).all() and view.hdr.min() >= 0
-    making = json.loads((EMBEDDED / name / "synth.json").read_text())
+    making = json.loads((SCENES / name / "synth.json").read_text())
     assert making["scene"] == name and making["denoise"] == "oidn" and making["seed"] == 0
-    size = sum(p.stat().st_size for p in (EMBEDDED / name).rglob("*.*") if p.name != "synth.json")
+    size = sum(p.stat().st_size for p in (SCENES / name).rglob("*.*") if p.name != "synth.json")
     assert size == making["packing"]["bytes"] < 2e6
     median = np.median([view.image for view in scene.train_views])
     assert 0.2 < median < 0.8
 
 
-def test_every_scene_of_the_generator_is_embedded():
+def test_scenes_lie_in_the_package_beside_it_or_where_the_environment_says(tmp_path, monkeypatch):
     assert {*embedded_scenes()} == {"room", *RECIPES}
+    monkeypatch.setattr("sehdr_warp.scene.embedded.resources.files", lambda package: tmp_path / "site" / package)
+    assert embedded_scenes() == ()
+    with pytest.raises(InputError, match="embedded:study: is not here; .* get the repository's scenes/ .* or render"):
+        load_scene("embedded:study")
+    monkeypatch.setenv("SEHDR_SCENES", str(SCENES))
+    assert {*embedded_scenes()} == {*RECIPES}
+    assert load_scene("embedded:study", max_size=16, response="srgb").name == "embedded:study"
 
 
 def test_a_scene_that_is_not_embedded_is_refused_with_the_names():
