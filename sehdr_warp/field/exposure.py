@@ -70,6 +70,12 @@ def exposure_times(base_time: float, items: Items = PAPER_BRACKETS) -> tuple[flo
     return tuple(exposure.time for exposure in read_exposures(items, base_time))
 
 
+def seconds(items: Items, field: str = "exposures") -> tuple[float, ...]:
+    """Times of their own, in the order given; SehdrError for an item that is none."""
+    items = [item for item in items.split(",") if item.strip()] if isinstance(items, str) else items
+    return tuple(_exposure(item, None, field).time for item in items)
+
+
 def is_seconds(item: str | float) -> bool:
     """Whether an item is a time of its own, not relative to the photos' exposure."""
     text = str(item).strip().lower()

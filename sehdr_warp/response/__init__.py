@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ..errors import InputError
-from .analytic import analytic_names, analytic_response
+from .analytic import DESCRIPTIONS, analytic_response
 from .curve import Response
 from .files import colour_response, response_from_file, responses_in_file
 from .learned import ToneMapper
@@ -20,19 +20,24 @@ __all__ = [
 ]
 
 
-def response_names() -> list[str]:
-    """The responses with a formula. Besides, response_by_name takes `gamma-G`, `colour:NAME` and files."""
-    return list(analytic_names())
+def response_names() -> dict[str, str]:
+    """The responses with a formula, each with a line that says what it stands for.
+
+    Besides, response_by_name takes `gamma-G`, `colour:NAME` (the encodings of colour-science) and files.
+    """
+    return dict(DESCRIPTIONS)
 
 
 def response_by_name(text: str | Path) -> Response:
     """A response from what a user writes.
 
-    One of response_names(); `hdr-nerf` (another name of reinhard-gamma); `gamma-G`; `colour:S-Log3` and the other
-    encodings of colour-science; `FILE` or `FILE:SELECTOR` (see response_from_file), such as
-    `201_CRF_data.mat:17`, `dorfCurves.txt:agfachrome-ctpreciska50Red`, `emor.txt:0.5,-0.1`, `my_camera.csv`.
+    Args:
+        text: one of response_names(); `gamma-G`; `colour:S-Log3` and the like; `FILE` or `FILE:SELECTOR` (see response_from_file), such as `my_camera.csv`,
+            `201_CRF_data.mat:17`, `dorfCurves.txt:agfachrome-ctpreciska50Red` or `emor.txt:0.5,-0.1`.
 
-    Raises SehdrError for a name that is not known, InputError for a file that cannot be used.
+    Raises:
+        SehdrError: for a name that is not known.
+        InputError: for a file that cannot be used.
     """
     text = str(text).strip()
     if text.lower().startswith("colour:"):

@@ -1,5 +1,6 @@
 """Responses with a formula: power laws with a linear toe, and tone curves followed by one."""
 
+import difflib
 import math
 
 import torch
@@ -176,13 +177,23 @@ _BANK = {
     "gamma-2.2": lambda: _gamma("gamma-2.2", 2.2),
     "srgb": _srgb,
     "rec709": _rec709,
-    # The curve with which HDR-NeRF's synthetic images were made.
-    "reinhard-gamma": lambda: ToneMapped("reinhard-gamma", Reinhard(), _gamma("gamma-2.2", 2.2)),
+    "hdr-nerf": lambda: ToneMapped("hdr-nerf", Reinhard(), _gamma("gamma-2.2", 2.2)),
     "filmic": _hable,
     "aces": _aces,
     "camera": _camera,
 }
-_ALIASES = {"hdr-nerf": "reinhard-gamma", "gamma": "gamma-2.2", "rec.709": "rec709", "bt709": "rec709"}
+DESCRIPTIONS = {
+    "camera": "a camera's own JPEG: Rec.709 with a roll-off into white",
+    "srgb": "sRGB (IEC 61966-2-1): renders, and photos developed without a tone curve",
+    "rec709": "Rec.709 video (ITU-R BT.709)",
+    "gamma-2.2": "a power law; gamma-G with any G from 1 to 5",
+    "linear": "values proportional to light",
+    "hdr-nerf": "Reinhard's curve and gamma 2.2, of HDR-NeRF's synthetic sets; also called reinhard-gamma",
+    "filmic": "Hable's filmic curve (Uncharted 2), shown as sRGB",
+    "aces": "Narkowicz's fit to the ACES display transform, shown as sRGB",
+}
+"""What each name stands for."""
+_ALIASES = {"reinhard-gamma": "hdr-nerf", "gamma": "gamma-2.2", "rec.709": "rec709", "bt709": "rec709"}
 
 
 def analytic_names() -> tuple[str, ...]:
@@ -206,5 +217,7 @@ def analytic_response(name: str) -> Response:
         if not 1.0 <= exponent <= 5.0:
             raise SehdrError(f"response {name!r}: the exponent of gamma-G must be a number from 1 to 5")
         return _gamma(key, exponent)
-    known = ", ".join((*_BANK, "hdr-nerf", "gamma-G", "colour:NAME"))
-    raise SehdrError(f"response {name!r} is neither a file nor a known name; take one of {known}, or a curve's file")
+    near = difflib.get_close_matches(name.lower(), DESCRIPTIONS, n=1)
+    hint = f"did you mean {near[0]}? " if near else ""
+    known = ", ".join((*DESCRIPTIONS, "gamma-G", "colour:NAME"))
+    raise SehdrError(f"response {name!r} is neither a file nor a known name; {hint}take one of {known}, or a file")

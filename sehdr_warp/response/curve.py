@@ -16,6 +16,8 @@ HALF_CODE = 0.5 / 255
 # Rise of encode_extended beyond the clip point for each factor of e in exposure. A tenth of what a gamma curve rises
 # just below white: enough for a gradient, too little for a clipped highlight to cost much where no hinge is used.
 EXTENSION_SLOPE = 0.05
+# Exposures to start from are at least this: a logarithm needs one above 0.
+START_FLOOR = 1e-6
 
 
 class Response(ABC):
@@ -28,6 +30,8 @@ class Response(ABC):
     peak: the largest value that the curve takes or approaches, at most 1.
     clip_exposure: the smallest exposure with f = peak; infinity for a curve that only approaches it.
     notes: one line each on what was repaired in measured samples; empty for most.
+    learnable: whether it is an nn.Module whose parameters are trained with the scene; photos can be decoded by it only
+        after that, so `decodable` is the opposite.
 
     encode, encode_extended and decode take a torch tensor (float32 or float64, any shape, any device; differentiable
     once) and return one like it, or a NumPy array or number and return a NumPy array. NaN stays NaN.
@@ -38,6 +42,7 @@ class Response(ABC):
     peak: float
     clip_exposure: float
     notes: tuple[str, ...] = ()
+    learnable: bool = False
     _kinds: ClassVar[dict[str, type["Response"]]] = {}
 
     def __init_subclass__(cls, *, kind: str | None = None, **options):
@@ -76,6 +81,15 @@ class Response(ABC):
     def formula(self) -> FormulaCurve | None:
         """The curve as a GPU evaluates it in one launch; None where there is no such kernel."""
         return None
+
+    @property
+    def decodable(self) -> bool:
+        """Whether photos can be decoded by it before a training."""
+        return not self.learnable
+
+    def start_exposures(self, encoded: np.ndarray) -> np.ndarray:
+        """Exposures above 0 for Gaussians to start from, of encoded values in (0, 1); same shape, float64."""
+        return np.maximum(self.decode(np.asarray(encoded, np.float64)), START_FLOOR)
 
     @property
     def clips(self) -> bool:

@@ -35,7 +35,8 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
     they are, on values made to increase, and is not differentiable.
     """
 
-    name = "mlp"
+    name = "learned"
+    learnable = True
     black, peak, clip_exposure = 0.0, 1.0, math.inf
 
     def __init__(self, width: int = 128, seed: int = 0):
@@ -114,6 +115,10 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
         with torch.enable_grad():
             given = exposure.detach().requires_grad_()
             return torch.autograd.grad(self.encode(given).sum(), given)[0]
+
+    def start_exposures(self, encoded):
+        """The logarithm starts at the encoded value (HDR-GS): what the mapper will make of it is not known yet."""
+        return np.exp(np.asarray(encoded, np.float64))
 
     @property
     def white(self) -> float:

@@ -1,4 +1,4 @@
-"""A response from photos: by colour mixtures at edges, the histogram and a prior; or by the paper's score."""
+"""A response from photos: by color mixtures at edges, the histogram and a prior; or by the paper's score."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from ..errors import SehdrError
-from . import response_by_name, response_names
+from .analytic import analytic_names, analytic_response
 from .curve import Response
 from .family import CODES, family_logs
 from .table import TabulatedResponse
@@ -41,7 +41,7 @@ DENSITY_SLOPE, DENSITY_JUMP, DENSITY_FREEDOM, DENSITY_SHARE = 0.9, 0.1, 5.0, 1e-
 # Neighbouring bins share what is unusual about a scene: this many count as one.
 BINS_PER_FACT = 4.0
 # Minus log prior, up to a constant. Of photos that say nothing about where they come from ...
-PRIOR = {"camera": 0.5, "srgb": 0.5, "rec709": 1.0, "gamma-2.2": 1.0, "reinhard-gamma": 1.0, "filmic": 2.0, "aces": 2.0}
+PRIOR = {"camera": 0.5, "srgb": 0.5, "rec709": 1.0, "gamma-2.2": 1.0, "hdr-nerf": 1.0, "filmic": 2.0, "aces": 2.0}
 # ... and of a camera's own JPEG, which is sharpened and cleaned of noise: its edges mislead (docs/response.md).
 CAMERA_PRIOR = {"camera": 0.0, "rec709": 1.0}
 UNLIKELY = 12.0
@@ -58,17 +58,17 @@ MOST_PIXELS, BAND_ROWS = 400_000, 32
 
 @dataclass(frozen=True)
 class ResponseScore:
-    """What the photos say about one candidate.
+    """What the photos say about one candidate; nats are minus log likelihoods, so that smaller is better.
 
-    dynamic_range: stops between the 0.1th and the 99.9th percentile of the decoded, unclipped values.
-    roughness: mean absolute second difference of log2 of the decoded values, stops.
-    paper_score: dynamic_range and minus roughness, each divided by its median over the candidates; larger is better.
-    edges: mean over edges of minus the log likelihood, nats, that the middle colour is a mixture of its two sides in
-        linear light, every share as likely; smaller is better; NaN if the photos have fewer than 50 usable edges.
-    highlights: minus the log likelihood, nats, of the pixels at the brightest code beside those just below it.
-    span: minus the log likelihood, nats, of how far the decoded values spread.
-    density: minus the log likelihood, nats, of how smoothly the decoded values are spread over log exposure.
-    prior: minus the log prior, nats. posterior: the sum of the five, edges times edge_facts(their number).
+    Attributes:
+        dynamic_range: stops between the 0.1th and the 99.9th percentile of the decoded, unclipped values.
+        roughness: mean absolute second difference of log2 of the decoded values, stops.
+        paper_score: range minus roughness, each over its median among the candidates; larger is better.
+        edges: nats an edge, that its middle is a mixture of its sides in linear light; NaN for under 50 usable edges.
+        highlights: nats, of the pixels at the brightest code beside those just below it.
+        span: nats, of how far the decoded values spread.
+        density: nats, of how smoothly they are spread over log exposure.
+        prior: nats. posterior: the sum of the five, edges times edge_facts(their number).
     """
 
     response: Response
@@ -97,44 +97,40 @@ def select_response(
     image,
     candidates: Sequence[Response] | None = None,
     *,
-    method: str = "edges",
+    method: str = "posterior",
     from_camera: bool = False,
     seed: int = 0,
 ) -> ResponseSelection:
-    """The candidate under which a photo looks most like linear light.
+    """The candidate under which photos look most like linear light, up to the exposure's scale.
 
-    image: [H, W, 3] uint8 or uint16 codes, or encoded values in [0, 1], array or tensor, as photographed:
-        resampling in encoded values mixes colours in them. Or a list of such images of one camera: their
-        edges are pooled, and the paper's statistics are of the one with the most pixels neither black nor clipped.
-    candidates: responses, of which one is taken; by default the analytic bank. A DoRF file's are
-        responses_in_file(path).
-    method: "paper" is SeHDR, section 3.3: the curve of DoRF that does best "on a randomly sampled training image,
-        evaluated by dynamic range and smoothness". The paper gives no formula; ours is ResponseScore.paper_score.
-        "edges" is after Lin et al. 2004 (Radiometric calibration from a single image): at an edge between two evenly
-        coloured regions a pixel is a mixture of both in linear light, so decoded colours lie on a line. Falls back to
-        "paper", and says so in `method`, where the photo has fewer than 50 such edges.
-        "posterior" adds a prior, what the clipped pixels tell, how many stops scenes span, and how smoothly their light
-        is spread over them; it needs no edges, and no well-exposed pixels.
-        Without `candidates`, and for photos that are not a camera's own, a smooth family of cameras' curves stands
-        beside the bank. A formula with a quarter of the posterior is taken; else the response is the posterior's
-        mean of log exposure at each code, a table that is none of the candidates.
-    from_camera: the photos are a camera's own JPEGs: the prior is then that of cameras.
-    seed: of the sample of edges where there are more than 12 000.
+    Args:
+        image: [H, W, 3] codes as photographed, uint8 or uint16, or encoded values in [0, 1] (array or tensor); or a
+            list of such photos of one camera. Resampling in encoded values mixes colors, which edges then tell of.
+        candidates: by default the responses with a formula.
+        method: "posterior" judges edges (after Lin et al. 2004: at an edge between two even regions a pixel mixes both
+            in linear light), clipped pixels, the spread and smoothness of light, and a prior; it needs none of them.
+            Without `candidates`, and for photos that are not a camera's own, a smooth family of cameras' curves stands
+            beside the formulae. One of these with a quarter of the posterior is taken; else the response is the
+            posterior's mean of log exposure at each code, a table that is none of the candidates.
+            "paper" is SeHDR, section 3.3: the curve that does best on one photo "by dynamic range and smoothness"; the
+            paper gives no formula, ours is ResponseScore.paper_score.
+        from_camera: the photos are a camera's own JPEGs, with the prior of cameras.
+        seed: of the sample of edges where there are more than 12 000.
 
-    All find a curve only up to the exposure's scale, and none is calibration: docs/response.md has measured errors.
-    Raises SehdrError for an unknown method, no candidates, an image of another shape or with NaN, or, but for the
-    posterior, under 100 pixels that are neither black nor clipped.
+    Raises:
+        SehdrError: for another method, no candidates, an image of another shape or not finite, or, with "paper", under
+            100 pixels that are neither black nor clipped.
     """
-    if method not in ("paper", "edges", "posterior"):
-        raise SehdrError(f"select_response: method = {method!r} is not one of paper, edges, posterior")
+    if method not in ("posterior", "paper"):
+        raise SehdrError(f"select_response: method = {method!r} is neither posterior nor paper")
     beside = candidates is None and method == "posterior" and not from_camera
     if candidates is None:
-        candidates = [response_by_name(name) for name in response_names()]
+        candidates = [analytic_response(name) for name in analytic_names()]
     if not candidates:
         raise SehdrError("select_response: there are no candidates; give at least one response")
     photos = [_bands(each) for each in (image if isinstance(image, list | tuple) else [image])]
     fullest = max(photos, key=lambda bands: sum(clear.sum() for _, clear in bands))
-    if method != "posterior" and sum(clear.sum() for _, clear in fullest) < 100:
+    if method == "paper" and sum(clear.sum() for _, clear in fullest) < 100:
         raise SehdrError("select_response: under 100 pixels are neither black nor clipped; name a response instead")
     edges = np.concatenate([_edge_colours(*band) for bands in photos for band in bands])
     if len(edges) > MAX_EDGES:
@@ -155,9 +151,7 @@ def select_response(
         rows.append((*_range_and_roughness(fullest, each), surprise, highlights, prior, posterior))
     ranges, roughnesses, surprises, highlights, priors, posteriors = np.array(rows, dtype=np.float64).T
     paper = _relative(ranges) - _relative(roughnesses)
-    if method == "edges" and np.isnan(surprises).all():
-        method = "paper"
-    goodness = {"paper": paper, "edges": -np.nan_to_num(surprises, nan=np.inf), "posterior": -posteriors}[method]
+    goodness = paper if method == "paper" else -posteriors
     columns = (ranges, roughnesses, paper, surprises, highlights, spans, densities, priors, posteriors)
     scores = [ResponseScore(each, *map(float, row)) for each, row in zip(candidates, np.stack(columns, 1), strict=True)]
     order = np.argsort(-goodness, kind="stable")
@@ -196,8 +190,8 @@ def _mean_response(chances, logs) -> TabulatedResponse:
 
 
 def _bands(image) -> list[tuple[np.ndarray, np.ndarray]]:
-    """A photo, or evenly spaced bands of a large one, each [h, W, 3] float64 with where it is neither black nor
-    clipped; codes become encoded values."""
+    """A photo, or evenly spaced bands of a large one, as encoded values [h, W, 3] float64, each with where it is
+    neither black nor clipped [h, W]."""
     image = np.asarray(image.detach().cpu() if isinstance(image, torch.Tensor) else image)
     if image.ndim != 3 or image.shape[2] != 3:
         raise SehdrError(f"select_response: an image of shape {list(image.shape)} is not [H, W, 3]")
@@ -206,17 +200,16 @@ def _bands(image) -> list[tuple[np.ndarray, np.ndarray]]:
     if rows * columns > MOST_PIXELS:
         starts = np.linspace(0, rows - BAND_ROWS, max(1, MOST_PIXELS // (BAND_ROWS * columns)))
         bands = [image[int(start) : int(start) + BAND_ROWS] for start in starts]
-    if image.dtype in (np.uint8, np.uint16):
-        bands = [each.astype(np.float32) / np.float32(np.iinfo(image.dtype).max) for each in bands]
+    white = np.iinfo(image.dtype).max if image.dtype.kind == "u" else 1.0
+    bands = [each / np.float64(white) for each in bands]
     if not all(np.isfinite(each).all() for each in bands):
         raise SehdrError("select_response: an image holds values that are not finite")
-    bands = [each.astype(np.float64) for each in bands]
     return [(each, ((each > 1.5 * CODE) & (each < 1 - 4.5 * CODE)).all(axis=2)) for each in bands]
 
 
 def _prior(response: Response, from_camera: bool) -> float:
     """Minus the log prior of a candidate; one that is not of the bank was given on purpose, and is as likely as any."""
-    if response.name not in response_names():
+    if response.name not in analytic_names():
         return 0.0
     if response.name == "linear":
         return LINEAR_PRIOR

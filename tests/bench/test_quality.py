@@ -30,7 +30,7 @@ def test_the_command_line_trains_evaluates_and_never_repeats(tmp_path, capsys):
         assert finished in said.err and "| default" in said.out
     (line,) = (json.loads(text) for text in (tmp_path / "results.jsonl").read_text().splitlines())
     figures, curve = line["figures"], line["curve"]
-    assert figures["protocol"]["gt-max"]["psnr_mu"] > 5 and figures["response"] == "reinhard-gamma"
+    assert figures["protocol"]["gt-max"]["psnr_mu"] > 5 and figures["response"] == "hdr-nerf"
     assert figures["render_fps"] > 0 and figures["peak_memory_bytes"] > 1e7
     assert curve[0]["iteration"] == 1 and curve[-1]["iteration"] == 12 and len(curve) >= 6
     assert [test["seconds"] for test in curve] == sorted(test["seconds"] for test in curve)

@@ -47,7 +47,7 @@ FORMULAE = {
     "gamma-2.2": lambda x: x ** (1 / 2.2),
     "srgb": lambda x: x * 12.92 if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055,
     "rec709": lambda x: 4.5 * x if x < 0.018 else 1.099 * x**0.45 - 0.099,
-    "reinhard-gamma": lambda x: (x / (1 + x)) ** (1 / 2.2),
+    "hdr-nerf": lambda x: (x / (1 + x)) ** (1 / 2.2),
     "hdr-nerf": lambda x: (x / (1 + x)) ** (1 / 2.2),
     "filmic": lambda x: srgb(hable(x) / hable(11.2)),
     "aces": lambda x: srgb(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14)),

@@ -1,0 +1,176 @@
+"""A camera's response from an exposure stack: photos of one still scene at known times (Debevec and Malik 1997)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import InputError
+from .table import TabulatedResponse
+
+DARKEST, BRIGHTEST = 3, 252
+"""8-bit codes outside are clipped, or nearly, and tell nothing."""
+CHANNELS = ("red", "green", "blue")
+CHANNELS_DIFFER = 0.15
+"""Stops, RMS, between a channel's own curve and the shared one from which the channels clearly differ."""
+
+WRONG_TIME = 0.25
+"""Stops by which a photo may be off its time without being named."""
+
+# Weight of the squared second derivative of the curve against the mean weight of a code.
+_SMOOTHNESS = 0.02
+# Residuals in stops from which a sample counts less (movement, misregistration, noise), and rounds of reweighting.
+_OUTLIER, _ROUNDS = 0.1, 4
+# RMS of the residuals in stops from which photos cannot be of one still scene.
+_MISALIGNED = 0.5
+# Least rise of log2 exposure from code to code, where the samples alone would let the curve fall.
+_LEAST_RISE = 1e-4
+_MOST_PIXELS, _SHOWN = 30_000, 3000
+_CODES = np.arange(256)
+_REMEDY = "photograph one still scene from a tripod at several times, one to three stops apart"
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A measured response and what speaks for it.
+
+    Attributes:
+        response: the curve; exposure 1 is white.
+        residual: weighted RMS of what the curve leaves unexplained, stops.
+        channel_spread: RMS difference of each channel's own curve from the shared one, stops; NaN where a channel tells
+            nothing alone.
+        photo_offsets: by how many stops each photo is brighter than its time says.
+        samples: [S, 2] exposures and encoded values of some samples, for a plot.
+    """
+
+    response: TabulatedResponse
+    residual: float
+    channel_spread: tuple[float, ...]
+    photo_offsets: tuple[float, ...]
+    samples: np.ndarray
+
+
+def calibrate_codes(
+    photos: Sequence[np.ndarray], times: Sequence[float], *, channel: str | None = None, name: str = "calibrated"
+) -> Calibration:
+    """The response of the camera that took a stack.
+
+    Least squares over pixels i and photos j of w (g(z_ij) - log2 E_i - log2 t_j)^2, w a hat over the codes that are not
+    clipped, with a penalty on the curvature of g, which only rises. Outliers count less from round to round.
+
+    Args:
+        photos: [H, W, 3] uint8 or uint16 codes, all of one size.
+        times: seconds, or any numbers in proportion to the light.
+        channel: "red", "green" or "blue" alone; None finds one curve for all three.
+        name: of the response, and of the stack in errors.
+
+    Raises:
+        InputError: for a stack that tells nothing, with the reason.
+    """
+    if channel not in (None, *CHANNELS):
+        raise InputError(name, f"channel {channel!r} is not one of {', '.join(CHANNELS)}", "name one, or none for all")
+    stops = np.log2(np.asarray(times, np.float64))
+    _check(photos, stops, name)
+    codes = np.stack([_eight_bit(photo) for photo in photos]).reshape(len(photos), -1, 3)
+    rng = np.random.default_rng(0)
+    codes = codes[:, rng.permutation(codes.shape[1])[:_MOST_PIXELS]]
+    _check_order(codes, stops, name)
+    chosen = slice(None) if channel is None else [CHANNELS.index(channel)]
+    taken = codes[..., chosen].reshape(len(photos), -1)
+    curve, residuals, weights, light = _solve(taken, stops, name)
+    plain = float(np.sqrt(np.square(residuals[weights > 0]).mean()))
+    if plain > _MISALIGNED:
+        raise InputError(name, f"its photos contradict each other by {plain:.2f} stops: something moved", _REMEDY)
+    shown = rng.permutation(np.argwhere(weights > 0))[:_SHOWN].T
+    samples = np.stack([2.0 ** (light[shown[1]] + stops[shown[0]] - curve[255]), taken[tuple(shown)] / 255], axis=1)
+    exposures = 2.0 ** (curve - curve[255])
+    exposures[0] = 0.0
+    return Calibration(
+        TabulatedResponse(name, exposures, _CODES / 255),
+        float(np.sqrt((weights * residuals**2).sum() / weights.sum())),
+        tuple(_spread(codes[..., index], stops, curve) for index in range(3)),
+        tuple((weights * residuals).sum(1) / np.maximum(weights.sum(1), 1e-9)),
+        samples,
+    )
+
+
+def _eight_bit(photo: np.ndarray) -> np.ndarray:
+    return photo if photo.dtype == np.uint8 else np.rint(photo / 257.0).astype(np.uint8)
+
+
+def _check(photos, stops: np.ndarray, name: str) -> None:
+    if len(photos) < 2 or len(photos) != len(stops):
+        raise InputError(name, f"{len(photos)} photo(s) with {len(stops)} time(s) are no exposure stack", _REMEDY)
+    if not np.isfinite(stops).all() or np.ptp(stops) < 0.1:
+        raise InputError(name, "every photo has the same exposure time", _REMEDY)
+    if len({photo.shape for photo in photos}) > 1:
+        raise InputError(name, "its photos differ in size", "give photos of one size from a tripod")
+
+
+def _check_order(codes: np.ndarray, stops: np.ndarray, name: str) -> None:
+    order = np.argsort(stops, kind="stable")
+    darker = np.diff(codes.mean(axis=(1, 2))[order]) < -2
+    if darker[np.diff(stops[order]) > 0.1].any():
+        raise InputError(name, "a photo of longer exposure is darker than one of shorter", "correct the exposure times")
+
+
+def _spread(codes: np.ndarray, stops: np.ndarray, shared: np.ndarray) -> float:
+    """RMS difference in stops of one channel's own curve from the shared one, over its codes from 10 to 245."""
+    try:
+        own, _, weights, _ = _solve(codes, stops, "")
+    except InputError:
+        return float("nan")
+    seen = np.bincount(codes.ravel(), weights.ravel(), 256) > 0
+    return float(np.std((own - shared)[10:246][seen[10:246]]))
+
+
+def _solve(codes: np.ndarray, stops: np.ndarray, name: str):
+    """log2 exposure of each code [256], and of samples [J, S]: residuals in stops, weights, and log2 radiance [S].
+
+    Each radiance is eliminated, so that 256 unknowns are left whatever the number of samples.
+    """
+    from scipy.linalg import solve
+
+    hat = np.sqrt(np.minimum(_CODES - DARKEST + 1, BRIGHTEST - _CODES + 1).clip(min=0) / (0.5 * (BRIGHTEST - DARKEST)))
+    start = hat[codes]
+    start *= (start > 0).sum(0) >= 2
+    if (start > 0).any(0).sum() < 256:
+        raise InputError(name, "hardly a pixel is well exposed in two photos", "give photos of closer exposure times")
+    bends, weights, places = _bends(), start, codes.astype(np.int64)
+    for _ in range(_ROUNDS):
+        total = np.maximum(weights.sum(0), 1e-12)
+        offset = stops[:, None] - (weights * stops[:, None]).sum(0) / total
+        matrix = np.diag(np.bincount(places.ravel(), weights.ravel(), 256))
+        right = np.bincount(places.ravel(), (weights * offset).ravel(), 256)
+        for place, weight in zip(places, weights, strict=True):
+            pairs = np.bincount((place * 256 + places).ravel(), (weight * weights / total).ravel(), 65536)
+            matrix -= pairs.reshape(256, 256)
+        scale = np.trace(matrix) / 256
+        matrix += scale * (_SMOOTHNESS * bends.T @ bends + 1e-9 * np.eye(256))
+        matrix[128, 128] += scale  # The curve is known up to a constant: this one is 0 at the middle code.
+        curve = solve(matrix, right, assume_a="pos")
+        if np.diff(curve).min() < _LEAST_RISE:
+            curve = _rising(matrix, right)
+        light = (weights * (curve[codes] - stops[:, None])).sum(0) / total
+        residuals = curve[codes] - light - stops[:, None]
+        weights = start / (1 + (residuals / _OUTLIER) ** 2)
+    return curve, residuals, weights, light
+
+
+def _rising(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The solution of the normal equations whose steps are all at least _LEAST_RISE."""
+    from scipy.linalg import cholesky, solve_triangular
+    from scipy.optimize import lsq_linear
+
+    root = cholesky(matrix)
+    steps = np.tril(np.ones((256, 256)))
+    lowest = np.r_[-np.inf, np.full(255, _LEAST_RISE)]
+    return steps @ lsq_linear(root @ steps, solve_triangular(root, right, trans="T"), (lowest, np.inf), tol=1e-6).x
+
+
+def _bends() -> np.ndarray:
+    """[254, 256] second derivatives of a curve, each with the root of its step, so that their squares sum to an integral.
+    They are over nearly the logit of the code: near black and white cameras' curves are almost straight on it."""
+    axis = np.log((_CODES + 1.0) / (280.0 - _CODES))
+    slopes = np.diff(np.eye(256), axis=0) / np.diff(axis)[:, None]
+    return np.diff(slopes, axis=0) / np.sqrt(0.5 * (axis[2:] - axis[:-2]))[:, None]

@@ -1,0 +1,56 @@
+"""The command lines of `sehdr-warp calibrate` and `responses`."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Measure a camera's response from an exposure stack: photos of one still scene at several exposure times."""
+
+    stack: Positional[Path]
+    """Folder of photos; their times come from EXIF, exposures.json or --exposures."""
+    out: Path
+    """CSV file for the curve, for --response; a plot goes beside it (.png)."""
+    exposures: str | None = None
+    """Times in the order of the files' names, such as 1/500,1/125,1/30."""
+    channel: Literal["red", "green", "blue"] | None = None
+    """One channel alone; by default one curve for all three."""
+    overwrite: bool = False
+    """Replace files that exist."""
+
+
+@dataclass(frozen=True)
+class Responses:
+    """List the camera responses that have a name, and what each is for."""
+
+    json: bool = False
+    """Print them as JSON."""
+
+
+def run_calibrate(asked: Calibrate) -> None:
+    """Measures and writes the curve."""
+    from ..field.exposure import seconds
+    from ..scene.stack import calibrate
+
+    times = None if asked.exposures is None else seconds(asked.exposures, "--exposures")
+    calibrate(asked.stack, times=times, channel=asked.channel, out=asked.out, overwrite=asked.overwrite)
+    print(f"{asked.out}: take it with --response {asked.out}; the plot is {asked.out.with_suffix('.png')}")
+
+
+def run_responses(asked: Responses) -> None:
+    """Prints the names and what they stand for."""
+    from . import response_names
+
+    names = response_names()
+    if asked.json:
+        print(json.dumps(names))
+        return
+    more = {"colour:NAME": "a camera's encoding of colour-science, such as colour:S-Log3", "FILE": "a curve: CSV, JSON, "
+            "EMoR, or FILE:INDEX of DoRF's curves; `sehdr-warp calibrate` makes one"}  # fmt: skip
+    for name, meaning in (names | more).items():
+        print(f"{name:<12}  {meaning}")

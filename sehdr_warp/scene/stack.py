@@ -1,0 +1,143 @@
+"""Exposure stacks: photos of one still scene at several times, and the camera's response that they tell."""
+
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import InputError
+from .capture import Shot
+from .exposure import with_exposure_times
+from .images import LDR_SUFFIXES, read_ldr
+from .names import list_images
+
+if TYPE_CHECKING:
+    from ..response import Response
+    from ..response.calibration import Calibration
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Photos of one still scene: their files, codes [H, W, 3] uint8 or uint16 each, and relative times, seconds."""
+
+    files: tuple[Path, ...]
+    codes: tuple[np.ndarray, ...]
+    times: tuple[float, ...]
+
+
+def read_stack(folder: Path | str, times: Sequence[float] | None = None) -> Stack:
+    """The stack in a folder of photos.
+
+    Args:
+        times: seconds, in the order of the files' names; by default exposures.json's, or EXIF's (which also counts ISO
+            and f-number).
+
+    Raises:
+        InputError: for a folder without photos, a photo without a time, or another number of times.
+    """
+    folder = Path(folder)
+    files = list_images(folder, LDR_SUFFIXES) if folder.is_dir() else []
+    if not files:
+        raise InputError(folder, "is no folder of photos", "give a folder of one scene at several exposure times")
+    if times is None:
+        shots = [Shot(file.stem, file, None, None) for file in files]
+        shots, known, notes = with_exposure_times(shots, folder)
+        if not known:
+            raise InputError(folder, "its photos state no exposure times", "give --exposures or an exposures.json")
+        for note in notes:
+            log.info(note)
+        times = [shot.exposure_time for shot in shots]
+    if len(times) != len(files):
+        raise InputError(folder, f"has {len(files)} photos, and {len(times)} times are given", "give one for each")
+    return Stack(tuple(files), tuple(read_ldr(file).pixels for file in files), tuple(map(float, times)))
+
+
+def calibrate(
+    stack: Stack | Path | str,
+    *,
+    times: Sequence[float] | None = None,
+    channel: str | None = None,
+    out: Path | str | None = None,
+    overwrite: bool = False,
+) -> "Response":
+    """The response of the camera that took an exposure stack (Debevec and Malik 1997); exposure 1 is white.
+
+    Args:
+        stack: a folder of photos, or what read_stack makes of one.
+        times: as read_stack takes them.
+        channel: "red", "green" or "blue" alone; by default one curve for all three.
+        out: a CSV file for the curve, which `response_by_name` reads; a plot goes beside it, with the suffix .png.
+
+    What it finds is logged: the residual, channels that clearly differ, photos that are off their times.
+
+    Raises:
+        InputError: for a stack that tells nothing, with the reason, or an existing file (unless overwrite).
+    """
+    from ..files import atomic_path, check_absent
+    from ..response.calibration import calibrate_codes
+
+    place = stack.files[0].parent if isinstance(stack, Stack) else Path(stack)
+    paths = [] if out is None else [Path(out), Path(out).with_suffix(".png")]
+    for path in paths:
+        check_absent(path, overwrite)
+    stack = stack if isinstance(stack, Stack) else read_stack(stack, times)
+    name = place.name if out is None else Path(out).stem
+    try:
+        found = calibrate_codes(stack.codes, stack.times, channel=channel, name=name)
+    except InputError as error:
+        raise InputError(place, *error.args[0].split(": ", 1)[1].split("; ", 1)) from None
+    _tell(found, stack, channel)
+    if paths:
+        with atomic_path(paths[1], overwrite) as picture:
+            _plot(found, stack, picture)
+        with atomic_path(paths[0], overwrite) as table:
+            rows = zip(found.response.decode(np.arange(256) / 255), range(256), strict=True)
+            lines = [f"{exposure:.9g},{code / 255:.9g}" for exposure, code in rows]
+            table.write_text("\n".join(["exposure,value", *lines, ""]), encoding="utf-8")
+    return found.response
+
+
+def _tell(found: "Calibration", stack: Stack, channel: str | None) -> None:
+    from ..response.calibration import CHANNELS, CHANNELS_DIFFER, WRONG_TIME
+
+    log.info("%d photos, residual %.3f stops", len(stack.files), found.residual)
+    spread = {name: value for name, value in zip(CHANNELS, found.channel_spread, strict=True) if value == value}
+    if channel is None and max(spread.values(), default=0.0) > CHANNELS_DIFFER:
+        said = ", ".join(f"{name} {value:.2f}" for name, value in spread.items())
+        log.warning("the channels' curves differ from the shared one, stops: %s; --channel takes one alone", said)
+    for file, offset in zip(stack.files, found.photo_offsets, strict=True):
+        if abs(offset) > WRONG_TIME:
+            log.warning("%s is %.2f stops %s than its time says", file.name, abs(offset), "brighter" if offset > 0 else "darker")
+
+
+def _plot(found: "Calibration", stack: Stack, path: Path) -> None:
+    """The curve over its samples: encoded value against stops from white."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    exposures, values = found.samples.T
+    axes.plot(np.log2(exposures), values * 255, ".", color="#9aa4ae", markersize=2, label="samples", rasterized=True)
+    codes = np.arange(1, 256)
+    axes.plot(np.log2(found.response.decode(codes / 255)), codes, color="#0072b2", linewidth=1.8, label="response")
+    axes.set_xlabel("exposure, stops from white")
+    axes.set_ylabel("8-bit code")
+    axes.set_xlim(left=max(axes.get_xlim()[0], -14))
+    axes.set_ylim(0, 260)
+    axes.grid(color="#e1e4e8", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    span = math.log2(max(stack.times) / min(stack.times))
+    axes.set_title(
+        f"{found.response.name}: {len(stack.files)} photos over {span:.1f} stops, residual {found.residual:.3f} stops",
+        loc="left",
+        fontsize=10,
+    )
+    axes.legend(frameon=False, loc="upper left", markerscale=4)
+    figure.savefig(path, dpi=140, facecolor="white", format="png")
