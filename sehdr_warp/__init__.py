@@ -22,6 +22,7 @@ _HOMES = {
     "output.report": ("write_report",),
     "response": ("Response", "response_by_name", "response_names"),
     "scene": ("Camera", "Scene", "View", "load_cameras", "load_scene"),
+    "scene.stack": ("calibrate",),
     "splatting": ("Rendering", "differentiable", "rasterize", "spherical_harmonics", "ssim"),
     "training.config": ("Config",),
     "training.config_files": ("load_config",),

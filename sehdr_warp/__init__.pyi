@@ -7,6 +7,7 @@ from .output.render_views import render_views
 from .output.report import write_report
 from .response import Response, response_by_name, response_names
 from .scene import Camera, Scene, View, load_cameras, load_scene
+from .scene.stack import calibrate
 from .splatting import Rendering, differentiable, rasterize, spherical_harmonics, ssim
 from .training.config import Config
 from .training.config_files import load_config
@@ -23,6 +24,7 @@ __all__ = [
     "Scene",
     "SehdrError",
     "View",
+    "calibrate",
     "differentiable",
     "evaluate",
     "load_cameras",

@@ -169,8 +169,10 @@ def _rising(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def _bends() -> np.ndarray:
-    """[254, 256] second derivatives of a curve, each with the root of its step, so that their squares sum to an integral.
-    They are over nearly the logit of the code: near black and white cameras' curves are almost straight on it."""
+    """[254, 256] second derivatives of a curve, each with the root of its step, so that squares sum to an integral.
+
+    They are over nearly the logit of the code: near black and white cameras' curves are almost straight on it.
+    """
     axis = np.log((_CODES + 1.0) / (280.0 - _CODES))
     slopes = np.diff(np.eye(256), axis=0) / np.diff(axis)[:, None]
     return np.diff(slopes, axis=0) / np.sqrt(0.5 * (axis[2:] - axis[:-2]))[:, None]

@@ -50,7 +50,7 @@ def run_responses(asked: Responses) -> None:
     if asked.json:
         print(json.dumps(names))
         return
-    more = {"colour:NAME": "a camera's encoding of colour-science, such as colour:S-Log3", "FILE": "a curve: CSV, JSON, "
-            "EMoR, or FILE:INDEX of DoRF's curves; `sehdr-warp calibrate` makes one"}  # fmt: skip
-    for name, meaning in (names | more).items():
+    names["colour:NAME"] = "a camera's encoding of colour-science, such as colour:S-Log3"
+    names["FILE"] = "a curve in CSV, JSON or EMoR's layout, FILE:INDEX of DoRF's; `sehdr-warp calibrate` makes one"
+    for name, meaning in names.items():
         print(f"{name:<12}  {meaning}")

@@ -113,7 +113,9 @@ def _tell(found: "Calibration", stack: Stack, channel: str | None) -> None:
         log.warning("the channels' curves differ from the shared one, stops: %s; --channel takes one alone", said)
     for file, offset in zip(stack.files, found.photo_offsets, strict=True):
         if abs(offset) > WRONG_TIME:
-            log.warning("%s is %.2f stops %s than its time says", file.name, abs(offset), "brighter" if offset > 0 else "darker")
+            log.warning(
+                "%s is %.2f stops %s than its time says", file.name, abs(offset), "brighter" if offset > 0 else "darker"
+            )
 
 
 def _plot(found: "Calibration", stack: Stack, path: Path) -> None:

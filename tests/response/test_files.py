@@ -131,12 +131,18 @@ def test_bad_json_is_refused(tmp_path, text):
     assert "SehdrError" in [each.__name__ for each in type(error.value).__mro__]
 
 
-def test_truncated_matlab_file(tmp_path):
+def test_damaged_matlab_files_end_no_more_than_their_reader(tmp_path):
+    from scipy.io import savemat
+
     path = tmp_path / "bad.mat"
-    for content in (b"", b"MATLAB 5.0 MAT-file" + b" " * 105 + b"\x00\x01IM\x0e\x00\x00\x00", b"\xff" * 300):
-        path.write_bytes(content)
-        with pytest.raises(InputError, match="bad.mat"):
+    savemat(path, {"B": np.array([["a", "b"]]), "I": np.eye(2)})
+    for content in (b"MATLAB 5.0 MAT-file" + b" " * 105 + b"\x00\x01IM\x0e\x00\x00\x00", b"\xff" * 300, None):
+        if content is not None:
+            path.write_bytes(content)
+        with pytest.raises(InputError, match="bad.mat: is not a DoRF file") as error:
             response_by_name(f"{path}:0")
+        assert "\n" not in str(error.value)
+        savemat(path, {"B": np.array([["a", "b"]]), "I": np.eye(2)})
 
 
 def test_noise_is_made_monotone_and_noted():

@@ -123,5 +123,5 @@ def test_learns_another_curve():
 
 
 def test_a_learned_response_is_refused():
-    with pytest.raises(SehdrError, match="mlp"):
+    with pytest.raises(SehdrError, match="learned"):
         RefinedResponse(ToneMapper(4))

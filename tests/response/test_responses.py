@@ -48,7 +48,6 @@ FORMULAE = {
     "srgb": lambda x: x * 12.92 if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055,
     "rec709": lambda x: 4.5 * x if x < 0.018 else 1.099 * x**0.45 - 0.099,
     "hdr-nerf": lambda x: (x / (1 + x)) ** (1 / 2.2),
-    "hdr-nerf": lambda x: (x / (1 + x)) ** (1 / 2.2),
     "filmic": lambda x: srgb(hable(x) / hable(11.2)),
     "aces": lambda x: srgb(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14)),
 }
@@ -203,6 +202,20 @@ def test_unknown_names_are_refused(name):
 def test_damaged_descriptions_are_refused(damage):
     with pytest.raises(SehdrError):
         Response.from_dict(damage)
+
+
+def test_names_are_listed_with_what_they_stand_for():
+    names = response_names()
+    assert "hdr-nerf" in names and all(len(meaning) > 10 for meaning in names.values())
+    assert response_by_name("reinhard-gamma").name == "hdr-nerf"
+    with pytest.raises(SehdrError, match="did you mean filmic"):
+        response_by_name("flimic")
+
+
+def test_a_response_says_what_gaussians_start_from(response):
+    encoded = np.array([0.004, 0.5, 0.99])
+    assert response.decodable and not response.learnable
+    np.testing.assert_allclose(response.start_exposures(encoded), np.maximum(response.decode(encoded), 1e-6))
 
 
 def test_integer_tensors_are_refused():

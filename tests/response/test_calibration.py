@@ -1,0 +1,118 @@
+"""Responses measured from exposure stacks: of known curves, of real cameras, and stacks that tell nothing."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+import sehdr_warp as sw
+from sehdr_warp.errors import InputError
+from sehdr_warp.response import response_by_name
+from sehdr_warp.response.calibration import calibrate_codes
+from sehdr_warp.scene.stack import read_stack
+
+CODES = np.arange(10, 246) / 255
+
+
+def light(seed=0, size=(96, 128)) -> np.ndarray:
+    """[H, W, 3] smooth radiance over some ten stops."""
+    field = gaussian_filter(np.random.default_rng(seed).normal(size=(*size, 3)), (5, 5, 0))
+    return np.exp(1.6 * field / field.std())
+
+
+def photograph(curve, radiance, times, noise=0.0, white=255) -> list[np.ndarray]:
+    rng, middle = np.random.default_rng(1), float(curve.decode(0.5))
+    values = [np.asarray(curve.encode(radiance * middle * time)) for time in times]
+    codes = [np.rint(value * white + rng.normal(size=value.shape) * noise).clip(0, white) for value in values]
+    return [each.astype(np.uint8 if white == 255 else np.uint16) for each in codes]
+
+
+def stops_off(response, truth) -> float:
+    """The largest difference over the well-exposed codes, stops, after one scale."""
+    difference = np.log2(response.decode(CODES)) - np.log2(truth.decode(CODES))
+    return float(abs(difference - difference.mean()).max())
+
+
+def write_stack(folder, photos, times=None):
+    folder.mkdir()
+    for number, photo in enumerate(photos):
+        Image.fromarray(photo).save(folder / f"{number}.png")
+    if times is not None:
+        listed = {f"{number}.png": time for number, time in enumerate(times)}
+        (folder / "exposures.json").write_text(json.dumps(listed))
+    return folder
+
+
+@pytest.mark.parametrize("name", ["srgb", "hdr-nerf", "camera", "linear"])
+@pytest.mark.parametrize("noise, times", [(0.0, (1 / 16, 1 / 4, 1, 4, 16)), (0.5, (1 / 8, 1, 8))])
+def test_a_known_curve_is_found(name, noise, times):
+    truth = response_by_name(name)
+    found = calibrate_codes(photograph(truth, light(), times, noise), times)
+    assert stops_off(found.response, truth) < 0.05
+    assert found.residual < 0.05 and max(found.channel_spread) < 0.05 and max(map(abs, found.photo_offsets)) < 0.05
+    decoded = found.response.decode(np.arange(256) / 255)
+    assert (np.diff(decoded) > 0).all() and decoded[255] == pytest.approx(1.0)
+
+
+def test_sixteen_bits_and_what_moved():
+    truth, times = response_by_name("srgb"), (0.25, 1.0, 4.0)
+    photos = photograph(truth, light(), times, white=65535)
+    assert stops_off(calibrate_codes(photos, times).response, truth) < 0.03
+    photos = photograph(truth, light(), times)
+    photos[1][20:40, 30:50] = 128  # Something stood there for one photo.
+    assert stops_off(calibrate_codes(photos, times).response, truth) < 0.06
+
+
+def test_channels_that_differ_and_wrong_times_are_said(tmp_path, caplog):
+    times = (0.25, 1.0, 4.0)
+    photos = photograph(response_by_name("srgb"), light(), times)
+    for photo, blue in zip(photos, photograph(response_by_name("filmic"), light(), times), strict=True):
+        photo[..., 2] = blue[..., 2]
+    folder = write_stack(tmp_path / "stack", photos, (0.25, 1.0, 6.0))
+    with caplog.at_level("INFO"):
+        response = sw.calibrate(folder, out=tmp_path / "camera.csv")
+    assert "the channels' curves differ" in caplog.text
+    again = response_by_name(tmp_path / "camera.csv")
+    np.testing.assert_allclose(again.decode(CODES), response.decode(CODES), rtol=1e-6)
+    assert Image.open(tmp_path / "camera.png").width > 500
+    with pytest.raises(InputError, match="exists already"):
+        sw.calibrate(folder, out=tmp_path / "camera.csv")
+    assert stops_off(sw.calibrate(folder, times=times, channel="red"), response_by_name("srgb")) < 0.05
+
+
+def test_useless_stacks_get_one_line(tmp_path):
+    curve, times = response_by_name("srgb"), (0.25, 1.0, 4.0)
+    good = photograph(curve, light(), times)
+    moved = [np.roll(photo, 25 * number, axis=1) for number, photo in enumerate(good)]
+    black = [np.zeros((64, 64, 3), np.uint8)] * 3
+    for place, (photos, given, words) in enumerate((
+        (good[:1], times[:1], "no exposure stack"),
+        (good, (1.0, 1.0, 1.0), "same exposure time"),
+        (good, times[::-1], "darker than one of shorter"),
+        (moved, times, "contradict each other"),
+        (black, times, "hardly a pixel is well exposed"),
+        ([*good[:2], good[2][:50]], times, "differ in size"),
+        (good, None, "state no exposure times"),
+    )):  # fmt: skip
+        folder = write_stack(tmp_path / str(place), photos, given)
+        with pytest.raises(InputError, match=words) as error:
+            sw.calibrate(folder, out=tmp_path / "camera.csv")
+        assert str(folder) in str(error.value) and "\n" not in str(error.value)
+    assert not (tmp_path / "camera.csv").exists()
+    with pytest.raises(InputError, match="no folder of photos"):
+        sw.calibrate(tmp_path)
+    with pytest.raises(InputError, match="2 times are given"):
+        sw.calibrate(folder, times=(1, 2))
+
+
+@pytest.mark.parametrize("name", ["frobisher", "library_window_sonyA6000"])
+def test_real_cameras(shared, name):
+    """The photos agree, channels do too, half of many photos tells what all tell, and no camera is sRGB."""
+    stack = read_stack(shared / "data" / "stacks" / name)
+    found = calibrate_codes(stack.codes, stack.times)
+    assert found.residual < 0.1 and max(found.channel_spread) < 0.1
+    if len(stack.times) > 5:
+        assert stops_off(calibrate_codes(stack.codes[::2], stack.times[::2]).response, found.response) < 0.3
+    assert stops_off(found.response, response_by_name("srgb")) > 0.8
