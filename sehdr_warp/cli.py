@@ -251,9 +251,7 @@ def _scene_of(run, data: str | None):
 def _curve_of(run):
     """The response that the photos of the training were developed with: a learned one was not known then."""
     options = run.config.response
-    if options.form == "mlp":
-        return "learned"
-    return run.response.start if options.refine else run.response
+    return "learned" if options.name == "learned" else run.response
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp import __version__, cli
-from sehdr_warp.response import RefinedResponse, response_by_name
+from sehdr_warp.response import response_by_name
 from sehdr_warp.scene.images import read_hdr, read_ldr
 from sehdr_warp.training.config import ResponseConfig
 
@@ -250,8 +250,6 @@ def test_a_run_is_judged_by_photos_scaled_as_those_it_was_trained_on():
     # Chosen after the photos were read, so they were scaled by load_scene's own curve.
     assert curves(ResponseConfig(name="auto"), srgb) == {}
     assert curves(ResponseConfig(name="srgb"), srgb) == {"decode": srgb.decode, "encode": srgb.encode}
-    corrected = curves(ResponseConfig(name="srgb", refine=True), RefinedResponse(srgb))
-    assert corrected == {"decode": srgb.decode, "encode": srgb.encode}
 
 
 @pytest.mark.parametrize("kind", ["hdr", "ldr"])

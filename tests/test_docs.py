@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 import tyro
 from packaging.requirements import Requirement
+from pydantic import BaseModel
 
 import sehdr_warp
 from sehdr_warp import cli
@@ -96,10 +97,9 @@ def flags_of(kind):
 
 def fields_of(config, prefix=""):
     """Dotted names of all choices of a training."""
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        nested = dataclasses.is_dataclass(value)
-        yield from fields_of(value, f"{prefix}{field.name}.") if nested else [prefix + field.name]
+    for name, value in config:
+        nested = isinstance(value, BaseModel)
+        yield from fields_of(value, f"{prefix}{name}.") if nested else [prefix + name]
 
 
 @soon

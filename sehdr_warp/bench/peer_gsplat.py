@@ -30,8 +30,7 @@ def train_with_gsplat(
 ) -> dict:
     """Train on a scene's training views as a config of the preset `3dgs` says and measure the held-out ones.
 
-    config: iterations, thresholds, losses and learning rates are taken from it; iteration numbers are read as they
-        stand, so schedule.stated_for must equal schedule.iterations.
+    config: iterations, thresholds, losses and learning rates are taken from it.
     resets: reset the opacities every densification.reset_every iterations, as 3DGS does. gsplat 1.5.3 as released
         never does: its condition is `step % reset_every == 0 & step > 0`, and & binds before the comparisons.
     steps: stop after so many iterations, to warm up.
@@ -56,8 +55,6 @@ def train_with_gsplat(
         torch.tensor(scene.points, dtype=torch.float32),
         torch.tensor(start_colours(scene.point_colors, "display", None), dtype=torch.float32),
         config.model.harmonics_degree,
-        opacity=config.model.initial_opacity,
-        scale=config.model.initial_scale,
     )
     values = {
         "means": (start.means, rates.means * extent),
@@ -81,10 +78,10 @@ def train_with_gsplat(
         grow_grad2d=densification.grow_gradient,
         grow_scale3d=densification.grow_scale,
         prune_scale3d=densification.prune_scale,
-        refine_start_iter=densification.start,
-        refine_stop_iter=densification.stop,
-        refine_every=densification.every,
-        reset_every=densification.reset_every,
+        refine_start_iter=config.scaled(densification.start),
+        refine_stop_iter=config.scaled(densification.stop),
+        refine_every=config.scaled(densification.every),
+        reset_every=config.scaled(densification.reset_every),
         verbose=False,
     )
     strategy.check_sanity(params, optimizers)
@@ -105,10 +102,11 @@ def train_with_gsplat(
             sh_degree=degree,
             packed=False,
             rasterize_mode="antialiased" if config.model.antialiased else "classic",
-            eps2d=config.model.low_pass,
+            eps2d=LOW_PASS,
         )
         return image[0], info
 
+    harmonics_every = config.scaled(schedule.harmonics_every)
     order, generator = [], torch.Generator().manual_seed(config.seed)
     iterations = steps or schedule.iterations
     torch.cuda.synchronize(device)
@@ -116,7 +114,7 @@ def train_with_gsplat(
     for step in range(iterations):
         order = order or torch.randperm(len(views), generator=generator).tolist()
         pose, intrinsics, photo, mask = views[order.pop()]
-        degree = min(step // schedule.harmonics_every, config.model.harmonics_degree)
+        degree = min(step // harmonics_every, config.model.harmonics_degree)
         image, info = render(pose, intrinsics, photo.shape[1], photo.shape[0], degree)
         strategy.step_pre_backward(params, optimizers, state, step, info)
         loss = image_loss(image, photo, mask, config.loss.form, config.loss.ssim_weight)
@@ -126,7 +124,7 @@ def train_with_gsplat(
             optimizer.zero_grad(set_to_none=True)
         decay.step()
         strategy.step_post_backward(params, optimizers, state, step, info, packed=False)
-        if resets and 0 < step < densification.stop and step % densification.reset_every == 0:
+        if resets and 0 < step < strategy.refine_stop_iter and step % strategy.reset_every == 0:
             reset_opa(params, optimizers, state, value=2 * densification.prune_opacity)
     torch.cuda.synchronize(device)
     seconds = time.perf_counter() - started

@@ -12,7 +12,7 @@ from pathlib import Path
 from ..errors import InputError, SehdrError
 from ..files import write_json
 from ..scene import embedded_folder, is_embedded
-from ..training.config import Config
+from ..training.config import REFERENCE_ITERATIONS, Config
 from ..training.config_files import config_to_dict, load_config, override_config
 from .methods import Method
 
@@ -122,12 +122,12 @@ def plan_jobs(settings: Settings, *, progress: Callable[[str], None] = lambda li
     ):
         config = configs[method.name, iterations, seed]
         told = [name for name in settings.responses if name == "known" or method.blind]
-        learned = config.response.form == "mlp"
+        learned = config.response.name == "learned"
         if response not in (told[:1] if learned else told):
             continue
         response = LEARNED if learned else response
         name = curve if response == "known" else "auto"
-        changes, files = {"response.name": name}, {}
+        changes, files = {} if learned else {"response.name": name}, {}
         if settings.predictor is not None and config.loss.predictor:
             place_of = {"{scene}": scenes[place]["name"], "{exposure}": str(exposure)}
             predictor = reduce(lambda text, item: text.replace(*item), place_of.items(), settings.predictor)
@@ -178,10 +178,12 @@ def _config(method: Method, iterations: int | None, seed: int) -> Config:
         # What a variant or --iterations states is no plan's to change.
         stated = [path for path in (*method.overrides, *overrides) if not path.startswith("plan.")]
         config = override_config(config, {"plan.keep": sorted({*config.plan.keep, *stated})}, method.preset)
-    schedule = config.schedule
-    steps = (schedule.stated_for * FIRST_TEST ** (-k / (TESTS - 1)) for k in range(TESTS))
+    steps = (REFERENCE_ITERATIONS * FIRST_TEST ** (-k / (TESTS - 1)) for k in range(TESTS))
     stated = sorted({max(1, round(step)) for step in steps})
-    times = {"schedule.evaluate_at": stated, "schedule.checkpoint_every": max(schedule.stated_for, schedule.iterations)}
+    times = {
+        "schedule.evaluate_at": stated,
+        "schedule.checkpoint_every": max(REFERENCE_ITERATIONS, config.schedule.iterations),
+    }
     return override_config(config, times, method.preset)
 
 

@@ -16,7 +16,7 @@ from ..evaluation.evaluate import evaluate
 from ..response import response_by_name
 from ..scene import Scene, load_scene
 from ..synth.expose import SensorNoise, expose, exposure_ladder
-from ..training.config import Config
+from ..training.config import REFERENCE_ITERATIONS, Config
 from ..training.config_files import config_from_dict, override_config
 from ..training.plan import apply_plan
 from ..training.train import train
@@ -94,12 +94,12 @@ class Runner:
 
     def _warm_up(self, method: dict, scene: Scene, config: Config, folder: Path) -> None:
         # What is compiled depends on the shape of the computation, not on seeds, rates or lengths.
-        parts = config.model, config.response.form, config.fusion, config.loss, config.densification.strategy
-        shape = repr((*parts, config.optimizer.visible_only, config.densification.contribution > 0))
+        learned = config.response.name == "learned"
+        shape = repr((config.model, learned, config.fusion, config.loss, config.densification.strategy))
         if shape in self._warm:
             return
         count = min(WARM_UP_ITERATIONS, config.schedule.iterations)
-        overrides = {"schedule.iterations": count, "schedule.evaluate_at": [config.schedule.stated_for]}
+        overrides = {"schedule.iterations": count, "schedule.evaluate_at": [REFERENCE_ITERATIONS]}
         scratch = folder / "warm-up"
         try:
             shutil.rmtree(scratch, ignore_errors=True)

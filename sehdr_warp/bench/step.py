@@ -88,14 +88,10 @@ def bench_step(
 
 
 def thick_of_training(config: Config) -> int:
-    """The first iteration, a multiple of the densification's interval, from which on harmonics, resolution and
-    densification are at their full cost."""
+    """The first iteration, a multiple of the densification's interval, from which on harmonics and densification
+    are at their full cost."""
     schedule, densification = config.schedule, config.densification
-    ready = max(
-        config.model.harmonics_degree * schedule.harmonics_every,
-        schedule.coarse_levels * schedule.coarse_every,
-        densification.start,
-    )
+    ready = max(config.model.harmonics_degree * schedule.harmonics_every, densification.start)
     every = config.scaled(densification.every)
     return -(-(config.scaled(ready) + 1) // every) * every
 

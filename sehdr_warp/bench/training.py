@@ -9,7 +9,7 @@ import torch
 
 from ..errors import InputError
 from ..scene import Scene
-from ..training.config import Config
+from ..training.config import Config, stated
 from ..training.config_files import config_to_dict, load_config
 from ..training.train import train
 from .kernels import OURS
@@ -64,16 +64,22 @@ def bench_training(
 
 def plain_config(iterations: int, seed: int) -> Config:
     """The preset `3dgs` for so many iterations, with 3DGS's iteration numbers unscaled."""
+    numbers = {
+        "schedule.evaluate_at": [stated(iterations, iterations)],
+        "schedule.checkpoint_every": stated(iterations, iterations),
+        "schedule.harmonics_every": stated(1000, iterations),
+        "densification.start": stated(500, iterations),
+        # 3DGS densifies while iteration < 15000: neither a change nor a reset falls on 15000 itself.
+        "densification.stop": stated(15_000, iterations),
+        "densification.every": stated(100, iterations),
+        "densification.reset_every": stated(3000, iterations),
+    }
     return load_config(
         "3dgs",
         {
             "seed": seed,
             "schedule.iterations": iterations,
-            "schedule.stated_for": iterations,
-            "schedule.evaluate_at": [iterations],
-            "schedule.checkpoint_every": iterations,
-            # 3DGS densifies while iteration < 15000: neither a change nor a reset falls on 15000 itself.
-            "densification.stop": 15_000,
+            **numbers,
         },
     )
 
@@ -109,10 +115,10 @@ def _warm_up(scene: Scene, config: Config, device: torch.device) -> None:
     gsplat's are warmed in the same way."""
     trainer = make_trainer(scene, config, device, 0)
     for degree in range(config.model.harmonics_degree + 1):
-        trainer.iteration = degree * config.schedule.harmonics_every
+        trainer.iteration = degree * config.scaled(config.schedule.harmonics_every)
         for _ in range(WARM_UP_STEPS // 4 if device.type == "cuda" else 1):
             trainer.step()
-    trainer.iteration = thick_of_training(config) + config.densification.every - 1
+    trainer.iteration = thick_of_training(config) + config.scaled(config.densification.every) - 1
     trainer.step()
 
 

@@ -85,21 +85,24 @@ def _zero_radiance(device):
     """The logarithm of zero radiance: a black photo as a start, and fusion of log 0 = -infinity."""
     from ..field.radiance_field import EXPOSURE_FLOOR
 
-    fusion = _fusion(0.2)
+    fusion = _fusion(0.2).to(device)
     logs = torch.tensor([[-math.inf] * 3, [-200.0] * 3, [math.log(EXPOSURE_FLOOR)] * 3])
     wrong = 0
-    for evaluation in ("exact", "tabulated"):
-        fusion.evaluation = evaluation
-        wrong += not_finite(fusion.to(device)(logs.to(device)))
+    for evaluate in (fusion.exact, fusion.tabulated):
+        wrong += not_finite(evaluate(logs.to(device)))
     decoded = torch.cat([response_by_name(name).decode(torch.zeros(1, device=device)) for name in CURVES])
     floored = decoded.clamp_min(EXPOSURE_FLOOR).log()
     return [count("not finite in fusion", wrong), count("not finite in the start's logarithm", not_finite(floored))]
 
 
+class _Exact(NeuralExposureFusion):
+    """The fusion by its equations, without the table."""
+
+    forward = NeuralExposureFusion.exact
+
+
 def _fusion(sigma: float) -> NeuralExposureFusion:
-    return NeuralExposureFusion(
-        response_by_name("srgb"), (1 / 8, 1 / 4, 1.0, 8.0, 16.0), 1.0, width=16, sigma=sigma, evaluation="exact"
-    )
+    return _Exact(response_by_name("srgb"), (1 / 8, 1 / 4, 1.0, 8.0, 16.0), 1.0, width=16, sigma=sigma)
 
 
 def _fused(fusion: NeuralExposureFusion):
@@ -184,7 +187,7 @@ def _photos(device):
 
 def _loss(prediction, target: Target):
     """The training's loss between encoded values of a simulated photo [H, W, 3]."""
-    return ldr_loss(SimpleNamespace(encoded=prediction), target, LossConfig(domain="encoded"))
+    return ldr_loss(SimpleNamespace(encoded=prediction, light=None), target, LossConfig())
 
 
 def _similarity(device):

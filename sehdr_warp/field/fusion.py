@@ -24,6 +24,7 @@ from .exposure import bracket_log_radiance, exposure_times
 # The table spans, for every bracket, exposures from where the encoded value is this far above black (a four-hundredth
 # of an 8-bit code) to this many octaves above white, where only the response's extension is left: a line in the log.
 DARKEST_VALUE, OCTAVES_ABOVE_WHITE = 1e-5, 6.0
+NODES = 1024
 # Gaussians evaluated together by the exact form: bounds its memory to some 100 MB at width 128 and 5 brackets.
 EXACT_CHUNK = 16384
 # Limits inside which exp(-z^2 / 2) and its gradient are finite in float32, for any sigma.
@@ -34,20 +35,18 @@ class NeuralExposureFusion(nn.Module):
     """NeEF: c^h = radiance_scale * sum_p w_p f(c^{l_p}), w = softmax over p of MLP_c(gamma_p, f(c^{l_p})) gamma_p.
 
     gamma = exp(-(f(c^{l_p}) - 0.5)^2 / (2 sigma_c^2)), sigma_c learnable for each channel, and one MLP a channel:
-    2 -> width -> ... -> 1 with ReLU between and no function at the end.
+    2 -> width -> 1 with ReLU between and no function at the end.
 
     response: f. Used with its extension beyond the clip point, so that f, and with it the result, may pass 1 there.
     times: n exposure times in seconds; base_time: dt_1.
-    width, hidden_layers: of each MLP. 128 and 1 are those of HDR-GS's tone mapper.
-    sigma: initial standard deviation, > 0.
-    evaluation: "exact" applies the equations to every Gaussian; "tabulated" to `nodes` values of the log radiance, with
-        cubic (Catmull-Rom) interpolation between them.
-    radiance_scale: what the fused value, which is at most 1, is multiplied by; "white" is response.white / base_time,
-        the radiance that the photo shows as white.
+    radiance_scale: what the fused value, which is at most 1, is multiplied by; > 0.
     seed: of the MLPs' initial weights.
+    width: hidden units of each MLP, as in HDR-GS's tone mapper. sigma: initial standard deviation.
 
+    forward() applies the equations to NODES values of the log radiance, with cubic (Catmull-Rom) interpolation between
+    them; exact() to every Gaussian.
     Parameters: log_sigma [3]; weights and biases, one stack over the three channels for each layer. All state is in
-    state_dict(). Raises SehdrError for a parameter out of range.
+    state_dict(). Raises SehdrError for times or a scale that are not positive.
     """
 
     def __init__(
@@ -56,29 +55,20 @@ class NeuralExposureFusion(nn.Module):
         times: Sequence[float],
         base_time: float,
         *,
-        width: int = 128,
-        hidden_layers: int = 1,
-        sigma: float = 0.2,
-        evaluation: str = "tabulated",
-        nodes: int = 1024,
-        radiance_scale: float | str = 1.0,
+        radiance_scale: float = 1.0,
         seed: int = 0,
+        width: int = 128,
+        sigma: float = 0.2,
     ):
         super().__init__()
-        for field, value, least in (("width", width, 1), ("hidden_layers", hidden_layers, 1), ("nodes", nodes, 16)):
-            if value < least:
-                raise SehdrError(f"fusion: {field} = {value} is less than {least}; raise it")
-        if not (math.isfinite(sigma) and sigma > 0):
-            raise SehdrError(f"fusion: sigma = {sigma} is not positive; the paper starts at 0.2")
-        if evaluation not in ("exact", "tabulated"):
-            raise SehdrError(f"fusion: evaluation = {evaluation!r} is neither 'exact' nor 'tabulated'")
+        if not (math.isfinite(radiance_scale) and radiance_scale > 0):
+            raise SehdrError(f"fusion: radiance_scale = {radiance_scale!r} is not positive")
         self.response = response
         self.times = exposure_times(base_time, [f"{float(time)!r}s" for time in times])
         (self.base_time,) = exposure_times(base_time, ("base",))
-        self.evaluation, self.nodes = evaluation, nodes
-        self.radiance_scale = _radiance_scale(radiance_scale, response, self.base_time)
+        self.radiance_scale = radiance_scale
         self.log_sigma = nn.Parameter(torch.full((3,), math.log(sigma)))
-        self.weights, self.biases = _channel_layers([2, *[width] * hidden_layers, 1], seed)
+        self.weights, self.biases = _channel_layers([2, width, 1], seed)
         brackets = [math.log(time / self.base_time) for time in self.times]
         self._low = math.log(response.decode(response.black + DARKEST_VALUE)) - max(brackets)
         self._kept_nodes = {}
@@ -86,8 +76,10 @@ class NeuralExposureFusion(nn.Module):
 
     def forward(self, log_base: torch.Tensor) -> torch.Tensor:
         """[N, 3] scene-linear radiance c^h from [N, 3] log c^{l_1}, the log of the radiance at the input exposure."""
-        if self.evaluation == "tabulated":
-            return self._interpolate(log_base)
+        return self.tabulated(log_base)
+
+    def exact(self, log_base: torch.Tensor) -> torch.Tensor:
+        """As forward, by the equations themselves for every Gaussian: what the table stands for."""
         if not torch.is_grad_enabled() or len(log_base) <= EXACT_CHUNK:
             return torch.cat([self._fuse(part) for part in log_base.split(EXACT_CHUNK)])
         return torch.cat([checkpoint(self._fuse, part, use_reentrant=False) for part in log_base.split(EXACT_CHUNK)])
@@ -122,16 +114,16 @@ class NeuralExposureFusion(nn.Module):
             values = torch.matmul(values.relu() if layer else values, weight[:, None]) + bias[:, None]
         return values[..., 0].permute(1, 2, 0)
 
-    def _interpolate(self, log_base):
-        """Catmull-Rom between the table's nodes; constant below them, a straight line in log radiance above."""
-        step = (self._high - self._low) / (self.nodes - 1)
+    def tabulated(self, log_base: torch.Tensor) -> torch.Tensor:
+        """As forward: Catmull-Rom between the table's nodes; constant below them, a straight line in log radiance above."""
+        step = (self._high - self._low) / (NODES - 1)
         plain = log_base.dtype != torch.float32 or torch.are_deterministic_algorithms_enabled()
         on_gpu = log_base.device.type == "cuda" and not plain
         table = self._table(log_base, step, on_gpu)
         if on_gpu:
             return interpolate(table, self._low, step, log_base)
         position = ((log_base - self._low) / step).clamp_min(0.0)
-        cell = position.detach().nan_to_num(0.0).clamp_max(self.nodes - 2).long()
+        cell = position.detach().nan_to_num(0.0).clamp_max(NODES - 2).long()
         part = position - cell
         before, left, right, after = (table.gather(0, cell + offset) for offset in range(4))
         slope_left, slope_right = 0.5 * (right - before), 0.5 * (after - left)
@@ -145,7 +137,7 @@ class NeuralExposureFusion(nn.Module):
     def _table(self, like, step, on_gpu):
         """[nodes + 2, 3] the fused values at the table's nodes."""
         encoded = self._encoded_at_nodes(like, step)
-        if on_gpu and not encoded.requires_grad and len(self.weights) == 2:
+        if on_gpu and not encoded.requires_grad:
             layers = (part for layer in zip(self.weights, self.biases, strict=True) for part in layer)
             limits = {"log_sigma_limit": MAX_LOG_SIGMA, "deviation_limit": MAX_DEVIATION}
             return fuse_exposures(encoded, self.log_sigma, *layers, scale=self.radiance_scale, **limits)
@@ -157,20 +149,12 @@ class NeuralExposureFusion(nn.Module):
         if key in self._kept_nodes:
             return self._kept_nodes[key]
         # One node more at either end gives every cell its four.
-        grid = torch.arange(-1, self.nodes + 1, dtype=like.dtype, device=like.device) * step + self._low
+        grid = torch.arange(-1, NODES + 1, dtype=like.dtype, device=like.device) * step + self._low
         encoded = self._encode(grid[:, None].expand(-1, 3))
         # What is made while a step is recorded has no content before the first replay, and dies with the recording.
         if not isinstance(self.response, nn.Module) and not is_recording(like.device):
             self._kept_nodes[key] = encoded
         return encoded
-
-
-def _radiance_scale(scale: float | str, response: Response, base_time: float) -> float:
-    if scale == "white":
-        return response.white / base_time
-    if isinstance(scale, str) or not (math.isfinite(scale) and scale > 0):
-        raise SehdrError(f"fusion: radiance_scale = {scale!r} is neither positive nor 'white'")
-    return float(scale)
 
 
 def _channel_layers(sizes: list[int], seed: int) -> tuple[nn.ParameterList, nn.ParameterList]:

@@ -91,22 +91,6 @@ class Gaussians(nn.Module):
         for name in PARAMETER_NAMES:
             self._exchange(name, getattr(self, name).detach()[index], optimizer, lambda state: state[index])
 
-    def set_degree(self, degree: int, optimizer: torch.optim.Optimizer | None = None) -> bool:
-        """Keeps the harmonics up to a degree, adding zeros for those that are missing, with their optimizer state;
-        whether that changed anything."""
-        columns = (degree + 1) ** 2 - 1
-        missing = columns - self.harmonics_rest.shape[1]
-        if missing == 0:
-            return False
-
-        def resized(values: Tensor) -> Tensor:
-            if missing < 0:
-                return values[:, :columns].contiguous()
-            return torch.cat([values, values.new_zeros(len(values), missing, 3)], dim=1)
-
-        self._exchange("harmonics_rest", resized(self.harmonics_rest.detach()), optimizer, resized)
-        return True
-
     def append(self, rows: dict[str, Tensor], optimizer: torch.optim.Optimizer | None = None) -> None:
         """Adds M Gaussians, given as by rows(); their optimizer state starts at zero."""
         for name in PARAMETER_NAMES:

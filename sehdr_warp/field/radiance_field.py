@@ -18,8 +18,6 @@ from .gaussians import HARMONIC_0, Gaussians
 
 EXPOSURE_FLOOR = 1e-6
 """Least exposure of a Gaussian with radiance "linear": keeps logarithms finite, 100 times below 8-bit black in sRGB."""
-RELATIVE_FLOOR = 1e-3
-"""Least part of its constant exposure that a Gaussian with radiance "log-chroma" shows in any direction."""
 LOG_EXPOSURE_LIMIT = 40.0
 """Log exposures are held within this: exp stays finite in float32, even squared and summed over a pixel."""
 
@@ -83,8 +81,7 @@ class RadianceField(nn.Module):
 
     base_time: dt_1, seconds. Colours are exposures x = E dt_1 (the paper's c^{l_1}), so that their size, and with it
         the learning rates, does not depend on the unit of time.
-    radiance: "log": x = exp(SH(d)); "linear": x = SH(d), kept positive; "log-chroma": x = exp(SH_0) (1 + SH_rest(d)),
-        kept positive; "display": encoded = max(SH(d) + 0.5, 0).
+    radiance: "log": x = exp(SH(d)); "linear": x = SH(d), kept positive; "display": encoded = max(SH(d) + 0.5, 0).
     tone_map: "pixel": f(sum of weighted x); "gaussian": sum of weighted f(x), as the paper composites.
     fusion: the paper's brackets and their fusion, at the same base time; without, the HDR colour is the base colour.
     confidence: [N] in [0, 1] of a trained scene, how far its photos vouch for each Gaussian (model/confidence.py); None
@@ -101,7 +98,6 @@ class RadianceField(nn.Module):
         tone_map: str = "pixel",
         fusion: NeuralExposureFusion | None = None,
         antialiased: bool = False,
-        low_pass: float = 0.3,
         style: BlendStyle = BlendStyle(),
     ):
         super().__init__()
@@ -112,7 +108,6 @@ class RadianceField(nn.Module):
         self.radiance = radiance
         self.tone_map = tone_map
         self.antialiased = antialiased
-        self.low_pass = low_pass
         self.style = style
         self.register_buffer("confidence", None, persistent=False)
 
@@ -124,17 +119,14 @@ class RadianceField(nn.Module):
         degree: int | None = None,
         also: frozenset[str] = frozenset(),
         capacity: int | None = None,
-        presence: Tensor | None = None,
         encode: bool = True,
     ) -> Photograph:
         """A photo of exposure_time seconds, harmonics up to `degree`; also: which of "exposure" and "base" are
         wanted, each a colour set more to render where the photo does not need it; capacity: as rasterize() takes it;
-        presence: [N] factors of the opacities; encode: False leaves a photo that has an exposure at that."""
+        encode: False leaves a photo that has an exposure at that."""
         ratio = exposure_time / self.base_time
         if self.radiance == "display":
-            rendering = self._rasterize(
-                camera, self._harmonics(camera, degree).add(0.5).clamp_min(0), capacity, presence
-            )
+            rendering = self._rasterize(camera, self._harmonics(camera, degree).add(0.5).clamp_min(0), capacity)
             return Photograph(self._reexpose(rendering.image, ratio), None, None, rendering)
         base, fused = self._exposures(camera, degree)
         sets = {"fused": fused}
@@ -144,7 +136,7 @@ class RadianceField(nn.Module):
         if "base" in also and self.fusion is not None:
             sets["base"] = base
         features = torch.cat(list(sets.values()), dim=1) if len(sets) > 1 else next(iter(sets.values()))
-        rendering = self._rasterize(camera, features, capacity, presence)
+        rendering = self._rasterize(camera, features, capacity)
         # Not split where it is one: the split's derivative would be a copy.
         parts = rendering.image.split(3, dim=2) if len(sets) > 1 else (rendering.image,)
         images = dict(zip(sets, parts, strict=True))
@@ -209,31 +201,18 @@ class RadianceField(nn.Module):
         coefficients = gaussians.harmonics_dc, gaussians.harmonics_rest
         return spherical_harmonics(used, coefficients, gaussians.means, camera.position)
 
-    def _log_constant(self) -> Tensor:
-        """[N, 3] what the harmonics of degree 0 say: a logarithm with radiance "log" and "log-chroma"."""
-        return (HARMONIC_0 * self.gaussians.harmonics_dc[:, 0]).clamp(-LOG_EXPOSURE_LIMIT, LOG_EXPOSURE_LIMIT)
-
-    def _relative_harmonics(self, camera: CameraTensors, degree: int | None) -> Tensor:
-        """[N, 3] 1 + SH_rest(d), how much brighter than the constant part each Gaussian is from here."""
-        gaussians = self.gaussians
-        used = gaussians.degree if degree is None else min(degree, gaussians.degree)
-        one = torch.full_like(gaussians.harmonics_dc, 1 / HARMONIC_0)
-        return spherical_harmonics(used, (one, gaussians.harmonics_rest), gaussians.means, camera.position)
-
     @torch.no_grad()
     def constant_exposures(self) -> Tensor:
         """[N, 3] exposure at the base time of each Gaussian by its harmonics of degree 0 alone."""
         constant = HARMONIC_0 * self.gaussians.harmonics_dc[:, 0]
         if self.radiance == "display":
             return self.response.decode((constant + 0.5).clamp(0, 1))
-        return constant.clamp_min(EXPOSURE_FLOOR) if self.radiance == "linear" else self._log_constant().exp()
+        if self.radiance == "linear":
+            return constant.clamp_min(EXPOSURE_FLOOR)
+        return constant.clamp(-LOG_EXPOSURE_LIMIT, LOG_EXPOSURE_LIMIT).exp()
 
     def _exposures(self, camera: CameraTensors, degree: int | None) -> tuple[Tensor, Tensor]:
         """Exposures at the base time of each Gaussian's base colour and of its HDR colour, [N, 3] each."""
-        if self.radiance == "log-chroma":
-            log_base = self._log_constant() + self._relative_harmonics(camera, degree).clamp_min(RELATIVE_FLOOR).log()
-            base = log_base.exp()
-            return base, base if self.fusion is None else self.fusion(log_base) * self.base_time
         value = self._harmonics(camera, degree)
         if self.radiance == "linear":
             base = value.clamp_min(EXPOSURE_FLOOR)
@@ -250,23 +229,19 @@ class RadianceField(nn.Module):
             return encoded
         return self.response.encode_extended(self.response.decode(encoded.clamp(0, 1)) * ratio)
 
-    def _rasterize(
-        self, camera: CameraTensors, features: Tensor, capacity: int | None = None, presence: Tensor | None = None
-    ) -> Rendering:
+    def _rasterize(self, camera: CameraTensors, features: Tensor, capacity: int | None = None) -> Rendering:
         gaussians = self.gaussians
-        opacities = gaussians.opacities() if presence is None else gaussians.opacities() * presence
         return rasterize(
             gaussians.means,
             gaussians.log_scales,
             gaussians.quaternions,
-            opacities,
+            gaussians.opacities(),
             features,
             camera.world_to_camera,
             camera.intrinsics,
             camera.width,
             camera.height,
             antialiased=self.antialiased,
-            low_pass=self.low_pass,
             capacity=capacity,
             style=self.style,
         )

@@ -7,10 +7,8 @@ from .analytic import DESCRIPTIONS, analytic_response
 from .curve import Response
 from .files import colour_response, response_from_file, responses_in_file
 from .learned import ToneMapper
-from .refined import RefinedResponse
 
 __all__ = [
-    "RefinedResponse",
     "Response",
     "ToneMapper",
     "response_by_name",

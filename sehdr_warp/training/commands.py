@@ -143,8 +143,7 @@ def _config(command: Train, resumed: bool):
 def developed_by(config) -> dict:
     """load_scene's choice of a response, as the config has it."""
     options = config.response
-    name = "learned" if options.form == "mlp" else options.name
-    return {"response": name, "method": options.method, "candidates": options.candidates}
+    return {"response": options.name, "method": options.method, "candidates": options.candidates}
 
 
 def _absolute(data: str) -> str:

@@ -1,16 +1,17 @@
 """Configs as files: TOML presets and overrides in, JSON beside the run out."""
 
+import difflib
 import json
 import reprlib
 import tomllib
-import types
-import typing
-from dataclasses import asdict, fields, is_dataclass
 from importlib import resources
 from pathlib import Path
 
+from pydantic import BaseModel, ValidationError
+
 from ..errors import InputError
-from .config import Config, ConfigError
+from .config import Config
+from .config_checks import ConfigError
 
 _LARGEST_FILE = 1 << 20
 _REMEDY = "correct the file; configs/default.toml lists every field"
@@ -61,7 +62,7 @@ def toml_value(text: str):
 
 def config_to_dict(config: Config) -> dict:
     """Plain nested values; config_from_dict reads them back exactly, through JSON as well."""
-    return asdict(config)
+    return config.model_dump()
 
 
 def config_from_dict(values: dict, source: Path | str = "config") -> Config:
@@ -153,42 +154,40 @@ def _merge(into: dict, values: dict) -> None:
 
 def _build(source: Path | str, values: dict) -> Config:
     try:
-        return _table(Config, values, "")
+        return Config.model_validate(_with_tuples(values))
+    except ValidationError as error:
+        problem = _problem(error.errors()[0])
     except ConfigError as error:
-        raise InputError(
-            source, str(error), "correct the value; configs/default.toml says what each field means"
-        ) from None
+        problem = str(error)
+    raise InputError(source, problem, "correct the value; configs/default.toml says what each field means")
 
 
-def _table(kind: type, values, prefix: str):
-    if not isinstance(values, dict):
-        raise ConfigError(f"{prefix.rstrip('.') or 'the config'} = {_shown(values)} is not a table")
-    hints = typing.get_type_hints(kind)
-    unknown = sorted(set(values) - set(hints))
-    if unknown:
-        raise ConfigError(f"unknown field {prefix}{unknown[0]} = {_shown(values[unknown[0]])}")
-    made = {}
-    for item in fields(kind):
-        if item.name in values:
-            hint, value, path = hints[item.name], values[item.name], prefix + item.name
-            made[item.name] = _table(hint, value, f"{path}.") if is_dataclass(hint) else _plain(hint, value, path)
-    return kind(**made)
+def _with_tuples(values):
+    """TOML's and JSON's lists as the tuples that a config holds."""
+    if isinstance(values, dict):
+        return {key: _with_tuples(value) for key, value in values.items()}
+    return tuple(map(_with_tuples, values)) if isinstance(values, list) else values
 
 
-def _plain(hint, value, path: str):
-    """A TOML or JSON value as the field's type; whole numbers are good for float fields, nothing else converts."""
-    if isinstance(hint, types.GenericAlias):
-        if not isinstance(value, list | tuple):
-            raise ConfigError(f"{path} = {_shown(value)} is not a list")
-        return tuple(_plain(typing.get_args(hint)[0], item, path) for item in value)
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        try:
-            return float(value)
-        except OverflowError:
-            raise ConfigError(f"{path} = {_shown(value)} is too large") from None
-    if type(value) is not hint:
-        raise ConfigError(f"{path} = {_shown(value)} is not of type {hint.__name__}")
-    return value
+def _problem(error: dict) -> str:
+    """One of pydantic's errors as `field = value: what is allowed`; of an unknown field, which known one is near."""
+    path = ".".join(str(part) for part in error["loc"] if isinstance(part, str)) or "the config"
+    value = f"{path} = {_shown(error['input'])}"
+    if error["type"] == "extra_forbidden":
+        near = difflib.get_close_matches(path, _paths(Config), 1)
+        return f"unknown field {value}" + (f"; did you mean {near[0]}?" if near else "")
+    return f"{value}: {error['msg'][0].lower()}{error['msg'][1:]}"
+
+
+def _paths(kind: type[BaseModel], prefix: str = "") -> list[str]:
+    """Dotted names of all tables and fields."""
+    found = []
+    for name, item in kind.model_fields.items():
+        inner = item.annotation
+        found.append(prefix + name)
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            found += _paths(inner, f"{prefix}{name}.")
+    return found
 
 
 def _shown(value) -> str:

@@ -10,16 +10,12 @@ import torch
 from torch import Tensor
 
 from ..field.gaussians import Gaussians
-from ..field.radiance_field import RadianceField
 from ..splatting import Rendering
 from ..splatting.training_step import add_gradient_statistics
 from .config import Config
 
 SPLIT_SHRINK = 1.6
 """The two halves of a split are this much smaller (3DGS: 0.8 times the number of halves)."""
-
-MOST_WEIGHT = 8.0
-"""Largest factor of slope_weights: beyond clipping the slope is 0, and noise would be all that is left to amplify."""
 
 SHORTEST_INTERVAL = 20
 """Iterations between changes are never fewer, however short the training: gradients need photos to be means of."""
@@ -47,18 +43,12 @@ class Densification:
     def prepare(self, count: int, device: torch.device | str) -> None:
         """Makes room for what observe() adds to."""
 
-    def observe(
-        self, rendering: Rendering, width: int, height: int, usable: Tensor, weights: Tensor | None = None
-    ) -> None:
-        """Takes note of a step's image gradients. usable: scalar tensor, 0 where the step is to be ignored; weights:
-        [N] factors of the gradients."""
+    def observe(self, rendering: Rendering, width: int, height: int, usable: Tensor) -> None:
+        """Takes note of a step's image gradients. usable: scalar tensor, 0 where the step is to be ignored."""
 
     def change(self, iteration: int, gaussians: Gaussians, optimizer: torch.optim.Optimizer, generator) -> bool:
         """Changes the Gaussians where this iteration is one for it; True if any tensor was replaced by another."""
         return False
-
-    def keep(self, kept: Tensor) -> None:
-        """Forgets the Gaussians that are taken away elsewhere. kept: [N] bool."""
 
     def perturb(self, iteration: int, gaussians: Gaussians, means_rate: float) -> None:
         """What happens to the positions after each step of the optimizer."""
@@ -91,11 +81,8 @@ class GradientDensification(Densification):
             self.gradient_sum, self.seen = torch.zeros(count, device=device), torch.zeros(count, device=device)
 
     @torch.no_grad()
-    def observe(
-        self, rendering: Rendering, width: int, height: int, usable: Tensor, weights: Tensor | None = None
-    ) -> None:
+    def observe(self, rendering: Rendering, width: int, height: int, usable: Tensor) -> None:
         gradient = rendering.means2d.grad
-        gradient = gradient if weights is None else gradient * weights[:, None]
         statistics = self.gradient_sum, self.seen
         add_gradient_statistics(gradient, rendering.radii, usable, width, height, *statistics)
 
@@ -110,10 +97,6 @@ class GradientDensification(Densification):
         if iteration < self.stop and iteration % self.reset_every == 0 and self.reset_every >= SHORTEST_RESET:
             self._reset_opacities(gaussians, optimizer)
         return changed
-
-    def keep(self, kept: Tensor) -> None:
-        if self.gradient_sum is not None:
-            self.gradient_sum, self.seen = self.gradient_sum[kept], self.seen[kept]
 
     @torch.no_grad()
     def _grow(self, gaussians: Gaussians, gradient: Tensor, optimizer, generator) -> None:
@@ -142,9 +125,6 @@ class GradientDensification(Densification):
         offsets = rotate(rows["quaternions"], normal * rows["log_scales"].exp())
         rows["means"] += offsets
         rows["log_scales"] -= math.log(SPLIT_SHRINK)
-        if self.options.revised_opacity:
-            opacity = 1 - torch.sqrt(1 - torch.sigmoid(rows["opacity_logits"]))
-            rows["opacity_logits"] = torch.logit(opacity, eps=1e-6)
         return rows
 
     @torch.no_grad()
@@ -168,22 +148,6 @@ class GradientDensification(Densification):
         self.gradient_sum, self.seen = state.get("gradient_sum"), state.get("seen")
 
 
-def slope_weights(field: RadianceField, ratio: float | Tensor) -> Tensor:
-    """[N] factors that give dark and bright Gaussians the image gradients of well-exposed ones.
-
-    A relative change of light moves the photo by x f'(x): little in the toe and on the shoulder of the response, so
-    gradients starve there whatever the scene needs (PhysHDR-GS, CVPR 2026, scales colour gradients for it). The factor
-    is the curve's steepest x f'(x) over the Gaussian's, both of its constant colour's mean exposure in the photo, at
-    most MOST_WEIGHT. ratio: exposure time of the photo over the base time.
-    """
-    response = field.response
-    grey = field.constant_exposures().mean(1) * ratio
-    codes = torch.linspace(0.02, 0.98, 49, device=grey.device)
-    middle = response.decode(codes)
-    steepest = (middle * response.slope(middle)).amax()
-    return (steepest / (grey * response.slope(grey)).clamp_min(1e-12)).clamp(1.0, MOST_WEIGHT)
-
-
 def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
     """Vectors [N, 3] turned by quaternions [N, 4] (w, x, y, z) of any length but zero."""
     unit = torch.nn.functional.normalize(quaternions, dim=1)
@@ -199,5 +163,4 @@ def make_densification(config: Config, extent: float, pixels: int) -> Densificat
 
     if config.densification.strategy == "relocation":
         return Relocation(config, extent, pixels)
-    kinds = {"gradient": GradientDensification, "none": Densification}
-    return kinds[config.densification.strategy](config, extent)
+    return GradientDensification(config, extent)

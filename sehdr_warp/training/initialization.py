@@ -8,13 +8,7 @@ from ..field.exposure import exposure_times
 from ..field.fusion import NeuralExposureFusion
 from ..field.gaussians import Gaussians
 from ..field.radiance_field import EXPOSURE_FLOOR, RadianceField
-from ..response import (
-    RefinedResponse,
-    Response,
-    ToneMapper,
-    response_by_name,
-    responses_named,
-)
+from ..response import Response, ToneMapper, response_by_name, responses_named
 from ..response.selection import select_response
 from ..scene import Scene, View
 from ..scene.exposure import made_by_camera
@@ -27,10 +21,6 @@ DEPTH_RANGE = (0.5, 3.0)
 """Depths of drawn points in units of the distance to where the cameras look. Nearer ones stay as veils before the
 cameras: on the embedded room a start at 0.15 costs 14 dB. Preferring points on whose colour the photos agree does not
 pay there."""
-
-FAR_RADIUS = 5.0
-"""Radius of the far shell over how far the scene reaches: parallax there is a fifth of the scene's."""
-
 
 MOST_JUDGED = 24
 """Photos that a response is chosen from, evenly spread: they give about as many edges as are looked at."""
@@ -55,13 +45,12 @@ def scene_extent(scene: Scene) -> float:
 
 
 def choose_response(scene: Scene, config: Config) -> Response:
-    """The response that the config names; for "auto" the candidate that fits the training photos best; with form "mlp"
-    one to be learned; with `refine` one to be corrected."""
-    options = config.response
-    if options.form == "mlp":
-        return ToneMapper(options.width, config.seed)
-    chosen = _selected(scene, config) if options.name == "auto" else response_by_name(options.name)
-    return RefinedResponse(chosen) if options.refine else chosen
+    """The response that the config names; for "auto" the candidate that fits the training photos best; for
+    "learned" one to be learned."""
+    name = config.response.name
+    if name == "learned":
+        return ToneMapper(seed=config.seed)
+    return _selected(scene, config) if name == "auto" else response_by_name(name)
 
 
 def _selected(scene: Scene, config: Config) -> Response:
@@ -88,20 +77,15 @@ def make_field(scene: Scene, config: Config, response: Response, device: torch.d
     check_scene(scene)
     rng = np.random.default_rng(config.seed)
     points, colours = (scene.points, scene.point_colors) if len(scene.points) else random_points(scene, config, rng)
-    budget = max(1, config.densification.max_gaussians - config.model.far_points)
+    budget = config.densification.max_gaussians
     if len(points) > budget:
         chosen = np.sort(rng.choice(len(points), budget, replace=False))
         points, colours = points[chosen], colours[chosen]
-    if config.model.far_points:
-        far, seen = far_points(scene, config.model.far_points, rng)
-        points, colours = np.concatenate([points, far]), np.concatenate([colours, seen])
     dc = start_colours(colours, config.model.radiance, response)
     gaussians = Gaussians.from_points(
         torch.tensor(points, dtype=torch.float32),
         torch.tensor(dc, dtype=torch.float32),
-        0 if config.schedule.harmonics_on_demand else config.model.harmonics_degree,
-        opacity=config.model.initial_opacity,
-        scale=config.model.initial_scale,
+        config.model.harmonics_degree,
     )
     return assemble_field(gaussians, config, response, base_exposure_time(scene)).to(device)
 
@@ -110,16 +94,11 @@ def assemble_field(gaussians: Gaussians, config: Config, response: Response, bas
     """Gaussians, response and a freshly seeded fusion as the config says."""
     fusion, options = None, config.fusion
     if options.enabled:
-        scales = {"unit": 1.0, "base": 1.0 / base_time, "white": "white"}
         fusion = NeuralExposureFusion(
             response,
             exposure_times(base_time, options.exposures),
             base_time,
-            width=options.width,
-            hidden_layers=options.hidden_layers,
-            sigma=options.sigma,
-            evaluation=options.evaluation,
-            radiance_scale=scales[options.radiance_scale],
+            radiance_scale=1.0 / base_time if options.radiance_scale == "base" else 1.0,
             seed=config.seed,
         )
     return RadianceField(
@@ -130,7 +109,6 @@ def assemble_field(gaussians: Gaussians, config: Config, response: Response, bas
         tone_map=config.model.tone_map,
         fusion=fusion,
         antialiased=config.model.antialiased,
-        low_pass=config.model.low_pass,
         style=BlendStyle(deterministic=config.deterministic),
     )
 
@@ -179,27 +157,6 @@ def random_points(scene: Scene, config: Config, rng: np.random.Generator) -> tup
         raise SehdrError(f"{scene.name}: no two training cameras look at the same place; check the poses")
     points, colours = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
     return points, colours
-
-
-def far_points(scene: Scene, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """At most `count` points [N, 3] evenly over the part of a far sphere that training cameras see, and their mean
-    encoded colours [N, 3]. Sparse points of motion hold no sky, and what is nearer would have to stand in for it.
-
-    The sphere's centre is the cameras' mean, its radius FAR_RADIUS times the farthest of the distance to the cameras'
-    focus, their spread, and the 90th percentile of the scene's points.
-    """
-    views = scene.train_views
-    positions = np.stack([view.camera.position for view in views])
-    centre = positions.mean(0)
-    reach = [focus_distance(views), float(np.linalg.norm(positions - centre, axis=1).max())]
-    if len(scene.points):
-        reach.append(float(np.quantile(np.linalg.norm(scene.points - centre, axis=1), 0.9)))
-    directions = rng.normal(size=(8 * count, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    points = centre + FAR_RADIUS * max(reach) * directions
-    seen, mean = colours_in_views(points, views)
-    chosen = np.flatnonzero(seen >= 1)[:count]
-    return points[chosen], mean[chosen]
 
 
 def focus_distance(views: tuple[View, ...]) -> float:

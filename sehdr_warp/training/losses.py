@@ -1,7 +1,7 @@
 """What a training minimises: photos against photos, exposures against exposures."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
@@ -9,8 +9,6 @@ from torch import Tensor
 
 from ..field.radiance_field import Photograph, RadianceField
 from ..response import Response, ToneMapper
-from ..response.curve import EXTENSION_SLOPE
-from ..response.refined import RefinedResponse
 from ..splatting.one_sided import seen_by_photo
 from ..splatting.ssim import image_distance, ssim
 from .config import LossConfig
@@ -19,8 +17,11 @@ CODE = 1 / 255
 """One step of an 8-bit photo."""
 MU = 5000.0
 """Of the mu-law in which HDR images are compared."""
-LOG_MU = 2.0**20
-"""Of the mu-law that is almost a logarithm, down to 20 stops below its unit."""
+KNEE = 8.0
+"""The code of 255 whose exposure is white / mu in the mu-law of photos: light below counts as light, above as its
+logarithm."""
+ANCHOR = 0.5
+"""What anchor_loss wants the unit exposure encoded as: the middle of the encoded range."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +32,6 @@ class Target:
     photo has none of them;
     mask: [H, W, 1] in [0, 1] or None; exposure_truth: [H, W, 3] true radiance times the base time, or None;
     light: [H, W, 3] exposures decoded from the photo, where they are kept for every step; None: decode them.
-    highlights: [4] stops over white that light is expected at where none (unused), one, two and three channels of a
-    pixel clip; None: nothing is expected.
     index: [1], int64, on the device; then photo is a stack [V, H, W, 3] that has the photo at this place.
     """
 
@@ -42,7 +41,6 @@ class Target:
     mask: Tensor | None
     exposure_truth: Tensor | None
     light: Tensor | None = None
-    highlights: Tensor | None = None
     index: Tensor | None = None
 
     @property
@@ -62,109 +60,69 @@ def values_of(photo: Tensor) -> Tensor:
     return photo if photo.dtype != torch.uint8 else photo / torch.full((), 255.0, device=photo.device)
 
 
-def one_sided(
-    prediction: Tensor, truth: Tensor, target: Target, lower: Tensor, upper: Tensor, interval: bool
-) -> Tensor:
+def one_sided(prediction: Tensor, truth: Tensor, target: Target, half_codes: tuple[float, float]) -> Tensor:
     """The prediction [H, W, 3] as far as the photo can tell: the truth, plus what lies outside of the bounds.
 
     A clipped pixel says `at least white less half a code`, so what is brighter equals it: without the half code a
     response that never quite reaches white would be pulled up for ever. A black pixel says `at most half a code`, so
-    what is darker equals it. With `interval` every other code too says no more than it does: between half a code less
-    and half a code more. truth, lower, upper: [H, W, 3], the photo and its bounds, in the prediction's domain.
+    what is darker equals it. truth: [H, W, 3], the photo in the prediction's domain; half_codes: there, of half a code
+    below white and above black.
     """
-    below, above = (prediction - lower).clamp_max(0), (prediction - upper).clamp_min(0)
-    seen = truth + below + above if interval else prediction
+    seen = prediction
     if target.clipped is not None:
-        seen = torch.where(target.clipped, truth + below, seen)
+        seen = torch.where(target.clipped, truth + (prediction - (truth - half_codes[0])).clamp_max(0), seen)
     if target.black is not None:
-        seen = torch.where(target.black, truth + above, seen)
+        seen = torch.where(target.black, truth + (prediction - (truth + half_codes[1])).clamp_min(0), seen)
     return seen
 
 
-def image_loss(
-    prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str, weight: float, *, similar: Tensor | None = None
-) -> Tensor:
+def image_loss(prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str, weight: float) -> Tensor:
     """L1 + weight (1 - SSIM) ("sum", SeHDR's equation 11) or (1 - weight) L1 + weight (1 - SSIM) ("blend", 3DGS).
 
     prediction, truth: [H, W, 3]; mask: [H, W, 1] or None: pixels outside count nothing in L1 and as equal in SSIM.
-    similar: [H, W, 3] that stands in the SSIM for the prediction.
     """
-    if weight and mask is None and similar is None and prediction.device.type == "cuda" and not truth.requires_grad:
+    if weight and mask is None and prediction.device.type == "cuda" and not truth.requires_grad:
         return image_distance(prediction, truth, 1.0 if form == "sum" else 1 - weight, weight)
-    similar = prediction if similar is None else similar
     if mask is not None:
-        prediction, truth, similar = prediction * mask, truth * mask, similar * mask
+        prediction, truth = prediction * mask, truth * mask
     difference = (prediction - truth).abs().mean()
     if mask is not None:
         difference = difference / mask.mean().clamp_min(1e-6)
     if weight == 0:
         return difference
-    dissimilarity = 1 - ssim(similar, truth)
+    dissimilarity = 1 - ssim(prediction, truth)
     return (difference if form == "sum" else (1 - weight) * difference) + weight * dissimilarity
 
 
 def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Response | None = None) -> Tensor:
-    """The photo against the simulated one, L_LDR: of encoded values, or with domain "mu-law" of exposures, for which
-    the response is needed. With `clipping` one-sided where the camera saturated; see also LossConfig.interval."""
-    bounds = None
-    if config.domain == "mu-law" or (config.domain == "auto" and _is_decodable(photo, response)):
-        known = known_response(response)
-        white, mu = known.white, mu_of_knee(known, config.knee)
-        light = _light(photo, response)
-        if config.interval == "off":
-            # Bounds count at white and at black alone, and there half a code is the same everywhere.
-            half_codes = _half_codes(known, mu)
-            photo_light = known.decode(target.encoded) if target.light is None else target.light
-            if config.clipping and light.device.type == "cuda":
-                masks = target.clipped, target.black
-                seen, truth = seen_by_photo(light, photo_light, *masks, white=white, mu=mu, half_codes=half_codes)
-                return image_loss(seen, truth, target.mask, config.form, config.ssim_weight)
-            truth = mu_law(photo_light, white, mu)
-        else:
-            encoded = target.encoded
-            codes = encoded, encoded - CODE / 2, encoded + CODE / 2
-            truth, *bounds = (mu_law(known.decode(image), white, mu) for image in codes)
-        prediction = mu_law(light, white, mu)
-    else:
+    """The photo against the simulated one, L_LDR: in the mu-law of exposures where pixels have one and the response is
+    known, else as encoded values. With `clipping` one-sided where the camera saturated."""
+    if photo.light is None or response is None or isinstance(response, ToneMapper):
         prediction, truth, half_codes = photo.encoded, target.encoded, (CODE / 2, CODE / 2)
-    if not config.clipping and config.interval == "off":
-        return image_loss(prediction, truth, target.mask, config.form, config.ssim_weight)
-    if bounds is None:
-        bounds = truth - half_codes[0], truth + half_codes[1]
-    bounded = target if config.clipping else replace(target, clipped=None, black=None)
-    seen = one_sided(prediction, truth, bounded, *bounds, config.interval != "off")
-    if config.interval != "difference" or config.ssim_weight == 0:
-        return image_loss(seen, truth, target.mask, config.form, config.ssim_weight)
-    similar = one_sided(prediction, truth, target, *bounds, False) if config.clipping else prediction
-    return image_loss(seen, truth, target.mask, config.form, config.ssim_weight, similar=similar)
+    else:
+        white, mu = response.white, mu_of_knee(response)
+        half_codes = _half_codes(response, mu)
+        photo_light = response.decode(target.encoded) if target.light is None else target.light
+        if config.clipping and photo.light.device.type == "cuda":
+            masks = target.clipped, target.black
+            seen, truth = seen_by_photo(photo.light, photo_light, *masks, white=white, mu=mu, half_codes=half_codes)
+            return image_loss(seen, truth, target.mask, config.form, config.ssim_weight)
+        prediction, truth = mu_law(photo.light, white, mu), mu_law(photo_light, white, mu)
+    seen = one_sided(prediction, truth, target, half_codes) if config.clipping else prediction
+    return image_loss(seen, truth, target.mask, config.form, config.ssim_weight)
 
 
 def compares_light(config: LossConfig, field: RadianceField) -> bool:
     """Whether ldr_loss decodes the photos of this field's training."""
     decodable = field.radiance != "display" and field.tone_map == "pixel" and not isinstance(field.response, ToneMapper)
-    return config.ldr_weight > 0 and (config.domain == "mu-law" or (config.domain == "auto" and decodable))
-
-
-def known_response(response: Response) -> Response:
-    """The curve by which photos are decoded, which does not change in a training: of a refined one its start."""
-    return response.start if isinstance(response, RefinedResponse) else response
-
-
-def _light(photo: Photograph, response: Response) -> Tensor:
-    """[H, W, 3] the photo's exposures; where the response is learned, those that its start curve would decode from the
-    simulated photo, so that the comparison also teaches the response."""
-    known = known_response(response)
-    if known is response:
-        return photo.light
-    surplus = (photo.encoded - known.peak).clamp_min(0)
-    return known.decode(photo.encoded) * torch.exp(surplus / EXTENSION_SLOPE)
+    return config.ldr_weight > 0 and decodable
 
 
 @lru_cache(maxsize=16)
-def mu_of_knee(response: Response, knee: float) -> float:
-    """The mu whose knee, white / mu, is the exposure of code `knee` of 255: the same place among the codes for any
+def mu_of_knee(response: Response) -> float:
+    """The mu whose knee, white / mu, is the exposure of code KNEE of 255: the same place among the codes for any
     curve, where one mu would leave all shadows of a curve that never clips below it."""
-    return response.white / max(float(response.decode(knee / 255)), 1e-12)
+    return response.white / max(float(response.decode(KNEE / 255)), 1e-12)
 
 
 @lru_cache(maxsize=16)
@@ -187,37 +145,14 @@ def mu_law(exposure: Tensor, white: float, mu: float = MU) -> Tensor:
     return torch.log1p(exposure * (mu / white)) / math.log1p(mu)
 
 
-PULL_DOWN = 0.1
-"""How strongly the prior on clipped light pulls down, in parts of how it lifts. The edges of small lights, where they
-mix with what is known, tell of more than is expected; but without any hold light runs away."""
+def anchor_loss(mapper: ToneMapper) -> Tensor:
+    """Mean over channels of (f(1) - ANCHOR)^2: photos of one exposure leave a learned f's scale open, and it drifts.
 
-
-def highlight_prior(
-    light: Tensor, clipped: Tensor | None, white: float, stops: Tensor | None, mask: Tensor | None = None
-) -> Tensor:
-    """Mean over the image of what clipped pixels brighter than white lack to the expected stops, and of PULL_DOWN of
-    what they have beyond; 0 at others.
-
-    light: [H, W, 3] exposures; clipped: [H, W, 3] bool; stops: [4], as Target.highlights, by how many channels of the
-    pixel clip; mask: [H, W, 1] or None: pixels outside count nothing. The photo says `at least white` there.
-    """
-    if clipped is None or stops is None:
-        return light.new_zeros(())
-    expected = stops[clipped.sum(dim=-1, keepdim=True)]
-    excess = torch.log2(light.clamp_min(white) / white)
-    lacking = expected - excess
-    off = torch.where(clipped & (light > white), torch.maximum(lacking, -PULL_DOWN * lacking), 0.0)
-    return off.mean() if mask is None else (off * mask).mean() / mask.mean().clamp_min(1e-6)
-
-
-def anchor_loss(mapper: ToneMapper, value: float) -> Tensor:
-    """Mean over channels of (f(1) - value)^2: photos of one exposure leave a learned f's scale open, and it drifts.
-
-    Source: the unit exposure loss of HDR-NeRF (CVPR 2022), which GaussHDR (CVPR 2025) keeps; value is 0.5 there for
-    photos, the middle of the encoded range.
+    Source: the unit exposure loss of HDR-NeRF (CVPR 2022), which GaussHDR (CVPR 2025) keeps, as its value for
+    photos.
     """
     log_unit = mapper.weights[0].new_zeros(1, 3)
-    return (mapper.encode_log(log_unit) - value).square().mean()
+    return (mapper.encode_log(log_unit) - ANCHOR).square().mean()
 
 
 def linear_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor | None:
@@ -227,25 +162,18 @@ def linear_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor
         return image_loss(photo.base, target.exposure_truth, target.mask, config.form, config.ssim_weight)
     if photo.base is photo.exposure:
         return None
-    base, fused = photo.base, photo.exposure
-    if config.linear_detach == "fused":
-        fused = fused.detach()
-    elif config.linear_detach == "base":
-        base = base.detach()
-    return image_loss(base, fused, target.mask, config.form, config.ssim_weight)
+    # The base follows: without the detached side both would settle on what is easiest to agree on.
+    return image_loss(photo.base, photo.exposure.detach(), target.mask, config.form, config.ssim_weight)
 
 
 def hdr_loss(photo: Photograph, target: Target, config: LossConfig, largest: float) -> Tensor:
-    """The HDR colour's exposure against the true one, both divided by `largest`, in LossConfig.hdr_domain.
+    """The HDR colour's exposure against the true one, both divided by `largest`, in the mu-law.
 
     largest: the greatest true exposure of the training views, see largest_truth. Source: HDR-GS's HDR loss, which
     divides each image by its own maximum instead, and with that leaves the scale of the scene open.
     """
     images = photo.exposure / largest, target.exposure_truth / largest
-    if config.hdr_domain != "linear":
-        mu = MU if config.hdr_domain == "mu-law" else LOG_MU
-        images = tuple(torch.log1p(mu * image) / math.log1p(mu) for image in images)
-    return image_loss(*images, target.mask, config.form, config.ssim_weight)
+    return image_loss(*(mu_law(image, 1.0) for image in images), target.mask, config.form, config.ssim_weight)
 
 
 def needed_colours(config: LossConfig, has_truth: bool) -> frozenset[str]:
@@ -262,8 +190,7 @@ def needed_colours(config: LossConfig, has_truth: bool) -> frozenset[str]:
 def data_loss(
     field: RadianceField, photo: Photograph, target: Target, config: LossConfig, largest_truth: float = 1.0
 ) -> Tensor:
-    """L_LDR + beta L_linear (equation 13), the HDR loss, and priors on light, each where it has a weight: what compares
-    a view, and what trainings and their parts are judged by."""
+    """L_LDR + beta L_linear (equation 13), the HDR loss and the anchor, each where it has a weight."""
     loss = ldr_loss(photo, target, config, field.response) if config.ldr_weight > 0 else 0.0
     if config.ldr_weight not in (0, 1):
         loss = config.ldr_weight * loss
@@ -272,21 +199,13 @@ def data_loss(
     if config.linear_weight > 0:
         linear = linear_loss(photo, target, config)
         loss = loss if linear is None else loss + config.linear_weight * linear
-    if config.highlight_weight > 0:
-        white = known_response(field.response).white
-        prior = highlight_prior(photo.light, target.clipped, white, target.highlights, target.mask)
-        loss = loss + config.highlight_weight * prior
     if config.anchor_weight > 0:
-        loss = loss + config.anchor_weight * anchor_loss(field.response, config.anchor_value)
+        loss = loss + config.anchor_weight * anchor_loss(field.response)
     return loss
 
 
 def regularised(loss: Tensor, field: RadianceField, config: LossConfig) -> Tensor:
-    """The loss and what the Gaussians themselves cost, whatever the view: harmonics, opacities, sizes."""
-    if config.harmonics_weight > 0:
-        loss = loss + config.harmonics_weight * field.gaussians.harmonics_rest.square().mean()
+    """The loss and what the Gaussians themselves cost, whatever the view: the opacities."""
     if config.opacity_weight > 0:
         loss = loss + config.opacity_weight * field.gaussians.opacities().mean()
-    if config.scale_weight > 0:
-        loss = loss + config.scale_weight * field.gaussians.log_scales.exp().mean()
     return loss

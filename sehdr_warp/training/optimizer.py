@@ -5,14 +5,12 @@ from torch import Tensor
 
 from ..field.gaussians import PARAMETER_NAMES
 from ..field.radiance_field import RadianceField
-from ..response import RefinedResponse, ToneMapper
+from ..response import ToneMapper
 from ..splatting.training_step import adam_step, judge_step
 from .config import Config
 
 EPSILON = 1e-15
 """3DGS: gradients of a single Gaussian are tiny, and must not drown in Adam's usual 1e-8."""
-DECAY_EVERY = 10
-"""Iterations between changes of the rates that decay_rates sets: on a GPU each is a launch."""
 
 
 class Adam(torch.optim.Adam):
@@ -73,12 +71,7 @@ def make_optimizer(field: RadianceField, config: Config, extent: float) -> Adam:
         groups.append(
             {"name": "response", "params": list(field.response.parameters()), "lr": config.optimizer.response}
         )
-    if isinstance(field.response, RefinedResponse):
-        groups.append(
-            {"name": "refinement", "params": list(field.response.parameters()), "lr": config.optimizer.refinement}
-        )
     for group in groups:
-        group["start_rate"] = group["lr"]
         if device.type == "cuda":
             group["lr"] = torch.tensor(group["lr"], device=device)
     return Adam(groups, eps=EPSILON, fused=True, capturable=device.type == "cuda")
@@ -91,26 +84,9 @@ def means_rate(config: Config, extent: float, iteration: int) -> float:
     return extent * rates.means * (rates.means_final / rates.means) ** part
 
 
-def decay_rates(optimizer: torch.optim.Adam, config: Config, iteration: int) -> None:
-    """Sets the other rates for the steps from an iteration on: theirs until decay_from of the training, then
-    exponential down to final_factor of theirs. Adam's steps do not shrink with the gradient: at full rate, colours
-    never come to rest. The rate is that of the last multiple of DECAY_EVERY, so a resumed training has the same."""
-    options, total = config.optimizer, config.schedule.iterations
-    if options.final_factor == 1:
-        return
-    done = (iteration - iteration % DECAY_EVERY) / total
-    part = max(0.0, done - options.decay_from) / (1 - options.decay_from)
-    for group in optimizer.param_groups:
-        if group["name"] != "means":
-            _set_rate(group, group["start_rate"] * options.final_factor**part)
-
-
 def set_means_rate(optimizer: torch.optim.Adam, rate: float) -> None:
     """Sets the learning rate of the positions for the next step."""
-    _set_rate(optimizer.param_groups[PARAMETER_NAMES.index("means")], rate)
-
-
-def _set_rate(group: dict, rate: float) -> None:
+    group = optimizer.param_groups[PARAMETER_NAMES.index("means")]
     if isinstance(group["lr"], Tensor):
         group["lr"].fill_(rate)
     else:

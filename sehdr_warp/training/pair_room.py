@@ -62,8 +62,3 @@ class PairRoom:
         self._pairs = math.ceil(max(needed * growth, KEPT * self._pairs))
         self._needed.zero_()
         self._given = 0
-
-    def resize(self) -> None:
-        """The photos have another size: what was seen of them says little."""
-        self._needed.zero_()
-        self._given = 0

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from ..scene import Scene
-from .config import DECISIONS, Config
+from .config import Config
 from .config_files import config_to_dict, override_config
 from .plan_checks import check_fields, check_scene
 from .plan_rules import RULES, Decision
@@ -20,7 +20,7 @@ class Plan:
     """What was decided about a scene.
 
     config: the config with the decisions in it, ready to be trained. facts: what they rest on. decisions: in the order
-    of config.DECISIONS. kept: fields that a decision would have changed and the user had given.
+    of RULES. kept: fields that a decision would have changed and the user had given.
     """
 
     config: Config
@@ -44,8 +44,7 @@ class Plan:
 def make_plan(scene: Scene, config: Config) -> Plan:
     """Reads a scene and decides what its training can leave out, on top of a config.
 
-    config.plan.decisions: which decisions to make, all where it is empty; the fields in config.plan.keep stay as they
-    are. The plan's own config has plan.enabled off: it is trained as it stands.
+    The fields in config.plan.keep stay as they are. The plan's own config has plan.enabled off: it is trained as it stands.
 
     Raises InputError for a scene that no plan makes sense for, and for kept values that the scene contradicts.
     """
@@ -53,10 +52,8 @@ def make_plan(scene: Scene, config: Config) -> Plan:
     check_scene(scene, facts)
     check_fields(scene, facts, config, config.plan.keep)
     planned, decisions, kept = config, [], {}
-    for name in DECISIONS:
-        if config.plan.decisions and name not in config.plan.decisions:
-            continue
-        decision = RULES[name](facts, planned)
+    for name, rule in RULES.items():
+        decision = rule(facts, planned)
         changes = {path: value for path, value in decision.fields.items() if path not in config.plan.keep}
         current = _flat(config_to_dict(planned))
         kept |= {path: current[path] for path in decision.fields if path not in changes}

@@ -14,8 +14,6 @@ FEWEST_PHOTOS = 3
 LEAST_OVERLAP = 0.02
 """Part of the places that must be in two photos' fields of view."""
 LEAST_CONTRAST = 1 / 255
-SMALLEST_SIDE = 16
-"""Pixels of a photo's shorter side at the coarsest level."""
 REACH = 2.0**16
 """Brackets farther from the photos' exposure than this are black or white in all pixels of 8 bits and some headroom."""
 
@@ -66,14 +64,6 @@ def check_fields(scene: Scene, facts: SceneFacts, config: Config, given: Collect
             budget,
             f"the scene starts from {facts.points} points",
             f"use {facts.points} or more, or leave the field out",
-        )
-    side, levels = min(facts.width, facts.height), config.schedule.coarse_levels
-    if "schedule.coarse_levels" in given and levels and side / 2**levels < SMALLEST_SIDE:
-        refuse(
-            "schedule.coarse_levels",
-            levels,
-            f"the photos of {facts.width} x {facts.height} pixels would be {side / 2**levels:.0f} on the shorter side",
-            f"leave {SMALLEST_SIDE} pixels or more",
         )
 
 

@@ -15,7 +15,7 @@ FEWEST_ITERATIONS = 3000
 
 @dataclass(frozen=True)
 class Decision:
-    """name: of config.DECISIONS. fields: dotted names of the config and their values. choice: in words; reason: with
+    """name: of RULES. fields: dotted names of the config and their values. choice: in words; reason: with
     the figures it rests on."""
 
     name: str
@@ -25,8 +25,8 @@ class Decision:
 
 
 def _response(facts: SceneFacts, config: Config) -> Decision:
-    if config.response.form == "mlp":
-        return Decision("response", {}, "learned", "response.form = mlp learns one with the scene: nothing to search")
+    if config.response.name == "learned":
+        return Decision("response", {}, "learned", "response.name = learned: one with the scene, nothing to search")
     if config.response.name != "auto":
         return Decision("response", {}, "no search", f"{config.response.name} was named")
     made = "a camera made the files" if facts.from_camera else "nothing says what made the files"
@@ -113,4 +113,4 @@ RULES: dict[str, Callable[[SceneFacts, Config], Decision]] = {
     "iterations": _iterations,
     "confidence": _confidence,
 }
-"""A rule for each of config.DECISIONS."""
+"""What a plan decides, in this order."""

@@ -1,6 +1,6 @@
-"""The training photos on the device, at every resolution of the schedule, uploaded once."""
+"""The training photos on the device, uploaded once."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from torch.nn import functional
 from ..errors import InputError
 from ..field.radiance_field import CameraTensors
 from ..response import Response
-from ..scene import Camera, Scene, View
+from ..scene import Scene, View
 from .config import LossConfig
 from .losses import CODE, Target, one_of, values_of
 
@@ -144,43 +144,28 @@ def largest_truth(scene: Scene, loss: LossConfig) -> float:
 
 def training_views(
     views: tuple[View, ...],
-    level: int,
-    response: Response,
     base_time: float,
     device,
     *,
     truth: bool,
     bounds: bool = True,
     light: Response | None = None,
-    highlights: Sequence[float] | None = None,
 ) -> list[TrainingView]:
-    """The views at 1 / 2^level of their size. truth: also upload HDR truth; bounds: note where they are clipped and
-    black; light: keep the exposures that this response decodes from the photos; highlights: stops over white that light
-    is expected at where one, two and three channels of a pixel clip. Photos are averaged as exposures, since light adds
-    up and encoded values do not; a pixel with a clipped part stays a lower bound."""
-    expected = None if highlights is None else torch.tensor((0.0, *highlights), device=device)
+    """The views on a device. truth: also upload HDR truth; bounds: note where they are clipped and black; light: keep
+    the exposures that this response decodes from the photos."""
     made = []
     for view in views:
-        width, height = (max(1, round(size / 2**level)) for size in (view.camera.width, view.camera.height))
-        camera: Camera = view.camera.resized(width, height) if level else view.camera
-        images = _images(view, (height, width), response, base_time, device, truth, bounds)
+        images = _images(view, base_time, device, truth, bounds)
         images["light"] = None if light is None else light.decode(values_of(images["photo"]))
-        images["highlights"] = expected
-        made.append(TrainingView(CameraTensors.of(camera, device), view.exposure_time, images))
+        made.append(TrainingView(CameraTensors.of(view.camera, device), view.exposure_time, images))
     return made
 
 
-def _images(
-    view: View, size: tuple[int, int], response: Response, base_time: float, device, truth: bool, bounds: bool
-) -> dict:
-    given = _upload(view.image, device)
-    encoded = given if tuple(given.shape[:2]) == size else response.encode(_shrink(response.decode(given), size))
-    masks = {}
-    if bounds:
-        masks["clipped"] = _shrink((given >= 1 - CODE / 2).float(), size) > 0
-        masks["black"] = _shrink((given <= CODE / 2).float(), size) == 1
-    mask = None if view.mask is None else _shrink(_upload(view.mask[..., None], device), size)
-    exposure_truth = _shrink(_upload(view.hdr, device) * base_time, size) if truth and view.hdr is not None else None
+def _images(view: View, base_time: float, device, truth: bool, bounds: bool) -> dict:
+    encoded = _upload(view.image, device)
+    masks = {"clipped": encoded >= 1 - CODE / 2, "black": encoded <= CODE / 2} if bounds else {}
+    mask = None if view.mask is None else _upload(view.mask[..., None], device)
+    exposure_truth = _upload(view.hdr, device) * base_time if truth and view.hdr is not None else None
     codes = (255 * encoded).round_().clamp_(0, 255).to(torch.uint8)
     told = all(torch.equal(noted, codes == MASKS[name]) for name, noted in masks.items())
     photo = codes if told and torch.equal(values_of(codes), encoded) else encoded
@@ -191,10 +176,3 @@ def _images(
 
 def _upload(array: np.ndarray, device) -> Tensor:
     return torch.tensor(np.ascontiguousarray(array), dtype=torch.float32, device=device)
-
-
-def _shrink(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """[H, W, C] averaged over areas to [*size, C]; the image itself where it has that size."""
-    if tuple(image.shape[:2]) == size:
-        return image
-    return functional.interpolate(image.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0).contiguous()

@@ -124,7 +124,7 @@ def _crowded(scene: Scene, trainer: Trainer) -> Iterator[str]:
     """What to know of a training with more start points than it may have, or may add to."""
     count, strategy, config = trainer.field.gaussians.count, trainer.densification, trainer.config
     most = config.densification.max_gaussians
-    if trainer.iteration == 0 and len(scene.points) > most - config.model.far_points:
+    if trainer.iteration == 0 and len(scene.points) > most:
         yield f"{len(scene.points)} start points: drawn from, for densification.max_gaussians = {most}"
     if isinstance(strategy, Relocation) and count > strategy.most:
         yield (
@@ -215,7 +215,7 @@ class _Loop:
                 iteration = trainer.iteration
                 if progress.is_due(iteration):
                     self._report(progress, self.seconds + time.perf_counter() - started)
-                evaluate = iteration in self.evaluate_at or trainer.stopped_at is not None
+                evaluate = iteration in self.evaluate_at
                 save = iteration % self.checkpoint_every == 0
                 if evaluate or save:
                     self._stop_clock(started)
@@ -230,14 +230,12 @@ class _Loop:
             self._summarise()
         if self.writer is not None:
             self.writer.close()
-        if trainer.stopped_at is not None:
-            progress.note(f"stopped at iteration {trainer.stopped_at}: the error no longer fell")
         if interrupted.is_set() and not self._is_done():
             progress.note(f"stopped at iteration {trainer.iteration}; continue with --resume")
             raise KeyboardInterrupt
 
     def _is_done(self) -> bool:
-        return self.trainer.iteration >= self.schedule.iterations or self.trainer.stopped_at is not None
+        return self.trainer.iteration >= self.schedule.iterations
 
     def _stop_clock(self, started: float) -> None:
         """Adds the seconds since `started`, in which steps ran, to the training's; the device finishes first."""
@@ -295,7 +293,6 @@ class _Loop:
             {
                 "iteration": trainer.iteration,
                 "finished": self._is_done(),
-                "stopped_at": trainer.stopped_at,
                 "plan": plan and {decision["name"]: decision["choice"] for decision in plan["decisions"]},
                 "train_seconds": round(self.seconds, 3),
                 "gaussians": self._gaussians().count,

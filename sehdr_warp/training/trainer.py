@@ -1,6 +1,5 @@
 """The training loop's state and its single step. What happens around steps is train.py's business."""
 
-import math
 import operator
 from contextlib import nullcontext
 from dataclasses import replace
@@ -10,21 +9,15 @@ from torch import Tensor
 
 from ..errors import SehdrError
 from ..field.radiance_field import RadianceField
-from ..response import RefinedResponse
 from ..response.learned import EXACT_BELOW
 from ..scene import Scene
 from ..splatting import GraphRecorder
 from ..splatting.memory import bytes_asked_for
 from .config import Config
-from .densification import make_densification, slope_weights
-from .early_stop import EarlyStop
-from .heldout import evaluate_views
-from .highlights import expected_excess
+from .densification import make_densification
 from .initialization import scene_extent
-from .losses import compares_light, data_loss, known_response, needed_colours, regularised
+from .losses import compares_light, data_loss, needed_colours, regularised
 from .optimizer import (
-    DECAY_EVERY,
-    decay_rates,
     guarded_step,
     load_optimizer_tensors,
     make_optimizer,
@@ -34,12 +27,13 @@ from .optimizer import (
 )
 from .pair_room import PairRoom
 from .targets import TrainingView, ViewStack, largest_truth, training_views
-from .thinning import contributing, degree_gain
 
 CHECK_EVERY = 20
 """Iterations between looks at the count of skipped steps, each of which waits for the device."""
 DECODED_PIXELS = 1 << 27
 """Photos of so many pixels in all are kept decoded as well, in 1.6 GB at most; more are decoded in each step."""
+MOST_SKIPPED = 20
+"""Steps with a loss or gradient that is not finite are skipped; more than so many end the training."""
 
 
 class Trainer:
@@ -61,11 +55,10 @@ class Trainer:
         pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
         self.densification = make_densification(config, self.extent, pixels)
         self._views = scene.train_views
-        # Where light is compared, by a curve that stays, nothing needs the photo encoded.
-        self._encoded = not compares_light(config.loss, field) or isinstance(field.response, RefinedResponse)
+        # Where light is compared, nothing needs the photo encoded.
+        self._encoded = not compares_light(config.loss, field)
         self._largest_truth = largest_truth(scene, config.loss) * field.base_time
-        self._highlights = expected_excess(self._views, known_response(field.response), config.loss)
-        self._levels: dict[int, ViewStack | list[TrainingView]] = {}
+        self._stack: ViewStack | list[TrainingView] | None = None
         self._order: list[int] = []
         self._order_generator = torch.Generator().manual_seed(config.seed)
         self._generator = torch.Generator(device=self.device).manual_seed(config.seed)
@@ -77,33 +70,12 @@ class Trainer:
         self._room = PairRoom(self.device)
         self._loss: Tensor | None = None
         self._last_index = 0
-        self._presence: Tensor | None = None
-        self._degree_limit = config.model.harmonics_degree
-        self._early_stop = EarlyStop(config)
-        self._held_out = scene.test_views
-        self._loss_sum = torch.zeros((), device=self.device)
-        stages = config.densification.contribution_at if config.densification.contribution > 0 else ()
-        self._thin_at = {config.scaled(stage) for stage in stages}
 
     @property
     def degree(self) -> int:
-        """The degree of the harmonics at this iteration: one more every harmonics_every, as long as they gain."""
-        return min(self._degree_limit, self.iteration // self._degree_every)
-
-    @property
-    def _degree_every(self) -> int:
-        return self.config.scaled(self.config.schedule.harmonics_every)
-
-    @property
-    def stopped_at(self) -> int | None:
-        """The iteration at which the training had nothing more to gain; None while it goes on."""
-        return self._early_stop.stopped_at
-
-    @property
-    def level(self) -> int:
-        """How often the photos are halved at this iteration."""
-        every = self.config.scaled(self.config.schedule.coarse_every)
-        return max(0, self.config.schedule.coarse_levels - max(0, self.iteration - 1) // every)
+        """The degree of the harmonics at this iteration: one more every harmonics_every."""
+        every = self.config.scaled(self.config.schedule.harmonics_every)
+        return min(self.config.model.harmonics_degree, self.iteration // every)
 
     @property
     def loss(self) -> float:
@@ -128,22 +100,18 @@ class Trainer:
         return self._room.lacked
 
     def step(self) -> None:
-        """One photo, one step. Raises SehdrError if more than schedule.nonfinite_limit steps had to be skipped."""
+        """One photo, one step. Raises SehdrError if more than MOST_SKIPPED steps had to be skipped."""
         self.iteration += 1
         views = self._training_views()
         index = self._next_index(len(views))
         gaussians = self.field.gaussians
-        self._choose_degree(views)
         watched = self.densification.needs_gradients(self.iteration)
         if watched:
             self.densification.prepare(gaussians.count, self.device)
         rate = means_rate(self.config, self.extent, self.iteration)
         set_means_rate(self.optimizer, rate)
-        if self.iteration % DECAY_EVERY == 0:
-            decay_rates(self.optimizer, self.config, self.iteration)
-        self._draw_presence()
         # The last: a learned response encodes few exposures otherwise, by kernels of its own.
-        kind = (self.degree, self.level, watched, self._hold_response(), gaussians.count < EXACT_BELOW)
+        kind = (self.degree, watched, gaussians.count < EXACT_BELOW)
         self._last_index = index
         if self._can_record(views, kind):
             self._loss = self._replay(views, index, watched, kind)
@@ -154,10 +122,6 @@ class Trainer:
         count = gaussians.count
         if self.densification.change(self.iteration, gaussians, self.optimizer, self._generator):
             self._forget_recording(gaussians.count / max(1, count))
-        if self.iteration in self._thin_at:
-            self._thin(views)
-        if self._early_stop.is_due(self.iteration):
-            self._look()
         if self.iteration % CHECK_EVERY == 0:
             self.check()
 
@@ -173,94 +137,28 @@ class Trainer:
             degree=self.degree,
             also=needed_colours(self.config.loss, target.exposure_truth is not None),
             capacity=capacity,
-            presence=self._presence,
             encode=self._encoded,
         )
         # What the backward pass does not read, or only its first part does, must not stay until the end of the step.
-        kept = {"means2d", "radii"} if watched else {"radii"} if self.config.optimizer.visible_only else set()
+        kept = {"means2d", "radii"} if watched else set()
         unread = {"image", "transmittance", "depths", "means2d", "radii"} - kept
         rendering = replace(photo.rendering, **dict.fromkeys(unread))
         if watched:
             rendering.means2d.retain_grad()
-        compared = data_loss(self.field, photo, target, self.config.loss, self._largest_truth)
+        loss = data_loss(self.field, photo, target, self.config.loss, self._largest_truth)
         del photo, target, view
-        loss = regularised(compared, self.field, self.config.loss)
-        if isinstance(self.field.response, RefinedResponse) and self.field.response.refining:
-            loss = loss + self.config.response.refine_weight * self.field.response.penalty()
+        loss = regularised(loss, self.field, self.config.loss)
         loss.backward()
-        if self.config.optimizer.visible_only:
-            self.optimizer.visible = rendering.visible
         nonfinite, made = guarded_step(self.optimizer, loss, rendering.overflow)
         if watched:
-            weights = None
-            if self.config.densification.slope_corrected:
-                weights = slope_weights(self.field, exposure_time / self.field.base_time)
-            self.densification.observe(rendering, camera.width, camera.height, made, weights)
+            self.densification.observe(rendering, camera.width, camera.height, made)
         self.optimizer.zero_grad(set_to_none=True)
         self._skipped += nonfinite
-        if self._early_stop.patience:
-            self._loss_sum += compared.detach()
         if capacity is None:
             self._room.launched(rendering.entry_count)
         else:
             self._room.note(rendering.pair_count, rendering.overflow)
         return loss.detach()
-
-    def _hold_response(self) -> bool:
-        """Whether the response is corrected in this step; before response.refine_after its gradient is held back."""
-        response, options = self.field.response, self.config.response
-        if not isinstance(response, RefinedResponse):
-            return False
-        response.refining = self.iteration > (self.config.scaled(options.refine_after) if options.refine_after else 0)
-        return response.refining
-
-    def _choose_degree(self, views: ViewStack | list[TrainingView]) -> None:
-        """Ends what the harmonics' last degree did not pay for, and makes room for those of this step."""
-        schedule, gaussians = self.config.schedule, self.field.gaussians
-        degree = (self.iteration - 1) // self._degree_every
-        judged = schedule.harmonics_gain > 0 and self.iteration % self._degree_every == 0
-        if judged and 0 < degree <= self._degree_limit:
-            gain = degree_gain(self.field, views, degree, self.config.loss, self._largest_truth)
-            if gain < schedule.harmonics_gain and gaussians.set_degree(degree - 1, self.optimizer):
-                self._degree_limit = degree - 1
-                self._forget_recording(1.0)
-        if schedule.harmonics_on_demand and gaussians.degree < self.degree:
-            gaussians.set_degree(self.degree, self.optimizer)
-            self._forget_recording(1.0)
-
-    def _thin(self, views: ViewStack | list[TrainingView]) -> None:
-        """Takes away the Gaussians that add nothing to any training photo."""
-        gaussians = self.field.gaussians
-        kept = contributing(self.field, views, self.config.densification.contribution)
-        if bool(kept.all()):
-            return
-        with torch.no_grad():
-            gaussians.keep(kept, self.optimizer)
-        self.densification.keep(kept)
-        # What added nothing hardly filled the room for pairs: the rest needs as much as before.
-        self._forget_recording(1.0)
-
-    def _look(self) -> None:
-        """A look at the error, for the early stop; part of the training, and of its time."""
-        if self.config.schedule.early_stop_on == "held-out" and self._held_out:
-            scores = evaluate_views(self.field, self._held_out, self.degree)
-            figure = scores.get("psnr_ldr", math.nan)
-        else:
-            mean = float(self._loss_sum) / self._early_stop.every
-            figure = -20 * math.log10(mean) if mean > 0 else math.nan
-        self._loss_sum.zero_()
-        self._early_stop.look(self.iteration, figure)
-
-    def _draw_presence(self) -> None:
-        """Which Gaussians the next step leaves out, and how much the others stand in for them (DropGaussian, CVPR
-        2025: the part grows evenly over the training). In place, where a recorded step reads it."""
-        if self.config.model.dropout == 0:
-            return
-        count, part = self.field.gaussians.count, self.config.model.dropout * self.iteration
-        if self._presence is None or len(self._presence) != count:
-            self._presence = torch.empty(count, device=self.device)
-        kept = 1 - part / self.config.schedule.iterations
-        self._presence.bernoulli_(kept, generator=self._generator).div_(kept)
 
     def _can_record(self, views, kind) -> bool:
         """Whether this step can be a recorded one: on a GPU, photos of one size, after a step like it was launched."""
@@ -300,12 +198,11 @@ class Trainer:
             self._room.change(growth)
 
     def check(self) -> None:
-        """Raises SehdrError if more than schedule.nonfinite_limit steps were skipped."""
-        limit = self.config.schedule.nonfinite_limit
-        if self.skipped_steps > limit:
+        """Raises SehdrError if more than MOST_SKIPPED steps were skipped."""
+        if self.skipped_steps > MOST_SKIPPED:
             raise SehdrError(
                 f"iteration {self.iteration}: {self.skipped_steps} steps had a loss or gradient that is not finite, "
-                f"more than schedule.nonfinite_limit = {limit}; lower the learning rates or check photos and cameras"
+                f"more than {MOST_SKIPPED}; lower the learning rates or check photos and cameras"
             )
         if self._recorder is not None and self._room.look():
             # Steps without room for all pairs changed nothing; record again with what they needed.
@@ -326,8 +223,6 @@ class Trainer:
             "iteration": self.iteration,
             "order": list(self._order),
             "skipped_steps": self.skipped_steps,
-            "degree_limit": self._degree_limit,
-            "early_stop": self._early_stop.state() | {"loss_sum": float(self._loss_sum)},
         }
         return tensors, values
 
@@ -342,24 +237,16 @@ class Trainer:
         if self._generator.get_state().numel() == generators["device"].numel():
             self._generator.set_state(generators["device"].cpu())
         self.iteration = values["iteration"]
-        self._degree_limit = operator.index(values.get("degree_limit", self._degree_limit))
-        if looks := values.get("early_stop"):
-            self._early_stop.load_state(looks)
-            self._loss_sum.fill_(looks["loss_sum"])
-        decay_rates(self.optimizer, self.config, self.iteration)
         self._order = [operator.index(place) for place in values["order"]]
         if not all(0 <= place < len(self._views) for place in self._order):
             raise ValueError(f"the order of the photos names others than the {len(self._views)} there are")
         self._skipped.fill_(values["skipped_steps"])
 
     def _training_views(self) -> ViewStack | list[TrainingView]:
-        level = self.level
-        if level not in self._levels:
-            # One resolution at a time: the coarser ones are not needed again.
-            views = self._upload(level)
-            self._room.resize()
-            self._levels = {level: ViewStack.of(views) or views}
-        return self._levels[level]
+        if self._stack is None:
+            views = self._upload()
+            self._stack = ViewStack.of(views) or views
+        return self._stack
 
     def _next_index(self, count: int) -> int:
         """Every photo once in random order, then again in another."""
@@ -367,20 +254,17 @@ class Trainer:
             self._order = torch.randperm(count, generator=self._order_generator).tolist()
         return self._order.pop()
 
-    def _upload(self, level: int) -> list[TrainingView]:
+    def _upload(self) -> list[TrainingView]:
         loss, field = self.config.loss, self.field
-        pixels = sum(view.camera.width * view.camera.height for view in self._views) // 4**level
-        kept = compares_light(loss, field) and loss.interval == "off" and pixels <= DECODED_PIXELS
+        pixels = sum(view.camera.width * view.camera.height for view in self._views)
+        kept = compares_light(loss, field) and pixels <= DECODED_PIXELS
         return training_views(
             self._views,
-            level,
-            field.response,
             field.base_time,
             self.device,
             truth=loss.uses_hdr,
-            bounds=loss.clipping or loss.highlight_weight > 0,
-            light=known_response(field.response) if kept else None,
-            highlights=self._highlights,
+            bounds=loss.clipping,
+            light=field.response if kept else None,
         )
 
 

@@ -52,7 +52,7 @@ def ran(out) -> list[str]:
 
 
 def test_jobs_are_every_combination_and_their_keys_tell_them_apart():
-    methods = tuple(choose_methods(["default", "truth"], ["plain:default:loss.clipping=false,model.low_pass=0.1"]))
+    methods = tuple(choose_methods(["default", "truth"], ["plain:default:loss.clipping=false,model.antialiased=true"]))
     asked = settings(methods=methods, exposures=(0, 4), responses=("known", "blind"), seeds=(0, 1), iterations=(10, 20))
     jobs = plan_jobs(asked)
     # The upper bound learns from truth: without the response it would be the same training again.
@@ -65,12 +65,12 @@ def test_jobs_are_every_combination_and_their_keys_tell_them_apart():
         assert training["seed"] == job.config["seed"]
     plain = next(job for job in jobs if job.config["method"]["name"] == "plain").config
     assert plain["method"]["base"] == "default"
-    assert (plain["training"]["loss"]["clipping"], plain["training"]["model"]["low_pass"]) == (False, 0.1)
+    assert (plain["training"]["loss"]["clipping"], plain["training"]["model"]["antialiased"]) == (False, True)
 
 
 @pytest.mark.parametrize("responses", [("known",), ("blind",), ("known", "blind"), ("blind", "known", "blind")])
 def test_a_method_that_learns_the_response_is_trained_once(responses):
-    chosen = choose_methods(["hdr-gs", "gauss-hdr", "default"], ["own:default:response.form=mlp,loss.domain=encoded"])
+    chosen = choose_methods(["hdr-gs", "gauss-hdr", "default"], ["own:default:response.name=learned"])
     jobs = plan_jobs(settings(methods=tuple(chosen), responses=responses))
     trained = [(job.config["method"]["name"], job.config["response"]) for job in jobs]
     others = [("default", response) for response in dict.fromkeys(responses)]

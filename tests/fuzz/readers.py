@@ -180,7 +180,7 @@ def _run(folder: Path) -> None:
     from sehdr_warp.training.trainer import Trainer
     from tests.training.toy import toy_scene
 
-    config = load_config("paper", {"schedule.iterations": 10, "fusion.width": 2})
+    config = load_config("paper", {"schedule.iterations": 10})
     gaussians = Gaussians.from_points(torch.rand(4, 3), torch.zeros(4, 3), 3)
     scene = toy_scene(2, 8)
     field = assemble_field(gaussians, config, response_by_name("srgb"), 0.25)

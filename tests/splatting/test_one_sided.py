@@ -23,7 +23,7 @@ def images(dtype=torch.float64):
 def reference(light, photo, clipped, black):
     value, truth = (mu_law(image, WHITE, MU) for image in (light, photo))
     target = Target(photo, clipped, black, None, None)
-    return one_sided(value, truth, target, truth - HALF_CODES[0], truth + HALF_CODES[1], False), truth
+    return one_sided(value, truth, target, HALF_CODES), truth
 
 
 @pytest.mark.parametrize(("has_clipped", "has_black"), [(True, True), (True, False), (False, True), (False, False)])

@@ -6,20 +6,11 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from sehdr_warp.field.gaussians import HARMONIC_0, PARAMETER_NAMES, Gaussians
-from sehdr_warp.response import response_by_name
+from sehdr_warp.field.gaussians import PARAMETER_NAMES, Gaussians
 from sehdr_warp.splatting import rasterize
 from sehdr_warp.training.config_files import load_config
-from sehdr_warp.training.densification import (
-    MOST_WEIGHT,
-    GradientDensification,
-    make_densification,
-    rotate,
-    slope_weights,
-)
+from sehdr_warp.training.densification import GradientDensification, make_densification, rotate
 from sehdr_warp.training.relocation import Relocation, _draw, _relocation_sums
-
-from .toy import toy_field
 
 EXTENT = 2.0
 
@@ -112,13 +103,6 @@ def test_rotation_is_the_quaternions():
     torch.testing.assert_close(turned, torch.tensor([[0.0, 1.0, 0.0]]))
 
 
-def test_revised_opacity_keeps_the_whole():
-    strategy, gaussians = gradient_strategy(revised_opacity=True), cloud(4)
-    rows = strategy._half(gaussians, torch.tensor([0]), torch.Generator().manual_seed(1))
-    half = torch.sigmoid(rows["opacity_logits"])
-    torch.testing.assert_close(1 - (1 - half) ** 2, gaussians.opacities()[:1].detach())
-
-
 def test_the_budget_goes_to_the_largest_gradients():
     gaussians = cloud(6)
     optimizer = adam(gaussians)
@@ -162,15 +146,6 @@ def test_nothing_changes_outside_the_schedule(iteration):
     gaussians, strategy = cloud(4), gradient_strategy()
     observe(strategy, [1.0] * 4)
     assert not strategy.change(iteration, gaussians, None, torch.Generator()) and gaussians.count == 4
-
-
-def test_none_changes_nothing():
-    strategy = make_densification(load_config("default", {"densification.strategy": "none"}), EXTENT, 1)
-    gaussians = cloud(4)
-    before = gaussians.means.detach().clone()
-    strategy.perturb(600, gaussians, 1.0)
-    assert not strategy.needs_gradients(600) and not strategy.change(600, gaussians, None, None)
-    assert torch.equal(before, gaussians.means)
 
 
 def relocation(**options):
@@ -268,29 +243,3 @@ def test_strategies_by_name():
     assert isinstance(relocation(), Relocation)
     gradient = load_config("default", {"densification.strategy": "gradient"})
     assert isinstance(make_densification(gradient, EXTENT, 1), GradientDensification)
-
-
-@pytest.mark.parametrize("name", ["srgb", "hdr-nerf"])
-def test_slope_weights_lift_dark_and_bright(name):
-    """In HDR-NeRF's curve x f'(x) = z / 2.2 / (1 + x): highest between the toe and the shoulder."""
-    response = response_by_name(name)
-    exposures = torch.tensor([1e-5, 0.3, response.white * 0.99, 100 * response.white])
-    field = toy_field(count=4)
-    constant = exposures.log()[:, None, None].expand(4, 1, 3) / HARMONIC_0
-    field.gaussians.overwrite({"harmonics_dc": constant})
-    field.response = response
-    dark, middle, bright, clipped = slope_weights(field, 1.0).tolist()
-    assert dark == MOST_WEIGHT and clipped == MOST_WEIGHT and 1 <= middle < 2
-    assert bright > 1 or name == "srgb"
-    expected = slope_weights(field, 0.5)[1].item()
-    field.gaussians.overwrite({"harmonics_dc": constant + math.log(0.5) / HARMONIC_0})
-    assert slope_weights(field, 1.0)[1].item() == pytest.approx(expected, rel=1e-5)
-
-
-def test_weights_multiply_the_statistics():
-    strategy = gradient_strategy()
-    gradient = torch.tensor([[3.0, 0.0], [0.0, 4.0]])
-    strategy.prepare(2, "cpu")
-    shown = rendering_with(gradient, torch.tensor([True, True]))
-    strategy.observe(shown, 200, 100, torch.tensor(1.0), torch.tensor([2.0, 1.0]))
-    assert strategy.gradient_sum.tolist() == [600.0, 200.0]

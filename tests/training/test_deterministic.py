@@ -4,12 +4,12 @@ import pytest
 import torch
 
 from sehdr_warp.splatting import BlendStyle
-from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.train import train
+
+from .toy import load_unscaled
 
 SHORT = {
     "schedule.iterations": 120,
-    "schedule.stated_for": 120,
     "schedule.harmonics_every": 20,
     "densification.start": 20,
     "densification.stop": 90,
@@ -21,8 +21,8 @@ SHORT = {
 
 @pytest.mark.parametrize("preset", ["default", "paper"])
 def test_two_trainings_are_the_same_bits(scene, tmp_path, device, preset):
-    overrides = SHORT | ({"response.name": "srgb", "fusion.width": 16} if preset == "paper" else {})
-    config = load_config(preset, overrides)
+    overrides = SHORT | ({"response.name": "srgb"} if preset == "paper" else {})
+    config = load_unscaled(preset, overrides)
     runs = [train(scene, tmp_path / name, config, device=device, quiet=True) for name in "ab"]
     assert not torch.are_deterministic_algorithms_enabled()
     assert runs[0].model.style == BlendStyle(deterministic=True)

@@ -7,14 +7,15 @@ import torch
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.training.checkpoint import newest_checkpoint
-from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
 
+from .toy import load_unscaled
+
 
 def config(**overrides):
-    values = {"schedule.iterations": 30, "schedule.checkpoint_every": 10, "schedule.stated_for": 30}
-    return load_config("demo", {**values, "schedule.evaluate_at": [30], **overrides})
+    values = {"schedule.iterations": 30, "schedule.checkpoint_every": 10}
+    return load_unscaled("demo", {**values, "schedule.evaluate_at": [30], **overrides})
 
 
 def after(monkeypatch, iteration, change):

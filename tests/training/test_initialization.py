@@ -7,15 +7,12 @@ import pytest
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.response import response_by_name
-from sehdr_warp.training.config import ConfigError
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.initialization import (
     base_exposure_time,
     choose_response,
     colours_in_views,
-    far_points,
     focus_distance,
-    make_field,
     random_points,
     scene_extent,
     start_colours,
@@ -92,7 +89,7 @@ def test_base_time_is_the_median_of_training(scene):
     assert base_exposure_time(dataclasses.replace(scene, views=views)) == pytest.approx(0.3)
 
 
-@pytest.mark.parametrize("method", ["edges", "paper"])
+@pytest.mark.parametrize("method", ["posterior", "paper"])
 def test_auto_chooses_from_the_candidates(method, tmp_path):
     scene = toy_scene(view_count=4, size=64)
     (tmp_path / "mine.csv").write_text("".join(f"{x / 20},{(x / 20) ** 0.4}\n" for x in range(21)))
@@ -104,27 +101,6 @@ def test_auto_chooses_from_the_candidates(method, tmp_path):
         str(tmp_path / "mine.csv"),
     )
     assert choose_response(scene, load_config("default", {"response.name": "rec709"})).name == "rec709"
-
-
-def test_far_points_surround_what_cameras_see(scene):
-    points, colours = far_points(scene, 200, np.random.default_rng(0))
-    centre = np.mean([view.camera.position for view in scene.train_views], axis=0)
-    distance = np.linalg.norm(points - centre, axis=1)
-    seen, mean = colours_in_views(points, scene.train_views)
-    assert 50 < len(points) <= 200 and (seen >= 1).all()
-    np.testing.assert_allclose(distance, distance[0])
-    assert distance[0] >= 4 * RADIUS
-    np.testing.assert_allclose(colours, mean)
-
-
-def test_far_points_join_the_scenes_points_within_the_budget(scene):
-    config = load_config("default", {"model.far_points": 40, "densification.max_gaussians": 90})
-    plain = make_field(scene, load_config("default"), response_by_name("srgb"), "cpu").gaussians
-    field = make_field(scene, config, response_by_name("srgb"), "cpu")
-    assert plain.count == len(scene.points) == 60 and 50 < field.gaussians.count <= 90
-    assert field.gaussians.means.norm(dim=1).max() > 4 * RADIUS > plain.means.norm(dim=1).max()
-    with pytest.raises(ConfigError, match=r"model\.far_points = 90 leaves no room"):
-        dataclasses.replace(config, model=dataclasses.replace(config.model, far_points=90))
 
 
 def test_posterior_takes_a_cameras_curve_for_a_cameras_files(tmp_path):

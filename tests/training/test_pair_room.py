@@ -43,16 +43,6 @@ def test_a_lack_of_room_is_noticed_and_mended(device):
     assert not room.look()
 
 
-def test_photos_of_another_size_are_unseen(device):
-    room = PairRoom(device)
-    room.launched(MANY)
-    replay(room, [5 * MANY] * 9)
-    room.resize()
-    room.launched(2 * MANY)
-    assert not room.look()
-    assert replay(room, [MANY]) == ROOM * 2 * MANY
-
-
 def test_few_pairs_get_the_least_room(device):
     room = PairRoom(device)
     room.launched(1)

@@ -8,7 +8,6 @@ import pytest
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import Camera, codes_of
-from sehdr_warp.training.config import DECISIONS
 from sehdr_warp.training.config_files import config_to_dict, load_config, override_config, parse_setting
 from sehdr_warp.training.plan import apply_plan, make_plan, read_plan
 from sehdr_warp.training.plan_rules import RULES
@@ -57,7 +56,7 @@ def test_facts_are_those_of_the_scene(scene, facts):
 
 def test_a_plan_decides_everything_once_with_figures(scene):
     plan = make_plan(scene, config_of())
-    assert [decision.name for decision in plan.decisions] == list(DECISIONS) == list(RULES)
+    assert [decision.name for decision in plan.decisions] == list(RULES)
     for decision in plan.decisions:
         assert any(character.isdigit() for character in decision.reason) or decision.name == "response"
     applied = flat(plan.config)
@@ -90,13 +89,6 @@ def test_a_plan_says_whether_relocation_has_room(facts, points, choice):
     """120 times the square root of 6144 pixels; without points of its own a scene starts with the preset's 50 000."""
     decision = RULES["densification"](replace(facts, pixels=6144, points=points), config_of())
     assert choice in decision.choice and f"{points or 50_000} to start with" in decision.reason
-
-
-def test_one_decision_alone_changes_its_own_fields(scene):
-    plan = make_plan(scene, config_of(plan__decisions=["iterations"]))
-    before, after = flat(config_of()), flat(plan.config)
-    changed = {path for path in before if before[path] != after[path]} - {"plan.enabled", "plan.decisions"}
-    assert changed == {"schedule.iterations"}
 
 
 def test_brackets_of_one_base_become_a_scaling(scene):
@@ -153,7 +145,6 @@ def test_scenes_without_a_plan_get_one_line(scene, spoil, words):
         ({"densification.max_gaussians": 20}, None, ["max_gaussians = 20", "60 points"]),
         ({"loss.hdr_weight": 0.6}, "hdr", ["hdr_weight = 0.6", "0 of 6"]),
         ({"loss.hdr_truth": True, "loss.linear_weight": 0.5}, "hdr", ["hdr_truth = true", "0 of 6"]),
-        ({"schedule.coarse_levels": 3}, None, ["coarse_levels = 3", "32 x 32", "4"]),
         (
             {"fusion.enabled": True, "fusion.exposures": ["1x", "1/125s"]},
             "times",
@@ -179,16 +170,15 @@ def test_values_that_the_scene_contradicts_are_refused_with_both(scene, changes,
 
 
 def test_a_training_follows_its_plan_and_keeps_it(scene, tmp_path):
-    config = config_of(schedule__iterations=12, schedule__stated_for=12, densification__strategy="none")
-    config = replace(config, plan=replace(config.plan, keep=("schedule.iterations",)))
+    config = config_of(schedule__iterations=12, plan__keep=["schedule.iterations"])
     run = train(scene, tmp_path / "run", config, device="cpu", quiet=True)
     plan = read_plan(tmp_path / "run")
-    assert {decision["name"] for decision in plan["decisions"]} == set(DECISIONS)
+    assert {decision["name"] for decision in plan["decisions"]} == set(RULES)
     assert run.config == make_plan(scene, config).config
     assert run.summary()["plan"]["brackets"] == "plain scaling"
     # Asking again for the same plan resumes; without one the old plan goes with the old run.
     assert train(scene, tmp_path / "run", config, device="cpu", quiet=True, resume=True).iterations == 12
-    unplanned = load_config("default", {"response.name": "srgb", "schedule.iterations": 2, "model.harmonics_degree": 0})
+    unplanned = load_config("default", {"response.name": "srgb", "schedule.iterations": 2, "plan.enabled": False})
     assert train(scene, tmp_path / "run", unplanned, device="cpu", quiet=True, overwrite=True).summary()["plan"] is None
     assert read_plan(tmp_path / "run") is None
 

@@ -11,13 +11,13 @@ import pytest
 import torch
 
 from sehdr_warp.training.checkpoint import Checkpoint, newest_checkpoint
-from sehdr_warp.training.config_files import load_config, override_config
 from sehdr_warp.training.initialization import choose_response, make_field
 from sehdr_warp.training.run import field_from_checkpoint
 from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
 
 from .test_train import QUICK
+from .toy import load_unscaled
 
 TRAIN = """
 import sys, time
@@ -40,8 +40,8 @@ train(toy_scene(), sys.argv[2], configuration(sys.argv[3]), device="cpu", quiet=
 def configuration(strategy):
     preset = "paper" if strategy == "paper" else "default"
     strategies = {} if strategy == "paper" else {"densification.strategy": strategy}
-    fixed = {"schedule.iterations": 120, "schedule.stated_for": 120, "densification.every": 25, "response.name": "srgb"}
-    return load_config(preset, QUICK | fixed | strategies)
+    fixed = {"schedule.iterations": 120, "densification.every": 25}
+    return load_unscaled(preset, QUICK | fixed | strategies)
 
 
 def kill_after_checkpoint(out, strategy):
@@ -101,19 +101,12 @@ def test_resume_of_a_finished_run_changes_nothing(scene, tmp_path):
     assert first.metrics() == again.metrics()
 
 
-def test_a_trainer_continues_from_its_state_with_rates_and_dropout(scene):
-    options = {
-        "model.dropout": 0.2,
-        "densification.slope_corrected": True,
-        "optimizer.final_factor": 0.1,
-        "optimizer.decay_from": 0.1,
-    }
-    config = override_config(configuration("gradient"), options)
+def test_a_trainer_continues_from_its_state(scene):
+    config = configuration("gradient")
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         whole = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cpu"))
-        # 45 is between two changes of the rates.
         _steps(whole, 45)
         tensors, values = whole.state()
         tensors = {name: value.clone() for name, value in tensors.items()}

@@ -5,15 +5,14 @@ import dataclasses
 import numpy as np
 import torch
 
-from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import codes_of
 from sehdr_warp.training.targets import STORED, ViewStack, training_views
 
 from .toy import EXPOSURE_TIME, toy_scene
 
 
-def views_of(scene, device, level=0):
-    return training_views(scene.train_views, level, response_by_name("srgb"), EXPOSURE_TIME, device, truth=True)
+def views_of(scene, device):
+    return training_views(scene.train_views, EXPOSURE_TIME, device, truth=True)
 
 
 def images(view):
@@ -85,5 +84,5 @@ def test_bounds_are_noted_where_asked_for(device):
     scene = toy_scene()
     dark = dataclasses.replace(scene.views[0], codes=np.zeros((32, 32, 3), np.uint8))
     for bounds in (True, False):
-        views = training_views((dark,), 0, response_by_name("srgb"), 1.0, device, truth=False, bounds=bounds)
+        views = training_views((dark,), 1.0, device, truth=False, bounds=bounds)
         assert (views[0].target.black is not None) == bounds

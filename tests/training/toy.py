@@ -7,8 +7,15 @@ from sehdr_warp.field.gaussians import Gaussians
 from sehdr_warp.field.radiance_field import RadianceField
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
+from sehdr_warp.training.config import Config, stated
+from sehdr_warp.training.config_files import config_to_dict, load_config
 
 EXPOSURE_TIME = 0.25
+NUMBERS = (
+    *(f"densification.{name}" for name in ("start", "stop", "every", "reset_every")),
+    *(f"schedule.{name}" for name in ("harmonics_every", "evaluate_at", "checkpoint_every")),
+)
+"""The fields of a config that are iteration numbers."""
 
 
 def orbit_camera(angle: float, size: int = 32, radius: float = 4.0) -> Camera:
@@ -40,3 +47,17 @@ def toy_scene(view_count: int = 8, size: int = 32, with_points: bool = True) -> 
     colors = np.full((len(points), 3), 0.5, dtype=np.float32)
     chosen = slice(None) if with_points else slice(0)
     return Scene("toy", "transforms", tuple(views), points[chosen], colors[chosen])
+
+
+def load_unscaled(preset: str = "default", overrides: dict | None = None, length: int | None = None) -> Config:
+    """load_config without a plan, with iteration numbers as they stand in a training of `length` iterations, by default
+    its own."""
+    given = {"plan.enabled": False} | (overrides or {})
+    plain = config_to_dict(load_config(preset))
+    iterations = length or given.get("schedule.iterations", plain["schedule"]["iterations"])
+    for path in NUMBERS:
+        part, name = path.split(".")
+        value = given.get(path, plain[part][name])
+        many = isinstance(value, list | tuple)
+        given[path] = [stated(n, iterations) for n in value] if many else stated(value, iterations)
+    return load_config(preset, given)
