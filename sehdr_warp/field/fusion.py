@@ -115,7 +115,7 @@ class NeuralExposureFusion(nn.Module):
         return values[..., 0].permute(1, 2, 0)
 
     def tabulated(self, log_base: torch.Tensor) -> torch.Tensor:
-        """As forward: Catmull-Rom between the table's nodes; constant below them, a straight line in log radiance above."""
+        """As forward: Catmull-Rom between the table's nodes; below them constant, above a line in log radiance."""
         step = (self._high - self._low) / (NODES - 1)
         plain = log_base.dtype != torch.float32 or torch.are_deterministic_algorithms_enabled()
         on_gpu = log_base.device.type == "cuda" and not plain

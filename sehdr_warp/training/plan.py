@@ -44,7 +44,8 @@ class Plan:
 def make_plan(scene: Scene, config: Config) -> Plan:
     """Reads a scene and decides what its training can leave out, on top of a config.
 
-    The fields in config.plan.keep stay as they are. The plan's own config has plan.enabled off: it is trained as it stands.
+    The fields in config.plan.keep stay as they are. The plan's own config has
+    plan.enabled off.
 
     Raises InputError for a scene that no plan makes sense for, and for kept values that the scene contradicts.
     """
