@@ -69,7 +69,7 @@ def grouped(rows: Sequence[dict], key: Callable) -> dict:
 
 def knowledge(row: dict) -> str:
     """known, blind, or learned, where the curve is learned with the scene and was not told either way."""
-    learned = row["config"]["training"]["response"]["form"] == "mlp"
+    learned = row["config"]["training"]["response"]["name"] == "learned"
     return LEARNED if learned else row["config"]["response"]
 
 
