@@ -7,9 +7,10 @@ import numpy as np
 from PIL import Image
 
 from sehdr_warp.scene import Camera, Scene, load_scene, look_at
-from sehdr_warp.scene.hdr_nerf_layout import RadianceView, reinhard_gamma, write_hdr_nerf_scene
+from sehdr_warp.scene.capture import reinhard_gamma
 from sehdr_warp.scene.images import read_hdr
 from sehdr_warp.scene.resample import area_average
+from sehdr_warp.synth.photo_set import RadianceView, write_hdr_nerf_scene
 
 
 def load(path, response="srgb", **options) -> Scene:

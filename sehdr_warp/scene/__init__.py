@@ -1,7 +1,7 @@
 """What was photographed: cameras, views, scenes, and the readers that load them. Imports neither torch nor warp."""
 
 from .camera import Camera, look_at
-from .camera_path import load_cameras
+from .camera_files import load_cameras
 from .develop import develop
 from .embedded import embedded_folder, embedded_scenes, is_embedded
 from .load import choose_response, load_scene, read_capture

@@ -5,9 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
-from sehdr_warp.errors import InputError
-
+from ..errors import InputError
 from .lens import Lens
+
+DERIVED_PHOTOS = "reinhard-gamma"
+"""What a set of truth alone states as `photo_response`: its photos are made of the truth by this curve."""
+
+
+def reinhard_gamma(exposure: np.ndarray) -> np.ndarray:
+    """HDR-NeRF's synthetic response: (x / (1 + x))^(1 / 2.2), exposure x >= 0 -> [0, 1)."""
+    exposure = np.maximum(exposure, 0.0)
+    return (exposure / (1.0 + exposure)) ** (1 / 2.2)
 
 
 @dataclass(frozen=True)

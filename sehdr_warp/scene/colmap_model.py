@@ -11,11 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sehdr_warp.errors import InputError
-
+from ..errors import InputError
+from ..files import read_bytes, read_text
 from .capture import pose_from_quaternion
 from .lens import CAMERA_MODELS, PARAMETER_COUNTS, Lens
-from .paths import read_bytes, read_text
 
 MAX_NAME_BYTES = 4096
 _REMEDY = "export the model again with COLMAP"

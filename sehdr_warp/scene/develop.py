@@ -9,8 +9,7 @@ import numpy as np
 
 from ..errors import InputError
 from .camera import Camera
-from .capture import Capture, Shot
-from .hdr_nerf_layout import reinhard_gamma
+from .capture import Capture, Shot, reinhard_gamma
 from .images import EncodedImage, image_sizes, read_hdr, read_ldr, read_mask
 from .lens import Lens, Undistortion
 from .names import unique_names

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from sehdr_warp.errors import InputError
-
+from ..errors import InputError
+from ..files import read_bytes
 from .capture import Shot
 from .images import open_image
-from .paths import read_bytes
 
 _EXIF_IFD = 0x8769
 _EXPOSURE_TIME, _F_NUMBER, _SPEED, _SHUTTER_APEX = 33434, 33437, 34855, 37377

@@ -1,12 +1,12 @@
 """Cameras as photographed, with lens distortion, and the pinhole cameras that their photos are resampled to."""
 
+import functools
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from sehdr_warp.errors import InputError
-
+from ..errors import InputError
 from .camera import Camera
 
 # COLMAP's camera models: identity in binary files -> (name, number of parameters), src/colmap/sensor/models.h.
@@ -107,24 +107,17 @@ class Lens:
 class Undistortion:
     """Resamples photos taken through one distorting lens to the pinhole camera that shows only real pixels.
 
-    The projection and the choice of the pinhole camera (size and focal length, no blank border) are pycolmap's;
-    the resampling is bilinear, on float images. Raises InputError where the lens cannot be undone.
+    Projections and the choice of the pinhole camera (size and focal length, no blank border) are COLMAP's; resampling
+    is bilinear, on float images. Raises InputError where the lens cannot be undone.
     """
 
     def __init__(self, lens: Lens):
-        import pycolmap
-
-        distorted = pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))
         try:
-            target = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), distorted)
-            width, height = int(target.width), int(target.height)
-            fx, fy = target.focal_length_x, target.focal_length_y
-            cx, cy = target.principal_point_x, target.principal_point_y
+            distort, (width, height, fx, fy, cx, cy) = _projection(lens)
             if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE and np.isfinite([fx, fy, cx, cy]).all()):
                 raise ValueError(f"size {width} x {height}, focal length {fx}")
             columns, rows = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy
-            rays = np.stack([*np.meshgrid(columns, rows), np.ones((height, width))], axis=2).reshape(-1, 3)
-            places = np.asarray(distorted.img_from_cam(rays)).reshape(height, width, 2)
+            places = distort(np.stack(np.meshgrid(columns, rows), axis=2).reshape(-1, 2)).reshape(height, width, 2)
         except (ValueError, RuntimeError, OverflowError, MemoryError) as error:
             raise InputError(lens.source, f"distortion {lens.model} {lens.params} cannot be undone ({error})",
                              "undistort the images with COLMAP's image_undistorter first") from None  # fmt: skip
@@ -153,3 +146,90 @@ class Undistortion:
             for plane in done:
                 plane[self.outside] = 0.0
         return done[0] if image.ndim == 2 else np.stack(done, axis=2)
+
+
+_RADIAL = {"SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 8}
+_FISHEYE = {"SIMPLE_RADIAL_FISHEYE": 1, "RADIAL_FISHEYE": 2, "OPENCV_FISHEYE": 4, "SIMPLE_FISHEYE": 0, "FISHEYE": 0}
+
+
+def _projection(lens: Lens):
+    """A function from normalised coordinates [N, 2] to the lens's pixels, and the pinhole camera's intrinsics.
+
+    Common lenses are projected here; pycolmap, which takes a second to load, knows the others.
+    """
+    if lens.model in _RADIAL or lens.model in _FISHEYE:
+        distort = functools.partial(_pixels, lens)
+        return distort, _pinhole_without_border(lens, distort)
+    import pycolmap
+
+    camera = pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))
+    target = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+    intrinsics = (target.focal_length_x, target.focal_length_y, target.principal_point_x, target.principal_point_y)
+
+    def distort(points: np.ndarray) -> np.ndarray:
+        return np.asarray(camera.img_from_cam(np.concatenate([points, np.ones((len(points), 1))], axis=1)))
+
+    return distort, (int(target.width), int(target.height), *intrinsics)
+
+
+def _pixels(lens: Lens, points: np.ndarray) -> np.ndarray:
+    """Normalised coordinates [N, 2] -> pixels [N, 2] (COLMAP, src/colmap/sensor/models.h)."""
+    (x, y), k = points.T, lens.params[3 if lens.model in _ONE_FOCAL else 4 :]
+    with np.errstate(all="ignore"):
+        if lens.model in _FISHEYE:
+            radius = np.hypot(x, y)
+            angle = np.arctan(radius)
+            bent = angle * (1 + sum(value * angle ** (2 * i + 2) for i, value in enumerate(k)))
+            scale = np.where(radius > 1e-12, bent / np.maximum(radius, 1e-12), 1.0)
+            u, v = x * scale, y * scale
+        else:
+            k1, k2, p1, p2, k3, k4, k5, k6 = (*k, *[0.0] * (8 - len(k)))
+            r = x * x + y * y
+            scale = (1 + r * (k1 + r * (k2 + r * k3))) / (1 + r * (k4 + r * (k5 + r * k6)))
+            u = x * scale + 2 * p1 * x * y + p2 * (r + 2 * x * x)
+            v = y * scale + 2 * p2 * x * y + p1 * (r + 2 * y * y)
+    (fx, fy), (cx, cy) = lens.focal, lens.centre
+    return np.stack([fx * u + cx, fy * v + cy], axis=1)
+
+
+def _pinhole_without_border(lens: Lens, distort) -> tuple[int, int, float, float, float, float]:
+    """The size and intrinsics that COLMAP's undistort_camera takes: the largest picture without a blank pixel."""
+    (fx, fy), (cx, cy), width, height = lens.focal, lens.centre, lens.width, lens.height
+    rows, columns = np.arange(height) + 0.5, np.arange(width) + 0.5
+
+    def edge(fixed: float, axis: int) -> np.ndarray:
+        """Where a border of the photo lies in the pinhole at the photo's focal lengths, along `axis`."""
+        along = rows if axis == 0 else columns
+        pixels = np.stack([np.full(len(along), fixed), along][:: 1 if axis == 0 else -1], axis=1)
+        places = _normalised(lens, distort, pixels)[:, axis] * (fx, fy)[axis] + (cx, cy)[axis]
+        places = places[np.isfinite(places)]
+        if not len(places):
+            raise ValueError("no border pixel has a ray")
+        return places
+
+    left, right, top, bottom = edge(0.5, 0), edge(width - 0.5, 0), edge(0.5, 1), edge(height - 0.5, 1)
+    with np.errstate(all="ignore"):
+        across = 1 / max(cx / (cx - left.max()), (width - 0.5 - cx) / (right.min() - cx))
+        down = 1 / max(cy / (cy - top.max()), (height - 0.5 - cy) / (bottom.min() - cy))
+    across, down = (float(np.clip(scale, 0.2, 2.0)) for scale in (across, down))
+    new = max(1, int(across * width)), max(1, int(down * height))
+    return *new, fx, fy, cx * new[0] / width, cy * new[1] / height
+
+
+def _normalised(lens: Lens, distort, pixels: np.ndarray) -> np.ndarray:
+    """[N, 2] normalised coordinates of pixels by Newton's method; NaN where it finds none."""
+    start = (pixels - lens.centre) / lens.focal
+    points, step = start.copy(), 1e-6
+    with np.errstate(all="ignore"):
+        for _ in range(100):
+            off = (distort(points) - pixels) / lens.focal
+            if not np.abs(off[np.isfinite(off).all(1)]).max(initial=0.0) > 1e-12:
+                break
+            columns = [(distort(points + shift) - distort(points - shift)) / lens.focal / (2 * step)
+                       for shift in np.eye(2) * step]  # fmt: skip
+            (a, c), (b, d) = (column.T for column in columns)
+            u, v = off.T / (a * d - b * c)
+            points -= np.stack([d * u - b * v, a * v - c * u], axis=1)
+        off = np.abs(distort(points) - pixels).max(axis=1)
+    points[~(off < 1e-4)] = np.nan
+    return points

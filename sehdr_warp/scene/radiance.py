@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sehdr_warp.errors import InputError
-
-from .paths import read_bytes
+from ..errors import InputError
+from ..files import read_bytes
 
 _REMEDY = "export the image again"
 _MAX_HEADER_BYTES = 1 << 16

@@ -3,14 +3,13 @@
 import re
 from pathlib import Path
 
-from sehdr_warp.errors import InputError
-
+from ..errors import InputError
+from ..files import contained, read_json
 from .capture import Capture, Shot
 from .colmap_model import SparseModel, find_model, read_model
 from .exposure import parse_seconds
 from .images import HDR_SUFFIXES, LDR_SUFFIXES
 from .names import natural_key, sibling
-from .paths import contained, read_json
 
 # The images of reduced copies of a set lie in images_2 ... images_8; the full ones are taken where they are there.
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")

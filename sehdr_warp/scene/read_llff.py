@@ -5,14 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from sehdr_warp.errors import InputError
-
+from ..errors import InputError
+from ..files import read_bytes
 from .capture import Capture, Shot, pose_from_camera_to_world
 from .colmap_model import find_model
 from .images import LDR_SUFFIXES
 from .lens import Lens
 from .names import list_images
-from .paths import read_bytes
 from .read_colmap import poses_by_view
 
 _REMEDY = "export the poses again with LLFF's imgs2poses"

@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from sehdr_warp.errors import InputError
-
+from ..errors import InputError
 from .capture import Capture, Shot
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, image_sizes
 from .names import list_images

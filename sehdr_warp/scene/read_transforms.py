@@ -6,16 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from sehdr_warp.errors import InputError
-
-from .capture import Capture, Shot, pose_from_camera_to_world
+from ..errors import InputError
+from ..files import contained, read_json
+from .capture import DERIVED_PHOTOS, Capture, Shot, pose_from_camera_to_world
 from .colmap_model import find_model, read_ply_points, read_points
 from .exposure import parse_seconds
-from .hdr_nerf_layout import DERIVED_PHOTOS
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, image_sizes
 from .lens import Lens
 from .names import sibling
-from .paths import contained, read_json
 
 _REMEDY = "correct the file or export it again"
 

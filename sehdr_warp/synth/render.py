@@ -14,9 +14,9 @@ from ..errors import InputError, SehdrError
 from ..files import atomic_path, write_json
 from ..output.exr import exr_header, read_exr, write_exr
 from ..scene import Camera
-from ..scene.hdr_nerf_layout import RadianceView
 from .cameras import VIEWS, make_cameras, split_of
 from .denoise import Denoiser, check_denoiser, denoiser_version
+from .photo_set import RadianceView
 from .scenes import Recipe
 from .stage import Stage
 from .truth_set import truth_path, write_truth_tables

@@ -14,8 +14,9 @@ import numpy as np
 from ..errors import InputError
 from ..files import atomic_path, write_json
 from ..scene import Scene, View, codes_of
-from ..scene.hdr_nerf_layout import DERIVED_PHOTOS, RadianceView, reinhard_gamma
+from ..scene.capture import DERIVED_PHOTOS, reinhard_gamma
 from .expose import exposure_ladder
+from .photo_set import RadianceView
 
 START_POINTS = 6000
 """Of a set's points3d.ply; at a point per five pixels and view, as dense as structure from motion gets them."""

@@ -48,7 +48,7 @@ def _read_transforms(folder: Path):
 
 
 def _hdr_nerf(folder: Path) -> None:
-    from sehdr_warp.scene.hdr_nerf_layout import RadianceView
+    from sehdr_warp.synth.photo_set import RadianceView
     from tests.training.toy import orbit_camera
 
     view = orbit_camera(0.0, 16)
@@ -257,7 +257,7 @@ def _cameras(folder: Path) -> None:
 
 
 def _read_cameras(folder: Path):
-    from sehdr_warp.scene.camera_path import load_cameras
+    from sehdr_warp.scene.camera_files import load_cameras
 
     return each(folder, "*.json", load_cameras)
 

@@ -44,6 +44,8 @@ def test_every_camera_model_has_pycolmaps_id_and_parameters():
     [
         ("OPENCV", (50, 52, 30, 25, -0.1, 0.02, 1e-3, -2e-3)),
         ("SIMPLE_RADIAL", (50, 32, 24, -0.15)),
+        ("FULL_OPENCV", (50, 52, 30, 25, -0.1, 0.02, 1e-3, -2e-3, 0.01, 0.02, 0, 0)),
+        ("RADIAL_FISHEYE", (30, 32, 24, 0.1, -0.05)),
         ("OPENCV_FISHEYE", (40, 40, 32, 24, 0.01, 0, 0, 0)),
         ("FOV", (50, 50, 32, 24, 0.4)),
     ],
@@ -59,6 +61,9 @@ def test_distortion_is_undone_where_pycolmap_projects(tmp_path, model, params):
     rows, columns = np.mgrid[2 : camera.height - 2 : 5, 2 : camera.width - 2 : 5].reshape(2, -1)
     rays = np.stack([(columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy, 0 * rows + 1.0], 1)
     np.testing.assert_allclose(view.image[rows, columns, :2] * 255 + 0.5, lens.img_from_cam(rays), atol=0.02)
+    pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
+    assert (camera.width, camera.height) == (pinhole.width, pinhole.height)
+    np.testing.assert_allclose(camera.intrinsics, pinhole.params, rtol=1e-9)
 
 
 def test_distorted_photos_scaled_down_show_the_same_places(tmp_path):
@@ -222,7 +227,7 @@ def test_fern_is_read_as_pycolmap_reads_it(shared):
 
 def test_hdr_gs_layout(tmp_path):
     write_colmap(tmp_path, name="{}_1.png")
-    from sehdr_warp.scene.hdr_nerf_layout import reinhard_gamma
+    from sehdr_warp.scene.capture import reinhard_gamma
 
     (tmp_path / "exr").mkdir()
     import OpenEXR

@@ -193,8 +193,12 @@ def test_embedded_scene_loads():
     assert scene.exposure_times_known
 
 
-def test_importing_the_scene_room_stays_light():
+def test_the_room_is_light_and_transforms_need_no_pycolmap(tmp_path):
+    """Also where lenses distort; triangulating points does need it."""
+    write_blender(tmp_path, k1=-0.1)
+    write_colmap(tmp_path / "colmap")
     heavy = "{'torch', 'warp', 'pycolmap', 'OpenEXR', 'scipy', 'matplotlib', 'colour'}"
-    code = f"import sys, sehdr_warp.scene; print(sorted({heavy} & set(sys.modules)))"
+    code = f"import sys, sehdr_warp.scene as s; print(sorted({heavy} & set(sys.modules)))\n"
+    code += f"s.load_scene({str(tmp_path)!r}, response='srgb'); print('pycolmap' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert done.stdout.split() == ["[]", "False"]

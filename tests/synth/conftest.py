@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sehdr_warp.output.exr import write_exr
-from sehdr_warp.scene.hdr_nerf_layout import RadianceView
 from sehdr_warp.synth.cameras import Grid, make_cameras, split_of
+from sehdr_warp.synth.photo_set import RadianceView
 from sehdr_warp.synth.truth_set import truth_path, write_truth_tables
 
 VIEWS = 6

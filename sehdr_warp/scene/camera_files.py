@@ -5,13 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from sehdr_warp.errors import InputError
-
+from ..errors import InputError
+from ..files import read_json
 from .camera import Camera
 from .capture import pose_from_camera_to_world
 from .images import MAX_PIXELS
 from .names import natural_key
-from .paths import read_json
 from .read_transforms import frame_lens, frame_pose, frames_of
 
 
