@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..field.radiance_field import Photograph, RadianceField
 from ..response import Response, ToneMapper
-from ..splatting.one_sided import seen_by_photo
+from ..splatting.clipped_residual import CodeScale, clipped_residual, code_values
 from ..splatting.ssim import image_distance, ssim
 from .config import LossConfig
 
@@ -26,27 +26,23 @@ ANCHOR = 0.5
 
 @dataclass(frozen=True)
 class Target:
-    """One training photo on the device, at one resolution.
+    """One training photo on the device.
 
-    photo: [H, W, 3] encoded values in [0, 1], or uint8 codes of 255; clipped, black: [H, W, 3] bool, or None where the
-    photo has none of them;
-    mask: [H, W, 1] in [0, 1] or None; exposure_truth: [H, W, 3] true radiance times the base time, or None;
-    light: [H, W, 3] exposures decoded from the photo, where they are kept for every step; None: decode them.
-    index: [1], int64, on the device; then photo is a stack [V, H, W, 3] that has the photo at this place.
+    codes: [H, W, 3] as code_tensor() holds them; scale: what they are worth, see code_scale; mask: [H, W, 1] in [0, 1]
+    or None; exposure_truth: [H, W, 3] true radiance times the base time, or None.
+    index: [1], int64, on the device; then codes is a stack [V, H, W, 3] that has the photo at this place.
     """
 
-    photo: Tensor
-    clipped: Tensor | None
-    black: Tensor | None
-    mask: Tensor | None
-    exposure_truth: Tensor | None
-    light: Tensor | None = None
+    codes: Tensor
+    scale: CodeScale
+    mask: Tensor | None = None
+    exposure_truth: Tensor | None = None
     index: Tensor | None = None
 
     @property
     def encoded(self) -> Tensor:
-        """[H, W, 3] in [0, 1], made of codes whenever it is asked for."""
-        return values_of(one_of(self.photo, self.index))
+        """[H, W, 3] in [0, 1], made of the codes whenever it is asked for."""
+        return code_values(one_of(self.codes, self.index))
 
 
 def one_of(stack: Tensor, index: Tensor | None) -> Tensor:
@@ -54,66 +50,49 @@ def one_of(stack: Tensor, index: Tensor | None) -> Tensor:
     return stack if index is None else stack.index_select(0, index)[0]
 
 
-def values_of(photo: Tensor) -> Tensor:
-    """Encoded values, float32, of a photo that may be stored as uint8 codes."""
-    # By a tensor: torch's division by a number on a GPU is a product with its reciprocal, which rounds differently.
-    return photo if photo.dtype != torch.uint8 else photo / torch.full((), 255.0, device=photo.device)
+def code_scale(
+    white: int, response: Response | None, device, *, clipping: bool = True, dtype: torch.dtype = torch.float32
+) -> CodeScale:
+    """How photos are compared: in the mu-law of the exposures that the response decodes, or without one as encoded.
 
-
-def one_sided(prediction: Tensor, truth: Tensor, target: Target, half_codes: tuple[float, float]) -> Tensor:
-    """The prediction [H, W, 3] as far as the photo can tell: the truth, plus what lies outside of the bounds.
-
-    A clipped pixel says `at least white less half a code`, so what is brighter equals it: without the half code a
-    response that never quite reaches white would be pulled up for ever. A black pixel says `at most half a code`, so
-    what is darker equals it. truth: [H, W, 3], the photo in the prediction's domain; half_codes: there, of half a code
-    below white and above black.
+    white: the largest code, 255 or 65535. clipping: it says `at least white less half a code`, and 0 says `at most half
+    a code`: without the half a response that never quite reaches white would be pulled up for ever. Half a code is that
+    of 8 bits for 16 too, since those are mostly averages of 8 bits.
     """
-    seen = prediction
-    if target.clipped is not None:
-        seen = torch.where(target.clipped, truth + (prediction - (truth - half_codes[0])).clamp_max(0), seen)
-    if target.black is not None:
-        seen = torch.where(target.black, truth + (prediction - (truth + half_codes[1])).clamp_min(0), seen)
-    return seen
+    values = torch.arange(white + 1, dtype=torch.float64) / white
+    if response is None:
+        return CodeScale(values.to(device, dtype), half_codes=(CODE / 2, CODE / 2) if clipping else None)
+    mu = mu_of_knee(response)
+    table = mu_law(response.decode(values), response.white, mu).to(device, dtype)
+    return CodeScale(table, mu, response.white, _half_codes(response, mu) if clipping else None)
 
 
 def image_loss(prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str, weight: float) -> Tensor:
     """L1 + weight (1 - SSIM) ("sum", SeHDR's equation 11) or (1 - weight) L1 + weight (1 - SSIM) ("blend", 3DGS).
 
-    prediction, truth: [H, W, 3]; mask: [H, W, 1] or None: pixels outside count nothing in L1 and as equal in SSIM.
+    prediction, truth: [H, W, 3], truth without a gradient; mask: [H, W, 1] or None: pixels outside count nothing in L1
+    and as equal in SSIM.
     """
-    if weight and mask is None and prediction.device.type == "cuda" and not truth.requires_grad:
-        return image_distance(prediction, truth, 1.0 if form == "sum" else 1 - weight, weight)
-    if mask is not None:
-        prediction, truth = prediction * mask, truth * mask
-    difference = (prediction - truth).abs().mean()
-    if mask is not None:
-        difference = difference / mask.mean().clamp_min(1e-6)
-    if weight == 0:
-        return difference
-    dissimilarity = 1 - ssim(prediction, truth)
-    return (difference if form == "sum" else (1 - weight) * difference) + weight * dissimilarity
+    distance_weight = 1.0 if form == "sum" else 1 - weight
+    if mask is None and weight:
+        return image_distance(prediction, truth, distance_weight, weight)
+    if mask is None:
+        return (prediction - truth).abs().mean()
+    prediction, truth = prediction * mask, truth * mask
+    difference = distance_weight * (prediction - truth).abs().mean() / mask.mean().clamp_min(1e-6)
+    return difference + weight * (1 - ssim(prediction, truth)) if weight else difference
 
 
-def ldr_loss(photo: Photograph, target: Target, config: LossConfig, response: Response | None = None) -> Tensor:
-    """The photo against the simulated one, L_LDR: in the mu-law of exposures where pixels have one and the response is
-    known, else as encoded values. With `clipping` one-sided where the camera saturated."""
-    if photo.light is None or response is None or isinstance(response, ToneMapper):
-        prediction, truth, half_codes = photo.encoded, target.encoded, (CODE / 2, CODE / 2)
-    else:
-        white, mu = response.white, mu_of_knee(response)
-        half_codes = _half_codes(response, mu)
-        photo_light = response.decode(target.encoded) if target.light is None else target.light
-        if config.clipping and photo.light.device.type == "cuda":
-            masks = target.clipped, target.black
-            seen, truth = seen_by_photo(photo.light, photo_light, *masks, white=white, mu=mu, half_codes=half_codes)
-            return image_loss(seen, truth, target.mask, config.form, config.ssim_weight)
-        prediction, truth = mu_law(photo.light, white, mu), mu_law(photo_light, white, mu)
-    seen = one_sided(prediction, truth, target, half_codes) if config.clipping else prediction
+def ldr_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor:
+    """The photo against the simulated one, L_LDR, on the target's scale, and where the camera saturated only as far as
+    the photo can tell."""
+    image = photo.light if target.scale.mu else photo.encoded
+    seen, truth = clipped_residual(image, target.codes, target.scale, target.index)
     return image_loss(seen, truth, target.mask, config.form, config.ssim_weight)
 
 
 def compares_light(config: LossConfig, field: RadianceField) -> bool:
-    """Whether ldr_loss decodes the photos of this field's training."""
+    """Whether ldr_loss compares exposures: where pixels have one and the curve is known."""
     decodable = field.radiance != "display" and field.tone_map == "pixel" and not isinstance(field.response, ToneMapper)
     return config.ldr_weight > 0 and decodable
 
@@ -133,11 +112,6 @@ def _half_codes(response: Response, mu: float) -> tuple[float, float]:
         math.log1p(mu * float(response.decode(value)) / response.white) / math.log1p(mu) for value in exposures
     )
     return white - below, above - black
-
-
-def _is_decodable(photo: Photograph, response: Response | None) -> bool:
-    """Whether the simulated photo's pixels have exposures, and a curve that is not itself learned tells the photo's."""
-    return photo.light is not None and response is not None and not isinstance(response, ToneMapper)
 
 
 def mu_law(exposure: Tensor, white: float, mu: float = MU) -> Tensor:
@@ -191,7 +165,7 @@ def data_loss(
     field: RadianceField, photo: Photograph, target: Target, config: LossConfig, largest_truth: float = 1.0
 ) -> Tensor:
     """L_LDR + beta L_linear (equation 13), the HDR loss and the anchor, each where it has a weight."""
-    loss = ldr_loss(photo, target, config, field.response) if config.ldr_weight > 0 else 0.0
+    loss = ldr_loss(photo, target, config) if config.ldr_weight > 0 else 0.0
     if config.ldr_weight not in (0, 1):
         loss = config.ldr_weight * loss
     if config.hdr_weight > 0 and target.exposure_truth is not None:

@@ -30,8 +30,6 @@ from .targets import TrainingView, ViewStack, largest_truth, training_views
 
 CHECK_EVERY = 20
 """Iterations between looks at the count of skipped steps, each of which waits for the device."""
-DECODED_PIXELS = 1 << 27
-"""Photos of so many pixels in all are kept decoded as well, in 1.6 GB at most; more are decoded in each step."""
 MOST_SKIPPED = 20
 """Steps with a loss or gradient that is not finite are skipped; more than so many end the training."""
 
@@ -256,15 +254,13 @@ class Trainer:
 
     def _upload(self) -> list[TrainingView]:
         loss, field = self.config.loss, self.field
-        pixels = sum(view.camera.width * view.camera.height for view in self._views)
-        kept = compares_light(loss, field) and pixels <= DECODED_PIXELS
         return training_views(
             self._views,
             field.base_time,
             self.device,
             truth=loss.uses_hdr,
-            bounds=loss.clipping,
-            light=field.response if kept else None,
+            clipping=loss.clipping,
+            light=field.response if compares_light(loss, field) else None,
         )
 
 
