@@ -11,7 +11,7 @@ from ..response import Response, response_by_name
 from ..response.table import TabulatedResponse
 from ..splatting import ssim
 from ..training.config import LossConfig
-from ..training.losses import CODE, Target, ldr_loss
+from ..training.losses import CODE, Target, code_scale, ldr_loss
 from .case import ROUNDINGS, UNIT, Case, Reading, compare, count, not_finite
 
 LIGHT = "light"
@@ -164,9 +164,7 @@ def _photos(device):
     for name, photo in (("clipped", torch.ones_like(noise)), ("black", torch.zeros_like(noise)), ("one pixel", spot)):
 
         def loss(prediction, photo=photo):
-            photo = photo.to(prediction)
-            target = Target(photo, photo >= 1 - CODE / 2, photo <= CODE / 2, None, None)
-            return {"loss": _loss(prediction, target)}
+            return {"loss": _loss(prediction, photo)}
 
         prediction = 0.05 + 0.9 * noise
         readings += [
@@ -179,15 +177,16 @@ def _photos(device):
     for name, photo, value in met:
         prediction = torch.full((8, 8, 3), value, device=device, requires_grad=True)
         photo = torch.full((8, 8, 3), photo, device=device)
-        target = Target(photo, photo > 0.5, photo < 0.5, None, None)
-        _loss(prediction, target).backward()
+        _loss(prediction, photo).backward()
         readings.append(count(f"{name}: pixels that still pull", (prediction.grad != 0).sum()))
     return readings
 
 
-def _loss(prediction, target: Target):
-    """The training's loss between encoded values of a simulated photo [H, W, 3]."""
-    return ldr_loss(SimpleNamespace(encoded=prediction, light=None), target, LossConfig())
+def _loss(prediction, photo):
+    """The training's loss between encoded values of a simulated photo [H, W, 3] and a photo of black and white."""
+    codes = (255 * photo).to(prediction.device, torch.uint8)
+    target = Target(codes, code_scale(255, None, prediction.device, dtype=prediction.dtype))
+    return ldr_loss(SimpleNamespace(encoded=prediction), target, LossConfig())
 
 
 def _similarity(device):

@@ -20,8 +20,9 @@ WHITE = {torch.uint8: 255, torch.int16: 65535}
 
 
 def code_tensor(codes: np.ndarray, device: torch.device | str) -> torch.Tensor:
-    """uint8 or uint16 codes on a device: uint8, or int16 of the same bits."""
-    return torch.tensor(codes.view(np.int16) if codes.dtype == np.uint16 else codes, device=device)
+    """uint8 or uint16 codes on a device: uint8, or int16 of the same bits. On the CPU in the array's own memory."""
+    codes = np.require(codes, requirements=("C", "W"))
+    return torch.from_numpy(codes.view(np.int16) if codes.dtype == np.uint16 else codes).to(device)
 
 
 def code_values(codes: torch.Tensor) -> torch.Tensor:

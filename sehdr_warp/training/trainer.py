@@ -243,7 +243,8 @@ class Trainer:
     def _training_views(self) -> ViewStack | list[TrainingView]:
         if self._stack is None:
             views = self._upload()
-            self._stack = ViewStack.of(views) or views
+            # Only recorded steps need what they read in one place.
+            self._stack = (None if self._recorder is None else ViewStack.of(views)) or views
         return self._stack
 
     def _next_index(self, count: int) -> int:

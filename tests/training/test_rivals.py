@@ -15,7 +15,7 @@ from sehdr_warp.training.config import Config, LossConfig, ModelConfig, Response
 from sehdr_warp.training.config_checks import ConfigError
 from sehdr_warp.training.config_files import load_config, override_config, preset_names
 from sehdr_warp.training.initialization import choose_response, make_field, start_colours
-from sehdr_warp.training.losses import Target, anchor_loss, data_loss, hdr_loss
+from sehdr_warp.training.losses import Target, anchor_loss, code_scale, data_loss, hdr_loss
 from sehdr_warp.training.run import load_run
 from sehdr_warp.training.targets import largest_truth
 from sehdr_warp.training.train import train
@@ -83,10 +83,15 @@ def images(seed):
     return 4 * torch.rand((12, 14, 3), generator=generator)
 
 
+def target_of(encoded, truth):
+    codes = (255 * encoded).round().to(torch.uint8)
+    return Target(codes, code_scale(255, None, "cpu", clipping=False), exposure_truth=truth)
+
+
 def test_the_hdr_loss_compares_in_the_mu_law():
     exposure, truth = images(0), images(1)
     config = LossConfig(form="blend", hdr_weight=1.0)
-    target = Target(truth, None, None, None, truth)
+    target = target_of(truth / 4, truth)
     loss = hdr_loss(Photograph(exposure, exposure, exposure, None), target, config, 4.0)
     a, b = ((1 + 5000 * x / 4).log() / math.log1p(5000) for x in (exposure, truth))
     assert float(loss) == pytest.approx(float(0.8 * (a - b).abs().mean() + 0.2 * (1 - ssim(a, b))), rel=1e-4)
@@ -94,7 +99,7 @@ def test_the_hdr_loss_compares_in_the_mu_law():
 
 def test_weights_mix_photos_and_truth(scene):
     photo = Photograph(images(0) / 4, images(1), images(1), None)
-    target = Target(images(2) / 4, None, None, None, images(3))
+    target = target_of(images(2) / 4, images(3))
     field = trainer_of(scene, quick()).field
 
     def loss(**weights):

@@ -3,86 +3,65 @@
 import dataclasses
 
 import numpy as np
+import pytest
 import torch
 
-from sehdr_warp.scene import codes_of
-from sehdr_warp.training.targets import STORED, ViewStack, training_views
+from sehdr_warp.response import response_by_name
+from sehdr_warp.training.targets import ViewStack, training_views
 
 from .toy import EXPOSURE_TIME, toy_scene
 
 
-def views_of(scene, device):
-    return training_views(scene.train_views, EXPOSURE_TIME, device, truth=True)
-
-
-def images(view):
-    target = view.target
-    return {name: getattr(target, name) for name in STORED} | {"photo": target.encoded}
+def views_of(views, device, **options):
+    return training_views(views, EXPOSURE_TIME, device, truth=True, **options)
 
 
 def test_a_stacked_view_is_the_view(device):
-    scene = toy_scene()
-    masked = dataclasses.replace(scene.views[1], mask=np.tri(32, dtype=np.float32), exposure_time=0.5)
-    scene = dataclasses.replace(scene, views=(scene.views[0], masked, *scene.views[2:]))
-    views = views_of(scene, device)
-    stack = ViewStack.of(views)
-    assert len(stack) == len(views)
-    for i, view in enumerate(views):
-        for taken in (stack[i], stack.at(torch.tensor([i], device=device))):
+    views = list(toy_scene().train_views)
+    views[1] = dataclasses.replace(views[1], mask=np.tri(32, dtype=np.float32), exposure_time=0.5)
+    alone = views_of(views, device)
+    stack = ViewStack.of(alone)
+    assert len(stack) == len(alone)
+    for i, view in enumerate(alone):
+        late = stack.at(torch.tensor([i], device=device))
+        assert late.target.codes is stack.targets.codes
+        for taken in (stack[i], late):
             assert float(taken.exposure_time) == view.exposure_time
-            assert torch.equal(taken.camera.world_to_camera, view.camera.world_to_camera)
-            assert torch.equal(taken.camera.intrinsics, view.camera.intrinsics)
-            assert torch.equal(taken.camera.position, view.camera.position)
-            for name, image in images(taken).items():
-                own = images(view)[name]
-                if own is None and image is not None:
-                    # A view without a mask counts everywhere; one without clipped or black pixels has none.
-                    assert bool((image == (1 if name == "mask" else 0)).all())
-                else:
-                    assert (image is None) == (own is None) and (own is None or torch.equal(image, own))
+            for name in ("world_to_camera", "intrinsics", "position"):
+                assert torch.equal(getattr(taken.camera, name), getattr(view.camera, name))
+            assert torch.equal(taken.target.encoded, view.target.encoded)
+            assert torch.equal(taken.target.exposure_truth, view.target.exposure_truth)
+            # One without a mask counts everywhere.
+            whole = torch.ones_like(taken.target.mask)
+            assert torch.equal(taken.target.mask, whole if view.target.mask is None else view.target.mask)
 
 
 def test_equal_times_stay_numbers_and_differing_sizes_do_not_stack(device):
-    views = views_of(toy_scene(), device)
+    views = views_of(toy_scene().train_views, device)
     assert ViewStack.of(views).times == EXPOSURE_TIME
-    assert ViewStack.of(views + views_of(toy_scene(size=16), device)) is None
+    assert ViewStack.of(views).targets.mask is None
+    assert ViewStack.of(views + views_of(toy_scene(size=16).train_views, device)) is None
 
 
-def test_photos_of_whole_codes_are_stacked_in_a_byte_each_and_come_back_exactly(device):
-    every = (np.arange(32 * 32 * 3) % 256).reshape(32, 32, 3).astype(np.float32) / np.float32(255)
-    scene = toy_scene()
-    for values, dtype in ((every, torch.uint8), (every * np.float32(0.999), torch.float32)):
-        views = views_of(
-            dataclasses.replace(scene, views=(dataclasses.replace(scene.views[0], codes=codes_of(values)),)), device
-        )
-        stack = ViewStack.of(views)
-        assert stack.images["photo"].dtype == dtype
-        late = stack.at(torch.zeros(1, dtype=torch.int64, device=device))
-        assert late.target.photo is stack.images["photo"]
-        for taken in (stack[0], late):
-            assert np.allclose(taken.target.encoded.cpu().numpy(), values, atol=1e-5)
+def test_codes_stay_codes_and_come_back_exactly(device):
+    view = toy_scene().views[0]
+    bytes_ = (np.arange(32 * 32 * 3) % 256).reshape(32, 32, 3).astype(np.uint8)
+    words = np.random.default_rng(0).integers(0, 65536, (32, 32, 3)).astype(np.uint16)
+    plain, deep = (dataclasses.replace(view, codes=codes) for codes in (bytes_, words))
+    for views, dtype in (((plain,), torch.uint8), ((plain, deep), torch.int16)):
+        made = views_of(views, device)
+        assert {one.target.codes.dtype for one in made} == {dtype}
+        for one, given in zip(made, views, strict=True):
+            np.testing.assert_array_equal(one.target.encoded.cpu().numpy(), given.image)
 
 
-def test_masks_of_codes_are_made_when_they_are_asked_for(device):
-    values = np.zeros((32, 32, 3), np.float32)
-    values[:16], values[16:, :8] = 1.0, np.float32(7 / 255)
-    scene = toy_scene()
-    whole = dataclasses.replace(scene.views[0], codes=codes_of(values))
-    broken = dataclasses.replace(whole, codes=codes_of(values * np.float32(0.99)))
-    alone, mixed = (
-        ViewStack.of(views_of(dataclasses.replace(scene, views=views), device)) for views in ((whole,), (whole, broken))
-    )
-    assert alone.images["clipped"] is True and mixed.images["photo"].dtype == torch.float32
-    for stack in (alone, mixed):
-        target = stack[0].target
-        assert np.array_equal(target.clipped.cpu().numpy(), values == 1)
-        assert np.array_equal(target.black.cpu().numpy(), values == 0)
-    assert not bool(mixed[1].target.clipped.any())
-
-
-def test_bounds_are_noted_where_asked_for(device):
-    scene = toy_scene()
-    dark = dataclasses.replace(scene.views[0], codes=np.zeros((32, 32, 3), np.uint8))
-    for bounds in (True, False):
-        views = training_views((dark,), 1.0, device, truth=False, bounds=bounds)
-        assert (views[0].target.black is not None) == bounds
+@pytest.mark.parametrize("deep", [False, True])
+def test_a_scale_has_black_at_0_and_white_at_1(device, deep):
+    view = toy_scene().views[0]
+    view = dataclasses.replace(view, codes=view.codes.astype(np.uint16)) if deep else view
+    for light in (None, response_by_name("srgb")):
+        scale = views_of((view,), device, light=light)[0].target.scale
+        assert len(scale.table) == (65536 if deep else 256)
+        assert scale.table[0] == 0 and scale.table[-1].item() == pytest.approx(1, abs=2e-3)
+        assert bool((scale.table.diff() > 0).all()) and min(scale.half_codes) > 0
+    assert views_of((view,), device, clipping=False)[0].target.scale.half_codes is None
