@@ -1,9 +1,153 @@
-"""What the command lines of all rooms share: numbers, and progress on standard error."""
+"""What the command lines of all rooms share: parsing with tyro, refusals in one line, and lists of numbers."""
 
+import dataclasses
+import inspect
+import io
+import itertools
 import math
+import re
 import sys
+import typing
+from collections.abc import Iterator
+from contextlib import redirect_stderr
 
-from .errors import InputError
+import tyro
+
+from .errors import InputError, UsageError, did_you_mean
+
+Options = typing.TypeVar("Options")
+MARKERS = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone)
+
+
+def parse(options: type[Options], words: list[str], program: str) -> Options:
+    """The options that the words of a command line state.
+
+    Args:
+        options: a dataclass; its docstring and its fields' are the help. A field may be a dataclass, whose fields form
+            a group of the help, a TypedDict, whose fields are in --help-all alone, or a union of dataclasses, which are
+            subcommands. A class attribute `gone` may say of flags of earlier versions what to do now.
+        program: what stands before the words, such as `sehdr-warp train`.
+
+    Raises:
+        UsageError: in one line, for words that are no options; with the nearest right one where there is one.
+        SystemExit: after --help.
+    """
+    _hide_empty_defaults(options)
+    details = [name for name, hint in _hints(options).items() if typing.is_typeddict(_plain(hint))]
+    if details and "--help-all" in words:
+        words = ["--help"]
+    elif details and {"-h", "--help"} & set(words):
+        hidden = [(name, tyro.conf.Suppress[_hints(options)[name]], dataclasses.field(default_factory=dict))
+                  for name in details]  # fmt: skip
+        short = dataclasses.make_dataclass(options.__name__, hidden, bases=(options,), frozen=True)
+        short.__doc__ = options.__doc__
+        try:
+            tyro.cli(short, prog=program, args=["--help"], config=MARKERS)
+        finally:
+            print(f"{program} --help-all adds every field of the config, as --loss.ssim-weight 0.2.")
+    _check_flags(options, words, program)
+    told = io.StringIO()
+    try:
+        with redirect_stderr(told):
+            return tyro.cli(options, prog=program, args=words, config=MARKERS)
+    except SystemExit as end:
+        if not end.code:
+            raise
+    raise UsageError(f"{_one_line(told.getvalue())}; see {program} --help")
+
+
+def _check_flags(options: type, words: list[str], program: str) -> None:
+    """Refuses words that are no subcommand or no flag of the options."""
+    below = subcommands(options)
+    if below and words and not words[0].startswith("-"):
+        if words[0] not in below:
+            hint = did_you_mean(words[0], below) or f"; there are {', '.join(below)}"
+            raise UsageError(f"{program} {words[0]}: no such command{hint}")
+        _check_flags(below[words[0]], words[1:], f"{program} {words[0]}")
+        return
+    known = {"--help", *flags(options)}
+    for word in words:
+        flag = word.partition("=")[0].replace("_", "-")
+        if not re.match(r"--[a-z]", flag) or flag in known:
+            continue
+        if flag in getattr(options, "gone", {}):
+            raise UsageError(f"{flag} is gone: {options.gone[flag]}")
+        # A field's own name is nearer than its part's: --los.clipping, --clipping.
+        tails = {name.rpartition(".")[2].removeprefix("--"): name for name in known if "." in name}
+        hint = did_you_mean(flag, known) or (f", did you mean {tails[flag[2:]]}?" if flag[2:] in tails else "")
+        raise UsageError(f"{program} has no {flag}{hint or f'; see {program} --help'}")
+
+
+def _hints(options: type) -> dict[str, typing.Any]:
+    return typing.get_type_hints(options, include_extras=True)
+
+
+def _plain(hint) -> typing.Any:
+    return hint.__origin__ if typing.get_origin(hint) is typing.Annotated else hint
+
+
+def subcommands(options: type) -> dict[str, type]:
+    """The subcommands of options by name."""
+    found = {}
+    for hint in _hints(options).values():
+        for choice in typing.get_args(_plain(hint)):
+            if dataclasses.is_dataclass(_plain(choice)):
+                found |= {mark.name: _plain(choice) for mark in choice.__metadata__ if getattr(mark, "name", None)}
+    return found
+
+
+def flags(options: type) -> Iterator[str]:
+    """The flags of options, without those of their subcommands."""
+    for name, hint in _hints(options).items():
+        kind = _plain(hint)
+        if dataclasses.is_dataclass(kind) or typing.is_typeddict(kind):
+            yield from flags(kind)
+        else:
+            yield "--" + name.replace("_", "-")
+
+
+def _hide_empty_defaults(options: type) -> None:
+    """Leaves `(default: None)` and `(default: False)`, which say nothing, out of the help of options."""
+    for field in dataclasses.fields(options) if dataclasses.is_dataclass(options) else ():
+        owner = next(kind for kind in options.__mro__ if field.name in inspect.get_annotations(kind))
+        hint = owner.__annotations__[field.name]
+        for part in (hint, *typing.get_args(_plain(hint))):
+            if dataclasses.is_dataclass(_plain(part)):
+                _hide_empty_defaults(_plain(part))
+        marks = getattr(hint, "__metadata__", ())
+        if field.default in (None, False, ()) and not any(hasattr(mark, "help_behavior_hint") for mark in marks):
+            quiet = tyro.conf.arg(help_behavior_hint="")
+            owner.__annotations__[field.name] = typing.Annotated[hint, quiet]
+
+
+# What tyro says, and the same in fewer words; a text in none of these forms is passed on as it is.
+_SHORTER = (
+    (r"Missing value for argument '(\S+)'.*", r"\1 needs a value"),
+    (r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*?),?\) ?\.", r"\2 \1: is none of \3"),
+    (r"Error parsing (\S+): no type matching (.+) could be instantiated from \['(.*?)'\].*", r"\1 \3: is no \2"),
+    (r"Error parsing (\S+): .*: '(.*)'", r"\1 \2: is no number"),
+    (r"Expected one of \{(.*)\} ?\.", r"needs one of \1"),
+    (r"Unrecognized options: (.*)", r"\1: more than is asked for"),
+)
+
+
+def _one_line(told: str) -> str:
+    """What tyro says in a box, above the first rule, as one line."""
+    title, *lines = re.sub(r"\x1b\[[0-9;]*m", "", told).splitlines() or [""]
+    # Two columns of border, drawn or blank; without drawing there is a rule below the title.
+    lines = [line[2:].rstrip(" │") for line in lines]
+    lines = list(
+        itertools.takewhile(lambda line: not re.fullmatch("[-─]{4,}.*", line), lines[not lines[0].strip("-") :])
+    )
+    if "Required options" in title:
+        # Names stand four columns in, their help deeper.
+        names = [line.strip() for line in lines if re.match(r" {4}\S", line)]
+        return f"{lines[0].strip(' :').replace('Missing from ', '')} needs {', '.join(names)}"
+    text = " ".join(" ".join(lines).split())
+    for pattern, shorter in _SHORTER:
+        if re.fullmatch(pattern, text):
+            return re.sub(pattern, shorter, text)
+    return text
 
 
 def numbers(flag: str, text: str | None, kind: type = float, least: float = -math.inf) -> tuple | None:

@@ -1,150 +1,73 @@
-"""The command `sehdr-warp`: parses, calls, prints. What needs torch is imported by the commands that need it."""
+"""The command `sehdr-warp`: finds the command, parses, calls, and says in one line what went wrong.
 
-import json
+Each command is a dataclass of options and a function that takes it, in the `commands` module of its room; a new one is
+a line of COMMANDS. Modules are imported by the commands that need them: nothing here needs torch.
+"""
+
 import os
 import sys
-import traceback
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Literal
-
-import tyro
+from collections.abc import Callable
+from importlib import import_module
+from typing import NamedTuple
 
 from . import __version__
-from .arguments import say
-from .bench.commands import Bench, run_bench
-from .check.commands import Check, run_check
-from .errors import InputError, SehdrError
-from .quiet import silence_exit
-from .synth.commands import Synth, run_synth
-from .training.commands import Train, run_train
+from .errors import SehdrError, UsageError, did_you_mean
 
-Positional = tyro.conf.Positional
+PROGRAM = "sehdr-warp"
 
 
-@dataclass(frozen=True)
-class Render:
-    """Render a trained scene: HDR EXR, previews, and exposure brackets. Needs no photos."""
+class Command(NamedTuple):
+    """Where a command is: a module of the package, its dataclass of options, and the function that runs them."""
 
-    run: Positional[Path]
-    """Folder of a run."""
-    out: Path
-    """Folder for the images."""
-    cameras: str = "test"
-    """test, train, all, orbit, interpolate, or a JSON file of cameras."""
-    count: int = 60
-    """Views of an orbit or interpolation."""
-    evs: str | None = None
-    """Brackets in stops from the photos' exposure, such as --evs=-4,-2,0,2,4."""
-    exposures: str | None = None
-    """Brackets as seconds (1/125), multiples of the photos' exposure (1/8x) or stops from it (-2ev): 1/125,1/30,1x."""
-    multipart: bool = False
-    """One multi-part EXR file for all exposures of a view."""
-    ldr_brackets: Literal["jpeg", "png", "png16"] | None = None
-    """Also write the brackets as simulated photos, through the camera response."""
-    colorspace: str = "rec709"
-    """Primaries of the EXR files, always scene-linear: rec709, acescg, aces2065-1, rec2020, display-p3 or dci-p3."""
-    pixel: Literal["half", "float"] = "half"
-    """Pixel type of the EXR files."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
-    overwrite: bool = False
-    """Replace files that exist."""
-    json: bool = False
-    """Print the written files as JSON on standard output."""
+    module: str
+    options: str
+    run: str
 
 
-@dataclass(frozen=True)
-class Evaluate:
-    """Compare a trained scene with its held-out photos and, where there is some, with HDR truth."""
-
-    run: Positional[Path]
-    """Folder of a run."""
-    json: Path | None = None
-    """Also write the figures to this file."""
-    data: str | None = None
-    """The photos, if they have moved since the training."""
-    lpips: Path | None = None
-    """Folder with LPIPS weights; without, LPIPS is null."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
-    overwrite: bool = False
-    """Replace the file of --json."""
-
-
-@dataclass(frozen=True)
-class Export:
-    """Write the Gaussians as PLY: `hdr` with scene-linear colours, `ldr` with the display colours of 3DGS viewers."""
-
-    run: Positional[Path]
-    """Folder of a run."""
-    out: Path
-    """The PLY file."""
-    kind: Literal["hdr", "ldr"] = "hdr"
-    """Which colours."""
-    overwrite: bool = False
-    """Replace the file if it exists."""
-
-
-@dataclass(frozen=True)
-class Report:
-    """Compare input, tone-mapped HDR and truth in a picture, and plot error against training time."""
-
-    run: Positional[Path]
-    """Folder of a run."""
-    out: Path
-    """Folder for the pictures."""
-    data: str | None = None
-    """The photos, if they have moved since the training."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
-    overwrite: bool = False
-    """Replace files that exist."""
-
-
-Command = (
-    Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Render, tyro.conf.subcommand("render")]
-    | Annotated[Evaluate, tyro.conf.subcommand("eval")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
-    | Annotated[Report, tyro.conf.subcommand("report")]
-    | Annotated[Bench, tyro.conf.subcommand("bench")]
-    | Annotated[Check, tyro.conf.subcommand("check")]
-    | Annotated[Synth, tyro.conf.subcommand("synth")]
-)
+COMMANDS = {
+    "train and use a scene": {
+        "train": Command("training.commands", "Train", "run_train"),
+        "render": Command("output.commands", "Render", "run_render"),
+        "eval": Command("evaluation.commands", "Evaluate", "run_evaluate"),
+        "report": Command("output.commands", "Report", "run_report"),
+        "export": Command("output.commands", "Export", "run_export"),
+    },
+    "what there is to choose from": {
+        "presets": Command("training.commands", "Presets", "run_presets"),
+        "config": Command("training.commands", "ShowConfig", "run_config"),
+        "calibrate": Command("response.commands", "Calibrate", "run_calibrate"),
+        "responses": Command("response.commands", "Responses", "run_responses"),
+        "scenes": Command("scene.commands", "Scenes", "run_scenes"),
+    },
+    "measure and make": {
+        "check": Command("check.commands", "Check", "run_check"),
+        "bench": Command("bench.commands", "Bench", "run_bench"),
+        "synth": Command("synth.commands", "Synth", "run_synth"),
+        "completion": Command("completion", "Completion", "run_completion"),
+    },
+}
+"""Every command, under the headings of the help."""
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs a command line and exits: 0 done, 1 an error the user can act on, 2 wrong usage, 130 interrupted, 141 nobody
     reads its output any more."""
-    # torch's OpenMP threads spin while they wait, which on a processor shared with other programs costs a training on
-    # the CPU most of its time; read once, when torch is loaded.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    silence_exit()
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    if arguments[:1] == ["--version"]:
-        print(f"sehdr-warp {__version__}")
-        sys.exit(0)
-    debug = "--debug" in arguments
-    arguments = [argument for argument in arguments if argument != "--debug"]
-    command = tyro.cli(
-        Command,
-        prog="sehdr-warp",
-        args=arguments,
-        description="Scene-linear HDR Gaussian scenes from photos of one exposure. "
-        "--version prints the version; --debug shows where an error comes from.",
-        config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
-    )
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in words
     try:
-        _COMMANDS[type(command)](command)
-        sys.stdout.flush()
+        try:
+            _run([word for word in words if word != "--debug"])
+        finally:
+            sys.stdout.flush()
     except SehdrError as error:
         if debug:
+            import traceback
+
             traceback.print_exc()
-        print(f"sehdr-warp: {error}", file=sys.stderr)
-        sys.exit(1)
+        _tell(f"{PROGRAM}: {str(error).removeprefix(PROGRAM + ' ')}")
+        sys.exit(2 if isinstance(error, UsageError) else 1)
     except KeyboardInterrupt:
-        print("sehdr-warp: interrupted", file=sys.stderr)
+        _tell(f"{PROGRAM}: interrupted")
         sys.exit(130)
     except BrokenPipeError:
         # As of `sehdr-warp ... | head`; Python would complain again when it closes what nobody reads.
@@ -153,105 +76,86 @@ def main(arguments: list[str] | None = None) -> None:
     sys.exit(0)
 
 
-def _render(command: Render) -> None:
-    from .output.render_views import render_views
-
-    written = render_views(
-        _load_run(command.run, command.device),
-        command.out,
-        cameras=command.cameras,
-        count=command.count,
-        evs=command.evs,
-        exposures=command.exposures,
-        multipart=command.multipart,
-        colorspace=command.colorspace,
-        pixel=command.pixel,
-        ldr_brackets=command.ldr_brackets,
-        overwrite=command.overwrite,
-        progress=say,
-    )
-    if command.json:
-        print(json.dumps({"files": [str(path) for path in written]}))
-    else:
-        print(f"{command.out}: {len(written)} files")
+def command_options() -> dict[str, type]:
+    """The dataclass of options of every command, by its name."""
+    return {name: _load(command)[0] for group in COMMANDS.values() for name, command in group.items()}
 
 
-def _evaluate(command: Evaluate) -> None:
-    from .evaluation.evaluate import evaluate
-    from .evaluation.table import format_table
-    from .files import check_absent, write_json
-    from .training.confidence import ensure_confidence
+def _run(words: list[str]) -> None:
+    # torch's OpenMP threads spin while they wait, which on a processor shared with other programs costs a training on
+    # the CPU most of its time; read once, when torch is loaded.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    from .console import show_logs
+    from .quiet import silence_exit
 
-    if command.json is not None:
-        check_absent(command.json, command.overwrite)
-    run = _load_run(command.run, command.device)
-    scene = _scene_of(run, command.data)
-    ensure_confidence(run, scene, say)
-    result = evaluate(run, scene, lpips_weights=command.lpips, progress=say)
-    if command.json is not None:
-        write_json(command.json, result, command.overwrite)
-    print(format_table(result))
-
-
-def _export(command: Export) -> None:
-    from .output.ply import write_ply
-
-    run = _load_run(command.run, "cpu")
-    path = write_ply(command.out, run, kind=command.kind, overwrite=command.overwrite, progress=say)
-    print(path)
+    silence_exit()
+    quiet, verbose = {"-q", "--quiet"} & set(words), "--verbose" in words
+    show_logs("warning" if quiet else "debug" if verbose else "info")
+    words = [word for word in words if word not in ("-q", "--quiet", "--verbose")]
+    if not words or words[0] in ("-h", "--help"):
+        print(_help())
+        return
+    if words[0] == "--version":
+        print(f"{PROGRAM} {__version__}")
+        return
+    run, options = parse_command(words)
+    run(options)
 
 
-def _report(command: Report) -> None:
-    from .output.report import write_report
-    from .training.confidence import ensure_confidence
+def parse_command(words: list[str]) -> tuple[Callable, object]:
+    """The function that runs a command, and its options; raises UsageError, and SystemExit after --help."""
+    from .arguments import parse
 
-    run = _load_run(command.run, command.device)
-    scene = _scene_of(run, command.data)
-    ensure_confidence(run, scene, say)
-    for path in write_report(run, scene, command.out, overwrite=command.overwrite):
-        print(path)
-
-
-_COMMANDS = {
-    Train: run_train,
-    Render: _render,
-    Evaluate: _evaluate,
-    Export: _export,
-    Report: _report,
-    Bench: run_bench,
-    Check: run_check,
-    Synth: run_synth,
-}
+    name, *rest = words
+    known = {name: command for group in COMMANDS.values() for name, command in group.items()}
+    if name not in known:
+        raise UsageError(f"no command {name}{did_you_mean(name, known)}; {PROGRAM} --help lists them")
+    options, run = _load(known[name])
+    return run, parse(options, rest, f"{PROGRAM} {name}")
 
 
-def _load_run(path: Path, device: str | None):
-    from .training.run import load_run
-    from .training.train import pick_device
-
-    return load_run(path, device=pick_device(device))
+def _load(command: Command):
+    module = import_module(f".{command.module}", __package__)
+    return getattr(module, command.options), getattr(module, command.run)
 
 
-def _scene_of(run, data: str | None):
-    """The scene a run was trained on, read again in the same way."""
-    from .scene import is_embedded, load_scene
+def _help() -> str:
+    """The commands under their headings, each with the first sentence of its help."""
+    import shutil
+    import textwrap
 
-    place = data or run.data.get("path")
-    if place is None:
-        raise SehdrError(f"{run.path}: does not say where its photos are; give --data")
-    if data is None and not is_embedded(place) and not Path(place).is_dir():
-        raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
-    return load_scene(
-        place,
-        exposure_index=run.data.get("exposure_index"),
-        max_size=run.data.get("max_size"),
-        response=_curve_of(run),
-    )
+    width = min(shutil.get_terminal_size().columns, 100)
+    lines = [f"usage: {PROGRAM} COMMAND ...", "", "Scene-linear HDR Gaussian scenes from photos of one exposure.", ""]
+    for heading, group in COMMANDS.items():
+        lines.append(f"{heading}:")
+        for name, command in group.items():
+            lines += textwrap.wrap(_summary(command), width, initial_indent=f"  {name:<12}", subsequent_indent=" " * 14)
+        lines.append("")
+    return "\n".join([*lines, *_CLOSING])
 
 
-def _curve_of(run):
-    """The response that the photos of the training were developed with: a learned one was not known then."""
-    options = run.config.response
-    return "learned" if options.name == "learned" else run.response
+def _summary(command: Command) -> str:
+    """The first sentence of a command's help, read from the source: importing every room takes seconds."""
+    import ast
+    from pathlib import Path
+
+    source = Path(__file__).parent.joinpath(*command.module.split(".")).with_suffix(".py").read_text(encoding="utf-8")
+    defined = next(node for node in ast.parse(source).body if getattr(node, "name", None) == command.options)
+    return " ".join((ast.get_docstring(defined) or "").split()).partition(". ")[0].removesuffix(".")
+
+
+_CLOSING = (
+    f"First try:  {PROGRAM} train embedded --out runs/first",
+    f"{PROGRAM} COMMAND --help explains it. Every command takes -q (quiet),",
+    "--verbose, and --debug (where an error comes from). --version prints it.",
+)
+
+
+def _tell(line: str) -> None:
+    try:
+        print(line, file=sys.stderr, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
 if __name__ == "__main__":

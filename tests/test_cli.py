@@ -3,15 +3,16 @@
 import json
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sehdr_warp import __version__, cli
-from sehdr_warp.response import response_by_name
+from sehdr_warp.response import response_by_name, response_names
 from sehdr_warp.scene.images import read_hdr, read_ldr
-from sehdr_warp.training.config import ResponseConfig
+from sehdr_warp.training import commands
+from sehdr_warp.training.config_fields import config_fields, flag_of
+from sehdr_warp.training.config_files import load_config, preset_names
 
 from .refusals import call
 
@@ -25,65 +26,67 @@ def run(tmp_path_factory):
     return out
 
 
-def test_output_that_nobody_reads_ends_quietly():
-    command = [sys.executable, "-m", "sehdr_warp", "check", "--cases", "needle"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+@pytest.mark.parametrize("command", [["check", "--cases", "needle"], ["train", "--help"], ["--help"], ["presets"]])
+def test_output_that_nobody_reads_ends_quietly(command):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sehdr_warp", *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
     process.stdout.close()
     assert process.stderr.read() == b"" and process.wait() == 141
     process.stderr.close()
 
 
-def test_version_and_help(capsys):
+def test_version_and_help(capsys, monkeypatch):
     assert call("--version") == 0
     assert capsys.readouterr().out == f"sehdr-warp {__version__}\n"
-    assert call("--help") == 0
-    text = capsys.readouterr().out
-    for command in ("train", "render", "eval", "export", "report"):
-        assert command in text
+    monkeypatch.setenv("COLUMNS", "80")
+    for words in ([], ["--help"], ["-h"]):
+        assert call(*words) == 0
+        text = capsys.readouterr().out
+        for group in cli.COMMANDS.values():
+            assert all(f"\n  {name} " in text for name in group)
+        assert len(text.splitlines()) <= 48 and all(len(line) <= 80 for line in text.splitlines())
 
 
-@pytest.mark.parametrize(
-    "command,flags",
-    [
-        (
-            "train",
-            [
-                "--out",
-                "--preset",
-                "--device",
-                "--exposure-index",
-                "--response",
-                "--iterations",
-                "--max-size",
-                "--seed",
-                "--resume",
-                "--json",
-            ],
-        ),
-        (
-            "render",
-            ["--out", "--cameras", "--evs", "--exposures", "--multipart", "--colorspace", "--pixel", "--overwrite"],
-        ),
-        ("eval", ["--json"]),
-    ],
-)
-def test_documented_flags_exist(command, flags, capsys):
-    assert call(command, "--help") == 0
+def test_the_help_of_train_fits_two_screens(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert call("train", "--help") == 0
     text = capsys.readouterr().out
-    assert [flag for flag in flags if flag not in text] == []
+    assert len(text.splitlines()) <= 50
+    for group in ("scene", "training", "output", "machine"):
+        assert f" {group} options " in text
+    assert "None" not in text and "default: False" not in text and "--loss.clipping" not in text
+    assert text.splitlines()[-1].startswith("sehdr-warp train --help-all")
+
+
+def test_every_field_of_the_config_is_a_flag_with_help(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    assert call("train", "--help-all") == 0
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for path, item in config_fields():
+        assert f"{flag_of(path)} " in text
+        assert path == "seed" or " ".join(item.description.split())[:40] in text
+
+
+@pytest.mark.parametrize("name", [name for group in cli.COMMANDS.values() for name in group])
+def test_every_command_explains_itself(name, capsys):
+    assert call(name, "--help") == 0
+    text = capsys.readouterr().out
+    assert f"sehdr-warp {name}" in text and "None" not in text
 
 
 def test_help_is_quick_and_needs_no_torch():
     """Under a second of processor time: how long that takes is a matter of what else runs."""
-    call = "try: cli.main(['train', '--help'])\nexcept SystemExit: print('torch' in sys.modules, time.process_time())"
-    code = f"import sys, time; from sehdr_warp import cli\n{call}"
-    times = []
-    for _ in range(3):
-        out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-        torch, seconds = out.split()[-2:]
-        assert torch == "False"
-        times.append(float(seconds))
-    assert min(times) < 1.0
+    call = "try: cli.main(['{}', '--help'])\nexcept SystemExit: print('torch' in sys.modules, time.process_time())"
+    for words in ("train", "--help"):
+        code = f"import sys, time; from sehdr_warp import cli\n{call.format(words)}"
+        times = []
+        for _ in range(3):
+            out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+            torch, seconds = out.split()[-2:]
+            assert torch == "False"
+            times.append(float(seconds))
+        assert min(times) < 1.0
 
 
 def test_module_is_the_command():
@@ -94,22 +97,35 @@ def test_module_is_the_command():
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    "line,told",
     [
-        [],
-        ["train"],
-        ["fly"],
-        ["train", "x", "--out", "y", "--seed", "one"],
-        ["render", "x", "--out", "y", "--pixel", "byte"],
+        ("trian", "no command trian, did you mean train?"),
+        ("fly", "no command fly; sehdr-warp --help"),
+        ("--out x", "no command --out"),
+        ("train", "train needs --out"),
+        ("train --out y", "train needs SCENE"),
+        ("train x y --out z", "y: more than is asked for"),
+        ("train x --out", "--out needs a value"),
+        ("train x --otu y", "train has no --otu, did you mean --out?"),
+        ("train x --los.clipping false", "did you mean --loss.clipping?"),
+        ("train x --clipping=false", "did you mean --loss.clipping?"),
+        ("train x --out y --seed one", "--seed one: is no INT"),
+        ("train x --out y --plan", "--plan is gone: it is the default"),
+        ("train x --out y --set loss.clipping=false", "--set is gone: every field is a flag"),
+        ("train x --out y --loss.knee 3", "--loss.knee is gone: it always is"),
+        ("train x --out y --response.form mlp", 'write response.name = "learned"'),
+        ("render x", "render needs --out PATH"),
+        ("render x --out y --pixel byte", "--pixel byte: is none of 'half', 'float'"),
+        ("bench setp", "bench setp: no such command, did you mean step?"),
+        ("bench step --repetitions many", "--repetitions many: is no number"),
+        ("completion tsch", "tsch"),
     ],
 )
-def test_wrong_usage_is_2(arguments, capsys):
-    assert call(*arguments) == 2
-
-
-def test_a_training_needs_a_folder(capsys):
-    assert call("train", "embedded") == 1
-    assert capsys.readouterr().err.startswith("sehdr-warp: train needs a folder for the run: give --out")
+def test_wrong_usage_is_one_line_with_the_nearest_right_word(line, told, capsys):
+    assert call(*line.split()) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("sehdr-warp: ") and told in error
+    assert error.count("\n") == 1
 
 
 def test_training_leaves_a_run_that_says_how_it_was_made(run):
@@ -119,41 +135,107 @@ def test_training_leaves_a_run_that_says_how_it_was_made(run):
         "path": "embedded",
         "exposure_index": None,
         "max_size": 48,
+        "holdout": None,
     }
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert lines[-1]["iteration"] == 30 and {"seconds", "psnr_ldr", "psnr_mu", "gaussians", "split"} <= lines[-1].keys()
 
 
 def test_existing_run_is_refused_and_resume_continues(run, capsys):
-    arguments = ("train", "embedded", "--out", run, "--max-size", "48", "--device", "cpu")
+    arguments = ("train", "embedded", "--out", run, "--device", "cpu")
     assert call(*arguments) == 1
     error = capsys.readouterr().err
     assert "--resume or --overwrite" in error and str(run) in error
-    assert call(*arguments, "--resume", "--json") == 0
+    # The scene and its size are the run's.
+    assert call("train", "--resume", "--out", run, "--device", "cpu", "--json") == 0
     result = json.loads(capsys.readouterr().out)
     assert result["iteration"] == 30 and result["finished"] and result["metrics"][-1]["iteration"] == 30
-    assert call(*arguments, "--resume", "--seed", "4") == 1
+    assert call("train", "--resume", "--out", run, "--device", "cpu", "--seed", "4") == 1
     assert "seed = 3, but 4" in capsys.readouterr().err
+    assert call("train", "--resume", "--out", run, "--device", "cpu", "--max-size", "40") == 1
+    assert "views differ" in capsys.readouterr().err
+
+
+def test_a_training_ends_by_saying_what_to_type_next(run, capsys):
+    assert call("train", "--resume", "--out", run, "--device", "cpu") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith(f"{run}: 30 iterations, ") and "held-out PSNR" in lines[0]
+    assert len(lines) == 3 and all(
+        f"sehdr-warp {word} {run}" in "".join(lines) for word in ("render", "report", "export")
+    )
+
+
+def test_falling_held_out_figures_are_told():
+    summary = {"iteration": 900, "gaussians": 10, "train_seconds": 1.0, "device": "cpu"}
+    scores = [{"psnr_ldr": 15.0, "iteration": 300}, {"psnr_ldr": 14.4, "iteration": 900}]
+    told = commands._ending("r", summary | {"metrics": scores})
+    assert "held-out PSNR was 15.00 dB at iteration 300 and fell: try --iterations 300" in told
+    assert "fell" not in commands._ending("r", summary | {"metrics": scores[:1]})
+
+
+def test_fields_named_on_the_command_line_override_the_preset_and_stay(capsys):
+    line = "train embedded --plan-only --json --max-size 40 --iterations 5000"
+    assert call(*line.split(), "--loss.ssim_weight=0.3") == 0
+    plan = json.loads(capsys.readouterr().out)
+    fields = {path: value for decision in plan["decisions"] for path, value in decision["fields"].items()}
+    assert "schedule.iterations" not in fields and plan["kept"]["schedule.iterations"] == 5000
 
 
 @pytest.mark.parametrize(
     "arguments,words",
     [
-        (["train", "nowhere", "--out", "r"], "nowhere"),
-        (["train", "embedded", "--out", "r", "--preset", "defualt"], "defualt"),
-        (["train", "embedded", "--out", "r", "--iterations", "0"], "schedule.iterations = 0"),
-        (["train", "embedded", "--out", "r", "--response", "kodak"], "kodak"),
-        (["train", "embedded", "--out", "r", "--device", "cuda:77"], "cuda:77"),
-        (["render", "nowhere", "--out", "r"], "nowhere"),
-        (["eval", "nowhere"], "nowhere"),
+        ("train nowhere --out r", "nowhere"),
+        ("train embedded --out r --preset defualt", "did you mean default?"),
+        ("train embedded --out r --iterations 0", "--iterations: schedule.iterations = 0"),
+        ("train embedded --out r --loss.ssim-weight 3", "--loss.ssim-weight: loss.ssim_weight = 3"),
+        ("train embedded --out r --loss.clipping maybe", "--loss.clipping: loss.clipping = 'maybe'"),
+        ("train embedded --out r --loss.linear-weight 1", "--loss.linear-weight: loss.linear_weight = 1"),
+        ("train embedded --out r --response kodak", "kodak"),
+        ("train embedded --out r --response hdr-nerv", "did you mean hdr-nerf?"),
+        ("train embedded:rom --out r", "did you mean room?"),
+        ("train embedded --out r --device cuda:77", "cuda:77"),
+        ("train embedded --out r --device mps", "device mps: is neither"),
+        ("train --resume --out r", "nothing to resume"),
+        ("config defualt", "did you mean default?"),
+        ("render nowhere --out r", "nowhere"),
+        ("eval nowhere", "nowhere"),
     ],
 )
 def test_errors_are_one_line_and_status_1(arguments, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert call(*arguments) == 1
+    assert call(*arguments.split()) == 1
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and error.startswith("sehdr-warp: ") and words in error
+    assert "default.toml" not in error
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_there_is_to_choose_from_can_be_asked_for(capsys):
+    for command, least in (("presets", preset_names()), ("responses", response_names()), ("scenes", ["embedded:room"])):
+        assert call(command, "--json") == 0
+        assert set(least) <= set(json.loads(capsys.readouterr().out))
+        assert call(command) == 0
+        text = capsys.readouterr().out
+        assert all(name in text for name in least) and all(len(line) <= 115 for line in text.splitlines())
+
+
+def test_config_prints_what_train_takes(run, tmp_path, capsys):
+    assert call("config", "paper", "--diff") == 0
+    (tmp_path / "own.toml").write_text(capsys.readouterr().out)
+    assert load_config(tmp_path / "own.toml") == load_config("paper")
+    assert call("config", run) == 0
+    text = capsys.readouterr().out
+    assert "iterations = 30  # default: 30000" in text
+    assert all(f"\n{path.rpartition('.')[2]} = " in f"\n{text}" for path, _ in config_fields())
+    assert call("config", run, "--json") == 0
+    assert json.loads(capsys.readouterr().out) == json.loads((run / "config.json").read_text())
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_shells_can_complete(shell, capsys):
+    assert call("completion", shell) == 0
+    text = capsys.readouterr().out
+    assert "sehdr-warp" in text and "render" in text and "ssim-weight" in text
 
 
 def test_debug_shows_where_an_error_comes_from(tmp_path, capsys):
@@ -165,7 +247,7 @@ def test_defects_are_not_hidden(monkeypatch):
     def broken(_):
         raise ZeroDivisionError
 
-    monkeypatch.setitem(cli._COMMANDS, cli.Evaluate, broken)
+    monkeypatch.setattr("sehdr_warp.evaluation.commands.run_evaluate", broken)
     with pytest.raises(ZeroDivisionError):
         cli.main(["eval", "x"])
 
@@ -174,7 +256,7 @@ def test_interrupt_is_130(monkeypatch, capsys):
     def interrupted(_):
         raise KeyboardInterrupt
 
-    monkeypatch.setitem(cli._COMMANDS, cli.Evaluate, interrupted)
+    monkeypatch.setattr("sehdr_warp.evaluation.commands.run_evaluate", interrupted)
     assert call("eval", "x") == 130
     assert capsys.readouterr().err == "sehdr-warp: interrupted\n"
 
@@ -222,7 +304,7 @@ def test_simulated_photos_merge_back_to_the_rendered_radiance(run, tmp_path, kin
 
 @pytest.mark.parametrize(
     "flags,words",
-    [(["--evs=1,x"], "--evs"), (["--evs=0", "--exposures", "1"], "both were"), (["--colorspace", "cmyk"], "cmyk")],
+    [(["--evs=1,x"], "evs:"), (["--evs=0", "--exposures", "1"], "both were"), (["--colorspace", "cmyk"], "cmyk")],
 )
 def test_render_refuses_what_it_cannot_use(run, tmp_path, flags, words, capsys):
     assert call("render", run, "--out", tmp_path / "r", "--device", "cpu", *flags) == 1
@@ -240,16 +322,9 @@ def test_eval_writes_json_and_prints_a_table(run, tmp_path, capsys, monkeypatch)
     assert result["ldr"]["lpips"] is None and "SEHDR_LPIPS" in result["ldr"]["lpips_reason"]
     assert result["protocol"]["gt-max"]["lpips_mu"] is None and "lpips_reason" in result["protocol"]["gt-max"]
     assert call("eval", run, "--json", file, "--device", "cpu") == 1
-
-
-def test_a_run_is_judged_by_photos_scaled_as_those_it_was_trained_on():
-    def curves(options, response):
-        return cli._curves_of(SimpleNamespace(config=SimpleNamespace(response=options), response=response))
-
-    srgb = response_by_name("srgb")
-    # Chosen after the photos were read, so they were scaled by load_scene's own curve.
-    assert curves(ResponseConfig(name="auto"), srgb) == {}
-    assert curves(ResponseConfig(name="srgb"), srgb) == {"decode": srgb.decode, "encode": srgb.encode}
+    capsys.readouterr()
+    assert call("eval", run, "--json", "-", "--device", "cpu") == 0
+    assert json.loads(capsys.readouterr().out)["ldr"] == result["ldr"]
 
 
 @pytest.mark.parametrize("kind", ["hdr", "ldr"])

@@ -1,7 +1,5 @@
 """What the pages say, held: examples run, command lines parse, links lead somewhere, versions agree."""
 
-import dataclasses
-import inspect
 import os
 import re
 import runpy
@@ -9,19 +7,15 @@ import shlex
 import shutil
 import subprocess
 import tomllib
-import typing
 from pathlib import Path
 
 import pytest
-import tyro
 from packaging.requirements import Requirement
-from pydantic import BaseModel
 
 import sehdr_warp
 from sehdr_warp import cli
-from sehdr_warp.training import commands
-from sehdr_warp.training.config import Config
-from sehdr_warp.training.config_files import preset_names
+from sehdr_warp.arguments import flags, subcommands
+from sehdr_warp.training.config_fields import GONE, config_fields
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
@@ -46,8 +40,8 @@ def command_lines():
     for page in PAGES:
         for block in blocks(page.relative_to(ROOT), "(?:sh)?"):
             for line in block.replace("\\\n", " ").splitlines():
-                line = line.strip().removeprefix("$ ").partition("  #")[0]
-                if line.startswith("sehdr-warp ") and "[" not in line:
+                line = re.split("  #| > ", line.strip().removeprefix("$ "))[0]
+                if re.match(r"sehdr-warp (?!-|compare|score)", line) and "[" not in line:
                     yield pytest.param(line, id=f"{page.name}: {line}")
 
 
@@ -72,51 +66,32 @@ def test_python_blocks_run(page, tmp_path, monkeypatch):
 
 
 def parse(line):
-    arguments = shlex.split(line)[1:]
-    tyro.cli(cli.Command, args=arguments, config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes))
+    cli.parse_command(shlex.split(line)[1:])
 
 
-soon = pytest.mark.skipif(not hasattr(cli, "command_options"), reason="the pages tell of the next command line")
-
-
-@soon
 @pytest.mark.parametrize("line", list(command_lines()))
 def test_documented_command_lines_parse(line):
     parse(line)
 
 
-def flags_of(kind):
+def flags_of(options):
     """Flags of a command and of all below it."""
-    for part in typing.get_args(kind):
-        yield from flags_of(part)
-    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
-        for field in dataclasses.fields(kind):
-            yield "--" + field.name.replace("_", "-")
-            yield from flags_of(field.type)
+    yield from flags(options)
+    for below in subcommands(options).values():
+        yield from flags_of(below)
 
 
-def fields_of(config, prefix=""):
-    """Dotted names of all choices of a training."""
-    for name, value in config:
-        nested = isinstance(value, BaseModel)
-        yield from fields_of(value, f"{prefix}{name}.") if nested else [prefix + name]
-
-
-@soon
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_flags_and_fields_on_the_pages_exist(page):
     text = page.read_text()
-    others = {"--version", "--help", "--debug", "--index-url", "--clock-control"}  # the last two of pip and Nsight
-    assert set(re.findall(r"(?<![\w-])(--[a-z][a-z-]*)", text)) <= {*flags_of(cli.Command), *others}
-    fields = set(fields_of(Config()))
+    known = {flag for options in cli.command_options().values() for flag in flags_of(options)}
+    others = {"--version", "--help", "--help-all", "--debug", "--set", "--plan"}  # the last two are gone
+    others |= {"--index-url", "--config-settings", "--clock-control"}  # of pip and Nsight
+    assert set(re.findall(r"(?<![\w-])(--[a-z][a-z-]*)(?![\w.])", text)) <= known | others
+    fields = {path for path, _ in config_fields()}
     parts = "|".join({field.split(".")[0] for field in fields if "." in field})
     named = set(re.findall(rf"`((?:{parts})\.[a-z_]+)", text)) - {"plan.json", "model.response"}  # a file, a module
-    assert named <= fields
-
-
-def test_the_help_names_every_preset():
-    (doc,) = re.findall(r'preset: str \| None = None\n    """(.*?)"""', inspect.getsource(commands.Train), re.DOTALL)
-    assert {name for name in preset_names() if re.search(rf"(?<![\w-]){name}(?![\w-])", doc)} == set(preset_names())
+    assert named <= fields | set(GONE)
 
 
 def test_the_pages_hold_command_lines():

@@ -1,11 +1,10 @@
 """Responses with a formula: power laws with a linear toe, and tone curves followed by one."""
 
-import difflib
 import math
 
 import torch
 
-from ..errors import SehdrError
+from ..errors import SehdrError, did_you_mean
 from ..splatting.response_curves import FormulaCurve
 from .curve import HALF_CODE, Response
 
@@ -217,7 +216,6 @@ def analytic_response(name: str) -> Response:
         if not 1.0 <= exponent <= 5.0:
             raise SehdrError(f"response {name!r}: the exponent of gamma-G must be a number from 1 to 5")
         return _gamma(key, exponent)
-    near = difflib.get_close_matches(name.lower(), DESCRIPTIONS, n=1)
-    hint = f"did you mean {near[0]}? " if near else ""
+    hint = did_you_mean(name, DESCRIPTIONS)
     known = ", ".join((*DESCRIPTIONS, "gamma-G", "colour:NAME"))
-    raise SehdrError(f"response {name!r} is neither a file nor a known name; {hint}take one of {known}, or a file")
+    raise SehdrError(f"response {name!r} is neither a file nor a known name{hint}; take one of {known}, or a file")

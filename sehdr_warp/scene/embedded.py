@@ -4,7 +4,7 @@ import os
 from importlib import resources
 from pathlib import Path
 
-from ..errors import InputError
+from ..errors import InputError, did_you_mean
 
 _MARK = "transforms_train.json"
 
@@ -26,7 +26,7 @@ def embedded_folder(path: str) -> Path:
         return next(place / name for place in _places() if (place / name / _MARK).is_file())
     raise InputError(
         path,
-        f"is not here; present are {', '.join(f'embedded:{known}' for known in embedded_scenes())}",
+        f"is not here{did_you_mean(name, embedded_scenes())}; present are {', '.join(f'embedded:{known}' for known in embedded_scenes())}",
         "get the repository's scenes/ and name it in SEHDR_SCENES, or render it with sehdr-warp synth",
     )
 

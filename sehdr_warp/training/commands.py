@@ -1,53 +1,64 @@
-"""The command line of `sehdr-warp train`: what may be asked for, and the call. torch is imported when it runs."""
+"""The command lines of `sehdr-warp train`, `presets` and `config`, and what other commands need of a run.
+
+torch is imported when they run.
+"""
 
 import json
-from dataclasses import dataclass
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import tyro
+from tyro.conf import Positional
 
-from ..arguments import say
-from ..errors import SehdrError
+from ..errors import InputError, SehdrError, UsageError
+from .config_fields import flag_of, flags_type, gone_flags, named_fields, value_of
+
+log = logging.getLogger(__name__)
+_FALL = 0.3
+"""Decibels by which held-out figures may fall behind their best before the end says so."""
 
 
 @dataclass(frozen=True)
-class Train:
-    """Train a scene from photos of one exposure."""
+class SceneOptions:
+    """"""
 
-    data: tyro.conf.Positional[str]
-    """Folder of photos: COLMAP, transforms.json, HDR-NeRF, HDR-GS, LLFF or bare photos; `embedded` is the room that
-    comes with the package, `embedded:NAME` another of its scenes."""
-    out: Path | None = None
-    """Folder for the run; needed for all but --plan-only."""
-    preset: str | None = None
-    """default, fast, demo, paper, a rival (paper-truth, hdr-gs, hdr-gs-truth, gauss-hdr, 3dgs, truth, predicted), or a
-    TOML file; with --resume the run's own config."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
-    exposure_index: int | None = None
-    """Which exposure to train on where a view has several; by default the middle one."""
     response: str | None = None
-    """Camera response: a name (srgb, gamma-2.2, hdr-nerf ...), a file, or auto."""
-    predict_hdr: str | None = None
-    """Train on single-image predictions in place of HDR truth: kovaleski-oliveira, a folder of predicted EXR files
-    named as the views, or a TorchScript (.pt) or ONNX (.onnx) file; the preset is then `predicted` unless you name
-    one."""
-    iterations: int | None = None
-    """Training steps; all schedules scale with it."""
+    """Camera response: a name of `sehdr-warp responses`, a file, auto (the default) or learned."""
     max_size: int | None = None
     """Longest side of the photos, in pixels; larger ones are reduced."""
+    holdout: int | None = None
+    """Hold out every Nth view for testing where the set states no split; 0: train on all. (default: 8)"""
+    exposure_index: int | None = None
+    """Which exposure to take where a view has several; by default the middle one."""
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """"""
+
+    preset: str | None = None
+    """A name of `sehdr-warp presets` or a TOML file. (default: default, or what --resume continues)"""
+    iterations: int | None = None
+    """Steps; by default as many as the photos deserve."""
     seed: int | None = None
     """Seed of every random number."""
-    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Another value of any field of the config, such as loss.clipping=false; may be given several times. A value that
-    the scene contradicts is refused, and a plan leaves these fields as they are."""
-    plan: bool = False
-    """Read the scene first and leave out what it does not need, on top of the preset."""
+    predict_hdr: str | None = None
+    """Single-image predictions in place of HDR truth: kovaleski-oliveira, an EXR folder, a .pt or .onnx file."""
     plan_only: bool = False
-    """Print the plan with its reasons and train nothing."""
+    """Print what the scene does not need, and why; train nothing."""
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """"""
+
+    out: Path | None = None
+    """Folder for the run."""
     resume: bool = False
-    """Continue the run in --out from its newest checkpoint."""
+    """Continue the run in --out, with its scene and config."""
     overwrite: bool = False
     """Replace the run in --out."""
     tensorboard: bool = False
@@ -56,102 +67,236 @@ class Train:
     """Print the result as JSON on standard output."""
 
 
-def run_train(command: Train) -> None:
+@dataclass(frozen=True)
+class MachineOptions:
+    """"""
+
+    device: str | None = None
+    """cpu or cuda:N; by default the first GPU if there is one."""
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a scene from photos of one exposure. What the scene does not need is left out; what you name stays."""
+
+    gone: ClassVar[Mapping[str, str]] = gone_flags() | {
+        "--plan": "it is the default; --plan.enabled false trains without",
+        "--set": "every field is a flag, as --loss.clipping false for --set loss.clipping=false",
+    }
+
+    data: Annotated[Positional[str | None], tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
+    """Photos: COLMAP, transforms.json, HDR-NeRF, HDR-GS, LLFF, or a bare folder; `embedded` is a scene to try."""
+    scene: SceneOptions = SceneOptions()
+    training: TrainingOptions = TrainingOptions()
+    output: OutputOptions = OutputOptions()
+    machine: MachineOptions = MachineOptions()
+    fields: Annotated[flags_type(), tyro.conf.arg(name="")] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Presets:
+    """List the presets: what each is for, and what it costs."""
+
+    json: bool = False
+    """Print them as JSON."""
+
+
+@dataclass(frozen=True)
+class ShowConfig:
+    """Print the whole config of a preset or a run, with the meaning of every field, as a TOML file."""
+
+    which: Positional[str] = "default"
+    """A preset, a TOML file, or the folder of a run."""
+    diff: bool = False
+    """Only what differs from the default preset: a file that --preset takes."""
+    json: bool = False
+    """Print it as JSON."""
+
+
+def run_train(asked: Train) -> None:
+    """Trains, or prints the plan, and says what was made and what to do next."""
     from .prediction import check_predictor
     from .run import check_folder
-    from .train import pick_device, train
+    from .train import pick_device
 
-    if command.plan_only:
-        _print_plan(command)
-        return
-    if command.out is None:
-        raise SehdrError("train needs a folder for the run: give --out, or --plan-only to train nothing")
+    out, resumed = asked.output.out, False
+    if out is None and not asked.training.plan_only:
+        raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
     # What can be refused is refused before the photos are read, which may take minutes.
-    resumed = check_folder(command.out, resume=command.resume, overwrite=command.overwrite)
-    config, device = _config(command, resumed), pick_device(command.device)
+    if out is not None and not asked.training.plan_only:
+        resumed = check_folder(out, resume=asked.output.resume, overwrite=asked.output.overwrite)
+    data = _data(asked, resumed)
+    config, device = _config(asked, resumed), pick_device(asked.machine.device)
     if config.loss.predictor:
         check_predictor(config.loss.predictor)
-    data = {"path": _absolute(command.data), "exposure_index": command.exposure_index, "max_size": command.max_size}
-    run = train(
-        _load(command, config),
-        command.out,
-        config,
-        device=device,
-        resume=command.resume,
-        overwrite=command.overwrite,
-        tensorboard=command.tensorboard,
-        data=data,
-    )
+    options = config.response
+    scene = _load(data, response=options.name, method=options.method, candidates=options.candidates)
+    if asked.training.plan_only:
+        from .plan import make_plan
+
+        plan = make_plan(scene, config)
+        print(json.dumps(plan.to_dict()) if asked.output.json else plan.table())
+        return
+    run = _train(asked, scene, config, device, data)
     summary = run.summary() | {"run": str(run.path), "metrics": run.metrics()}
-    if command.json:
-        print(json.dumps(summary))
-    else:
-        seconds, count = summary["train_seconds"], summary["gaussians"]
-        print(f"{run.path}: {run.iterations} iterations, {count} Gaussians, {seconds:.1f} s on {summary['device']}")
-        if summary.get("plan"):
-            print("plan: " + "; ".join(f"{name} {choice}" for name, choice in summary["plan"].items()))
+    print(json.dumps(summary) if asked.output.json else _ending(run.path, summary))
 
 
-def _print_plan(command: Train) -> None:
-    """The plan alone: as a table, or with --json as JSON on standard output."""
-    from .plan import make_plan
+def run_presets(asked: Presets) -> None:
+    """Prints every preset with its purpose and cost."""
+    from .config_files import load_config, preset_names, preset_purpose
 
-    config = _config(command, resumed=False)
-    plan = make_plan(_load(command, config), config)
-    print(json.dumps(plan.to_dict()) if command.json else plan.table())
+    rows = {name: {"purpose": preset_purpose(name), "cost": _cost(load_config(name))} for name in preset_names()}
+    if asked.json:
+        print(json.dumps(rows))
+        return
+    for name, row in rows.items():
+        print(f"{name:<14}{row['purpose']}\n{'':<14}{row['cost']}")
 
 
-def _load(command: Train, config):
-    """The scene, its notes told."""
-    from ..scene import load_scene
+def run_config(asked: ShowConfig) -> None:
+    """Prints a config."""
+    from .config_files import config_as_toml, config_to_dict, load_config, read_config_json
+    from .run import CONFIG
 
-    scene = load_scene(
-        command.data,
-        exposure_index=command.exposure_index,
-        max_size=command.max_size,
-        **developed_by(config),
-    )
-    for note in scene.notes:
-        say(note)
+    folder = Path(asked.which)
+    config = read_config_json(folder / CONFIG) if (folder / CONFIG).is_file() else load_config(asked.which)
+    print(json.dumps(config_to_dict(config)) if asked.json else config_as_toml(config, asked.diff))
+
+
+def open_run(path: Path, device: str | None):
+    """The run in a folder, on the device that a command line names."""
+    from .run import load_run
+    from .train import pick_device
+
+    return load_run(path, device=pick_device(device))
+
+
+def ensured_scene(run, data: str | None):
+    """The scene a run was trained on, read again in the same way, after the run's confidence was measured on it.
+
+    data: where the photos are, if they have moved.
+    """
+    from ..arguments import say
+    from ..scene import is_embedded
+    from .confidence import ensure_confidence
+
+    place = data or run.data.get("path")
+    if place is None:
+        raise SehdrError(f"{run.path}: does not say where its photos are; give --data")
+    if data is None and not is_embedded(place) and not Path(place).is_dir():
+        raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
+    # A learned response was not known when the photos of the training were developed.
+    learned = run.config.response.name == "learned"
+    scene = _load({**run.data, "path": place}, response="learned" if learned else run.response)
+    ensure_confidence(run, scene, say)
     return scene
 
 
-def _config(command: Train, resumed: bool):
-    from .config_files import load_config, override_config, parse_setting, read_config_json
+def _data(asked: Train, resumed: bool) -> dict:
+    """What load_scene takes: as it is given, or else, resuming, as the run has it."""
+    from ..scene import is_embedded
+    from .run import read_run_info
+
+    path = asked.data
+    if path is not None and not is_embedded(path):
+        path = str(Path(path).absolute())
+    options = asked.scene
+    given = {
+        "path": path,
+        "exposure_index": options.exposure_index,
+        "max_size": options.max_size,
+        "holdout": options.holdout,
+    }
+    if resumed:
+        known = read_run_info(asked.output.out)["data"]
+        given = {name: known.get(name) if value is None else value for name, value in given.items()}
+    if given["path"] is None and asked.output.resume:
+        raise InputError(asked.output.out, "holds nothing to resume", "give SCENE to begin, or the folder of a run")
+    if given["path"] is None:
+        raise UsageError("train needs SCENE, a folder of photos or `embedded`; see sehdr-warp train --help")
+    return given
+
+
+def _config(asked: Train, resumed: bool):
+    """The preset's config, or the resumed run's, with what the command line names in it."""
+    from .config_files import load_config, override_config, read_config_json
     from .run import CONFIG
 
-    given = {
-        "response.name": command.response,
-        "loss.predictor": _predictor(command.predict_hdr),
-        "schedule.iterations": command.iterations,
-        "seed": command.seed,
+    options = asked.training
+    shortcuts = {
+        "response.name": ("--response", asked.scene.response),
+        "loss.predictor": ("--predict-hdr", _predictor(options.predict_hdr)),
+        "schedule.iterations": ("--iterations", options.iterations),
+        "seed": ("--seed", options.seed),
     }
-    settings = dict(parse_setting(text) for text in command.set)
-    overrides = {name: value for name, value in given.items() if value is not None} | settings
-    if command.plan or command.plan_only:
-        overrides["plan.enabled"] = True
-    if resumed and command.preset is None:
-        path = command.out / CONFIG
-        return override_config(read_config_json(path), overrides, path)
-    preset = command.preset or ("default" if command.predict_hdr is None else "predicted")
-    config = load_config(preset, overrides)
-    stated = overrides if config.plan.enabled else settings
-    kept = {*config.plan.keep, *(path for path in stated if not path.startswith("plan."))}
+    fields = named_fields(asked.fields)
+    named = {path: value for path, (_, value) in shortcuts.items() if value is not None}
+    named |= {path: value_of(path, text) for path, text in fields.items()}
+    flags = {path: flag_of(path) if path in fields else shortcuts[path][0] for path in named}
+    if resumed and options.preset is None:
+        return override_config(read_config_json(asked.output.out / CONFIG), named, flags=flags)
+    preset = options.preset or ("default" if options.predict_hdr is None else "predicted")
+    config = load_config(preset, named, flags)
+    kept = {*config.plan.keep, *(path for path in named if not path.startswith("plan."))}
     return override_config(config, {"plan.keep": sorted(kept)})
-
-
-def developed_by(config) -> dict:
-    """load_scene's choice of a response, as the config has it."""
-    options = config.response
-    return {"response": options.name, "method": options.method, "candidates": options.candidates}
-
-
-def _absolute(data: str) -> str:
-    from ..scene import is_embedded
-
-    return data if is_embedded(data) else str(Path(data).absolute())
 
 
 def _predictor(text: str | None) -> str | None:
     """A predictor for the config, which outlives this folder: paths in full, names as they are."""
     return str(Path(text).absolute()) if text is not None and Path(text).exists() else text
+
+
+def _load(data: Mapping, **response):
+    """The scene, developed with a response, as load_scene takes it; its notes go to the log."""
+    from ..scene import load_scene
+
+    names = ("exposure_index", "max_size", "holdout")
+    scene = load_scene(data["path"], **{name: data.get(name) for name in names}, **response)
+    for note in scene.notes:
+        log.info("%s", note)
+    return scene
+
+
+def _train(asked: Train, scene, config, device, data: dict):
+    from .train import train
+
+    return train(
+        scene,
+        asked.output.out,
+        config,
+        device=device,
+        resume=asked.output.resume,
+        overwrite=asked.output.overwrite,
+        tensorboard=asked.output.tensorboard,
+        data=data,
+    )
+
+
+def _cost(config) -> str:
+    """How much work a training by a config is, in words."""
+    planned = "as many steps as the photos deserve, up to" if config.plan.enabled else "steps:"
+    parts = [f"{planned} {config.schedule.iterations}", f"up to {config.densification.max_gaussians:,} Gaussians"]
+    if config.fusion.enabled:
+        parts.append(f"{len(config.fusion.exposures)} brackets in every step")
+    if config.response.name == "learned":
+        parts.append("a learned response")
+    if config.loss.predictor or config.loss.uses_hdr:
+        parts.append("predicted HDR" if config.loss.predictor else "needs HDR truth")
+    return "; ".join(parts)
+
+
+def _ending(path: Path, summary: dict) -> str:
+    """What was made, and what to type next."""
+    scores = [(line["psnr_ldr"], line["iteration"]) for line in summary["metrics"] if "psnr_ldr" in line]
+    heldout = f", held-out PSNR {scores[-1][0]:.2f} dB" if scores else ""
+    made = f"{summary['iteration']} iterations, {summary['gaussians']} Gaussians{heldout}"
+    lines = [f"{path}: {made}, {summary['train_seconds']:.1f} s on {summary['device']}"]
+    if scores and max(scores)[0] - scores[-1][0] > _FALL:
+        best, at = max(scores)
+        lines.append(f"held-out PSNR was {best:.2f} dB at iteration {at} and fell: try --iterations {at}")
+    lines += [
+        f"exposure brackets:  sehdr-warp render {path} --out {path}/views --evs=-4,-2,0,2,4",
+        f"pictures, splats:   sehdr-warp report {path} --out {path}/report;  sehdr-warp export {path} --out scene.ply",
+    ]
+    return "\n".join(lines)

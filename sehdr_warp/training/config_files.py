@@ -1,20 +1,22 @@
 """Configs as files: TOML presets and overrides in, JSON beside the run out."""
 
-import difflib
 import json
 import reprlib
+import textwrap
 import tomllib
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
-from ..errors import InputError
+from ..errors import InputError, did_you_mean
 from .config import Config
 from .config_checks import ConfigError
+from .config_fields import GONE, config_fields
 
 _LARGEST_FILE = 1 << 20
-_REMEDY = "correct the file; configs/default.toml lists every field"
+_REMEDY = "`sehdr-warp config` lists every field with its meaning"
 
 
 def preset_names() -> list[str]:
@@ -23,33 +25,57 @@ def preset_names() -> list[str]:
     return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
 
 
-def load_config(preset: str | Path = "default", overrides: dict | None = None) -> Config:
+def preset_purpose(name: str) -> str:
+    """What a preset is for: the first line of its file."""
+    return _text(_locate(name)).partition("\n")[0].strip("# .")
+
+
+def load_config(
+    preset: str | Path = "default", overrides: dict | None = None, flags: Mapping[str, str] | None = None
+) -> Config:
     """The config of a preset or of a TOML file.
 
-    preset: a name of preset_names(), or the path of a TOML file.
-    overrides: dotted field names and values that replace the file's, e.g. {"schedule.iterations": 500}.
+    Args:
+        preset: a name of preset_names(), or the path of a TOML file.
+        overrides: dotted field names and values that replace the file's, e.g. {"schedule.iterations": 500}.
+        flags: what overrides are called in errors, where they are flags of a command line.
 
-    Raises InputError naming file, field and value for a missing file, bad TOML, an unknown field, a wrong type or a
-    value out of range.
+    Raises:
+        InputError: naming file, field and value for a missing file, bad TOML, an unknown field, a wrong type or a value
+            out of range.
     """
     source, values = _read(preset)
-    return _override(source, values, overrides or {})
+    _build(source, values)
+    return _override("overrides", values, overrides or {}, flags)
 
 
-def override_config(config: Config, overrides: dict, source: Path | str = "config") -> Config:
+def override_config(
+    config: Config, overrides: dict, source: Path | str = "the config", flags: Mapping[str, str] | None = None
+) -> Config:
     """A config with some fields replaced, given as for load_config; `source` names it in errors. Raises InputError."""
-    return _override(source, config_to_dict(config), overrides)
+    return _override(source, config_to_dict(config), overrides, flags)
 
 
-def parse_setting(text: str) -> tuple[str, object]:
-    """A field's dotted name and its value from `field=value`, the value as in TOML (plain words need no quotes).
-
-    Raises InputError for a text without a name or an equals sign; load_config checks name and value.
-    """
-    path, equals, value = (part.strip() for part in text.partition("="))
-    if not path or not equals:
-        raise InputError(f"--set {text}", "is not field=value", "write for example --set loss.clipping=false")
-    return path, toml_value(value)
+def config_as_toml(config: Config, differing: bool = False) -> str:
+    """A config as a TOML file: every field with its meaning, and marked where it is not the default's; or, differing,
+    just these, which load_config takes."""
+    lines: list[str] = ['base = "default"'] if differing else []
+    table = ""
+    for path, item in config_fields():
+        part, _, name = path.rpartition(".")
+        value = getattr(getattr(config, part) if part else config, name)
+        if differing and value == item.default:
+            continue
+        if part != table:
+            lines += ["", f"[{part}]"]
+            table = part
+        if not differing:
+            told = " ".join((item.description or "").split())
+            lines += textwrap.wrap(told, 116, initial_indent="# ", subsequent_indent="# ")
+        changed = "" if differing or value == item.default else f"  # default: {json.dumps(item.default)}"
+        # JSON's strings, numbers, booleans and lists are TOML's as well.
+        lines.append(f"{name} = {json.dumps(value)}{changed}")
+    return "\n".join(lines)
 
 
 def toml_value(text: str):
@@ -116,7 +142,9 @@ def _locate(preset: str | Path, beside: Path | None = None) -> Path:
         found = False
     if not found:
         raise InputError(
-            str(preset)[:200], "no such preset or file", f"use one of {', '.join(preset_names())}, or a TOML file"
+            str(preset)[:200],
+            f"no such preset or file{did_you_mean(str(preset), preset_names())}",
+            f"use one of {', '.join(preset_names())}, or a TOML file",
         )
     return path
 
@@ -132,16 +160,17 @@ def _text(path: Path) -> str:
         raise InputError(path, "not UTF-8 text", "this is not a config file") from None
 
 
-def _override(source: Path | str, values: dict, overrides: dict) -> Config:
+def _override(source: Path | str, values: dict, overrides: dict, flags: Mapping[str, str] | None) -> Config:
+    """Values with others in their place. Raises InputError that blames the override, by its flag where it has one."""
     for path, value in overrides.items():
         *parents, leaf = path.split(".")
         table = values
         for parent in parents:
             table = table.setdefault(parent, {})
             if not isinstance(table, dict):
-                raise InputError(source, f"{parent} = {_shown(table)} is not a table", _REMEDY)
+                raise InputError(path, f"{parent} is a field, not a table", _REMEDY)
         table[leaf] = value
-    return _build(source, values)
+    return _build(source, values, flags)
 
 
 def _merge(into: dict, values: dict) -> None:
@@ -152,14 +181,19 @@ def _merge(into: dict, values: dict) -> None:
             into[key] = value
 
 
-def _build(source: Path | str, values: dict) -> Config:
+def _build(source: Path | str, values: dict, flags: Mapping[str, str] | None = None) -> Config:
     try:
         return Config.model_validate(_with_tuples(values))
     except ValidationError as error:
-        problem = _problem(error.errors()[0])
+        path, problem = _problem(error.errors()[0])
     except ConfigError as error:
-        problem = str(error)
-    raise InputError(source, problem, "correct the value; configs/default.toml says what each field means")
+        path, problem = "", str(error)
+    flag = (flags or {}).get(path)
+    if flag is None and flags and not path:  # Fields that contradict each other: the first that was named.
+        flag = next((flag for path, flag in flags.items() if path in problem), None)
+    if path in GONE:
+        raise InputError(source, f"{problem} of an earlier version is gone", GONE[path])
+    raise InputError(flag or source, problem, _REMEDY)
 
 
 def _with_tuples(values):
@@ -169,25 +203,18 @@ def _with_tuples(values):
     return tuple(map(_with_tuples, values)) if isinstance(values, list) else values
 
 
-def _problem(error: dict) -> str:
-    """One of pydantic's errors as `field = value: what is allowed`; of an unknown field, which known one is near."""
-    path = ".".join(str(part) for part in error["loc"] if isinstance(part, str)) or "the config"
-    value = f"{path} = {_shown(error['input'])}"
+def _problem(error: dict) -> tuple[str, str]:
+    """The field of one of pydantic's errors, and `field = value: what is allowed`; of an unknown one, what is near."""
+    path, value = ".".join(str(part) for part in error["loc"] if isinstance(part, str)), error["input"]
+    if error["type"] == "extra_forbidden" and isinstance(value, dict) and value:
+        name, value = next(iter(value.items()))
+        path += f".{name}"
+    value = f"{path or 'the config'} = {_shown(value)}"
+    if path in GONE:
+        return path, value
     if error["type"] == "extra_forbidden":
-        near = difflib.get_close_matches(path, _paths(Config), 1)
-        return f"unknown field {value}" + (f"; did you mean {near[0]}?" if near else "")
-    return f"{value}: {error['msg'][0].lower()}{error['msg'][1:]}"
-
-
-def _paths(kind: type[BaseModel], prefix: str = "") -> list[str]:
-    """Dotted names of all tables and fields."""
-    found = []
-    for name, item in kind.model_fields.items():
-        inner = item.annotation
-        found.append(prefix + name)
-        if isinstance(inner, type) and issubclass(inner, BaseModel):
-            found += _paths(inner, f"{prefix}{name}.")
-    return found
+        return path, f"unknown field {value}{did_you_mean(path, (name for name, _ in config_fields()))}"
+    return path, f"{value}: {error['msg'][0].lower()}{error['msg'][1:]}"
 
 
 def _shown(value) -> str:

@@ -145,6 +145,8 @@ def pick_device(device: str | torch.device | None) -> torch.device:
     """The device a user named, by default the first GPU or else the CPU; raises InputError if it is not there."""
     if device is None:
         return torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
+    if not str(device).startswith(("cpu", "cuda")):
+        raise InputError(f"device {device}", "is neither a CPU nor a CUDA GPU", "use cpu or cuda:N")
     try:
         made = torch.device(device)
         torch.empty(0, device=made)
@@ -153,8 +155,6 @@ def pick_device(device: str | torch.device | None) -> torch.device:
         raise InputError(
             f"device {device}", f"cannot be used ({reason})", "use cpu, or cuda:N of a GPU that torch sees"
         ) from None
-    if made.type not in ("cpu", "cuda"):
-        raise InputError(f"device {device}", "is neither a CPU nor a CUDA GPU", "use cpu or cuda:N")
     return torch.device("cuda", made.index or 0) if made.type == "cuda" else made
 
 

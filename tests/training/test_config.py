@@ -1,35 +1,27 @@
 """Configs: presets, files, overrides, and clear refusals."""
 
 import json
-import textwrap
 from pathlib import Path
 
 import pytest
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 import sehdr_warp
 from sehdr_warp.errors import InputError
 from sehdr_warp.training.config import Config, FusionConfig, LossConfig, ModelConfig, ResponseConfig, stated
 from sehdr_warp.training.config_checks import ConfigError
+from sehdr_warp.training.config_fields import GONE, config_fields, value_of
 from sehdr_warp.training.config_files import (
+    config_as_toml,
     config_from_dict,
     config_to_dict,
     load_config,
     override_config,
     preset_names,
+    read_config_json,
 )
 
 PACKAGE = Path(sehdr_warp.__file__).parent
-
-
-def leaves(node=None, prefix=""):
-    node = Config() if node is None else node
-    for name, item in type(node).model_fields.items():
-        value = getattr(node, name)
-        if isinstance(value, BaseModel):
-            yield from leaves(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, item
 
 
 def test_presets_that_ship():
@@ -42,29 +34,21 @@ def test_preset_loads_and_survives_json(name):
     assert config_from_dict(json.loads(json.dumps(config_to_dict(config)))) == config
 
 
-def as_toml(config):
-    """A commented TOML file that states every field of a config."""
-
-    def lines_of(node):
-        for name, item in type(node).model_fields.items():
-            value = getattr(node, name)
-            if not isinstance(value, BaseModel):
-                text = item.description.replace("\n", " ")
-                yield from textwrap.wrap(text, 116, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False)
-                # JSON's strings, numbers, booleans and lists are TOML's as well.
-                yield f"{name} = {json.dumps(value)}"
-
-    lines = list(lines_of(config))
-    for name, value in config:
-        if isinstance(value, BaseModel):
-            lines += [f"\n[{name}]", *lines_of(value)]
-    return "\n".join(lines) + "\n"
-
-
-def test_default_preset_states_every_field_with_its_meaning():
-    text = (PACKAGE.parent / "configs" / "default.toml").read_text()
-    assert text.endswith(as_toml(Config())), "write configs/default.toml again with as_toml(Config())"
+def test_the_default_preset_is_the_defaults():
     assert load_config("default") == Config()
+
+
+@pytest.mark.parametrize("name", preset_names())
+@pytest.mark.parametrize("differing", [False, True])
+def test_a_config_as_toml_is_read_back(name, differing, tmp_path):
+    config = load_config(name)
+    (tmp_path / "own.toml").write_text(config_as_toml(config, differing))
+    assert load_config(tmp_path / "own.toml") == config
+
+
+def test_what_differs_is_marked():
+    lines = config_as_toml(load_config("default", {"loss.clipping": False})).splitlines()
+    assert [line for line in lines if "default:" in line] == ["clipping = false  # default: true"]
 
 
 def test_paper_preset_is_the_papers():
@@ -83,7 +67,7 @@ def test_presets_keep_the_densification_of_their_method(name):
     assert found == (("relocation", 0.01) if relocates else ("gradient", 0.0))
 
 
-@pytest.mark.parametrize("path,item", list(leaves()), ids=[path for path, _ in leaves()])
+@pytest.mark.parametrize("path,item", list(config_fields()), ids=[path for path, _ in config_fields()])
 def test_every_field_is_documented_and_read(path, item):
     assert item.description
     name = path.split(".")[-1]
@@ -103,6 +87,9 @@ def test_every_field_is_documented_and_read(path, item):
     "text,words",
     [
         ("[model]\nopacity = 0.2", ["model.opacity", "0.2", "unknown"]),
+        ("[loss]\nknee = 8.0", ["loss.knee = 8.0 of an earlier version is gone", "leave it out"]),
+        ("[response]\nform = 'mlp'", ["response.form = 'mlp'", 'write response.name = "learned"']),
+        ("[los]\nclipping = true", ["los.clipping = True", "did you mean loss.clipping?"]),
         ("[model]\nradiance2 = 1", ["model.radiance2 = 1", "did you mean model.radiance?"]),
         ("[schedule]\niterations = 0", ["schedule.iterations = 0", "greater than or equal to 1"]),
         ("[schedule]\niterations = 1.5", ["schedule.iterations = 1.5", "int"]),
@@ -129,8 +116,46 @@ def test_bad_files_name_file_field_and_value(tmp_path, text, words):
 
 
 def test_missing_preset_is_refused():
-    with pytest.raises(InputError, match="default, demo"):
+    with pytest.raises(InputError, match=r"did you mean default\?; use one of 3dgs, default, demo"):
         load_config("defualt")
+
+
+def test_an_override_is_blamed_by_its_flag_and_never_the_file():
+    with pytest.raises(InputError, match=r"^--iterations: schedule.iterations = 0: "):
+        load_config("fast", {"schedule.iterations": 0}, {"schedule.iterations": "--iterations"})
+    with pytest.raises(InputError, match=r"^overrides: unknown field los.clipping = 1, did you mean loss.clipping\?"):
+        load_config("fast", {"los.clipping": 1})
+    with pytest.raises(InputError, match=r"^--loss.linear-weight: loss.linear_weight = 1.0 has nothing to compare"):
+        load_config("default", {"loss.linear_weight": 1.0}, {"loss.linear_weight": "--loss.linear-weight"})
+    with pytest.raises(InputError, match=r"^fusion.enabled.x: enabled is a field"):
+        load_config("paper", {"fusion.enabled.x": 1})
+
+
+def test_a_run_of_an_earlier_version_is_told_so(tmp_path):
+    values = config_to_dict(Config())
+    values["schedule"]["stated_for"] = 30_000
+    (tmp_path / "config.json").write_text(json.dumps(values))
+    with pytest.raises(InputError, match=r"config.json: schedule.stated_for = 30000 of an earlier version is gone"):
+        read_config_json(tmp_path / "config.json")
+
+
+@pytest.mark.parametrize(
+    "path,text,value",
+    [
+        ("fusion.exposures", "1/8x, 1x", ["1/8x", "1x"]),
+        ("response.name", "201", "201"),
+        ("schedule.evaluate_at", "100,200", [100, 200]),
+        ("loss.clipping", "false", False),
+        ("optimizer.means", "1e-4", 1e-4),
+        ("plan.keep", "", []),
+    ],
+)
+def test_values_of_flags(path, text, value):
+    assert value_of(path, text) == value
+
+
+def test_no_field_is_both_here_and_gone():
+    assert not {path for path, _ in config_fields()} & GONE.keys()
 
 
 def test_base_and_overrides(tmp_path):
