@@ -16,8 +16,11 @@ __version__ = "0.2.0"
 
 _HOMES = {
     "errors": ("InputError", "SehdrError"),
+    "evaluation.compare": ("compare_runs",),
     "evaluation.evaluate": ("evaluate",),
+    "evaluation.score": ("score_folder",),
     "output.brackets": ("write_brackets",),
+    "output.ply": ("export",),
     "output.render_views": ("render_views",),
     "output.report": ("write_report",),
     "response": ("Response", "response_by_name", "response_names"),

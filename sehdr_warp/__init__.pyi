@@ -1,8 +1,11 @@
 """The public names, for editors and type checkers; __init__.py loads them when they are first used."""
 
 from .errors import InputError, SehdrError
+from .evaluation.compare import compare_runs
 from .evaluation.evaluate import evaluate
+from .evaluation.score import score_folder
 from .output.brackets import write_brackets
+from .output.ply import export
 from .output.render_views import render_views
 from .output.report import write_report
 from .response import Response, response_by_name, response_names
@@ -25,8 +28,10 @@ __all__ = [
     "SehdrError",
     "View",
     "calibrate",
+    "compare_runs",
     "differentiable",
     "evaluate",
+    "export",
     "load_cameras",
     "load_config",
     "load_run",
@@ -35,6 +40,7 @@ __all__ = [
     "render_views",
     "response_by_name",
     "response_names",
+    "score_folder",
     "spherical_harmonics",
     "ssim",
     "train",

@@ -31,6 +31,8 @@ COMMANDS = {
         "eval": Command("evaluation.commands", "Evaluate", "run_evaluate"),
         "report": Command("output.commands", "Report", "run_report"),
         "export": Command("output.commands", "Export", "run_export"),
+        "compare": Command("evaluation.commands", "Compare", "run_compare"),
+        "score": Command("evaluation.commands", "Score", "run_score"),
     },
     "what there is to choose from": {
         "presets": Command("training.commands", "Presets", "run_presets"),

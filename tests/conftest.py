@@ -1,5 +1,6 @@
 """What every test may ask for: devices, and the optional folder of larger real data."""
 
+import logging
 import os
 from pathlib import Path
 
@@ -36,3 +37,17 @@ def shared() -> Path:
     if not folder.is_dir():
         pytest.skip("larger real data is not here (set SEHDR_SHARED)")
     return folder
+
+
+@pytest.fixture
+def logged():
+    """What the package logs during a test, line by line; works also after the command line has set logging up."""
+    lines, logger = [], logging.getLogger("sehdr_warp")
+    handler = logging.Handler()
+    handler.emit = lambda record: lines.append(record.getMessage())
+    level = logger.level
+    logger.addHandler(handler)
+    logger.setLevel("INFO")
+    yield lines
+    logger.removeHandler(handler)
+    logger.setLevel(level)

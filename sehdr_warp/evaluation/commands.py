@@ -1,6 +1,7 @@
-"""The command line of `sehdr-warp eval`. torch is imported when it runs."""
+"""The command lines of `sehdr-warp eval`, `compare` and `score`. torch is imported when they run."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,17 +28,89 @@ class Evaluate:
     """Replace the file of --json."""
 
 
+@dataclass(frozen=True)
+class Compare:
+    """Compare trained runs in one table; runs that differ by their seed alone become a mean with its spread."""
+
+    runs: Positional[tuple[Path, ...]]
+    """Folders of runs."""
+    plot: Path | None = None
+    """Also draw held-out error against training time to this PNG file."""
+    csv: Path | None = None
+    """Also write the table to this CSV file."""
+    latex: Path | None = None
+    """Also write the table to this LaTeX file (booktabs)."""
+    overwrite: bool = False
+    """Replace files that exist."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """Score a folder of EXR pictures of any origin against the HDR truth of a set."""
+
+    folder: Positional[Path]
+    """EXR files of scene-linear radiance, Rec.709 primaries, named as the set's views."""
+    truth: str
+    """The set: a folder with HDR truth, or an embedded scene."""
+    max_size: int | None = None
+    """Longest side of the truth in pixels, as the pictures have it; larger truth is reduced."""
+    json: Path | None = None
+    """Also write the figures to this file; - prints them on standard output in place of the table."""
+    lpips: Path | None = None
+    """Folder with LPIPS weights; without, LPIPS is null."""
+    overwrite: bool = False
+    """Replace the file of --json."""
+
+
 def run_evaluate(asked: Evaluate) -> None:
     """Prints the figures as a table or as JSON, and writes what was asked for."""
-    from ..files import check_absent, write_json
     from .evaluate import evaluate
+
+    def figures():
+        run = open_run(asked.run, asked.device)
+        return evaluate(run, ensured_scene(run, asked.data), lpips_weights=asked.lpips)
+
+    _tell(figures, asked)
+
+
+def run_score(asked: Score) -> None:
+    """Prints the figures as a table or as JSON, and writes what was asked for."""
+    from ..scene import load_scene
+    from .score import score_folder
+
+    _tell(
+        lambda: score_folder(asked.folder, load_scene(asked.truth, max_size=asked.max_size), lpips_weights=asked.lpips),
+        asked,
+    )
+
+
+def run_compare(asked: Compare) -> None:
+    """Prints the table and writes what was asked for."""
+    from ..files import atomic_path, check_absent
+    from .compare import compare_runs, comparison_csv, comparison_figure, comparison_latex, comparison_table
+
+    for path in filter(None, (asked.plot, asked.csv, asked.latex)):
+        check_absent(path, asked.overwrite)
+    rows = compare_runs([open_run(path, "cpu") for path in asked.runs])
+    for path, write in ((asked.csv, comparison_csv), (asked.latex, comparison_latex)):
+        if path is not None:
+            with atomic_path(path, asked.overwrite) as file:
+                file.write_text(write(rows), encoding="utf-8")
+    if asked.plot is not None:
+        with atomic_path(asked.plot, asked.overwrite) as file:
+            comparison_figure(rows).savefig(file, dpi=140, facecolor="white", format="png")
+    print(comparison_table(rows))
+
+
+def _tell(figures: Callable[[], dict], asked: Evaluate | Score) -> None:
+    """Computes once it is known that the result can be written."""
+    from ..files import check_absent, write_json
     from .table import format_table
 
     to_file = asked.json is not None and str(asked.json) != "-"
     if to_file:
         check_absent(asked.json, asked.overwrite)
-    run = open_run(asked.run, asked.device)
-    result = evaluate(run, ensured_scene(run, asked.data), lpips_weights=asked.lpips)
+    result = figures()
     if to_file:
         write_json(asked.json, result, asked.overwrite)
     print(format_table(result) if asked.json is None or to_file else json.dumps(result))

@@ -1,8 +1,10 @@
 """Held-out evaluation of a trained run: every figure with its protocol's name, or null with a reason."""
 
+import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol
 
 import torch
 
@@ -17,6 +19,48 @@ from .ranking import DARKEST_CODE, ErrorRanking
 # cd/m^2 at which the brightest value of a view's truth is shown for PU21: the peak of a common HDR display.
 PEAK_LUMINANCE = 1000.0
 PERFECT = "there is no error at all, so the PSNR is infinite"
+log = logging.getLogger(__name__)
+
+
+class Pictures(Protocol):
+    """Predictions of views. facts: plain values about them, for the result."""
+
+    facts: dict
+
+    def hdr(self, view: View) -> torch.Tensor:
+        """[H, W, 3] scene-linear radiance."""
+
+    def ldr(self, view: View) -> torch.Tensor | None:
+        """[H, W, 3] simulated photo in [0, 1], or None where there is none."""
+
+    def doubt(self, view: View) -> tuple[torch.Tensor, float] | None:
+        """Confidence [H, W] in [0, 1], and the radiance that a photo shows as black; None where it is not known."""
+
+
+class RunPictures:
+    """What a trained run renders."""
+
+    def __init__(self, run):
+        self.run = run
+        self.facts = {
+            "train_seconds": run.train_seconds,
+            "gaussians": run.gaussian_count,
+            "iterations": run.iterations,
+        }
+
+    def hdr(self, view):
+        return self.run.render(view.camera).hdr
+
+    def ldr(self, view):
+        return self.run.render_ldr(view.camera, view.exposure_time)
+
+    def doubt(self, view):
+        render = getattr(self.run, "render_confidence", None)
+        confidence = render(view.camera) if render else None
+        if confidence is None:
+            return None
+        black = self.run.response.decode(torch.full((1, 3), DARKEST_CODE, device=confidence.device))
+        return confidence, float(black.mean()) / view.exposure_time
 
 
 @torch.no_grad()
@@ -29,67 +73,64 @@ def evaluate(
     peak_luminance: float = PEAK_LUMINANCE,
     white_percentile: float = 100.0,
     flip: bool = False,
-    progress: Callable[[str], None] | None = None,
 ) -> dict:
     """Render the scene's test views with a trained run and compare them with the photos and the HDR truth.
 
-    run: a sehdr_warp.training.Run, or anything with its `render(camera)` (an object with `.hdr`, [H, W, 3] scene-linear
-        radiance on `device`), `render_ldr(camera, seconds)` ([H, W, 3] in [0, 1]), and the numbers `train_seconds`,
-        `gaussian_count` and `iterations`; where it has them, `render_confidence(camera)` ([H, W] in [0, 1], or None)
-        and `response` tell how well its confidence ranks its errors.
-    scene: the views, at the exposure that was trained on. Without test views the training views are taken, and
-        "split" says so.
-    lpips_weights: folder, see load_lpips; protocols: names out of PROTOCOLS.
-    peak_luminance, white_percentile: how PU21 maps the truth to cd/m^2, see pu21_metrics.
-    flip: also HDR-FLIP, under each protocol's scale, where flip-evaluator is installed; slow.
-    progress: called with one line for each view.
+    Args:
+        run: a Run.
+        scene: the views, at the exposure that was trained on. Without test views the training views are taken, and
+            "split" says so.
+        lpips_weights: a folder, see load_lpips.
+        protocols: names out of PROTOCOLS.
+        peak_luminance, white_percentile: how PU21 maps the truth to cd/m^2, see pu21_metrics.
+        flip: also HDR-FLIP under each protocol's scale, where flip-evaluator is installed; slow.
 
-    Returns plain values, ready for strict JSON (null in place of NaN and infinity):
-        "protocol": {name: {"psnr_mu", "ssim_mu", "lpips_mu", "views"}}, with "hdr_flip" if it was asked for; "aligned"
-            also holds its "scale"
-        "pu21": {name: {"psnr", "ssim"}, "peak_luminance", "white_percentile"}
-        "ldr": {"psnr", "ssim", "lpips"} of the simulated photo at the view's exposure time, unquantised, against the
-            photo
-        "regions": {region: {"fraction", "psnr_ldr", "psnr_mu": {name: dB}}}, errors pooled over all views
-        "confidence": {"spearman_log2", "spearman_mu": rank correlation of 1 - confidence with the error; "mean",
-            "pixels", "scale"}, see ranking.py
-        "views": the same for each view; and "split", "lpips_backbone", "train_seconds", "gaussians", "iterations"
-    Means are over views. What cannot be computed is null with "reason" (or "lpips_reason") beside it. A view's mask
-    applies to everything: outside it the prediction is taken to be right, and nothing there is averaged, but by LPIPS
-    and HDR-FLIP, which are of whole images; a view whose mask is empty is left out.
+    Returns:
+        Plain values, ready for strict JSON (null in place of NaN and infinity). "protocol": {name: psnr_mu, ssim_mu,
+        lpips_mu, views, hdr_flip if asked for}, with "scale" for "aligned"; "pu21": {name: psnr, ssim}; "ldr": psnr,
+        ssim, lpips of the simulated photo, unquantised; "regions": {region: fraction, psnr_ldr, psnr_mu}, pooled over
+        views; "confidence": see ranking.py; "views": the same for each view; "split", "lpips_backbone" and the run's
+        facts. Means are over views. What cannot be computed is null with "reason" (or "lpips_reason") beside it.
+        Outside a view's mask the prediction counts as right and nothing is averaged, but by LPIPS and HDR-FLIP, which
+        are of whole images; views with an empty mask are left out.
 
-    Raises SehdrError for a scene without views, images that disagree with their camera, a render that is not finite
-    or an unknown protocol; InputError for LPIPS weights that cannot be read.
+    Raises:
+        SehdrError: for a scene without views, images that disagree with their camera, a render that is not finite or an
+            unknown protocol.
+        InputError: for LPIPS weights that cannot be read.
     """
-    evaluation = _Evaluation(run, scene, lpips_weights, protocols, peak_luminance, white_percentile, flip)
-    return evaluation.result(progress)
+    options = {"peak_luminance": peak_luminance, "white_percentile": white_percentile}
+    return Evaluation(RunPictures(run), scene, run.device, lpips_weights, protocols, options, flip).result()
 
 
-class _Evaluation:
-    def __init__(self, run, scene, lpips_weights, names, peak_luminance, white_percentile, flip):
+class Evaluation:
+    """One comparison of pictures with a scene's views."""
+
+    def __init__(self, pictures: Pictures, scene, device, lpips_weights, names, pu21_mapping, flip, views=None):
         for name in names:
             if name not in PROTOCOLS:
                 raise SehdrError(f"protocol = {name!r} is unknown; choose from {', '.join(PROTOCOLS)}")
-        self.run, self.scene, self.names = run, scene, tuple(names)
-        self.pu21_mapping = {"peak_luminance": peak_luminance, "white_percentile": white_percentile}
-        self.split = "test" if scene.test_views else "train"
-        self.views = [view for view in scene.test_views or scene.train_views if view.mask is None or view.mask.any()]
+        self.pictures, self.scene, self.names = pictures, scene, tuple(names)
+        self.pu21_mapping, self.split = pu21_mapping, "test" if scene.test_views else "train"
+        given = (scene.test_views or scene.train_views) if views is None else views
+        self.views = [view for view in given if view.mask is None or view.mask.any()]
+        self.scale_views = scene.train_views
         if not self.views:
             raise SehdrError(f"scene {scene.name!r} has no views to evaluate; check its splits and masks")
-        self.device = torch.device(run.device)
+        self.device = torch.device(device)
         self.lpips, self.lpips_reason = load_lpips(lpips_weights, self.device)
         self.with_flip = flip
         self.flip, self.flip_reason = load_flip() if flip else (None, None)
         self.regions = {region: _RegionErrors(self.names) for region in metrics.REGIONS}
         self.ranking = ErrorRanking()
 
-    def result(self, progress) -> dict:
-        scale, scale_reason = self._scale(progress)
+    def result(self) -> dict:
+        """The figures, as evaluate() describes them."""
+        scale, scale_reason = self._scale()
         rows = []
         for number, view in enumerate(self.views, 1):
             rows.append(self._view(view, scale))
-            if progress:
-                progress(_line(number, len(self.views), rows[-1]))
+            log.info(_line(number, len(self.views), rows[-1]))
         truths = [row for row, view in zip(rows, self.views) if view.hdr is not None]
         missing = None if truths else f"the {self.split} views hold no HDR truth"
         hdr, pu21 = {}, {}
@@ -107,7 +148,10 @@ class _Evaluation:
         if "aligned" in hdr:
             hdr["aligned"]["scale"] = scale
         ldr = _mean([row["ldr"] for row in rows])
-        self._explain(ldr, "lpips")
+        if ldr["psnr"] is None:
+            ldr["reason"] = "the folder holds radiance, no simulated photos"
+        else:
+            self._explain(ldr, "lpips")
         result = {
             "scene": self.scene.name,
             "split": self.split,
@@ -118,34 +162,30 @@ class _Evaluation:
             "confidence": self.ranking.result() | ({"reason": missing} if missing else {}),
             "views": rows,
             "lpips_backbone": BACKBONE if self.lpips else None,
-            "train_seconds": self.run.train_seconds,
-            "gaussians": self.run.gaussian_count,
-            "iterations": self.run.iterations,
         }
-        return _plain(result)
+        return _plain(result | self.pictures.facts)
 
-    def _scale(self, progress) -> tuple[float | None, str | None]:
+    def _scale(self) -> tuple[float | None, str | None]:
         """The one factor of the scene for `aligned`, or why there is none."""
         if "aligned" not in self.names or not any(view.hdr is not None for view in self.views):
             return None, None
-        views = [view for view in self.scene.train_views if view.hdr is not None]
+        views = [view for view in self.scale_views if view.hdr is not None]
         if not views:
             return None, "no training view holds HDR truth to fit the scale on"
-        if progress:
-            progress(f"fitting the scale on {len(views)} training views")
+        log.info("fitting the scale on %d views", len(views))
         scale = fit_scale((*self._render(view), self._tensor(view.mask), self._tensor(view.image)) for view in views)
-        return scale, None if scale else "the renders of the training views hold no light to fit the scale on"
+        return scale, None if scale else "the pictures hold no light to fit the scale on"
 
     def _render(self, view: View) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Prediction and truth, [H, W, 3] float32 on the run's device each; no truth gives None."""
+        """Prediction and truth, [H, W, 3] float32 on the device each; no truth gives None."""
         size = (view.camera.height, view.camera.width, 3)
-        for what, image in (("photo", view.image), ("HDR truth", view.hdr)):
-            if image is not None and image.shape != size:
+        prediction = self.pictures.hdr(view).detach()
+        for what, image in (("photo", view.codes), ("HDR truth", view.hdr), ("picture", prediction)):
+            if image is not None and tuple(image.shape) != size:
                 raise SehdrError(
                     f"view {view.name!r}: its {what} is {image.shape[1]} x {image.shape[0]}, its camera "
-                    f"{size[1]} x {size[0]}; load both at one size"
+                    f"{size[1]} x {size[0]}; take both at one size"
                 )
-        prediction = self.run.render(view.camera).hdr.detach()
         if not bool(torch.isfinite(prediction).all()):
             raise SehdrError(f"view {view.name!r}: the render holds values that are not finite; the training diverged")
         return prediction.float(), self._tensor(view.hdr)
@@ -156,17 +196,20 @@ class _Evaluation:
     def _view(self, view: View, scale: float | None) -> dict:
         hdr, truth = self._render(view)
         photo, mask = self._tensor(view.image), self._tensor(view.mask)
-        encoded = self.run.render_ldr(view.camera, view.exposure_time).detach().float()
-        encoded = _inside(encoded, photo, mask)
-        row = {"name": view.name, "ldr": self._ldr(encoded, photo, mask), "protocol": {}, "pu21": {}}
+        row = {"name": view.name, "ldr": dict.fromkeys(("psnr", "ssim", "lpips")), "protocol": {}, "pu21": {}}
         regions = metrics.region_masks(photo)
         weights = {name: region if mask is None else region * mask for name, region in regions.items()}
         counted = float(photo.shape[0] * photo.shape[1] if mask is None else mask.sum())
+        encoded = self.pictures.ldr(view)
+        if encoded is not None:
+            encoded = _inside(encoded.detach().float(), photo, mask)
+            row["ldr"] = self._ldr(encoded, photo, mask)
         for region, weight in weights.items():
             self.regions[region].add_ldr(encoded, photo, weight, counted)
         if truth is None:
             return row
-        self._rank(view, hdr, truth, regions["well-exposed"], mask)
+        if doubt := self.pictures.doubt(view):
+            self.ranking.add(doubt[0], hdr, truth, regions["well-exposed"], doubt[1], mask)
         for name in self.names:
             if name == "aligned" and scale is None:
                 continue
@@ -186,15 +229,6 @@ class _Evaluation:
             for region, weight in weights.items():
                 self.regions[region].add_hdr(name, *pair, weight)
         return row
-
-    def _rank(self, view: View, prediction, truth, well_exposed, mask) -> None:
-        """Sets the confidence of a view beside its errors, if the run knows its confidence."""
-        render = getattr(self.run, "render_confidence", None)
-        confidence = render(view.camera) if render else None
-        if confidence is not None:
-            black = self.run.response.decode(truth.new_full((1, 3), DARKEST_CODE))
-            darkest = float(black.mean()) / view.exposure_time
-            self.ranking.add(confidence, prediction, truth, well_exposed, darkest, mask)
 
     def _ldr(self, encoded, photo, mask) -> dict:
         return {
@@ -223,10 +257,11 @@ class _RegionErrors:
         self.hdr = dict.fromkeys(names, (0.0, 0.0))
 
     def add_ldr(self, prediction, truth, weight, counted: float) -> None:
-        error, total = metrics.squared_error(prediction, truth, weight)
+        """Counts the region; prediction None leaves its photo error unknown."""
+        error, total = metrics.squared_error(truth if prediction is None else prediction, truth, weight)
         self.pixels += counted
         self.weight += total
-        self.ldr += float(error.mean())
+        self.ldr += math.nan if prediction is None else float(error.mean())
 
     def add_hdr(self, name, prediction, truth, weight) -> None:
         error, total = metrics.squared_error(prediction, truth, weight)
@@ -278,5 +313,6 @@ def _values(item) -> list:
 
 
 def _line(number: int, count: int, row: dict) -> str:
-    hdr = "".join(f", HDR {name} {figures['psnr_mu']:.2f} dB" for name, figures in row["protocol"].items())
-    return f"view {number}/{count} {row['name']}: LDR {row['ldr']['psnr']:.2f} dB{hdr}"
+    figures = [] if row["ldr"]["psnr"] is None else [f"LDR {row['ldr']['psnr']:.2f} dB"]
+    figures += [f"HDR {name} {values['psnr_mu']:.2f} dB" for name, values in row["protocol"].items()]
+    return f"view {number}/{count} {row['name']}: {', '.join(figures)}"

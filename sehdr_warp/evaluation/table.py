@@ -3,15 +3,10 @@
 
 def format_table(result: dict) -> str:
     """The figures of evaluate() as a table for a terminal; missing ones are dashes, with the reasons below."""
-    count, split = len(result["views"]), result["split"]
-    trained = f"{result['gaussians']:,} Gaussians, {result['iterations']:,} iterations"
-    title = f"{result['scene']}: {count} {split} views, {trained}"
-    lines = [
-        f"{title} in {result['train_seconds']:.1f} s",
-        "",
-        f"{'':<22}{'PSNR':>8}{'SSIM':>9}{'LPIPS':>9}",
-        _row("LDR", result["ldr"], ("psnr", "ssim", "lpips")),
-    ]
+    lines = [f"{result['scene']}: {len(result['views'])} {result['split']} views, {_origin(result)}", ""]
+    lines.append(f"{'':<22}{'PSNR':>8}{'SSIM':>9}{'LPIPS':>9}")
+    if "folder" not in result:
+        lines.append(_row("LDR", result["ldr"], ("psnr", "ssim", "lpips")))
     # Sets without truth have no HDR figures: seven lines of dashes would say less than the reason below.
     names = list(result["protocol"]) if any(figures["views"] for figures in result["protocol"].values()) else []
     for name in names:
@@ -31,6 +26,13 @@ def format_table(result: dict) -> str:
     return "\n".join(lines)
 
 
+def _origin(result: dict) -> str:
+    if "folder" in result:
+        return result["folder"]
+    facts = f"{result['gaussians']:,} Gaussians, {result['iterations']:,} iterations"
+    return f"{facts} in {result['train_seconds']:.1f} s"
+
+
 def _row(label: str, figures: dict, keys: tuple[str, ...]) -> str:
     widths, digits = (8, 9, 9), (2, 4, 4)
     return f"{label:<22}" + "".join(_number(figures[k], w, d) for k, w, d in zip(keys, widths, digits))
@@ -47,11 +49,12 @@ def _notes(result: dict) -> list[str]:
     notes = [f"PU21: the {white} of each view's truth is shown at {pu21['peak_luminance']:g} cd/m^2."] * has_truth
     scale = result["protocol"].get("aligned", {}).get("scale")
     if scale is not None:
-        notes.append(f"aligned: radiance times {scale:.4g}, fitted on what the training photos do not show clipped.")
+        where = "the scored views" if result.get("scale_from") == "scored" else "the training photos"
+        notes.append(f"aligned: radiance times {scale:.4g}, fitted on what {where} do not show clipped.")
     if result["lpips_backbone"]:
         notes.append(f"LPIPS: {result['lpips_backbone']}.")
     if result["split"] == "train":
         notes.append("There are no test views: these figures are of the training views.")
-    figures = [result["ldr"], *result["protocol"].values()]
+    figures = [*([] if "folder" in result else [result["ldr"]]), *result["protocol"].values()]
     reasons = [entry[key] for entry in figures for key in ("reason", "lpips_reason", "flip_reason") if key in entry]
     return notes + [f"-: {reason}." for reason in dict.fromkeys(reasons)]

@@ -78,8 +78,7 @@ def bracket_exposures(
     for exposure in made:
         if not _SHORTEST <= exposure.time <= _LONGEST:
             raise SehdrError(
-                f"{field}: {exposure.time:.6g} s ({exposure.ev:+g} EV) is outside {_SHORTEST:g} to {_LONGEST:g} seconds; "
-                "stay inside"
+                f"{field}: {exposure.time:.6g} s ({exposure.ev:+g} EV) is outside {_SHORTEST:g} to {_LONGEST:g} seconds"
             )
     return made
 

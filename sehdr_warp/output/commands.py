@@ -106,6 +106,6 @@ def run_report(asked: Report) -> None:
 
 def run_export(asked: Export) -> None:
     """Writes the file and prints its name."""
-    from .ply import write_ply
+    from .ply import export
 
-    print(write_ply(asked.out, open_run(asked.run, "cpu"), kind=asked.kind, overwrite=asked.overwrite))
+    print(export(open_run(asked.run, "cpu"), asked.out, kind=asked.kind, overwrite=asked.overwrite))

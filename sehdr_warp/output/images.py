@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 from ..files import atomic_path
 
-# EXIF 2.32, table 8: rationals are two unsigned 32-bit integers.
-_RATIONAL_LIMIT = 2**32 - 1
 _EXIF_IFD, _EXPOSURE_TIME, _EXPOSURE_BIAS, _SOFTWARE, _DATE = 0x8769, 0x829A, 0x9204, 0x0131, 0x9003
 
 
@@ -29,17 +28,16 @@ def quantize(values: np.ndarray, bits: int = 8) -> np.ndarray:
 
 
 def exposure_exif(exposure_time: float, *, bias: float | None = None, captured: str | None = None) -> Image.Exif:
-    """EXIF with ExposureTime as a rational.
+    """EXIF with ExposureTime as the nearest rational of 32 bits: seconds.
 
-    exposure_time: seconds; the simplest fraction within a billionth of it, 1/8 as 1/8.
     bias: ExposureBiasValue in stops. captured: DateTimeOriginal, `YYYY:MM:DD hh:mm:ss`.
     """
     exif = Image.Exif()
     exif[_SOFTWARE] = "sehdr-warp"
     details = exif.get_ifd(_EXIF_IFD)
-    details[_EXPOSURE_TIME] = _rational(exposure_time)
+    details[_EXPOSURE_TIME] = IFDRational(Fraction(exposure_time).limit_denominator(10**6))
     if bias is not None:
-        details[_EXPOSURE_BIAS] = _rational(bias)
+        details[_EXPOSURE_BIAS] = IFDRational(Fraction(bias).limit_denominator(10**6))
     if captured is not None:
         details[_DATE] = captured
     return exif
@@ -76,21 +74,6 @@ def _check(codes: np.ndarray, dtypes: tuple) -> None:
         or 0 in codes.shape
     ):
         raise ValueError(f"code values are {codes.dtype} {codes.shape}, not [H, W] or [H, W, 3] of {dtypes}")
-
-
-def _rational(value: float):
-    from PIL.TiffImagePlugin import IFDRational
-
-    exact = Fraction(value)
-    limit = 1
-    while limit < _RATIONAL_LIMIT:
-        nearest = exact.limit_denominator(limit)
-        if abs(nearest - exact) <= abs(exact) * Fraction(1, 10**9):
-            break
-        limit *= 2
-    if max(abs(nearest.numerator), nearest.denominator) > _RATIONAL_LIMIT:
-        raise ValueError(f"{value} does not fit an EXIF rational")
-    return IFDRational(nearest.numerator, nearest.denominator)
 
 
 def _png16(codes: np.ndarray, exif: Image.Exif | None) -> bytes:

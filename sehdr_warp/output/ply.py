@@ -1,5 +1,6 @@
 """A trained scene as PLY: scene-linear for HDR tools, or baked to display colours for the viewers of 3DGS."""
 
+import logging
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from ..files import check_absent
 from .bake import bake
 from .gaussian_file import GaussianArrays, write_gaussians
 
+log = logging.getLogger(__name__)
 KINDS = ("hdr", "ldr")
 
 _HARMONIC_0 = 0.5 / np.sqrt(np.pi)
@@ -22,23 +24,23 @@ _DARKEST = 1e-12
 Colors = Callable[[np.ndarray], np.ndarray]
 
 
-def write_ply(
-    path: Path | str,
+def export(
     run,
+    path: Path | str,
     *,
     kind: str = "hdr",
     exposure_time: float | None = None,
     overwrite: bool = False,
-    progress: Callable[[str], None] | None = None,
 ) -> Path:
-    """Writes the Gaussians of a trained run; returns the path.
+    """Writes the Gaussians of a trained run as PLY; returns the path.
 
-    kind: "hdr": scene-linear radiance, see hdr_gaussians; "ldr": display colours, see ldr_gaussians.
-    exposure_time: of "ldr", seconds; by default the one the scene was photographed at.
-    progress: takes a line that says which degrees of the harmonics were left out, because they change no colour.
+    Args:
+        kind: "hdr": scene-linear radiance, see hdr_gaussians; "ldr": display colors, see ldr_gaussians.
+        exposure_time: of "ldr", seconds; by default the one the scene was photographed at.
 
-    Raises SehdrError for another kind or an exposure time that is not positive, InputError where the file exists
-    (unless overwrite) or a value is not finite.
+    Raises:
+        SehdrError: for another kind, or an exposure time that is not positive.
+        InputError: where the file exists (unless overwrite) or a value is not finite.
     """
     if kind not in KINDS:
         raise SehdrError(f"PLY kind {kind!r} is not one of {', '.join(KINDS)}")
@@ -47,11 +49,8 @@ def write_ply(
     check_absent(path, overwrite)  # Before minutes of fitting.
     gaussians = hdr_gaussians(run) if kind == "hdr" else ldr_gaussians(run, exposure_time)
     stored = without_unseen_degrees(gaussians)
-    if stored.degree < gaussians.degree and progress is not None:
-        progress(
-            f"harmonics above degree {stored.degree} change no colour by more than {_UNSEEN:.2%}: "
-            f"stored up to degree {stored.degree} of {gaussians.degree}"
-        )
+    if stored.degree < gaussians.degree:
+        log.info("harmonics above degree %d change no color visibly and are left out", stored.degree)
     write_gaussians(path, stored, overwrite=overwrite)
     return Path(path)
 
@@ -113,24 +112,9 @@ def _stored(run) -> tuple[GaussianArrays, Colors | None]:
     """The run's Gaussians in the colours of its model (exposures at the base time, or encoded values), and how these
     become radiance; None where radiance is the exposure over the base time."""
     tensors = {name: value.cpu().numpy() for name, value in run.model.gaussians.tensors().items()}
-    harmonics, color_model = (
-        np.concatenate([tensors["harmonics_dc"], tensors["harmonics_rest"]], axis=1),
-        run.model.radiance,
-    )
-    if color_model == "log-chroma":
-        # exp(constant) (1 + rest) is a harmonic series itself.
-        constant = np.exp(_HARMONIC_0 * harmonics[:, :1].astype(np.float64))
-        harmonics = np.concatenate([constant / _HARMONIC_0, constant * harmonics[:, 1:]], axis=1).astype(np.float32)
-        color_model = "linear"
-    gaussians = GaussianArrays(
-        tensors["means"],
-        tensors["log_scales"],
-        tensors["quaternions"],
-        tensors["opacity_logits"],
-        harmonics,
-        color_model,
-        run.exposure_time,
-    )
+    harmonics = np.concatenate([tensors["harmonics_dc"], tensors["harmonics_rest"]], axis=1)
+    geometry = (tensors[name] for name in ("means", "log_scales", "quaternions", "opacity_logits"))
+    gaussians = GaussianArrays(*geometry, harmonics, run.model.radiance, run.exposure_time)
     if run.model.radiance == "display":
         return gaussians, lambda encoded: run.response.decode(np.clip(encoded, 0, 1)) / run.exposure_time
     return gaussians, None if run.model.fusion is None else lambda exposure: _fuse(run, exposure)

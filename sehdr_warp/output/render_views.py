@@ -1,6 +1,7 @@
 """Pictures of a trained scene: HDR files, previews and exposure brackets, for any set of cameras."""
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Sequence
 from contextlib import nullcontext
 from datetime import datetime
 from pathlib import Path
@@ -21,6 +22,7 @@ from .images import quantize, write_png
 from .names import safe_names
 from .tonemap import ToneMap, fit_tone_map
 
+log = logging.getLogger(__name__)
 SPLITS = ("train", "test", "all")
 PATHS = ("orbit", "interpolate")
 
@@ -55,7 +57,6 @@ def render_views(
     pixel: str = "half",
     overwrite: bool = False,
     ldr_brackets: str | None = None,
-    progress: Callable[[str], None] | None = None,
 ) -> list[Path]:
     """Renders views of a run into `out`; returns the files written.
 
@@ -65,13 +66,12 @@ def render_views(
 
     cameras: "train", "test", "all", "orbit", "interpolate", or a JSON file. count: views of an orbit or interpolation.
     overwrite: replaces the folders hdr, preview and brackets of an earlier render; other files in `out` stay.
-    progress: takes one line for each view, and what the user should know.
 
     Everything appears when the last view is done; if a view fails, nothing new is left.
     Raises SehdrError for unusable options or an empty set of cameras, InputError where something would be replaced or
     a pixel is not finite.
     """
-    out, say = Path(out), progress or (lambda line: None)
+    out = Path(out)
     wanted = evs is not None or exposures is not None
     if (multipart or ldr_brackets) and not wanted:
         raise SehdrError("brackets were asked for without exposures; give evs (--evs=-2,0,2) or exposures")
@@ -100,17 +100,14 @@ def render_views(
             if confidence is not None:
                 layers["confidence"] = _array(confidence)
             elif index == 1:
-                say(
-                    "without a confidence channel: the run has none yet; `sehdr-warp report` measures it from the "
-                    "photos"
-                )
+                log.info("without a confidence channel: `sehdr-warp report` measures it, from the photos")
             stored = {_write_hdr(hdr_folder / f"{name}.exr", hdr, layers, camera, options)}
             write_png(preview_folder / f"{name}.png", quantize(tone_map(hdr)))
             if brackets is not None:
                 stored.add(brackets.add(name, hdr, camera))
-            say(f"{name} ({index} of {len(views)})")
+            log.info("%s (%d of %d)", name, index, len(views))
             if stored != {pixel}:
-                say(f"{name}: holds values above 65504, which half cannot; written as float")
+                log.info("%s: holds values above 65504, which half cannot; written as float", name)
     files = [
         out / folder / f"{name}.{suffix}"
         for folder, suffix in (("hdr", "exr"), ("preview", "png"))

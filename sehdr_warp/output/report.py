@@ -1,6 +1,5 @@
-"""Pictures of what a training achieved: photo, HDR and truth side by side, exposure stops, error against time."""
+"""Pictures of what a training achieved: what the photo lost and HDR held, exposure stops, error against time."""
 
-import json
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -9,19 +8,22 @@ from pathlib import Path
 import numpy as np
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.scene import Scene, View
+from sehdr_warp.scene import Camera, Scene, View
 
 from ..files import atomic_path, check_absent
+from .camera_paths import interpolate
 from .tonemap import expose, fit_tone_map
 
 STOPS = (-4, -2, 0, 2, 4)
 """Stops from the photos' exposure in the strip."""
+DARKER = -4
+"""Stops at which photo, scene and truth stand side by side: what was clipped tells them apart."""
 
 _DPI = 160
 _INK, _QUIET, _RULE = "#1f2328", "#6a737d", "#e1e4e8"
 # Two hues that the colour-blind tell apart (Okabe and Ito's blue and vermilion).
 _SERIES = (("psnr_ldr", "LDR", "#0072b2"), ("psnr_mu", "HDR (mu-law)", "#d55e00"))
-STYLE = {
+_STYLE = {
     "font.family": "sans-serif",
     "font.sans-serif": ["Inter", "Helvetica Neue", "Arial", "DejaVu Sans"],
     "font.size": 9,
@@ -31,16 +33,20 @@ STYLE = {
     "ytick.color": _QUIET,
     "axes.edgecolor": _RULE,
 }
-"""How matplotlib draws all of the project's plots."""
 
 
 @dataclass(frozen=True)
 class Comparison:
     """One view of the report.
 
-    name: of the view. photo: [H, W, 3] encoded, in [0, 1]. from_photo: [H, W, 3] the radiance that the photo alone
-    gives, its response undone. hdr: [H, W, 3] rendered radiance. truth: [H, W, 3] true radiance; None without.
-    confidence: [H, W] in [0, 1] of the render; None where the run's was not measured.
+    Attributes:
+        name: of the view.
+        photo: [H, W, 3] encoded, in [0, 1].
+        from_photo: [H, W, 3] the radiance that the photo alone gives, its response undone.
+        hdr: [H, W, 3] rendered radiance.
+        truth: [H, W, 3] true radiance; None without.
+        confidence: [H, W] in [0, 1] of the render; None where the run's was not measured.
+        new: [H, W, 3] radiance from a place without a photo, on the way to the nearest other view; None for one view.
     """
 
     name: str
@@ -49,31 +55,42 @@ class Comparison:
     hdr: np.ndarray
     truth: np.ndarray | None = None
     confidence: np.ndarray | None = None
+    new: np.ndarray | None = None
 
 
 def write_report(run, scene: Scene, out: Path | str, *, view_count: int = 3, overwrite: bool = False) -> list[Path]:
-    """Renders some held-out views and writes the report's pictures; returns their paths.
+    """Renders some held-out views and writes the report's pictures.
 
-    `comparison.png`: held-out photo, tone-mapped HDR and truth (where the scene has it), one row a view.
-    `stops.png`: one view as photographed and from -4 to +4 stops: the photo alone, the HDR scene with its confidence,
+    `comparison.png`: photo; photo, HDR scene and truth (where there is some) at -4 EV; a new view; one row a view.
+    `stops.png`: the view of most clipped light from -4 to +4 stops: the photo alone, the HDR scene with its confidence,
     the truth.
-    `training.png`: held-out error against training time, from `RUN/metrics.jsonl`; left out where that has no lines.
+    `training.png`: held-out error against training time; left out for a run without evaluations.
 
-    run: a trained run (render, render_confidence, response, exposure_time, path). view_count: rows of the comparison,
-    evenly chosen. Without test views the training views are shown, and captions say so.
-    Raises InputError where a picture exists (unless overwrite), SehdrError for a scene without views.
+    Args:
+        run: a trained Run.
+        scene: of its photos. Without test views the training views are shown, and captions say so.
+        view_count: rows of the comparison, evenly chosen.
+
+    Returns:
+        The pictures' paths.
+
+    Raises:
+        InputError: where a picture exists (unless overwrite).
+        SehdrError: for a scene without views.
     """
     out = Path(out)
-    metrics = read_metrics(Path(run.path) / "metrics.jsonl")
+    metrics = [line for line in run.metrics() if "seconds" in line and any(line.get(key) for key, _, _ in _SERIES)]
     names = ["comparison.png", "stops.png"] + ["training.png"] * bool(metrics)
     for name in names:
         check_absent(out / name, overwrite)
     held_out = bool(scene.test_views)
     views = _chosen(scene.test_views or scene.train_views, view_count)
-    comparisons = [_compare(run, view) for view in views]
+    comparisons = [_compare(run, view, scene.views) for view in views]
+    time = views[0].exposure_time
+    brightest = max(comparisons, key=lambda comparison: float((comparison.photo > 0.99).mean()))
     figures = [
-        comparison_figure(comparisons, _caption(views, metrics, held_out), held_out=held_out),
-        stops_figure(comparisons[len(comparisons) // 2], views[len(views) // 2].exposure_time),
+        comparison_figure(comparisons, time, _caption(views, metrics, held_out), held_out=held_out),
+        stops_figure(brightest, time),
     ] + ([training_figure(metrics)] if metrics else [])
     with ExitStack() as stack:
         for name, figure in zip(names, figures, strict=True):
@@ -82,30 +99,25 @@ def write_report(run, scene: Scene, out: Path | str, *, view_count: int = 3, ove
     return [out / name for name in names]
 
 
-def read_metrics(path: Path | str) -> list[dict]:
-    """The lines of a metrics.jsonl with "seconds" and a figure; empty without the file. Damaged lines are left out."""
-    path, lines = Path(path), []
-    for text in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
-        try:
-            line = json.loads(text)
-        except (ValueError, RecursionError):  # A killed process leaves half a line behind.
-            continue
-        if isinstance(line, dict) and "seconds" in line and any(line.get(key) is not None for key, _, _ in _SERIES):
-            lines.append(line)
-    return lines
+def comparison_figure(comparisons: Sequence[Comparison], exposure_time: float, caption: str, *, held_out: bool = True):
+    """A matplotlib Figure: one row a view, with what the photo and the scene hold four stops darker, and a new view.
 
-
-def comparison_figure(comparisons: Sequence[Comparison], caption: str, *, held_out: bool = True):
-    """A matplotlib Figure: one row a view; photo, tone-mapped HDR, and truth where every view has it.
-
-    HDR and truth share one tone map, fitted to the truth where there is one: a wrong scale shows.
+    exposure_time: seconds at 0 EV. The new view is tone-mapped, by one map for all.
     """
-    with_truth = all(c.truth is not None for c in comparisons)
-    tone_map = fit_tone_map([c.truth if with_truth else c.hdr for c in comparisons])
-    titles = ["Held-out photo" if held_out else "Training photo", "HDR scene, tone-mapped"]
-    titles += ["Truth, tone-mapped"] if with_truth else []
-    rows = [[c.photo, tone_map(c.hdr)] + ([tone_map(c.truth)] if with_truth else []) for c in comparisons]
-    return _grid(rows, titles, [c.name for c in comparisons], caption, cell=2.9)
+    darker = f"{DARKER:+g} EV".replace("-", "\N{MINUS SIGN}")
+    kind = "Held-out photo" if held_out else "Training photo"
+    columns = {
+        kind: [c.photo for c in comparisons],
+        f"Photo at {darker}": [expose(c.from_photo, DARKER, scale=exposure_time) for c in comparisons],
+        f"HDR scene at {darker}": [expose(c.hdr, DARKER, scale=exposure_time) for c in comparisons],
+    }
+    if all(c.truth is not None for c in comparisons):
+        columns[f"Truth at {darker}"] = [expose(c.truth, DARKER, scale=exposure_time) for c in comparisons]
+    if all(c.new is not None for c in comparisons):
+        tone_map = fit_tone_map([c.new for c in comparisons])
+        columns["New view, tone-mapped"] = [tone_map(c.new) for c in comparisons]
+    rows = list(zip(*columns.values(), strict=True))
+    return _grid(rows, list(columns), [c.name for c in comparisons], caption, cell=2.6)
 
 
 def stops_figure(comparison: Comparison, exposure_time: float):
@@ -135,17 +147,17 @@ def training_figure(metrics: Sequence[dict]):
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(7.2, 4.2), layout="constrained")
         figure.get_layout_engine().set(w_pad=0.12, h_pad=0.12)
         axes = figure.add_subplot()
-        drawn = [series for series in _SERIES if any(line.get(series[0]) is not None for line in metrics)]
-        ends = []
-        for key, label, color in drawn:
-            points = np.array([(line["seconds"], line[key]) for line in metrics if line.get(key) is not None], float)
-            axes.plot(*points.T, color=color, linewidth=1.8, marker="o", markersize=4, clip_on=False)
-            ends.append((points[-1], label, color))
-        _label_ends(axes, ends)
+        for key, label, color in _SERIES:
+            points = [(line["seconds"], line[key]) for line in metrics if line.get(key) is not None]
+            if points:
+                style = {"color": color, "linewidth": 1.8, "marker": "o", "markersize": 4, "clip_on": False}
+                axes.plot(*zip(*points, strict=True), label=f"{label}  {points[-1][1]:.1f} dB", **style)
+        # Curves rise: the corner below them on the right is free.
+        axes.legend(loc="lower right", frameon=False, labelcolor="linecolor", prop={"weight": "bold"}, reverse=True)
         axes.set_title("Held-out error against training time", loc="left", fontsize=11, fontweight="bold", pad=12)
         axes.set_xlabel("training time, seconds")
         axes.set_ylabel("PSNR, dB (higher is better)")
@@ -173,7 +185,7 @@ def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, ce
     heights = [cell * shape[0] / shape[1] for shape in shapes]
     width = left + len(titles) * (cell + gap) - gap + edge
     height = top + sum(heights) + gap * (len(rows) - 1) + bottom
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(width, height))
         for column, title in enumerate(titles):
             where = ((left + column * (cell + gap) + cell / 2) / width, (height - top + 0.1) / height)
@@ -201,20 +213,6 @@ def _wrap(text: str, inches: float) -> str:
     return "\n".join(textwrap.wrap(text, max(30, int(inches * 17))))
 
 
-def _label_ends(axes, ends) -> None:
-    """Names and last values at the ends of the lines, in their colours: the upper one above, the lower one below.
-
-    A rising line passes over what stands to the left below its end, so the lower one keeps more distance.
-    """
-    top = max(y for (_, y), _, _ in ends)
-    for (x, y), label, color in ends:
-        where = (2, 12 if y == top else -26)
-        text = f"{label}  {y:.1f} dB"
-        axes.annotate(
-            text, (x, y), where, textcoords="offset points", ha="right", va="center", color=color, fontweight="bold"
-        )
-
-
 def _psnr_to_percent(psnr):
     return 100 * 10.0 ** (-np.asarray(psnr, float) / 20)
 
@@ -240,12 +238,28 @@ def _chosen(views: Sequence[View], count: int) -> list[View]:
     return [views[i] for i in sorted({round(i) for i in np.linspace(0, len(views) - 1, max(count, 1))})]
 
 
-def _compare(run, view: View) -> Comparison:
+def _compare(run, view: View, views: Sequence[View]) -> Comparison:
     hdr, confidence = _array(run.render(view.camera).hdr), run.render_confidence(view.camera)
     from_photo = np.asarray(run.response.decode(view.image)) / view.exposure_time
+    between = _between(view, views)
     return Comparison(
-        view.name, view.image, from_photo, hdr, view.hdr, None if confidence is None else _array(confidence)
+        view.name,
+        view.image,
+        from_photo,
+        hdr,
+        view.hdr,
+        None if confidence is None else _array(confidence),
+        None if between is None else _array(run.render(between).hdr),
     )
+
+
+def _between(view: View, views: Sequence[View]) -> Camera | None:
+    """A camera halfway to the nearest other view."""
+    others = [other.camera for other in views if other.name != view.name]
+    if not others:
+        return None
+    nearest = min(others, key=lambda camera: float(np.linalg.norm(camera.position - view.camera.position)))
+    return interpolate([view.camera, nearest], 3)[1]
 
 
 def _array(value) -> np.ndarray:

@@ -10,6 +10,7 @@ import json
 import logging
 import math
 import os
+import struct
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -21,7 +22,7 @@ from ..errors import InputError, SehdrError
 from .capture import Capture, Shot
 from .colmap_model import SparseModel, read_model
 from .develop import as_photographed, fitted_lens
-from .images import EXIF_ERRORS, open_image, read_ldr, read_mask
+from .images import open_image, read_ldr, read_mask
 from .lens import Lens
 from .types import encoded_values
 
@@ -178,7 +179,7 @@ def _name(index: int) -> str:
 def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Oriented 8-bit copies of at most MAX_SIDE pixels; returns the oriented full sizes and the copies' sizes."""
     folder.mkdir()
-    sizes, small, shown = [], [], False
+    sizes, small, informative = [], [], False
     for i, photo in enumerate(photos):
         if i % _CHUNK == 0:
             _log.info("reading photos %d to %d of %d", i + 1, min(i + _CHUNK, len(photos)), len(photos))
@@ -187,11 +188,12 @@ def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tup
         image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
         small.append(image.size)
         values = np.asarray(image)
-        shown |= bool(((values > 2) & (values < 253)).mean() > 1e-3)
+        informative |= bool(((values > 2) & (values < 253)).mean() > 1e-3)
         image.save(folder / _name(i), compress_level=1)
-    if not shown:
-        problem = "the photos are all black or all white"
-        raise InputError(photos[0].parent, problem, "expose them so that the scene shows")
+    if not informative:
+        raise InputError(
+            photos[0].parent, "the photos are all black or all white", "expose them so that the scene shows"
+        )
     return sizes, small
 
 
@@ -241,7 +243,7 @@ def _device(photo: Path) -> tuple:
         try:
             exif = image.getexif()
             lens = exif.get_ifd(0x8769)
-        except EXIF_ERRORS:
+        except (OSError, SyntaxError, ValueError, KeyError, TypeError, EOFError, struct.error):
             return None, None, None, None
     return exif.get(0x010F), exif.get(0x0110), lens.get(0x920A), lens.get(0xA405)
 
@@ -250,8 +252,9 @@ def _extract(database: Path, images: Path, names: list[str], model: str, params,
     """Features of images that share one camera, a few at a time so that progress can be told."""
     import pycolmap
 
-    stated = ",".join(f"{value:.17g}" for value in params)
-    reader = pycolmap.ImageReaderOptions(camera_model=model, camera_params=stated)
+    reader = pycolmap.ImageReaderOptions(
+        camera_model=model, camera_params=",".join(f"{value:.17g}" for value in params)
+    )
     for start in range(0, len(names), _CHUNK):
         part = names[start : start + _CHUNK]
         if told:
@@ -282,7 +285,9 @@ def _match(database: Path, count: int) -> None:
 
 
 def _seed(options) -> None:
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = _SEED
+    options.random_seed = _SEED
+    options.mapper.random_seed = _SEED
+    options.triangulation.random_seed = _SEED
 
 
 def _map(database: Path, work: Path, count: int, source: Path):

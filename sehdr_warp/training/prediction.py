@@ -13,8 +13,7 @@ import numpy as np
 from ..errors import InputError, SehdrError
 from ..response import Response, ToneMapper, response_by_name
 from ..scene import Scene, View
-from ..scene.hdr_files import read_hdr
-from ..scene.images import HDR_SUFFIXES
+from ..scene.images import HDR_SUFFIXES, read_hdr
 
 Predictor = Callable[[View], tuple[str, np.ndarray]]
 """From a view to where its prediction comes from, and the prediction [H, W, 3]."""

@@ -72,9 +72,8 @@ def test_what_training_photos_show_clipped_does_not_decide_the_scale():
     assert evaluate(run(change), scene(plain))["protocol"]["aligned"]["scale"] == pytest.approx(6.3)
 
 
-def test_a_render_that_is_too_dark():
-    lines = []
-    result = evaluate(run(lambda hdr: hdr / 2.1), scene(VIEWS), progress=lines.append)
+def test_a_render_that_is_too_dark(logged):
+    result = evaluate(run(lambda hdr: hdr / 2.1), scene(VIEWS))
     protocol = result["protocol"]
     # Near 20 log10(log(5001) / log 2.1) = 21.2 dB; the many dark pixels of these views pay less.
     assert 21.2 < protocol["gt-max"]["psnr_mu"] < 26
@@ -87,7 +86,7 @@ def test_a_render_that_is_too_dark():
     assert [row["name"] for row in result["views"]] == ["r_2", "r_3"]
     assert result["views"][0]["ldr"]["psnr"] == pytest.approx(expected[0], abs=1e-4)
     assert (result["train_seconds"], result["gaussians"], result["iterations"]) == (12.5, 4321, 700)
-    assert len(lines) == 3 and "r_3" in lines[-1]
+    assert len(logged) == 3 and "r_3" in logged[-1]
     assert result["ldr"]["lpips"] is None and "SEHDR_LPIPS" in result["ldr"]["lpips_reason"]
     assert protocol["gt-max"]["lpips_mu"] is None and "SEHDR_LPIPS" in protocol["gt-max"]["lpips_reason"]
     assert result["pu21"]["gt-max"]["psnr"] < result["pu21"]["aligned"]["psnr"]

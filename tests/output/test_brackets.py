@@ -168,7 +168,7 @@ def test_unusable_options():
         write_brackets("x", {}, 1, evs=[0], ldr="gif", response=GammaResponse())
     with pytest.raises(SehdrError, match="need a camera response"):
         write_brackets("x", {}, 1, evs=[0], ldr="png")
-    with pytest.raises(SehdrError, match="colour space"):
+    with pytest.raises(SehdrError, match="color space"):
         write_brackets("x", {}, 1, evs=[0], colorspace="cmyk")
 
 

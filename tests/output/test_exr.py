@@ -161,6 +161,10 @@ def test_acescg_matrix_is_the_published_one():
     # ACEScg from linear sRGB as in the OpenColorIO ACES configurations.
     published = [[0.613097, 0.339523, 0.047379], [0.070194, 0.916354, 0.013452], [0.020616, 0.109570, 0.869815]]
     np.testing.assert_allclose(matrix_from_rec709("acescg"), published, atol=2e-6)
+    import colour
+
+    space = colour.RGB_COLOURSPACES["ITU-R BT.709"]
+    assert chromaticities("rec709") == (*space.primaries.ravel(), *space.whitepoint)
 
 
 @pytest.mark.parametrize("name", _SPACES)
@@ -175,33 +179,11 @@ def test_chromaticities_are_those_of_the_interop_id(name):
     assert OpenEXR.chromaticitiesToColorInteropID(header["chromaticities"]) == header["colorInteropID"]
 
 
-TITLES = {
-    "rec709": "ITU-R BT.709",
-    "acescg": "ACEScg",
-    "aces2065-1": "ACES2065-1",
-    "rec2020": "ITU-R BT.2020",
-    "display-p3": "Display P3",
-    "dci-p3": "DCI-P3",
-}
-
-
-@pytest.mark.parametrize("name", _SPACES)
-def test_spaces_are_those_of_colour_science(name):
-    import colour
-
-    space, rec709 = (colour.RGB_COLOURSPACES[title].copy() for title in (TITLES[name], TITLES["rec709"]))
-    np.testing.assert_array_equal(chromaticities(name), [*space.primaries.ravel(), *space.whitepoint])
-    for each in (space, rec709):
-        each.use_derived_transformation_matrices(True)
-    expected = colour.matrix_RGB_to_RGB(rec709, space, "Bradford")
-    np.testing.assert_allclose(matrix_from_rec709(name), expected, rtol=1e-12, atol=1e-14)
-
-
-def test_spaces_do_without_colour_science():
-    """Its import takes a second, and leaves lines on the terminal where OpenImageIO is installed."""
+def test_plain_output_does_without_colour_science():
+    """Its import takes seconds, and leaves lines on the terminal where OpenImageIO is installed."""
     code = (
         "import sys; from sehdr_warp.output.exr import exr_header; from sehdr_warp.output.colorspace import *; "
-        "exr_header(colorspace='acescg'); matrix_from_rec709('acescg'); assert 'colour' not in sys.modules"
+        "exr_header(); from_rec709([1, 1, 1], 'rec709'); assert 'colour' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 

@@ -8,7 +8,7 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output import bake as bake_module
 from sehdr_warp.output.bake import bake, evaluate_colors, harmonic_basis, sphere_directions
 from sehdr_warp.output.gaussian_file import GaussianArrays, write_gaussians
-from sehdr_warp.output.ply import hdr_gaussians, ldr_gaussians, write_ply
+from sehdr_warp.output.ply import export, hdr_gaussians, ldr_gaussians
 
 from .helpers import Entry, GammaResponse, camera, read_gaussians
 
@@ -112,14 +112,14 @@ def test_bake_follows_the_cameras_where_harmonics_cannot_hold_all():
 
 
 class StoredRun:
-    """A run as write_ply sees it, with tensors."""
+    """A run as export sees it, with tensors."""
 
     response = GammaResponse()
     exposure_time = 0.25
 
     def __init__(self, radiance="log", fusion=None):
         torch = pytest.importorskip("torch")
-        self.arrays = gaussians(color_model="log" if radiance == "log-chroma" else radiance)
+        self.arrays = gaussians(color_model=radiance)
         tensors = {name: torch.from_numpy(getattr(self.arrays, name)) for name in ARRAYS[:4]}
         harmonics = torch.from_numpy(self.arrays.harmonics)
         tensors |= {"harmonics_dc": harmonics[:, :1], "harmonics_rest": harmonics[:, 1:]}
@@ -131,21 +131,10 @@ class StoredRun:
         return evaluate_colors(self.arrays, directions)
 
 
-def test_hdr_ply_of_log_chroma_is_linear_and_exact(tmp_path):
-    run = StoredRun("log-chroma")
-    write_ply(tmp_path / "hdr.ply", run)
-    read, directions = read_gaussians(tmp_path / "hdr.ply"), sphere_directions(20)
-    basis, stored = harmonic_basis(directions, 3), run.arrays.harmonics.astype(np.float64)
-    constant = np.exp(basis[0, 0] * stored[:, None, 0])
-    exposure = constant * np.maximum(1 + basis[:, 1:] @ stored[:, 1:], 0)
-    assert read.color_model == "linear"
-    np.testing.assert_allclose(evaluate_colors(read, directions), exposure / 0.25, rtol=1e-4, atol=1e-6)
-
-
 @pytest.mark.parametrize("radiance", ["log", "linear"])
 def test_hdr_ply_is_the_radiance_exactly(tmp_path, radiance):
     run = StoredRun(radiance)
-    assert write_ply(tmp_path / "hdr.ply", run) == tmp_path / "hdr.ply"
+    assert export(run, tmp_path / "hdr.ply") == tmp_path / "hdr.ply"
     read = read_gaussians(tmp_path / "hdr.ply")
     assert read.color_model == radiance and read.base_exposure_time == 0.25
     directions = sphere_directions(20)
@@ -163,7 +152,7 @@ def test_hdr_ply_of_fused_brackets_is_fitted_in_log_radiance():
 
 def test_ldr_ply_shows_the_photo(tmp_path):
     run = StoredRun()
-    write_ply(tmp_path / "ldr.ply", run, kind="ldr", exposure_time=1.0)
+    export(run, tmp_path / "ldr.ply", kind="ldr", exposure_time=1.0)
     read = read_gaussians(tmp_path / "ldr.ply")
     assert read.color_model == "display" and read.degree == 3
     seen = run.arrays.means[:, None] - np.array([[1.0, 0, -6]])
@@ -181,9 +170,9 @@ def test_display_model_is_kept_as_it_is_at_its_own_exposure():
 def test_unusable_requests(tmp_path):
     run = StoredRun()
     with pytest.raises(SehdrError, match="'sdr' is not one of hdr, ldr"):
-        write_ply(tmp_path / "a.ply", run, kind="sdr")
+        export(run, tmp_path / "a.ply", kind="sdr")
     with pytest.raises(SehdrError, match="exposure time 0 is not"):
-        write_ply(tmp_path / "a.ply", run, kind="ldr", exposure_time=0)
+        export(run, tmp_path / "a.ply", kind="ldr", exposure_time=0)
     with pytest.raises(SehdrError, match="has no exposure time"):
-        write_ply(tmp_path / "a.ply", run, exposure_time=1)
+        export(run, tmp_path / "a.ply", exposure_time=1)
     assert list(tmp_path.iterdir()) == []

@@ -18,15 +18,14 @@ def tree(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
-def test_layout_on_disk(tmp_path):
-    said = []
-    files = render_views(AnalyticRun(), tmp_path / "out", evs=[-2, 0, 2], progress=said.append)
+def test_layout_on_disk(tmp_path, logged):
+    files = render_views(AnalyticRun(), tmp_path / "out", evs=[-2, 0, 2])
     expected = ["hdr/t_0.exr", "hdr/t_1.exr", "preview/t_0.png", "preview/t_1.png", "brackets.json"]
     expected += [
         f"brackets/{v}/{v}_b{i}_ev{ev}.exr" for v in ("t_0", "t_1") for i, ev in enumerate(("-2.0", "+0.0", "+2.0"))
     ]
     assert tree(tmp_path / "out") == sorted(expected) == sorted(str(f.relative_to(tmp_path / "out")) for f in files)
-    assert said == ["t_0 (1 of 2)", "t_1 (2 of 2)"]
+    assert logged == ["t_0 (1 of 2)", "t_1 (2 of 2)"]
 
 
 def test_hdr_file_holds_what_was_rendered(tmp_path):
@@ -46,12 +45,12 @@ def test_hdr_file_holds_what_was_rendered(tmp_path):
     assert Image.open(tmp_path / "preview" / "t_0.png").size == (entry.camera.width, entry.camera.height)
 
 
-def test_without_confidence_there_is_no_channel_and_a_line_says_so(tmp_path):
-    run, said = AnalyticRun(), []
+def test_without_confidence_there_is_no_channel_and_a_line_says_so(tmp_path, logged):
+    run = AnalyticRun()
     run.confident = False
-    render_views(run, tmp_path, progress=said.append)
+    render_views(run, tmp_path)
     assert read_exr(tmp_path / "hdr" / "t_0.exr")[1] == ("R", "G", "B", "A", "Z")
-    assert sum("without a confidence channel" in line for line in said) == 1
+    assert sum("without a confidence channel" in line for line in logged) == 1
 
 
 def test_brackets_are_the_hdr_file_times_the_exposure(tmp_path):
@@ -85,11 +84,11 @@ def test_a_bad_pixel_leaves_nothing_new(tmp_path, multipart):
     assert not (tmp_path / "deep").exists()
 
 
-def test_values_past_half_are_said(tmp_path):
-    run, said = AnalyticRun(), []
+def test_values_past_half_are_said(tmp_path, logged):
+    run = AnalyticRun()
     run.gain = 1e5
-    render_views(run, tmp_path, progress=said.append)
-    assert "t_0: holds values above 65504, which half cannot; written as float" in said
+    render_views(run, tmp_path)
+    assert "t_0: holds values above 65504, which half cannot; written as float" in logged
 
 
 def test_options_that_do_nothing_are_refused(tmp_path):

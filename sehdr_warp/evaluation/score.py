@@ -1,0 +1,77 @@
+"""Any folder of EXR pictures against the HDR truth of a set, by the protocols of evaluate()."""
+
+import logging
+from pathlib import Path
+
+import torch
+
+from ..errors import InputError
+from ..output.names import safe_names
+from ..scene import Scene
+from ..scene.images import read_hdr
+from .evaluate import PEAK_LUMINANCE, PROTOCOLS, Evaluation
+
+log = logging.getLogger(__name__)
+
+
+class FolderPictures:
+    """EXR files of views, by the views' names."""
+
+    def __init__(self, folder: Path, files: dict[str, Path]):
+        self.files = files
+        self.facts = {"folder": str(folder)}
+
+    def hdr(self, view):
+        """Raises InputError for a file that cannot be read."""
+        return torch.from_numpy(read_hdr(self.files[view.name]).copy())
+
+    def ldr(self, view):
+        """A folder of radiance has no simulated photos."""
+
+    def doubt(self, view):
+        """Nor does it say how sure it is."""
+
+
+@torch.no_grad()
+def score_folder(
+    folder: Path | str, truth: Scene, *, lpips_weights: Path | str | None = None, flip: bool = False
+) -> dict:
+    """Scores pictures of any origin against a scene's HDR truth.
+
+    Args:
+        folder: EXR files of scene-linear radiance with Rec.709 primaries, named as the views (`r_0.exr`).
+        truth: a scene whose views hold HDR truth. Its test views are scored, or all named ones where it has none.
+        lpips_weights, flip: as of evaluate().
+
+    Returns:
+        As evaluate(), without figures of photos; and "missing", test views without a file, and "extra", files of no
+        view. The scale of "aligned" is fitted on the training views that have a file, else on the scored views, which
+        favours the folder: "scale_from" says which.
+
+    Raises:
+        InputError: for a folder without a file of a scored view, or a picture of another size.
+    """
+    folder = Path(folder)
+    found = {file.stem: file for file in sorted(folder.glob("*.exr"))} if folder.is_dir() else {}
+    names = dict(zip((view.name for view in truth.views), safe_names([view.name for view in truth.views]), strict=True))
+    files = {view: found[stem] for view, stem in names.items() if stem in found}
+    wanted = [view for view in truth.test_views or truth.train_views if view.hdr is not None]
+    if not wanted:
+        raise InputError(truth.name, "its views hold no HDR truth", "give a set with truth")
+    views = [view for view in wanted if view.name in files]
+    if not views:
+        place = (
+            f"holds no {names[wanted[0].name]}.exr or other picture of a view" if folder.is_dir() else "is no folder"
+        )
+        raise InputError(folder, place, f"name the EXR files as the {len(wanted)} views of {truth.name}")
+    missing = [view.name for view in wanted if view.name not in files]
+    extra = sorted(set(found) - set(names.values()))
+    for what, which in (("views have no file", missing), ("files are of no view", extra)):
+        if which:
+            log.warning("%d %s: %s", len(which), what, ", ".join(which[:5]) + (", ..." if len(which) > 5 else ""))
+    pu21 = {"peak_luminance": PEAK_LUMINANCE, "white_percentile": 100.0}
+    evaluation = Evaluation(FolderPictures(folder, files), truth, "cpu", lpips_weights, PROTOCOLS, pu21, flip, views)
+    training = [view for view in truth.train_views if view.name in files and view.hdr is not None]
+    evaluation.scale_views = training or views
+    more = {"missing": missing, "extra": extra, "scale_from": "train" if training else "scored"}
+    return evaluation.result() | more

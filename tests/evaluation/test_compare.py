@@ -1,0 +1,120 @@
+"""Runs side by side, and folders of pictures against truth."""
+
+import csv
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import sehdr_warp as sw
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.evaluation.compare import (
+    compare_runs,
+    comparison_csv,
+    comparison_figure,
+    comparison_latex,
+    comparison_table,
+)
+from sehdr_warp.evaluation.evaluate import evaluate
+from sehdr_warp.evaluation.table import format_table
+from sehdr_warp.output.exr import write_exr
+from sehdr_warp.training.config import Config
+
+from .test_evaluate import VIEWS, radiance, run, scene, view
+
+
+def trained(path, *, seed=0, iterations=100, ldr=(20.0, 25.0), mu=(None, 30.0)):
+    lines = [
+        {"iteration": 50 * i, "seconds": 4.0 * i, "psnr_ldr": a, "psnr_mu": b}
+        for i, (a, b) in enumerate(zip(ldr, mu, strict=True), 1)
+    ]
+    config = Config(seed=seed, schedule={"iterations": iterations})
+    facts = {"iterations": iterations, "gaussian_count": 1000 + seed, "train_seconds": 8.0 + seed}
+    return SimpleNamespace(
+        path=path, config=config, metrics=lambda: lines, scene_name="room_1", data={"path": "embedded"}, **facts
+    )
+
+
+def test_runs_that_differ_by_their_seed_share_a_row(tmp_path):
+    runs = [
+        trained(tmp_path / "a", ldr=(20, 25.0)),
+        trained(tmp_path / "long", iterations=200),
+        trained(tmp_path / "b", seed=1, ldr=(20, 27.0)),
+    ]
+    rows = compare_runs(runs)
+    assert [(row.label, row.count) for row in rows] == [("a and 1 more", 2), ("long", 1)]
+    assert rows[0].mean("psnr_ldr") == 26 and rows[0].spread("psnr_ldr") == pytest.approx(2**0.5)
+    assert rows[1].spread("psnr_ldr") is None
+    table = comparison_table(rows)
+    assert "26.00 ± 1.41" in table and "30.00" in table and "100 ±" not in table and len(table.splitlines()) == 3
+    found = list(csv.DictReader(comparison_csv(rows).splitlines()))
+    assert float(found[0]["psnr_ldr_sd"]) == pytest.approx(2**0.5) and found[1]["psnr_ldr_sd"] == ""
+    latex = comparison_latex(rows)
+    assert r"26.00 $\pm$ 1.41" in latex and r"room\_1" in latex and latex.count(r"\\") == 3
+
+
+def test_the_chart_has_a_line_for_every_run_and_a_name_for_every_row(tmp_path):
+    rows = compare_runs([trained(tmp_path / name, seed=seed) for seed, name in enumerate("ab")])
+    rows += compare_runs([trained(tmp_path / "c", iterations=50, mu=(None, None))])
+    figure = comparison_figure(rows)
+    assert [len(axes.get_lines()) for axes in figure.axes] == [3, 2]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a and 1 more", "c"]
+    assert figure.axes[1].get_lines()[0].get_xydata().tolist() == [[8.0, 30.0]]
+
+
+def test_what_cannot_be_compared_is_one_line(tmp_path):
+    one = trained(tmp_path / "a")
+    empty = trained(tmp_path / "b", ldr=(), mu=())
+    for runs, words in (([], "no runs"), ([one, one], "given twice"), ([one, empty], "b: has no evaluations")):
+        with pytest.raises(SehdrError, match=words):
+            compare_runs(runs)
+    assert compare_runs([trained(tmp_path / "c", mu=(None, None))])[0].mean("psnr_mu") is None
+
+
+def write_pictures(folder, factors):
+    folder.mkdir()
+    for index, factor in factors.items():
+        channels = dict(zip("RGB", np.moveaxis(radiance(index) * np.float32(factor), 2, 0), strict=True))
+        write_exr(folder / f"r_{index}.exr", channels, pixel="float")
+    return folder
+
+
+def test_a_folder_scores_as_a_run_that_renders_it(tmp_path, logged):
+    folder = write_pictures(tmp_path / "out", dict.fromkeys(range(4), 0.5))
+    ours, theirs = sw.score_folder(folder, scene(VIEWS)), evaluate(run(lambda hdr: hdr * 0.5), scene(VIEWS))
+    for name, figures in theirs["protocol"].items():
+        assert ours["protocol"][name] == pytest.approx(figures, nan_ok=True)
+    assert ours["pu21"] == theirs["pu21"] and ours["scale_from"] == "train"
+    assert ours["protocol"]["aligned"]["scale"] == pytest.approx(2.0)
+    assert ours["ldr"]["psnr"] is None and "no simulated photos" in ours["ldr"]["reason"]
+    assert ours["missing"] == ours["extra"] == []
+    json.dumps(ours, allow_nan=False)
+    table = format_table(ours)
+    assert str(folder) in table and "LDR   " not in table.split("region")[0]
+
+
+def test_missing_and_extra_files_are_said(tmp_path, logged):
+    folder = write_pictures(tmp_path / "out", {3: 1.0, 9: 1.0})
+    result = sw.score_folder(folder, scene(VIEWS))
+    assert (result["missing"], result["extra"], result["scale_from"]) == (["r_2"], ["r_9"], "scored")
+    assert [row["name"] for row in result["views"]] == ["r_3"]
+    assert any("1 views have no file: r_2" in line for line in logged)
+    assert any("files are of no view: r_9" in line for line in logged)
+    assert "fitted on what the scored views" in format_table(result)
+
+
+def test_folders_that_cannot_be_scored(tmp_path):
+    folder = write_pictures(tmp_path / "out", {7: 1.0})
+    bare = scene([view(0, "train", truth=False), view(1, "test", truth=False)])
+    for place, truth, words in (
+        (folder, scene(VIEWS), "holds no r_2.exr"),
+        (tmp_path / "none", scene(VIEWS), "is no folder"),
+        (folder, bare, "no HDR truth"),
+    ):
+        with pytest.raises(InputError, match=words):
+            sw.score_folder(place, truth)
+    small = write_pictures(tmp_path / "small", {2: 1.0})
+    write_exr(small / "r_2.exr", dict.fromkeys("RGB", np.ones((4, 5))), overwrite=True)
+    with pytest.raises(SehdrError, match="its picture is 5 x 4"):
+        sw.score_folder(small, scene(VIEWS))
