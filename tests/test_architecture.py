@@ -27,7 +27,7 @@ ALLOWED = {
     "evaluation": ANY | {"scene", "splatting.ssim", "output.names"},
     "training": ANY | {"scene", "response", "field", "splatting", "evaluation.metrics", "evaluation.protocols"},
     "synth": ANY | {"scene", "response", "output.exr", "output.images", "field.exposure"},
-    "check": ANY | {"kernels.constants", "scene", "response", "field", "splatting", "training"},
+    "check": ANY | {"bench.results", "kernels.constants", "scene", "response", "field", "splatting", "training"},
     "bench": ANY
     | {
         "synth.expose",

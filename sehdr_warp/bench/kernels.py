@@ -1,6 +1,8 @@
-"""`bench kernels`: the whole differentiable splat (project, order, bin, blend; colours given)."""
+"""`bench kernels`: the whole differentiable splat (project, order, bin, blend; colors given), timed and checked."""
 
-from collections.abc import Callable
+import logging
+import math
+from collections.abc import Callable, Sequence
 
 import torch
 
@@ -8,161 +10,161 @@ from ..kernels.constants import TILE_SIZE
 from ..splatting.rasterization import rasterize
 from ..splatting.recorded_rasterizer import RecordedRasterizer
 from ..splatting.recording import GraphRecorder
-from . import checks
-from .machine import package_version
-from .peers import Peer, differs, find_peers
-from .report import new_report
-from .splats import Size, SplatScene, make_splat_scene
+from ..splatting.reference import rasterize_reference
+from .gsplat_peer import BOUND, GSPLAT, gsplat_renderer, missing
+from .results import check, new_result
+from .splats import NAMES, Size, SplatScene, make_splat_scene
 from .timing import Variant, peak_memory, time_variants
 
-OURS = "sehdr-warp"
-OURS_REPLAYED = "sehdr-warp, RecordedRasterizer"
+LOG = logging.getLogger(__name__)
+OURS, PLAIN_TORCH = "sehdr-warp", "plain torch"
+REPLAYED = "sehdr-warp, RecordedRasterizer"
 """Called from Python like the peers, gradients by torch's autograd; two CUDA graphs behind each call."""
-OURS_RECORDED = "sehdr-warp, recorded"
+RECORDED = "sehdr-warp, recorded"
 """rasterize() with room for a quarter more entries than there are, replayed as a CUDA graph: what it costs inside a
 recorded training step."""
-PLAIN_TORCH = "plain torch"
 PLAIN_TORCH_BYTES = 4 << 30
 """The plain torch rasterizer keeps about 16 numbers for each pixel-Gaussian pair; beyond this it is left out."""
+IMAGE_BOUND, GRADIENT_BOUND = 1e-4, 1e-3
+"""Largest relative difference, in norm, of float32 from float64 truth. Alphas that fall on the other side of the
+threshold make most of it; a wrong formula or a lost Gaussian is far beyond."""
+REFERENCE_GAUSSIANS = 4000
+"""Scenes of at most so many Gaussians are checked themselves, larger ones on a smaller one of the same density."""
+COLUMNS = {
+    "Gaussians=gaussians": ",d", "width": "d", "height": "d", "C=channels": "d", "pass": "",
+    "rasterizer=implementation": "", "median ms=median_ms": ".3f", "p90 ms=p90_ms": ".3f", "n=repetitions": "d",
+    "peak MiB=peak_memory_bytes": "MiB", "ours / this=ours_over_this": ".3f",
+}  # fmt: skip
 
 
 def bench_kernels(
-    sizes: list[Size],
-    channels: list[int],
+    sizes: Sequence[Size],
+    channels: Sequence[int],
     device: torch.device,
     *,
-    peers: bool = True,
-    repetitions: int = 30,
-    budget: float = 20.0,
-    progress: Callable[[str], None] = lambda line: None,
+    peers: bool,
+    repetitions: int,
+    budget: float,
 ) -> dict:
-    """Time and check; returns the report.
+    """Every combination of size and channels, forward, and forward and backward; a result.
 
-    sizes, channels: every combination is measured. peers: compare with the peers that import.
-    repetitions, budget: see time_variants.
+    Args:
+        peers: also gsplat, where it is installed. repetitions, budget: see time_variants.
     """
-    settings = {"device": str(device), "repetitions": repetitions, "cpu_seconds_per_variant": budget}
-    report = new_report("kernels", device, settings)
-    found, notes = find_peers(device) if peers else ([], ["peers not compared: not asked for (--peers)"])
-    report["notes"] += notes
+    result = new_result("kernels", device, {"device": str(device), "repetitions": repetitions, "budget": budget})
+    reason = missing(device) if peers else "gsplat not compared: not asked for (--peers)"
+    result["notes"] += [reason] if reason else []
     for size in sizes:
         for count in channels:
-            scene = make_splat_scene(size, count).to(device)
-            usable = [peer for peer in found if peer.supports(count)]
-            report["checks"] += [check.to_dict() for check in _checks(scene, usable)]
-            report["rows"] += _splat_rows(scene, usable, repetitions, budget, report["notes"])
-            best = next(
-                row for row in report["rows"][::-1] if row["implementation"] == OURS and row["stage"] == "splat"
-            )
-            progress(f"{size}, {count} channels: {best['pass']} {best['median_ms']:.3f} ms")
-    report["notes"] = list(dict.fromkeys(report["notes"]))
-    return report
+            scene = make_splat_scene(size, count, device)
+            result["checks"] += _checks(scene, peer=reason is None)
+            rows = _rows(scene, reason is None, repetitions, budget)
+            result["rows"] += rows
+            ours = [row["median_ms"] for row in rows if row["implementation"] == OURS]
+            LOG.info("%s, %d channels: %.3f ms forward, %.3f ms with backward", size, count, *ours)
+    return result
 
 
-def _render(scene: SplatScene) -> torch.Tensor:
+def render(scene: SplatScene) -> torch.Tensor:
     return rasterize(*scene.arguments).image
 
 
-def _replayed(scene: SplatScene) -> Callable[[], torch.Tensor]:
-    splat = RecordedRasterizer(scene.device)
-    return lambda: splat(*scene.arguments).image
+def render_reference(scene: SplatScene) -> torch.Tensor:
+    """The plain torch rasterizer, in the scene's own precision and on its device."""
+    return rasterize_reference(*scene.arguments).image
+
+
+def image_and_gradients(rendered: Callable[[SplatScene], torch.Tensor], scene: SplatScene) -> list[torch.Tensor]:
+    """The image, and the gradients of scene.leaves for scene.cotangent()."""
+    scene.clear()
+    image = rendered(scene)
+    image.backward(scene.cotangent())
+    gradients = [leaf.grad for leaf in scene.leaves]
+    scene.clear()
+    return [image.detach(), *gradients]
+
+
+def differs(value: torch.Tensor, other: torch.Tensor) -> float:
+    """|value - other| / |other| over the whole tensor, in float64; infinite where a number is not finite."""
+    value, other = value.detach().double().cpu(), other.detach().double().cpu()
+    difference = float((value - other).norm() / other.norm().clamp_min(1e-300))
+    return difference if math.isfinite(difference) else math.inf
+
+
+def compared(name: str, against: str, ours: list[torch.Tensor], truth: list[torch.Tensor]) -> list[dict]:
+    """Checks of an image and the gradients of NAMES, as image_and_gradients() gives them."""
+    labels = ["image", *(f"gradient of {leaf}" for leaf in NAMES)]
+    return [
+        check(f"{name}: {label}", against, differs(a, b), IMAGE_BOUND if label == "image" else GRADIENT_BOUND)
+        for label, a, b in zip(labels, ours, truth, strict=True)
+    ]
+
+
+def _checks(scene: SplatScene, *, peer: bool) -> list[dict]:
+    """What is timed, against float64; on a GPU also against the CPU's kernels at full size."""
+    channels = scene.leaves[-1].shape[1]
+    small = make_splat_scene(scene.size.reduced(REFERENCE_GAUSSIANS), channels, scene.device)
+    truth = image_and_gradients(render_reference, small.to("cpu", torch.float64))
+    made = compared(OURS, "float64", image_and_gradients(render, small), truth)
+    if scene.device.type == "cuda":
+        cpu = image_and_gradients(render, scene.to("cpu"))
+        splat = RecordedRasterizer(scene.device)
+        replayed = image_and_gradients(lambda s: splat(*s.arguments).image, scene)
+        recorded = _recorded(scene, scene.cotangent())()
+        for name, ours in ((OURS, image_and_gradients(render, scene)), (REPLAYED, replayed), (RECORDED, recorded)):
+            made += compared(name, "the CPU's kernels", ours, cpu)
+    if peer:
+        with torch.no_grad():
+            made.append(check("gsplat: image", OURS, differs(gsplat_renderer(scene)(), render(scene)), BOUND))
+    return made
 
 
 def _recorded(scene: SplatScene, cotangent: torch.Tensor | None) -> Callable[[], list[torch.Tensor]]:
-    """A replay of the render with a capacity: of [image], or with a cotangent of [image, gradients of the leaves]."""
+    """A replay: of [image], or with a cotangent of [image, gradients of the leaves]."""
     with torch.no_grad():
         capacity = rasterize(*scene.arguments).entry_count * 5 // 4
 
     def forward():
-        with torch.no_grad():
-            return [rasterize(*scene.arguments, capacity=capacity).image]
-
-    def forward_backward():
-        image = rasterize(*scene.arguments, capacity=capacity).image
+        with torch.set_grad_enabled(cotangent is not None):
+            image = rasterize(*scene.arguments, capacity=capacity).image
+        if cotangent is None:
+            return [image]
         return [image.detach(), *torch.autograd.grad(image, scene.leaves, cotangent)]
 
-    function = forward if cotangent is None else forward_backward
-    function()  # loads the kernels, which a recording cannot
+    forward()  # loads the kernels, which a recording cannot
     recorder = GraphRecorder(scene.device)
-    return lambda: recorder.run("render", function)
+    return lambda: recorder.run("render", forward)
 
 
-def _checks(scene: SplatScene, peers: list[Peer]) -> list[checks.Check]:
-    """Every variant that is timed: on a scene small enough for the reference, on CUDA also on the timed one."""
-    small = make_splat_scene(scene.size.reduced(checks.REFERENCE_GAUSSIANS), scene.channels).to(scene.device)
-    made = []
-    if scene.device.type == "cuda":
-        cpu = checks.image_and_gradients(_render, scene.to("cpu"))
-        for name, render in ((OURS, _render), (OURS_REPLAYED, lambda scene: _replayed(scene)())):
-            made += checks.check_against_reference(name, render, small)
-            ours = checks.image_and_gradients(render, scene)
-            made += checks.compare(name, "CPU kernels", scene, ours, cpu)
-        made += checks.compare(OURS_RECORDED, "CPU kernels", scene, _recorded(scene, scene.cotangent())(), cpu)
-    else:
-        made += checks.check_against_reference(PLAIN_TORCH, checks.render_reference, small)
-        made += checks.check_against_reference(OURS, _render, small)
-    if peers:
-        with torch.no_grad():
-            image = _render(scene)
-            for peer in peers:
-                difference = differs(peer.renderer(scene)(), image)
-                what = f"{peer.name}: image"
-                made.append(checks.Check(what, OURS, str(scene.size), scene.channels, difference, peer.bound))
-    return made
-
-
-def _splat_rows(scene: SplatScene, peers: list[Peer], repetitions: int, budget: float, notes: list[str]) -> list[dict]:
-    """Rows of the whole splat, forward, and forward and backward, of us and of everyone we compare with."""
+def _rows(scene: SplatScene, peer: bool, repetitions: int, budget: float) -> list[dict]:
     with torch.no_grad():
         entries = rasterize(*scene.arguments).entry_count
-    renderers = {OURS: lambda: _render(scene)} | {peer.name: peer.renderer(scene) for peer in peers}
-    versions = {OURS: package_version(OURS)} | {peer.name: peer.version for peer in peers}
+    renderers = {OURS: lambda: render(scene)}
+    if peer:
+        renderers[GSPLAT] = gsplat_renderer(scene)
     if scene.device.type == "cuda":
-        renderers[OURS_REPLAYED] = _replayed(scene)
-        versions[OURS_REPLAYED] = versions[OURS]
-    else:
-        if entries * TILE_SIZE**2 * 16 * 4 <= PLAIN_TORCH_BYTES:
-            renderers[PLAIN_TORCH] = lambda: checks.render_reference(scene)
-            versions[PLAIN_TORCH] = package_version("torch")
-        else:
-            notes.append(f"{PLAIN_TORCH} not compared at {scene.size}: it would need more than 4 GiB")
-    cotangent = scene.cotangent()
-    rows = []
-    for name, make in (("forward", _forward), ("forward + backward", _forward_backward)):
-        variants = {key: make(render, scene, cotangent) for key, render in renderers.items()}
+        splat = RecordedRasterizer(scene.device)
+        renderers[REPLAYED] = lambda: splat(*scene.arguments).image
+    elif entries * TILE_SIZE**2 * 16 * 4 <= PLAIN_TORCH_BYTES:
+        renderers[PLAIN_TORCH] = lambda: render_reference(scene)
+    cotangent, rows = scene.cotangent(), []
+    for name, backward in (("forward", False), ("forward + backward", True)):
+        variants = {key: _variant(call, scene, cotangent if backward else None) for key, call in renderers.items()}
         if scene.device.type == "cuda":
-            replay = _recorded(scene, None if make is _forward else cotangent)
-            variants[OURS_RECORDED] = Variant(lambda _, replay=replay: replay())
-            versions[OURS_RECORDED] = versions[OURS]
+            replay = _recorded(scene, cotangent if backward else None)
+            variants[RECORDED] = Variant(lambda _, replay=replay: replay())
         timings = time_variants(variants, scene.device, repetitions=repetitions, budget=budget)
         for key, timing in timings.items():
-            row = _row(scene, "splat", key, name) | {"version": versions[key], "entries": entries} | timing.to_dict()
-            row["peak_memory_bytes"] = peak_memory(variants[key], scene.device)
-            row["ours_over_this"] = None if key == OURS else timings[OURS].median / timing.median
-            rows.append(row)
+            size = scene.size
+            row = {"gaussians": size.gaussians, "width": size.width, "height": size.height}
+            row |= {"channels": scene.leaves[-1].shape[1], "pass": name, "implementation": key, "entries": entries}
+            row |= timing | {"peak_memory_bytes": peak_memory(variants[key], scene.device)}
+            ratio = None if key == OURS else timings[OURS]["median_ms"] / timing["median_ms"]
+            rows.append(row | {"ours_over_this": ratio})
     return rows
 
 
-def _forward(render, scene, cotangent) -> Variant:
-    def run(_):
-        with torch.no_grad():
-            render()
-
-    return Variant(run)
-
-
-def _forward_backward(render, scene, cotangent) -> Variant:
-    return Variant(lambda _: render().backward(cotangent), prepare=scene.clear)
-
-
-def _row(scene: SplatScene, stage: str, implementation: str, passes: str) -> dict:
-    size = scene.size
-    return {
-        "stage": stage,
-        "gaussians": size.gaussians,
-        "width": size.width,
-        "height": size.height,
-        "channels": scene.channels,
-        "implementation": implementation,
-        "pass": passes,
-    }
+def _variant(call: Callable[[], torch.Tensor], scene: SplatScene, cotangent: torch.Tensor | None) -> Variant:
+    if cotangent is not None:
+        return Variant(lambda _: call().backward(cotangent), prepare=scene.clear)
+    return Variant(torch.no_grad()(lambda _: call()))

@@ -1,268 +1,194 @@
-"""`bench scale`: how time and memory grow with Gaussians, pixels and channels, stage by stage, and how steeply."""
+"""`bench scale`: how time and memory of splats and training steps grow with Gaussians, pixels, channels and photos."""
 
-import gc
-from collections.abc import Callable
-from contextlib import ExitStack, contextmanager
+import logging
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from unittest.mock import patch
 
 import torch
 
 from ..errors import SehdrError
-from ..field import radiance_field
 from ..splatting.memory import held_by_warp
-from ..splatting.rasterization import rasterize
-from ..training.config import Config
 from ..training.config_files import load_config
-from . import checks
-from .kernels import OURS
-from .peer_gsplat import rasterize_with_gsplat, spherical_harmonics_with_gsplat
-from .peers import Peer, find_peers
-from .report import new_report
-from .scenes import make_photo_scene
-from .slopes import fit_slopes
-from .splats import Size, SplatScene, make_splat_scene
-from .stages import prepare, stage_variants
-from .step import between_changes, make_trainer, thick_of_training
+from .gsplat_peer import BOUND, GSPLAT, gsplat_renderer, missing, rasterize_with_gsplat
+from .kernels import OURS, compared, differs, image_and_gradients, render, render_reference
+from .results import check, new_result
+from .splats import Size, SplatScene, make_photo_scene, make_splat_scene
+from .step import forget_peaks, held_memory, make_trainer, step_variant
 from .timing import Variant, peak_memory, time_variants
 
+LOG = logging.getLogger(__name__)
 COMPARED_CHANNELS = 9
-"""gsplat's time and memory stand beside ours at this count."""
-STEP_VIEWS = 2
-STEP_PRESET = "paper"
-"""The preset with three colour sets, nine channels in one pass."""
-WHOLE_STEP, WHOLE_SPLAT = "training step", "splat, forward + backward"
-GSPLAT, GSPLAT_AND_HARMONICS = "gsplat", "gsplat and its harmonics"
-"""Steps with gsplat's rasterizer in place of ours, all else alike; and with its spherical harmonics too, as whoever
-builds on gsplat would take them."""
+"""gsplat stands beside ours at this count."""
+STEP_VIEWS, STEP_PRESET = 2, "paper"
+"""The preset with three color sets, nine channels in one pass."""
+STEP, SPLAT = "training step", "splat"
+STEEPEST = 1.2
+"""A slope above it, at the large end of a sweep, is steeper than linear; 2 is quadratic."""
+LARGE_END = 3
+"""The large end is a sweep's last so many points."""
+COLUMNS = {
+    "sweep": "", "Gaussians=gaussians": ",d", "width": "d", "height": "d", "C=channels": "d", "photos": "d",
+    "rasterizer=implementation": "", "what": "", "median ms=median_ms": ".3f", "n=repetitions": "d",
+    "peak MiB=peak_memory_bytes": "MiB",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Sweep:
-    """One quantity varied, the others held. name: gaussians, pixels or channels."""
+class Point:
+    """Where a sweep measures. photos: of its training step; 0 for none."""
 
-    name: str
-    points: tuple[tuple[Size, int], ...]
-    """(size, channels) of each point, ascending."""
+    size: Size
+    channels: int = COMPARED_CHANNELS
+    photos: int = STEP_VIEWS
+
+    def varied(self, sweep: str) -> int:
+        size = self.size
+        return {"gaussians": size.gaussians, "pixels": size.width * size.height}.get(sweep) or getattr(self, sweep)
 
 
-def sweeps(device_type: str) -> dict[str, Sweep]:
-    """The sweeps of a device, by name."""
+def sweeps(device_type: str, small: bool = False) -> dict[str, list[Point]]:
+    """The points of each sweep, ascending. small: every second one, up to a moderate size."""
     if device_type == "cuda":
         counts = (10_000, 30_000, 100_000, 300_000, 1_000_000, 2_500_000, 5_000_000)
-        images = ((200, 200), (400, 400), (800, 800), (1600, 1200), (2560, 1440), (3840, 2160))
-        gaussians = [(Size(count, 1600, 1200), 9) for count in counts]
-        pixels = [(Size(200_000, *image), 9) for image in images]
-        channels = [(Size(200_000, 800, 800), count) for count in (3, 4, 6, 9, 12, 16, 24, 32, 48)]
+        sides = ((200, 200), (400, 400), (800, 800), (1600, 1200), (2560, 1440), (3840, 2160))
+        channels, photos = (3, 4, 6, 9, 12, 16, 24, 32, 48), (2, 8, 32, 128)
+        image, many, few = (1600, 1200), 200_000, Size(200_000, 800, 800)
     else:
-        counts, sides = (1000, 2500, 5000, 10_000, 20_000, 50_000), (64, 128, 256, 512)
-        gaussians = [(Size(count, 200, 200), 9) for count in counts]
-        pixels = [(Size(5000, side, side), 9) for side in sides]
-        channels = [(Size(5000, 200, 200), count) for count in (3, 6, 9, 16, 24, 48)]
-    made = (("gaussians", gaussians), ("pixels", pixels), ("channels", channels))
-    return {name: Sweep(name, tuple(points)) for name, points in made}
-
-
-def parse_sweeps(text: str, device_type: str) -> list[Sweep]:
-    """Sweeps from `gaussians,pixels`. Raises SehdrError for a name that is none."""
-    known = sweeps(device_type)
-    names = [name.strip() for name in text.split(",")]
-    for name in names:
-        if name not in known:
-            raise SehdrError(f"--sweeps {text}: {name!r} is none; use {', '.join(known)}")
-    return [known[name] for name in names]
+        counts, sides = (1000, 2500, 5000, 10_000, 20_000, 50_000), ((64, 64), (128, 128), (256, 256), (512, 512))
+        channels, photos = (3, 6, 9, 16, 24, 48), (2, 8, 32)
+        image, many, few = (200, 200), 5000, Size(5000, 200, 200)
+    found = {
+        "gaussians": [Point(Size(count, *image)) for count in counts],
+        "pixels": [Point(Size(many, *side)) for side in sides],
+        "channels": [Point(few, count, 0) for count in channels],
+        "photos": [Point(few, COMPARED_CHANNELS, count) for count in photos],
+    }
+    return {name: points[:-1:2] if small else points for name, points in found.items()}
 
 
 def bench_scale(
-    chosen: list[Sweep],
-    device: torch.device,
-    *,
-    peers: bool = True,
-    steps: bool = True,
-    repetitions: int = 30,
-    budget: float = 5.0,
-    progress: Callable[[str], None] = lambda line: None,
+    names: Sequence[str], device: torch.device, *, peers: bool, repetitions: int, budget: float, small: bool = False
 ) -> dict:
-    """Time, weigh and check; returns the report.
+    """A result: a row for each splat and training step at each point, and `slopes` of their logarithms.
 
-    peers: gsplat beside ours at nine channels, where it imports. steps: also whole training steps, in the sweeps over
-    Gaussians and pixels. repetitions, budget: see time_variants.
+    Args:
+        names: of sweeps(). peers: gsplat's splat, and the same step on its rasterizer, beside ours.
     """
-    settings = {"device": str(device), "repetitions": repetitions, "cpu_seconds_per_variant": budget}
-    report = new_report("scale", device, settings | {"sweeps": [sweep.name for sweep in chosen]})
-    found, notes = find_peers(device) if peers else ([], ["gsplat not compared: not asked for (--peers)"])
-    gsplat = next((peer for peer in found if peer.name == GSPLAT), None)
-    report["notes"] += [note for note in notes if note.startswith("gsplat")]
-    checked: set[int] = set()
-    for sweep in chosen:
-        for size, channels in sweep.points:
-            beside = gsplat if channels == COMPARED_CHANNELS else None
-            scene = make_splat_scene(size, channels).to(device)
-            if channels not in checked:
-                report["checks"] += _checks(scene)
-                checked.add(channels)
-            report["rows"] += _splat_rows(sweep.name, scene, beside, repetitions, budget, report)
-            del scene
-            _empty(device)
-            if steps and sweep.name != "channels":
-                report["rows"] += _step_rows(sweep.name, size, device, beside, repetitions, budget, report)
-                _empty(device)
-            progress(_line(sweep.name, size, channels, report["rows"]))
-    slopes = fit_slopes(report["rows"])
-    report["rows"] += slopes
-    report["notes"].append(verdict(slopes))
-    return report
+    known = sweeps(device.type, small)
+    for name in names:
+        if name not in known:
+            raise SehdrError(f"--sweeps {','.join(names)}: {name!r} is none; use {', '.join(known)}")
+    settings = {"device": str(device), "sweeps": list(names), "repetitions": repetitions, "preset": STEP_PRESET}
+    result = new_result("scale", device, settings)
+    reason = missing(device) if peers else "gsplat not compared: not asked for (--peers)"
+    result["notes"] += [reason] if reason else []
+    for name in names:
+        for point in known[name]:
+            peer = reason is None and point.channels == COMPARED_CHANNELS
+            rows = [] if name == "photos" else _splat_rows(point, device, peer, repetitions, budget, result["checks"])
+            forget_peaks(device)
+            if point.photos:
+                rows += _step_rows(point, device, peer, repetitions, budget, result["checks"])
+                forget_peaks(device)
+            size = point.size
+            place = {"sweep": name, "varied": point.varied(name), "gaussians": size.gaussians, "width": size.width}
+            place |= {"height": size.height, "channels": point.channels, "photos": point.photos or None}
+            result["rows"] += [place | row for row in rows]
+            shown = (f"{row['what']} {row['median_ms']:.2f} ms" for row in rows if row["implementation"] == OURS)
+            LOG.info("%s %d: %s", name, point.varied(name), ", ".join(shown))
+    result["slopes"] = fit_slopes(result["rows"])
+    result["notes"].append(verdict(result["slopes"]))
+    return result
 
 
-def verdict(slopes: list[dict]) -> str:
-    """One sentence on the steepest slope at the large end of a sweep, of any stage of ours."""
+def fit_slopes(rows: Sequence[dict]) -> list[dict]:
+    """Slopes of log(time) and log(memory) on log(what is varied), over a whole sweep and over its large end, by least
+    squares; times are the least of their repetitions, which other work disturbs least."""
+    series: dict[tuple, list[tuple[int, float]]] = {}
+    for row in rows:
+        for quantity, field in (("time", "min_ms"), ("memory", "peak_memory_bytes")):
+            if row.get(field):
+                key = row["sweep"], row["implementation"], row["what"], quantity
+                series.setdefault(key, []).append((row["varied"], row[field]))
+    fields = ("sweep", "implementation", "what", "quantity")
+    return [
+        dict(zip(fields, key, strict=True)) | {"slope": slope(points), "slope_large": slope(points[-LARGE_END:])}
+        for key, points in series.items()
+        if len(points) > 1
+    ]
+
+
+def slope(points: Sequence[tuple[float, float]]) -> float:
+    """Least squares of log y on log x; at least two points, all positive, not all of one x."""
+    xs, ys = zip(*((math.log(x), math.log(y)) for x, y in points), strict=True)
+    mean_x, mean_y = sum(xs) / len(xs), sum(ys) / len(ys)
+    over, under = zip(*(((x - mean_x) * (y - mean_y), (x - mean_x) ** 2) for x, y in zip(xs, ys, strict=True)))
+    return sum(over) / sum(under)
+
+
+def verdict(slopes: Sequence[dict]) -> str:
+    """One sentence on the steepest slope of ours at the large end of a sweep."""
     ours = [row for row in slopes if row["implementation"] == OURS]
     if not ours:
-        return "no slopes: a sweep needs two points"
-    steep = [row for row in ours if row["too_steep"]]
-    if not steep:
-        worst = max(ours, key=lambda row: row["slope_large"])
-        return f"no step quadratic: the steepest slope at the large end is {_slope(worst)}"
-    return "steeper than linear at the large end: " + "; ".join(_slope(row) for row in steep)
+        return "No slopes: a sweep needs two points."
+    steep = [row for row in ours if row["slope_large"] > STEEPEST]
+    told = steep or [max(ours, key=lambda row: row["slope_large"])]
+    lines = (f"{row['slope_large']:.2f} ({row['quantity']} of the {row['what']} over {row['sweep']})" for row in told)
+    head = "Steeper than linear at the large end: " if steep else "Nothing is quadratic: the steepest slope is "
+    return head + "; ".join(lines) + "."
 
 
-def _slope(row: dict) -> str:
-    return (
-        f"{row['slope_large']:.2f} ({row['quantity']} of {row['what']} over {row['sweep']}, "
-        f"{row['large_from']:,d} to {row['large_to']:,d})"
-    )
-
-
-def _render(scene: SplatScene) -> torch.Tensor:
-    return rasterize(*scene.arguments).image
-
-
-def _checks(scene: SplatScene) -> list[dict]:
-    small = make_splat_scene(scene.size.reduced(checks.REFERENCE_GAUSSIANS // 4), scene.channels).to(scene.device)
-    return [check.to_dict() for check in checks.check_against_reference(OURS, _render, small)]
-
-
-def _splat_rows(name, scene: SplatScene, gsplat: Peer | None, repetitions, budget, report) -> list[dict]:
-    """A row for each stage, and for the whole splat of ours and of gsplat, with its peak memory."""
-    device, cotangent = scene.device, scene.cotangent()
-    prepared = prepare(scene)
-    renderers = {OURS: lambda: _render(scene)}
-    if gsplat is not None:
-        renderers[GSPLAT] = gsplat.renderer(scene)
+def _splat_rows(point: Point, device, peer: bool, repetitions: int, budget: float, checks: list[dict]) -> list[dict]:
+    scene = make_splat_scene(point.size, point.channels, device)
+    if not any(c["what"] == f"{OURS}, {point.channels} channels: image" for c in checks):
+        small = make_splat_scene(scene.size.reduced(1000), point.channels, device)
+        truth = image_and_gradients(render_reference, small.to("cpu", torch.float64))
+        name = f"{OURS}, {point.channels} channels"
+        checks += compared(name, "float64", image_and_gradients(render, small), truth)
+    renderers = {OURS: lambda: render(scene)}
+    if peer:
+        renderers[GSPLAT] = gsplat_renderer(scene)
         with torch.no_grad():
-            difference = checks.differs(renderers[GSPLAT](), _render(scene))
-        found = checks.Check("gsplat: image", OURS, str(scene.size), scene.channels, difference, gsplat.bound)
-        report["checks"].append(found.to_dict())
-    variants = {(OURS, stage): variant for stage, variant in stage_variants(scene, prepared).items()}
-    for who, render in renderers.items():
-        variants[who, WHOLE_SPLAT] = Variant(lambda _, render=render: render().backward(cotangent), prepare=scene.clear)
-    timings = time_variants(variants, device, repetitions=repetitions, budget=budget)
-    entries = prepared.lists.entry_count
+            checks.append(check("gsplat: image", OURS, differs(renderers[GSPLAT](), render(scene)), BOUND))
+    return _timed(renderers, scene, device, repetitions, budget)
+
+
+def _timed(renderers: dict, scene: SplatScene, device, repetitions: int, budget: float) -> list[dict]:
+    cotangent = scene.cotangent()
+    variants = {
+        who: Variant(lambda _, call=call: call().backward(cotangent), prepare=scene.clear)
+        for who, call in renderers.items()
+    }
     rows = []
-    for (who, stage), timing in timings.items():
-        row = _row(name, scene.size, scene.channels, who, stage) | {"entries": entries} | timing.to_dict()
-        row["entries_per_tile"] = entries / max(1, prepared.lists.ranges.shape[0])
-        if stage == WHOLE_SPLAT:
-            row["peak_memory_bytes"] = peak_memory(variants[who, stage], device)
-            if who == OURS:
-                # Warp's own scratch stays from the largest call so far, so this is an upper bound.
-                row["peak_memory_bytes"] += held_by_warp(device)
-                row["warp_memory_bytes"] = held_by_warp(device)
-        rows.append(row)
+    for who, timing in time_variants(variants, device, repetitions=repetitions, budget=budget).items():
+        # Warp's own scratch stays from the largest call so far, so for ours this is an upper bound.
+        held = held_by_warp(device) if who == OURS else 0
+        memory = peak_memory(variants[who], device) + held
+        rows.append({"implementation": who, "what": SPLAT} | timing | {"peak_memory_bytes": memory})
     return rows
 
 
-def _step_rows(name: str, size: Size, device, gsplat: Peer | None, repetitions, budget, report) -> list[dict]:
-    """Whole training steps of the preset on photos of this size; peak memory is all that is held on a GPU, photos,
-    parameters and optimiser included."""
-    scene = make_photo_scene(size, views=STEP_VIEWS, device=device)
-    first = thick_of_training(_step_config(OURS, size))
+def _step_rows(point: Point, device, peer: bool, repetitions: int, budget: float, checks: list[dict]) -> list[dict]:
+    """Whole training steps on photos of this size; on a GPU memory is all that is held, photos, parameters and
+    optimizer included. Without densification, which would watch gradients that gsplat gives in another form; steps of
+    gsplat are launched, since they cannot be recorded."""
+    scene = make_photo_scene(point.size, point.photos, device)
     rows, losses = [], {}
-    for who in (OURS,) if gsplat is None else (OURS, GSPLAT, GSPLAT_AND_HARMONICS):
-        _empty(device)
-        with _kernels_of(who):
-            trainer = make_trainer(scene, _step_config(who, size), device, first)
-            variant = Variant(lambda _, t=trainer: t.step(), prepare=lambda t=trainer: between_changes(t, first))
-            variant.once()
-            losses[who] = trainer.loss
-            # One variant: turns would only add untimed runs.
-            timing = time_variants({who: variant}, device, repetitions=repetitions, budget=budget)[who]
-        row = _row(name, size, COMPARED_CHANNELS, who, WHOLE_STEP) | timing.to_dict()
-        if device.type == "cuda":
-            row["peak_memory_bytes"] = torch.cuda.max_memory_allocated(device)
-            row["requested_memory_bytes"] = torch.cuda.memory_stats(device)["requested_bytes.all.peak"]
-            row["reserved_memory_bytes"] = torch.cuda.max_memory_reserved(device)
-            if who == OURS:
-                row["peak_memory_bytes"] += held_by_warp(device)
-                row["warp_memory_bytes"] = held_by_warp(device)
-        else:
-            row["peak_memory_bytes"] = peak_memory(variant, device)
+    for who, rasterizer in [(OURS, None), *([(GSPLAT, rasterize_with_gsplat)] if peer else [])]:
+        forget_peaks(device)
+        fixed = {"densification.stop": 0, "densification.max_gaussians": point.size.gaussians + 1}
+        config = load_config(STEP_PRESET, fixed | {"schedule.recorded": who == OURS})
+        trainer = make_trainer(scene, config, device, rasterizer)
+        variant = step_variant(trainer)
+        variant.once()
+        losses[who] = trainer.loss
+        row = {"implementation": who, "what": STEP}
+        row |= time_variants({who: variant}, device, repetitions=repetitions, budget=budget)[who]
+        row["peak_memory_bytes"] = held_memory(device) if device.type == "cuda" else peak_memory(variant, device)
         rows.append(row)
         del trainer, variant
-        if who != OURS:
-            difference = abs(losses[who] - losses[OURS]) / abs(losses[OURS])
-            found = checks.Check(
-                f"{who}: loss of the first step", OURS, str(size), COMPARED_CHANNELS, difference, gsplat.bound
-            )
-            report["checks"].append(found.to_dict())
+    if peer:
+        difference = abs(losses[GSPLAT] - losses[OURS]) / abs(losses[OURS])
+        checks.append(check("gsplat: loss of the first step", OURS, difference, BOUND))
     return rows
-
-
-def _step_config(who: str, size: Size) -> Config:
-    """Without densification, which on both sides would watch gradients that gsplat gives in another form; steps of
-    gsplat are launched, since they cannot be recorded as a CUDA graph."""
-    return load_config(
-        STEP_PRESET,
-        {
-            "densification.stop": 0,
-            "densification.max_gaussians": size.gaussians + 1,
-            "schedule.recorded": who == OURS,
-        },
-    )
-
-
-@contextmanager
-def _kernels_of(who: str):
-    """Within the block training steps run on our kernels, or on gsplat's where it has them."""
-    with ExitStack() as replaced:
-        if who != OURS:
-            replaced.enter_context(patch.object(radiance_field, "rasterize", rasterize_with_gsplat))
-        if who == GSPLAT_AND_HARMONICS:
-            replaced.enter_context(patch.object(radiance_field, "spherical_harmonics", spherical_harmonics_with_gsplat))
-        yield
-
-
-def _empty(device: torch.device) -> None:
-    """What is left of the point before must not count as this one's."""
-    gc.collect()
-    if device.type == "cuda":
-        torch.cuda.empty_cache()
-        torch.cuda.reset_peak_memory_stats(device)
-
-
-def _row(sweep: str, size: Size, channels: int, implementation: str, what: str) -> dict:
-    varied = {"gaussians": size.gaussians, "pixels": size.width * size.height, "channels": channels}
-    return {
-        "stage": "scale",
-        "sweep": sweep,
-        "varied": varied[sweep],
-        "gaussians": size.gaussians,
-        "width": size.width,
-        "height": size.height,
-        "channels": channels,
-        "implementation": implementation,
-        "what": what,
-    }
-
-
-def _line(sweep: str, size: Size, channels: int, rows: list[dict]) -> str:
-    here = (sweep, size.gaussians, size.width, size.height, channels)
-    keys = ("sweep", "gaussians", "width", "height", "channels")
-    shown = ", ".join(
-        f"{row['what']} {row['median_ms']:.2f} ms"
-        for row in rows
-        if row["what"] in (WHOLE_SPLAT, WHOLE_STEP)
-        and row["implementation"] == OURS
-        and tuple(row[key] for key in keys) == here
-    )
-    return f"{sweep}: {size}, {channels} channels: {shown}"

@@ -1,14 +1,20 @@
-"""Synthetic splats: Gaussians that fill an image at a density like that of a trained scene, at any count and size."""
+"""What is measured on: random Gaussians before a camera, and photos of a synthetic scene, at any count and size."""
 
 import math
 import re
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from ..errors import SehdrError
+from ..field.gaussians import Gaussians
+from ..field.radiance_field import RadianceField
+from ..response import response_by_name
+from ..scene import Camera, Scene, View, codes_of, look_at
 
 NAMES = ("means", "log_scales", "quaternions", "opacities", "features")
+EXPOSURE_TIME, BALLS = 0.25, 24
 
 
 @dataclass(frozen=True)
@@ -22,43 +28,21 @@ class Size:
     def __str__(self) -> str:
         return f"{self.gaussians}@{self.width}x{self.height}"
 
-    def reduced(self, most_gaussians: int) -> "Size":
-        """The same density of Gaussians, at most so many of them (but an image of at least 16 pixels a side)."""
-        shrink = math.sqrt(max(1.0, self.gaussians / most_gaussians))
+    def reduced(self, most: int) -> "Size":
+        """The same density, with at most so many Gaussians (but an image of at least 16 pixels a side)."""
+        shrink = math.sqrt(max(1.0, self.gaussians / most))
         sides = (max(16, round(side / shrink)) for side in (self.width, self.height))
         return Size(max(1, round(self.gaussians / shrink**2)), *sides)
 
 
-SIZES = {
-    "cuda": {
-        "small": Size(50_000, 400, 400),
-        "medium": Size(200_000, 800, 800),
-        "large": Size(1_000_000, 1600, 1200),
-    },
-    "cpu": {
-        "small": Size(5_000, 200, 200),
-        "medium": Size(20_000, 200, 200),
-        "large": Size(50_000, 400, 400),
-    },
-}
-DEFAULT_SIZES = {"cuda": "small,medium,large", "cpu": "small,medium"}
-
-
-def parse_sizes(text: str | None, device_type: str) -> list[Size]:
-    """Sizes from `small,medium` or `20000@200x200,1M@1600x1200`; None means the device's default. Raises SehdrError."""
-    return [parse_size(item.strip(), device_type) for item in (text or DEFAULT_SIZES[device_type]).split(",")]
-
-
-def parse_size(text: str, device_type: str) -> Size:
-    """One size: a name of SIZES, or Gaussians@WIDTHxHEIGHT, where k and M multiply. Raises SehdrError."""
-    if text in SIZES[device_type]:
-        return SIZES[device_type][text]
-    match = re.fullmatch(r"(\d+)([kM]?)@(\d+)x(\d+)", text)
+def parse_size(text: str) -> Size:
+    """`20k@200x200`, where k and M multiply. Raises SehdrError."""
+    match = re.fullmatch(r"(\d+)([kM]?)@(\d+)x(\d+)", text.strip())
     if match:
         count = int(match[1]) * {"": 1, "k": 1000, "M": 1_000_000}[match[2]]
         if count and int(match[3]) and int(match[4]):
             return Size(count, int(match[3]), int(match[4]))
-    raise SehdrError(f"size {text}: not a size; use small, medium, large or Gaussians@WIDTHxHEIGHT such as 20k@200x200")
+    raise SehdrError(f"size {text}: not a size; write Gaussians@WIDTHxHEIGHT such as 20k@200x200")
 
 
 @dataclass(frozen=True)
@@ -76,10 +60,6 @@ class SplatScene:
         return (*self.leaves, self.world_to_camera, self.intrinsics, self.size.width, self.size.height)
 
     @property
-    def channels(self) -> int:
-        return self.leaves[-1].shape[1]
-
-    @property
     def device(self) -> torch.device:
         return self.leaves[0].device
 
@@ -95,19 +75,19 @@ class SplatScene:
             leaf.grad = None
 
     def cotangent(self) -> torch.Tensor:
-        """[H, W, C] in [0, 1), the gradient that a loss would send back; the same on every device and dtype."""
+        """[H, W, C] in [0, 1), the gradient that a loss would send back; alike on every device and in every dtype."""
         generator = torch.Generator().manual_seed(1)
-        values = torch.rand(self.size.height, self.size.width, self.channels, generator=generator)
-        return values.to(self.leaves[0])
+        shape = self.size.height, self.size.width, self.leaves[-1].shape[1]
+        return torch.rand(shape, generator=generator).to(self.leaves[0])
 
 
-def make_splat_scene(size: Size, channels: int, seed: int = 0) -> SplatScene:
-    """float32 Gaussians on the CPU before a centred pinhole camera at the origin.
+def make_splat_scene(size: Size, channels: int, device: torch.device | str = "cpu") -> SplatScene:
+    """float32 Gaussians at depths of 2 to 8 before a centered pinhole camera at the origin.
 
-    Depths 2 to 8; centres spread over the image and 5 % beyond its borders; standard deviations in pixels follow the
-    mean distance between centres, most of them small, so that the depth of layers does not depend on the size.
+    Standard deviations follow the mean distance between centers, so that the depth of layers, some 15 over the alpha
+    threshold in a pixel, does not depend on the size.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     count, width, height = size.gaussians, size.width, size.height
 
     def uniform(*shape):
@@ -117,11 +97,51 @@ def make_splat_scene(size: Size, channels: int, seed: int = 0) -> SplatScene:
     depth = 2 + 6 * uniform(count)
     across = torch.stack([(uniform(count) - 0.5) * 1.1 * side / focal for side in (width, height)], dim=1)
     means = torch.cat([across * depth[:, None], depth[:, None]], dim=1)
-    spacing = math.sqrt(width * height / (1.2 * count))
-    deviation = 0.5 * spacing * (0.6 + 2.4 * uniform(count) ** 2)
+    deviation = 0.5 * math.sqrt(width * height / (1.2 * count)) * (0.6 + 2.4 * uniform(count) ** 2)
     log_scales = torch.log((deviation * depth / focal)[:, None] * (0.4 + 1.2 * uniform(count, 3)))
     quaternions = torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=1)
-    opacities = 0.05 + 0.9 * uniform(count) ** 1.5
-    leaves = (means, log_scales, quaternions, opacities, uniform(count, channels))
+    leaves = (means, log_scales, quaternions, 0.05 + 0.9 * uniform(count) ** 1.5, uniform(count, channels))
     intrinsics = torch.tensor([focal, focal, width / 2, height / 2])
-    return SplatScene(leaves, torch.eye(4), intrinsics, size).to()
+    return SplatScene(leaves, torch.eye(4), intrinsics, size).to(device)
+
+
+def make_photo_scene(size: Size, views: int = 18, device: str | torch.device = "cpu") -> Scene:
+    """8-bit sRGB photos, all for training, of colored balls on a floor, from a circle around them.
+
+    size.gaussians points lie on the surfaces, as those of a trained scene do; the photos show them as Gaussians, some
+    pixels clipped and some black. device: where they are rendered.
+    """
+    rng = np.random.default_rng(0)
+    points, log_exposure = _surfaces(size.gaussians, rng)
+    response = response_by_name("srgb")
+    points32, colors32 = (torch.tensor(x, dtype=torch.float32, device=device) for x in (points, log_exposure))
+    gaussians = Gaussians.from_points(points32, colors32, 0, opacity=0.9)
+    field = RadianceField(gaussians, response, base_time=EXPOSURE_TIME)
+    photos = []
+    for index in range(views):
+        camera = _camera(2 * np.pi * index / views, size)
+        codes = codes_of(field.render_ldr(camera).cpu().numpy(), 8)
+        photos.append(View(f"v_{index}", codes, camera, EXPOSURE_TIME, "train"))
+    colors = np.asarray(response.encode(np.exp(log_exposure)), dtype=np.float32)
+    return Scene(f"synthetic {size}", "transforms", tuple(photos), points, colors)
+
+
+def _surfaces(count: int, rng) -> tuple[np.ndarray, np.ndarray]:
+    """Points [N, 3] on balls and on the floor z = 0, and their log exposures [N, 3] over some six stops."""
+    centers = np.concatenate([rng.uniform(-1.2, 1.2, (BALLS, 2)), rng.uniform(0.2, 1.0, (BALLS, 1))], axis=1)
+    radii, tints = rng.uniform(0.1, 0.35, BALLS), rng.uniform(-3.5, 0.5, (BALLS + 1, 3))
+    which = rng.integers(0, BALLS + 8, count).clip(max=BALLS)
+    on_floor = which == BALLS
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    ball = np.where(on_floor, 0, which)
+    points = centers[ball] + radii[ball, None] * direction
+    points[on_floor] = np.concatenate([rng.uniform(-2, 2, (on_floor.sum(), 2)), np.zeros((on_floor.sum(), 1))], axis=1)
+    return points, tints[which] + 0.4 * np.sin(9 * points).sum(axis=1, keepdims=True)
+
+
+def _camera(angle: float, size: Size, radius: float = 3.5) -> Camera:
+    """On a circle at height 1.6, looking at the middle of the balls."""
+    pose = look_at([radius * np.cos(angle), radius * np.sin(angle), 1.6], (0.0, 0.0, 0.4))
+    focal = 1.1 * size.width
+    return Camera(size.width, size.height, focal, focal, size.width / 2, size.height / 2, pose)

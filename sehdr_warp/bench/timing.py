@@ -27,51 +27,21 @@ class Variant:
         self.run(self.prepare())
 
 
-@dataclass(frozen=True)
-class Timing:
-    """Milliseconds of each repetition, in their order."""
-
-    samples: tuple[float, ...]
-
-    @property
-    def median(self) -> float:
-        return statistics.median(self.samples)
-
-    def to_dict(self) -> dict:
-        """median, mean, least and 90th percentile in ms, and the number of repetitions."""
-        ordered = sorted(self.samples)
-        return {
-            "median_ms": self.median,
-            "mean_ms": statistics.fmean(ordered),
-            "min_ms": ordered[0],
-            "p90_ms": ordered[min(len(ordered) - 1, math.ceil(0.9 * len(ordered)) - 1)],
-            "repetitions": len(ordered),
-        }
-
-
 def time_variants(
-    variants: dict[str, Variant],
-    device: torch.device,
-    *,
-    repetitions: int = 30,
-    warm_up: int | None = None,
-    budget: float = 20.0,
-) -> dict[str, Timing]:
-    """Time variants in turns.
+    variants: dict[str, Variant], device: torch.device, *, repetitions: int = 30, budget: float = 20.0
+) -> dict[str, dict]:
+    """Times of each variant, see summary().
 
-    warm_up: untimed runs of each before, by default 8 on CUDA and 2 on the CPU.
-    budget: on the CPU, seconds that one variant may take; a slow one is repeated less often, but at least 3 times.
-    CUDA: events around each run, with the device idle before, so that the host's time counts where it is the limit.
+    On a GPU events stand around each run with the device idle before, so that the host's time counts where it is the
+    limit. budget: on the CPU, seconds that one variant may take; a slow one runs less often, but at least 3 times.
     """
-    warm_up = (8 if device.type == "cuda" else 2) if warm_up is None else warm_up
     samples: dict[str, list[float]] = {name: [] for name in variants}
     wanted = {}
     for name, variant in variants.items():
-        for _ in range(warm_up):
+        for _ in range(8 if device.type == "cuda" else 2):
             variant.once()
         wanted[name] = repetitions
         if device.type == "cpu":
-            # The trial counts as one more warm run: the first one may have compiled kernels.
             trial = _milliseconds(variant, device) / 1e3
             wanted[name] = max(min(LEAST_REPETITIONS, repetitions), min(repetitions, int(budget / max(trial, 1e-9))))
     for turn in range(TURNS):
@@ -80,7 +50,19 @@ def time_variants(
             variant.once()
             for _ in range(wanted[name] * (turn + 1) // TURNS - wanted[name] * turn // TURNS):
                 samples[name].append(_milliseconds(variant, device))
-    return {name: Timing(tuple(values)) for name, values in samples.items()}
+    return {name: summary(values) for name, values in samples.items()}
+
+
+def summary(samples: list[float]) -> dict:
+    """Median, mean, least and 90th percentile in ms, and the number of repetitions."""
+    ordered = sorted(samples)
+    return {
+        "median_ms": statistics.median(ordered),
+        "mean_ms": statistics.fmean(ordered),
+        "min_ms": ordered[0],
+        "p90_ms": ordered[math.ceil(0.9 * len(ordered)) - 1],
+        "repetitions": len(ordered),
+    }
 
 
 def _milliseconds(variant: Variant, device: torch.device) -> float:
@@ -98,15 +80,21 @@ def _milliseconds(variant: Variant, device: torch.device) -> float:
     return first.elapsed_time(last)
 
 
+def wait(device: torch.device) -> None:
+    """Until the device has done what it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
 def peak_memory(variant: Variant, device: torch.device) -> int:
     """Largest memory of torch's allocator during one run above what was in use before it, bytes."""
     prepared = variant.prepare()
     if device.type == "cuda":
-        torch.cuda.synchronize(device)
+        wait(device)
         before = torch.cuda.memory_allocated(device)
         torch.cuda.reset_peak_memory_stats(device)
         variant.run(prepared)
-        torch.cuda.synchronize(device)
+        wait(device)
         return torch.cuda.max_memory_allocated(device) - before
     os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # the profiler's own messages are not the user's
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
@@ -114,5 +102,4 @@ def peak_memory(variant: Variant, device: torch.device) -> int:
     # In the order of time; events() of the profiler leaves out what is freed within the operation that allocated it.
     events = recorded.profiler.kineto_results.events()
     changes = [(event.start_ns(), event.nbytes()) for event in events if event.name() == "[memory]"]
-    held = accumulate(nbytes for _, nbytes in sorted(changes))
-    return max(held, default=0)
+    return max(accumulate(nbytes for _, nbytes in sorted(changes)), default=0)

@@ -37,11 +37,10 @@ class Reading:
 
 @dataclass(frozen=True)
 class Case:
-    """name: for --cases. group: the table's section. what: one line. measure: device -> readings. quick: part of
-    --quick and of the tests. note: what float32 cannot do better here, and what is done about it."""
+    """name: for --cases. what: one line. measure: device -> readings. quick: part of --quick and of the tests. note:
+    what float32 cannot do better here, and what is done about it."""
 
     name: str
-    group: str
     what: str
     measure: Callable[[torch.device], list[Reading]]
     quick: bool = True
@@ -66,14 +65,10 @@ def _factors(x: Tensor, generator: torch.Generator) -> Tensor:
     return 1 + (2 * noise - 1) * (ROUNDINGS * UNIT)
 
 
-class Disturbance:
-    """Calls disturb tensors with new random numbers each; the one of draw 0 leaves them as they are."""
-
-    def __init__(self, draw: int):
-        self._generator = torch.Generator().manual_seed(draw) if draw else None
-
-    def __call__(self, tensor: Tensor) -> Tensor:
-        return tensor if self._generator is None else _Disturb.apply(tensor, self._generator)
+def _disturbance(draw: int) -> Callable[[Tensor], Tensor]:
+    """Disturbs tensors with new random numbers at each call; draw 0 leaves them as they are."""
+    generator = torch.Generator().manual_seed(draw)
+    return (lambda x: _Disturb.apply(x, generator)) if draw else lambda x: x
 
 
 def as_float32(tensors: list[Tensor]) -> list[Tensor]:
@@ -81,21 +76,20 @@ def as_float32(tensors: list[Tensor]) -> list[Tensor]:
     return [tensor.float().double() for tensor in tensors]
 
 
-def upstream(tensor: Tensor, seed: int) -> Tensor:
+def _upstream(tensor: Tensor, seed: int) -> Tensor:
     """Fixed weights in [0.5, 1.5] for a result, so that a scalar's gradient sees each of its numbers."""
     return 0.5 + torch.rand(tensor.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def results_and_gradients(function, tensors: list[Tensor], wanted: list[int]) -> list[Tensor]:
-    """The results of function(*tensors), a dict by name, then the gradients of their weighted sum by the wanted
-    tensors; all float64 on the CPU."""
+def _measured(function, tensors: list[Tensor], wanted: list[int]) -> dict[str, Tensor]:
+    """The results of function(*tensors) by name, then the gradients of their weighted sum by the wanted tensors, by
+    their number; all float64 on the CPU."""
     leaves = [t.detach().clone().requires_grad_(i in wanted) for i, t in enumerate(tensors)]
-    outputs = list(function(*leaves).values())
-    total = sum((out * upstream(out, 7 + i).to(out)).sum() for i, out in enumerate(outputs))
+    outputs = function(*leaves)
     if wanted:
-        total.backward()
-    gradients = [torch.zeros_like(leaves[i]) if leaves[i].grad is None else leaves[i].grad for i in wanted]
-    return [value.detach().double().cpu() for value in (*outputs, *gradients)]
+        sum((out * _upstream(out, 7 + i).to(out)).sum() for i, out in enumerate(outputs.values())).backward()
+    gradients = {f"{i}": torch.zeros_like(leaves[i]) if leaves[i].grad is None else leaves[i].grad for i in wanted}
+    return {name: value.detach().double().cpu() for name, value in (outputs | gradients).items()}
 
 
 def compare(
@@ -108,41 +102,49 @@ def compare(
     elementwise: bool = False,
     floor: float = 0.0,
     extra: float = 0.0,
+    label: str = "{}",
 ) -> list[Reading]:
     """Readings of function in float32 on the device against truth in float64.
 
-    function(*tensors) -> dict of results by name; truth(disturb, *tensors) -> the same, which passes what crosses a
-    stage's border through disturb (a Disturbance).
-    tensors: float64 values by name. gradients: names by which the derivative is compared too.
-    elementwise: the largest relative error of any number, rather than the relative error of the whole in norm;
-    floor: numbers below it are compared absolutely, in units of it.
-    extra: added to every bound, for what the kernel's arithmetic costs beside disturbed interfaces; the case says why.
+    Args:
+        function: function(*tensors) -> dict of results by name.
+        truth: truth(disturb, *tensors) -> the same, which passes what crosses a stage's border through disturb.
+        tensors: float64 values by name. gradients: names by which the derivative is compared too.
+        elementwise: the largest relative error of any number, rather than the relative error of the whole in norm.
+        floor: numbers below it are compared absolutely, in units of it.
+        extra: added to every bound, for what the kernel's arithmetic costs beside disturbed interfaces; the case says
+            why. label: what becomes of a quantity's name.
     """
     names, values = list(tensors), as_float32(list(tensors.values()))
     wanted = [names.index(name) for name in gradients]
-    ours = results_and_gradients(function, [v.to(device, torch.float32) for v in values], wanted)
+    ours = _measured(function, [v.to(device, torch.float32) for v in values], wanted)
     runs = []
     for draw in range(DRAWS + 1):
-        disturb = Disturbance(draw)
-        runs.append(results_and_gradients(lambda *t, d=disturb: truth(d, *map(d, t)), values, wanted))
-    quantities = [*function(*[v.to(device, torch.float32) for v in values]), *(f"d/d {name}" for name in gradients)]
+        disturb = _disturbance(draw)
+        runs.append(_measured(lambda *t, d=disturb: truth(d, *map(d, t)), values, wanted))
     measure = _elementwise if elementwise else _in_norm
     readings = []
-    for k, quantity in enumerate(quantities):
-        exact = runs[0][k]
-        effect = max(measure(run[k], exact, floor) for run in runs[1:])
-        readings.append(Reading(quantity, measure(ours[k], exact, floor), 2 * effect + ROUNDINGS * UNIT + extra))
+    for key, exact in runs[0].items():
+        effect = max(measure(run[key], exact, floor) for run in runs[1:])
+        quantity = f"d/d {names[int(key)]}" if key.isdecimal() else key
+        error, bound = measure(ours[key], exact, floor), 2 * effect + ROUNDINGS * UNIT + extra
+        readings.append(Reading(label.format(quantity), error, bound))
     return readings
 
 
+def compare_alike(function, tensors: dict[str, Tensor], device: torch.device, **options) -> list[Reading]:
+    """compare() of a function whose float64 truth is itself, disturbed in its arguments alone."""
+    return compare(function, lambda _, *t: function(*t), tensors, device, **options)
+
+
 def _in_norm(value: Tensor, exact: Tensor, floor: float) -> float:
-    size = float(exact.norm())
-    return float((value - exact).norm()) / max(size, floor) if max(size, floor) > 0 else float(value.norm())
+    size = max(float(exact.norm()), floor)
+    return float((value - exact).norm()) / size if size > 0 else float(value.norm())
 
 
 def _elementwise(value: Tensor, exact: Tensor, floor: float) -> float:
-    difference, size = (value - exact).abs(), exact.abs().clamp_min(floor or torch.finfo(torch.float32).tiny)
-    return float((difference / size).max())
+    size = exact.abs().clamp_min(floor or torch.finfo(torch.float32).tiny)
+    return float(((value - exact).abs() / size).max())
 
 
 def count(quantity: str, wrong: int | Tensor) -> Reading:

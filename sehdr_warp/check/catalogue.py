@@ -1,88 +1,118 @@
-"""The whole catalogue, and a run of it: measured case by case, told as a table, written as JSON."""
+"""The whole catalogue, and a run of it: measured case by case, printed as a table."""
 
+import logging
 import math
 import time
-from pathlib import Path
+from collections.abc import Sequence
 
 import torch
 
 from ..errors import SehdrError
-from ..files import write_json
+from ..response import response_by_name
 from .case import Case, Reading
-from .light_cases import CASES as LIGHT_CASES
-from .poison_cases import CASES as POISON_CASES
-from .splat_cases import CASES as SPLAT_CASES
-from .training_cases import CASES as TRAINING_CASES
+from .light_cases import LIGHT_CASES, encode_readings
+from .splat_cases import POISON_CASES, SPLAT_CASES, Splats, compare_splat, overlapping
+from .training_cases import TRAINING_CASES
 
-CASES: tuple[Case, ...] = (*SPLAT_CASES, *LIGHT_CASES, *POISON_CASES, *TRAINING_CASES)
+LOG = logging.getLogger(__name__)
+GROUPS = {"splat": SPLAT_CASES, "light": LIGHT_CASES, "poison": POISON_CASES, "training": TRAINING_CASES}
+CASES = tuple((group, case) for group, cases in GROUPS.items() for case in cases)
 
 
-def choose_cases(names: str | None, quick: bool) -> list[Case]:
-    """The cases of these names or groups, separated by commas; all by default. quick: those that take a moment.
-
-    Raises SehdrError for a name that is not known.
-    """
+def choose_cases(names: str | None, quick: bool) -> list[tuple[str, Case]]:
+    """The cases of these names or groups, separated by commas, each with its group; all by default. quick: those that
+    take a moment. Raises SehdrError for a name that is not known."""
     if names is None:
-        return [case for case in CASES if case.quick or not quick]
+        return [(group, case) for group, case in CASES if case.quick or not quick]
     chosen = []
     for name in (part.strip() for part in names.split(",")):
-        found = [case for case in CASES if name in (case.name, case.group)]
+        found = [item for item in CASES if name in (item[0], item[1].name)]
         if not found:
-            known = ", ".join(dict.fromkeys([case.group for case in CASES] + [case.name for case in CASES]))
+            known = ", ".join([*GROUPS, *(case.name for _, case in CASES)])
             raise SehdrError(f"--cases {name:.60}: no such case; take some of {known}")
-        chosen += [case for case in found if case not in chosen]
+        chosen += [item for item in found if item not in chosen]
     return chosen
 
 
-def run_cases(cases: list[Case], device: torch.device, say) -> dict:
-    """Measures the cases and returns what write_result takes; say(line) is called with the table's lines.
+def run_cases(cases: Sequence[tuple[str, Case]], device: torch.device) -> list[dict]:
+    """Measures the cases, prints a table, and returns a row for each, with its readings.
 
     torch runs on one thread, so that the figures do not depend on the machine's cores.
     """
-    started, rows = time.perf_counter(), []
-    threads = torch.get_num_threads()
+    rows, threads = [], torch.get_num_threads()
     torch.set_num_threads(1)
-    say(f"{'case':17} {'quantity':42} {'error':>9} {'bound':>9}  verdict")
+    print(f"{'case':17} {'quantity':42} {'error':>9} {'bound':>9}  verdict")
     try:
-        for case in cases:
-            case_started = time.perf_counter()
+        for group, case in cases:
+            started = time.perf_counter()
             readings = case.measure(device)
-            rows.append(_row(case, readings, time.perf_counter() - case_started))
-            for line in _lines(case, readings):
-                say(line)
+            row = {"case": case.name, "group": group, "what": case.what, "note": case.note or None}
+            row |= {"seconds": round(time.perf_counter() - started, 3), "holds": all(r.holds for r in readings)}
+            rows.append(row | {"readings": [_values(reading) for reading in readings]})
+            for place, reading in enumerate(readings):
+                numbers = f"{_number(reading.error)} {_number(reading.bound)}  {'ok' if reading.holds else 'FAILED'}"
+                print(f"{'' if place else case.name:17} {reading.quantity:42.42} {numbers}")
     finally:
         torch.set_num_threads(threads)
-    failed = [row["case"] for row in rows if not row["holds"]]
-    seconds = time.perf_counter() - started
-    say(f"{len(rows)} cases, {sum(len(row['readings']) for row in rows)} bounds, {len(failed)} failed, {seconds:.1f} s")
-    return {"format": 1, "device": str(device), "seconds": round(seconds, 1), "failed": failed, "cases": rows}
+    failed = sum(not row["holds"] for row in rows)
+    bounds, seconds = (sum(values) for values in zip(*((len(row["readings"]), row["seconds"]) for row in rows)))
+    print(f"{len(rows)} cases, {bounds} bounds, {failed} failed, {seconds:.1f} s")
+    return rows
 
 
-def write_result(result: dict, path: Path, overwrite: bool) -> None:
-    """Writes the result as JSON; errors that are not finite become null. Raises as write_json does."""
-    write_json(path, result, overwrite)
-
-
-def _row(case: Case, readings: list[Reading], seconds: float) -> dict:
-    return {
-        "case": case.name,
-        "group": case.group,
-        "what": case.what,
-        "note": case.note,
-        "seconds": round(seconds, 3),
-        "holds": all(reading.holds for reading in readings),
-        "readings": [{"quantity": r.quantity, "error": r.error, "bound": r.bound, "holds": r.holds} for r in readings],
-    }
-
-
-def _lines(case: Case, readings: list[Reading]) -> list[str]:
-    lines = []
-    for place, reading in enumerate(readings):
-        name = case.name if place == 0 else ""
-        verdict = "ok" if reading.holds else "FAILED"
-        lines.append(f"{name:17} {reading.quantity:42.42} {_number(reading.error)} {_number(reading.bound)}  {verdict}")
-    return lines
+def _values(reading: Reading) -> dict:
+    return {"quantity": reading.quantity, "error": reading.error, "bound": reading.bound, "holds": reading.holds}
 
 
 def _number(value: float) -> str:
     return f"{value:9.0f}" if math.isfinite(value) and value == int(value) and value < 1e6 else f"{value:9.1e}"
+
+
+def _needle(ratio: float, device) -> list[Reading]:
+    return compare_splat(Splats(24).scaled(1.0, 1 / ratio, 1.3 / ratio), device)
+
+
+def _radiance_range(decades: float, device) -> list[Reading]:
+    splats = Splats(40, spread=1.0)
+    splats.opacities *= 0.5
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(1))
+    splats.features[:] = 10.0 ** ((order / 39 - 0.5) * decades).double()[:, None]
+    return compare_splat(splats, device)
+
+
+def _overlap(number: float, device) -> list[Reading]:
+    splats, options = overlapping(int(number), 5.0 / number, 1e-7)  # together they cover a pixel to 1 - e^-5
+    return compare_splat(splats, device, **options)
+
+
+def _exposure(stops: float, device) -> list[Reading]:
+    x = torch.linspace(2.0**stops, 2.0 ** (stops + 1), 33, dtype=torch.float64)
+    curves = map(response_by_name, ("srgb", "gamma-2.2", "hdr-nerf", "aces"))
+    return [reading for curve in curves for reading in encode_readings(curve, device, x)]
+
+
+SWEEPS = (
+    ("length of a needle / its thickness", tuple(10.0**k for k in range(8)), _needle,
+     ("image", "d/d log_scales", "d/d quaternions")),
+    ("decades of radiance within the image", tuple(range(0, 29, 4)), _radiance_range,
+     ("image", "d/d opacities", "d/d features")),
+    ("Gaussians behind each other", (10, 30, 100, 300, 1000, 3000, 10_000, 30_000), _overlap,
+     ("image", "d/d opacities", "d/d features")),
+    ("stops of exposure", tuple(range(-24, 25, 4)), _exposure,
+     ("srgb f", "gamma-2.2 f", "hdr-nerf f", "aces f")),
+)  # fmt: skip
+"""What is varied, its values, a measure of one value, and the quantities that are kept."""
+
+
+def run_sweeps(device: torch.device) -> list[dict]:
+    """Error and bound over what is varied: for each sweep its label, values, and (error, bound) of each quantity."""
+    found = []
+    for label, values, measure, kept in SWEEPS:
+        LOG.info("%s", label)
+        readings: dict[str, list] = {name: [] for name in kept}
+        for value in values:
+            for reading in measure(value, device):
+                if reading.quantity in kept:
+                    readings[reading.quantity].append((reading.error, reading.bound))
+        found.append({"label": label, "values": values, "readings": readings})
+    return found

@@ -1,38 +1,149 @@
-"""The catalogue's splats: shapes, places, opacities, overlap, radiance."""
+"""The catalogue's splats: shapes, places, opacities, overlap, radiance, and poison in their arguments."""
 
 import math
+from collections.abc import Callable
 
 import torch
+from torch import Tensor
 
-from ..kernels.constants import ALPHA_THRESHOLD, NEAR, TRANSMITTANCE_MIN
-from ..splatting import rasterize, spherical_harmonics
-from ..splatting.reference import rasterize_reference
-from .case import ROUNDINGS, UNIT, Case, Reading, compare, count, not_finite
-from .splats import Splats, compare_splat
+from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR, TRANSMITTANCE_MIN
+from ..splatting import rasterize, spherical_harmonics, ssim_map
+from ..splatting.reference import blend_reference, project_reference, rasterize_reference
+from .case import ROUNDINGS, UNIT, Case, Reading, as_float32, compare, compare_alike, count, not_finite
 
-SPLATS = "splat"
+NAMES = ("means", "log_scales", "quaternions", "opacities", "features", "world_to_camera", "intrinsics")
+POISON = (math.nan, math.inf, -math.inf, 3e38, -3e38, 1e-40)
 
 
-def _scaled(scales) -> callable:
+class Splats:
+    """Arguments of rasterize() in float64, to be changed by a case; tensors by the names of rasterize()."""
+
+    def __init__(self, count: int = 40, width: int = 40, height: int = 30, spread: float = 2.0):
+        generator = torch.Generator().manual_seed(0)
+
+        def uniform(*shape):
+            return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+        def normal(*shape):
+            return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+        self.width, self.height = width, height
+        self.means = (uniform(count, 3) - 0.5) * torch.tensor([spread, spread, 2.0]) + torch.tensor([0.0, 0.0, 3.0])
+        self.log_scales = torch.log(0.05 + 0.25 * uniform(count, 3))
+        self.quaternions = normal(count, 4)
+        self.opacities = 0.05 + 0.9 * uniform(count)
+        self.features = torch.exp(normal(count, 3))
+        self.world_to_camera = torch.eye(4, dtype=torch.float64)
+        focal = 0.9 * max(width, height)
+        self.intrinsics = torch.tensor([focal, focal, width / 2 + 0.3, height / 2 - 0.2], dtype=torch.float64)
+        self.options = {"near": NEAR, "low_pass": LOW_PASS, "alpha_threshold": ALPHA_THRESHOLD, "antialiased": False}
+
+    def scaled(self, *scales: float) -> "Splats":
+        self.log_scales[:] = torch.tensor(scales, dtype=torch.float64).log()
+        return self
+
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        return {name: getattr(self, name) for name in NAMES}
+
+    def float32(self, device) -> list[Tensor]:
+        return [tensor.to(device, torch.float32) for tensor in self.tensors.values()]
+
+    def draw(self, device):
+        return rasterize(*self.float32(device), self.width, self.height)
+
+
+def compare_splat(splats: Splats, device: torch.device, *, ties: bool = False, **options) -> list[Reading]:
+    """Image, alpha and gradients of rasterize() against the float64 reference.
+
+    ties: depths are equal, and their order is by index: they are not disturbed. options: as compare() takes them.
+    """
+    size, given = (splats.width, splats.height), splats.options
+
+    def ours(*tensors):
+        rendering = rasterize(*tensors, *size, **given)
+        return {"image": rendering.image, "alpha": rendering.alpha}
+
+    exact = as_float32(list(splats.tensors.values()))
+    exact_depths = project_reference(*exact[:4], *exact[5:], *size, *given.values())[2]
+
+    def truth(disturb, means, log_scales, quaternions, opacities, features, pose, intrinsics):
+        projected = project_reference(
+            means, log_scales, quaternions, opacities, pose, intrinsics, *size, *given.values()
+        )
+        means2d, conics, depths, opacities2d, extents = projected
+        depths = exact_depths if ties else disturb(depths.detach())
+        image, transmittance = blend_reference(
+            disturb(means2d), disturb(conics), disturb(opacities2d), features, depths, extents, *size,
+            given["alpha_threshold"],
+        )  # fmt: skip
+        return {"image": image, "alpha": 1.0 - transmittance}
+
+    return compare(ours, truth, splats.tensors, device, gradients=NAMES[:5], **options)
+
+
+def overlapping(number: int, opacity: float, threshold: float) -> tuple[Splats, dict]:
+    """Gaussians one behind the other in one tile, and the options to compare them by: each rounds the pixel's
+    transmittance once, a random walk of as many steps as are counted."""
+    splats = Splats(number, width=4, height=4, spread=0.2).scaled(0.3, 0.5, 0.7)
+    splats.opacities[:] = opacity
+    splats.means[:, 2] = torch.linspace(2.0, 6.0, number, dtype=torch.float64)
+    splats.options["alpha_threshold"] = threshold
+    steps = min(number, math.log(1 / TRANSMITTANCE_MIN) / opacity)
+    return splats, {"ties": True, "extra": ROUNDINGS * UNIT * math.sqrt(steps)}
+
+
+def _scaled(*scales: float):
+    return lambda device: compare_splat(Splats(24).scaled(*scales), device)
+
+
+def _overlap(*arguments):
     def measure(device):
-        splats = Splats(24)
-        splats.log_scales[:] = torch.tensor(scales, dtype=torch.float64).log()
-        return compare_splat(splats, device)
+        splats, options = overlapping(*arguments)
+        return compare_splat(splats, device, **options)
 
     return measure
 
 
-def _mixed_scales(device):
-    """Every size from 1e-7 to 1e4 in one image, the large ones faint."""
-    splats = Splats(60)
+def _changed(count: int, change: Callable[[Splats], None], **options):
+    """Splats that a function changes, compared."""
+
+    def measure(device):
+        splats = Splats(count)
+        change(splats)
+        return compare_splat(splats, device, **options)
+
+    return measure
+
+
+def _mix_scales(splats: Splats) -> None:
     splats.log_scales[:] = torch.linspace(math.log(1e-7), math.log(1e4), 60, dtype=torch.float64)[:, None]
     splats.log_scales += torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)
-    splats.opacities[:] = torch.where(splats.log_scales[:, 0] > 0, 0.02, splats.opacities)
-    return compare_splat(splats, device)
+    splats.opacities[:] = torch.where(splats.log_scales[:, 0] > 0, 0.02, splats.opacities)  # the large ones faint
+
+
+def _near_threshold(splats: Splats) -> None:
+    step = ALPHA_THRESHOLD
+    given = [0.0, 0.5 * step, step * (1 - 1e-6), step, step * (1 + 1e-3), 0.5, 0.998, 0.999, 0.9995, 1.0, 1.0, 0.1]
+    splats.opacities[:] = torch.tensor(given, dtype=torch.float64)
+
+
+def _radiance(low: float, high: float):
+    def change(splats):
+        exponents = torch.linspace(math.log10(low), math.log10(high), 50, dtype=torch.float64)
+        order = torch.randperm(50, generator=torch.Generator().manual_seed(1))
+        splats.features[:] = 10.0 ** exponents[order][:, None]
+
+    return _changed(50, change)
+
+
+def _move_away(splats: Splats) -> None:
+    splats.means *= 1e6
+    splats.log_scales += math.log(1e6)
 
 
 def _near_plane(device):
-    """Depths at, just before and behind the near plane and the camera; what is behind is culled exactly."""
+    """What is behind the near plane is culled exactly."""
     splats = Splats(16, spread=0.001)
     near = torch.tensor(NEAR, dtype=torch.float32).item()
     # Float32's own roundings of a depth are 1e-9 here: nearer than 1e-6 there is no telling before from behind.
@@ -42,13 +153,11 @@ def _near_plane(device):
     splats.log_scales[:8] = math.log(1e-3)
     readings = compare_splat(splats, device, ties=True)
     splats.means[0, 2] = near
-    rendering = rasterize(*splats.float32(device), splats.width, splats.height)
     behind = splats.means[:, 2].float() <= near
-    return [*readings, count("drawn behind the near plane", (rendering.visible.cpu() & behind).sum())]
+    return [*readings, count("drawn behind the near plane", (splats.draw(device).visible.cpu() & behind).sum())]
 
 
 def _border(device):
-    """Centres on and just beyond each border and corner of the image."""
     splats = Splats(16, width=33, height=17)
     focal_x, focal_y, cx, cy = splats.intrinsics
     x = torch.tensor([0.0, 33.0, 16.5, 16.5, 0.0, 33.0, 33.0, 0.0, -3.0, 36.0, 16.0, 16.0, -0.01, 33.01, 8.0, 25.0])
@@ -58,69 +167,31 @@ def _border(device):
     return compare_splat(splats, device)
 
 
-def _opacity(device):
-    """0, just below, at and just above the threshold, the limit of 0.999, and 1."""
-    splats = Splats(12)
-    step = ALPHA_THRESHOLD
-    given = [0.0, 0.5 * step, step * (1 - 1e-6), step, step * (1 + 1e-3), 0.5, 0.998, 0.999, 0.9995, 1.0, 1.0, 0.1]
-    splats.opacities[:] = torch.tensor(given, dtype=torch.float64)
-    return compare_splat(splats, device)
-
-
-def _overlap(number: int, opacity: float, threshold: float) -> callable:
-    def measure(device):
-        splats = Splats(number, width=4, height=4, spread=0.2)
-        splats.log_scales[:] = torch.tensor([0.3, 0.5, 0.7], dtype=torch.float64).log()
-        splats.opacities[:] = opacity
-        splats.means[:, 2] = torch.linspace(2.0, 6.0, number, dtype=torch.float64)
-        splats.options = {"alpha_threshold": threshold}
-        # Every Gaussian rounds the pixel's transmittance once: a random walk of as many steps as are counted.
-        steps = min(number, math.log(1 / TRANSMITTANCE_MIN) / opacity)
-        return compare_splat(splats, device, ties=True, extra=ROUNDINGS * UNIT * math.sqrt(steps))
-
-    return measure
-
-
 def _equal_depths(device):
-    """All at one depth: their order is that of their indices, on every device and in every run."""
+    """Their order is that of their indices, on every device and in every run."""
     splats = Splats(60)
     splats.means[:, 2] = 3.0
     readings = compare_splat(splats, device, ties=True)
-    runs = [rasterize(*splats.float32(device), splats.width, splats.height).image for _ in range(2)]
+    runs = [splats.draw(device).image for _ in range(2)]
     return [*readings, count("numbers that differ between two runs", (runs[0] != runs[1]).sum())]
 
 
-def _radiance(low: float, high: float) -> callable:
-    def measure(device):
-        splats = Splats(50)
-        exponents = torch.linspace(math.log10(low), math.log10(high), 50, dtype=torch.float64)
-        order = torch.randperm(50, generator=torch.Generator().manual_seed(1))
-        splats.features[:] = 10.0 ** exponents[order][:, None]
-        return compare_splat(splats, device)
-
-    return measure
-
-
 def _dim_before_bright(device):
-    """Sixteen decades within a pixel: the dim Gaussians' own gradients, with a light 1e16 times brighter behind."""
+    """The dim Gaussians' own gradients, with a light 1e16 times brighter behind, and without."""
     splats = Splats(30, spread=0.8)
     splats.opacities *= 0.4
-    splats.features[:] = 1e-8
-    splats.features[splats.means[:, 2].argmax()] = 1e8
-    readings = compare_splat(splats, device)
-    # Without the light: the dim ones alone carry the image.
-    splats.features[splats.means[:, 2].argmax()] = 1e-8
-    return readings + [Reading(f"{r.quantity}, dim alone", r.error, r.bound) for r in compare_splat(splats, device)]
+    light, readings = splats.means[:, 2].argmax(), []
+    for bright, label in ((1e8, "{}"), (1e-8, "{}, dim alone")):
+        splats.features[:] = 1e-8
+        splats.features[light] = bright
+        readings += compare_splat(splats, device, label=label)
+    return readings
 
 
 def _sizes(device):
-    """1 x 1, odd sizes, one pixel beyond a tile, and a line of pixels."""
     readings = []
     for width, height in ((1, 1), (17, 33), (15, 1), (1, 50)):
-        splats = Splats(30, width, height)
-        readings += [
-            Reading(f"{r.quantity} {width} x {height}", r.error, r.bound) for r in compare_splat(splats, device)
-        ]
+        readings += compare_splat(Splats(30, width, height), device, label=f"{{}} {width} x {height}")
     return readings
 
 
@@ -130,16 +201,15 @@ def _quaternions(device):
     for length in (1e-12, 1e-6, 1e6, 1e15):
         splats = Splats(20)
         splats.quaternions *= length / splats.quaternions.norm(dim=1, keepdim=True)
-        readings += [Reading(f"{r.quantity} at {length:g}", r.error, r.bound) for r in compare_splat(splats, device)]
-    splats = Splats(20)
+        readings += compare_splat(splats, device, label=f"{{}} at {length:g}")
     splats.quaternions[:] = 0.0
-    zero = rasterize(*splats.float32(device), splats.width, splats.height).image
+    zero = splats.draw(device).image
     splats.quaternions[:, 0] = 1.0
-    one = rasterize(*splats.float32(device), splats.width, splats.height).image
-    return [*readings, count("numbers in which zero differs from the identity", (zero != one).sum())]
+    wrong = (zero != splats.draw(device).image).sum()
+    return [*readings, count("numbers in which zero differs from the identity", wrong)]
 
 
-def _far(distance: float) -> callable:
+def _far(distance: float):
     """Places in the image, in pixels, of a scene far from the origin before a camera that is turned."""
 
     def measure(device):
@@ -149,88 +219,130 @@ def _far(distance: float) -> callable:
         offset = torch.tensor([distance, -0.7 * distance, 0.4 * distance], dtype=torch.float64)
         splats.means = ((splats.means + offset) @ turn).float().double()
         splats.world_to_camera[:3, :3], splats.world_to_camera[:3, 3] = turn.float().double(), -offset.float().double()
-        tensors = splats.float32(device)
-        rendering = rasterize(*tensors, splats.width, splats.height)
-        exact = [tensor.double().cpu() for tensor in tensors]
+        rendering = splats.draw(device)
+        exact = [tensor.double().cpu() for tensor in splats.float32(device)]
         truth = rasterize_reference(*exact, splats.width, splats.height)
         both = rendering.visible.cpu() & truth.visible
         error = (rendering.means2d.cpu().double() - truth.means2d)[both].norm(dim=1).max()
         nearest, focal = float(truth.depths[both].min()), float(splats.intrinsics[0])
         # Each coordinate before the camera is a sum of four numbers as large as the distance.
         bound = 4 * math.sqrt(3) * UNIT * 1.3 * distance * focal / nearest
-        return [Reading("centres, pixels", float(error), bound), count("not finite", not_finite(rendering.image))]
+        return [Reading("centers, pixels", float(error), bound), count("not finite", not_finite(rendering.image))]
 
     return measure
 
 
-def _far_tiny(device):
-    """Far before the camera rather than far from the origin: 1e6 units away and as large."""
-    splats = Splats(30)
-    splats.means *= 1e6
-    splats.log_scales += math.log(1e6)
-    return compare_splat(splats, device)
-
-
 def _harmonics(device):
-    """Degree 3 from all around, from 1e-6 to 1e6 units away; and at the very place of the camera, which is finite."""
+    """Degree 3 from all around; and at the very place of the camera, which is finite."""
     generator = torch.Generator().manual_seed(3)
     offsets = torch.randn(60, 3, generator=generator, dtype=torch.float64)
     offsets *= torch.logspace(-6, 6, 60, dtype=torch.float64)[:, None]
     coefficients = torch.randn(60, 16, 3, generator=generator, dtype=torch.float64)
     position = torch.zeros(3, dtype=torch.float64)
     tensors = {"coefficients": coefficients, "means": offsets, "camera_position": position}
-
-    def evaluate(coefficients, means, position):
-        return {"values": spherical_harmonics(3, coefficients, means, position)}
-
-    readings = compare(evaluate, lambda disturb, *t: evaluate(*t), tensors, device, gradients=("coefficients", "means"))
+    given = {"gradients": ("coefficients", "means")}
+    readings = compare_alike(lambda *t: {"values": spherical_harmonics(3, *t)}, tensors, device, **given)
     at_camera = [t.to(device, torch.float32).requires_grad_() for t in (coefficients[:1], torch.zeros(1, 3), position)]
     value = spherical_harmonics(3, *at_camera)
     value.sum().backward()
     return [*readings, count("not finite at the camera", not_finite(value, *(t.grad for t in at_camera)))]
 
 
-CASES = (
-    Case("scale-tiny", SPLATS, "standard deviations from 1e-7", _scaled([1e-7, 2e-7, 5e-7])),
-    Case(
-        "scale-huge",
-        SPLATS,
-        "standard deviations from 1e4: each covers the image",
-        _scaled([1e4, 2e4, 5e4]),
-        note="a Gaussian wider than about 4e9 pixels overflows the determinant and is culled",
-    ),
-    Case("scale-mixed", SPLATS, "standard deviations from 1e-7 to 1e4 in one image", _mixed_scales),
-    Case(
-        "needle",
-        SPLATS,
-        "needles, 1e6 times longer than thick",
-        _scaled([1e1, 1e-5, 1e-5]),
-        note="the conic's three terms cancel along a needle: error grows with the square of the distance in pixels",
-    ),
-    Case("disc", SPLATS, "discs, 1e6 times wider than thick", _scaled([1e1, 1e1, 1e-5])),
-    Case("near-plane", SPLATS, "at, before and behind the near plane", _near_plane),
-    Case("border", SPLATS, "centres on and beyond the image's borders", _border),
-    Case("subpixel", SPLATS, "a thousandth of a pixel wide", _scaled([1e-4, 2e-5, 5e-5])),
-    Case("opacity", SPLATS, "opacity 0, 1/255, 0.999, 1 and next to them", _opacity),
-    Case("overlap-100k", SPLATS, "10^5 Gaussians in one tile, all counted", _overlap(100_000, 5e-5, 1e-6), quick=False),
-    Case(
-        "overlap-opaque", SPLATS, "10^4 Gaussians in one tile, finished early", _overlap(10_000, 0.02, ALPHA_THRESHOLD)
-    ),
-    Case("equal-depths", SPLATS, "60 Gaussians at one depth", _equal_depths),
-    Case("radiance-dark", SPLATS, "radiance from 1e-12 to 1e-8", _radiance(1e-12, 1e-8)),
-    Case("radiance-bright", SPLATS, "radiance from 1e5 to 1e9", _radiance(1e5, 1e9)),
-    Case("radiance-range", SPLATS, "radiance from 1e-12 to 1e9 in one image", _radiance(1e-12, 1e9)),
-    Case("decades", SPLATS, "16 decades of radiance within a pixel", _dim_before_bright),
-    Case("image-sizes", SPLATS, "images of 1 x 1 and of odd size", _sizes),
-    Case("quaternions", SPLATS, "unnormalised, zero and huge quaternions", _quaternions),
-    Case("far-1e3", SPLATS, "scene and camera 1e3 units from the origin", _far(1e3)),
-    Case(
-        "far-1e6",
-        SPLATS,
-        "scene and camera 1e6 units from the origin",
-        _far(1e6),
-        note="float32 places are 0.06 units apart there: move the scene to the origin before training",
-    ),
-    Case("far-away", SPLATS, "1e6 units before the camera, and as large", _far_tiny),
-    Case("harmonics", SPLATS, "spherical harmonics from 1e-6 to 1e6 units, and at the camera", _harmonics),
+def _poisoned_gaussians(device):
+    """One poisoned number of one Gaussian at a time: it is drawn rightly or culled, and the others do not notice."""
+    leaked = gradients = changed = 0
+    others = torch.arange(12, device=device) != 5
+    for which, name in enumerate(NAMES[:5]):
+        for value in POISON:
+            splats = Splats(12, 20, 18)
+            tensors = splats.float32(device)
+            tensors[which].view(12, -1)[5, 0] = value
+            leaves = [tensor.clone().requires_grad_() for tensor in tensors]
+            rendering = rasterize(*leaves, splats.width, splats.height)
+            (rendering.image.sum() + rendering.alpha.sum()).backward()
+            # A feature near float32's limit may overflow in the pixels that show it; nothing else may.
+            if not (name == "features" and math.isfinite(value)):
+                leaked += not_finite(rendering.image, rendering.alpha)
+                gradients += sum(not_finite(leaf.grad[others]) for leaf in leaves[:5])
+            if not bool(rendering.visible[5]):
+                kept = [tensor[others] for tensor in tensors[:5]]
+                without = rasterize(*kept, *tensors[5:], splats.width, splats.height)
+                changed += int((without.image != rendering.image).sum())
+    return [
+        count("pixels not finite", leaked),
+        count("gradients of others not finite", gradients),
+        count("pixels changed by a culled Gaussian", changed),
+    ]
+
+
+def _poisoned_camera(device):
+    """A camera that is not finite shows nothing; a huge one shows nothing that is not finite."""
+    wrong = 0
+    for which in (5, 6):
+        for value in POISON:
+            for at in range(4):
+                splats = Splats(12, 20, 18)
+                tensors = splats.float32(device)
+                tensors[which].view(-1)[at] = value
+                rendering = rasterize(*tensors, splats.width, splats.height)
+                wrong += not_finite(rendering.image, rendering.alpha)
+                wrong += 0 if math.isfinite(value) else int(rendering.image.count_nonzero())
+    return [count("pixels shown or not finite", wrong)]
+
+
+def _poisoned_others(device):
+    """NaN stays with its own row or window."""
+    generator = torch.Generator().manual_seed(0)
+    coefficients = torch.randn(8, 16, 3, generator=generator).to(device)
+    means = torch.randn(8, 3, generator=generator).to(device)
+    rows = pixels = 0
+    for value in POISON:
+        for poisoned in (0, 1):
+            given = [coefficients.clone(), means.clone()]
+            given[poisoned][3].view(-1)[0] = value
+            result = spherical_harmonics(3, *given, torch.zeros(3, device=device))
+            rows += not_finite(torch.cat([result[:3], result[4:]]))
+        image = torch.rand(30, 30, 3, generator=generator).to(device)
+        spoiled = image.clone()
+        spoiled[4, 4, 0] = value
+        similarity = ssim_map(spoiled, image)
+        # The window reaches five pixels.
+        pixels += not_finite(similarity[10:], similarity[:, 10:], similarity[..., 1:])
+    return [
+        count("other rows of harmonics not finite", rows),
+        count("similarity not finite beyond the window", pixels),
+    ]
+
+
+SPLAT_CASES = (
+    Case("scale-tiny", "standard deviations from 1e-7", _scaled(1e-7, 2e-7, 5e-7)),
+    Case("scale-huge", "standard deviations from 1e4: each covers the image", _scaled(1e4, 2e4, 5e4),
+         note="a Gaussian wider than about 4e9 pixels overflows the determinant and is culled"),
+    Case("scale-mixed", "standard deviations from 1e-7 to 1e4 in one image", _changed(60, _mix_scales)),
+    Case("needle", "needles, 1e6 times longer than thick", _scaled(1e1, 1e-5, 1e-5),
+         note="the conic's three terms cancel along a needle: error grows with the square of the distance in pixels"),
+    Case("disc", "discs, 1e6 times wider than thick", _scaled(1e1, 1e1, 1e-5)),
+    Case("near-plane", "at, before and behind the near plane", _near_plane),
+    Case("border", "centers on and beyond the image's borders", _border),
+    Case("subpixel", "a thousandth of a pixel wide", _scaled(1e-4, 2e-5, 5e-5)),
+    Case("opacity", "opacity 0, 1/255, 0.999, 1 and next to them", _changed(12, _near_threshold)),
+    Case("overlap-100k", "10^5 Gaussians in one tile, all counted", _overlap(100_000, 5e-5, 1e-6), quick=False),
+    Case("overlap-opaque", "10^4 Gaussians in one tile, finished early", _overlap(10_000, 0.02, ALPHA_THRESHOLD)),
+    Case("equal-depths", "60 Gaussians at one depth", _equal_depths),
+    Case("radiance-dark", "radiance from 1e-12 to 1e-8", _radiance(1e-12, 1e-8)),
+    Case("radiance-bright", "radiance from 1e5 to 1e9", _radiance(1e5, 1e9)),
+    Case("radiance-range", "radiance from 1e-12 to 1e9 in one image", _radiance(1e-12, 1e9)),
+    Case("decades", "16 decades of radiance within a pixel", _dim_before_bright),
+    Case("image-sizes", "images of 1 x 1 and of odd size", _sizes),
+    Case("quaternions", "unnormalized, zero and huge quaternions", _quaternions),
+    Case("far-1e3", "scene and camera 1e3 units from the origin", _far(1e3)),
+    Case("far-1e6", "scene and camera 1e6 units from the origin", _far(1e6),
+         note="float32 places are 0.06 units apart there: move the scene to the origin before training"),
+    Case("far-away", "1e6 units before the camera, and as large", _changed(30, _move_away)),
+    Case("harmonics", "spherical harmonics from 1e-6 to 1e6 units, and at the camera", _harmonics),
+)  # fmt: skip
+POISON_CASES = (
+    Case("poison-gaussians", "NaN, infinite, huge and denormal numbers in Gaussians", _poisoned_gaussians),
+    Case("poison-camera", "the same in the camera", _poisoned_camera),
+    Case("poison-others", "the same in harmonics and similarity", _poisoned_others),
 )

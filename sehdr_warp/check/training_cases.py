@@ -1,11 +1,15 @@
 """The catalogue's training: where it diverges, what the guards do, and what resets and clipped batches do to it."""
 
 import math
+from functools import cache
 
 import numpy as np
 import torch
 
+from ..field.gaussians import Gaussians
+from ..field.radiance_field import RadianceField
 from ..response import response_by_name
+from ..scene import Camera, Scene, View, codes_of, look_at
 from ..training.config import Config
 from ..training.config_files import load_config
 from ..training.initialization import make_field
@@ -13,24 +17,51 @@ from ..training.losses import data_loss, regularised
 from ..training.targets import training_views
 from ..training.trainer import Trainer
 from .case import Case, Reading, count, not_finite
-from .toy import EXPOSURE_TIME, toy_field, toy_scene
 
-TRAINING = "training"
 STEPS = 40
+SIZE, VIEWS, EXPOSURE_TIME = 32, 6, 0.25
+RATES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics_dc", "harmonics_rest")
 
 
-def _config(**changes) -> Config:
-    """A short training; changes: dotted fields with __ for the dot."""
-    overrides = {name.replace("__", "."): value for name, value in changes.items()}
-    # Without changes of the Gaussians, their number or their places.
-    still = {"densification.start": 30_000, "densification.noise": 0.0}
-    given = {"schedule.iterations": STEPS, "schedule.harmonics_every": 30_000, "schedule.evaluate_at": [30_000]}
-    return load_config("default", given | still | {"seed": 1} | overrides)
+def toy_field(device="cpu", base_time: float = EXPOSURE_TIME) -> RadianceField:
+    """A cloud of 60 blobs whose exposures span four stops."""
+    generator = torch.Generator().manual_seed(3)
+    points = torch.rand(60, 3, generator=generator) * 2 - 1
+    logs = torch.rand(60, 3, generator=generator) * 3.3 - 3.0
+    gaussians = Gaussians.from_points(points, logs, 0, opacity=0.9, scale=0.6)
+    return RadianceField(gaussians, response_by_name("srgb"), base_time=base_time).to(device)
 
 
-def _trainer(device, clipped: float = 0.0, **changes) -> Trainer:
-    scene, config = toy_scene(clipped), _config(**changes)
+@cache
+def toy_scene(clipped: float = 0.0) -> Scene:
+    """8-bit photos of toy_field() from a circle around it. clipped: this share of each photo's rows is white."""
+    field, views = toy_field(), []
+    for index in range(VIEWS):
+        angle = 2 * np.pi * index / VIEWS
+        pose = look_at([4 * np.cos(angle), 4 * np.sin(angle), 0.8])
+        camera = Camera(SIZE, SIZE, 1.2 * SIZE, 1.2 * SIZE, SIZE / 2, SIZE / 2, pose)
+        codes = codes_of(field.render_ldr(camera).numpy(), 8)
+        codes[: round(clipped * SIZE)] = 255
+        views.append(View(f"v_{index}", codes, camera, EXPOSURE_TIME, "train"))
+    points = field.gaussians.means.detach().numpy().astype(np.float64)
+    return Scene("toy", "transforms", tuple(views), points, np.full((len(points), 3), 0.5, np.float32))
+
+
+def _trainer(device, clipped: float = 0.0, **rates: float) -> Trainer:
+    """A short training that neither adds nor moves Gaussians by itself."""
+    still = {"densification.stop": 0, "densification.noise": 0.0, "schedule.harmonics_every": 30_000}
+    fixed = {"schedule.iterations": STEPS, "seed": 1} | still
+    config = load_config("default", fixed | {f"optimizer.{name}": rate for name, rate in rates.items()})
+    scene = toy_scene(clipped)
     return Trainer(scene, config, make_field(scene, config, response_by_name("srgb"), device))
+
+
+def _losses(trainer: Trainer, steps: int) -> list[float]:
+    losses = []
+    for _ in range(steps):
+        trainer.step()
+        losses.append(trainer.loss)
+    return losses
 
 
 def _state_not_finite(trainer: Trainer) -> int:
@@ -41,37 +72,23 @@ def _learning_rates(device):
     """All learning rates times 1, 10, 100 and 1000: the loss relative to the start's, and what stays finite."""
     readings = []
     for factor in (1, 10, 100, 1000):
-        rates = {
-            f"optimizer__{name}": min(1.0, getattr(Config().optimizer, name) * factor)
-            for name in ("means", "log_scales", "quaternions", "opacity_logits", "harmonics_dc", "harmonics_rest")
-        }
-        trainer = _trainer(device, **rates)
-        trainer.step()
-        first = trainer.loss
-        losses = []
-        while trainer.iteration < STEPS:
-            trainer.step()
-            losses.append(trainer.loss)
+        trainer = _trainer(device, **{name: min(1.0, getattr(Config().optimizer, name) * factor) for name in RATES})
+        losses = _losses(trainer, STEPS)
         readings.append(count(f"rates x {factor}: numbers of the state not finite", _state_not_finite(trainer)))
         # At its own rates a training must descend. Far above, the loss of encoded values must stay bounded.
-        last = float(np.mean(losses[-8:])) / first
+        last = float(np.mean(losses[-8:])) / losses[0]
         readings.append(Reading(f"rates x {factor}: last loss / first", last, 0.8 if factor == 1 else 3.0))
     return readings
 
 
 def _gradient_norms(device):
-    """The norm of each loss term's gradient by each parameter: finite, and none drowns the photo's by 1e4."""
+    """Finite, and none drowns the photo's by 1e4."""
     field = _trainer(device).field
     view = training_views(toy_scene().train_views, field.base_time, device, truth=False)[0]
-    plain = {"loss.ssim_weight": 0.0}
-    terms = {
-        "L1": plain,
-        "L1 and SSIM": {},
-        "opacity": plain | {"loss.opacity_weight": 0.01},
-    }
+    terms = {"L1": (0.0, 0.0), "L1 and SSIM": (0.2, 0.0), "opacity": (0.0, 0.01)}
     norms, broken = {}, 0
-    for name, changes in terms.items():
-        config = load_config("default", changes).loss
+    for name, (ssim, opacity) in terms.items():
+        config = load_config("default", {"loss.ssim_weight": ssim, "loss.opacity_weight": opacity}).loss
         photo = field.photograph(view.camera, view.exposure_time)
         field.zero_grad(set_to_none=True)
         regularised(data_loss(field, photo, view.target, config), field, config).backward()
@@ -83,37 +100,28 @@ def _gradient_norms(device):
 
 
 def _scale_ambiguity(device):
-    """Exposure and radiance appear only as a product: the photo of radiance k at time t / k is the photo at t.
+    """The photo of radiance k at time t / k is the photo at t.
 
     With a fixed response that direction is exactly flat; a free response would add its own. The base time takes it out:
-    colours are exposures at that time.
+    colors are exposures at that time.
     """
-    readings = []
-    for factor in (2.0**-20, 1e-3, 1e3, 2.0**20):
-        photos = []
-        for scale in (1.0, factor):
-            field = toy_field(device, EXPOSURE_TIME * scale)
-            camera = toy_scene().train_views[0].camera
-            photos.append(field.render_ldr(camera, EXPOSURE_TIME * scale).double())
-        error = float((photos[0] - photos[1]).abs().max())
-        readings.append(Reading(f"photo at base time x {factor:.3g}", error, 2.0**-22))
+    readings, camera = [], toy_scene().train_views[0].camera
+    times = [EXPOSURE_TIME * factor for factor in (1.0, 2.0**-20, 1e-3, 1e3, 2.0**20)]
+    photos = [toy_field(device, time).render_ldr(camera, time).double() for time in times]
+    for time, photo in zip(times[1:], photos[1:], strict=True):
+        error = float((photos[0] - photo).abs().max())
+        readings.append(Reading(f"photo at base time x {time / EXPOSURE_TIME:.3g}", error, 2.0**-22))
     return readings
 
 
 def _opacity_reset(device):
     """The steps after a reset of all opacities to 0.01: finite, and the loss is back within twice its value before."""
     trainer = _trainer(device)
-    while trainer.iteration < STEPS // 2:
-        trainer.step()
-    before = trainer.loss
+    before = _losses(trainer, STEPS // 2)[-1]
     with torch.no_grad():
-        low = math.log(0.01 / 0.99)
-        trainer.field.gaussians.opacity_logits.clamp_(max=low)
+        trainer.field.gaussians.opacity_logits.clamp_(max=math.log(0.01 / 0.99))
         trainer.field.gaussians.forget("opacity_logits", slice(None), trainer.optimizer)
-    losses = []
-    for _ in range(60):
-        trainer.step()
-        losses.append(trainer.loss)
+    losses = _losses(trainer, 60)
     return [
         count("steps skipped", trainer.skipped_steps),
         count("numbers of the state not finite", _state_not_finite(trainer)),
@@ -123,12 +131,11 @@ def _opacity_reset(device):
 
 
 def _clipped_batches(device):
-    """Photos of which a half and all but one row are clipped: no step is lost, and nothing runs away."""
+    """No step is lost, and nothing runs away."""
     readings = []
     for share in (0.5, 0.97):
         trainer = _trainer(device, clipped=share)
-        while trainer.iteration < STEPS:
-            trainer.step()
+        _losses(trainer, STEPS)
         brightest = float(trainer.field.gaussians.harmonics_dc.detach().abs().max())
         readings += [
             count(f"{share:.0%} clipped: steps skipped", trainer.skipped_steps),
@@ -143,17 +150,18 @@ def _guard(device):
     """A step whose gradient is NaN changes nothing; the next one goes on."""
     trainer = _trainer(device)
     trainer.step()
-    before = {name: tensor.clone() for name, tensor in trainer.field.gaussians.tensors().items()}
-    hook = trainer.field.gaussians.means.register_hook(lambda gradient: gradient * math.nan)
+    gaussians = trainer.field.gaussians
+    before = {name: tensor.clone() for name, tensor in gaussians.tensors().items()}
+    hook = gaussians.means.register_hook(lambda gradient: gradient * math.nan)
     trainer.step()
     hook.remove()
     if trainer._recorder is not None:
         trainer._recorder.invalidate()  # the hook is in the recording
-    after = {name: tensor.clone() for name, tensor in trainer.field.gaussians.tensors().items()}
-    changed = sum(int((before[name] != after[name]).sum()) for name in before)
+    after = {name: tensor.clone() for name, tensor in gaussians.tensors().items()}
     skipped = trainer.skipped_steps
     trainer.step()
-    moved = int((after["means"] != trainer.field.gaussians.means).sum())
+    moved = int((after["means"] != gaussians.means).sum())
+    changed = sum(int((before[name] != after[name]).sum()) for name in before)
     return [
         count("numbers changed by a step that is not finite", changed),
         count("such steps not counted", abs(1 - skipped)),
@@ -161,11 +169,11 @@ def _guard(device):
     ]
 
 
-CASES = (
-    Case("learning-rates", TRAINING, "learning rates up to 1000 times the default", _learning_rates, quick=False),
-    Case("gradient-norms", TRAINING, "gradient norms of the loss's terms", _gradient_norms),
-    Case("scale-ambiguity", TRAINING, "radiance and exposure known only as a product", _scale_ambiguity),
-    Case("opacity-reset", TRAINING, "the steps after opacities are reset", _opacity_reset, quick=False),
-    Case("clipped-batches", TRAINING, "photos half clipped, and all but one row", _clipped_batches, quick=False),
-    Case("guard", TRAINING, "a step that is not finite", _guard),
+TRAINING_CASES = (
+    Case("learning-rates", "learning rates up to 1000 times the default", _learning_rates, quick=False),
+    Case("gradient-norms", "gradient norms of the loss's terms", _gradient_norms),
+    Case("scale-ambiguity", "radiance and exposure known only as a product", _scale_ambiguity),
+    Case("opacity-reset", "the steps after opacities are reset", _opacity_reset, quick=False),
+    Case("clipped-batches", "photos half clipped, and all but one row", _clipped_batches, quick=False),
+    Case("guard", "a step that is not finite", _guard),
 )

@@ -4,6 +4,7 @@ Every colour set that a step needs is a group of three channels of one rasterisa
 sorted and blended once.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -81,6 +82,7 @@ class RadianceField(nn.Module):
 
     base_time: dt_1, seconds. Colours are exposures x = E dt_1 (the paper's c^{l_1}), so that their size, and with it
         the learning rates, does not depend on the unit of time.
+    rasterizer: rasterize(), or what takes its arguments in its place.
     radiance: "log": x = exp(SH(d)); "linear": x = SH(d), kept positive; "display": encoded = max(SH(d) + 0.5, 0).
     tone_map: "pixel": f(sum of weighted x); "gaussian": sum of weighted f(x), as the paper composites.
     fusion: the paper's brackets and their fusion, at the same base time; without, the HDR colour is the base colour.
@@ -94,6 +96,7 @@ class RadianceField(nn.Module):
         response: Response,
         *,
         base_time: float,
+        rasterizer: Callable[..., Rendering] = rasterize,
         radiance: str = "log",
         tone_map: str = "pixel",
         fusion: NeuralExposureFusion | None = None,
@@ -105,6 +108,7 @@ class RadianceField(nn.Module):
         self.fusion = fusion
         self.response = response
         self.base_time = base_time
+        self.rasterizer = rasterizer
         self.radiance = radiance
         self.tone_map = tone_map
         self.antialiased = antialiased
@@ -231,7 +235,7 @@ class RadianceField(nn.Module):
 
     def _rasterize(self, camera: CameraTensors, features: Tensor, capacity: int | None = None) -> Rendering:
         gaussians = self.gaussians
-        return rasterize(
+        return self.rasterizer(
             gaussians.means,
             gaussians.log_scales,
             gaussians.quaternions,

@@ -1,118 +1,131 @@
-"""`sehdr-warp bench` from the command line, at sizes that take seconds."""
+"""`sehdr-warp bench kernels`, `step`, `scale` and `training`, at sizes that take seconds."""
 
 import json
+import sys
+import time
+from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from sehdr_warp.bench import kernels, step, training
-from sehdr_warp.bench.checks import require
-from sehdr_warp.bench.splats import Size
-from sehdr_warp.bench.training import bench_training, plain_config
+from sehdr_warp.bench import gsplat_peer, kernels, scale, step
+from sehdr_warp.bench.results import finish
+from sehdr_warp.bench.splats import Size, make_splat_scene, parse_size
+from sehdr_warp.bench.timing import Variant, peak_memory, time_variants
+from sehdr_warp.bench.training import bench_training
 from sehdr_warp.errors import SehdrError
+from sehdr_warp.splatting import rasterize
 
-from ..refusals import call
+from ..refusals import call, refused
 from ..training.toy import toy_scene
 
 KERNELS = ["bench", "kernels", "--device", "cpu", "--sizes", "200@40x33", "--repetitions", "3", "--budget", "1"]
 CPU = torch.device("cpu")
+BRIEF = {"repetitions": 1, "budget": 0.01}
 
 
 def test_kernels_report_times_checks_and_machine(tmp_path, capsys):
-    assert call(*KERNELS, "--channels", "3,4", "--peers", "--json", tmp_path / "a.json", "--out", tmp_path / "out") == 0
-    report = json.loads((tmp_path / "a.json").read_text())
-    assert report == json.loads((tmp_path / "out" / "kernels.json").read_text())
-    assert (tmp_path / "out" / "kernels.png").read_bytes()[:4] == b"\x89PNG"
-    table = capsys.readouterr().out
-    assert table.strip() == (tmp_path / "out" / "kernels.md").read_text().strip()
-    assert "gsplat not compared: it needs CUDA" in table
-    assert (report["schema"], report["benchmark"]) == (1, "kernels")
+    assert call(*KERNELS, "--channels", "3,4", "--peers", "--json", tmp_path / "a.json") == 0
+    result = json.loads((tmp_path / "a.json").read_text())
+    assert (result["schema"], result["benchmark"]) == (2, "kernels")
     # The installed metadata may leave out the build that torch names, such as +cu130.
-    assert torch.__version__.startswith(report["machine"]["versions"]["torch"].split("+")[0])
-    splats = [row for row in report["rows"] if row["stage"] == "splat"]
-    assert {(row["channels"], row["pass"], row["implementation"]) for row in splats} == {
+    assert torch.__version__.startswith(result["machine"]["versions"]["torch"].split("+")[0])
+    table = capsys.readouterr().out
+    assert "gsplat not compared: it needs CUDA" in table and "| rasterizer " in table
+    assert {(row["channels"], row["pass"], row["implementation"]) for row in result["rows"]} == {
         (channels, passes, name)
         for channels in (3, 4)
         for passes in ("forward", "forward + backward")
         for name in ("sehdr-warp", "plain torch")
     }
-    assert all(row["median_ms"] > 0 and row["repetitions"] == 3 for row in report["rows"])
-    assert all(row["peak_memory_bytes"] >= 40 * 33 * row["channels"] * 4 for row in splats)
-    ratios = [row for row in splats if row["implementation"] == "plain torch" and row["ours_over_this"] > 0]
-    assert len(ratios) == 4
-    # Plain torch and ours: image and five gradients, for two channel counts.
-    assert len(report["checks"]) == 2 * 2 * 6
-    assert all(check["passed"] and check["difference"] < 1e-4 for check in report["checks"])
+    assert all(row["median_ms"] > 0 and row["repetitions"] == 3 for row in result["rows"])
+    assert all(row["peak_memory_bytes"] >= 40 * 33 * row["channels"] * 4 for row in result["rows"])
+    # Image and five gradients, for two channel counts.
+    assert len(result["checks"]) == 2 * 6
+    assert all(check["passed"] and check["difference"] < 1e-4 for check in result["checks"])
 
 
-def test_a_wrong_image_is_reported_and_fails(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("gradient", [False, True])
+def test_what_is_wrong_is_written_and_fails(gradient, tmp_path, monkeypatch, capsys):
     right = kernels.rasterize
 
-    def wrong(*arguments, **options):
-        rendering = right(*arguments, **options)
+    def wrong(means, log_scales, *rest, **options):
+        if gradient:
+            return right(means, 1.01 * log_scales - 0.01 * log_scales.detach(), *rest, **options)
+        rendering = right(means, log_scales, *rest, **options)
         return type(rendering)(**{**vars(rendering), "image": rendering.image * 1.001})
 
     monkeypatch.setattr(kernels, "rasterize", wrong)
     assert call(*KERNELS, "--channels", "3", "--json", tmp_path / "a.json") == 1
     error = capsys.readouterr().err.strip().splitlines()[-1]
-    assert "correctness checks failed" in error
-    assert "sehdr-warp: image" in error
-    assert "do not use these times" in error
-    # What was measured is kept, with the checks that condemn it.
+    wanted = "gradient of log_scales" if gradient else "sehdr-warp: image"
+    assert wanted in error and "do not use these times" in error
     assert not all(check["passed"] for check in json.loads((tmp_path / "a.json").read_text())["checks"])
 
 
-def test_a_wrong_gradient_fails(monkeypatch):
-    right = kernels.rasterize
-
-    def wrong(means, log_scales, *rest, **options):
-        return right(means, 1.01 * log_scales - 0.01 * log_scales.detach(), *rest, **options)
-
-    monkeypatch.setattr(kernels, "rasterize", wrong)
-    report = kernels.bench_kernels([Size(200, 40, 33)], [3], CPU, repetitions=1, budget=0.1)
-    with pytest.raises(SehdrError, match="1 of 12 .* gradient of log_scales"):
-        require(report["checks"])
-
-
-def test_files_in_the_way_are_named_before_anything_is_measured(tmp_path, capsys):
+def test_arguments_that_do_not_fit_are_named_before_anything_is_measured(tmp_path, capfd):
     (tmp_path / "a.json").write_text("mine")
-    assert call(*KERNELS, "--json", tmp_path / "a.json") == 1
-    captured = capsys.readouterr()
-    assert "exists already" in captured.err
-    assert "ms" not in captured.out
-    assert (tmp_path / "a.json").read_text() == "mine"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
+    for arguments, message in (
+        (["--json", tmp_path / "a.json"], "exists already"),
         (["--channels", "3,x"], "--channels 3,x: not whole numbers from 1"),
-        (["--channels", "0"], "--channels 0: not whole numbers from 1"),
         (["--sizes", "9@9"], "size 9@9: not a size"),
         (["--repetitions", "0"], "--repetitions 0: not positive"),
-    ],
-)
-def test_arguments_that_do_not_fit_are_named(arguments, message, capsys):
-    assert call("bench", "kernels", "--device", "cpu", *arguments) == 1
-    assert message in capsys.readouterr().err
+    ):
+        assert message in refused(capfd, "bench", "kernels", "--device", "cpu", *arguments)
+    assert (tmp_path / "a.json").read_text() == "mine"
+    assert "'pixel' is none" in refused(capfd, "bench", "scale", "--device", "cpu", "--sweeps", "pixel")
+
+
+def test_sizes_are_read_and_reduced():
+    assert parse_size("20k@200x100") == Size(20_000, 200, 100)
+    assert parse_size("1M@1600x1200") == Size(1_000_000, 1600, 1200)
+    assert Size(8000, 240, 160).reduced(2000) == Size(2000, 120, 80)
+    for bad in ("tiny", "0@4x4", "5@4", "5@0x4", ""):
+        with pytest.raises(SehdrError, match="not a size"):
+            parse_size(bad)
+
+
+def test_variants_take_turns_and_slow_ones_run_less_often():
+    ran, seconds = [], {"fast": 0.0, "slow": 0.02}
+
+    def variant(name):
+        def run(prepared):
+            assert prepared == f"for {name}"
+            ran.append(name)
+            time.sleep(seconds[name])
+
+        return Variant(run, prepare=lambda: f"for {name}")
+
+    timings = time_variants({name: variant(name) for name in seconds}, CPU, repetitions=12, budget=0.11)
+    assert timings["fast"]["repetitions"] == 12
+    assert 3 <= timings["slow"]["repetitions"] <= 5 and timings["slow"]["median_ms"] >= 20
+    assert sum(a != b for a, b in pairwise(ran)) >= 5
+    assert timings["slow"]["min_ms"] <= timings["slow"]["median_ms"] <= timings["slow"]["p90_ms"]
+
+
+def test_peak_memory_counts_what_is_held_at_once():
+    def run(_):
+        for _ in range(3):
+            a = torch.empty(1_000_000, dtype=torch.float32)
+            b = torch.empty(500_000, dtype=torch.float32)
+            del a, b
+
+    assert peak_memory(Variant(run), CPU) == pytest.approx(6_000_000, rel=0.01)
 
 
 def test_step_times_whole_steps_and_checks_their_loss(tmp_path, capsys):
     command = ["bench", "step", "--device", "cpu", "--size", "400@40x32", "--repetitions", "3", "--budget", "1"]
-    assert call(*command, "--json", tmp_path / "a.json") == 0
-    report = json.loads((tmp_path / "a.json").read_text())
-    ours, plain = report["rows"]
+    assert call(*command, "--preset", "default", "--json", tmp_path / "a.json") == 0
+    result = json.loads((tmp_path / "a.json").read_text())
+    ours, plain = result["rows"]
     assert (ours["implementation"], plain["implementation"]) == ("sehdr-warp", "plain torch")
-    assert ours["gaussians"] == plain["gaussians"] == 400
+    assert ours["preset"] == "default" and ours["gaussians"] == plain["gaussians"] == 400
     assert plain["ours_over_this"] == pytest.approx(ours["median_ms"] / plain["median_ms"])
-    assert ours["densifications"] == 1
-    assert ours["amortised_steps"] == 100
-    assert ours["gaussians_after"] <= 441
-    # In the thick of a training: all degrees of the harmonics, and densification under way.
-    assert report["settings"]["first_iteration"] > 3000
-    assert [check["what"] for check in report["checks"]] == [
-        "sehdr-warp: loss of step 1",
-        f"sehdr-warp: loss of step {step.CHECKED_STEPS}",
+    assert ours["amortized_steps"] == 100 and ours["gaussians_after"] <= 441
+    assert [check["what"] for check in result["checks"]] == [
+        "default: loss of step 1",
+        f"default: loss of step {step.CHECKED_STEPS}",
     ]
     assert "with densification" in capsys.readouterr().out
 
@@ -124,62 +137,107 @@ def test_a_step_with_another_loss_fails(monkeypatch):
         return right(means, log_scales + 0.01, *rest, **options)
 
     monkeypatch.setattr(step, "rasterize_reference", other)
-    report = step.bench_step(Size(300, 40, 32), CPU, repetitions=1, budget=0.1)
+    result = step.bench_step(Size(300, 40, 32), CPU, presets=["default"], views=4, **BRIEF)
     with pytest.raises(SehdrError, match="loss of step 1"):
-        require(report["checks"])
+        finish(result, None, False, step.COLUMNS)
 
 
-def test_a_step_that_ignores_the_plain_rasterizer_is_refused():
-    with pytest.raises(SehdrError, match="ours with ours"), step.plain_torch_rasterizer():
-        pass
+def fake_gsplat(monkeypatch):
+    """gsplat's call, drawn by ours: what it is given and what it returns are as in gsplat 1.5."""
+
+    def rasterization(
+        means, quats, scales, opacities, colors, viewmats, matrix, width, height,
+        *, packed, rasterize_mode="classic", eps2d=0.3,
+    ):  # fmt: skip
+        matrix = matrix[0]
+        camera = torch.stack([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+        drawn = rasterize(
+            means, scales.log(), quats, opacities, colors, viewmats[0], camera, width, height,
+            antialiased=rasterize_mode == "antialiased", low_pass=eps2d,
+        )  # fmt: skip
+        radii = drawn.radii[None, :, None].expand(-1, -1, 2)
+        info = {"means2d": drawn.means2d[None], "radii": radii, "depths": drawn.depths[None]}
+        return drawn.image[None], drawn.alpha[None, ..., None], info
+
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
+    for module in (kernels, scale):
+        monkeypatch.setattr(module, "missing", lambda device: None)
 
 
-def test_training_keeps_3dgs_thresholds_whatever_its_length():
-    config = plain_config(2000, 0)
-    assert config.scaled(config.densification.start) == 500
-    assert config.scaled(config.densification.every) == 100
-    assert config.scaled(config.densification.reset_every) == 3000
-    assert config.scaled(config.schedule.harmonics_every) == 1000
-    assert config.model.radiance == "display"
-    assert config.loss.form == "blend"
+def test_gsplat_draws_what_we_draw(monkeypatch):
+    fake_gsplat(monkeypatch)
+    scene = make_splat_scene(Size(200, 50, 40), 4)
+    options = {"low_pass": 0.1, "antialiased": True}
+    ours, theirs = (
+        rasterize(*scene.arguments, **options),
+        gsplat_peer.rasterize_with_gsplat(*scene.arguments, **options),
+    )
+    torch.testing.assert_close(theirs.image, ours.image, rtol=1e-5, atol=1e-6)
+    assert torch.equal(theirs.visible, ours.visible)
+    gradients = [torch.autograd.grad(drawn.image.square().sum(), scene.leaves) for drawn in (ours, theirs)]
+    for mine, other in zip(*gradients, strict=True):
+        torch.testing.assert_close(other, mine, rtol=1e-3, atol=1e-3)
+    result = kernels.bench_kernels([Size(150, 40, 32)], [5], CPU, peers=True, **BRIEF)
+    assert {row["implementation"] for row in result["rows"]} == {"sehdr-warp", "gsplat", "plain torch"}
+    assert all(check["passed"] for check in result["checks"])
+    assert gsplat_peer.missing(CPU) == "gsplat not compared: it needs CUDA"
 
 
-def test_training_reports_quality_time_and_size(tmp_path):
-    report = bench_training(toy_scene(), CPU, iterations=30, out=tmp_path)
-    (row,) = report["rows"]
-    assert row["implementation"] == "sehdr-warp"
-    assert row["iterations"] == 30
-    assert row["gaussians"] == 60
-    assert 5 < row["psnr_ldr"] < 60
-    assert row["train_seconds"] > 0
-    assert row["peak_gpu_memory_bytes"] is None
-    assert report["notes"] == ["gsplat not compared: it needs CUDA"]
-    assert (tmp_path / "run" / "summary.json").exists()
+def test_scale_has_splats_steps_memory_slopes_and_gsplat(monkeypatch):
+    fake_gsplat(monkeypatch)
+    points = [scale.Point(Size(count, 48, 40)) for count in (200, 800)]
+    photos = [scale.Point(Size(200, 48, 40), photos=count) for count in (2, 3)]
+    monkeypatch.setattr(scale, "sweeps", lambda *_: {"gaussians": points, "photos": photos})
+    result = scale.bench_scale(["gaussians", "photos"], CPU, peers=True, **BRIEF)
+    rows = [(r["sweep"], r["varied"], r["implementation"], r["what"]) for r in result["rows"]]
+    both = ("sehdr-warp", "gsplat")
+    assert sorted(rows) == sorted(
+        [("gaussians", n, who, what) for n in (200, 800) for who in both for what in ("splat", "training step")]
+        + [("photos", n, who, "training step") for n in (2, 3) for who in both]
+    )
+    assert all(row["median_ms"] > 0 and row["peak_memory_bytes"] > 48 * 40 * 9 * 4 for row in result["rows"])
+    assert len(result["slopes"]) == 2 * 6 and result["notes"][-1] == scale.verdict(result["slopes"])
+    what = [check["what"] for check in result["checks"]]
+    assert what.count("gsplat: image") == 2 and what.count("gsplat: loss of the first step") == 4
+    assert all(check["passed"] for check in result["checks"])
+
+
+def test_a_quadratic_stage_is_found_and_a_linear_one_is_not():
+    def rows(what, times):
+        counts = (1000, 10_000, 100_000, 1_000_000)
+        fields = {"sweep": "gaussians", "implementation": "sehdr-warp", "what": what}
+        return [fields | {"varied": n, "min_ms": t} for n, t in zip(counts, times, strict=False)]
+
+    linear, quadratic = scale.fit_slopes(rows("linear", (5, 5, 40, 400)) + rows("quadratic", (1, 1, 100, 10_000)))
+    assert linear["slope_large"] == pytest.approx(0.9515, abs=1e-3)
+    assert (quadratic["slope"], quadratic["slope_large"]) == pytest.approx((1.4, 2.0))
+    assert scale.verdict([linear]).startswith("Nothing is quadratic: the steepest slope is 0.95 (time of the linear")
+    assert scale.verdict([linear, quadratic]) == (
+        "Steeper than linear at the large end: 2.00 (time of the quadratic over gaussians)."
+    )
+    assert "two points" in scale.verdict(scale.fit_slopes(rows("one", (1,))))
+
+
+def test_sweeps_ascend():
+    for device in ("cuda", "cpu"):
+        for small in (False, True):
+            for name, points in scale.sweeps(device, small).items():
+                varied = [point.varied(name) for point in points]
+                assert varied == sorted(set(varied)) and varied
 
 
 def test_training_puts_gsplat_beside_ours(monkeypatch):
-    calls = []
+    row, calls = {"psnr_ldr": 20.0, "train_seconds": 1.0, "gaussians": 7, "peak_memory_bytes": 5}, []
 
-    def fake(scene, config, device, *, resets=True, steps=None):
-        calls.append((resets, steps))
-        return {
-            "psnr_ldr": 20.0,
-            "train_seconds": 1.0,
-            "gaussians": 7,
-            "iterations": config.schedule.iterations,
-            "peak_gpu_memory_bytes": 5,
-        }
+    def fake(scene, config, device, steps=None):
+        calls.append(steps)
+        return row
 
-    peer = training.find_peers(CPU)[0] or [type("Peer", (), {"name": "gsplat", "version": "1.5.3"})]
-    monkeypatch.setattr(training, "find_peers", lambda device: (peer, []))
-    monkeypatch.setattr(training, "train_with_gsplat", fake)
-    report = bench_training(toy_scene(), CPU, iterations=5, released=True)
-    assert [row["implementation"] for row in report["rows"]] == ["sehdr-warp", "gsplat", "gsplat without resets"]
-    assert [row["iterations"] for row in report["rows"]] == [5, 5, 5]
-    # Each is warmed up before it is timed.
-    assert calls == [(True, 5), (True, None), (False, 5), (False, None)]
-
-
-def test_training_refuses_terms_that_are_not_equal():
-    with pytest.raises(SehdrError, match="has no points"):
-        bench_training(toy_scene(with_points=False), CPU, iterations=5)
+    monkeypatch.setattr("sehdr_warp.bench.training.train_with_gsplat", fake)
+    ours = bench_training(toy_scene(), CPU, iterations=20)
+    assert ours["notes"] == ["gsplat not compared: it needs CUDA"] and calls == []
+    assert ours["rows"][0]["iterations"] == 20 and 5 < ours["rows"][0]["psnr_ldr"] < 60
+    monkeypatch.setattr("sehdr_warp.bench.training.missing", lambda device: None)
+    both = bench_training(toy_scene(), CPU, iterations=5)
+    assert [row["implementation"] for row in both["rows"]] == ["sehdr-warp", "gsplat"]
+    assert calls == [40, None], "it is warmed up before it is timed"

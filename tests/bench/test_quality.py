@@ -1,123 +1,196 @@
-"""`bench quality` with real trainings, tiny ones: one from the command line, the rest in this process."""
+"""`bench quality`: jobs and keys, resuming, workers that fail or die, and one real training."""
 
 import json
-from dataclasses import replace
+import os
+import signal
+import sys
+from pathlib import Path
 
-import numpy as np
 import pytest
 
-from sehdr_warp.bench import quality_run
-from sehdr_warp.bench.methods import METHODS, choose_methods
-from sehdr_warp.bench.quality_jobs import Settings, plan_jobs
-from sehdr_warp.bench.quality_run import Runner, photos, seconds_to_final, without_training_truth
+from sehdr_warp.bench import quality
+from sehdr_warp.bench.jobs import FAILURE, FORMAT, RESULT, Job, choose_methods, plan_jobs, read_result
+from sehdr_warp.bench.quality import Runner, exposed, run_jobs, seconds_to_final
 from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.files import write_json
 
 from ..make_scenes import write_blender
-from ..refusals import call
+from ..refusals import call, refused
+
+FINE, DIVERGES, BREAKS, DIES = range(4)
+SMALL = ["bench", "quality", "--device", "cpu", "--max-size", "32", "--iterations", "12"]
 
 
-def job(*names, variants=(), **changes):
-    values = {"scenes": ("embedded",), "exposures": (3,), "iterations": (12,), "max_size": 32}
-    return plan_jobs(Settings(methods=tuple(choose_methods(names, variants)), **(values | changes)))[0]
+def jobs(methods=("default",), variants=(), **changes) -> list[Job]:
+    return plan_jobs(["embedded"], choose_methods(methods, variants), **{"iterations": 10} | changes)
 
 
-def test_the_command_line_trains_evaluates_and_never_repeats(tmp_path, capsys):
-    arguments = "--methods default --exposures 2 --iterations 12 --max-size 32 --device cpu --launcher process"
-    command = ["bench", "quality", "--out", tmp_path, *arguments.split()]
-    for finished in ("0 finished", "1 finished"):
-        status, said = call(*command), capsys.readouterr()
-        assert status == 0, said.err
-        assert finished in said.err and "| default" in said.out
-    (line,) = (json.loads(text) for text in (tmp_path / "results.jsonl").read_text().splitlines())
-    figures, curve = line["figures"], line["curve"]
-    assert figures["protocol"]["gt-max"]["psnr_mu"] > 5 and figures["response"] == "hdr-nerf"
-    assert figures["render_fps"] > 0 and figures["peak_memory_bytes"] > 1e7
-    assert curve[0]["iteration"] == 1 and curve[-1]["iteration"] == 12 and len(curve) >= 6
-    assert [test["seconds"] for test in curve] == sorted(test["seconds"] for test in curve)
-    assert 0 < figures["seconds_to_final"] <= figures["train_seconds"]
-    (folder,) = (tmp_path / "jobs").iterdir()
-    assert not (folder / "run").exists(), "models are kept only on request"
+def made_up(job: Job, psnr: float = 30.0) -> dict:
+    """A complete result with plausible figures."""
+    hdr = {"psnr_mu": psnr, "ssim_mu": 0.9, "lpips_mu": None}
+    figures = {
+        "protocol": {name: dict(hdr) for name in ("gt-max", "self-max", "aligned")},
+        "ldr": {"psnr": psnr + 1},
+        "regions": {
+            name: {"fraction": 0.3, "psnr_mu": {"aligned": psnr - 3}} for name in ("clipped", "well-exposed", "dark")
+        },
+        "confidence": {"spearman_log2": 0.6},
+        "response": "srgb",
+        **dict.fromkeys(("train_seconds", "seconds_to_final", "renders_per_second"), 2.0),
+        **dict.fromkeys(("peak_memory_bytes", "gaussians"), 5000),
+        "iterations": 10,
+    }
+    curve = [{"seconds": 1.0, "psnr_mu": psnr - 5}, {"seconds": 2.0, "psnr_mu": psnr}]
+    return {"format": FORMAT, "key": job.key, "shared_by": 1, "config": job.config, "figures": figures, "curve": curve}
 
 
-def test_photos_are_made_from_the_truth_at_the_jobs_exposure_and_judged_without_noise():
-    dark, bright = (photos(job("default", exposures=(place,), curves=("srgb",)))[0] for place in (1, 3))
-    assert bright.views[0].exposure_time == pytest.approx(16 * dark.views[0].exposure_time)
-    assert bright.views[0].image.mean() > dark.views[0].image.mean()
-    noisy, clean = photos(job("default", curves=("srgb",), noise=(500.0, 5.0)))
-    for taken, judged in zip(noisy.views, clean.views, strict=True):
-        assert np.array_equal(taken.image, judged.image) == (taken.split == "test")
-        assert np.array_equal(taken.hdr, judged.hdr)
+class StubRunner:
+    """Trainings that take no time: the seed says what becomes of a job."""
+
+    def __init__(self, *_, **__):
+        pass
+
+    def run(self, job, folder):
+        with open(folder.parent.parent / "ran.txt", "a") as file:
+            file.write(f"{job.config['seed']}\n")
+        if job.config["seed"] == DIVERGES:
+            raise SehdrError("iteration 7: not finite")
+        if job.config["seed"] == BREAKS:
+            raise RuntimeError("a defect")
+        if job.config["seed"] == DIES:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return made_up(job)
+
+
+def ran(out) -> list[int]:
+    path = out / "ran.txt"
+    return sorted(map(int, path.read_text().split())) if path.exists() else []
+
+
+def test_jobs_are_every_combination_and_their_keys_tell_them_apart():
+    changes = {"exposures": (0, 4), "responses": ("known", "blind"), "seeds": (0, 1)}
+    made = jobs(("default", "truth", "hdr-gs"), ["plain:default:loss.clipping=false,loss.ssim_weight=0.1"], **changes)
+    # The upper bound learns from truth and hdr-gs learns the curve: blind they would be the same trainings again.
+    assert len(made) == 2 * 2 * (2 + 1 + 1 + 2)
+    assert len({job.key for job in made}) == len({job.folder(Path()) for job in made}) == len(made)
+    for job in made:
+        config, training = job.config, job.config["training"]
+        told = {"known": "hdr-nerf", "blind": "auto"}.get(config["response"])
+        assert told is None or training["response"]["name"] == told
+        assert config["sees_truth"] == (config["method"] == "truth")
+        assert training["schedule"]["iterations"] == 10 and "schedule.iterations" in training["plan"]["keep"]
+        if config["method"] == "plain":
+            assert (training["loss"]["clipping"], training["loss"]["ssim_weight"]) == (False, 0.1)
+    assert jobs()[0].key == jobs()[0].key != jobs(max_size=40)[0].key
+    assert jobs(iterations=None)[0].config["training"]["schedule"]["iterations"] > 10
+
+
+def test_what_cannot_be_planned_is_named(capfd, tmp_path):
+    write_blender(tmp_path / "photos", 6)
+    for arguments, message in (
+        (["--methods", "nope"], "method 'nope' is unknown"),
+        (["--methods", "default,default", "--variant", "default:default:seed=1"], "asked for twice"),
+        (["--variant", "x:default"], "--variant x:default: not NAME:BASE"),
+        (["--exposures", "5"], "exposure 5 is not one of 0 to 4"),
+        (["--responses", "seen"], "response 'seen' is not one of known, blind"),
+        (["--methods", "truth", "--responses", "blind"], "none of the methods makes sense"),
+        (["--scenes", tmp_path / "nowhere"], "no such folder"),
+        (["--jobs", "0"], "--jobs 0: not positive"),
+        (["--slurm", "gpu"], "not name=value pairs"),
+    ):
+        line = refused(capfd, *SMALL, "--out", tmp_path / "out", *arguments)
+        assert message in line, line
+    asked = ["--scenes", tmp_path / "photos", "--methods", "default"]
+    assert call(*SMALL, "--out", tmp_path / "out", *asked) == 1
+    assert "1 of 1 jobs failed, the first with: " in (line := capfd.readouterr().err) and "no HDR truth" in line
+
+
+def test_finished_jobs_never_run_again_and_damaged_results_do(tmp_path, monkeypatch):
+    monkeypatch.setattr(quality, "Runner", StubRunner)
+    asked = jobs(seeds=(FINE, 7, 8))
+    assert [row["gt_max"] for row in run_jobs(asked, tmp_path, device="cpu")] == [30.0] * 3
+    folders = [job.folder(tmp_path) for job in asked]
+    whole = (folders[1] / RESULT).read_bytes()
+    (folders[1] / RESULT).write_bytes(whole[: len(whole) // 2])
+    (folders[2] / RESULT).write_text(json.dumps(json.loads((folders[2] / RESULT).read_text()) | {"key": "other"}))
+    assert [read_result(folder) is not None for folder in folders] == [True, False, False]
+    rows = run_jobs(asked, tmp_path, device="cpu")
+    assert ran(tmp_path) == [FINE, 7, 7, 8, 8] and not any("error" in row for row in rows)
+
+
+def test_a_job_that_fails_costs_itself_alone_and_is_tried_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(quality, "Runner", StubRunner)
+    asked = jobs(seeds=(DIVERGES, BREAKS, 7))
+    rows = run_jobs(asked, tmp_path, device="cpu")
+    assert [row.get("error") for row in rows] == ["iteration 7: not finite", "RuntimeError: a defect", None]
+    run_jobs(asked, tmp_path, device="cpu")
+    assert ran(tmp_path) == [DIVERGES] * 2 + [BREAKS] * 2 + [7]
+    # A success takes the failure of before away.
+    write_json(asked[0].folder(tmp_path) / RESULT, made_up(asked[0]))
+    assert not any("error" in row for row in run_jobs(asked[:1], tmp_path, device="cpu"))
+    assert (asked[1].folder(tmp_path) / FAILURE).is_file()
+
+
+def test_submitit_runs_several_at_once_and_outlives_one_that_dies(tmp_path, monkeypatch):
+    pytest.importorskip("submitit")
+    work = quality.work
+    monkeypatch.setattr(quality, "work", lambda *arguments: _run_stubbed(work, arguments))
+    rows = run_jobs(jobs(seeds=(DIES, 7, 8, 9)), tmp_path, device="cpu", at_once=2)
+    assert [row.get("error") for row in rows] == ["its process ended without a result", None, None, None]
+    assert ran(tmp_path).count(7) == ran(tmp_path).count(8) == 1
+
+
+def _run_stubbed(work, arguments):
+    work.__globals__["Runner"] = StubRunner
+    return work(*arguments)
+
+
+def test_several_jobs_without_submitit_end_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "submitit", None)
+    with pytest.raises(SehdrError, match="submitit starts several jobs at once and is not installed; pip install"):
+        run_jobs(jobs(seeds=(0, 7)), tmp_path, device="cpu", at_once=2)
 
 
 def test_only_methods_with_truth_see_that_of_training_views(tmp_path, monkeypatch):
     seen = {}
 
     def look(scene, out, config, **options):
-        seen["train"] = [view.hdr is not None for view in scene.train_views]
-        seen["test"] = [view.hdr is not None for view in scene.test_views]
+        seen["train"] = {view.hdr is not None for view in scene.train_views}
+        seen["test"] = {view.hdr is not None for view in scene.test_views}
         raise SehdrError("seen enough")
 
-    monkeypatch.setattr(quality_run, "train", look)
-    for name, method in METHODS.items():
+    monkeypatch.setattr("sehdr_warp.training.train.train", look)
+    for name, truth in (("default", False), ("truth", True), ("paper", False), ("hdr-gs-truth", True)):
         with pytest.raises(SehdrError, match="seen enough"):
-            Runner("cpu").run(job(name), tmp_path)
-        assert set(seen["train"]) == {method.truth} and all(seen["test"]), name
+            Runner("cpu").run(jobs((name,), max_size=32)[0], tmp_path)
+        assert seen == {"train": {truth}, "test": {True}}, name
 
 
-def test_a_scene_without_truth_and_a_training_that_diverges_end_in_one_line(tmp_path):
-    write_blender(tmp_path / "photos", 6)
-    with pytest.raises(InputError, match="photos: view r_0 has no HDR truth; only scenes with truth"):
-        Runner("cpu").run(job("default", scenes=(str(tmp_path / "photos"),)), tmp_path)
-    diverging = job("default", iterations=(30,))
-    scene, judged = photos(diverging)
-    # Exposure times beyond float32 stand in for a training that diverges: every loss is then not finite.
-    broken = replace(
-        scene,
-        views=tuple(replace(v, exposure_time=v.exposure_time * (1e45 if i else 1)) for i, v in enumerate(scene.views)),
-    )
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(SehdrError, match="not finite"):
-        patch.setattr(quality_run, "photos", lambda job: (broken, judged))
-        Runner("cpu").run(diverging, tmp_path)
+def test_exposures_are_four_times_apart_and_photos_follow():
+    dark, bright = (exposed(jobs(exposures=(place,), max_size=32)[0]) for place in (1, 2))
+    assert bright.views[0].exposure_time == pytest.approx(4 * dark.views[0].exposure_time)
+    assert bright.views[0].image.mean() > 1.3 * dark.views[0].image.mean()
 
 
-def test_without_training_truth_leaves_the_rest_alone():
-    scene, _ = photos(job("default"))
-    bare = without_training_truth(scene)
-    assert all(view.hdr is None for view in bare.train_views)
-    assert all(np.array_equal(a.image, b.image) for a, b in zip(scene.views, bare.views, strict=True))
+def test_the_time_to_the_final_figure():
+    curve = [{"seconds": 1.0, "psnr_mu": 20.0}, {"seconds": 2.0, "psnr_mu": 29.95}, {"seconds": 9.0, "psnr_mu": 30.0}]
+    assert seconds_to_final(curve, 10.0) == 2.0
+    assert seconds_to_final([{"seconds": 3.0, "psnr_ldr": 20.0}], 2.5) == 2.5
 
 
-@pytest.mark.parametrize(
-    "psnr,expected",
-    [([10, 20, 30, 30.05], 3.0), ([30, 30, 30, 30], 1.0), ([10, 40, 30, 31], 9.0), ([10, 20, 30, 29], 3.0)],
-)
-def test_seconds_to_final_is_the_first_time_that_stays_within_a_tenth(psnr, expected):
-    curve = [{"seconds": seconds, "psnr_mu": value} for seconds, value in zip((1.0, 2.0, 3.0, 9.0), psnr)]
-    assert seconds_to_final(curve, 9.0) == expected
+def test_one_training_from_the_command_line(tmp_path, capsys):
+    command = [*SMALL, "--methods", "default", "--out", tmp_path / "out", "--json"]
+    assert call(*command, tmp_path / "a.json") == 0
+    assert "gt-max dB" in capsys.readouterr().out
+    (row,) = json.loads((tmp_path / "a.json").read_text())["rows"]
+    assert (row["scene"], row["method"], row["response"], row["iterations"]) == ("embedded", "default", "known", 12)
+    assert 5 < row["gt_max"] < 60 and row["chosen"] == "hdr-nerf" and row["seconds"] > 0
+    assert row["tests"][-1][1] == pytest.approx(row["gt_max"], abs=0.5)
+    assert call(*command, tmp_path / "b.json") == 0
+    again = json.loads((tmp_path / "b.json").read_text())["rows"]
+    assert again == [row], "a finished job keeps its figures, its seconds among them"
 
 
-@pytest.mark.parametrize(
-    "flags,message",
-    [
-        ("--exposures 5", "exposure 5 is not one of 0 to 4"),
-        ("--responses sometimes", "response 'sometimes' is not one of known, blind"),
-        ("--methods truth --responses blind", "none of the methods makes sense without the response"),
-        ("--scenes nowhere", "nowhere: no such folder"),
-        ("--scenes embedded:nowhere", "embedded:nowhere: is not here"),
-        ("--curves kodachrome", "kodachrome"),
-        ("--workers 0", "--workers 0: not positive"),
-        ("--launcher ship", "--launcher ship: not one of auto, slurm, local, process"),
-        ("--noise loud", "--noise loud: not one or two numbers"),
-        ("--gpus 0", "there are none with --device cpu"),
-        ("--seeds one", "--seeds one: not whole numbers"),
-        ("--variant a:b", "not NAME:BASE:field=value"),
-        ("--slurm gpu", "--slurm gpu: not name=value"),
-        ("--report-only", "holds no jobs"),
-        ("--report-scenes embedded", "--report-scenes embedded: needs --report-only"),
-    ],
-)
-def test_flags_that_cannot_be_are_refused_in_one_line_before_anything_runs(flags, message, tmp_path, capsys):
-    assert call("bench", "quality", "--out", tmp_path / "out", "--device", "cpu", *flags.split()) == 1
-    error = capsys.readouterr().err.strip()
-    assert message in error and len(error.splitlines()) == 1
-    assert not (tmp_path / "out").exists()
+def test_a_scene_that_lost_its_place_is_told(tmp_path):
+    with pytest.raises(InputError, match="is not here"):
+        plan_jobs(["embedded:nowhere"], choose_methods(["default"]))

@@ -5,16 +5,17 @@ import json
 import pytest
 import torch
 
-from sehdr_warp.check import catalogue, splats
-from sehdr_warp.check.case import Case, Reading, compare
+from sehdr_warp.check import catalogue, splat_cases
+from sehdr_warp.check.case import Case, Reading, compare_alike
 from sehdr_warp.errors import SehdrError
 from tests.refusals import call, refused
 
 SLOW = ("radiance-range", "scale-huge")  # the like of others here; `sehdr-warp check` measures them too
+CPU = torch.device("cpu")
 
 
 @pytest.mark.parametrize(
-    "case", [case for case in catalogue.CASES if case.quick and case.name not in SLOW], ids=lambda case: case.name
+    "case", [case for _, case in catalogue.CASES if case.quick and case.name not in SLOW], ids=lambda case: case.name
 )
 def test_bounds_hold(case, device):
     readings = case.measure(torch.device(device))
@@ -23,9 +24,10 @@ def test_bounds_hold(case, device):
 
 
 def test_names_are_unique_and_choose():
-    names = [case.name for case in catalogue.CASES]
-    assert len(set(names)) == len(names)
-    assert [case.name for case in catalogue.choose_cases("needle, poison", False)][:2] == ["needle", "poison-gaussians"]
+    names = [case.name for _, case in catalogue.CASES]
+    assert len(set(names)) == len(names) >= 41
+    chosen = catalogue.choose_cases("needle, poison", False)
+    assert [case.name for _, case in chosen][:2] == ["needle", "poison-gaussians"]
     assert len(catalogue.choose_cases(None, True)) < len(catalogue.choose_cases(None, False)) == len(names)
     with pytest.raises(SehdrError, match="--cases nope: no such case"):
         catalogue.choose_cases("nope", False)
@@ -34,14 +36,14 @@ def test_names_are_unique_and_choose():
 @pytest.mark.parametrize("error", [5e-5, 1e-3])
 def test_a_small_error_of_the_kernels_is_noticed(monkeypatch, error):
     """A relative error of a thousand float32 roundings, such as a coarser exponential makes."""
-    rasterize = splats.rasterize
+    rasterize = splat_cases.rasterize
 
     def wrong(means, log_scales, quaternions, opacities, *rest, **options):
         return rasterize(means, log_scales, quaternions, opacities * (1 - error), *rest, **options)
 
-    monkeypatch.setattr(splats, "rasterize", wrong)
-    case = next(case for case in catalogue.CASES if case.name == "border")
-    failed = [reading.quantity for reading in case.measure(torch.device("cpu")) if not reading.holds]
+    monkeypatch.setattr(splat_cases, "rasterize", wrong)
+    ((_, case),) = catalogue.choose_cases("border", False)
+    failed = [reading.quantity for reading in case.measure(CPU) if not reading.holds]
     assert "image" in failed and "alpha" in failed and "d/d features" in failed
 
 
@@ -49,15 +51,10 @@ def test_bounds_follow_the_condition_not_the_result():
     """1 - x next to 1: the error of the float32 result is allowed only as far as x's own rounding causes it."""
     near = {"x": torch.full((5,), 1 - 2.0**-12, dtype=torch.float64)}
     far = {"x": torch.full((5,), 0.5, dtype=torch.float64)}
-    cpu = torch.device("cpu")
-    ill = compare(lambda x: {"y": 1 - x}, lambda _, x: {"y": 1 - x}, near, cpu)[0]
-    well = compare(lambda x: {"y": 1 - x}, lambda _, x: {"y": 1 - x}, far, cpu)[0]
+    ill, well = (compare_alike(lambda x: {"y": 1 - x}, x, CPU)[0] for x in (near, far))
     assert ill.bound > 100 * well.bound and ill.holds and well.holds
-    off = compare(lambda x: {"y": (1 - x) * 1.0001}, lambda _, x: {"y": 1 - x}, far, cpu)[0]
+    off = compare_alike(lambda x: {"y": (1 - x) * (1.0001 if x.dtype == torch.float32 else 1)}, far, CPU)[0]
     assert not off.holds and off.bound == well.bound
-
-
-def test_nan_fails():
     assert not Reading("x", float("nan"), 1.0).holds
 
 
@@ -65,13 +62,22 @@ def test_the_command_writes_its_result_and_fails_with_a_bound(tmp_path, capfd, m
     path = tmp_path / "check.json"
     assert call("check", "--device", "cpu", "--cases", "quaternions,photos", "--json", path) == 0
     result = json.loads(path.read_text())
-    assert result["failed"] == [] and [row["case"] for row in result["cases"]] == ["quaternions", "photos"]
-    assert all({"quantity", "error", "bound", "holds"} == set(r) for row in result["cases"] for r in row["readings"])
+    assert [(row["case"], row["holds"]) for row in result["rows"]] == [("quaternions", True), ("photos", True)]
+    assert all({"quantity", "error", "bound", "holds"} == set(r) for row in result["rows"] for r in row["readings"])
+    assert result["machine"]["cpu"] and result["benchmark"] == "stability" and result["sweeps"] == []
     assert "2 cases, " in capfd.readouterr().out
     assert "exists already" in refused(capfd, "check", "--device", "cpu", "--cases", "photos", "--json", path)
 
-    broken = Case("broken", "splat", "fails", lambda device: [Reading("error", float("nan"), 1e-6)])
-    monkeypatch.setattr(catalogue, "CASES", (broken,))
+    broken = Case("broken", "fails", lambda device: [Reading("error", float("nan"), 1e-6)])
+    monkeypatch.setattr(catalogue, "CASES", (("splat", broken),))
     line = refused(capfd, "check", "--device", "cpu", "--json", tmp_path / "failed.json")
     assert "1 of 1 cases exceed their bounds on cpu: broken" in line
-    assert json.loads((tmp_path / "failed.json").read_text())["failed"] == ["broken"]
+    assert [row["holds"] for row in json.loads((tmp_path / "failed.json").read_text())["rows"]] == [False]
+
+
+def test_sweeps_keep_what_is_drawn(monkeypatch):
+    label, values, measure, kept = catalogue.SWEEPS[3]
+    monkeypatch.setattr(catalogue, "SWEEPS", ((label, values[:2], measure, kept),))
+    (sweep,) = catalogue.run_sweeps(CPU)
+    assert set(sweep["readings"]) == set(kept) and sweep["values"] == values[:2]
+    assert all(len(points) == 2 and error <= bound for points in sweep["readings"].values() for error, bound in points)

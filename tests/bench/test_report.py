@@ -1,0 +1,73 @@
+"""The reports: made of stored results, and as they are in the repository."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from sehdr_warp.bench.jobs import choose_methods, plan_jobs
+from sehdr_warp.bench.quality import row_of
+from sehdr_warp.bench.report import write_reports
+from sehdr_warp.bench.report_plots import error_over_time
+from sehdr_warp.bench.results import markdown_table
+
+from ..refusals import refused
+from .test_quality import made_up
+
+REPORTS = Path(__file__).resolve().parents[2] / "docs" / "reports"
+
+
+def test_the_pages_are_what_the_results_make(tmp_path):
+    """Pages may not be edited by hand: `sehdr-warp bench report` makes them."""
+    (tmp_path / "results").mkdir()
+    for path in (REPORTS / "results").glob("*.json"):
+        (tmp_path / "results" / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "tried.csv").write_bytes((REPORTS / "tried.csv").read_bytes())
+    write_reports(tmp_path)
+    for page in sorted(REPORTS.glob("*.md")):
+        assert page.read_text() == (tmp_path / page.name).read_text(), page.name
+    assert {path.name for path in tmp_path.glob("*.*")} == {path.name for path in REPORTS.glob("*.*")}
+
+
+def test_quality_is_paired_with_the_upper_bound(tmp_path):
+    scenes = {"exposures": (1, 2), "responses": ("known",), "iterations": 10}
+    rows = []
+    for method, decibels in (("default", (30.0, 28.0)), ("hdr-gs", (20.0, 22.0)), ("truth", (33.0, 32.0))):
+        made = plan_jobs(["embedded"], choose_methods([method]), **scenes)
+        rows += [row_of(made_up(job, psnr)) for job, psnr in zip(made, decibels, strict=True)]
+    machine = {"cpu": "stub", "cores": 2, "gpu": None, "versions": {"torch": "2"}}
+    result = {
+        "command": "sehdr-warp bench quality",
+        "machine": machine,
+        "date": "2026-01-01",
+        "rows": rows,
+        "notes": [],
+    }
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "quality.json").write_text(json.dumps(result))
+    assert {path.name for path in write_reports(tmp_path)} == {"quality.md", "quality.png", "README.md"}
+    lines = (tmp_path / "quality.md").read_text().splitlines()
+    cells = {line.split("|")[1].strip(): [c.strip() for c in line.split("|")[2:-1]] for line in lines if "|" in line}
+    # n, mean, worst, difference to the bound.
+    assert cells["default"][:4] == ["2", "29.00", "28.00", "-3.50"]
+    assert cells["hdr-gs"][:4] == ["2", "21.00", "20.00", "-11.50"], "a learned curve stands beside the known one"
+    assert cells["truth"][:4] == ["2", "32.50", "32.00", "-"]
+
+
+def test_error_over_time_is_a_mean_on_a_log_scale():
+    seconds, mean = error_over_time([[[1.0, 20.0], [100.0, 40.0]], [[1.0, 10.0], [10.0, 30.0]]], count=3)
+    assert seconds == pytest.approx([1, 10, 100]) and mean == pytest.approx([15, 30, 35])
+
+
+def test_tables_leave_out_what_nothing_has_and_mark_what_one_lacks():
+    rows = [{"a": 1.234, "b": "x", "c": None}, {"a": None, "b": "yy"}]
+    assert markdown_table(rows, {"A=a": ".1f", "b": "", "c": "d"}) == "\n".join(
+        ["|   A | b  |", "| --: | -- |", "| 1.2 | x  |", "|   - | yy |"]
+    )
+
+
+def test_what_is_no_result_is_named(tmp_path, capfd):
+    assert "holds no results" in refused(capfd, "bench", "report", tmp_path)
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "step.json").write_text("{}")
+    assert "is no result" in refused(capfd, "bench", "report", tmp_path)
