@@ -7,7 +7,7 @@ import pytest
 from sehdr_warp import cli
 
 # What may stand before the error: the steps that a command tells of.
-PROGRESS = re.compile(r"(reading|finding|matching|placing|placed|fitting|using|view|response|iteration|no exposure) ")
+PROGRESS = re.compile(r"(reading|choosing|triangulating|finding|matching|placing|placed|fitting|using|view|response|iteration|no exposure) ")
 
 
 def call(*arguments):

@@ -82,6 +82,8 @@ COLMAP_TEXT = {
     "zero quaternion": ("images.txt", lambda text: re.sub(r"(?m)^1( \S+){4}", "1 0 0 0 0", text), "quaternion"),
     "leaves the folder": ("images.txt", lambda text: text.replace("000.png", "../../etc/passwd"), "'..'"),
     "absolute": ("images.txt", lambda text: text.replace("000.png", "/etc/passwd"), "absolute"),
+    "absolute on Windows": ("images.txt", lambda text: text.replace("000.png", "C:\\x.png"), "absolute"),
+    "leaves within": ("images.txt", lambda text: text.replace("000.png", "b/../../a.png"), "'..'"),
     "unknown camera": ("images.txt", lambda text: text.replace(" 1 000.png", " 9 000.png"), "camera 9"),
     "huge camera": ("cameras.txt", lambda text: text.replace(" 64 48 ", " 999999999 48 "), "999999999"),
     "negative focal length": ("cameras.txt", lambda text: text.replace(" 50 ", " -50 "), "cameras.txt"),
@@ -114,6 +116,15 @@ COLMAP_BINARY = {
         lambda content: content[: content.index(b"000.png")] + b"a" * 9000,
         "no end within",
     ),
+    "huge count of observations": (
+        "images.bin",
+        lambda content: (
+            content[: (end := content.index(b"000.png") + 8)] + struct.pack("<Q", 2**61) + content[end + 8 :]
+        ),
+        "count",
+    ),
+    "zero quaternion": ("images.bin", lambda content: content[:12] + bytes(32) + content[44:], "quaternion"),
+    "no images": ("images.bin", lambda content: struct.pack("<Q", 0), "no registered views"),
     "name leaves": ("images.bin", lambda content: content.replace(b"000.png", b"../etc/p"), "'..'"),
     "images are a pickle": (
         "images.bin",
@@ -186,6 +197,7 @@ PHOTOS = {
     "truth empty": (lambda data: _truth(data).write_bytes(b""), "001.exr"),
     "truth of huge windows": (lambda data: _huge_window(_truth(data)), "001.exr"),
     "truth is no OpenEXR": (lambda data: _truth(data).write_bytes(b"\x76\x2f\x31\x01" + b"\xff" * 64), "001.exr"),
+    "no folder of photos": (lambda data: (data / "images").rename(data / "photos"), "images: folder not found"),
     "no photos": (lambda data: [path.unlink() for path in (data / "images").iterdir()], "none of the model's 6"),
 }
 
@@ -265,10 +277,15 @@ def test_transforms(frames, capfd, case):
     assert "transforms.json" in train_refused(capfd, frames)
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e300, "x", None])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e300, "x", None, "scaled", "mirrored"])
 def test_pose_values(frames, capfd, value):
     values = json.loads((frames / "transforms.json").read_text())
-    values["frames"][2]["transform_matrix"][0][3] = value
+    matrix = values["frames"][2]["transform_matrix"]
+    if value in ("scaled", "mirrored"):
+        factors = (2, 2, 2) if value == "scaled" else (-1, 1, 1)
+        values["frames"][2]["transform_matrix"] = [[*np.multiply(row[:3], factors), row[3]] for row in matrix]
+    else:
+        matrix[0][3] = value
     (frames / "transforms.json").write_text(json.dumps(values))
     assert "r_2" in train_refused(capfd, frames)
 

@@ -24,11 +24,11 @@ def embedded_folder(path: str) -> Path:
     name = str(path).partition(":")[2] or "room"
     if name in embedded_scenes():
         return next(place / name for place in _places() if (place / name / _MARK).is_file())
-    raise InputError(
-        path,
-        f"is not here{did_you_mean(name, embedded_scenes())}; present are {', '.join(f'embedded:{known}' for known in embedded_scenes())}",
-        "get the repository's scenes/ and name it in SEHDR_SCENES, or render it with sehdr-warp synth",
-    )
+    known = embedded_scenes()
+    present = ", ".join(f"embedded:{each}" for each in known)
+    raise InputError(path, f"is not here{did_you_mean(name, known)}; present are {present}",
+                     "get the repository's scenes/ and name it in SEHDR_SCENES, or render it with "
+                     "sehdr-warp synth")  # fmt: skip
 
 
 def _places() -> list[Path]:

@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import InputError
 from .capture import Capture, Shot
 from .colmap_model import find_model
-from .develop import as_photographed, check_content, develop
+from .develop import as_photographed, check_content, develop, fitted_lens
 from .embedded import embedded_folder, is_embedded
 from .exposure import choose_exposure, made_by_camera, with_exposure_times
 from .read_colmap import image_folder, is_hdr_gs, read_colmap, read_hdr_gs
@@ -85,7 +85,8 @@ def read_capture(
     holdout: int | None = None,
     cache: Path | str | None = None,
 ) -> Capture:
-    """Cameras, files, exposure times and splits of a data folder; no pixels. Arguments and errors as load_scene's."""
+    """Cameras, files, exposure times and splits of a data folder; of photos their sizes alone. Arguments and errors are
+    load_scene's."""
     if holdout is not None and holdout < 0:
         raise InputError(path, f"every {holdout}th view asked for as test view", "give 0 (none) or more")
     folder = _folder(path)
@@ -99,6 +100,9 @@ def read_capture(
     if training < 2:
         found = f"{len(shots)} view{'s' * (len(shots) != 1)}, {training} for training"
         raise InputError(folder, f"has {found}; one view does not show depth", "add views from other places")
+    for shot in shots:
+        if not shot.derived:
+            fitted_lens(shot)
     notes = (*capture.notes, *notes, *more, *split)
     name = str(path) if is_embedded(path) else folder.resolve().name
     return replace(capture, shots=tuple(shots), notes=notes, name=name, folder=folder, times_known=times_known)
