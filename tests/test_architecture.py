@@ -12,7 +12,7 @@ PACKAGE = ROOT / "sehdr_warp"
 
 # What each room may import of the others: training -> field -> response -> splatting -> kernels, and below them all
 # what any room may use. Rooms that read a trained scene take it as an object with named methods.
-ANY = {"errors", "quiet", "arguments", "files"}
+ANY = {"errors", "quiet", "arguments", "files", "console"}
 ALLOWED = {
     "kernels": set(),
     "errors": set(),

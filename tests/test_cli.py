@@ -10,7 +10,6 @@ import pytest
 from sehdr_warp import __version__, cli
 from sehdr_warp.response import response_by_name, response_names
 from sehdr_warp.scene.images import read_hdr, read_ldr
-from sehdr_warp.training import commands
 from sehdr_warp.training.config_fields import config_fields, flag_of
 from sehdr_warp.training.config_files import load_config, preset_names
 
@@ -163,14 +162,6 @@ def test_a_training_ends_by_saying_what_to_type_next(run, capsys):
     assert len(lines) == 3 and all(
         f"sehdr-warp {word} {run}" in "".join(lines) for word in ("render", "report", "export")
     )
-
-
-def test_falling_held_out_figures_are_told():
-    summary = {"iteration": 900, "gaussians": 10, "train_seconds": 1.0, "device": "cpu"}
-    scores = [{"psnr_ldr": 15.0, "iteration": 300}, {"psnr_ldr": 14.4, "iteration": 900}]
-    told = commands._ending("r", summary | {"metrics": scores})
-    assert "held-out PSNR was 15.00 dB at iteration 300 and fell: try --iterations 300" in told
-    assert "fell" not in commands._ending("r", summary | {"metrics": scores[:1]})
 
 
 def test_fields_named_on_the_command_line_override_the_preset_and_stay(capsys):

@@ -187,7 +187,7 @@ class Runner:
         self._warm_up(shown, training, folder)
         shutil.rmtree(out, ignore_errors=True)
         self._forget_peaks()
-        run = train(shown, out, training, device=self.device, quiet=True)
+        run = train(shown, out, training, device=self.device)
         peak = self._peak_memory()
         weights = self.lpips if "lpips" in config["judged_by"] else None
         figures = evaluate(run, scene, lpips_weights=weights, flip="flip" in config["judged_by"])
@@ -215,7 +215,7 @@ class Runner:
         scratch = folder / "warm-up"
         try:
             shutil.rmtree(scratch, ignore_errors=True)
-            train(scene, scratch, override_config(config, short), device=self.device, quiet=True)
+            train(scene, scratch, override_config(config, short), device=self.device)
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
         self._warm.add(shape)

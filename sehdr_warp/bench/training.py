@@ -26,9 +26,9 @@ def bench_training(scene: Scene, device: torch.device, *, iterations: int = 30_0
     result = new_result("training", device, {"device": str(device), "scene": scene.name, "iterations": iterations})
     short = override_config(config, {"schedule.iterations": WARM_UP_STEPS}, "3dgs")
     with tempfile.TemporaryDirectory() as folder:
-        train(scene, Path(folder) / "warm-up", short, device=device, quiet=True)
+        train(scene, Path(folder) / "warm-up", short, device=device)
         forget_peaks(device)
-        run = train(scene, Path(folder) / "run", config, device=device, quiet=True)
+        run = train(scene, Path(folder) / "run", config, device=device)
         held_out = (run.metrics() or [{}])[-1]
         peak = held_memory(device) if device.type == "cuda" else None
         row = {"psnr_ldr": held_out.get("psnr_ldr"), "train_seconds": run.train_seconds, "peak_memory_bytes": peak}

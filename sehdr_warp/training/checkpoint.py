@@ -17,8 +17,8 @@ from torch import Tensor
 from ..errors import InputError
 from ..files import atomic_folder
 
-FORMAT = 1
-"""Version of the layout; a reader refuses others."""
+FORMAT = 2
+"""Version of what a run holds; a reader refuses others."""
 TENSORS, VALUES = "state.safetensors", "checkpoint.json"
 
 
@@ -86,9 +86,9 @@ def read_checkpoint(path: Path) -> Checkpoint:
         raise InputError(error.filename or path, f"cannot be read ({error.strerror})", remedy) from None
     except (ValueError, RecursionError) as error:
         raise InputError(path / VALUES, f"not valid JSON ({error})", remedy) from None
-    if not isinstance(values, dict) or values.get("format") != FORMAT:
-        found = values.get("format") if isinstance(values, dict) else None
-        raise InputError(path / VALUES, f"format = {found!r} is not {FORMAT}", remedy)
+    if not isinstance(values, dict):
+        raise InputError(path / VALUES, "is not a JSON object", remedy)
+    refuse_format(path / VALUES, values)
     for name, kind in (("iteration", int), ("seconds", int | float)):
         if not isinstance(values.get(name), kind) or not 0 <= values[name] < math.inf:
             raise InputError(path / VALUES, f"{name} = {reprlib.repr(values.get(name))} is not a number from 0", remedy)
@@ -101,6 +101,15 @@ def read_checkpoint(path: Path) -> Checkpoint:
     if (name := first_not_finite(tensors)) is not None:
         raise InputError(path / TENSORS, f"{name} holds values that are not finite", remedy)
     return Checkpoint(path, tensors, values)
+
+
+def refuse_format(path: Path, values: dict) -> None:
+    """Raises InputError for values of another format than this version's."""
+    found = values.get("format")
+    if found == 1:
+        raise InputError(path, "was made by version 0.1, whose runs this version does not read", "train again")
+    if found != FORMAT:
+        raise InputError(path, f"format = {reprlib.repr(found)} is not {FORMAT}", "the run is damaged: train again")
 
 
 def first_not_finite(tensors: dict[str, Tensor]) -> str | None:

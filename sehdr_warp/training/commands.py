@@ -17,8 +17,6 @@ from ..errors import InputError, SehdrError, UsageError
 from .config_fields import flag_of, flags_type, gone_flags, named_fields, value_of
 
 log = logging.getLogger(__name__)
-_FALL = 0.3
-"""Decibels by which held-out figures may fall behind their best before the end says so."""
 
 
 @dataclass(frozen=True)
@@ -115,16 +113,16 @@ class ShowConfig:
 
 def run_train(asked: Train) -> None:
     """Trains, or prints the plan, and says what was made and what to do next."""
+    from .machine import pick_device
     from .prediction import check_predictor
-    from .run import check_folder
-    from .train import pick_device
+    from .run_folder import RunFolder
 
     out, resumed = asked.output.out, False
     if out is None and not asked.training.plan_only:
         raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
     # What can be refused is refused before the photos are read, which may take minutes.
     if out is not None and not asked.training.plan_only:
-        resumed = check_folder(out, resume=asked.output.resume, overwrite=asked.output.overwrite)
+        resumed = RunFolder(out).check(resume=asked.output.resume, overwrite=asked.output.overwrite)
     data = _data(asked, resumed)
     config, device = _config(asked, resumed), pick_device(asked.machine.device)
     if config.loss.predictor:
@@ -134,7 +132,7 @@ def run_train(asked: Train) -> None:
     if asked.training.plan_only:
         from .plan import make_plan
 
-        plan = make_plan(scene, config)
+        plan = make_plan(scene, config, device)
         print(json.dumps(plan.to_dict()) if asked.output.json else plan.table())
         return
     run = _train(asked, scene, config, device, data)
@@ -156,18 +154,18 @@ def run_presets(asked: Presets) -> None:
 
 def run_config(asked: ShowConfig) -> None:
     """Prints a config."""
-    from .config_files import config_as_toml, config_to_dict, load_config, read_config_json
-    from .run import CONFIG
+    from .config_files import config_as_toml, config_to_dict, load_config
+    from .run_folder import RunFolder
 
-    folder = Path(asked.which)
-    config = read_config_json(folder / CONFIG) if (folder / CONFIG).is_file() else load_config(asked.which)
+    folder = RunFolder(asked.which)
+    config = folder.read_config() if folder.config.is_file() else load_config(asked.which)
     print(json.dumps(config_to_dict(config)) if asked.json else config_as_toml(config, asked.diff))
 
 
 def open_run(path: Path, device: str | None):
     """The run in a folder, on the device that a command line names."""
+    from .machine import pick_device
     from .run import load_run
-    from .train import pick_device
 
     return load_run(path, device=pick_device(device))
 
@@ -177,9 +175,8 @@ def ensured_scene(run, data: str | None):
 
     data: where the photos are, if they have moved.
     """
-    from ..arguments import say
     from ..scene import is_embedded
-    from .confidence import ensure_confidence
+    from .run import ensure_confidence
 
     place = data or run.data.get("path")
     if place is None:
@@ -189,14 +186,14 @@ def ensured_scene(run, data: str | None):
     # A learned response was not known when the photos of the training were developed.
     learned = run.config.response.name == "learned"
     scene = _load({**run.data, "path": place}, response="learned" if learned else run.response)
-    ensure_confidence(run, scene, say)
+    ensure_confidence(run, scene)
     return scene
 
 
 def _data(asked: Train, resumed: bool) -> dict:
     """What load_scene takes: as it is given, or else, resuming, as the run has it."""
     from ..scene import is_embedded
-    from .run import read_run_info
+    from .run_folder import RunFolder
 
     path = asked.data
     if path is not None and not is_embedded(path):
@@ -209,7 +206,7 @@ def _data(asked: Train, resumed: bool) -> dict:
         "holdout": options.holdout,
     }
     if resumed:
-        known = read_run_info(asked.output.out)["data"]
+        known = RunFolder(asked.output.out).read_info()["data"]
         given = {name: known.get(name) if value is None else value for name, value in given.items()}
     if given["path"] is None and asked.output.resume:
         raise InputError(asked.output.out, "holds nothing to resume", "give SCENE to begin, or the folder of a run")
@@ -220,8 +217,8 @@ def _data(asked: Train, resumed: bool) -> dict:
 
 def _config(asked: Train, resumed: bool):
     """The preset's config, or the resumed run's, with what the command line names in it."""
-    from .config_files import load_config, override_config, read_config_json
-    from .run import CONFIG
+    from .config_files import load_config, override_config
+    from .run_folder import RunFolder
 
     options = asked.training
     shortcuts = {
@@ -235,7 +232,7 @@ def _config(asked: Train, resumed: bool):
     named |= {path: value_of(path, text) for path, text in fields.items()}
     flags = {path: flag_of(path) if path in fields else shortcuts[path][0] for path in named}
     if resumed and options.preset is None:
-        return override_config(read_config_json(asked.output.out / CONFIG), named, flags=flags)
+        return override_config(RunFolder(asked.output.out).read_config(), named, flags=flags)
     preset = options.preset or ("default" if options.predict_hdr is None else "predicted")
     config = load_config(preset, named, flags)
     kept = {*config.plan.keep, *(path for path in named if not path.startswith("plan."))}
@@ -259,9 +256,10 @@ def _load(data: Mapping, **response):
 
 
 def _train(asked: Train, scene, config, device, data: dict):
-    from .train import train
+    from ..console import follow
+    from .train import Training
 
-    return train(
+    training = Training(
         scene,
         asked.output.out,
         config,
@@ -271,6 +269,8 @@ def _train(asked: Train, scene, config, device, data: dict):
         tensorboard=asked.output.tensorboard,
         data=data,
     )
+    follow(training, training.total)
+    return training.run
 
 
 def _cost(config) -> str:
@@ -292,9 +292,6 @@ def _ending(path: Path, summary: dict) -> str:
     heldout = f", held-out PSNR {scores[-1][0]:.2f} dB" if scores else ""
     made = f"{summary['iteration']} iterations, {summary['gaussians']} Gaussians{heldout}"
     lines = [f"{path}: {made}, {summary['train_seconds']:.1f} s on {summary['device']}"]
-    if scores and max(scores)[0] - scores[-1][0] > _FALL:
-        best, at = max(scores)
-        lines.append(f"held-out PSNR was {best:.2f} dB at iteration {at} and fell: try --iterations {at}")
     lines += [
         f"exposure brackets:  sehdr-warp render {path} --out {path}/views --evs=-4,-2,0,2,4",
         f"pictures, splats:   sehdr-warp report {path} --out {path}/report;  sehdr-warp export {path} --out scene.ply",

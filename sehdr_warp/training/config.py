@@ -207,6 +207,10 @@ class Config(_Table):
         """An iteration number of the config as a number of this training's iterations, at least 1."""
         return max(1, round(iteration * self.schedule.iterations / REFERENCE_ITERATIONS))
 
+    def degree_at(self, iteration: int) -> int:
+        """The degree of the harmonics that a step after so many uses: one more every harmonics_every."""
+        return min(self.model.harmonics_degree, iteration // self.scaled(self.schedule.harmonics_every))
+
 
 def stated(iteration: float, iterations: int) -> int:
     """The number to write in a config of so many iterations for what is to happen at an iteration of its own."""

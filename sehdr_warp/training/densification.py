@@ -30,6 +30,7 @@ class Densification:
         self.config = config
         self.options = config.densification
         self.extent = extent
+        self.most = self.options.max_gaussians
         self.start, self.stop, self.every, self.reset_every = (
             config.scaled(number)
             for number in (self.options.start, self.options.stop, self.options.every, self.options.reset_every)

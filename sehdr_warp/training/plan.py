@@ -1,18 +1,44 @@
 """The plan of a training: what its scene does not need, decided before it begins, each with a reason in figures."""
 
 import json
+import math
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
+import torch
+
+from ..errors import InputError
+from ..field.exposure import exposure_times, is_seconds
 from ..scene import Scene
+from ..splatting.threads import thread_count
 from .config import Config
 from .config_files import config_to_dict, override_config
-from .plan_checks import check_fields, check_scene
-from .plan_rules import RULES, Decision
-from .plan_scene import SceneFacts, measure_scene
+from .initialization import base_exposure_time
+from .machine import pick_device
+from .plan_scene import SceneFacts, check_scene, measure_scene
+from .relocation import gaussian_budget
 
-PLAN = "plan.json"
-"""The plan's file in the folder of a run."""
+PASSES = 900
+"""Steps on each photo. A second look at the same photos teaches less and less, and in the end their noise."""
+FEWEST_ITERATIONS = 3000
+CPU_SECONDS = 240.0
+"""What a training on a CPU may take, as far as CPU_FEWEST allows."""
+CPU_FEWEST = 1000
+CPU_PIXEL, CPU_GAUSSIAN = 0.9e-6, 2.6e-6
+"""Seconds of one core for each pixel and each Gaussian of a step, measured on an AMD EPYC of 2024."""
+REACH = 2.0**16
+"""Brackets farther from the photos' exposure than this are black or white in all pixels of 8 bits and some headroom."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """name: of RULES. fields: dotted names of the config and their values. choice: in words; reason: with the figures
+    it rests on."""
+
+    name: str
+    fields: dict[str, object]
+    choice: str
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -37,52 +63,54 @@ class Plan:
         }
 
     def table(self) -> str:
-        """The decisions as lines: what, which values, and why."""
+        """All decisions as lines: what, which values, and why."""
         return format_plan(self.to_dict())
 
+    def lines(self) -> Iterator[str]:
+        """One line for each decision that changes something."""
+        for decision in self.decisions:
+            if decision.fields:
+                yield f"plan: {decision.name}: {decision.choice} ({decision.reason})"
+        for path, value in self.kept.items():
+            yield f"plan: {path} = {json.dumps(value)}, as given"
 
-def make_plan(scene: Scene, config: Config) -> Plan:
-    """Reads a scene and decides what its training can leave out, on top of a config.
 
-    The fields in config.plan.keep stay as they are. The plan's own config has
-    plan.enabled off.
+def make_plan(scene: Scene, config: Config, device: str | torch.device | None = None) -> Plan:
+    """Reads a scene and decides what its training on a device can leave out, on top of a config.
+
+    The fields in config.plan.keep stay as they are. The plan's own config has plan.enabled off.
 
     Raises InputError for a scene that no plan makes sense for, and for kept values that the scene contradicts.
     """
+    device = pick_device(device)
     facts = measure_scene(scene, config.seed)
     check_scene(scene, facts)
     check_fields(scene, facts, config, config.plan.keep)
     planned, decisions, kept = config, [], {}
     for name, rule in RULES.items():
-        decision = rule(facts, planned)
-        changes = {path: value for path, value in decision.fields.items() if path not in config.plan.keep}
-        current = _flat(config_to_dict(planned))
-        kept |= {path: current[path] for path in decision.fields if path not in changes}
+        decision = rule(facts, planned, device)
+        current = {path: _field(planned, path) for path in decision.fields}
+        changes = {
+            path: value
+            for path, value in decision.fields.items()
+            if path not in config.plan.keep and value != current[path]
+        }
+        kept |= {path: current[path] for path in decision.fields if path in config.plan.keep}
         decisions.append(Decision(name, changes, decision.choice, decision.reason))
         planned = override_config(planned, changes, f"{scene.name}: plan of {name}")
     planned = override_config(planned, {"plan.enabled": False}, scene.name)
     return Plan(planned, facts, tuple(decisions), kept)
 
 
-def apply_plan(scene: Scene, config: Config) -> tuple[Config, Plan | None]:
+def apply_plan(scene: Scene, config: Config, device: str | torch.device | None = None) -> tuple[Config, Plan | None]:
     """The config to train a scene with, and its plan where config.plan asks for one; without, the fields in plan.keep
     are checked against the scene all the same. Raises InputError as make_plan does."""
     if config.plan.enabled:
-        plan = make_plan(scene, config)
+        plan = make_plan(scene, config, device)
         return plan.config, plan
     if config.plan.keep:
         check_fields(scene, measure_scene(scene, config.seed), config, config.plan.keep)
     return config, None
-
-
-def read_plan(folder: Path) -> dict | None:
-    """The plan that a run was trained by, as Plan.to_dict gave it; None without one, or where its file is damaged."""
-    try:
-        values = json.loads((folder / PLAN).read_text(encoding="utf-8"))
-        format_plan(values)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return None
-    return values
 
 
 def format_plan(values: dict) -> str:
@@ -102,8 +130,132 @@ def format_plan(values: dict) -> str:
     return "\n".join(lines)
 
 
-def _flat(values: dict, prefix: str = "") -> dict:
-    found = {}
-    for key, value in values.items():
-        found |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return found
+def check_fields(scene: Scene, facts: SceneFacts, config: Config, given: Collection[str]) -> None:
+    """Raises InputError, with both values, for fields that the user gave and the scene contradicts. given: names."""
+
+    def refuse(path: str, problem: str, remedy: str) -> None:
+        raise InputError(scene.name, f"{path} = {json.dumps(_field(config, path))}, but {problem}", remedy)
+
+    if "fusion.exposures" in given:
+        base = base_exposure_time(scene)
+        timed = [item for item in config.fusion.exposures if is_seconds(item)]
+        if timed and not scene.exposure_times_known:
+            remedy = "write multiples of the photos' exposure (1/8x) or stops from it (-3ev)"
+            refuse("fusion.exposures", f"{timed[0]} is a time and the photos state none", remedy)
+        for time in exposure_times(base, config.fusion.exposures):
+            if not 1 / REACH <= time / base <= REACH:
+                problem = f"{time:.3g} s is {time / base:.3g} times the photos' {base:.3g} s"
+                refuse("fusion.exposures", problem, f"stay within 1/{REACH:.0f} and {REACH:.0f} times")
+    if {"loss.hdr_truth", "loss.linear_weight", "loss.hdr_weight"} & set(given) and not facts.truths:
+        problem = f"0 of {facts.photos} training photos have HDR truth"
+        for path in ("loss.hdr_truth", "loss.hdr_weight"):
+            if _field(config, path) and not config.loss.predictor:
+                refuse(path, problem, "take a scene with HDR truth, leave the field out, or use --predict-hdr")
+    if "densification.max_gaussians" in given and config.densification.max_gaussians < facts.points:
+        problem = f"the scene starts from {facts.points} points"
+        refuse("densification.max_gaussians", problem, f"use {facts.points} or more, or leave the field out")
+
+
+def _response(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
+    name = config.response.name
+    if name != "auto":
+        reason = "learned with the scene" if name == "learned" else f"{name} was named"
+        return Decision("response", {}, "no search", reason)
+    made = "a camera made the files" if facts.from_camera else "nothing says what made the files"
+    return Decision(
+        "response", {}, "search", f"no curve was named, and {made}: it is chosen from {facts.photos} photos"
+    )
+
+
+def _brackets(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
+    darker, brighter = (2 if facts.clipped < 0.001 else 4), (2 if facts.black < 0.001 else 4)
+    reason = (
+        f"{facts.clipped:.1%} of the pixels clip, {facts.black:.1%} are black: look at -{darker} to +{brighter} EV "
+        f"(render --evs=-{darker},0,{brighter}); all are scalings of one render, made at export"
+    )
+    if not config.fusion.enabled:
+        return Decision("brackets", {}, "plain scaling", reason)
+    fields: dict[str, object] = {"fusion.enabled": False}
+    if config.loss.linear_weight > 0 and not (config.loss.hdr_truth and (facts.truths or config.loss.predictor)):
+        fields["loss.linear_weight"] = 0.0
+    reason = f"{len(config.fusion.exposures)} brackets of one base hold no light of their own; {reason}"
+    return Decision("brackets", fields, "plain scaling", reason)
+
+
+def _linear_loss(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
+    shown = f"{facts.truths} of {facts.photos} photos have HDR truth"
+    if config.loss.linear_weight == 0:
+        return Decision("linear-loss", {}, "none", f"loss.linear_weight = 0; {shown}")
+    if config.loss.hdr_truth and (facts.truths or config.loss.predictor):
+        return Decision("linear-loss", {}, "against truth", shown)
+    fields: dict[str, object] = {"loss.linear_weight": 0.0}
+    return Decision("linear-loss", fields, "none", f"{shown}: against its own brackets a base learns nothing")
+
+
+def _densification(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
+    options = config.densification
+    most = gaussian_budget(options, facts.pixels)
+    reason = f"densification.max_gaussians = {options.max_gaussians}"
+    if options.budget:
+        reason = f"{options.budget:g} times the square root of {facts.pixels} pixels, below {options.max_gaussians}"
+    if options.strategy == "relocation":
+        start = facts.points or config.model.initial_count
+        choice = f"relocation grows to at most {most}" if start < most else "relocation without growth"
+        return Decision("densification", {}, choice, f"{reason}; {start} to start with")
+    # Relocation has this budget by itself; densification by gradients stops nowhere.
+    most = min(options.max_gaussians, max(most, 2 * facts.points))
+    fields: dict[str, object] = {"densification.max_gaussians": most}
+    if config.model.initial_count > most // 2 and not facts.points:
+        fields["model.initial_count"] = max(100, most // 2)
+    return Decision("densification", fields, f"{most} Gaussians", f"{reason}; {facts.points} points to start from")
+
+
+def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
+    preset = config.schedule.iterations
+    wanted = min(preset, math.ceil(max(FEWEST_ITERATIONS, PASSES * facts.photos) / 100) * 100)
+    reason = f"{PASSES} steps on each of {facts.photos} photos, at least {FEWEST_ITERATIONS}, at most {preset}"
+    if device.type == "cpu":
+        step = cpu_step_seconds(facts, config)
+        most = max(CPU_FEWEST, math.ceil(CPU_SECONDS / step / 100) * 100)
+        if wanted > most:
+            wanted = most
+            # Of the seconds and not of the steps: a step is as slow as its photo is large.
+            reason = f"about {_minutes(wanted * step)} on a CPU with {thread_count()} threads; --iterations for more"
+            if wanted == CPU_FEWEST and wanted * step > 2 * CPU_SECONDS:
+                reason += ", --max-size for smaller photos and less time"
+    return Decision("iterations", {"schedule.iterations": wanted}, f"{wanted}", reason)
+
+
+def _confidence(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
+    unsure = facts.clipped + facts.black
+    choice = "worth a look" if unsure >= 0.001 or facts.seen < 4 else "high throughout"
+    reason = f"{unsure:.1%} of the pixels state a bound alone, and a place is seen by {facts.seen:.1f} photos"
+    return Decision("confidence", {}, choice, reason)
+
+
+RULES: dict[str, Callable[[SceneFacts, Config, torch.device], Decision]] = {
+    "response": _response,
+    "brackets": _brackets,
+    "linear-loss": _linear_loss,
+    "densification": _densification,
+    "iterations": _iterations,
+    "confidence": _confidence,
+}
+"""What a plan decides, in this order."""
+
+
+def cpu_step_seconds(facts: SceneFacts, config: Config) -> float:
+    """About how long a step takes on this machine's CPU, with two thirds of the Gaussians that the training ends with:
+    the mean over one that grows for half of its steps."""
+    count = max(facts.points or config.model.initial_count, gaussian_budget(config.densification, facts.pixels))
+    work = CPU_PIXEL * facts.pixels / facts.photos + CPU_GAUSSIAN * min(count, config.densification.max_gaussians) / 1.5
+    return work / thread_count()
+
+
+def _minutes(seconds: float) -> str:
+    return f"{max(1, round(seconds / 60))} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def _field(config: Config, path: str):
+    part, name = path.split(".")
+    return config_to_dict(config)[part][name]

@@ -1,9 +1,10 @@
-"""What a plan rests on: a scene measured from its photos, cameras and points, before anything is trained."""
+"""What a plan rests on: a scene measured from its photos, cameras and points; and scenes that no plan fits."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from ..errors import InputError
 from ..scene import Scene, View
 from ..scene.exposure import made_by_camera
 from .initialization import focus_distance, points_on_rays
@@ -12,6 +13,10 @@ PROBES = 2000
 """Places at which overlap, parallax and visibility are measured."""
 FEWEST_POINTS = 100
 """With fewer sparse points places along the cameras' rays serve as probes."""
+FEWEST_PHOTOS = 3
+LEAST_OVERLAP = 0.02
+"""Part of the places that must be in two photos' fields of view."""
+LEAST_CONTRAST = 1 / 255
 MOST_VIEWS = 64
 """Photos that codes are read from, evenly spread; geometry is of all."""
 
@@ -79,6 +84,29 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         black=black,
         contrast=float(np.sqrt(np.mean([image.var() for image in codes]) + np.var([image.mean() for image in codes]))),
     )
+
+
+def check_scene(scene: Scene, facts: SceneFacts) -> None:
+    """Raises InputError for a scene that no training can make sense of."""
+    if facts.photos < FEWEST_PHOTOS:
+        raise InputError(
+            scene.name,
+            f"{facts.photos} training photos: depth and light cannot be told apart from so few",
+            f"take {FEWEST_PHOTOS} or more photos from different places, better 20",
+        )
+    if facts.contrast < LEAST_CONTRAST:
+        raise InputError(
+            scene.name,
+            f"all photos show a single colour (standard deviation {255 * facts.contrast:.2f} of 255): nothing to match",
+            "check that the files are the photos, and their exposure",
+        )
+    if facts.overlap < LEAST_OVERLAP:
+        raise InputError(
+            scene.name,
+            f"the photos share no view: {facts.overlap:.1%} of the places that one shows are in the field of view of "
+            "another",
+            "check the poses and the axes' convention, or take photos that overlap by a half",
+        )
 
 
 def visibility(points: np.ndarray, views: tuple[View, ...]) -> np.ndarray:

@@ -16,6 +16,8 @@ from .densification import Densification
 
 MOST_COPIES = 51
 """A Gaussian is shared by at most this many at once, as in the authors' code: the binomial sums stay exact."""
+MOST_GROWTH = 1.0
+"""A change adds at most as many as there are: each then shares with one other in the mean."""
 SEED_STEP = 1_000_003
 """Seeds of trainings are this far apart in the seeds of their noise, one for each iteration."""
 
@@ -38,10 +40,19 @@ class Relocation(Densification):
         dead = gaussians.opacities() <= self.options.prune_opacity
         self._relocate(gaussians, dead, optimizer, generator)
         count = gaussians.count
-        target = min(self.most, math.ceil((1 + self.options.growth) * count))
+        target = self.next_count(iteration, count)
         if target > count:
             self._add(gaussians, target - count, optimizer, generator)
         return target > count
+
+    def next_count(self, iteration: int, count: int) -> int:
+        """How many Gaussians there are after the change at an iteration: more by `growth`, or by as much as takes the
+        count to the budget by the last change, at most MOST_GROWTH."""
+        growth = self.options.growth
+        if growth and count < self.most:
+            left = (self.stop - 1) // self.every - iteration // self.every + 1
+            growth = max(growth, min((self.most / count) ** (1 / left) - 1, MOST_GROWTH))
+        return max(count, min(self.most, math.ceil((1 + growth) * count)))
 
     def perturb(self, iteration: int, gaussians: Gaussians, means_rate: float) -> None:
         if self.options.noise == 0:

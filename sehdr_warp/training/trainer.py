@@ -72,8 +72,7 @@ class Trainer:
     @property
     def degree(self) -> int:
         """The degree of the harmonics at this iteration: one more every harmonics_every."""
-        every = self.config.scaled(self.config.schedule.harmonics_every)
-        return min(self.config.model.harmonics_degree, self.iteration // every)
+        return self.config.degree_at(self.iteration)
 
     @property
     def loss(self) -> float:

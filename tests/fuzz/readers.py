@@ -173,10 +173,9 @@ def _run(folder: Path) -> None:
 
     from sehdr_warp.field.gaussians import Gaussians
     from sehdr_warp.response import response_by_name
-    from sehdr_warp.training.checkpoint import write_checkpoint
     from sehdr_warp.training.config_files import load_config
     from sehdr_warp.training.initialization import assemble_field
-    from sehdr_warp.training.run import CHECKPOINTS, append_metrics, write_start
+    from sehdr_warp.training.run_folder import RunFolder
     from sehdr_warp.training.trainer import Trainer
     from tests.training.toy import toy_scene
 
@@ -184,11 +183,12 @@ def _run(folder: Path) -> None:
     gaussians = Gaussians.from_points(torch.rand(4, 3), torch.zeros(4, 3), 3)
     scene = toy_scene(2, 8)
     field = assemble_field(gaussians, config, response_by_name("srgb"), 0.25)
-    write_start(folder, scene, config, field, {"path": "embedded"})
+    run = RunFolder(folder)
+    run.begin(scene, config, field, {"path": "embedded"}, None)
     tensors, values = Trainer(scene, config, field).state()
-    write_checkpoint(folder / CHECKPOINTS, tensors, values | {"seconds": 1.0}, kept=1)
-    append_metrics(folder, {"iteration": 1, "seconds": 0.5, "psnr_ldr": 20.0})
-    (folder / "summary.json").write_text(json.dumps({"iteration": 10, "train_seconds": 2.0}))
+    run.write_checkpoint(tensors, values | {"seconds": 1.0}, kept=1)
+    run.append_metrics({"iteration": 1, "seconds": 0.5, "psnr_ldr": 20.0})
+    run.write_summary({"iteration": 10, "train_seconds": 2.0})
 
 
 def _read_run(folder: Path):
@@ -201,12 +201,10 @@ def _read_run(folder: Path):
 
 def _read_resume(folder: Path):
     """What --resume reads."""
-    import torch
-
-    from sehdr_warp.training.train import _continue
+    from sehdr_warp.training.train import Training
     from tests.training.toy import toy_scene
 
-    return _continue(toy_scene(2, 8), folder, None, torch.device("cpu"))
+    return Training(toy_scene(2, 8), folder, device="cpu", resume=True)
 
 
 def _resign(folder: Path) -> None:

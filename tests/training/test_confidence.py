@@ -6,16 +6,15 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.training.confidence import CONFIDENCE, ensure_confidence
 from sehdr_warp.training.config_files import load_config
-from sehdr_warp.training.run import load_run
+from sehdr_warp.training.run import ensure_confidence, load_run
 from sehdr_warp.training.train import train
 
 
 @pytest.fixture(scope="module")
 def trained(scene, tmp_path_factory):
     config = load_config("demo", {"schedule.iterations": 6, "response.name": "srgb"})
-    return train(scene, tmp_path_factory.mktemp("run") / "run", config, device="cpu", quiet=True)
+    return train(scene, tmp_path_factory.mktemp("run") / "run", config, device="cpu")
 
 
 @pytest.fixture
@@ -30,27 +29,27 @@ def test_a_training_leaves_its_confidence(trained, scene):
     confidence = load_run(trained.path).model.confidence
     assert torch.equal(confidence, trained.model.confidence)
     assert confidence.shape == (trained.gaussian_count,) and 0 <= confidence.min() < confidence.max() <= 1
-    kept = load_file(trained.path / CONFIDENCE)
+    kept = load_file(trained.folder.confidence)
     assert sorted(kept) == ["clipped", "confidence", "seen", "stops"]
     shown = trained.render_confidence(scene.test_views[0].camera)
     assert shown.shape == (32, 32) and 0 < shown.max() <= 1
 
 
-def test_an_older_run_gets_it_on_demand(run, scene):
+def test_an_older_run_gets_it_on_demand(run, scene, caplog):
     expected = run.model.confidence
-    (run.path / CONFIDENCE).unlink()
+    run.folder.confidence.unlink()
     run = load_run(run.path)
     assert run.model.confidence is None and run.render_confidence(scene.test_views[0].camera) is None
-    said = []
-    ensure_confidence(run, scene, said.append)
+    caplog.set_level("INFO")
+    ensure_confidence(run, scene)
     torch.testing.assert_close(run.model.confidence, expected)
     torch.testing.assert_close(load_run(run.path).model.confidence, expected)
-    ensure_confidence(run, scene, said.append)
-    assert len(said) == 1
+    ensure_confidence(run, scene)
+    assert caplog.text.count("measuring confidence") == 1
 
 
 def test_that_of_another_checkpoint_does_not_count(run):
-    save_file({"confidence": run.model.confidence}, run.path / CONFIDENCE, {"format": "1", "checkpoint": "0" * 64})
+    save_file({"confidence": run.model.confidence}, run.folder.confidence, {"format": "2", "checkpoint": "0" * 64})
     assert load_run(run.path).model.confidence is None
 
 
@@ -60,12 +59,12 @@ def test_that_of_another_checkpoint_does_not_count(run):
     ids=["short", "values", "damaged"],
 )
 def test_damage_is_one_line(run, confidence, problem):
-    stated = {"format": "1", "checkpoint": run.checkpoint_hash}
+    stated = {"format": "2", "checkpoint": run.checkpoint_hash}
     if isinstance(confidence, bytes):
-        (run.path / CONFIDENCE).write_bytes(confidence)
+        run.folder.confidence.write_bytes(confidence)
     else:
         values = torch.full_like(run.model.confidence, torch.nan) if confidence is None else confidence
-        save_file({"confidence": values}, run.path / CONFIDENCE, stated)
+        save_file({"confidence": values}, run.folder.confidence, stated)
     with pytest.raises(InputError, match=problem) as error:
         load_run(run.path)
-    assert CONFIDENCE in str(error.value) and "report" in str(error.value)
+    assert run.folder.confidence.name in str(error.value) and "report" in str(error.value)

@@ -219,6 +219,19 @@ def test_relocation_grows_to_the_budget():
     assert gaussians.count == 106
 
 
+@pytest.mark.parametrize("iterations", [300, 1500, 30_000])
+def test_a_training_of_any_length_reaches_its_budget(iterations):
+    strategy = make_densification(load_config("default", {"schedule.iterations": iterations}), EXTENT, 10**6)
+    assert strategy.most == 120_000
+    count = 5000
+    for iteration in range(1, iterations + 1):
+        if strategy._is_due(iteration):
+            growth = strategy.next_count(iteration, count) / count
+            assert iterations < 30_000 or growth <= 1.05 + 1 / count
+            count = strategy.next_count(iteration, count)
+    assert count == 120_000
+
+
 def test_noise_comes_with_the_iteration():
     moved = []
     for iteration in (7, 7, 8):

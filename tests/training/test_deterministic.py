@@ -23,7 +23,7 @@ SHORT = {
 def test_two_trainings_are_the_same_bits(scene, tmp_path, device, preset):
     overrides = SHORT | ({"response.name": "srgb"} if preset == "paper" else {})
     config = load_unscaled(preset, overrides)
-    runs = [train(scene, tmp_path / name, config, device=device, quiet=True) for name in "ab"]
+    runs = [train(scene, tmp_path / name, config, device=device) for name in "ab"]
     assert not torch.are_deterministic_algorithms_enabled()
     assert runs[0].model.style == BlendStyle(deterministic=True)
     first, second = (run.model.gaussians.tensors() for run in runs)

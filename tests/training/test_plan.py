@@ -5,17 +5,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import Camera, codes_of
 from sehdr_warp.training.config_files import config_to_dict, load_config, override_config
-from sehdr_warp.training.plan import apply_plan, make_plan, read_plan
-from sehdr_warp.training.plan_rules import RULES
+from sehdr_warp.training.plan import RULES, apply_plan, cpu_step_seconds, make_plan
 from sehdr_warp.training.plan_scene import measure_scene
+from sehdr_warp.training.run_folder import RunFolder
 from sehdr_warp.training.train import train
 
 from ..refusals import call
 from .toy import orbit_camera, toy_scene
+
+GPU, CPU = torch.device("cuda"), torch.device("cpu")
 
 
 def config_of(**changes):
@@ -80,15 +83,27 @@ def test_decisions_follow_their_figures(facts, name, change, field, few, many):
     small = {"photos": 6, "seen": 3.0, "pixels": 6144}
     # Relocation has a budget of its own.
     config = config_of(**({"densification__strategy": "gradient"} if name == "densification" else {}))
-    assert RULES[name](replace(facts, **small), config).fields.get(field) == few
-    assert RULES[name](replace(facts, **small | change), config).fields.get(field) == many
+    assert RULES[name](replace(facts, **small), config, GPU).fields.get(field) == few
+    assert RULES[name](replace(facts, **small | change), config, GPU).fields.get(field) == many
 
 
 @pytest.mark.parametrize("points,choice", [(0, "without growth"), (3000, "at most 9406"), (10_000, "without growth")])
 def test_a_plan_says_whether_relocation_has_room(facts, points, choice):
     """120 times the square root of 6144 pixels; without points of its own a scene starts with the preset's 50 000."""
-    decision = RULES["densification"](replace(facts, pixels=6144, points=points), config_of())
+    decision = RULES["densification"](replace(facts, pixels=6144, points=points), config_of(), GPU)
     assert choice in decision.choice and f"{points or 50_000} to start with" in decision.reason
+
+
+def test_a_cpu_gets_the_iterations_that_fit_into_minutes(facts, monkeypatch):
+    monkeypatch.setattr("sehdr_warp.training.plan.thread_count", lambda: 2)
+    config, rule = config_of(), RULES["iterations"]
+    small, large = (replace(facts, photos=200, pixels=200 * side * side) for side in (32, 2000))
+    some, few, all_of_them = rule(small, config, CPU), rule(large, config, CPU), rule(small, config, GPU)
+    assert all_of_them.fields == {"schedule.iterations": 30_000}
+    assert few.fields == {"schedule.iterations": 1000}
+    assert "--max-size" in few.reason and "73 min on a CPU" in few.reason
+    assert 1000 < some.fields["schedule.iterations"] <= 30_000
+    assert cpu_step_seconds(large, config) > 50 * cpu_step_seconds(small, config)
 
 
 def test_brackets_of_one_base_become_a_scaling(scene):
@@ -171,16 +186,16 @@ def test_values_that_the_scene_contradicts_are_refused_with_both(scene, changes,
 
 def test_a_training_follows_its_plan_and_keeps_it(scene, tmp_path):
     config = config_of(schedule__iterations=12, plan__keep=["schedule.iterations"])
-    run = train(scene, tmp_path / "run", config, device="cpu", quiet=True)
-    plan = read_plan(tmp_path / "run")
+    run = train(scene, tmp_path / "run", config, device="cpu")
+    plan = run.folder.read_plan()
     assert {decision["name"] for decision in plan["decisions"]} == set(RULES)
     assert run.config == make_plan(scene, config).config
     assert run.summary()["plan"]["brackets"] == "plain scaling"
     # Asking again for the same plan resumes; without one the old plan goes with the old run.
-    assert train(scene, tmp_path / "run", config, device="cpu", quiet=True, resume=True).iterations == 12
+    assert train(scene, tmp_path / "run", config, device="cpu", resume=True).iterations == 12
     unplanned = load_config("default", {"response.name": "srgb", "schedule.iterations": 2, "plan.enabled": False})
-    assert train(scene, tmp_path / "run", unplanned, device="cpu", quiet=True, overwrite=True).summary()["plan"] is None
-    assert read_plan(tmp_path / "run") is None
+    assert train(scene, tmp_path / "run", unplanned, device="cpu", overwrite=True).summary()["plan"] is None
+    assert RunFolder(tmp_path / "run").read_plan() is None
 
 
 def test_plan_only_prints_and_trains_nothing(tmp_path, capsys, monkeypatch):
@@ -191,6 +206,6 @@ def test_plan_only_prints_and_trains_nothing(tmp_path, capsys, monkeypatch):
     assert plan["kept"] == {"schedule.iterations": 500} and plan["facts"]["photos"] == 18
     assert call(*arguments) == 0
     table = capsys.readouterr().out
-    assert "schedule.iterations = 16200" in table and "900 steps on each of 18 photos" in table
+    assert "schedule.iterations = " in table and "kept" not in table
     assert call(*arguments[:2]) == 2 and "--out" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -98,18 +98,18 @@ def test_truth_of_training_views_is_never_seen(scene, tmp_path):
     )
     config = quick("predicted", **{"schedule.iterations": 5})
     runs = [
-        train(given, tmp_path / str(number), config, device="cpu", quiet=True)
+        train(given, tmp_path / str(number), config, device="cpu")
         for number, given in enumerate((scene, dataclasses.replace(scene, views=liars)))
     ]
     camera = scene.test_views[0].camera
     assert torch.equal(runs[0].render(camera).hdr, runs[1].render(camera).hdr)
-    seen = train(scene, tmp_path / "truth", quick("truth", **{"schedule.iterations": 5}), device="cpu", quiet=True)
+    seen = train(scene, tmp_path / "truth", quick("truth", **{"schedule.iterations": 5}), device="cpu")
     assert not torch.equal(seen.render(camera).hdr, runs[0].render(camera).hdr)
     # A scene that holds predictions already keeps them, and a resumed training predicts again.
     other = predicted_scene(scene, torchscript(tmp_path / "square.pt", Square()))
-    run = train(other, tmp_path / "other", config, device="cpu", quiet=True)
+    run = train(other, tmp_path / "other", config, device="cpu")
     assert not torch.equal(run.render(camera).hdr, runs[0].render(camera).hdr)
-    resumed = train(scene, tmp_path / "0", device="cpu", quiet=True, resume=True)
+    resumed = train(scene, tmp_path / "0", device="cpu", resume=True)
     assert torch.equal(resumed.render(camera).hdr, runs[0].render(camera).hdr)
 
 

@@ -33,7 +33,7 @@ def slow(self):
     step(self)
     time.sleep(0.5 if self.iteration > 60 else 0)
 trainer.Trainer.step = slow
-train(toy_scene(), sys.argv[2], configuration(sys.argv[3]), device="cpu", quiet=True)
+train(toy_scene(), sys.argv[2], configuration(sys.argv[3]), device="cpu")
 """
 
 
@@ -62,11 +62,11 @@ def kill_after_checkpoint(out, strategy):
 @pytest.mark.parametrize("strategy", ["gradient", "relocation", "paper"])
 def test_resume_is_exact(scene, tmp_path, strategy):
     config = configuration(strategy)
-    train(scene, tmp_path / "whole", config, device="cpu", quiet=True)
+    train(scene, tmp_path / "whole", config, device="cpu")
     kill_after_checkpoint(tmp_path / "killed", strategy)
     assert newest_checkpoint(tmp_path / "killed" / "checkpoints").values["iteration"] == 60
     # The statistics of a densification interval that the kill cut in two (50 to 75) are part of the state.
-    run = train(scene, tmp_path / "killed", device="cpu", quiet=True, resume=True)
+    run = train(scene, tmp_path / "killed", device="cpu", resume=True)
     whole = newest_checkpoint(tmp_path / "whole" / "checkpoints")
     resumed = newest_checkpoint(tmp_path / "killed" / "checkpoints")
     assert run.config == config and resumed.values["iteration"] == 120
@@ -82,21 +82,21 @@ def test_resume_is_exact(scene, tmp_path, strategy):
 
 def test_resume_before_the_first_checkpoint_starts_over(scene, tmp_path):
     config = configuration("gradient")
-    whole = train(scene, tmp_path / "whole", config, device="cpu", quiet=True)
-    train(scene, tmp_path / "cut", config, device="cpu", quiet=True)
+    whole = train(scene, tmp_path / "whole", config, device="cpu")
+    train(scene, tmp_path / "cut", config, device="cpu")
     for folder in (tmp_path / "cut" / "checkpoints").iterdir():
         for file in folder.iterdir():
             file.unlink()
         folder.rmdir()
-    again = train(scene, tmp_path / "cut", device="cpu", quiet=True, resume=True)
+    again = train(scene, tmp_path / "cut", device="cpu", resume=True)
     assert torch.equal(whole.model.gaussians.means, again.model.gaussians.means)
     assert len(again.metrics()) == len(whole.metrics())
 
 
 def test_resume_of_a_finished_run_changes_nothing(scene, tmp_path):
     config = configuration("gradient")
-    first = train(scene, tmp_path / "run", config, device="cpu", quiet=True)
-    again = train(scene, tmp_path / "run", config, device="cpu", quiet=True, resume=True)
+    first = train(scene, tmp_path / "run", config, device="cpu")
+    again = train(scene, tmp_path / "run", config, device="cpu", resume=True)
     assert torch.equal(first.model.gaussians.means, again.model.gaussians.means)
     assert first.metrics() == again.metrics()
 

@@ -52,7 +52,7 @@ def test_every_rival_learns_and_loads_as_it_was_trained(scene, tmp_path, name):
     config = quick(name, **RIVALS[name], **{"schedule.iterations": 100})
     # What trains without truth trains without any there.
     given = scene if config.loss.uses_hdr and not config.loss.predictor else without_truth(scene)
-    run = train(given, tmp_path / "run", config, device="cpu", quiet=True)
+    run = train(given, tmp_path / "run", config, device="cpu")
     first, last = run.metrics()
     figure = "psnr_mu" if config.loss.hdr_weight > 0 else "psnr_ldr"
     # Perceptrons take longer than this to find their weights.
@@ -129,9 +129,7 @@ def test_photos_of_no_weight_teach_nothing(scene):
 def test_a_scene_without_truth_is_refused_by_name_and_field(scene, tmp_path, preset):
     field = "loss.hdr_truth = true" if preset == "paper-truth" else "loss.hdr_weight = "
     with pytest.raises(InputError, match=f"^toy: no training view has the HDR truth that {field}"):
-        train(
-            without_truth(scene), tmp_path / "run", quick(preset, **{"response.name": "srgb"}), device="cpu", quiet=True
-        )
+        train(without_truth(scene), tmp_path / "run", quick(preset, **{"response.name": "srgb"}), device="cpu")
     assert not (tmp_path / "run").exists()
 
 

@@ -16,7 +16,7 @@ from sehdr_warp.scene import codes_of
 from sehdr_warp.training.config_files import load_config, override_config
 from sehdr_warp.training.initialization import choose_response, make_field
 from sehdr_warp.training.run import load_run
-from sehdr_warp.training.train import train
+from sehdr_warp.training.train import Training, train
 from sehdr_warp.training.trainer import Trainer
 
 from .recorded import check_recorded_like_launched
@@ -65,7 +65,7 @@ VARIANTS = {
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_every_variant_learns(scene, tmp_path, variant):
-    run = train(scene, tmp_path / "run", VARIANTS[variant], device="cpu", quiet=True)
+    run = train(scene, tmp_path / "run", VARIANTS[variant], device="cpu")
     first, last = run.metrics()
     assert first["iteration"] == 10 and last["iteration"] == 150 and last["split"] == "test"
     # The perceptrons of the fusion take longer than this to find their weights.
@@ -77,7 +77,7 @@ def test_every_variant_learns(scene, tmp_path, variant):
 
 
 def test_the_default_gets_radiance_right(scene, tmp_path):
-    run = train(scene, tmp_path / "run", quick(), device="cpu", quiet=True)
+    run = train(scene, tmp_path / "run", quick(), device="cpu")
     last = run.metrics()[-1]
     assert last["psnr_ldr"] > 20 and last["psnr_mu"] > 20
     assert run.exposure_time == EXPOSURE_TIME and run.gaussian_count == last["gaussians"]
@@ -85,7 +85,7 @@ def test_the_default_gets_radiance_right(scene, tmp_path):
 
 def test_a_scene_without_points_starts_from_drawn_ones(tmp_path):
     scene = toy_scene(with_points=False)
-    run = train(scene, tmp_path / "run", quick(), device="cpu", quiet=True)
+    run = train(scene, tmp_path / "run", quick(), device="cpu")
     assert run.metrics()[-1]["psnr_ldr"] > 20
 
 
@@ -97,28 +97,31 @@ def test_a_scene_without_points_starts_from_drawn_ones(tmp_path):
         {"densification.max_gaussians": 50},
     ],
 )
-def test_more_start_points_than_the_budget_stay_as_many_and_are_told(scene, tmp_path, capsys, options):
+def test_more_start_points_than_the_budget_stay_as_many_and_are_told(scene, tmp_path, caplog, options):
     """60 points; 0.1 times the square root of six photos of 32 x 32 pixels is 7."""
+    caplog.set_level("INFO")
     config = quick(**{"schedule.iterations": 50, "densification.growth": 0.5} | options)
     run = train(scene, tmp_path / "run", config, device="cpu")
-    told = capsys.readouterr().err
+    told = caplog.text
     assert ("60 Gaussians are more than relocation's budget of 7" in told) == ("densification.budget" in options)
     assert ("60 start points: drawn from" in told) == ("densification.max_gaussians" in options)
-    assert run.gaussian_count == options.get("densification.max_gaussians", 60 if options else 90)
+    assert run.gaussian_count == options.get("densification.max_gaussians", 60 if options else 120)
 
 
-def test_what_was_repaired_in_a_response_file_is_told(scene, tmp_path, capsys):
+def test_what_was_repaired_in_a_response_file_is_told(scene, tmp_path, caplog):
+    caplog.set_level("INFO")
     path = tmp_path / "camera.csv"
     path.write_text("0 0\n0.2 0.5\n0.4 0.7\n0.6 0.6\n1 1\n")
     config = quick(**{"schedule.iterations": 2, "response.name": str(path)})
     for resume in (False, True):
         train(scene, tmp_path / "run", config, device="cpu", resume=resume)
-        assert capsys.readouterr().err.count(f"{path}: 1 of 5 values fall, by up to 0.1; made monotone\n") == 1
+        assert caplog.text.count(f"{path}: 1 of 5 values fall, by up to 0.1; made monotone\n") == 1
+        caplog.clear()
 
 
 def test_run_folder_is_complete_and_loads_without_photos(scene, tmp_path):
     out = tmp_path / "run"
-    run = train(scene, out, quick(), device="cpu", quiet=True, data={"path": "somewhere"})
+    run = train(scene, out, quick(), device="cpu", data={"path": "somewhere"})
     names = {path.name for path in out.iterdir()}
     files = {"config.json", "scene.json", "run.json", "metrics.jsonl", "summary.json", "confidence.safetensors"}
     assert names == files | {"checkpoints"}
@@ -145,7 +148,7 @@ def test_views_of_differing_exposure_agree(tmp_path):
         time = EXPOSURE_TIME * (2 if index % 2 else 1)
         photo = np.round(srgb.encode(view.hdr * time) * 255).astype(np.float32) / 255
         views.append(dataclasses.replace(view, codes=codes_of(photo), exposure_time=time))
-    run = train(dataclasses.replace(base, views=tuple(views)), tmp_path / "run", quick(), device="cpu", quiet=True)
+    run = train(dataclasses.replace(base, views=tuple(views)), tmp_path / "run", quick(), device="cpu")
     # Taken for equal, the times would leave the simulated photos a stop off: below 15 dB.
     assert run.metrics()[-1]["psnr_ldr"] > 18
     assert run.metrics()[-1]["psnr_mu"] > 19
@@ -172,29 +175,29 @@ def test_existing_folders_are_safe(scene, tmp_path):
     (out / "notes.txt").write_text("mine")
     for options in ({}, {"overwrite": True}, {"resume": True}):
         with pytest.raises(InputError):
-            train(scene, out, quick(), device="cpu", quiet=True, **options)
+            train(scene, out, quick(), device="cpu", **options)
     assert [path.name for path in out.iterdir()] == ["notes.txt"]
     (tmp_path / "file").write_text("mine")
     with pytest.raises(InputError, match="is a file"):
-        train(scene, tmp_path / "file", quick(), device="cpu", quiet=True)
+        train(scene, tmp_path / "file", quick(), device="cpu")
 
 
 def test_overwrite_starts_anew(scene, tmp_path):
     short = quick(**{"schedule.iterations": 5})
-    train(scene, tmp_path / "run", short, device="cpu", quiet=True)
+    train(scene, tmp_path / "run", short, device="cpu")
     with pytest.raises(InputError, match="--resume or --overwrite"):
-        train(scene, tmp_path / "run", short, device="cpu", quiet=True)
-    run = train(scene, tmp_path / "run", quick(**{"schedule.iterations": 3}), device="cpu", quiet=True, overwrite=True)
+        train(scene, tmp_path / "run", short, device="cpu")
+    run = train(scene, tmp_path / "run", quick(**{"schedule.iterations": 3}), device="cpu", overwrite=True)
     assert run.iterations == 3 and [line["iteration"] for line in run.metrics()][-1] == 3
 
 
 def test_resume_refuses_another_config_or_scene(scene, tmp_path):
     short = quick(**{"schedule.iterations": 5})
-    train(scene, tmp_path / "run", short, device="cpu", quiet=True)
+    train(scene, tmp_path / "run", short, device="cpu")
     with pytest.raises(InputError, match="seed = 0, but 1"):
-        train(scene, tmp_path / "run", override_config(short, {"seed": 1}), device="cpu", quiet=True, resume=True)
+        train(scene, tmp_path / "run", override_config(short, {"seed": 1}), device="cpu", resume=True)
     with pytest.raises(InputError, match="views differ"):
-        train(toy_scene(view_count=6), tmp_path / "run", short, device="cpu", quiet=True, resume=True)
+        train(toy_scene(view_count=6), tmp_path / "run", short, device="cpu", resume=True)
 
 
 def test_seeds_decide_and_global_state_does_not(scene, tmp_path):
@@ -202,7 +205,7 @@ def test_seeds_decide_and_global_state_does_not(scene, tmp_path):
     results = []
     for index, seed in enumerate((0, 0, 1)):
         torch.manual_seed(index)
-        run = train(scene, tmp_path / str(index), override_config(config, {"seed": seed}), device="cpu", quiet=True)
+        run = train(scene, tmp_path / str(index), override_config(config, {"seed": seed}), device="cpu")
         results.append(run.model.gaussians.means)
     assert torch.equal(results[0], results[1])
     assert results[2].shape != results[0].shape or not torch.equal(results[0], results[2])
@@ -246,7 +249,7 @@ def test_an_interrupt_leaves_a_usable_checkpoint(scene, tmp_path):
     config = quick(**{"schedule.iterations": 100_000, "schedule.evaluate_at": [100_000]})
     threading.Timer(2.0, lambda: signal.raise_signal(signal.SIGINT)).start()
     with pytest.raises(KeyboardInterrupt):
-        train(scene, tmp_path / "run", config, device="cpu", quiet=True)
+        train(scene, tmp_path / "run", config, device="cpu")
     run = load_run(tmp_path / "run")
     assert 0 < run.iterations < 100_000 and not run.summary()["finished"]
 
@@ -255,24 +258,23 @@ def test_an_interrupt_leaves_a_usable_checkpoint(scene, tmp_path):
 def test_photos_without_light_or_shadow_are_refused(scene, tmp_path, value, words):
     views = tuple(dataclasses.replace(view, codes=codes_of(np.full_like(view.image, value))) for view in scene.views)
     with pytest.raises(InputError, match=words):
-        train(dataclasses.replace(scene, views=views), tmp_path / "run", quick(), device="cpu", quiet=True)
+        train(dataclasses.replace(scene, views=views), tmp_path / "run", quick(), device="cpu")
 
 
 def test_one_view_is_refused_and_leaves_no_run(scene, tmp_path):
     with pytest.raises(InputError, match="1 training view"):
-        train(dataclasses.replace(scene, views=scene.views[:1]), tmp_path / "run", quick(), device="cpu", quiet=True)
+        train(dataclasses.replace(scene, views=scene.views[:1]), tmp_path / "run", quick(), device="cpu")
     assert not (tmp_path / "run").exists()
 
 
 def test_a_failed_overwrite_keeps_the_old_run(scene, tmp_path):
-    train(scene, tmp_path / "run", quick(**{"schedule.iterations": 2}), device="cpu", quiet=True)
+    train(scene, tmp_path / "run", quick(**{"schedule.iterations": 2}), device="cpu")
     with pytest.raises(InputError):
         train(
             dataclasses.replace(scene, views=scene.views[:1]),
             tmp_path / "run",
             quick(),
             device="cpu",
-            quiet=True,
             overwrite=True,
         )
     assert load_run(tmp_path / "run").iterations == 2
@@ -281,7 +283,7 @@ def test_a_failed_overwrite_keeps_the_old_run(scene, tmp_path):
 def test_unknown_device_is_refused(scene, tmp_path):
     for device in ("cuda:99", "tpu", "meta"):
         with pytest.raises(InputError, match=device):
-            train(scene, tmp_path / "run", quick(), device=device, quiet=True)
+            train(scene, tmp_path / "run", quick(), device=device)
     assert not (tmp_path / "run").exists()
 
 
@@ -313,13 +315,58 @@ def test_tensorboard_gets_the_figures_of_the_held_out_views(scene, tmp_path, mon
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "torch.utils.tensorboard", None)
         with pytest.raises(SehdrError, match=r"pip install sehdr-warp\[tensorboard\]"):
-            train(scene, tmp_path / "without", short, device="cpu", quiet=True, tensorboard=True)
+            train(scene, tmp_path / "without", short, device="cpu", tensorboard=True)
     assert not (tmp_path / "without").exists()
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    run = train(scene, tmp_path / "run", short, device="cpu", quiet=True, tensorboard=True)
+    run = train(scene, tmp_path / "run", short, device="cpu", tensorboard=True)
     events = EventAccumulator(str(run.path / "tensorboard")).Reload()
     last = run.metrics()[-1]
     written = events.Scalars("test/psnr_ldr")[-1]
     assert written.step == last["iteration"] == 4 and abs(written.value - last["psnr_ldr"]) < 1e-3
+
+
+def test_a_training_is_driven_step_by_step_and_left_at_any_time(scene, tmp_path):
+    training = Training(scene, tmp_path / "run", quick(), device="cpu")
+    seen = []
+    for step in training:
+        seen.append((step.iteration, step.seconds, step.seconds_left))
+        if step.iteration == 12:
+            assert step.loss > 0 and step.psnr > 5 and step.gaussians == 60 and step.total == 150
+            break
+    assert [iteration for iteration, *_ in seen] == list(range(1, 13))
+    assert seen[0][2] is None and 0 < seen[-1][2] < 138 * (seen[-1][1] - seen[0][1])
+    assert training.run.iterations == 12 and not training.run.summary()["finished"]
+    training = Training(scene, tmp_path / "run", device="cpu", resume=True)
+    for step in training:
+        if step.iteration == 20:
+            training.stop()
+    assert load_run(tmp_path / "run").iterations == training.run.iterations == 20
+
+
+@pytest.mark.parametrize("config", ["demo", {"schedule.iterations": 3, "response.name": "srgb"}, 7])
+def test_a_config_may_be_a_name_or_fields(scene, tmp_path, config):
+    if config == 7:
+        with pytest.raises(InputError, match="is int"):
+            Training(scene, tmp_path / "run", config)
+        return
+    training = Training(scene, tmp_path / "run", config, device="cpu")
+    assert training.total == (1500 if config == "demo" else 3)
+
+
+def test_held_out_photos_that_get_worse_are_told(scene, tmp_path, caplog):
+    training = Training(scene, tmp_path / "run", quick(**{"schedule.iterations": 4}), device="cpu")
+    training.folder.append_metrics({"iteration": 2, "psnr_ldr": 99.0})
+    for _ in training:
+        pass
+    assert "held-out photos were best at iteration 2 (99.00 dB), now" in caplog.text
+
+
+def test_a_run_of_an_earlier_version_is_refused_in_one_line(scene, tmp_path):
+    run = train(scene, tmp_path / "run", quick(**{"schedule.iterations": 1}), device="cpu")
+    info = json.loads(run.folder.info.read_text())
+    run.folder.info.write_text(json.dumps(info | {"format": 1}))
+    for use in (load_run, lambda path: train(scene, path, device="cpu", resume=True)):
+        with pytest.raises(InputError, match=r"made by version 0\.1"):
+            use(run.path)

@@ -1,0 +1,91 @@
+"""What a training asks of the machine: a device, torch's settings, the memory used, and tidy interrupts."""
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from ..errors import InputError
+from ..splatting.threads import thread_count
+
+
+def pick_device(device: str | torch.device | None) -> torch.device:
+    """The device a user named, by default the first GPU or else the CPU; raises InputError if it is not there."""
+    if device is None:
+        return torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
+    if not str(device).startswith(("cpu", "cuda")):
+        raise InputError(f"device {device}", "is neither a CPU nor a CUDA GPU", "use cpu or cuda:N")
+    try:
+        made = torch.device(device)
+        torch.empty(0, device=made)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(
+            f"device {device}", f"cannot be used ({reason})", "use cpu, or cuda:N of a GPU that torch sees"
+        ) from None
+    return torch.device("cuda", made.index or 0) if made.type == "cuda" else made
+
+
+def device_name(device: torch.device) -> str:
+    """What runs the training, for a report."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu ({thread_count()} threads)"
+
+
+def peak_memory(device: torch.device) -> dict[str, int]:
+    """Largest memory so far, bytes: of this process, and on a GPU of torch's tensors there."""
+    peaks = {}
+    if sys.platform != "win32":
+        import resource
+
+        unit = 1 if sys.platform == "darwin" else 1024
+        peaks["peak_memory_bytes"] = unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    if device.type == "cuda":
+        peaks["peak_gpu_memory_bytes"] = torch.cuda.max_memory_allocated(device)
+    return peaks
+
+
+@contextmanager
+def torch_settings(deterministic: bool) -> Iterator[None]:
+    """torch on one thread: its sums then do not depend on the machine's cores, and a CPU training repeats bit for bit.
+    It costs nothing: the work is in the kernels, which have threads of their own, and torch's would stand in their way.
+
+    deterministic: also torch's sums on a GPU in a fixed order.
+    """
+    threads, ordered = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
+    filled = torch.utils.deterministic.fill_uninitialized_memory
+    torch.set_num_threads(1)
+    if deterministic:
+        # cuBLAS repeats itself only with a workspace of its own; it reads this when it is first used.
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+        torch.use_deterministic_algorithms(True)
+        torch.utils.deterministic.fill_uninitialized_memory = False
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        torch.use_deterministic_algorithms(ordered)
+        torch.utils.deterministic.fill_uninitialized_memory = filled
+
+
+@contextmanager
+def interruptible() -> Iterator[threading.Event]:
+    """An event that the first interrupt sets, so that a step is never cut in two; a second interrupt stops at once."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    previous = signal.getsignal(signal.SIGINT)
+
+    def on_interrupt(*_):
+        event.set()
+        signal.signal(signal.SIGINT, previous)
+
+    signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, previous)

@@ -1,0 +1,278 @@
+"""The folder of a training: every name in it, and all that writes and reads it.
+
+config.json                 the Config
+scene.json                  cameras of all views, splits, exposure times, names: enough to render without the photos
+run.json                    response, base exposure time, version, where the photos were
+plan.json                   what was left out and why, where a plan was made
+metrics.jsonl               one line for each evaluation
+checkpoints/                see checkpoint.py
+confidence.safetensors      how far the photos vouch for each Gaussian, and of which checkpoint
+summary.json                times, memory and counts, when the training ended
+"""
+
+import json
+import math
+import reprlib
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+
+from ..errors import InputError, SehdrError
+from ..field.confidence import Evidence
+from ..field.radiance_field import RadianceField
+from ..files import atomic_path, write_json, writing
+from ..response import Response
+from ..scene import Camera, Scene
+from ..scene.images import MAX_PIXELS
+from .checkpoint import FORMAT, Checkpoint, first_not_finite, newest_checkpoint, refuse_format, write_checkpoint
+from .config import Config
+from .config_files import config_to_dict, read_config_json
+
+_REMEDY = "the run is damaged: train again"
+
+
+@dataclass(frozen=True)
+class CameraEntry:
+    """A view of the scene a run was trained on. exposure_time: seconds; split: "train" or "test"."""
+
+    name: str
+    split: str
+    camera: Camera
+    exposure_time: float
+
+
+class RunFolder:
+    """The files of one training at a path; nothing is read or made before it is asked for."""
+
+    def __init__(self, path: Path | str):
+        self.path = Path(path)
+        self.config, self.scene, self.info, self.plan, self.summary = (
+            self.path / f"{name}.json" for name in ("config", "scene", "run", "plan", "summary")
+        )
+        self.metrics = self.path / "metrics.jsonl"
+        self.checkpoints = self.path / "checkpoints"
+        self.confidence = self.path / "confidence.safetensors"
+        self.tensorboard = self.path / "tensorboard"
+
+    def check(self, *, resume: bool, overwrite: bool) -> bool:
+        """Whether there is a run to continue. Changes nothing.
+
+        Raises InputError if something is there and neither was asked for, or if what is there is no run.
+        """
+        if self.path.exists() and not self.path.is_dir():
+            raise InputError(self.path, "is a file", "choose another folder for the run")
+        if not self.path.exists() or not any(self.path.iterdir()):
+            return False
+        if not resume and not overwrite:
+            raise InputError(
+                self.path, "exists and is not empty", "choose another folder, or use --resume or --overwrite"
+            )
+        self.require()
+        return resume
+
+    def require(self) -> None:
+        """Raises InputError if this is not the folder of a training."""
+        remedy = "give the folder that `sehdr-warp train --out` wrote"
+        if not self.path.is_dir():
+            raise InputError(self.path, "no such folder", remedy)
+        if not any(self.path.iterdir()):
+            raise InputError(self.path, "is an empty folder", remedy)
+        if not self.config.is_file():
+            raise InputError(self.path, f"is not a run (no {self.config.name})", remedy)
+
+    def begin(self, scene: Scene, config: Config, field: RadianceField, data: dict, plan: dict | None) -> None:
+        """Makes the folder, or removes the run in it, and writes what does not change during the training; config.json
+        last: its presence says that the folder is a run. Raises InputError if the folder cannot be made."""
+        from .. import __version__
+
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            problem = f"cannot be made ({error.strerror})"
+            raise InputError(self.path, problem, "choose another folder for the run") from None
+        for file in (self.summary, self.metrics, self.confidence, self.plan, self.scene, self.info, self.config):
+            file.unlink(missing_ok=True)
+        shutil.rmtree(self.checkpoints, ignore_errors=True)
+        info = {
+            "format": FORMAT,
+            "version": __version__,
+            "scene": scene.name,
+            "data": data,
+            "base_exposure_time": field.base_time,
+            "response": field.response.to_dict(),
+        }
+        if plan is not None:
+            write_json(self.plan, plan, overwrite=True)
+        write_json(self.scene, describe_scene(scene), overwrite=True)
+        write_json(self.info, info, overwrite=True)
+        write_json(self.config, config_to_dict(config), overwrite=True)
+
+    def read_config(self) -> Config:
+        """The config of the training; raises InputError."""
+        self.read_info()
+        return read_config_json(self.config)
+
+    def read_info(self) -> dict:
+        """What run.json holds; raises InputError, also for a run of another version's format."""
+        info = _read_json(self.info)
+        refuse_format(self.path, info)
+        for name, kind in (("scene", str), ("data", dict), ("base_exposure_time", int | float), ("response", dict)):
+            if name not in info:
+                raise InputError(self.info, f"lacks the field {name}", _REMEDY)
+            if not isinstance(info[name], kind):
+                raise InputError(self.info, f"{name} = {reprlib.repr(info[name])} is of the wrong type", _REMEDY)
+        time = info["base_exposure_time"]
+        if not 0 < time < math.inf or time > 1e300:
+            problem = f"base_exposure_time = {reprlib.repr(time)} is not a positive number of seconds"
+            raise InputError(self.info, problem, _REMEDY)
+        try:
+            Response.from_dict(info["response"])
+        except SehdrError as error:
+            raise InputError(self.info, str(error), _REMEDY) from None
+        return info
+
+    def read_cameras(self) -> tuple[CameraEntry, ...]:
+        """The views in scene.json; raises InputError."""
+        try:
+            return tuple(_camera_entry(view) for view in _read_json(self.scene)["views"])
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise InputError(self.scene, f"a view is damaged ({error!r:.200})", _REMEDY) from None
+
+    def check_same_scene(self, scene: Scene) -> None:
+        """Raises InputError if the run was trained on another scene than this one."""
+        saved, given = _read_json(self.scene), json.loads(json.dumps(describe_scene(scene)))
+        for name in ("layout", "views"):
+            if saved.get(name) != given[name]:
+                problem = f"its {name} differ from those of {scene.name}"
+                raise InputError(self.scene, problem, "resume with the same data, --max-size and --holdout")
+
+    def read_plan(self) -> dict | None:
+        """The plan that the run was trained by, as Plan.to_dict gave it; None without one, or where it is damaged."""
+        from .plan import format_plan
+
+        try:
+            values = json.loads(self.plan.read_text(encoding="utf-8"))
+            format_plan(values)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            return None
+        return values
+
+    def read_summary(self) -> dict:
+        """Times, memory and counts of the training; empty if it has not ended."""
+        return _read_json(self.summary) if self.summary.exists() else {}
+
+    def write_summary(self, values: dict) -> None:
+        write_json(self.summary, values, overwrite=True)
+
+    def append_metrics(self, line: dict) -> None:
+        """Adds a line to metrics.jsonl; raises SehdrError if the disk refuses."""
+        with writing(self.metrics), open(self.metrics, "a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def read_metrics(self) -> list[dict]:
+        """The lines of metrics.jsonl; what a killed process left half-written is passed over."""
+        if not self.metrics.exists():
+            return []
+        lines = []
+        for text in self.metrics.read_text(encoding="utf-8", errors="replace").splitlines():
+            try:
+                line = json.loads(text)
+            except (ValueError, RecursionError):
+                continue
+            if isinstance(line, dict) and isinstance(line.get("iteration", 0), int):
+                lines.append(line)
+        return lines
+
+    def rewind_metrics(self, iteration: int) -> None:
+        """Drops the evaluations after an iteration: a resumed training makes them again."""
+        kept = [line for line in self.read_metrics() if line.get("iteration", 0) <= iteration]
+        with atomic_path(self.metrics, overwrite=True) as beside:
+            beside.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
+
+    def write_checkpoint(self, tensors: dict[str, Tensor], values: dict, *, kept: int) -> Path:
+        return write_checkpoint(self.checkpoints, tensors, values, kept=kept)
+
+    def newest_checkpoint(self) -> Checkpoint | None:
+        return newest_checkpoint(self.checkpoints)
+
+    def write_confidence(self, evidence: Evidence, checkpoint_hash: str) -> None:
+        """Writes the evidence, in place of an earlier one. Raises SehdrError if the disk refuses."""
+        from safetensors.torch import save
+
+        tensors = {name: getattr(evidence, name) for name in ("seen", "stops", "clipped")}
+        tensors["confidence"] = evidence.confidence()
+        stated = {"format": str(FORMAT), "checkpoint": checkpoint_hash}
+        data = save({name: value.float().cpu().contiguous() for name, value in tensors.items()}, stated)
+        with atomic_path(self.confidence, overwrite=True) as beside:
+            beside.write_bytes(data)
+
+    def read_confidence(self, checkpoint: Checkpoint) -> Tensor | None:
+        """[N] in [0, 1] of a checkpoint's Gaussians; None where there is none, or one of another checkpoint.
+
+        Raises InputError for a file that is damaged.
+        """
+        from safetensors import SafetensorError, safe_open
+
+        path = self.confidence
+        if not path.is_file():
+            return None
+        remedy = "remove this file; `sehdr-warp report` makes it again from the photos"
+        try:
+            with safe_open(str(path), framework="pt") as file:
+                stated = file.metadata() or {}
+                if stated.get("format") != str(FORMAT) or stated.get("checkpoint") != checkpoint.values["sha256"]:
+                    return None
+                confidence = file.get_tensor("confidence")
+        except (SafetensorError, OSError, ValueError, KeyError, RuntimeError) as error:
+            raise InputError(path, f"not safetensors ({error!s:.200})", remedy) from None
+        count = len(checkpoint.tensors["gaussians.means"])
+        if tuple(confidence.shape) != (count,) or not confidence.is_floating_point():
+            raise InputError(path, f"confidence has shape {tuple(confidence.shape)}, not {(count,)}", remedy)
+        if first_not_finite({"confidence": confidence}) or not bool(((confidence >= 0) & (confidence <= 1)).all()):
+            raise InputError(path, "confidence holds values outside of 0 to 1", remedy)
+        return confidence.float()
+
+
+def describe_scene(scene: Scene) -> dict:
+    """What scene.json holds."""
+    views = [
+        {
+            "name": view.name,
+            "split": view.split,
+            "exposure_time": view.exposure_time,
+            "camera": view.camera.to_dict(),
+            "has_hdr": view.hdr is not None,
+        }
+        for view in scene.views
+    ]
+    return {
+        "format": FORMAT,
+        "name": scene.name,
+        "layout": scene.format,
+        "exposure_times_known": scene.exposure_times_known,
+        "notes": list(scene.notes),
+        "views": views,
+    }
+
+
+def _camera_entry(view: dict) -> CameraEntry:
+    camera, time = Camera.from_dict(view["camera"]), float(view["exposure_time"])
+    if camera.width * camera.height > MAX_PIXELS:
+        raise ValueError(f"{camera.width} x {camera.height} is more than {MAX_PIXELS} pixels")
+    if not (math.isfinite(time) and time > 0):
+        raise ValueError(f"exposure_time = {time} is not a positive number of seconds")
+    return CameraEntry(str(view["name"]), str(view["split"]), camera, time)
+
+
+def _read_json(path: Path) -> dict:
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", _REMEDY) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, f"not valid JSON ({error})", _REMEDY) from None
+    if not isinstance(values, dict):
+        raise InputError(path, "is not a JSON object", _REMEDY)
+    return values
