@@ -61,7 +61,7 @@ def test_what_a_killed_writer_left_is_no_checkpoint(tmp_path):
     assert not left.exists()
 
 
-@pytest.mark.parametrize("text,words", [("{", "JSON"), ("[]", "format"), ('{"format": 99}', "format = 99")])
+@pytest.mark.parametrize("text,words", [("{", "JSON"), ("[]", "JSON object"), ('{"format": 99}', "format = 99")])
 def test_bad_values_are_named(tmp_path, text, words):
     path = write_checkpoint(tmp_path, *state(1), kept=1)
     (path / "checkpoint.json").write_text(text)
