@@ -30,7 +30,7 @@ _HOMES = {
     "training.config": ("Config",),
     "training.config_files": ("load_config",),
     "training.run": ("Run", "load_run"),
-    "training.train": ("train",),
+    "training.train": ("Step", "Training", "train"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = sorted(_HOME_OF)  # noqa: PLE0605

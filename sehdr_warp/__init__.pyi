@@ -15,7 +15,7 @@ from .splatting import Rendering, differentiable, rasterize, spherical_harmonics
 from .training.config import Config
 from .training.config_files import load_config
 from .training.run import Run, load_run
-from .training.train import train
+from .training.train import Step, Training, train
 
 __all__ = [
     "Camera",
@@ -26,6 +26,8 @@ __all__ = [
     "Run",
     "Scene",
     "SehdrError",
+    "Step",
+    "Training",
     "View",
     "calibrate",
     "compare_runs",
