@@ -1,14 +1,16 @@
 """The command line of `sehdr-warp synth`: what may be asked for, and the calls."""
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from ..arguments import numbers, say
+from ..arguments import numbers
 from ..errors import SehdrError
 
+LOG = logging.getLogger(__name__)
 Positional = tyro.conf.Positional
 
 
@@ -96,9 +98,9 @@ def _render(asked: RenderTruth) -> None:
     views = numbers("--views", asked.views, int)
     settings = Settings(width, height, asked.samples, asked.seed, views, asked.denoise)
     mi = load_mitsuba(asked.variant)
-    say(f"Mitsuba {mi.__version__}, {mi.variant()}")
+    LOG.info("Mitsuba %s, %s", mi.__version__, mi.variant())
     for recipe in recipes:
-        print(render_scene(mi, recipe, asked.out, settings, say))
+        print(render_scene(mi, recipe, asked.out, settings))
 
 
 def _expose(asked: ExposeTruth) -> None:
@@ -111,7 +113,7 @@ def _expose(asked: ExposeTruth) -> None:
 
     response = response_by_name(asked.response)
     for note in response.notes:
-        say(note)
+        LOG.info("%s", note)
     noise = None
     if asked.noise is not None:
         figures = numbers("--noise", asked.noise)
@@ -130,13 +132,11 @@ def _expose(asked: ExposeTruth) -> None:
 def _pack(asked: PackTruth) -> None:
     from .pack import pack_truth
 
-    pack_truth(
-        asked.truth,
-        asked.out,
-        compression=asked.compression,
-        level=asked.level,
-        overwrite=asked.overwrite,
-        progress=print,
+    options = {"compression": asked.compression, "level": asked.level, "overwrite": asked.overwrite}
+    packing = pack_truth(asked.truth, asked.out, **options)
+    print(
+        f"{asked.out}: {packing['bytes'] / 1e6:.2f} MB, relative error {100 * packing['relative_error']:.2f} %, "
+        f"{packing['mu_law_psnr']:.1f} dB (mu-law)"
     )
 
 

@@ -1,7 +1,6 @@
 """Truth made small enough to ship: half floats under a compression whose error is measured against the floats."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,6 @@ def pack_truth(
     compression: str = "dwab",
     level: float = 45.0,
     overwrite: bool = False,
-    progress: Callable[[str], None] = lambda line: None,
 ) -> dict:
     """Write a set of truth as half floats into `out`, with all its tables; returns the error and the size.
 
@@ -69,10 +67,6 @@ def pack_truth(
             "bytes": size,
         }
         write_json(made / "synth.json", read_making(folder) | {"packing": packing})
-    progress(
-        f"{out}: {size / 1e6:.2f} MB, relative error {100 * packing['relative_error']:.2f} %, "
-        f"{packing['mu_law_psnr']:.1f} dB (mu-law)"
-    )
     return packing
 
 

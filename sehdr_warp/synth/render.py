@@ -1,9 +1,10 @@
 """Renders a scene's views by path tracing, view by view, resumable, and writes the set of truth."""
 
 import json
+import logging
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from .scenes import Recipe
 from .stage import Stage
 from .truth_set import truth_path, write_truth_tables
 
+LOG = logging.getLogger(__name__)
 # Samples of one launch, over all pixels: what fits memory (the wavefront variants hold every ray at once).
 _RAYS = {"cuda_ad_rgb": 2**24, "llvm_ad_rgb": 2**21, "scalar_rgb": 2**40}
 # Surface points kept of each training view.
@@ -56,9 +58,7 @@ class Settings:
         check_denoiser(self.denoise)
 
 
-def render_scene(
-    mi, recipe: Recipe, out: Path | str, settings: Settings, progress: Callable[[str], None] = lambda line: None
-) -> Path:
+def render_scene(mi, recipe: Recipe, out: Path | str, settings: Settings) -> Path:
     """Render `out`/<name>: finished views are kept, so a run that was stopped goes on. Returns the folder.
 
     mi: from load_mitsuba. Each view is the mean of its paths a pixel under a box filter, without clamping: unbiased
@@ -80,7 +80,7 @@ def render_scene(
         counts[split_of(view)] += 1
     missing = [view for view in chosen if not (places[view].is_file() and _aside(folder, view).is_file())]
     if len(missing) < len(chosen):
-        progress(f"{recipe.name}: {len(chosen) - len(missing)} of {len(chosen)} views are there already")
+        LOG.info("%s: %d of %d views are there already", recipe.name, len(chosen) - len(missing), len(chosen))
     if missing:
         started = time.perf_counter()
         with tempfile.TemporaryDirectory() as meshes:
@@ -88,11 +88,11 @@ def render_scene(
             recipe.build(stage)
             scene = mi.load_dict(stage.items)
             denoiser = Denoiser(mi, stage.items, scene) if settings.denoise == "oidn" else None
-        progress(f"{recipe.name}: {len(stage.items)} things built in {time.perf_counter() - started:.1f} s")
+        LOG.info("%s: %d things built in %.1f s", recipe.name, len(stage.items), time.perf_counter() - started)
         for view in missing:
             where = places[view], _aside(folder, view)
             line = _render_view(mi, scene, recipe, cameras[view], view, settings, denoiser, *where)
-            progress(f"{recipe.name}: view {view} of {VIEWS}, {line}")
+            LOG.info("%s: view %d of %d, %s", recipe.name, view, VIEWS, line)
     _finish(mi, recipe, folder, settings, {view: cameras[view] for view in chosen}, places)
     return folder
 
@@ -120,25 +120,12 @@ def _aside(folder: Path, view: int) -> Path:
 
 
 def _sensor(mi, camera: Camera):
-    return mi.load_dict(
-        {
-            "type": "perspective",
-            "to_world": mi.ScalarTransform4f(camera.camera_to_world @ _OPENCV_TO_MITSUBA),
-            "fov": float(np.degrees(2 * np.arctan(0.5 * camera.width / camera.fx))),
-            "fov_axis": "x",
-            "near_clip": 0.01,
-            "far_clip": 1000.0,
-            "sampler": {"type": "independent"},
-            "film": {
-                "type": "hdrfilm",
-                "width": camera.width,
-                "height": camera.height,
-                "pixel_format": "rgb",
-                "component_format": "float32",
-                "rfilter": {"type": "box"},
-            },
-        }
-    )
+    film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
+    film |= {"pixel_format": "rgb", "component_format": "float32"}
+    place = mi.ScalarTransform4f(camera.camera_to_world @ _OPENCV_TO_MITSUBA)
+    angle = float(np.degrees(2 * np.arctan(0.5 * camera.width / camera.fx)))
+    sensor = {"type": "perspective", "to_world": place, "fov": angle, "fov_axis": "x", "film": film}
+    return mi.load_dict(sensor | {"near_clip": 0.01, "far_clip": 1000.0, "sampler": {"type": "independent"}})
 
 
 def _check_light(radiance: np.ndarray, found: str, remedy: str) -> None:
