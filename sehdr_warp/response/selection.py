@@ -135,32 +135,32 @@ def select_response(
     edges = np.concatenate([_edge_colours(*band) for bands in photos for band in bands])
     if len(edges) > MAX_EDGES:
         edges = edges[np.random.default_rng(seed).choice(len(edges), MAX_EDGES, replace=False)]
-    values = [values for bands in photos for values, _ in bands]
-    bright, shares = _highlight_shares(values), _code_shares(values)
-    points, rows = _edge_points(edges), []
-    known = np.stack([np.log(each.decode(np.maximum(CODES, each.black + CODE))) for each in candidates])
-    spans, densities = _span_surprise(shares, known), _density_surprise(shares, known)
-    for each, of_shares in zip(candidates, spans + densities, strict=True):
-        stops = np.log2(float(each.decode(1 - CODE / 2)) / float(each.decode(1 - 9.5 * CODE)))
-        surprise, highlights, prior = (
-            _edge_surprise(points, each),
-            _highlights(bright, stops),
-            _prior(each, from_camera),
-        )
-        posterior = np.nan_to_num(surprise) * edge_facts(len(edges)) + highlights + of_shares + prior
-        rows.append((*_range_and_roughness(fullest, each), surprise, highlights, prior, posterior))
-    ranges, roughnesses, surprises, highlights, priors, posteriors = np.array(rows, dtype=np.float64).T
-    paper = _relative(ranges) - _relative(roughnesses)
-    goodness = paper if method == "paper" else -posteriors
-    columns = (ranges, roughnesses, paper, surprises, highlights, spans, densities, priors, posteriors)
-    scores = [ResponseScore(each, *map(float, row)) for each, row in zip(candidates, np.stack(columns, 1), strict=True)]
-    order = np.argsort(-goodness, kind="stable")
-    ranked, best = tuple(scores[index] for index in order), candidates[order[0]]
+    bands = [values for each in photos for values, _ in each]
+    logs, rises = map(np.stack, zip(*map(_at_codes, candidates), strict=True))
     if beside:
-        chances, logs = _beside_family(points, bright, shares, known, priors, posteriors)
+        logs, rises = (np.concatenate(pair) for pair in zip((logs, rises), family_logs(), strict=True))
+    count, facts = len(candidates), edge_facts(len(edges))
+    surprise = _edge_surprise(_edge_points(edges), logs, rises)
+    bright, shares = _highlights(bands, logs), _code_shares(bands)
+    spans, densities = _span_surprise(shares, logs), _density_surprise(shares, logs)
+    priors = np.array([_prior(each, from_camera) for each in candidates])
+    evidence = np.nan_to_num(surprise) * facts + bright + spans + densities
+    posteriors = evidence[:count] + priors
+    ranges, roughnesses = np.array([_range_and_roughness(fullest, each) for each in candidates]).T
+    paper = _relative(ranges) - _relative(roughnesses)
+    columns = (ranges, roughnesses, paper, surprise, bright, spans, densities, priors, posteriors)
+    rows = zip(candidates, *(column[:count] for column in columns), strict=True)
+    scores = [ResponseScore(each, *map(float, row)) for each, *row in rows]
+    order = np.argsort(-paper if method == "paper" else posteriors, kind="stable")
+    best = candidates[order[0]]
+    if beside:
+        named = posteriors + np.log(np.exp(-priors).sum() / (1 - NO_FORMULA))
+        costs = np.concatenate([named, evidence[count:] + np.log((len(logs) - count) / NO_FORMULA)])
+        chances = np.exp(costs.min() - costs)
+        chances /= chances.sum()
         if chances[order[0]] < DECISIVE:
-            best = _mean_response(chances, logs)
-    return ResponseSelection(best, method, len(edges), ranked)
+            best = TabulatedResponse("posterior mean", np.r_[0.0, np.exp(chances @ logs)[1:]], CODES)
+    return ResponseSelection(best, method, len(edges), tuple(scores[index] for index in order))
 
 
 def edge_facts(count: int) -> float:
@@ -168,25 +168,10 @@ def edge_facts(count: int) -> float:
     return min(count / EDGES_PER_FACT, MOST_FACTS)
 
 
-def _beside_family(points, bright, shares, known, priors, posteriors):
-    """Probabilities [K + 512] of the candidates and of the family's members, and their log exposures [K + 512, 256]."""
-    logs, rises = family_logs()
-    surprise = _family_surprise(points, logs, rises)
-    stops = (logs[:, 254:].mean(1) - logs[:, 245:247].mean(1)) / np.log(2)
-    members = np.array([_highlights(bright, each) for each in stops])
-    members += np.nan_to_num(surprise) * edge_facts(len(points)) + _span_surprise(shares, logs)
-    members += _density_surprise(shares, logs)
-    members += np.log(len(logs) / NO_FORMULA)
-    named = posteriors + np.log(np.exp(-priors).sum() / (1 - NO_FORMULA))
-    costs = np.concatenate([named, members])
-    chances = np.exp(costs.min() - costs)
-    return chances / chances.sum(), np.concatenate([known, logs])
-
-
-def _mean_response(chances, logs) -> TabulatedResponse:
-    exposures = np.exp(chances @ logs)
-    exposures[0] = 0.0
-    return TabulatedResponse("posterior mean", exposures, CODES)
+def _at_codes(response: Response) -> tuple[np.ndarray, np.ndarray]:
+    """[256] natural log of the exposure at each 8-bit code, and d ln x / dz there; code 0 counts as 1."""
+    exposures = np.asarray(response.decode(np.maximum(CODES, response.black + CODE)))
+    return np.log(exposures), 1 / (exposures * np.maximum(np.asarray(response.slope(exposures)), 1e-9))
 
 
 def _bands(image) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -216,22 +201,21 @@ def _prior(response: Response, from_camera: bool) -> float:
     return (CAMERA_PRIOR if from_camera else PRIOR).get(response.name, UNLIKELY)
 
 
-def _highlight_shares(images) -> tuple[float, float]:
-    """The shares of values at the brightest code, and at the nine codes below it."""
+def _highlights(images, logs: np.ndarray) -> np.ndarray:
+    """[K] minus the log likelihood of the shares of values at the brightest code and at the nine codes below it.
+
+    If log radiance falls off as exp(-rate stops), the nine codes span S stops and white holds all beyond them, then
+    near / (at + near) = 1 - exp(-rate S): a clipping camera piles values up at 255, a curve that never clips spreads
+    the same light over the codes below. The rate is log-normal.
+    """
     count = sum(image.size for image in images)
-    at_white = sum(int((image >= 1 - CODE / 2).sum()) for image in images)
-    near_white = sum(int((image >= 1 - 9.5 * CODE).sum()) for image in images) - at_white
-    return at_white / count, near_white / count
-
-
-def _highlights(shares: tuple[float, float], stops: float) -> float:
-    """Minus the log likelihood of those shares. If log radiance falls off as exp(-rate stops), the nine codes span
-    S `stops` and white holds all beyond them, then near / (at + near) = 1 - exp(-rate S): a clipping camera piles
-    values up at 255, a curve that never clips spreads the same light over the codes below. The rate is log-normal."""
-    white, near = (share + HIGHLIGHT_FLOOR / 2 for share in shares)
-    rate = np.log1p(near / white) / max(stops, 1e-6)
-    spread = HIGHLIGHT_SPREAD**2 + HIGHLIGHT_FLOOR / (sum(shares) + 1e-9)
-    return float(0.5 * np.log(rate / HIGHLIGHT_RATE) ** 2 / spread)
+    bright = sum(int((image >= 1 - 9.5 * CODE).sum()) for image in images) / count
+    at_white = sum(int((image >= 1 - CODE / 2).sum()) for image in images) / count
+    stops = (logs[:, 254:].mean(1) - logs[:, 245:247].mean(1)) / np.log(2)
+    white, near = at_white + HIGHLIGHT_FLOOR / 2, bright - at_white + HIGHLIGHT_FLOOR / 2
+    rate = np.log1p(near / white) / np.maximum(stops, 1e-6)
+    spread = HIGHLIGHT_SPREAD**2 + HIGHLIGHT_FLOOR / (bright + 1e-9)
+    return 0.5 * np.log(rate / HIGHLIGHT_RATE) ** 2 / spread
 
 
 def _code_shares(images) -> np.ndarray:
@@ -330,17 +314,9 @@ def _edge_points(edges):
     return np.concatenate([edges.reshape(-1, 9), *limits, first, last], axis=1)
 
 
-def _edge_surprise(points, response) -> float:
-    """Mean over edges of minus the log likelihood under a response, nats; NaN for too few edges."""
-    if len(points) < MIN_EDGES:
-        return np.nan
-    exposures = np.asarray(response.decode(np.maximum(points, response.black + CODE)))
-    slopes = np.maximum(np.asarray(response.slope(exposures[:, :9])), 1e-9)
-    return float(_mixture_surprise(torch.from_numpy(exposures), torch.from_numpy(slopes)))
-
-
-def _family_surprise(points, logs, rises) -> np.ndarray:
-    """[512] the same under each member of the family, in float32; read off between codes along straight lines."""
+def _edge_surprise(points, logs, rises) -> np.ndarray:
+    """[K] mean over edges of minus the log likelihood, nats, in float32; between codes along straight lines. NaN for
+    too few edges."""
     if len(points) < MIN_EDGES:
         return np.full(len(logs), np.nan)
     exposures = torch.from_numpy(np.exp(logs)).float()
