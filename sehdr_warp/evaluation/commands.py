@@ -4,7 +4,9 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+import tyro
 from tyro.conf import Positional
 
 from ..training.commands import ensured_scene, open_run
@@ -32,7 +34,7 @@ class Evaluate:
 class Compare:
     """Compare trained runs in one table; runs that differ by their seed alone become a mean with its spread."""
 
-    runs: Positional[tuple[Path, ...]]
+    runs: Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN ...")]
     """Folders of runs."""
     plot: Path | None = None
     """Also draw held-out error against training time to this PNG file."""

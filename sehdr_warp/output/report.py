@@ -1,5 +1,6 @@
 """Pictures of what a training achieved: what the photo lost and HDR held, exposure stops, error against time."""
 
+import textwrap
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -143,7 +144,7 @@ def stops_figure(comparison: Comparison, exposure_time: float):
 
 
 def training_figure(metrics: Sequence[dict]):
-    """A matplotlib Figure: held-out PSNR against training seconds; the right axis says it as an error."""
+    """A matplotlib Figure: held-out PSNR against training seconds."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -167,8 +168,6 @@ def training_figure(metrics: Sequence[dict]):
         axes.set_axisbelow(True)
         axes.tick_params(length=0)
         axes.spines[["top", "right", "left"]].set_visible(False)
-        error = axes.secondary_yaxis("right", functions=(_psnr_to_percent, _percent_to_psnr))
-        _percent_ticks(error, axes.get_ylim())
         return figure
 
 
@@ -203,33 +202,9 @@ def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, ce
             where = ((left - 0.1) / width, (y + row_height / 2) / height)
             figure.text(*where, name, rotation=90, ha="right", va="center", color=_QUIET, fontsize=8.5)
             y -= gap
-        figure.text(left / width, 0.16 / height, _wrap(caption, width - left), color=_QUIET, fontsize=8, va="bottom")
+        caption = "\n".join(textwrap.wrap(caption, max(30, int((width - left) * 17))))
+        figure.text(left / width, 0.16 / height, caption, color=_QUIET, fontsize=8, va="bottom")
         return figure
-
-
-def _wrap(text: str, inches: float) -> str:
-    import textwrap
-
-    return "\n".join(textwrap.wrap(text, max(30, int(inches * 17))))
-
-
-def _psnr_to_percent(psnr):
-    return 100 * 10.0 ** (-np.asarray(psnr, float) / 20)
-
-
-def _percent_to_psnr(percent):
-    return -20 * np.log10(np.maximum(np.asarray(percent, float), 1e-9) / 100)
-
-
-def _percent_ticks(axis, limits: tuple[float, float]) -> None:
-    low, high = sorted(_psnr_to_percent(np.array(limits)))
-    steps = [digit * 10.0**power for power in range(-4, 3) for digit in (1, 1.5, 2, 3, 5, 7)]
-    ticks = [step for step in steps if low <= step <= high]
-    axis.set_yticks(ticks, [f"{tick:g} %" for tick in ticks])
-    axis.set_ylabel("root mean square error, of white")
-    axis.tick_params(length=0, which="both")
-    axis.spines["right"].set_visible(False)
-    axis.minorticks_off()
 
 
 def _chosen(views: Sequence[View], count: int) -> list[View]:

@@ -30,8 +30,8 @@ def response_by_name(text: str | Path) -> Response:
     """A response from what a user writes.
 
     Args:
-        text: one of response_names(); `gamma-G`; `colour:S-Log3` and the like; `FILE` or `FILE:SELECTOR` (see response_from_file), such as `my_camera.csv`,
-            `201_CRF_data.mat:17`, `dorfCurves.txt:agfachrome-ctpreciska50Red` or `emor.txt:0.5,-0.1`.
+        text: one of response_names(); `gamma-G`; `colour:S-Log3` and the like; `FILE` or `FILE:SELECTOR` (see
+            response_from_file), such as `my_camera.csv`, `201_CRF_data.mat:17` or `emor.txt:0.5,-0.1`.
 
     Raises:
         SehdrError: for a name that is not known.

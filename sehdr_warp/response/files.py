@@ -4,6 +4,7 @@ import difflib
 import io
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -72,6 +73,7 @@ def colour_response(encoding: str) -> Response:
         with np.errstate(all="ignore"), colour.utilities.suppress_warnings(colour_warnings=True):
             return np.asarray(colour.CCTF_ENCODINGS[name](np.asarray(exposure, np.float64)), np.float64)
 
+    # White: the first of these stops at which the encoding reaches 1, then by halves.
     bright = np.exp2(np.linspace(-10, 20, 30 * 32 + 1))
     reached = np.flatnonzero(encode(bright) >= 1.0)
     if not len(reached) or reached[0] == 0:
@@ -91,21 +93,19 @@ def _key(name: str) -> str:
     return "".join(letter for letter in name.lower() if letter.isalnum())
 
 
-def _check_size(path: Path):
+def _read_text(path: Path) -> str:
+    _check_size(path)
+    return path.read_text(encoding="utf-8", errors="replace")
+
+
+def _check_size(path: Path) -> None:
     try:
-        size = path.stat().st_size
+        with open(path, "rb") as file:
+            size = file.seek(0, os.SEEK_END)
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})", "give the path of a response file") from error
     if size > MAX_BYTES:
         raise InputError(path, f"{size} bytes are too many for a response", f"give a file under {MAX_BYTES} bytes")
-
-
-def _read_text(path: Path) -> str:
-    _check_size(path)
-    try:
-        return path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", "give the path of a response file") from error
 
 
 def _numbers(path: Path, text: str) -> np.ndarray:
@@ -183,33 +183,21 @@ def _dorf_text(path: Path, text: str) -> list[Response]:
 
 def _emor(path: Path, text: str, selector: str | None) -> Response:
     """Sections "E =", "f0 =", "h(1)=", ... of equal length; in the inverse file "B =", "g0 =", "hinv(1)=", ..."""
-    parts = [section.split("=", 1) for section in _sections(text)]
-    if any(len(part) != 2 for part in parts) or len(parts) < 3:
-        raise InputError(path, "is not EMoR's layout", "give emor.txt or invemor.txt as published")
-    rows = [_numbers(path, body) for _, body in parts]
-    if len({len(row) for row in rows}) != 1:
-        raise InputError(path, "its sections differ in length", "give emor.txt or invemor.txt as published")
+    remedy = "give emor.txt or invemor.txt as published"
+    sections = re.split(r"^[^=\n]*=", text, flags=re.MULTILINE)[1:]
+    rows = [_numbers(path, body) for body in sections]
+    if len(rows) < 3 or len({len(row) for row in rows}) != 1:
+        raise InputError(path, "is not EMoR's layout of sections of one length", remedy)
     coefficients = _numbers(path, (selector or "").replace(",", " "))
     if len(coefficients) > len(rows) - 2 or not np.isfinite(coefficients).all():
         raise InputError(path, f"{selector!r} is not up to {len(rows) - 2} finite numbers", "separate them by commas")
     curve = rows[1] + sum((c * row for c, row in zip(coefficients, rows[2:], strict=False)), np.zeros_like(rows[1]))
-    inverse = parts[0][0].strip() == "B"
+    inverse = text.lstrip().startswith("B")
     name = ("invemor" if inverse else "emor") + (f":{selector}" if selector else "")
     curve = curve.clip(0.0, 1.0)
     if inverse:
         return TabulatedResponse(name, np.maximum.accumulate(curve), rows[0], source=str(path))
     return TabulatedResponse(name, rows[0], curve, source=str(path))
-
-
-def _sections(text: str) -> list[str]:
-    """The text cut before each line that holds an equals sign."""
-    sections: list[list[str]] = []
-    for line in text.splitlines():
-        if "=" in line:
-            sections.append([])
-        if sections:
-            sections[-1].append(line)
-    return ["\n".join(section) for section in sections]
 
 
 def _json_curve(path: Path, text: str) -> Response:

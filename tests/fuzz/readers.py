@@ -192,11 +192,10 @@ def _run(folder: Path) -> None:
 
 
 def _read_run(folder: Path):
-    from sehdr_warp.output.report import read_metrics
     from sehdr_warp.training.run import load_run
 
     run = load_run(folder)
-    return run.metrics(), run.summary(), read_metrics(folder / "metrics.jsonl"), run.degree
+    return run.metrics(), run.summary(), run.degree
 
 
 def _read_resume(folder: Path):
