@@ -196,10 +196,10 @@ def _build(source: Path | str, values: dict, flags: Mapping[str, str] | None = N
     raise InputError(flag or source, problem, _REMEDY)
 
 
-def _with_tuples(values):
-    """TOML's and JSON's lists as the tuples that a config holds."""
+def _with_tuples(values, depth: int = 0):
+    """TOML's and JSON's lists as the tuples that a config holds; what is nested deeper than a config is left."""
     if isinstance(values, dict):
-        return {key: _with_tuples(value) for key, value in values.items()}
+        return {key: value if depth > 2 else _with_tuples(value, depth + 1) for key, value in values.items()}
     return tuple(map(_with_tuples, values)) if isinstance(values, list) else values
 
 
