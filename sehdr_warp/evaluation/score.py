@@ -8,7 +8,7 @@ import torch
 from ..errors import InputError
 from ..output.names import safe_names
 from ..scene import Scene
-from ..scene.images import read_hdr
+from ..scene.hdr_files import read_hdr
 from .evaluate import PEAK_LUMINANCE, PROTOCOLS, Evaluation
 
 log = logging.getLogger(__name__)

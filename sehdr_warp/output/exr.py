@@ -16,7 +16,8 @@ import numpy as np
 from sehdr_warp import __version__
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.scene import Camera
-from sehdr_warp.scene.images import MAX_PIXELS, read_exr_channels
+from sehdr_warp.scene.hdr_files import read_exr_channels
+from sehdr_warp.scene.images import MAX_PIXELS
 
 from ..files import atomic_path
 from .colorspace import chromaticities, color_space

@@ -45,10 +45,8 @@ class Camera:
         object.__setattr__(self, "world_to_camera", pose)
         if self.width < 1 or self.height < 1:
             raise ValueError(f"image size {self.width} x {self.height} is not positive")
-        for field in ("fx", "fy", "cx", "cy"):
-            value = getattr(self, field)
-            if not np.isfinite(value):
-                raise ValueError(f"camera {field} = {value} is not finite")
+        if not np.isfinite([self.fx, self.fy, self.cx, self.cy]).all():
+            raise ValueError(f"camera fx, fy, cx, cy = {self.fx}, {self.fy}, {self.cx}, {self.cy} are not finite")
         if self.fx <= 0 or self.fy <= 0:
             raise ValueError(f"focal lengths ({self.fx}, {self.fy}) are not positive")
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
@@ -84,25 +82,12 @@ class Camera:
 
     def to_dict(self) -> dict:
         """Plain values for JSON; from_dict reads them back exactly."""
-        return {
-            "width": self.width,
-            "height": self.height,
-            "fx": self.fx,
-            "fy": self.fy,
-            "cx": self.cx,
-            "cy": self.cy,
-            "world_to_camera": self.world_to_camera.tolist(),
-        }
+        names = ("width", "height", "fx", "fy", "cx", "cy")
+        return {name: getattr(self, name) for name in names} | {"world_to_camera": self.world_to_camera.tolist()}
 
     @staticmethod
     def from_dict(values: dict) -> "Camera":
         """The camera that to_dict described; raises KeyError for a missing field, ValueError for a bad value."""
-        return Camera(
-            int(values["width"]),
-            int(values["height"]),
-            float(values["fx"]),
-            float(values["fy"]),
-            float(values["cx"]),
-            float(values["cy"]),
-            np.array(values["world_to_camera"], dtype=np.float64),
-        )
+        sizes = (int(values[name]) for name in ("width", "height"))
+        numbers = (float(values[name]) for name in ("fx", "fy", "cx", "cy"))
+        return Camera(*sizes, *numbers, np.array(values["world_to_camera"], dtype=np.float64))

@@ -33,9 +33,7 @@ def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
             for name, frame in frames_of(values, path)
         ]
     else:
-        raise InputError(
-            path, "has none of cameras, camera_path and frames", "export cameras as described in the manual"
-        )
+        raise InputError(path, "has none of cameras, camera_path and frames", "export cameras as the manual describes")
     if not cameras:
         raise InputError(path, "lists no cameras", "add at least one")
     for i, (_, camera) in enumerate(cameras):
@@ -66,12 +64,10 @@ def _nerfstudio(entry, index: int, values: dict, path: Path) -> tuple[str, Camer
         width, height = int(values["render_width"]), int(values["render_height"])
         matrix = np.array(entry["camera_to_world"], dtype=np.float64).reshape(4, 4)
         fov = float(entry["fov"])
-    except KeyError as error:
-        raise InputError(path, f"camera {index}: {error.args[0]} is missing", "export the camera path again") from None
-    except (ValueError, TypeError, OverflowError) as error:
-        raise InputError(
-            path, f"camera {index} cannot be used ({str(error)[:120]})", "export the camera path again"
-        ) from None
+    except (KeyError, ValueError, TypeError, OverflowError) as error:
+        missing = isinstance(error, KeyError)
+        problem = f": {error.args[0]} is missing" if missing else f" cannot be used ({str(error)[:120]})"
+        raise InputError(path, f"camera {index}{problem}", "export the camera path again") from None
     if not 1e-6 <= fov < 180:
         raise InputError(path, f"camera {index} has fov {fov}", "use degrees between 0 and 180")
     _check_size(width, height, index, path)

@@ -23,12 +23,9 @@ class Shot:
     """One photo of one view.
 
     view: the key that photos of one view at several exposures share; becomes the view's name.
-    image: the LDR file.
-    lens, world_to_camera: the camera; [4, 4] float64, rigid.
+    image, mask, hdr: files. lens, world_to_camera: the camera; [4, 4] float64, rigid.
     exposure_key: the exposure's number where a view has several (the k of `<view>_<k>.png`); None otherwise.
-    exposure_time: seconds from the set's own files; None lets EXIF speak.
-    split: "train" or "test" where the set says so.
-    mask, hdr: files, where there are any.
+    exposure_time: seconds from the set's own files; None lets EXIF speak. split: "train" or "test", if stated.
     derived: the set has no photos; this one is made of the truth, and `image` names the truth's file.
     oriented: the lens speaks of the pixels after EXIF orientation; None finds out from the sizes.
     """

@@ -6,6 +6,7 @@ names are terminated and at most 4096 bytes long, values are finite, quaternions
 
 import math
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,9 @@ from .lens import CAMERA_MODELS, PARAMETER_COUNTS, Lens
 
 MAX_NAME_BYTES = 4096
 _REMEDY = "export the model again with COLMAP"
+_UNDISTORT = "undistort with COLMAP first"
+_COUNT, _CAMERA, _IMAGE, _POINT = (struct.Struct(layout) for layout in ("<Q", "<IiQQ", "<I7dI", "<Q3d3BdQ"))
+_OBSERVATION_BYTES, _TRACK_ELEMENT_BYTES = 24, 8
 
 
 @dataclass(frozen=True)
@@ -40,12 +44,9 @@ class SparseModel:
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder among sparse/0, sparse and colmap/sparse/0 that holds cameras and images, or None."""
-    for name in ("sparse/0", "sparse", "colmap/sparse/0", "dense/sparse"):
-        for suffix in (".bin", ".txt"):
-            if (folder / name / f"cameras{suffix}").is_file():
-                return folder / name
-    return None
+    """The folder among sparse/0, sparse, colmap/sparse/0 and dense/sparse that holds cameras, or None."""
+    places = (folder / name for name in ("sparse/0", "sparse", "colmap/sparse/0", "dense/sparse"))
+    return next((p for p in places if any((p / f"cameras{end}").is_file() for end in (".bin", ".txt"))), None)
 
 
 def read_model(folder: Path) -> SparseModel:
@@ -54,28 +55,31 @@ def read_model(folder: Path) -> SparseModel:
     Raises InputError where a file is missing, empty, damaged or truncated, or holds values that cannot be.
     """
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
-    suffix = ".bin" if binary else ".txt"
-    cameras = (_cameras_binary if binary else _cameras_text)(folder / f"cameras{suffix}")
-    images_path = folder / f"images{suffix}"
-    images = (_images_binary if binary else _images_text)(images_path)
-    for image in images:
-        if image.camera_id not in cameras:
-            raise InputError(
-                images_path, f"image {image.name!r:.90} has camera {image.camera_id}, which is not listed", _REMEDY
-            )
-    points, colors = read_points(folder)
-    return SparseModel(cameras, tuple(images), points, colors)
+    paths = [folder / f"{name}{'.bin' if binary else '.txt'}" for name in ("cameras", "images")]
+    cameras: dict[int, Lens] = {}
+    for number, lens in (_cameras_binary if binary else _cameras_text)(paths[0]):
+        if number in cameras:
+            raise InputError(paths[0], f"camera {number} is listed twice", _REMEDY)
+        cameras[number] = lens
+    images: dict[str, ModelImage] = {}
+    for values, number, name in (_images_binary if binary else _images_text)(paths[1]):
+        if not name or len(name.encode("utf-8", "replace")) > MAX_NAME_BYTES:
+            problem = f"image name {name[:40]!r} is empty or longer than {MAX_NAME_BYTES} bytes"
+            raise InputError(paths[1], problem, "rename the image")
+        if name in images:
+            raise InputError(paths[1], f"image {name!r:.90} is listed twice", _REMEDY)
+        if number not in cameras:
+            raise InputError(paths[1], f"image {name!r:.90} has camera {number}, which is not listed", _REMEDY)
+        images[name] = ModelImage(name, number, pose_from_quaternion(values[:4], values[4:], paths[1], name))
+    return SparseModel(cameras, tuple(images.values()), *read_points(folder))
 
 
 def read_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """[P, 3] float64 places and [P, 3] float32 colours in [0, 1] of points3D.bin, .txt or .ply; else none."""
-    if (path := folder / "points3D.bin").is_file():
-        return _points_binary(path)
-    if (path := folder / "points3D.txt").is_file():
-        return _points_text(path)
-    for name in ("points3D.ply", "points3d.ply"):
+    readers = {".bin": _points_binary, ".txt": _points_text, ".ply": read_ply_points}
+    for name in ("points3D.bin", "points3D.txt", "points3D.ply", "points3d.ply"):
         if (path := folder / name).is_file():
-            return read_ply_points(path)
+            return readers[path.suffix](path)
     return np.zeros((0, 3)), np.zeros((0, 3), np.float32)
 
 
@@ -95,14 +99,14 @@ def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     # plyfile has no exception of its own for what damaged files do to it.
     except Exception as error:  # noqa: BLE001
         raise InputError(path, f"cannot be read as PLY points ({error!r:.120})", "export the points again") from None
-    return _checked_points(points, np.clip(colors, 0, 1).astype(np.float32), path)
+    return _checked_points(points, np.clip(colors, 0, 1), path)
 
 
 def _checked_points(points: np.ndarray, colors: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
         raise InputError(path, f"point {int(np.argmax(bad))} is at {points[np.argmax(bad)].tolist()}", _REMEDY)
-    return points, colors
+    return points, colors.astype(np.float32)
 
 
 class _Bytes:
@@ -118,22 +122,19 @@ class _Bytes:
         self.position += layout.size
         return values
 
-    def count(self, smallest_record: int) -> int:
+    def count(self, smallest: int) -> int:
         """A 64-bit count of records of at least so many bytes each."""
         (count,) = self.take(_COUNT)
         left = len(self.data) - self.position
-        if count * smallest_record > left:
-            raise InputError(
-                self.path, f"count {count} needs {count * smallest_record} bytes, but {left} are left", _REMEDY
-            )
+        if count * smallest > left:
+            raise InputError(self.path, f"count {count} needs {count * smallest} bytes, but {left} are left", _REMEDY)
         return count
 
     def name(self) -> str:
         end = self.data.find(b"\0", self.position, self.position + MAX_NAME_BYTES + 1)
         if end < 0:
-            raise InputError(
-                self.path, f"image name at byte {self.position} has no end within {MAX_NAME_BYTES} bytes", _REMEDY
-            )
+            problem = f"image name at byte {self.position} has no end within {MAX_NAME_BYTES} bytes"
+            raise InputError(self.path, problem, _REMEDY)
         raw, self.position = self.data[self.position : end], end + 1
         try:
             return raw.decode("utf-8")
@@ -144,34 +145,23 @@ class _Bytes:
         self.position += size
 
 
-_COUNT = struct.Struct("<Q")
-_CAMERA = struct.Struct("<IiQQ")
-_IMAGE = struct.Struct("<I7dI")
-_POINT = struct.Struct("<Q3d3BdQ")
-_OBSERVATION_BYTES = 24
-_TRACK_ELEMENT_BYTES = 8
-
-
-def _cameras_binary(path: Path) -> dict[int, Lens]:
-    file, cameras = _Bytes(path), {}
+def _cameras_binary(path: Path) -> Iterator[tuple[int, Lens]]:
+    file = _Bytes(path)
     for _ in range(file.count(_CAMERA.size + 3 * 8)):
-        camera_id, model, width, height = file.take(_CAMERA)
+        number, model, width, height = file.take(_CAMERA)
         if model not in CAMERA_MODELS:
-            raise InputError(path, f"camera {camera_id} has the unknown model {model}", "undistort with COLMAP first")
+            raise InputError(path, f"camera {number} has the unknown model {model}", _UNDISTORT)
         name, count = CAMERA_MODELS[model]
-        params = file.take(struct.Struct(f"<{count}d"))
-        _add_camera(cameras, camera_id, Lens(name, width, height, params, path), path)
-    return cameras
+        yield number, Lens(name, width, height, file.take(struct.Struct(f"<{count}d")), path)
 
 
-def _images_binary(path: Path) -> list[ModelImage]:
-    file, images, names = _Bytes(path), [], set()
+def _images_binary(path: Path) -> Iterator[tuple[tuple, int, str]]:
+    file = _Bytes(path)
     for _ in range(file.count(_IMAGE.size + 1 + 8)):
-        _, qw, qx, qy, qz, tx, ty, tz, camera_id = file.take(_IMAGE)
+        _, *values, camera_id = file.take(_IMAGE)
         name = file.name()
         file.skip(file.count(_OBSERVATION_BYTES) * _OBSERVATION_BYTES)
-        images.append(_image(name, (qw, qx, qy, qz), (tx, ty, tz), camera_id, names, path))
-    return images
+        yield values, camera_id, name
 
 
 def _points_binary(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -187,35 +177,21 @@ def _points_binary(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return _checked_points(points, colors / np.float32(255), path)
 
 
-def _add_camera(cameras: dict[int, Lens], camera_id: int, lens: Lens, path: Path) -> None:
-    if camera_id in cameras:
-        raise InputError(path, f"camera {camera_id} is listed twice", _REMEDY)
-    cameras[camera_id] = lens
+def _numbered_lines(path: Path) -> Iterator[tuple[int, str]]:
+    return enumerate(read_text(path).splitlines(), start=1)
 
 
-def _image(name, quaternion, translation, camera_id, names: set, path: Path) -> ModelImage:
-    if not name or len(name.encode("utf-8", "replace")) > MAX_NAME_BYTES:
-        raise InputError(
-            path, f"image name {name[:40]!r} is empty or longer than {MAX_NAME_BYTES} bytes", "rename the image"
-        )
-    if name in names:
-        raise InputError(path, f"image {name!r:.90} is listed twice", _REMEDY)
-    names.add(name)
-    return ModelImage(name, camera_id, pose_from_quaternion(quaternion, translation, path, name))
-
-
-def _numbered_lines(path: Path):
-    return list(enumerate(read_text(path).splitlines(), start=1))
+def _is_record(line: str) -> bool:
+    return bool(line.strip()) and not line.startswith("#")
 
 
 def _broken(path: Path, number: int, line: str, what: str) -> InputError:
     return InputError(path, f"line {number} is not {what}: {line[:60]!r}", _REMEDY)
 
 
-def _cameras_text(path: Path) -> dict[int, Lens]:
-    cameras = {}
+def _cameras_text(path: Path) -> Iterator[tuple[int, Lens]]:
     for number, line in _numbered_lines(path):
-        if not line.strip() or line.startswith("#"):
+        if not _is_record(line):
             continue
         fields = line.split()
         try:
@@ -224,18 +200,14 @@ def _cameras_text(path: Path) -> dict[int, Lens]:
         except (ValueError, IndexError):
             raise _broken(path, number, line, "a camera (id, model, width, height, parameters)") from None
         if model not in PARAMETER_COUNTS:
-            raise InputError(
-                path, f"line {number} has the unknown camera model {model!r:.40}", "undistort with COLMAP first"
-            )
-        _add_camera(cameras, camera_id, Lens(model, width, height, params, path), path)
-    return cameras
+            raise InputError(path, f"line {number} has the unknown camera model {model!r:.40}", _UNDISTORT)
+        yield camera_id, Lens(model, width, height, params, path)
 
 
-def _images_text(path: Path) -> list[ModelImage]:
-    lines = iter(_numbered_lines(path))
-    images, names = [], set()
+def _images_text(path: Path) -> Iterator[tuple[list[float], int, str]]:
+    lines = _numbered_lines(path)
     for number, line in lines:
-        if not line.strip() or line.startswith("#"):
+        if not _is_record(line):
             continue
         fields = line.split(maxsplit=9)
         try:
@@ -244,24 +216,21 @@ def _images_text(path: Path) -> list[ModelImage]:
         except (ValueError, IndexError):
             raise _broken(path, number, line, "an image (id, quaternion, translation, camera, name)") from None
         next(lines, None)  # the observations; an empty line, or none at the end of the file, where there are none
-        images.append(_image(name, values[:4], values[4:], camera_id, names, path))
-    return images
+        yield values, camera_id, name
 
 
 def _points_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    points, colors = [], []
+    rows = []
     for number, line in _numbered_lines(path):
-        if not line.strip() or line.startswith("#"):
+        if not _is_record(line):
             continue
-        fields = line.split(maxsplit=7)
         try:
-            place = [float(value) for value in fields[1:4]]
-            color = [int(value) for value in fields[4:7]]
+            row = [float(value) for value in line.split(maxsplit=7)[1:4]]
+            row += [int(value) for value in line.split(maxsplit=7)[4:7]]
         except ValueError:
             raise _broken(path, number, line, "a point (id, x, y, z, r, g, b, ...)") from None
-        if len(color) != 3 or not all(0 <= value <= 255 for value in color) or not all(map(math.isfinite, place)):
+        if len(row) != 6 or not all(0 <= value <= 255 for value in row[3:]) or not all(map(math.isfinite, row[:3])):
             raise _broken(path, number, line, "a point with finite x, y, z and colours in 0..255")
-        points.append(place)
-        colors.append(color)
-    colors = np.array(colors, np.float32).reshape(-1, 3) / np.float32(255)
-    return np.array(points, np.float64).reshape(-1, 3), colors
+        rows.append(row)
+    table = np.array(rows, np.float64).reshape(-1, 6)
+    return table[:, :3], table[:, 3:].astype(np.float32) / np.float32(255)

@@ -10,7 +10,8 @@ import numpy as np
 from ..errors import InputError
 from .camera import Camera
 from .capture import Capture, Shot, reinhard_gamma
-from .images import EncodedImage, image_sizes, read_hdr, read_ldr, read_mask
+from .hdr_files import hdr_size, read_hdr
+from .images import EncodedImage, image_sizes, read_ldr, read_mask
 from .lens import Lens, Undistortion
 from .names import unique_names
 from .resample import area_average, limited_size, restore_clipping
@@ -154,7 +155,7 @@ def _shrunk(image: np.ndarray, to: Lens | Camera) -> np.ndarray:
 
 
 def _truth(path: Path, lens: Lens, working: Lens, undistortion: Undistortion | None, camera: Camera) -> np.ndarray:
-    width, height = image_sizes(path)[0]
+    width, height = hdr_size(path)
     same = (width, height) == (lens.width, lens.height)
     # Truth may be rendered larger than the photos (HDR-NeRF's evaluation averages it down); never smaller.
     larger = width >= camera.width and height >= camera.height and _same_aspect((width, height), lens)
@@ -191,11 +192,7 @@ def _fitted_mask(path: Path, lens: Lens, oriented: bool) -> np.ndarray:
     height, width = mask.shape
     if (width, height) == (lens.width, lens.height):
         return mask
-    if (
-        width > lens.width
-        and height > lens.height
-        and abs(width * lens.height - height * lens.width) <= max(width, height)
-    ):
+    if width > lens.width and height > lens.height and _same_aspect((width, height), lens):
         return area_average(mask, lens.width, lens.height)
     raise InputError(path, f"mask is {width} x {height}, its image {lens.width} x {lens.height}",
                      "make the mask at the image's size")  # fmt: skip

@@ -2,7 +2,6 @@
 
 import json
 import math
-import struct
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..files import read_bytes
 from .capture import Shot
-from .images import open_image
+from .images import EXIF_ERRORS, open_image
 
 _EXIF_IFD = 0x8769
 _EXPOSURE_TIME, _F_NUMBER, _SPEED, _SHUTTER_APEX = 33434, 33437, 34855, 37377
@@ -29,15 +28,13 @@ def choose_exposure(shots: tuple[Shot, ...], index: int | None, source: Path) ->
             raise InputError(source, f"exposure index {index} asked for, but each view has one exposure",
                              "leave the exposure index out")  # fmt: skip
         return list(shots), []
+    notes = []
     if index is None:
         chosen = keys[len(keys) // 2]
-        notes = (
-            [f"each view has {len(keys)} exposures {keys}; took the middle one, index {chosen}"]
-            if len(keys) > 1
-            else []
-        )
+        if len(keys) > 1:
+            notes = [f"each view has {len(keys)} exposures {keys}; took the middle one, index {chosen}"]
     elif index in keys:
-        chosen, notes = index, []
+        chosen = index
     else:
         raise InputError(source, f"exposure index {index} asked for, but the exposures are {keys}",
                          f"choose one of {keys[0]} to {keys[-1]}")  # fmt: skip
@@ -60,9 +57,7 @@ def with_exposure_times(shots: list[Shot], source: Path) -> tuple[list[Shot], bo
     notes = []
     if any(time is None for time in stated):
         listed = _listed_times(shots, source)
-        stated = [
-            time if time is not None else listed.get(shot.image.name) for time, shot in zip(stated, shots, strict=True)
-        ]
+        stated = [listed.get(s.image.name) if time is None else time for time, s in zip(stated, shots, strict=True)]
     if all(time is None for time in stated):
         stated, notes = _exif_times(shots)
     for shot, time in zip(shots, stated, strict=True):
@@ -100,10 +95,10 @@ def _listed_times(shots: list[Shot], source: Path) -> dict[str, float]:
         if path.is_file():
             try:
                 values = json.loads(read_bytes(path, 1 << 24))
-                entries = (
-                    values.items() if isinstance(values, dict) else [(e["file"], e["exposure_time"]) for e in values]
-                )
-            except (ValueError, RecursionError, TypeError, KeyError) as error:
+                if isinstance(values, list):
+                    values = {entry["file"]: entry["exposure_time"] for entry in values}
+                entries = values.items()
+            except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as error:
                 raise InputError(path, f"is not a table of exposure times ({error!r:.80})",
                                  'write {"file name": seconds, ...}') from None  # fmt: skip
             return {Path(str(name)).name: parse_seconds(value, path, str(name)) for name, value in entries}
@@ -112,18 +107,17 @@ def _listed_times(shots: list[Shot], source: Path) -> dict[str, float]:
 
 def _exif_times(shots: list[Shot]) -> tuple[list[float | None], list[str]]:
     settings = [exif_exposure(shot.image) for shot in shots]
-    speeds = [iso for _, iso, _ in settings]
-    numbers = [aperture for _, _, aperture in settings]
     notes, factors = [], [1.0] * len(shots)
-    for name, values, power in (("ISO", speeds, 1.0), ("f-number", numbers, -2.0)):
-        if len(set(values)) > 1:
-            if None in values:
-                notes.append(f"{name} is not stated for all photos and was not counted")
-                continue
-            factors = [f * (v / values[0]) ** power for f, v in zip(factors, values, strict=True)]
-            notes.append(
-                f"{name} differs ({min(values):g} to {max(values):g}); exposure times are relative to {values[0]:g}"
-            )
+    for name, place, power in (("ISO", 1, 1.0), ("f-number", 2, -2.0)):
+        values = [setting[place] for setting in settings]
+        if len(set(values)) == 1:
+            continue
+        if None in values:
+            notes.append(f"{name} is not stated for all photos and was not counted")
+            continue
+        factors = [f * (v / values[0]) ** power for f, v in zip(factors, values, strict=True)]
+        span = f"{min(values):g} to {max(values):g}"
+        notes.append(f"{name} differs ({span}); exposure times are relative to {values[0]:g}")
     return [None if t is None else t * f for (t, _, _), f in zip(settings, factors, strict=True)], notes
 
 
@@ -137,7 +131,7 @@ def exif_exposure(path: Path) -> tuple[float | None, float | None, float | None]
             table = image.getexif().get_ifd(_EXIF_IFD)
             time, apex = _number(table.get(_EXPOSURE_TIME)), _number(table.get(_SHUTTER_APEX))
             speed, aperture = _number(table.get(_SPEED)), _number(table.get(_F_NUMBER))
-    except (OSError, SyntaxError, ValueError, KeyError, TypeError, EOFError, MemoryError, struct.error):
+    except EXIF_ERRORS:
         return None, None, None
     if time is None and apex is not None and math.isfinite(apex) and abs(apex) < 64:
         time = 2.0**-apex
@@ -147,8 +141,7 @@ def exif_exposure(path: Path) -> tuple[float | None, float | None, float | None]
 
 
 def made_by_camera(sources: Sequence[Path | None]) -> bool:
-    """Whether photos are a camera's own JPEGs: most of the files are JPEG, and state an exposure time or f-number in
-    EXIF."""
+    """Whether most of the files are a camera's own: JPEGs whose EXIF states an exposure time or f-number."""
     made = 0
     for path in sources:
         if path is not None and Path(path).suffix.lower() in (".jpg", ".jpeg") and Path(path).is_file():

@@ -37,26 +37,22 @@ def read_colmap(folder: Path) -> Capture:
             absent.append(entry.name)
             continue
         else:
-            hdr = next(
-                (file for name in ("hdr", "exr") if (file := sibling(folder / name / image.name, HDR_SUFFIXES))), None
-            )
-        shots.append(
-            Shot(image.stem, image, model.cameras[entry.camera_id], entry.world_to_camera,
-                 mask=_mask(folder, entry.name, source), hdr=hdr)
-        )  # fmt: skip
+            beside = (sibling(folder / name / image.name, HDR_SUFFIXES) for name in ("hdr", "exr"))
+            hdr = next((file for file in beside if file), None)
+        mask, lens = _mask(folder, entry.name, source), model.cameras[entry.camera_id]
+        shots.append(Shot(image.stem, image, lens, entry.world_to_camera, mask=mask, hdr=hdr))
     if not shots:
         raise InputError(images, f"none of the model's {len(absent)} images is here (the first is {absent[0]!r:.90})",
                          "copy the images that COLMAP used")  # fmt: skip
-    notes = (
-        (f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ...",) if absent else ()
-    )
+    notes = ()
+    if absent:
+        notes = (f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ...",)
     return Capture("colmap", tuple(shots), holdout=(8, 0), points=model.points, point_colors=model.colors, notes=notes)
 
 
 def is_hdr_gs(folder: Path) -> bool:
-    return (folder / "exr").is_dir() and (folder / "images").is_dir() and find_model(folder) is not None and bool(
-        _exposures_by_view(folder / "images")
-    )  # fmt: skip
+    there = (folder / "exr").is_dir() and (folder / "images").is_dir() and find_model(folder) is not None
+    return there and bool(_exposures_by_view(folder / "images"))
 
 
 def read_hdr_gs(folder: Path) -> Capture:
@@ -72,11 +68,9 @@ def read_hdr_gs(folder: Path) -> Capture:
             continue
         placed.add(view)
         hdr = sibling(folder / "exr" / f"{view}.exr", HDR_SUFFIXES)
-        shots += [
-            Shot(view, image, model.cameras[entry.camera_id], entry.world_to_camera, exposure_key=key,
-                 exposure_time=seconds[key] if seconds else None, hdr=hdr)
-            for key, image in sorted(exposures[view].items())
-        ]  # fmt: skip
+        for key, image in sorted(exposures[view].items()):
+            camera, time = (model.cameras[entry.camera_id], entry.world_to_camera), seconds[key] if seconds else None
+            shots.append(Shot(view, image, *camera, exposure_key=key, exposure_time=time, hdr=hdr))
     if not shots:
         raise InputError(source, "none of the model's images is in images/", "copy the images that COLMAP used")
     return Capture("hdr-gs", tuple(shots), alpha="background", holdout=(2, 1), points=model.points,

@@ -38,11 +38,9 @@ def read_photos(folder: Path, cache: Path | str | None = None) -> Capture:
         if i in placed
     ]  # fmt: skip
     lost = [photo.name for i, photo in enumerate(photos) if i not in placed]
-    notes = (
-        (f"{len(lost)} of {len(photos)} photos could not be placed and were left out: {', '.join(lost[:5])}",)
-        if lost
-        else ()
-    )
+    notes = ()
+    if lost:
+        notes = (f"{len(lost)} of {len(photos)} photos could not be placed and were left out: {', '.join(lost[:5])}",)
     return Capture("photos", tuple(shots), points=model.points, point_colors=model.colors, notes=notes)
 
 

@@ -11,6 +11,7 @@ from ..files import contained, read_json
 from .capture import DERIVED_PHOTOS, Capture, Shot, pose_from_camera_to_world
 from .colmap_model import find_model, read_ply_points, read_points
 from .exposure import parse_seconds
+from .hdr_files import hdr_size
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, image_sizes
 from .lens import Lens
 from .names import sibling
@@ -70,9 +71,8 @@ def read_hdr_nerf(folder: Path) -> Capture:
         for place, (name, frame) in enumerate(frames_of(values, path)):
             stated = times.get(_plain(name))
             if not stated:
-                raise InputError(
-                    times_path, f"has no exposure time for {name!r:.90}", "list <file_path>_<k>.png: seconds"
-                )
+                problem = f"has no exposure time for {name!r:.90}"
+                raise InputError(times_path, problem, "list <file_path>_<k>.png: seconds")
             hdr = sibling(folder / f"{split}_hdr" / f"hdr_{place:03d}.exr", HDR_SUFFIXES)
             matrix = frame_pose(frame, path, name)
             if derived:
@@ -89,9 +89,8 @@ def read_hdr_nerf(folder: Path) -> Capture:
             present = [(k, contained(folder, file, times_path), t) for k, (file, t) in sorted(stated.items())]
             present = [entry for entry in present if entry[1].is_file()]
             if not present:
-                raise InputError(
-                    folder / f"{_plain(name)}_{min(stated)}.png", "image file not found", "copy the whole set"
-                )
+                absent = folder / f"{_plain(name)}_{min(stated)}.png"
+                raise InputError(absent, "image file not found", "copy the whole set")
             shots += [
                 Shot(Path(_plain(name)).name, image, frame_lens(values, frame, image, path), matrix, exposure_key=key,
                      exposure_time=time, split=split, hdr=hdr)
@@ -120,18 +119,15 @@ def frames_of(values: dict, path: Path) -> list[tuple[str, dict]]:
 
 def _named_splits(values: dict, path: Path) -> dict[str, str]:
     """Each frame's split where the file says so: nerfstudio's <split>_filenames, or a frame's own "split"."""
-    named = {}
-    for name, frame in frames_of(values, path):
-        if frame.get("split") in ("train", "test", "val"):
-            named[name] = frame["split"]
+    known = ("train", "test", "val")
+    named = {name: frame["split"] for name, frame in frames_of(values, path) if frame.get("split") in known}
     for key, split in (("train_filenames", "train"), ("val_filenames", "val"), ("test_filenames", "test")):
         listed = values.get(key)
         if isinstance(listed, list):
             named.update({name: split for name in listed if isinstance(name, str)})
     held_out = "test" if "test" in named.values() else "val"
-    return {
-        name: "train" if split == "train" else "test" for name, split in named.items() if split in ("train", held_out)
-    }
+    kept = {"train": "train", held_out: "test"}
+    return {name: kept[split] for name, split in named.items() if split in kept}
 
 
 def _frame_shot(folder: Path, path: Path, values: dict, frame: dict, name: str, split: str | None) -> Shot:
@@ -184,7 +180,7 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
     if width is None or height is None:
         if image is None:
             raise InputError(path, "states no image size", "add w and h")
-        width, height = image_sizes(image)[0]
+        width, height = hdr_size(image) if image.suffix.lower() in HDR_SUFFIXES else image_sizes(image)[0]
     fx, fy = number("fl_x"), number("fl_y")
     if fx is None and (angle := number("camera_angle_x")) is not None and 0 < angle < math.pi:
         fx = 0.5 * width / math.tan(0.5 * angle)

@@ -10,7 +10,6 @@ import json
 import logging
 import math
 import os
-import struct
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -22,7 +21,7 @@ from ..errors import InputError, SehdrError
 from .capture import Capture, Shot
 from .colmap_model import SparseModel, read_model
 from .develop import as_photographed, fitted_lens
-from .images import open_image, read_ldr, read_mask
+from .images import EXIF_ERRORS, open_image, read_ldr, read_mask
 from .lens import Lens
 from .types import encoded_values
 
@@ -179,7 +178,7 @@ def _name(index: int) -> str:
 def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Oriented 8-bit copies of at most MAX_SIDE pixels; returns the oriented full sizes and the copies' sizes."""
     folder.mkdir()
-    sizes, small, informative = [], [], False
+    sizes, small, shown = [], [], False
     for i, photo in enumerate(photos):
         if i % _CHUNK == 0:
             _log.info("reading photos %d to %d of %d", i + 1, min(i + _CHUNK, len(photos)), len(photos))
@@ -188,12 +187,11 @@ def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tup
         image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
         small.append(image.size)
         values = np.asarray(image)
-        informative |= bool(((values > 2) & (values < 253)).mean() > 1e-3)
+        shown |= bool(((values > 2) & (values < 253)).mean() > 1e-3)
         image.save(folder / _name(i), compress_level=1)
-    if not informative:
-        raise InputError(
-            photos[0].parent, "the photos are all black or all white", "expose them so that the scene shows"
-        )
+    if not shown:
+        problem = "the photos are all black or all white"
+        raise InputError(photos[0].parent, problem, "expose them so that the scene shows")
     return sizes, small
 
 
@@ -243,7 +241,7 @@ def _device(photo: Path) -> tuple:
         try:
             exif = image.getexif()
             lens = exif.get_ifd(0x8769)
-        except (OSError, SyntaxError, ValueError, KeyError, TypeError, EOFError, struct.error):
+        except EXIF_ERRORS:
             return None, None, None, None
     return exif.get(0x010F), exif.get(0x0110), lens.get(0x920A), lens.get(0xA405)
 
@@ -252,9 +250,8 @@ def _extract(database: Path, images: Path, names: list[str], model: str, params,
     """Features of images that share one camera, a few at a time so that progress can be told."""
     import pycolmap
 
-    reader = pycolmap.ImageReaderOptions(
-        camera_model=model, camera_params=",".join(f"{value:.17g}" for value in params)
-    )
+    stated = ",".join(f"{value:.17g}" for value in params)
+    reader = pycolmap.ImageReaderOptions(camera_model=model, camera_params=stated)
     for start in range(0, len(names), _CHUNK):
         part = names[start : start + _CHUNK]
         if told:
@@ -285,9 +282,7 @@ def _match(database: Path, count: int) -> None:
 
 
 def _seed(options) -> None:
-    options.random_seed = _SEED
-    options.mapper.random_seed = _SEED
-    options.triangulation.random_seed = _SEED
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = _SEED
 
 
 def _map(database: Path, work: Path, count: int, source: Path):

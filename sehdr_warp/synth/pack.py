@@ -7,7 +7,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import atomic_folder, write_json
-from ..scene.images import read_hdr
+from ..scene.hdr_files import read_hdr
 from .truth_set import read_making
 
 COMPRESSIONS = ("zip", "piz", "dwab")

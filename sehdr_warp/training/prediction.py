@@ -13,7 +13,8 @@ import numpy as np
 from ..errors import InputError, SehdrError
 from ..response import Response, ToneMapper, response_by_name
 from ..scene import Scene, View
-from ..scene.images import HDR_SUFFIXES, read_hdr
+from ..scene.hdr_files import read_hdr
+from ..scene.images import HDR_SUFFIXES
 
 Predictor = Callable[[View], tuple[str, np.ndarray]]
 """From a view to where its prediction comes from, and the prediction [H, W, 3]."""

@@ -108,9 +108,9 @@ def _exr(folder: Path) -> None:
 
 def _read_exr(folder: Path):
     from sehdr_warp.output.exr import read_exr
-    from sehdr_warp.scene.images import image_sizes, read_hdr
+    from sehdr_warp.scene.hdr_files import hdr_size, read_hdr
 
-    each(folder, "*.exr", image_sizes)
+    each(folder, "*.exr", hdr_size)
     each(folder, "*.exr", read_hdr)
     return each(folder, "*.exr", read_exr)
 
@@ -123,7 +123,7 @@ def _radiance(folder: Path) -> None:
 
 
 def _read_radiance(folder: Path):
-    from sehdr_warp.scene.images import read_hdr
+    from sehdr_warp.scene.hdr_files import read_hdr
 
     return each(folder, "*.hdr", read_hdr)
 

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.scene.images import image_sizes, read_hdr, read_ldr
+from sehdr_warp.scene.hdr_files import hdr_size, read_hdr
+from sehdr_warp.scene.images import image_sizes, read_ldr
 from sehdr_warp.scene.resample import (
     area_average,
     limited_size,
@@ -133,7 +134,7 @@ def test_too_many_pixels_are_refused_before_decoding(tmp_path):
     png = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
     (tmp_path / "a.png").write_bytes(png + struct.pack(">I", 0) + b"IDAT" + struct.pack(">I", zlib.crc32(b"IDAT")))
     (tmp_path / "a.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 60000 +X 60000\n")
-    for read, name in ((read_ldr, "a.png"), (image_sizes, "a.png"), (read_hdr, "a.hdr"), (image_sizes, "a.hdr")):
+    for read, name in ((read_ldr, "a.png"), (image_sizes, "a.png"), (read_hdr, "a.hdr"), (hdr_size, "a.hdr")):
         with pytest.raises(InputError, match="60000 x 60000"):
             read(tmp_path / name)
 

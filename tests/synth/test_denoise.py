@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.scene.images import read_hdr
+from sehdr_warp.scene.hdr_files import read_hdr
 from sehdr_warp.synth import denoise
 from sehdr_warp.synth.cameras import make_cameras
 from sehdr_warp.synth.render import Settings, _render_view, render_scene

@@ -1,0 +1,171 @@
+"""Scene-linear pixels from OpenEXR and Radiance files (shared-exponent RGBE; Ward, Graphics Gems II, II.5)."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from ..files import read_bytes
+from ..quiet import silent_stderr
+from .images import DAMAGED, MAX_PIXELS, check_size, require_file
+
+# OpenEXR asks for the memory of all pixels before it reads one. Its ZIP of a single colour holds 500 pixels in a byte.
+_MOST_PIXELS_PER_BYTE = 4096
+_REMEDY = "export the image again"
+_MAX_HEADER_BYTES = 1 << 16
+_EXR_ERRORS = (RuntimeError, ValueError, KeyError, TypeError, MemoryError)
+
+
+def hdr_size(path: Path) -> tuple[int, int]:
+    """(width, height) from the header alone; InputError where it cannot be read or states too many pixels."""
+    if path.suffix.lower() != ".hdr":
+        return _exr_window(path, MAX_PIXELS)[1]
+    require_file(path)
+    with path.open("rb") as file:
+        size = _radiance_header(file.read(_MAX_HEADER_BYTES), path)[:2]
+    check_size(path, *size)
+    return size
+
+
+def read_hdr(path: Path, *, keep_negative: bool = False) -> np.ndarray:
+    """[H, W, 3] float32 scene-linear radiance; negative values are raised to zero unless they are to be kept.
+
+    Raises InputError where the file is missing, damaged or too large, or a value is NaN or infinite (with its place).
+    """
+    if path.suffix.lower() == ".hdr":
+        hdr_size(path)
+        pixels = _read_radiance(path)
+    else:
+        channels, _ = read_exr_channels(path)
+        known = (("R", "G", "B"), ("r", "g", "b"), ("Y",) * 3, ("V",) * 3)
+        names = next((names for names in known if set(names) <= set(channels)), None)
+        if names is None:
+            found = f"has the channels {sorted(channels)[:8]}, not R, G, B"
+            raise InputError(path, found, "export it with colour channels")
+        pixels = np.stack([channels[name] for name in names], axis=2)
+    bad = ~np.isfinite(pixels)
+    if bad.any():
+        row, column, channel = (int(i) for i in np.argwhere(bad)[0])
+        place = f"one {'RGB'[channel]} = {pixels[row, column, channel]} at x={column}, y={row}"
+        raise InputError(path, f"{int(bad.any(axis=2).sum())} pixels not finite, {place}",
+                         "render or export the image again")  # fmt: skip
+    return pixels if keep_negative else np.maximum(pixels, 0.0)
+
+
+def read_exr_channels(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[dict[str, np.ndarray], dict]:
+    """The channels of an OpenEXR file's first part, each [H, W] float32 over the display window, and its header.
+
+    Pixels of the display window outside the data window are 0. Values are as stored: NaN and infinity pass.
+    Raises InputError where the file is missing, damaged, truncated or holds more than max_pixels pixels.
+    """
+    import OpenEXR
+
+    (x0, y0), (width, height) = _exr_window(path, max_pixels)
+    try:
+        with silent_stderr(), OpenEXR.File(str(path), separate_channels=True) as file:
+            # A file whose pixels end early leaves no part behind instead of raising.
+            if not file.parts:
+                raise InputError(path, "pixel data is damaged or ends early", DAMAGED)
+            header = dict(file.header())
+            stored = {name: channel.pixels for name, channel in file.channels().items()}
+    except _EXR_ERRORS as error:
+        raise InputError(path, f"cannot be read as OpenEXR ({error})", DAMAGED) from None
+    left, top = (int(a) - b for a, b in zip(header["dataWindow"][0], (x0, y0), strict=True))
+    channels = {}
+    for name, pixels in stored.items():
+        if pixels is None or pixels.ndim != 2:
+            continue
+        full = np.zeros((height, width), np.float32)
+        rows = slice(max(top, 0), min(top + pixels.shape[0], height))
+        columns = slice(max(left, 0), min(left + pixels.shape[1], width))
+        if rows.start < rows.stop and columns.start < columns.stop:
+            full[rows, columns] = pixels[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
+        channels[name] = full
+    return channels, header
+
+
+def _exr_window(path: Path, max_pixels: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    """The display window's origin and its (width, height)."""
+    import OpenEXR
+
+    require_file(path)
+    try:
+        with silent_stderr(), OpenEXR.File(str(path), header_only=True) as file:
+            header = file.header()
+            windows = [[[int(v) for v in corner] for corner in header[key]] for key in ("displayWindow", "dataWindow")]
+    except _EXR_ERRORS as error:
+        raise InputError(path, f"cannot be read as OpenEXR ({error})", DAMAGED) from None
+    sizes = [(high[0] - low[0] + 1, high[1] - low[1] + 1) for low, high in windows]
+    stored = path.stat().st_size
+    for size in sizes:
+        check_size(path, *size, max_pixels)
+        if size[0] * size[1] > _MOST_PIXELS_PER_BYTE * stored:
+            raise InputError(path, f"states {size[0]} x {size[1]} pixels, but has only {stored} bytes", DAMAGED)
+    return tuple(windows[0][0]), sizes[0]
+
+
+def _read_radiance(path: Path) -> np.ndarray:
+    """[H, W, 3] float32 linear RGB, scaled by the header's EXPOSURE lines (radiance = pixel / exposure)."""
+    data = read_bytes(path)
+    width, height, position, exposure = _radiance_header(data[:_MAX_HEADER_BYTES], path)
+    codes, rgbe = np.frombuffer(data, np.uint8), np.empty((height, width, 4), np.uint8)
+    for row in range(height):
+        position = _read_row(codes, position, rgbe[row])
+        if position < 0:
+            raise InputError(path, f"pixel data is damaged or ends early in row {row}", _REMEDY)
+    scale = np.ldexp(1.0, rgbe[..., 3].astype(np.int32) - 136)
+    pixels = (rgbe[..., :3] + 0.5) * scale[..., None] / exposure
+    pixels[rgbe[..., 3] == 0] = 0.0
+    return pixels.astype(np.float32)
+
+
+def _radiance_header(data: bytes, path: Path) -> tuple[int, int, int, float]:
+    """Width, height, where the pixels begin, and the product of the exposures."""
+    if not data.startswith((b"#?RADIANCE", b"#?RGBE")):
+        raise InputError(path, "is not a Radiance picture", _REMEDY)
+    end = data.find(b"\n\n")
+    size = re.compile(rb"-Y (\d{1,6}) \+X (\d{1,6})\n").match(data, end + 2) if end >= 0 else None
+    if size is None:
+        raise InputError(path, "Radiance header has no '-Y height +X width' line", _REMEDY)
+    if b"32-bit_rle_xyze" in data[:end]:
+        raise InputError(path, "holds XYZ colours, not RGB", "convert it to RGB (ra_xyze -r)")
+    try:
+        stated = re.findall(rb"^EXPOSURE\s*=\s*([^\s]{1,40})", data[:end], re.MULTILINE)
+        exposure = float(np.prod([float(value) for value in stated]))
+    except ValueError:
+        exposure = np.nan
+    if not (np.isfinite(exposure) and exposure > 0):
+        raise InputError(path, "EXPOSURE is not a positive number", _REMEDY)
+    return int(size[2]), int(size[1]), size.end(), exposure
+
+
+def _read_row(codes: np.ndarray, position: int, row: np.ndarray) -> int:
+    """Fill one row [W, 4], flat or run-length coded, from codes[position:]; returns where the next begins, or -1."""
+    width = len(row)
+    first = codes[position : position + 4]
+    if len(first) < 4:
+        return -1
+    if first[0] != 2 or first[1] != 2 or first[2] & 0x80 or not 8 <= width < 32768:
+        flat = codes[position : position + 4 * width]
+        if len(flat) < 4 * width:
+            return -1
+        row[:] = flat.reshape(width, 4)
+        return position + 4 * width
+    if int(first[2]) << 8 | int(first[3]) != width:
+        return -1
+    position += 4
+    for channel in range(4):
+        filled = 0
+        while filled < width:
+            if position + 2 > len(codes):
+                return -1
+            count, repeated = int(codes[position]), codes[position] > 128
+            count -= 128 * repeated
+            values = codes[position + 1 : position + 2 if repeated else position + 1 + count]
+            if count == 0 or filled + count > width or len(values) < (1 if repeated else count):
+                return -1
+            row[filled : filled + count, channel] = values
+            filled += count
+            position += 1 + len(values)
+    return position
