@@ -17,6 +17,7 @@ def encode_kernel(dtype, tone: int):
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def encode(
+        first: int,
         exposures: wp.array(dtype=real),
         power_law: vec4,
         tone_numbers: vec5,
@@ -27,7 +28,7 @@ def encode_kernel(dtype, tone: int):
     ):
         """power_law: exponent, offset, slope and end of the toe; tone_numbers: Filmic's a, b, d, e, g or Knee's start
         and softness; clip: the clip point, infinite for none; extension_slope: of the rise by log exposure beyond."""
-        i = wp.tid()
+        i = first + wp.tid()
         exposure = exposures[i]
         x = wp.clamp(exposure, real(0.0), clip)
         light = x

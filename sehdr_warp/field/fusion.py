@@ -16,7 +16,7 @@ from torch.utils.checkpoint import checkpoint
 
 from ..errors import SehdrError
 from ..response.curve import Response
-from ..splatting.exposure_fusion import fuse_exposures
+from ..splatting.exposure_fusion import fuse_exposures, fusion_weights
 from ..splatting.interpolation import interpolate
 from ..splatting.recording import is_recording
 from .exposure import bracket_log_radiance, exposure_times
@@ -27,8 +27,6 @@ DARKEST_VALUE, OCTAVES_ABOVE_WHITE = 1e-5, 6.0
 NODES = 1024
 # Gaussians evaluated together by the exact form: bounds its memory to some 100 MB at width 128 and 5 brackets.
 EXACT_CHUNK = 16384
-# Limits inside which exp(-z^2 / 2) and its gradient are finite in float32, for any sigma.
-MAX_LOG_SIGMA, MAX_DEVIATION = 30.0, 30.0
 
 
 class NeuralExposureFusion(nn.Module):
@@ -87,61 +85,25 @@ class NeuralExposureFusion(nn.Module):
     def fusion_weights(self, log_base: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The weights w and the encoded brackets f(c^{l_p}) behind the sum, each [n, N, 3], for [N, 3] log c^{l_1}."""
         encoded = self._encode(log_base)
-        return self._weights(encoded), encoded
+        return fusion_weights(encoded, *self._learned()), encoded
 
     def _encode(self, log_base):
         """[n, N, 3] the encoded brackets of log_base [N, 3]."""
         return self.response.encode_extended(bracket_log_radiance(log_base, self.times, self.base_time).exp())
 
-    def _weights(self, encoded):
-        """[n, N, 3] weights that sum to 1 over the brackets."""
-        sigma = self.log_sigma.clamp(-MAX_LOG_SIGMA, MAX_LOG_SIGMA).exp()
-        deviation = ((encoded - 0.5) / sigma).clamp(-MAX_DEVIATION, MAX_DEVIATION)
-        exposedness = (-0.5 * deviation.square()).exp()
-        logits = self._channel_mlps(torch.stack([exposedness, encoded], dim=-1)) * exposedness
-        return logits.softmax(dim=0)
+    def _learned(self):
+        """What fuse_exposures() takes behind the brackets."""
+        return self.log_sigma, *(part for layer in zip(self.weights, self.biases, strict=True) for part in layer)
 
     def _fuse(self, log_base):
         weights, encoded = self.fusion_weights(log_base)
         return self.radiance_scale * (weights * encoded).sum(dim=0)
 
-    def _channel_mlps(self, features):
-        """[n, N, 3] outputs of the three MLPs for features [n, N, 3, 2]."""
-        # One product for each channel and bracket: the weights' gradients are sums over many points, which a GPU makes
-        # in parallel only across products.
-        values = features.permute(2, 0, 1, 3)
-        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            values = torch.matmul(values.relu() if layer else values, weight[:, None]) + bias[:, None]
-        return values[..., 0].permute(1, 2, 0)
-
     def tabulated(self, log_base: torch.Tensor) -> torch.Tensor:
         """As forward: Catmull-Rom between the table's nodes; below them constant, above a line in log radiance."""
         step = (self._high - self._low) / (NODES - 1)
-        plain = log_base.dtype != torch.float32 or torch.are_deterministic_algorithms_enabled()
-        on_gpu = log_base.device.type == "cuda" and not plain
-        table = self._table(log_base, step, on_gpu)
-        if on_gpu:
-            return interpolate(table, self._low, step, log_base)
-        position = ((log_base - self._low) / step).clamp_min(0.0)
-        cell = position.detach().nan_to_num(0.0).clamp_max(NODES - 2).long()
-        part = position - cell
-        before, left, right, after = (table.gather(0, cell + offset) for offset in range(4))
-        slope_left, slope_right = 0.5 * (right - before), 0.5 * (after - left)
-        inside = part.clamp_max(1.0)
-        rise = right - left
-        cubic = slope_left + slope_right - 2.0 * rise
-        square = 3.0 * rise - 2.0 * slope_left - slope_right
-        value = left + inside * (slope_left + inside * (square + inside * cubic))
-        return value + (part - inside) * slope_right
-
-    def _table(self, like, step, on_gpu):
-        """[nodes + 2, 3] the fused values at the table's nodes."""
-        encoded = self._encoded_at_nodes(like, step)
-        if on_gpu and not encoded.requires_grad:
-            layers = (part for layer in zip(self.weights, self.biases, strict=True) for part in layer)
-            limits = {"log_sigma_limit": MAX_LOG_SIGMA, "deviation_limit": MAX_DEVIATION}
-            return fuse_exposures(encoded, self.log_sigma, *layers, scale=self.radiance_scale, **limits)
-        return self.radiance_scale * (self._weights(encoded) * encoded).sum(dim=0)
+        table = fuse_exposures(self._encoded_at_nodes(log_base, step), *self._learned(), scale=self.radiance_scale)
+        return interpolate(table, self._low, step, log_base)
 
     def _encoded_at_nodes(self, like, step):
         """[n, nodes + 2, 3] the encoded brackets at the table's nodes; kept, unless the curve is itself learned."""

@@ -79,7 +79,7 @@ class Response(ABC):
             raise SehdrError(f"response: the stored {kind} curve is damaged ({error!r:.200})") from error
 
     def formula(self) -> FormulaCurve | None:
-        """The curve as a GPU evaluates it in one launch; None where there is no such kernel."""
+        """The curve as one launch evaluates it with its slope; None where there is no such kernel."""
         return None
 
     @property
@@ -158,7 +158,7 @@ class _Encode(_Pointwise):
     def forward(ctx, exposure, response, extension_slope):
         differentiate = ctx.needs_input_grad[0]
         clip = response.clip_exposure
-        if differentiate and exposure.device.type == "cuda" and (formula := response.formula()) is not None:
+        if differentiate and (formula := response.formula()) is not None:
             value, slope = encode_with_slope(exposure, formula, extension_slope or 0.0)
             ctx.save_for_backward(slope)
             return value

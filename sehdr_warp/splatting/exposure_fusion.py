@@ -3,7 +3,10 @@
 import torch
 
 from ..kernels.exposure_fusion import POINTS_PER_THREAD, fusion_kernels
-from .launching import launch, warp_scalar
+from .launching import launch, sums_are_ordered, warp_scalar
+
+MAX_LOG_SIGMA, MAX_DEVIATION = 30.0, 30.0
+"""Limits inside which exp(-d^2 / 2) and its gradient are finite in float32, for any sigma."""
 
 
 def fuse_exposures(
@@ -15,14 +18,13 @@ def fuse_exposures(
     outer_bias: torch.Tensor,
     *,
     scale: float,
-    log_sigma_limit: float,
-    deviation_limit: float,
 ) -> torch.Tensor:
     """[M, 3]: scale times the encoded brackets [P, M, 3], weighted by the softmax over P of MLP(gamma, encoded) gamma.
 
     gamma = exp(-d^2 / 2), d = (encoded - 0.5) / exp(log_sigma), with log_sigma [3] and d held within their limits. The
     perceptrons, one a channel: inner [3, 2, H], inner_bias [3, 1, H], ReLU, outer [3, H, 1], outer_bias [3, 1, 1].
-    Differentiable once with respect to all but the brackets; sums of gradients are made in no fixed order on a GPU.
+    Differentiable once, with respect to all tensors. By kernels, or by torch's own operations where the brackets ask
+    for a gradient, or on a GPU for a fixed order of sums (torch.use_deterministic_algorithms).
     All contiguous, of one type, float32 or float64, and on one device; raises ValueError for other shapes.
     """
     hidden = inner.shape[-1]
@@ -40,15 +42,34 @@ def fuse_exposures(
                 f"{name} is {tensor.dtype} {list(tensor.shape)} on {tensor.device}, expected {encoded.dtype} "
                 f"{list(shape)} on {encoded.device}"
             )
-    return _Fusion.apply(
-        encoded, log_sigma, inner, inner_bias, outer, outer_bias, scale, log_sigma_limit, deviation_limit
-    )
+    learned = log_sigma, inner, inner_bias, outer, outer_bias
+    if encoded.requires_grad or sums_are_ordered(encoded.device):
+        return scale * (fusion_weights(encoded, *learned) * encoded).sum(dim=0)
+    return _Fusion.apply(encoded, *learned, scale)
+
+
+def fusion_weights(
+    encoded: torch.Tensor,
+    log_sigma: torch.Tensor,
+    inner: torch.Tensor,
+    inner_bias: torch.Tensor,
+    outer: torch.Tensor,
+    outer_bias: torch.Tensor,
+) -> torch.Tensor:
+    """[P, M, 3] the weights in fuse_exposures(), which sum to 1 over P, by torch's own operations."""
+    deviation = (encoded - 0.5) / log_sigma.clamp(-MAX_LOG_SIGMA, MAX_LOG_SIGMA).exp()
+    exposedness = (-0.5 * deviation.clamp(-MAX_DEVIATION, MAX_DEVIATION).square()).exp()
+    # One product for each channel and bracket: the weights' gradients are sums over many points, which a GPU makes in
+    # parallel only across products.
+    points = torch.stack([exposedness, encoded], dim=-1).permute(2, 0, 1, 3)
+    units = torch.matmul(points, inner[:, None]) + inner_bias[:, None]
+    logits = (torch.matmul(units.relu(), outer[:, None]) + outer_bias[:, None])[..., 0].permute(1, 2, 0)
+    return (logits * exposedness).softmax(dim=0)
 
 
 class _Fusion(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, encoded, log_sigma, inner, inner_bias, outer, outer_bias, *numbers):
-        scale, *limits = numbers
+    def forward(ctx, encoded, log_sigma, inner, inner_bias, outer, outer_bias, scale):
         brackets, count, _ = encoded.shape
         by_channel = encoded.detach().permute(2, 0, 1).reshape(3, -1).contiguous()
         weights = [tensor.detach().contiguous() for tensor in (inner, inner_bias, outer, outer_bias)]
@@ -56,18 +77,18 @@ class _Fusion(torch.autograd.Function):
         exposedness, outputs = torch.empty_like(by_channel), torch.empty_like(by_channel)
         results = encoded.new_empty(count, 3)
         kernels = fusion_kernels(warp_scalar(encoded.dtype))
-        given = by_channel, log_sigma, *limits, *_flat(weights)
+        given = by_channel, log_sigma, MAX_LOG_SIGMA, MAX_DEVIATION, *_flat(weights)
         launch(kernels.perceptrons, by_channel.shape, *given, exposedness, outputs)
         launch(kernels.mix, results.shape, by_channel, exposedness, outputs, brackets, scale, results)
         ctx.save_for_backward(by_channel, log_sigma, *weights, exposedness, outputs, results)
-        ctx.numbers = brackets, scale, limits
+        ctx.numbers = brackets, scale
         return results
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradients):
         encoded, log_sigma, *weights, exposedness, outputs, results = ctx.saved_tensors
-        brackets, scale, limits = ctx.numbers
+        brackets, scale = ctx.numbers
         by_exposedness, by_output, by_log_sigma = (torch.empty_like(encoded) for _ in range(3))
         sizes = [weight.numel() for weight in weights]
         zeros = encoded.new_zeros(sum(sizes)).split(sizes)
@@ -80,9 +101,9 @@ class _Fusion(torch.autograd.Function):
         units = 3, -(-encoded.shape[1] // POINTS_PER_THREAD), outer.shape[1]
         given = encoded, exposedness, by_output, *learned, POINTS_PER_THREAD
         launch(kernels.unit_adjoint, units, *given, *_flat(by_weights))
-        points = encoded, exposedness, by_exposedness, by_output, log_sigma, *limits
+        points = encoded, exposedness, by_exposedness, by_output, log_sigma, MAX_LOG_SIGMA, MAX_DEVIATION
         launch(kernels.point_adjoint, encoded.shape, *points, *learned, by_log_sigma)
-        return None, by_log_sigma.sum(1), *by_weights, None, None, None
+        return None, by_log_sigma.sum(1), *by_weights, None
 
 
 def _flat(weights):

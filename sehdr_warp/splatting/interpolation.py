@@ -3,25 +3,42 @@
 import torch
 
 from ..kernels import interpolation
-from .launching import launch
+from .launching import launch, sums_are_ordered
 
 
 def interpolate(table: torch.Tensor, low: float, step: float, positions: torch.Tensor) -> torch.Tensor:
     """[N, C] values at positions [N, C] of C functions given at equal steps (Catmull and Rom 1974).
 
-    table: [nodes + 2, C] float32, column c holding function c at low - step, low, low + step ...; nodes from 2. Below
-    `low` a function is constant, above its last node but one a straight line. Differentiable once with respect to table
-    and positions; on a GPU sums by node are made in no fixed order.
+    table: [nodes + 2, C], column c holding function c at low - step, low, low + step ...; nodes from 2. Below `low` a
+    function is constant, above its last node but one a straight line. Differentiable once with respect to table and
+    positions. By a kernel, or by torch's own operations in float64 and, on a GPU, where torch is asked for a fixed
+    order of sums (torch.use_deterministic_algorithms).
     Raises ValueError for a table that is too short or for shapes, types or devices that do not fit.
     """
     fits = table.ndim == positions.ndim == 2 and table.shape[1] == positions.shape[1] and table.shape[0] >= 4
-    same = table.dtype == positions.dtype == torch.float32 and table.device == positions.device
+    same = table.dtype == positions.dtype in (torch.float32, torch.float64) and table.device == positions.device
     if not (fits and same):
         raise ValueError(
-            f"interpolate takes float32 [nodes + 2, C] and [N, C] on one device, not {table.dtype} {list(table.shape)} "
+            f"interpolate takes floats [nodes + 2, C] and [N, C] on one device, not {table.dtype} {list(table.shape)} "
             f"on {table.device} and {positions.dtype} {list(positions.shape)} on {positions.device}"
         )
+    if table.dtype == torch.float64 or sums_are_ordered(table.device):
+        return _in_torch(table, low, step, positions)
     return _Interpolation.apply(table, low, step, positions)
+
+
+def _in_torch(table: torch.Tensor, low: float, step: float, positions: torch.Tensor) -> torch.Tensor:
+    nodes = table.shape[0] - 2
+    position = ((positions - low) / step).clamp_min(0.0)
+    cell = position.detach().nan_to_num(0.0).clamp_max(nodes - 2).long()
+    part = position - cell
+    before, left, right, after = (table.gather(0, cell + offset) for offset in range(4))
+    slope_left, slope_right = 0.5 * (right - before), 0.5 * (after - left)
+    inside, rise = part.clamp_max(1.0), right - left
+    cubic = slope_left + slope_right - 2.0 * rise
+    square = 3.0 * rise - 2.0 * slope_left - slope_right
+    value = left + inside * (slope_left + inside * (square + inside * cubic))
+    return value + (part - inside) * slope_right
 
 
 class _Interpolation(torch.autograd.Function):

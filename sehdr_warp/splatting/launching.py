@@ -95,6 +95,11 @@ def _descriptor(tensor: torch.Tensor, kind: wp.array) -> Any:
     return wp.from_torch(tensor, dtype=kind.dtype, requires_grad=False, return_ctype=True)
 
 
+def sums_are_ordered(device: torch.device) -> bool:
+    """Whether sums on a device must be made in a fixed order that atomics of many threads do not keep."""
+    return device.type == "cuda" and torch.are_deterministic_algorithms_enabled()
+
+
 def torch_stream(device: torch.device) -> AbstractContextManager:
     """Whatever Warp does goes to torch's current stream for as long as this context lasts."""
     stream = _stream(device)

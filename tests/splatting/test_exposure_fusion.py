@@ -3,13 +3,11 @@
 import pytest
 import torch
 
-from sehdr_warp.field.fusion import MAX_DEVIATION, MAX_LOG_SIGMA, NeuralExposureFusion
+from sehdr_warp.field.fusion import NeuralExposureFusion
 from sehdr_warp.response import response_by_name
-from sehdr_warp.splatting.exposure_fusion import fuse_exposures
+from sehdr_warp.splatting.exposure_fusion import fuse_exposures, fusion_weights
 
 from .scenes import relative_error
-
-LIMITS = {"log_sigma_limit": MAX_LOG_SIGMA, "deviation_limit": MAX_DEVIATION}
 
 
 def learned(dtype, device="cpu", width=24, sigmas=(-1.6, -0.4, 0.5)):
@@ -35,9 +33,9 @@ def test_values_and_gradients_are_those_of_torch(device, dtype, bound, sigmas):
     encoded = brackets()
     upstream = torch.randn(200, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     plain, ours = learned(torch.float64, sigmas=sigmas), learned(dtype, device, sigmas=sigmas)
-    truth = 2.5 * (plain._weights(encoded) * encoded).sum(0)
+    truth = 2.5 * (fusion_weights(encoded, *parts(plain)) * encoded).sum(0)
     (truth * upstream).sum().backward()
-    value = fuse_exposures(encoded.to(device, dtype), *parts(ours), scale=2.5, **LIMITS)
+    value = fuse_exposures(encoded.to(device, dtype), *parts(ours), scale=2.5)
     (value * upstream.to(device, dtype)).sum().backward()
     assert relative_error(value, truth) < bound
     for name, mine, true in zip(("sigma", "W", "b", "V", "c"), parts(ours), parts(plain), strict=True):
@@ -45,15 +43,24 @@ def test_values_and_gradients_are_those_of_torch(device, dtype, bound, sigmas):
         assert relative_error(mine.grad, true.grad) < 10 * bound, name
 
 
+def test_brackets_that_are_learned_have_gradients_too(device):
+    encoded, ours = brackets().to(device), parts(learned(torch.float64, device))
+    plain = fuse_exposures(encoded, *ours, scale=1.5)
+    leaf = encoded.clone().requires_grad_()
+    through = fuse_exposures(leaf, *ours, scale=1.5)
+    through.sum().backward()
+    assert relative_error(through, plain) < 1e-12 and bool((leaf.grad != 0).any())
+
+
 def test_gradients_match_finite_differences(device):
     encoded = brackets(5).to(device)
     leaves = [part.detach().requires_grad_() for part in parts(learned(torch.float64, device, width=4))]
-    assert torch.autograd.gradcheck(lambda *given: fuse_exposures(encoded, *given, scale=1.5, **LIMITS), leaves)
+    assert torch.autograd.gradcheck(lambda *given: fuse_exposures(encoded, *given, scale=1.5), leaves)
 
 
 def test_what_does_not_fit_is_refused(device):
     given = parts(learned(torch.float32, device))
     with pytest.raises(ValueError, match=r"encoded is torch.float32 \[3, 200, 2\]"):
-        fuse_exposures(brackets().float().to(device)[..., :2], *given, scale=1.0, **LIMITS)
+        fuse_exposures(brackets().float().to(device)[..., :2], *given, scale=1.0)
     with pytest.raises(ValueError, match="log_sigma is torch.float32"):
-        fuse_exposures(brackets().to(device), *given, scale=1.0, **LIMITS)
+        fuse_exposures(brackets().to(device), *given, scale=1.0)

@@ -29,13 +29,13 @@ def test_values_and_slopes_are_those_of_torch(device, name, dtype, bound, extens
     given = exposures(response)
     # Where the slope jumps or is infinite, rounding decides on which side of the place a float32 falls.
     given = given[(given - response.clip_exposure).abs() > 1e-5 * min(response.clip_exposure, 1e3)]
-    truth_given = given.clone().requires_grad_()
-    truth = response.encode_extended(truth_given) if extension else response.encode(truth_given)
-    truth.sum().backward()
+    # Without a gradient responses use torch's own operations.
+    truth = response.encode_extended(given) if extension else response.encode(given)
+    true_slope = torch.where(given > response.clip_exposure, extension / given, response.slope(given))
     value, slope = encode_with_slope(given.to(device, dtype), response.formula(), extension)
-    assert (value.cpu().double() - truth.detach()).abs().max() < bound
-    finite = truth_given.grad.isfinite()
-    assert relative_error(slope[finite.to(device)], truth_given.grad[finite]) < 10 * bound
+    assert (value.cpu().double() - truth).abs().max() < bound
+    finite = true_slope.isfinite()
+    assert relative_error(slope[finite.to(device)], true_slope[finite]) < 10 * bound
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -50,13 +50,11 @@ def test_slopes_match_finite_differences(device, name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_differentiable_encoding_is_the_same_on_every_device(device, name):
+def test_the_differentiable_encoding_is_the_plain_one(device, name):
     response = response_by_name(name)
-    given = exposures(response).float()
-    with torch.no_grad():
-        plain = response.encode_extended(given)
-    leaf = given.to(device).requires_grad_()
-    assert (response.encode_extended(leaf).detach().cpu() - plain).abs().max() < 1e-5
+    given = exposures(response).float().to(device)
+    leaf = given.clone().requires_grad_()
+    assert (response.encode_extended(leaf) - response.encode_extended(given)).abs().max() < 1e-5
 
 
 def test_poison_stays_and_black_is_black(device):
