@@ -9,12 +9,13 @@ import torch
 
 from ..errors import SehdrError
 from ..evaluation.metrics import psnr
+from ..field.color_models import color_model
 from ..field.gaussians import Gaussians
 from ..kernels.constants import LOW_PASS
 from ..scene import Scene
 from ..splatting import Rendering
 from ..training.config import Config
-from ..training.initialization import scene_extent, start_colours
+from ..training.initialization import scene_extent
 from ..training.losses import image_loss
 from .splats import SplatScene
 
@@ -92,7 +93,7 @@ def train_with_gsplat(scene: Scene, config: Config, device: torch.device, *, ste
     extent = scene_extent(scene)
     start = Gaussians.from_points(
         torch.tensor(scene.points, dtype=torch.float32),
-        torch.tensor(start_colours(scene.point_colors, "display", None), dtype=torch.float32),
+        torch.tensor(color_model("display").start(scene.point_colors, None), dtype=torch.float32),
         config.model.harmonics_degree,
     )
     values = {

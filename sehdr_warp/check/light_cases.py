@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
+from ..field.color_models import EXPOSURE_FLOOR
 from ..field.fusion import NeuralExposureFusion
-from ..field.radiance_field import EXPOSURE_FLOOR
 from ..response import Response, response_by_name
 from ..response.table import TabulatedResponse
 from ..splatting import ssim

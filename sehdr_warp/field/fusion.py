@@ -114,7 +114,7 @@ class NeuralExposureFusion(nn.Module):
         grid = torch.arange(-1, NODES + 1, dtype=like.dtype, device=like.device) * step + self._low
         encoded = self._encode(grid[:, None].expand(-1, 3))
         # What is made while a step is recorded has no content before the first replay, and dies with the recording.
-        if not isinstance(self.response, nn.Module) and not is_recording(like.device):
+        if not self.response.learnable and not is_recording(like.device):
             self._kept_nodes[key] = encoded
         return encoded
 

@@ -9,18 +9,13 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import hardtanh
 
 from ..response import Response
 from ..scene import Camera
 from ..splatting import BlendStyle, Rendering, rasterize, spherical_harmonics
+from .color_models import color_model
 from .fusion import NeuralExposureFusion
-from .gaussians import HARMONIC_0, Gaussians
-
-EXPOSURE_FLOOR = 1e-6
-"""Least exposure of a Gaussian with radiance "linear": keeps logarithms finite, 100 times below 8-bit black in sRGB."""
-LOG_EXPOSURE_LIMIT = 40.0
-"""Log exposures are held within this: exp stays finite in float32, even squared and summed over a pixel."""
+from .gaussians import Gaussians
 
 
 @dataclass(frozen=True)
@@ -48,7 +43,7 @@ class Photograph:
 
     encoded: [H, W, 3] encoded values, extended beyond [0, 1] as by Response.encode_extended; None where they were not
         asked for.
-    exposure: [H, W, 3] of the HDR colour at the base time (I^h dt_1 of the paper); None with radiance "display", and
+    exposure: [H, W, 3] of the HDR colour at the base time (I^h dt_1 of the paper); None where colors are encoded, and
         where neither it nor the photo was asked for.
     base: [H, W, 3] of the base colour at the base time (I^b); the same tensor as `exposure` without fusion.
     rendering: what the rasteriser knows: alpha, projected means, radii.
@@ -80,10 +75,9 @@ class RenderedView:
 class RadianceField(nn.Module):
     """A scene: Gaussians, the camera response that photographed them, and, where used, the fusion of brackets.
 
-    base_time: dt_1, seconds. Colours are exposures x = E dt_1 (the paper's c^{l_1}), so that their size, and with it
-        the learning rates, does not depend on the unit of time.
+    base_time: dt_1, seconds.
     rasterizer: rasterize(), or what takes its arguments in its place.
-    radiance: "log": x = exp(SH(d)); "linear": x = SH(d), kept positive; "display": encoded = max(SH(d) + 0.5, 0).
+    radiance: the name of the color model (color_models.py).
     tone_map: "pixel": f(sum of weighted x); "gaussian": sum of weighted f(x), as the paper composites.
     fusion: the paper's brackets and their fusion, at the same base time; without, the HDR colour is the base colour.
     confidence: [N] in [0, 1] of a trained scene, how far its photos vouch for each Gaussian (model/confidence.py); None
@@ -109,7 +103,7 @@ class RadianceField(nn.Module):
         self.response = response
         self.base_time = base_time
         self.rasterizer = rasterizer
-        self.radiance = radiance
+        self.color_model = color_model(radiance)
         self.tone_map = tone_map
         self.antialiased = antialiased
         self.style = style
@@ -129,8 +123,8 @@ class RadianceField(nn.Module):
         wanted, each a colour set more to render where the photo does not need it; capacity: as rasterize() takes it;
         encode: False leaves a photo that has an exposure at that."""
         ratio = exposure_time / self.base_time
-        if self.radiance == "display":
-            rendering = self._rasterize(camera, self._harmonics(camera, degree).add(0.5).clamp_min(0), capacity)
+        if self.color_model.encoded:
+            rendering = self._rasterize(camera, self._colors(camera, degree)[0], capacity)
             return Photograph(self._reexpose(rendering.image, ratio), None, None, rendering)
         base, fused = self._exposures(camera, degree)
         sets = {"fused": fused}
@@ -160,7 +154,7 @@ class RadianceField(nn.Module):
         depth = self.gaussians.means @ pose[2, :3, None] + pose[2, 3]
         rendering = self._rasterize(tensors, torch.cat([self._inference_colours(tensors, degree), depth], dim=1))
         colours, depth = rendering.image[..., :3], rendering.image[..., 3]
-        if self.radiance == "display":
+        if self.color_model.encoded:
             colours = self.response.decode(colours.clamp(0, 1))
         alpha = rendering.alpha
         depth = torch.where(alpha > 1e-3, depth / alpha.clamp_min(1e-3), torch.zeros_like(depth))
@@ -195,37 +189,20 @@ class RadianceField(nn.Module):
             return torch.autograd.grad(blended, features, images)[0]
 
     def _inference_colours(self, camera: CameraTensors, degree: int | None) -> Tensor:
-        if self.radiance == "display":
-            return self._harmonics(camera, degree).add(0.5).clamp_min(0)
-        return self._exposures(camera, degree)[1]
+        return self._colors(camera, degree)[0] if self.color_model.encoded else self._exposures(camera, degree)[1]
 
-    def _harmonics(self, camera: CameraTensors, degree: int | None) -> Tensor:
+    def _colors(self, camera: CameraTensors, degree: int | None) -> tuple[Tensor, Tensor | None]:
         gaussians = self.gaussians
         used = gaussians.degree if degree is None else min(degree, gaussians.degree)
         coefficients = gaussians.harmonics_dc, gaussians.harmonics_rest
-        return spherical_harmonics(used, coefficients, gaussians.means, camera.position)
-
-    @torch.no_grad()
-    def constant_exposures(self) -> Tensor:
-        """[N, 3] exposure at the base time of each Gaussian by its harmonics of degree 0 alone."""
-        constant = HARMONIC_0 * self.gaussians.harmonics_dc[:, 0]
-        if self.radiance == "display":
-            return self.response.decode((constant + 0.5).clamp(0, 1))
-        if self.radiance == "linear":
-            return constant.clamp_min(EXPOSURE_FLOOR)
-        return constant.clamp(-LOG_EXPOSURE_LIMIT, LOG_EXPOSURE_LIMIT).exp()
+        return self.color_model.colors(spherical_harmonics(used, coefficients, gaussians.means, camera.position))
 
     def _exposures(self, camera: CameraTensors, degree: int | None) -> tuple[Tensor, Tensor]:
         """Exposures at the base time of each Gaussian's base colour and of its HDR colour, [N, 3] each."""
-        value = self._harmonics(camera, degree)
-        if self.radiance == "linear":
-            base = value.clamp_min(EXPOSURE_FLOOR)
-            log_base = base.log() if self.fusion is not None else None
-        else:
-            # clamp(), but for the derivative, which is one operation in place of four.
-            log_base = hardtanh(value, -LOG_EXPOSURE_LIMIT, LOG_EXPOSURE_LIMIT)
-            base = log_base.exp()
-        return base, base if self.fusion is None else self.fusion(log_base) * self.base_time
+        base, logarithm = self._colors(camera, degree)
+        if self.fusion is None:
+            return base, base
+        return base, self.fusion(base.log() if logarithm is None else logarithm) * self.base_time
 
     def _reexpose(self, encoded: Tensor, ratio: float) -> Tensor:
         """Encoded values at the base time as they would be at `ratio` times it."""

@@ -114,8 +114,8 @@ def _stored(run) -> tuple[GaussianArrays, Colors | None]:
     tensors = {name: value.cpu().numpy() for name, value in run.model.gaussians.tensors().items()}
     harmonics = np.concatenate([tensors["harmonics_dc"], tensors["harmonics_rest"]], axis=1)
     geometry = (tensors[name] for name in ("means", "log_scales", "quaternions", "opacity_logits"))
-    gaussians = GaussianArrays(*geometry, harmonics, run.model.radiance, run.exposure_time)
-    if run.model.radiance == "display":
+    gaussians = GaussianArrays(*geometry, harmonics, run.model.color_model.name, run.exposure_time)
+    if run.model.color_model.encoded:
         return gaussians, lambda encoded: run.response.decode(np.clip(encoded, 0, 1)) / run.exposure_time
     return gaussians, None if run.model.fusion is None else lambda exposure: _fuse(run, exposure)
 

@@ -4,10 +4,11 @@ import numpy as np
 import torch
 
 from ..errors import InputError, SehdrError
+from ..field.color_models import color_model
 from ..field.exposure import exposure_times
 from ..field.fusion import NeuralExposureFusion
 from ..field.gaussians import Gaussians
-from ..field.radiance_field import EXPOSURE_FLOOR, RadianceField
+from ..field.radiance_field import RadianceField
 from ..response import Response, ToneMapper, response_by_name, responses_named
 from ..response.selection import select_response
 from ..scene import Scene, View
@@ -15,8 +16,6 @@ from ..scene.exposure import made_by_camera
 from ..splatting import BlendStyle
 from .config import Config
 
-CODE_RANGE = (1 / 255, 250 / 255)
-"""Start colours are held within these encoded values: beyond them a photo tells a bound, not a colour."""
 DEPTH_RANGE = (0.5, 3.0)
 """Depths of drawn points in units of the distance to where the cameras look. Nearer ones stay as veils before the
 cameras: on the embedded room a start at 0.15 costs 14 dB. Preferring points on whose colour the photos agree does not
@@ -81,7 +80,7 @@ def make_field(scene: Scene, config: Config, response: Response, device: torch.d
     if len(points) > budget:
         chosen = np.sort(rng.choice(len(points), budget, replace=False))
         points, colours = points[chosen], colours[chosen]
-    dc = start_colours(colours, config.model.radiance, response)
+    dc = color_model(config.model.radiance).start(colours, response)
     gaussians = Gaussians.from_points(
         torch.tensor(points, dtype=torch.float32),
         torch.tensor(dc, dtype=torch.float32),
@@ -125,18 +124,6 @@ def check_scene(scene: Scene) -> None:
         raise InputError(scene.name, "every training photo is black", "use a longer exposure")
     if min(float(image.min()) for image in images) >= 254 / 255:
         raise InputError(scene.name, "every training photo is white", "use a shorter exposure")
-
-
-def start_colours(encoded: np.ndarray, radiance: str, response: Response) -> np.ndarray:
-    """[N, 3] start values of the constant part of the colour from encoded values [N, 3] in [0, 1]."""
-    encoded = np.clip(np.asarray(encoded, dtype=np.float64), *CODE_RANGE)
-    if radiance == "display":
-        return encoded - 0.5
-    if isinstance(response, ToneMapper):
-        # HDR-GS starts the logarithm at the encoded value: what the mapper will make of it is not known yet.
-        return np.exp(encoded) if radiance == "linear" else encoded
-    exposure = np.maximum(response.decode(encoded), EXPOSURE_FLOOR)
-    return exposure if radiance == "linear" else np.log(exposure)
 
 
 def random_points(scene: Scene, config: Config, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -93,7 +93,7 @@ def ldr_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor:
 
 def compares_light(config: LossConfig, field: RadianceField) -> bool:
     """Whether ldr_loss compares exposures: where pixels have one and the curve is known."""
-    decodable = field.radiance != "display" and field.tone_map == "pixel" and not isinstance(field.response, ToneMapper)
+    decodable = not field.color_model.encoded and field.tone_map == "pixel" and field.response.decodable
     return config.ldr_weight > 0 and decodable
 
 

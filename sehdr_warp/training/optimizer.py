@@ -5,7 +5,6 @@ from torch import Tensor
 
 from ..field.gaussians import PARAMETER_NAMES
 from ..field.radiance_field import RadianceField
-from ..response import ToneMapper
 from ..splatting.training_step import adam_step, judge_step
 from .config import Config
 
@@ -67,7 +66,7 @@ def make_optimizer(field: RadianceField, config: Config, extent: float) -> Adam:
     groups = [{"name": name, "params": [getattr(field.gaussians, name)], "lr": rate} for name, rate in rates.items()]
     if field.fusion is not None:
         groups.append({"name": "fusion", "params": list(field.fusion.parameters()), "lr": config.optimizer.fusion})
-    if isinstance(field.response, ToneMapper):
+    if field.response.learnable:
         groups.append(
             {"name": "response", "params": list(field.response.parameters()), "lr": config.optimizer.response}
         )

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError, SehdrError
-from ..response import Response, ToneMapper, response_by_name
+from ..response import Response, response_by_name
 from ..scene import Scene, View
 from ..scene.hdr_files import read_hdr
 from ..scene.images import HDR_SUFFIXES
@@ -56,7 +56,7 @@ def predicted_scene(scene: Scene, predictor: str | Path | None = None, response:
     """
     predictor = predictor_names()[0] if predictor is None else predictor
     check_predictor(predictor)
-    if response is None or isinstance(response, ToneMapper):
+    if response is None or response.learnable:
         response = response_by_name("srgb")
     predict = _predictor(predictor, response)
     views = tuple(_predicted(view, *predict(view)) if view.split == "train" else view for view in scene.views)

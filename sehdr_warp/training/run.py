@@ -124,8 +124,9 @@ def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) ->
     try:
         gaussians = Gaussians(*(checkpoint.tensors[f"gaussians.{name}"] for name in PARAMETER_NAMES))
         field = assemble_field(gaussians, config, Response.from_dict(info["response"]), info["base_exposure_time"])
-        for name, part in (("fusion.", field.fusion), ("response.", field.response)):
-            if isinstance(part, torch.nn.Module):
+        learned = field.response if field.response.learnable else None
+        for name, part in (("fusion.", field.fusion), ("response.", learned)):
+            if part is not None:
                 states = {k.removeprefix(name): v for k, v in checkpoint.tensors.items() if k.startswith(name)}
                 part.load_state_dict(states)
     except (KeyError, ValueError, RuntimeError) as error:

@@ -161,7 +161,7 @@ class Trainer:
         """Whether this step can be a recorded one: on a GPU, photos of one size, after a step like it was launched."""
         if self._recorder is None or not isinstance(views, ViewStack):
             return False
-        if self.field.radiance == "display" and not isinstance(views.times, float):
+        if self.field.color_model.encoded and not isinstance(views.times, float):
             return False
         ready = kind in self._launched and self._room.known
         self._launched.add(kind)
@@ -210,7 +210,7 @@ class Trainer:
         parts = {
             "gaussians": self.field.gaussians.tensors(),
             "fusion": {} if self.field.fusion is None else self.field.fusion.state_dict(),
-            "response": self.field.response.state_dict() if isinstance(self.field.response, torch.nn.Module) else {},
+            "response": self.field.response.state_dict() if self.field.response.learnable else {},
             "optimizer": optimizer_tensors(self.optimizer),
             "densification": self.densification.state(),
             "generators": {"order": self._order_generator.get_state(), "device": self._generator.get_state()},

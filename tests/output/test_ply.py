@@ -5,6 +5,7 @@ import pytest
 from plyfile import PlyData
 
 from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.field.color_models import color_model
 from sehdr_warp.output import bake as bake_module
 from sehdr_warp.output.bake import bake, evaluate_colors, harmonic_basis, sphere_directions
 from sehdr_warp.output.gaussian_file import GaussianArrays, write_gaussians
@@ -124,7 +125,8 @@ class StoredRun:
         harmonics = torch.from_numpy(self.arrays.harmonics)
         tensors |= {"harmonics_dc": harmonics[:, :1], "harmonics_rest": harmonics[:, 1:]}
         stored = SimpleNamespace(tensors=lambda: tensors, means=tensors["means"])
-        self.model = SimpleNamespace(gaussians=stored, radiance=radiance, fusion=fusion)
+        model = color_model(radiance)
+        self.model = SimpleNamespace(gaussians=stored, color_model=model, fusion=fusion)
         self.cameras = [Entry(str(i), "train", camera(position=(i, 0, -6))) for i in range(3)]
 
     def exposures(self, directions):

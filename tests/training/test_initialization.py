@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp.errors import SehdrError
+from sehdr_warp.field.color_models import color_model
 from sehdr_warp.response import response_by_name
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.initialization import (
@@ -15,7 +16,6 @@ from sehdr_warp.training.initialization import (
     focus_distance,
     random_points,
     scene_extent,
-    start_colours,
 )
 
 from .toy import orbit_camera, toy_scene
@@ -71,7 +71,7 @@ def test_cameras_back_to_back_share_nothing():
 @pytest.mark.parametrize("radiance", ["log", "linear", "display"])
 def test_start_colours_invert_the_colour_model(radiance):
     srgb, encoded = response_by_name("srgb"), np.array([[0.2, 0.5, 0.9]])
-    value = start_colours(encoded, radiance, srgb)
+    value = color_model(radiance).start(encoded, srgb)
     shown = {
         "log": lambda: srgb.encode(np.exp(value)),
         "linear": lambda: srgb.encode(value),
@@ -80,7 +80,7 @@ def test_start_colours_invert_the_colour_model(radiance):
     np.testing.assert_allclose(shown[radiance](), encoded, atol=1e-6)
     # Black and white say a bound only; their start values are finite and inside it.
     for extreme in (0.0, 1.0):
-        assert np.isfinite(start_colours(np.full((1, 3), extreme), radiance, response_by_name("hdr-nerf"))).all()
+        assert np.isfinite(color_model(radiance).start(np.full((1, 3), extreme), response_by_name("hdr-nerf"))).all()
 
 
 def test_base_time_is_the_median_of_training(scene):

@@ -8,13 +8,14 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.field.color_models import color_model
 from sehdr_warp.field.radiance_field import Photograph
 from sehdr_warp.response import ToneMapper, response_by_name
 from sehdr_warp.splatting.ssim import ssim
 from sehdr_warp.training.config import Config, LossConfig, ModelConfig, ResponseConfig
 from sehdr_warp.training.config_checks import ConfigError
 from sehdr_warp.training.config_files import load_config, override_config, preset_names
-from sehdr_warp.training.initialization import choose_response, make_field, start_colours
+from sehdr_warp.training.initialization import choose_response, make_field
 from sehdr_warp.training.losses import Target, anchor_loss, code_scale, data_loss, hdr_loss
 from sehdr_warp.training.run import load_run
 from sehdr_warp.training.targets import largest_truth
@@ -177,9 +178,9 @@ def test_a_learned_tone_mapper_starts_as_hdr_gs_does(scene):
     assert isinstance(mapper, ToneMapper) and mapper.width == 128
     assert torch.equal(mapper.weights[0], ToneMapper(seed=5).weights[0])
     encoded = np.array([[0.2, 0.5, 0.9]])
-    assert np.allclose(start_colours(encoded, "log", mapper), encoded)
-    assert np.allclose(start_colours(encoded, "linear", mapper), np.exp(encoded))
-    assert not np.allclose(start_colours(encoded, "log", response_by_name("srgb")), encoded)
+    assert np.allclose(color_model("log").start(encoded, mapper), encoded)
+    assert np.allclose(color_model("linear").start(encoded, mapper), np.exp(encoded))
+    assert not np.allclose(color_model("log").start(encoded, response_by_name("srgb")), encoded)
 
 
 def test_the_anchor_holds_the_unit_exposure_of_a_learned_tone_mapper(scene):
