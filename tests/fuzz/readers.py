@@ -61,7 +61,7 @@ def _hdr_nerf(folder: Path) -> None:
 def _load_scene(folder: Path):
     from sehdr_warp.scene import load_scene
 
-    return load_scene(folder)
+    return load_scene(folder, response="srgb")
 
 
 def _exposures(folder: Path) -> None:

@@ -5,7 +5,6 @@ that numbers were lost, more than --seconds of processor time, more than --memor
 """
 
 import argparse
-import json
 import os
 import random
 import resource
@@ -89,62 +88,45 @@ def fuzz(name: str, folder: Path, seed: int, first: int, count: int, seconds: fl
     return done
 
 
-def _child(pipe, name, folder, seed, first, count, seconds, until, memory):
+def _child(pipe, name: str, folder: Path, options, first: int) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # decoders print there
     import torch  # its address space is no reader's doing
 
     torch.set_num_threads(1)
-    with open("/proc/self/statm") as file:
-        used = int(file.read().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + memory, used + memory))
-    fuzz(name, folder, seed, first, count, seconds, until, lambda *message: pipe.send(message))
-    pipe.send((None, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss))
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + (options.memory << 20),) * 2)
+    count, until = options.inputs - first, time.monotonic() + options.budget
+    fuzz(name, folder, options.seed, first, count, options.seconds, until, lambda *message: pipe.send(message))
 
 
-def run_reader(name: str, folder: Path, options) -> dict:
-    """Fuzzes one reader in child processes: a new one after each death. Returns counts and findings by kind."""
-    context = get_context("spawn")
-    until, index, tried, findings, peak = time.monotonic() + options.budget, 0, 0, {}, 0
-
-    def found(what, at):
-        entry = findings.setdefault(what, {"count": 0, "first": at})
-        entry["count"] += 1
-
-    while tried < options.inputs and time.monotonic() < until:
-        pipe, other = context.Pipe(False)
-        arguments = (other, name, folder, options.seed, index, options.inputs - tried, options.seconds, until)
-        child = context.Process(target=_child, args=(*arguments, options.memory << 20))
+def run_reader(name: str, folder: Path, options) -> tuple[int, dict[str, list[int]]]:
+    """How many inputs one reader was given, and the indices behind each finding; a new process after a death."""
+    tried, findings, started = 0, {}, time.monotonic()
+    while tried < options.inputs and time.monotonic() < started + options.budget:
+        pipe, other = get_context("spawn").Pipe(False)
+        child = get_context("spawn").Process(target=_child, args=(other, name, folder, options, tried))
         child.start()
         other.close()
-        begun = None
-        while True:
-            if not pipe.poll(30 + 10 * options.seconds):
-                child.kill()
-                found("hang", begun)
-                break
+        begun, what = None, "the process died"
+        while pipe.poll(60 + 10 * options.seconds):
             try:
-                at, what = pipe.recv()
+                index, finding = pipe.recv()
             except EOFError:
                 break
-            if at is None:
-                peak = max(peak, what)
-            elif what == "begun":
-                begun = at
-            else:
-                begun, tried, index = None, tried + 1, at + 1
-                if what is not None:
-                    found(what, at)
-        child.join()
-        if begun is not None:
-            if child.exitcode != -signal.SIGKILL:
-                found(f"process died with {child.exitcode}", begun)
-            tried, index = tried + 1, begun + 1
-        elif child.exitcode:
-            found(f"process died with {child.exitcode} between inputs", index)
-            break
+            begun = index if finding == "begun" else None
+            if begun is None:
+                tried = index + 1
+                if finding is not None:
+                    findings.setdefault(finding, []).append(index)
         else:
+            child.kill()
+            what = "hang"
+        child.join()
+        if begun is None:
             break
-    return {"inputs": tried, "peak_rss_mb": peak // 1024, "findings": findings}
+        findings.setdefault(what, []).append(begun)
+        tried = begun + 1
+    return tried, findings
 
 
 def main() -> int:
@@ -155,23 +137,12 @@ def main() -> int:
     parser.add_argument("--budget", type=float, default=600.0, help="seconds for each reader")
     parser.add_argument("--seconds", type=float, default=2.0, help="of processor time that one input may take")
     parser.add_argument("--memory", type=int, default=4096, help="MiB of address space that a reader may take")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    results = {}
-    with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
+    options, bad = parser.parse_args(), 0
+    with tempfile.TemporaryDirectory() as folder:
         for name in options.readers.split(","):
-            started = time.monotonic()
-            results[name] = run_reader(name, Path(folder) / name, options)
-            took = time.monotonic() - started
-            result = results[name]
-            kinds = len(result["findings"])
-            print(
-                f"{name:16} {result['inputs']:7} inputs {took:7.1f} s  peak {result['peak_rss_mb']} MB  {kinds} kinds"
-            )
-            for what, entry in result["findings"].items():
-                print(f"    {entry['count']:6} x {what} (first: index {entry['first']})", flush=True)
-    total = sum(result["inputs"] for result in results.values())
-    print(f"{total} inputs, {sum(len(result['findings']) for result in results.values())} kinds of findings")
-    if options.json is not None:
-        options.json.write_text(json.dumps({"seed": options.seed, "total": total, "readers": results}, indent=1) + "\n")
-    return 1 if any(result["findings"] for result in results.values()) else 0
+            tried, findings = run_reader(name, Path(folder) / name, options)
+            print(f"{name:16} {tried:7} inputs, {len(findings)} kinds of findings", flush=True)
+            for what, indices in findings.items():
+                print(f"    {len(indices):6} x {what} (first: index {indices[0]})", flush=True)
+            bad += len(findings)
+    return min(bad, 1)
