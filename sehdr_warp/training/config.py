@@ -4,11 +4,12 @@ The defaults are the `default` preset. Iteration numbers other than `schedule.it
 `REFERENCE_ITERATIONS` and scale with it, so a shorter training is the same training, compressed.
 """
 
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from .config_checks import check_together
+from ..errors import SehdrError
 
 REFERENCE_ITERATIONS = 30_000
 """The length of training for which iteration numbers are stated: 3DGS's."""
@@ -18,6 +19,10 @@ Weight = Annotated[float, Field(ge=0.0, le=100.0)]
 Rate = Annotated[float, Field(gt=0.0, le=1.0)]
 Iteration = Annotated[int, Field(ge=1)]
 Name = Annotated[str, Field(min_length=1)]
+
+
+class ConfigError(SehdrError):
+    """Fields of a config contradict each other; names field, value and what is allowed."""
 
 
 class _Table(BaseModel):
@@ -200,7 +205,8 @@ class Config(_Table):
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Config":
-        check_together(self)
+        if problem := next(_contradictions(self), None):
+            raise ConfigError(problem)
         return self
 
     def scaled(self, iteration: int) -> int:
@@ -215,3 +221,34 @@ class Config(_Table):
 def stated(iteration: float, iterations: int) -> int:
     """The number to write in a config of so many iterations for what is to happen at an iteration of its own."""
     return max(1, round(iteration * REFERENCE_ITERATIONS / iterations))
+
+
+def _contradictions(config: Config) -> Iterator[str]:
+    """One line for each pair of fields that contradict each other."""
+    model, fusion, loss = config.model, config.fusion, config.loss
+    learned, display = config.response.name == "learned", model.radiance == "display"
+    if fusion.enabled and len(fusion.exposures) < 2:
+        yield f"fusion.exposures = {list(fusion.exposures)} is too few; a fusion needs two or more"
+    no_radiance = 'needs radiance: model.radiance = "display" has none'
+    if display and fusion.enabled:
+        yield f"fusion.enabled = True {no_radiance}"
+    if display and loss.linear_weight > 0:
+        yield f"loss.linear_weight = {loss.linear_weight} {no_radiance}"
+    if display and loss.hdr_weight > 0:
+        yield f"loss.hdr_weight = {loss.hdr_weight} {no_radiance}"
+    no_curve = 'needs a known response: response.name = "learned" has none'
+    if learned and display:
+        yield f"model.radiance = 'display' {no_curve}"
+    if learned and fusion.enabled:
+        yield f"fusion.enabled = True {no_curve}"
+    if loss.linear_weight > 0 and not (fusion.enabled or loss.hdr_truth):
+        needs = "has nothing to compare: needs fusion.enabled or loss.hdr_truth"
+        yield f"loss.linear_weight = {loss.linear_weight} {needs}"
+    if loss.ldr_weight == loss.hdr_weight == loss.linear_weight == 0:
+        yield "loss.ldr_weight = 0.0 leaves nothing to compare: give loss.hdr_weight or loss.ldr_weight"
+    if loss.predictor and not loss.uses_hdr:
+        yield f"loss.predictor = {loss.predictor!r} is for nothing: loss.hdr_weight = 0.0"
+    if loss.anchor_weight > 0 and not learned:
+        yield f'loss.anchor_weight = {loss.anchor_weight} is for nothing: needs response.name = "learned"'
+    if config.optimizer.means_final > config.optimizer.means:
+        yield f"optimizer.means_final = {config.optimizer.means_final} is greater than optimizer.means"

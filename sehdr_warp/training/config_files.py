@@ -11,8 +11,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from ..errors import InputError, did_you_mean
-from .config import Config
-from .config_checks import ConfigError
+from .config import Config, ConfigError
 from .config_fields import GONE, config_fields
 
 _LARGEST_FILE = 1 << 20

@@ -15,6 +15,7 @@ from ..splatting import GraphRecorder
 from ..splatting.memory import bytes_asked_for
 from .config import Config
 from .densification import make_densification
+from .graph_capacity import GraphCapacity
 from .initialization import scene_extent
 from .losses import compares_light, data_loss, needed_colours, regularised
 from .optimizer import (
@@ -25,7 +26,6 @@ from .optimizer import (
     optimizer_tensors,
     set_means_rate,
 )
-from .pair_room import PairRoom
 from .targets import TrainingView, ViewStack, largest_truth, training_views
 
 CHECK_EVERY = 20
@@ -65,7 +65,7 @@ class Trainer:
         recorded = self.device.type == "cuda" and config.schedule.recorded
         self._recorder = GraphRecorder(self.device) if recorded else None
         self._launched: set = set()
-        self._room = PairRoom(self.device)
+        self._room = GraphCapacity(self.device)
         self._loss: Tensor | None = None
         self._last_index = 0
 

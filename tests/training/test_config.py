@@ -8,8 +8,15 @@ from pydantic import ValidationError
 
 import sehdr_warp
 from sehdr_warp.errors import InputError
-from sehdr_warp.training.config import Config, FusionConfig, LossConfig, ModelConfig, ResponseConfig, stated
-from sehdr_warp.training.config_checks import ConfigError
+from sehdr_warp.training.config import (
+    Config,
+    ConfigError,
+    FusionConfig,
+    LossConfig,
+    ModelConfig,
+    ResponseConfig,
+    stated,
+)
 from sehdr_warp.training.config_fields import GONE, config_fields, value_of
 from sehdr_warp.training.config_files import (
     config_as_toml,

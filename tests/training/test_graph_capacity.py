@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sehdr_warp.training.pair_room import KEPT, LEAST_ROOM, ROOM, PairRoom
+from sehdr_warp.training.graph_capacity import KEPT, LEAST_ROOM, ROOM, GraphCapacity
 
 MANY = 10 * LEAST_ROOM
 
@@ -18,7 +18,7 @@ def replay(room, pairs):
 
 
 def test_room_follows_the_most_pairs_seen(device):
-    room = PairRoom(device)
+    room = GraphCapacity(device)
     assert not room.known
     room.launched(MANY)
     assert room.known
@@ -34,7 +34,7 @@ def test_room_follows_the_most_pairs_seen(device):
 
 
 def test_a_lack_of_room_is_noticed_and_mended(device):
-    room = PairRoom(device)
+    room = GraphCapacity(device)
     room.launched(MANY)
     replay(room, [MANY, 5 * MANY, MANY])
     assert room.lacked == 1
@@ -44,6 +44,6 @@ def test_a_lack_of_room_is_noticed_and_mended(device):
 
 
 def test_few_pairs_get_the_least_room(device):
-    room = PairRoom(device)
+    room = GraphCapacity(device)
     room.launched(1)
     assert replay(room, [1]) == LEAST_ROOM

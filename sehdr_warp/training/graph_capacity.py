@@ -13,7 +13,7 @@ KEPT = 0.97
 LEAST_ROOM = 1 << 14
 
 
-class PairRoom:
+class GraphCapacity:
     """Counts pairs on the device and says how many the next recording gets room for."""
 
     def __init__(self, device: torch.device | str):
