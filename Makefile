@@ -24,7 +24,7 @@ EDITABLE = $(PIP) --no-build-isolation --config-settings editable_mode=compat --
 TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
-.PHONY: demo test lint docs pictures
+.PHONY: demo test lint docs pictures reports
 
 demo: $(VENV)/installed
 	$(BIN)/sehdr-warp train embedded --out $(DEMO)/run --preset demo --response hdr-nerf --device cpu --overwrite
@@ -46,6 +46,10 @@ lint: $(VENV)/installed-dev
 
 docs: $(VENV)/installed-dev
 	env NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+# The tables and plots of docs/reports, from the results stored there.
+reports: $(VENV)/installed
+	$(BIN)/sehdr-warp bench report docs/reports
 
 # The README's picture: trains a scene that clips, a few minutes on two cores.
 pictures: $(VENV)/installed

@@ -228,21 +228,12 @@ class Runner:
             torch.cuda.init()  # before a first use torch has no peaks to forget, and says so by an error
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats(self.device)
-        # Linux: 5 resets the process's peak; elsewhere the peak is that of all jobs so far, and is left out.
-        with contextlib.suppress(OSError):
-            Path("/proc/self/clear_refs").write_text("5")
 
     def _peak_memory(self) -> int | None:
-        """Bytes: of torch's tensors on a GPU, of the process on the CPU (Linux; else None)."""
-        if self.device.startswith("cuda"):
-            import torch
+        """Bytes of torch's tensors on a GPU; None on the CPU."""
+        import torch
 
-            return torch.cuda.max_memory_allocated(self.device)
-        with contextlib.suppress(OSError):
-            for line in Path("/proc/self/status").read_text().splitlines():
-                if line.startswith("VmHWM:"):
-                    return 1024 * int(line.split()[1])
-        return None
+        return torch.cuda.max_memory_allocated(self.device) if self.device.startswith("cuda") else None
 
     def _render_rate(self, run, scene: Scene) -> float:
         """HDR renders of held-out views per second, called one after the other."""
