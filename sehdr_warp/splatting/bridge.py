@@ -60,7 +60,7 @@ class Program:
 
     def launch(
         self,
-        kernel: wp.Kernel,
+        kernel: Any,
         dim: int | Sequence[int],
         inputs: Sequence[Any],
         outputs: Sequence[Any] = (),

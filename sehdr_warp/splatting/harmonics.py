@@ -3,12 +3,18 @@
 import torch
 
 from ..kernels.harmonics import harmonics_adjoint_kernel, harmonics_kernel
+from .checks import check_tensors, whole_number
 from .launching import launch, warp_scalar
 
 MAX_DEGREE = 3
 
 
-def spherical_harmonics(degree: int, coefficients, means, camera_position):
+def spherical_harmonics(
+    degree: int,
+    coefficients: torch.Tensor | tuple[torch.Tensor, torch.Tensor],
+    means: torch.Tensor,
+    camera_position: torch.Tensor,
+) -> torch.Tensor:
     """Evaluate spherical harmonics for the direction from the camera to each Gaussian (3DGS's basis and signs).
 
     degree: 0 to 3, not above what the coefficients hold.
@@ -16,33 +22,24 @@ def spherical_harmonics(degree: int, coefficients, means, camera_position):
         the rest, which saves joining them.
     means: [N, 3] world coordinates; camera_position: [3].
 
-    Returns [N, 3]. Differentiable with respect to every tensor. Raises ValueError for a degree out of range, and for
-    shapes, dtypes or devices that do not fit.
+    Returns [N, 3]. Differentiable with respect to every tensor. Raises TypeError for what is no tensor, ValueError for
+    a degree out of range, and for shapes, dtypes or devices that do not fit.
     """
-    constant, rest = (
-        (coefficients[:, :1], coefficients[:, 1:]) if isinstance(coefficients, torch.Tensor) else coefficients
-    )
-    if not 0 <= degree <= MAX_DEGREE:
-        raise ValueError(f"spherical harmonics degree {degree} is not in 0..{MAX_DEGREE}")
-    _check(constant, rest, means, camera_position)
-    if rest.shape[1] < (degree + 1) ** 2 - 1:
+    pair = isinstance(coefficients, tuple | list) and len(coefficients) == 2
+    given = {"means": (means, ("N", 3))}
+    if pair:
+        given |= {
+            "coefficients[0]": (coefficients[0], ("N", 1, 3)),
+            "coefficients[1]": (coefficients[1], ("N", "K", 3)),
+        }
+    else:
+        given |= {"coefficients": (coefficients, ("N", "K", 3))}
+    check_tensors(**given, camera_position=(camera_position, (3,)))
+    degree = whole_number("degree", degree, 0, MAX_DEGREE)
+    constant, rest = coefficients if pair else (coefficients[:, :1], coefficients[:, 1:])
+    if constant.shape[1] + rest.shape[1] < (degree + 1) ** 2:
         raise ValueError(f"degree {degree} needs {(degree + 1) ** 2} coefficients, not {1 + rest.shape[1]}")
     return _Evaluation.apply(degree, *(t.contiguous() for t in (constant, rest, means, camera_position)))
-
-
-def _check(constant, rest, means, camera_position) -> None:
-    count = means.shape[0] if means.ndim else 0
-    shapes = {
-        "means": (means, (count, 3)),
-        "the constant coefficients": (constant, (count, 1, 3)),
-        "the other coefficients": (rest, (count, rest.shape[1] if rest.ndim == 3 else 0, 3)),
-        "camera_position": (camera_position, (3,)),
-    }
-    for name, (tensor, shape) in shapes.items():
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"shape {tuple(tensor.shape)} of {name}, expected {shape}")
-        if tensor.dtype != means.dtype or tensor.device != means.device:
-            raise ValueError(f"{name}: {tensor.dtype} on {tensor.device}, but means is {means.dtype} on {means.device}")
 
 
 class _Evaluation(torch.autograd.Function):

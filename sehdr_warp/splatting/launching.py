@@ -28,7 +28,7 @@ def warp_scalar(dtype: torch.dtype) -> Any:
 
 
 def launch(
-    kernel: wp.Kernel,
+    kernel: Any,
     dim: int | Sequence[int],
     *arguments: Any,
     ranges: list[tuple[int, int]] | None = None,
@@ -65,7 +65,7 @@ def launch(
     )
 
 
-def launch_ranges(kernel: wp.Kernel, ranges: list[tuple[int, int]], inputs: list, **options: Any) -> None:
+def launch_ranges(kernel: Any, ranges: list[tuple[int, int]], inputs: list, **options: Any) -> None:
     """Launch `kernel(first, *inputs)` over each [first, last) range, side by side on the CPU."""
     if len(ranges) > 1:
         wp.load_module(kernel.module, device="cpu")  # compiling is not safe from two threads at once
@@ -78,7 +78,7 @@ def launch_ranges(kernel: wp.Kernel, ranges: list[tuple[int, int]], inputs: list
 
 
 @cache
-def parameters(kernel: wp.Kernel) -> tuple[bool, list]:
+def parameters(kernel: Any) -> tuple[bool, list]:
     """Whether the kernel takes the start of a range, `first`, and the types of its other parameters."""
     arguments = kernel.adj.args
     ranged = arguments[0].label == "first"

@@ -1,9 +1,7 @@
 """Memory: how much Warp holds beside torch's allocator, and one clear line when there is not enough."""
 
-import functools
-import inspect
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import torch
@@ -44,7 +42,7 @@ def bytes_asked_for(error: BaseException) -> str | None:
 
 
 def out_of_memory(
-    error: BaseException, device, gaussians: int, width: int, height: int, channels: int | None = None
+    error: BaseException, device: torch.device, gaussians: int, width: int, height: int, channels: int | None = None
 ) -> OutOfMemory | None:
     """The error to raise instead, or None if `error` is not about memory."""
     asked = bytes_asked_for(error)
@@ -56,8 +54,9 @@ def out_of_memory(
 
 
 @contextmanager
-def memory_told(device, sizes: Callable[[], tuple[int, int, int]]):
-    """Makes allocations that fail within the block OutOfMemory errors. sizes: Gaussians, width and height by then."""
+def memory_told(device: torch.device, sizes: Callable[[], tuple[int, ...]]) -> Iterator[None]:
+    """Makes allocations that fail within the block OutOfMemory errors. sizes: Gaussians, width, height and perhaps
+    channels by then."""
     try:
         yield
     except (RuntimeError, MemoryError) as error:
@@ -65,27 +64,6 @@ def memory_told(device, sizes: Callable[[], tuple[int, int, int]]):
         if told is None:
             raise
         raise told from error
-
-
-def tells_sizes(rasterize: Callable) -> Callable:
-    """Makes a rasterizer's failed allocations OutOfMemory errors with the sizes of what it was asked to draw."""
-    signature = inspect.signature(rasterize)
-
-    @functools.wraps(rasterize)
-    def telling(*arguments, **options):
-        try:
-            return rasterize(*arguments, **options)
-        except (RuntimeError, MemoryError) as error:
-            given = signature.bind(*arguments, **options).arguments
-            means, features = given["means"], given["features"]
-            told = out_of_memory(
-                error, means.device, means.shape[0], given["width"], given["height"], features.shape[1]
-            )
-            if told is None:
-                raise
-            raise told from error
-
-    return telling
 
 
 def _readable(count: int) -> str:

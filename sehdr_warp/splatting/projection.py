@@ -1,20 +1,23 @@
 """Stage one of a render: 3D Gaussians to 2D Gaussians."""
 
+import torch
+import warp as wp
+
 from ..kernels.geometry import matrix, vector
 from ..kernels.project import projection_kernel
-from .bridge import differentiable
+from .bridge import Program, differentiable
 from .launching import warp_scalar
 
 
 @differentiable
 def project(
-    program,
-    means,
-    log_scales,
-    quaternions,
-    opacities,
-    world_to_camera,
-    intrinsics,
+    program: Program,
+    means: torch.Tensor,
+    log_scales: torch.Tensor,
+    quaternions: torch.Tensor,
+    opacities: torch.Tensor,
+    world_to_camera: torch.Tensor,
+    intrinsics: torch.Tensor,
     *,
     width: int,
     height: int,
@@ -22,7 +25,7 @@ def project(
     low_pass: float,
     alpha_threshold: float,
     antialiased: bool,
-):
+) -> tuple[wp.array, wp.array, wp.array, wp.array, wp.array]:
     """The 2D Gaussians of one camera.
 
     means, log_scales [N, 3]; quaternions [N, 4] (w, x, y, z), any length; opacities [N] in [0, 1];

@@ -7,9 +7,13 @@ import torch
 
 from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR
 from .blending import DEFAULT_STYLE, BlendStyle, blend
-from .memory import tells_sizes
+from .checks import check_opacities, check_tensors, warn_of_scales, whole_number
+from .memory import memory_told
 from .projection import project
 from .tile_lists import LARGEST_CAPACITY, build_tile_lists, pack_records
+
+LARGEST_SIDE = 1 << 20
+"""Of an image, in pixels."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,6 @@ class Rendering:
         return self.radii > 0
 
 
-@tells_sizes
 def rasterize(
     means: torch.Tensor,
     log_scales: torch.Tensor,
@@ -86,83 +89,65 @@ def rasterize(
     every tensor, camera included. On the CPU results repeat bit for bit, whatever the number of threads.
     A Gaussian whose position or shape in the image, or a feature, is not finite is culled; a camera that is not finite
     culls them all.
-    Raises ValueError for shapes, dtypes, devices or values that do not fit; OutOfMemory (an SehdrError), with the
-    sizes, if memory does not suffice.
+    Raises TypeError for what is no tensor or no whole number, ValueError for shapes, dtypes, devices or options that do
+    not fit, and on the CPU for opacities outside of [0, 1]; OutOfMemory (an SehdrError), with the sizes, if memory does
+    not suffice. Warns on the CPU of log_scales that look like sizes.
     """
-    _check_tensors(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics)
-    _check_options(width, height, near, low_pass, alpha_threshold, capacity)
+    check_tensors(
+        means=(means, ("N", 3)),
+        log_scales=(log_scales, ("N", 3)),
+        quaternions=(quaternions, ("N", 4)),
+        opacities=(opacities, ("N",)),
+        features=(features, ("N", "C")),
+        world_to_camera=(world_to_camera, (4, 4)),
+        intrinsics=(intrinsics, (4,)),
+    )
+    if not features.shape[1]:
+        raise ValueError(f"features has shape {list(features.shape)}, expected [N, C] with C >= 1")
+    check_opacities(opacities)
+    warn_of_scales(log_scales)
+    width = whole_number("width", width, 1, LARGEST_SIDE)
+    height = whole_number("height", height, 1, LARGEST_SIDE)
+    if capacity is not None:
+        capacity = whole_number("capacity", capacity, 1, LARGEST_CAPACITY)
+    _check_options(near, low_pass, alpha_threshold)
     tensors = (means, log_scales, quaternions, opacities, world_to_camera, intrinsics)
-    means2d, conics, depths, opacities2d, extents = project(
-        *(tensor.contiguous() for tensor in tensors),
-        width=width,
-        height=height,
-        near=near,
-        low_pass=low_pass,
-        alpha_threshold=alpha_threshold,
-        antialiased=antialiased,
-    )
-    features = features.contiguous()
-    records = pack_records(
-        *(tensor.detach() for tensor in (means2d, conics, opacities2d)), extents, alpha_threshold, features.detach()
-    )
-    lists = build_tile_lists(
-        records,
-        depths.detach(),
-        extents,
-        width,
-        height,
-        capacity,
-        emission=means.device.type == "cpu" or style.deterministic,
-    )
-    image, transmittance = blend(
-        means2d,
-        conics,
-        opacities2d,
-        features,
-        lists=lists,
-        records=records,
-        extents=extents,
-        width=width,
-        height=height,
-        alpha_threshold=alpha_threshold,
-        style=style,
-    )
-    radii = extents.amax(dim=1)
+    with memory_told(means.device, lambda: (len(means), width, height, features.shape[1])):
+        means2d, conics, depths, opacities2d, extents = project(
+            *(tensor.contiguous() for tensor in tensors),
+            width=width,
+            height=height,
+            near=near,
+            low_pass=low_pass,
+            alpha_threshold=alpha_threshold,
+            antialiased=antialiased,
+        )
+        features = features.contiguous()
+        shown = (tensor.detach() for tensor in (means2d, conics, opacities2d))
+        records = pack_records(*shown, extents, alpha_threshold, features.detach())
+        emission = means.device.type == "cpu" or style.deterministic
+        lists = build_tile_lists(records, depths.detach(), extents, width, height, capacity, emission=emission)
+        image, transmittance = blend(
+            means2d,
+            conics,
+            opacities2d,
+            features,
+            lists=lists,
+            records=records,
+            extents=extents,
+            width=width,
+            height=height,
+            alpha_threshold=alpha_threshold,
+            style=style,
+        )
+        radii = extents.amax(dim=1)
     return Rendering(image, transmittance, means2d, depths, radii, lists.entry_count, lists.overflow, lists.total)
 
 
-def _check_tensors(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics) -> None:
-    count = means.shape[0] if means.ndim else 0
-    shapes = {
-        "means": (means, (count, 3)),
-        "log_scales": (log_scales, (count, 3)),
-        "quaternions": (quaternions, (count, 4)),
-        "opacities": (opacities, (count,)),
-        "world_to_camera": (world_to_camera, (4, 4)),
-        "intrinsics": (intrinsics, (4,)),
-    }
-    for name, (tensor, shape) in shapes.items():
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {shape}")
-    if features.ndim != 2 or features.shape[0] != count or features.shape[1] < 1:
-        raise ValueError(f"features has shape {tuple(features.shape)}, expected ({count}, C) with C >= 1")
-    for name, (tensor, _) in {**shapes, "features": (features, None)}.items():
-        if tensor.dtype != means.dtype or tensor.device != means.device:
-            raise ValueError(
-                f"{name} is {tensor.dtype} on {tensor.device}, but means is {means.dtype} on {means.device}"
-            )
-    if means.dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"means is {means.dtype}, expected torch.float32 or torch.float64")
-
-
-def _check_options(width, height, near, low_pass, alpha_threshold, capacity) -> None:
-    if width < 1 or height < 1:
-        raise ValueError(f"image size {width} x {height} is not positive")
+def _check_options(near: float, low_pass: float, alpha_threshold: float) -> None:
     if not 0.0 < near < math.inf:
         raise ValueError(f"near {near} is not a positive number")
     if not 0.0 <= low_pass < math.inf:
         raise ValueError(f"low_pass {low_pass} is not a number from 0")
     if not 0.0 < alpha_threshold < 1.0:
         raise ValueError(f"alpha_threshold {alpha_threshold} is not between 0 and 1")
-    if capacity is not None and not 1 <= capacity <= LARGEST_CAPACITY:
-        raise ValueError(f"capacity {capacity} is not in 1..{LARGEST_CAPACITY}")

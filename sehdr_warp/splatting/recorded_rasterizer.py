@@ -5,17 +5,27 @@ they draw; recorded as two CUDA graphs and replayed, what the GPU needs and a fe
 """
 
 from dataclasses import replace
+from typing import TypedDict, Unpack
 
 import torch
 
+from .blending import BlendStyle
 from .rasterization import Rendering, rasterize
 from .recording import GraphRecorder
 
 ROOM = 1.25
 """A recording has room for this many times the (Gaussian, tile) pairs of the call before it."""
 LEAST_ROOM = 1 << 12
-DIFFERENTIABLE = 7
-"""Tensors among rasterize()'s arguments."""
+
+
+class Options(TypedDict, total=False):
+    """rasterize()'s options, but for the capacity."""
+
+    near: float
+    low_pass: float
+    alpha_threshold: float
+    antialiased: bool
+    style: BlendStyle
 
 
 class RecordedRasterizer:
@@ -34,7 +44,7 @@ class RecordedRasterizer:
     the arguments and of the gradients.
     """
 
-    def __init__(self, device: torch.device | str):
+    def __init__(self, device: torch.device | str) -> None:
         self._forward = GraphRecorder(device)
         self._backward = GraphRecorder(device, self._forward.stream)
         self._key = None
@@ -44,9 +54,22 @@ class RecordedRasterizer:
         self._gradients: list[torch.Tensor | None] = []
         self._calls = 0
 
-    def __call__(self, *arguments, **options) -> Rendering:
+    def __call__(
+        self,
+        means: torch.Tensor,
+        log_scales: torch.Tensor,
+        quaternions: torch.Tensor,
+        opacities: torch.Tensor,
+        features: torch.Tensor,
+        world_to_camera: torch.Tensor,
+        intrinsics: torch.Tensor,
+        width: int,
+        height: int,
+        **options: Unpack[Options],
+    ) -> Rendering:
         """Arguments and result are rasterize()'s; `capacity` is not among them."""
-        tensors, size = arguments[:DIFFERENTIABLE], arguments[DIFFERENTIABLE:]
+        tensors = means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics
+        size = width, height
         wanted = tuple(torch.is_grad_enabled() and tensor.requires_grad for tensor in tensors)
         key = (tuple((tensor.shape, tensor.dtype) for tensor in tensors), wanted, size, tuple(sorted(options.items())))
         if key != self._key:

@@ -6,13 +6,16 @@ long as the GPU. Recorded once and replayed, the GPU sets the pace.
 
 import gc
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager, suppress
+from typing import Any, TypeVar
 
 import torch
 import warp as wp
 
 from .launching import torch_stream
+
+T = TypeVar("T")
 
 IDLE_BYTES = 1 << 30
 """If more of torch's memory than this lies idle, it is given back before a recording is made: a recording has memory of
@@ -67,13 +70,14 @@ class GraphRecorder:
     continues another recording's work, as a backward pass does, must be recorded on the same.
     """
 
-    def __init__(self, device: torch.device | str, stream: torch.cuda.Stream | None = None):
+    def __init__(self, device: torch.device | str, stream: torch.cuda.Stream | None = None) -> None:
         self.device = torch.device(device)
         if self.device.type != "cuda":
             raise ValueError(f"device {self.device} has no CUDA graphs; use a GPU, or call the function itself")
         self._key = None
         self._graph: torch.cuda.CUDAGraph | None = None
-        self._modules = self._result = None
+        self._modules: Any = None
+        self._result: Any = None
         self.stream = stream or _own_stream(self, self.device)
         self._pool = torch.cuda.graph_pool_handle()
         self._kept = 0
@@ -81,7 +85,7 @@ class GraphRecorder:
         self._anchor = self._record(lambda: torch.zeros(1, device=self.device))
 
     @contextmanager
-    def launching(self):
+    def launching(self) -> Iterator[None]:
         """Launches within this block go to the stream of the recordings, after and before what is launched around it.
 
         For work that is recorded later: torch keeps the stream on which a parameter's gradient was first summed for as
@@ -102,7 +106,7 @@ class GraphRecorder:
             self._graph.reset()
             self._graph = None
 
-    def run(self, key, function: Callable):
+    def run(self, key: Hashable, function: Callable[[], T]) -> T:
         """Replay the recording made under `key`, after recording `function` if there is none; returns its result.
 
         Raises RuntimeError if the function cannot be recorded.
@@ -111,7 +115,7 @@ class GraphRecorder:
             self.record(key, function)
         return self.replay()
 
-    def record(self, key, function: Callable):
+    def record(self, key: Hashable, function: Callable[[], T]) -> T:
         """Record `function` without playing it, in the place of any other recording; returns what will be its result.
 
         Raises RuntimeError if the function cannot be recorded.
@@ -121,8 +125,9 @@ class GraphRecorder:
         self._key = key
         return self._result
 
-    def replay(self):
+    def replay(self) -> Any:
         """Play the recording; returns its result."""
+        assert self._graph is not None, "nothing is recorded"
         self._graph.replay()
         return self._result
 

@@ -5,6 +5,7 @@ from functools import cache
 import torch
 
 from ..kernels.ssim import RADIUS, ssim_kernels, window
+from .checks import check_tensors
 from .launching import launch, warp_scalar
 
 # Numbers that one step of the CPU kernels takes: one AVX-512 register of float32.
@@ -22,7 +23,7 @@ def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     Returns a scalar of the same type, at most 1, differentiable once with respect to both images. The result and the
     gradient do not depend on the number of threads.
 
-    Raises ValueError if the shapes differ or are not [H, W, C], TypeError for another type or two devices.
+    Raises TypeError for what is no tensor, ValueError if shapes, types or devices differ or are others.
     """
     return _Similarity.apply(a, b, True)
 
@@ -32,7 +33,9 @@ def ssim_map(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return _Similarity.apply(a, b, False)
 
 
-def image_distance(a: torch.Tensor, b: torch.Tensor, distance_weight: float, dissimilarity_weight: float):
+def image_distance(
+    a: torch.Tensor, b: torch.Tensor, distance_weight: float, dissimilarity_weight: float
+) -> torch.Tensor:
     """distance_weight mean |a - b| + dissimilarity_weight (1 - ssim(a, b)), in one launch more than ssim() takes.
 
     a, b: as for ssim(), with its errors. Returns a scalar, differentiable once with respect to a.
@@ -86,13 +89,9 @@ class _Similarity(torch.autograd.Function):
 
 
 def _check(a: torch.Tensor, b: torch.Tensor) -> None:
-    if a.shape != b.shape or a.ndim != 3 or a.numel() == 0:
-        raise ValueError(f"ssim takes two images of one shape [H, W, C], not {list(a.shape)} and {list(b.shape)}")
-    if a.dtype != b.dtype or a.dtype not in (torch.float32, torch.float64) or a.device != b.device:
-        raise TypeError(
-            f"ssim takes float32 or float64 images on one device, not {a.dtype} on {a.device} and "
-            f"{b.dtype} on {b.device}"
-        )
+    check_tensors(a=(a, ("H", "W", "C")), b=(b, ("H", "W", "C")))
+    if not a.numel():
+        raise ValueError(f"a has shape {list(a.shape)}, expected [H, W, C] with a pixel at least")
 
 
 def _compare(

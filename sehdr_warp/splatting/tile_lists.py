@@ -78,7 +78,7 @@ def build_tile_lists(
     tiles, gaussians = emit_entries(order, *records, extents, columns, rows, ends, room, capacity is not None)
     tiles, gaussians, places = sort_by_tile(tiles, gaussians, room, tile_count, emission)
     ranges = find_ranges(tiles, tile_count)
-    by_gaussian = Emission(order, ends, places) if emission else None
+    by_gaussian = None if places is None else Emission(order, ends, places)
     return TileLists(ranges, gaussians, by_gaussian, columns, rows, overflow, total)
 
 
@@ -106,7 +106,7 @@ def pack_records(means2d, conics, opacities, extents, alpha_threshold: float, fe
     return shapes, ellipses
 
 
-def depth_order(depths, extents):
+def depth_order(depths: torch.Tensor, extents: torch.Tensor) -> torch.Tensor:
     """[N] int32: Gaussians nearest first, culled ones last; equal depths keep the order of their indices."""
     count = depths.shape[0]
     # The sort needs room for twice as many; what is returned does not hold on to it.

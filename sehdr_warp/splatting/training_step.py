@@ -62,9 +62,13 @@ def adam_step(
 
 
 def _step_in_torch(parameter, gradient, first_moment, second_moment, step, skipped, rate, betas, epsilon) -> None:
-    torch._fused_adam_(
-        *([tensor] for tensor in (parameter, gradient, first_moment, second_moment)),
-        *([], [step]),
+    torch._fused_adam_(  # pyright: ignore[reportPrivateImportUsage]
+        [parameter],
+        [gradient],
+        [first_moment],
+        [second_moment],
+        [],
+        [step],
         lr=rate,
         beta1=betas[0],
         beta2=betas[1],

@@ -85,28 +85,3 @@ def test_no_gaussians_have_gradients_of_their_shapes(device):
     spherical_harmonics(3, *leaves).sum().backward()
     assert [leaf.grad.shape for leaf in leaves] == [leaf.shape for leaf in leaves]
     assert not leaves[2].grad.any()
-
-
-@pytest.mark.parametrize(("degree", "message"), [(4, "not in 0..3"), (-1, "not in 0..3"), (3, "needs 16 coefficients")])
-def test_degrees_out_of_range_are_refused(degree, message):
-    coefficients, means, camera = inputs(terms=9)
-    with pytest.raises(ValueError, match=message):
-        spherical_harmonics(degree, coefficients, means, camera)
-
-
-@pytest.mark.parametrize(
-    ("which", "change", "message"),
-    [
-        (0, lambda t: t[:-1], "of the constant coefficients"),
-        (1, lambda t: t[:-1], "of the other coefficients"),
-        (2, lambda t: t[:, :2], "of means"),
-        (3, lambda t: t[:2], "of camera_position"),
-        (1, lambda t: t.double(), "the other coefficients: torch.float64"),
-    ],
-)
-def test_misfits_are_named(which, change, message):
-    tensors = [torch.ones(5, 1, 3), torch.ones(5, 3, 3), torch.ones(5, 3), torch.zeros(3)]
-    tensors[which] = change(tensors[which])
-    constant, rest, means, camera_position = tensors
-    with pytest.raises(ValueError, match=message):
-        spherical_harmonics(1, (constant, rest), means, camera_position)

@@ -61,6 +61,7 @@ def test_one_gaussian_of_any_numbers_leaves_the_others_alone(data):
     good[3] = torch.full((COUNT, 1), 0.5)
     for part in good:
         part[2] = tensor([data.draw(anything) for _ in range(part.shape[1])])
+    good[3] = torch.where(good[3].isfinite(), good[3].clamp(0, 1), good[3])
     leaves = [part.clone().requires_grad_() for part in good]
     given_ = [leaves[0], leaves[1], leaves[2], leaves[3][:, 0], leaves[4]]
     rendering = rasterize(*given_, *camera(), 18, 14)

@@ -1,0 +1,78 @@
+"""What public operations say of arguments that do not fit: one line with the argument's name and what it takes.
+
+Nothing here waits for a GPU: values are looked at on the CPU alone.
+"""
+
+import math
+import operator
+import warnings
+from typing import Any
+
+import torch
+
+
+def check_tensors(**arguments: tuple[Any, tuple[int | str, ...]]) -> None:
+    """Raises TypeError for what is no torch tensor; ValueError for another shape, another type than float32 or float64,
+    or another type or device than the first's.
+
+    arguments: by name, the value and its shape, in which a letter is a size of the first tensor that has it.
+    """
+    sizes: dict[str, int] = {}
+    first_name, (first, _) = next(iter(arguments.items()))
+    for name, (value, shape) in arguments.items():
+        expected = f"[{', '.join(map(str, shape))}]"
+        if not isinstance(value, torch.Tensor):
+            kind = type(value)
+            raise TypeError(
+                f"{name} is a {kind.__module__.split('.')[0]}.{kind.__name__}, expected a torch tensor {expected}"
+            )
+        if value.ndim == len(shape):
+            for size, letter in zip(value.shape, shape, strict=True):
+                if isinstance(letter, str):
+                    sizes.setdefault(letter, size)
+        if tuple(value.shape) != tuple(sizes.get(n, -1) if isinstance(n, str) else n for n in shape):
+            known = ", ".join(f"{n} = {sizes[n]}" for n in shape if isinstance(n, str) and n in sizes)
+            raise ValueError(
+                f"{name} has shape {list(value.shape)}, expected {expected}" + (f" with {known}" if known else "")
+            )
+        if value.dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"{name} is {value.dtype}, expected torch.float32 or torch.float64")
+        if value.dtype != first.dtype or value.device != first.device:
+            raise ValueError(
+                f"{name} is {value.dtype} on {value.device}, but {first_name} is {first.dtype} on {first.device}"
+            )
+
+
+def whole_number(name: str, value: Any, least: int, most: int) -> int:
+    """The value as an int; TypeError for another kind of number, ValueError for one out of range."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        raise TypeError(f"{name} is {value!r:.60}, expected a whole number") from None
+    if not least <= number <= most:
+        raise ValueError(f"{name} {number} is not in {least}..{most}")
+    return number
+
+
+@torch.no_grad()
+def check_opacities(opacities: torch.Tensor) -> None:
+    """Raises ValueError for opacities on the CPU that are finite and outside of [0, 1]."""
+    if opacities.device.type == "cpu" and opacities.numel():
+        low, high = (float(value) for value in opacities.aminmax())
+        if -math.inf < low < -1e-6 or math.inf > high > 1 + 1e-6:
+            raise ValueError(f"opacities are from {low:g} to {high:g}, expected 0 to 1; give logits through a sigmoid")
+
+
+@torch.no_grad()
+def warn_of_scales(log_scales: torch.Tensor) -> None:
+    """Warns of log_scales on the CPU that are probably sizes: two or more Gaussians, and all numbers between 0 and 1.
+
+    Logarithms may be so, of sizes from 1 to 2.7; then the warning is wrong, and an error would be worse.
+    """
+    if log_scales.device.type == "cpu" and len(log_scales) > 1:
+        low, high = (float(value) for value in log_scales.aminmax())
+        if low > 0 and high < 1:
+            warnings.warn(
+                f"log_scales are from {low:g} to {high:g}, as sizes would be; expected their logarithms, scales.log()",
+                stacklevel=3,
+            )
