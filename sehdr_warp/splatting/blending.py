@@ -132,11 +132,11 @@ def blend_on_cpu(
         launch(
             blend_cpu.backward_kernel(scalar, channels, halvings, degree),
             tile_count,
-            *(lists.ranges, lists.gaussians, lists.emission.places, *records, *frame, last),
+            *(lists.ranges, lists.gaussians, _emission(lists).places, *records, *frame, last),
             *(image_gradient.view(-1, channels), left_over_gradient, transmittance, *scratch, entry_gradients),
             ranges=pieces,
         )
-        return gather_by_gaussian(lists.emission, entry_gradients)
+        return gather_by_gaussian(_emission(lists), entry_gradients)
 
     return backward
 
@@ -195,10 +195,15 @@ def blend_on_cuda(
             return gathered
         by_entry = transmittance.new_zeros(lists.entry_count, channels + 6)
         for corner in range(corners):
-            launch_blocks(kernel, 1, *given, corner, lists.emission.places, by_entry)
-        return gather_by_gaussian(lists.emission, by_entry)
+            launch_blocks(kernel, 1, *given, corner, _emission(lists).places, by_entry)
+        return gather_by_gaussian(_emission(lists), by_entry)
 
     return backward
+
+
+def _emission(lists: TileLists) -> Emission:
+    assert lists.emission is not None, "sums in a fixed order need the entries as they were emitted"
+    return lists.emission
 
 
 def gather_by_gaussian(emission: Emission, by_entry: torch.Tensor) -> torch.Tensor:

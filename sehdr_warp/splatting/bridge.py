@@ -74,7 +74,7 @@ class Program:
         adjoint that adds to an input which items share.
         """
         ranged, _ = parameters(kernel)
-        if ranged and self.device.is_cpu:
+        if ranged and self.device.is_cpu and isinstance(dim, int):
             self._launch_ranges(kernel, dim, [*inputs], [*outputs])
             return
         inputs = [0, *inputs] if ranged else [*inputs]
@@ -147,7 +147,7 @@ class _ProgramFunction(torch.autograd.Function):
             *(tensor for tensor, array in zip(outputs, arrays, strict=True) if not program.outputs[id(array)][2])
         )
         # torch makes this node the outputs' origin: held here as well, neither would ever be freed.
-        program.outputs = {key: (tensor.detach(), *rest) for key, (tensor, *rest) in program.outputs.items()}
+        program.outputs = {key: (t.detach(), array, smooth) for key, (t, array, smooth) in program.outputs.items()}
         ctx.set_materialize_grads(False)
         if recording:
             # The tape holds the arrays, hence the memory, until torch frees this node.
@@ -174,7 +174,7 @@ class _ProgramFunction(torch.autograd.Function):
                     gradient = torch.empty_like(tensor).copy_(gradient)
                 array.grad = _array(gradient, array.dtype)
                 array.retain_grad = True  # the gradient is torch's: adjoint kernels must not clear it
-            results = [None] * len(plain)
+            results: list[torch.Tensor | None] = [None] * len(plain)
             by_memory = {}
             wanted = [position for position, needed in enumerate(ctx.needs_input_grad[2:]) if needed]
             # On a GPU leaves, whose gradients stay, have them in one memory; others' are soon let go, each by itself.

@@ -1,5 +1,7 @@
 """View-dependent values from spherical harmonics."""
 
+from typing import Any
+
 import torch
 
 from ..kernels.harmonics import harmonics_adjoint_kernel, harmonics_kernel
@@ -25,9 +27,8 @@ def spherical_harmonics(
     Returns [N, 3]. Differentiable with respect to every tensor. Raises TypeError for what is no tensor, ValueError for
     a degree out of range, and for shapes, dtypes or devices that do not fit.
     """
-    pair = isinstance(coefficients, tuple | list) and len(coefficients) == 2
-    given = {"means": (means, ("N", 3))}
-    if pair:
+    given: dict[str, Any] = {"means": (means, ("N", 3))}
+    if isinstance(coefficients, tuple | list) and len(coefficients) == 2:
         given |= {
             "coefficients[0]": (coefficients[0], ("N", 1, 3)),
             "coefficients[1]": (coefficients[1], ("N", "K", 3)),
@@ -36,7 +37,8 @@ def spherical_harmonics(
         given |= {"coefficients": (coefficients, ("N", "K", 3))}
     check_tensors(**given, camera_position=(camera_position, (3,)))
     degree = whole_number("degree", degree, 0, MAX_DEGREE)
-    constant, rest = coefficients if pair else (coefficients[:, :1], coefficients[:, 1:])
+    whole = isinstance(coefficients, torch.Tensor)
+    constant, rest = (coefficients[:, :1], coefficients[:, 1:]) if whole else coefficients
     if constant.shape[1] + rest.shape[1] < (degree + 1) ** 2:
         raise ValueError(f"degree {degree} needs {(degree + 1) ** 2} coefficients, not {1 + rest.shape[1]}")
     return _Evaluation.apply(degree, *(t.contiguous() for t in (constant, rest, means, camera_position)))

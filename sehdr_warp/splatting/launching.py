@@ -51,7 +51,7 @@ def launch(
         _descriptor(argument, kind) if isinstance(argument, torch.Tensor) else argument
         for argument, kind in zip(arguments, types, strict=True)
     ]
-    if ranged and device.type == "cpu":
+    if ranged and device.type == "cpu" and isinstance(dim, int):
         launch_ranges(kernel, threads.even_ranges(dim, smallest) if ranges is None else ranges, inputs)
         return
     wp.launch(

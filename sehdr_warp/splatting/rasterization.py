@@ -123,8 +123,8 @@ def rasterize(
             antialiased=antialiased,
         )
         features = features.contiguous()
-        shown = (tensor.detach() for tensor in (means2d, conics, opacities2d))
-        records = pack_records(*shown, extents, alpha_threshold, features.detach())
+        means_, conics_, opacities_ = (tensor.detach() for tensor in (means2d, conics, opacities2d))
+        records = pack_records(means_, conics_, opacities_, extents, alpha_threshold, features.detach())
         emission = means.device.type == "cpu" or style.deterministic
         lists = build_tile_lists(records, depths.detach(), extents, width, height, capacity, emission=emission)
         image, transmittance = blend(

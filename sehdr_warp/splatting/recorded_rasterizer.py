@@ -75,11 +75,16 @@ class RecordedRasterizer:
         if key != self._key:
             self._record(key, tensors, wanted, size, options)
         image, transmittance = _Replay.apply(self, *tensors)
-        if self._rendering.overflow:
+        if self._rendered.overflow:
             # These arguments need more room than those that were recorded.
             self._record(key, tensors, wanted, size, options)
             image, transmittance = _Replay.apply(self, *tensors)
-        return replace(self._rendering, image=image, transmittance=transmittance)
+        return replace(self._rendered, image=image, transmittance=transmittance)
+
+    @property
+    def _rendered(self) -> Rendering:
+        assert self._rendering is not None, "nothing is recorded"
+        return self._rendering
 
     def _record(self, key, tensors, wanted, size, options) -> None:
         self._key = None
@@ -88,7 +93,7 @@ class RecordedRasterizer:
 
         def forward(capacity=None):
             with torch.set_grad_enabled(bool(leaves)):
-                return rasterize(*self._arguments, *size, capacity=capacity, **options)
+                return rasterize(*self._arguments, *size, capacity=capacity, **options)  # pyright: ignore[reportArgumentType]
 
         def backward(rendering):
             return torch.autograd.grad(
@@ -124,10 +129,12 @@ class _Replay(torch.autograd.Function):
     def forward(ctx, owner: RecordedRasterizer, *tensors):
         owner._calls += 1
         ctx.owner, ctx.call = owner, owner._calls
-        torch._foreach_copy_([argument.detach() for argument in owner._arguments], [t.detach() for t in tensors])
+        torch._foreach_copy_(  # pyright: ignore[reportPrivateImportUsage]
+            [argument.detach() for argument in owner._arguments], [t.detach() for t in tensors]
+        )
         owner._forward.replay()
         ctx.set_materialize_grads(False)
-        return owner._rendering.image.detach(), owner._rendering.transmittance.detach()
+        return owner._rendered.image.detach(), owner._rendered.transmittance.detach()
 
     @staticmethod
     @torch.autograd.function.once_differentiable

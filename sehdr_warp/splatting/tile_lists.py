@@ -57,7 +57,14 @@ class TileLists:
 
 @torch.no_grad()
 def build_tile_lists(
-    records, depths, extents, width: int, height: int, capacity: int | None = None, *, emission: bool = True
+    records: tuple[torch.Tensor, torch.Tensor],
+    depths: torch.Tensor,
+    extents: torch.Tensor,
+    width: int,
+    height: int,
+    capacity: int | None = None,
+    *,
+    emission: bool = True,
 ) -> TileLists:
     """Order the projected Gaussians by depth and list, for each tile, those whose ellipse touches it.
 
@@ -70,12 +77,14 @@ def build_tile_lists(
     columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
     tile_count = columns * rows
     order = depth_order(depths, extents)
-    counts = count_entries(order, *records, extents, columns, rows)
+    shapes, ellipses = records
+    counts = count_entries(order, shapes, ellipses, extents, columns, rows)
     total = counts.sum(dtype=torch.int64)
     overflow = None if capacity is None else total > capacity
     room = _exact_room(int(total), order.shape[0], columns, rows) if capacity is None else capacity
     ends = counts.cumsum(0, dtype=torch.int32)
-    tiles, gaussians = emit_entries(order, *records, extents, columns, rows, ends, room, capacity is not None)
+    touched = order, shapes, ellipses, extents, columns, rows
+    tiles, gaussians = emit_entries(*touched, ends, room, capacity is not None)
     tiles, gaussians, places = sort_by_tile(tiles, gaussians, room, tile_count, emission)
     ranges = find_ranges(tiles, tile_count)
     by_gaussian = None if places is None else Emission(order, ends, places)
@@ -91,7 +100,14 @@ def _exact_room(total: int, gaussian_count: int, columns: int, rows: int) -> int
     return total
 
 
-def pack_records(means2d, conics, opacities, extents, alpha_threshold: float, features=None):
+def pack_records(
+    means2d: torch.Tensor,
+    conics: torch.Tensor,
+    opacities: torch.Tensor,
+    extents: torch.Tensor,
+    alpha_threshold: float,
+    features: torch.Tensor | None = None,
+) -> tuple[torch.Tensor, torch.Tensor]:
     """What is drawn of each projected Gaussian, in rows of four: shapes and ellipses.
 
     shapes: [N, 4] x, y, opacity, half-height; ellipses: [N, 4] conic a, b, c and the level where alpha meets the
