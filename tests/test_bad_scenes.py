@@ -388,6 +388,6 @@ def test_flags(data, capfd, flags, words):
 def test_tiny_photos(data, capfd):
     """Photos reduced to single pixels cannot be compared; they must not crash either."""
     out = data.parent / "run"
-    status = call("train", data, "--out", out, "--iterations", "2", "--device", "cpu", "--max-size", "1")
+    status = call("train", data, "--out", out, "--iterations", "2", "--device", "cpu", "--max-size", "1", "-q")
     if status:
         error_line(capfd)

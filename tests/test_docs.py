@@ -41,7 +41,7 @@ def command_lines():
         for block in blocks(page.relative_to(ROOT), "(?:sh)?"):
             for line in block.replace("\\\n", " ").splitlines():
                 line = re.split("  #| > ", line.strip().removeprefix("$ "))[0]
-                if re.match(r"sehdr-warp (?!-|compare|score)", line) and "[" not in line:
+                if re.match(r"sehdr-warp (?!-)", line) and "[" not in line:
                     yield pytest.param(line, id=f"{page.name}: {line}")
 
 

@@ -14,7 +14,7 @@ import tyro
 from tyro.conf import Positional
 
 from ..errors import InputError, SehdrError, UsageError
-from .config_fields import flag_of, flags_type, gone_flags, named_fields, value_of
+from .config_fields import flag_of, flags_type, gone_flags, named_fields
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +28,7 @@ class SceneOptions:
     max_size: int | None = None
     """Longest side of the photos, in pixels; larger ones are reduced."""
     holdout: int | None = None
-    """Hold out every Nth view for testing where the set states no split; 0: train on all. (default: 8)"""
+    """Hold out every Nth view for testing, 0 none; by default what the set states, or every 8th."""
     exposure_index: int | None = None
     """Which exposure to take where a view has several; by default the middle one."""
 
@@ -217,7 +217,7 @@ def _data(asked: Train, resumed: bool) -> dict:
 
 def _config(asked: Train, resumed: bool):
     """The preset's config, or the resumed run's, with what the command line names in it."""
-    from .config_files import load_config, override_config
+    from .config_files import load_config, override_config, value_of
     from .run_folder import RunFolder
 
     options = asked.training

@@ -11,52 +11,21 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from .config import Config
 
-_DEFAULT = "it always is what the default was: leave it out"
-_LOST = "it gained nothing: leave it out"
+_GAINED_NOTHING = """model.dropout model.far_points response.refine response.refine_after response.refine_weight
+    loss.interval loss.highlight_weight loss.highlight_stops loss.highlight_expected loss.harmonics_weight
+    loss.scale_weight densification.contribution densification.contribution_at densification.slope_corrected
+    densification.revised_opacity optimizer.refinement optimizer.final_factor optimizer.decay_from
+    optimizer.visible_only schedule.harmonics_on_demand schedule.harmonics_gain schedule.coarse_levels
+    schedule.coarse_every schedule.early_stop schedule.early_stop_every schedule.early_stop_gain
+    schedule.early_stop_on"""
+_CONSTANT = """model.low_pass model.initial_opacity model.initial_scale response.width fusion.sigma fusion.width
+    fusion.hidden_layers fusion.evaluation loss.knee loss.domain loss.hdr_domain loss.linear_detach loss.anchor_value
+    schedule.nonfinite_limit"""
 GONE = {
-    "model.dropout": _LOST,
-    "model.far_points": _LOST,
-    "model.low_pass": _DEFAULT,
-    "model.initial_opacity": _DEFAULT,
-    "model.initial_scale": _DEFAULT,
+    **dict.fromkeys(_GAINED_NOTHING.split(), "it gained nothing: leave it out"),
+    **dict.fromkeys(_CONSTANT.split(), "it always is what the default was: leave it out"),
     "response.form": 'write response.name = "learned" for mlp, nothing for curve',
-    "response.width": _DEFAULT,
-    "response.refine": _LOST,
-    "response.refine_after": _LOST,
-    "response.refine_weight": _LOST,
-    "fusion.sigma": _DEFAULT,
-    "fusion.width": _DEFAULT,
-    "fusion.hidden_layers": _DEFAULT,
-    "fusion.evaluation": _DEFAULT,
-    "loss.interval": _LOST,
-    "loss.highlight_weight": _LOST,
-    "loss.highlight_stops": _LOST,
-    "loss.highlight_expected": _LOST,
-    "loss.harmonics_weight": _LOST,
-    "loss.scale_weight": _LOST,
-    "loss.knee": _DEFAULT,
-    "loss.domain": _DEFAULT,
-    "loss.hdr_domain": _DEFAULT,
-    "loss.linear_detach": _DEFAULT,
-    "loss.anchor_value": _DEFAULT,
-    "densification.contribution": _LOST,
-    "densification.contribution_at": _LOST,
-    "densification.slope_corrected": _LOST,
-    "densification.revised_opacity": _LOST,
-    "optimizer.refinement": _LOST,
-    "optimizer.final_factor": _LOST,
-    "optimizer.decay_from": _LOST,
-    "optimizer.visible_only": _LOST,
     "schedule.stated_for": "iteration numbers are for 30000 iterations: scale them",
-    "schedule.harmonics_on_demand": _LOST,
-    "schedule.harmonics_gain": _LOST,
-    "schedule.coarse_levels": _LOST,
-    "schedule.coarse_every": _LOST,
-    "schedule.early_stop": "the plan chooses the iterations: leave it out",
-    "schedule.early_stop_every": _LOST,
-    "schedule.early_stop_gain": _LOST,
-    "schedule.early_stop_on": _LOST,
-    "schedule.nonfinite_limit": _DEFAULT,
     "plan.decisions": "all are made, and plan.keep says which fields stay",
 }
 """Fields of earlier versions, each with what to do now."""
@@ -84,33 +53,12 @@ def gone_flags() -> dict[str, str]:
     return {flag_of(path): advice for path, advice in GONE.items()}
 
 
-def value_of(path: str, text: str):
-    """A field's value as it was written behind its flag; the config then checks it.
-
-    Text stands as it is, lists are separated by commas, and everything else is written as in TOML.
-    """
-    from .config_files import toml_value
-
-    kind = dict(config_fields())[path].annotation
-    if get_origin(kind) is tuple:
-        inner = get_args(kind)[0]
-        return [item if is_text(inner) else toml_value(item) for item in map(str.strip, text.split(",")) if item]
-    return text if is_text(kind) else toml_value(text)
-
-
-def is_text(kind) -> bool:
-    """Whether values of a type are text."""
-    kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
-    return kind is str or get_origin(kind) is Literal
-
-
 def flags_type() -> type:
     """A TypedDict of every field, for tyro: nothing but what was named is in it, as text."""
     tables: dict[str, dict[str, typing.Any]] = {}
     for path, item in config_fields():
         if path == "seed":  # A flag of its own, in every help.
             continue
-        default = shown(item.default)
         spec = PrimitiveConstructorSpec(
             nargs=1,
             metavar=_metavar(item.annotation),
@@ -119,7 +67,7 @@ def flags_type() -> type:
             str_from_instance=lambda value: [value],
         )
         told = tyro.conf.arg(
-            help=" ".join((item.description or "").split()), help_behavior_hint=f"(default: {default})"
+            help=" ".join((item.description or "").split()), help_behavior_hint=f"(default: {_shown(item.default)})"
         )
         tables.setdefault(path.rpartition(".")[0], {})[path] = Annotated[str, spec, told]
     parts = {
@@ -138,7 +86,7 @@ def named_fields(values: dict) -> dict[str, str]:
     return found
 
 
-def shown(value) -> str:
+def _shown(value) -> str:
     """A field's value as its flag takes it."""
     if isinstance(value, tuple):
         return ",".join(map(str, value)) or "none"

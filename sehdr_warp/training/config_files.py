@@ -7,6 +7,7 @@ import tomllib
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
+from typing import Annotated, Literal, get_args, get_origin
 
 from pydantic import ValidationError
 
@@ -75,6 +76,22 @@ def config_as_toml(config: Config, differing: bool = False) -> str:
         # JSON's strings, numbers, booleans and lists are TOML's as well.
         lines.append(f"{name} = {json.dumps(value)}{changed}")
     return "\n".join(lines)
+
+
+def value_of(path: str, text: str):
+    """A field's value as it was written behind its flag; the config then checks it.
+
+    Text stands as it is, lists are separated by commas, and everything else is written as in TOML.
+    """
+    kind = dict(config_fields())[path].annotation
+    if get_origin(kind) is tuple:
+        return [_one_value(get_args(kind)[0], item) for item in map(str.strip, text.split(",")) if item]
+    return _one_value(kind, text)
+
+
+def _one_value(kind, text: str):
+    kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
+    return text if kind is str or get_origin(kind) is Literal else toml_value(text)
 
 
 def toml_value(text: str):

@@ -17,7 +17,7 @@ from sehdr_warp.training.config import (
     ResponseConfig,
     stated,
 )
-from sehdr_warp.training.config_fields import GONE, config_fields, value_of
+from sehdr_warp.training.config_fields import GONE, config_fields
 from sehdr_warp.training.config_files import (
     config_as_toml,
     config_from_dict,
@@ -26,6 +26,7 @@ from sehdr_warp.training.config_files import (
     override_config,
     preset_names,
     read_config_json,
+    value_of,
 )
 
 PACKAGE = Path(sehdr_warp.__file__).parent
