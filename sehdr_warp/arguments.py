@@ -6,7 +6,6 @@ import io
 import itertools
 import math
 import re
-import sys
 import typing
 from collections.abc import Iterator
 from contextlib import redirect_stderr
@@ -173,8 +172,3 @@ def positive(flag: str, value):
     if not value > 0:
         raise InputError(f"{flag} {value}", "not positive", "give a number above 0")
     return value
-
-
-def say(line: str) -> None:
-    """A line of progress; results go to standard output, this does not."""
-    print(line, file=sys.stderr, flush=True)
