@@ -39,9 +39,7 @@ def normalise(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Relative radiance of prediction and truth, [H, W, 3] float64 each, the truth's maximum at 1; not yet limited.
 
-    prediction, truth: [H, W, 3] scene-linear radiance. mask: [H, W]; maxima are taken where it is above 0.
-    scale: the factor of fit_scale; used by `aligned` alone.
-
+    mask: [H, W]; maxima are taken where it is above 0. scale: the factor of fit_scale, for `aligned` alone.
     Raises ValueError for an unknown protocol.
     """
     if protocol not in PROTOCOLS:
