@@ -42,11 +42,8 @@ class RunPictures:
 
     def __init__(self, run):
         self.run = run
-        self.facts = {
-            "train_seconds": run.train_seconds,
-            "gaussians": run.gaussian_count,
-            "iterations": run.iterations,
-        }
+        names = {"train_seconds": "train_seconds", "gaussians": "gaussian_count", "iterations": "iterations"}
+        self.facts = {key: getattr(run, name) for key, name in names.items()}
 
     def hdr(self, view):
         return self.run.render(view.camera).hdr
@@ -203,7 +200,8 @@ class Evaluation:
         encoded = self.pictures.ldr(view)
         if encoded is not None:
             encoded = _inside(encoded.detach().float(), photo, mask)
-            row["ldr"] = self._ldr(encoded, photo, mask)
+            figures = {"psnr": metrics.psnr(encoded, photo, mask), "ssim": metrics.ssim(encoded, photo, mask)}
+            row["ldr"] = figures | {"lpips": self._lpips(encoded, photo)}
         for region, weight in weights.items():
             self.regions[region].add_ldr(encoded, photo, weight, counted)
         if truth is None:
@@ -229,13 +227,6 @@ class Evaluation:
             for region, weight in weights.items():
                 self.regions[region].add_hdr(name, *pair, weight)
         return row
-
-    def _ldr(self, encoded, photo, mask) -> dict:
-        return {
-            "psnr": metrics.psnr(encoded, photo, mask),
-            "ssim": metrics.ssim(encoded, photo, mask),
-            "lpips": self._lpips(encoded, photo),
-        }
 
     def _lpips(self, prediction, truth) -> float | None:
         if self.lpips is None or min(truth.shape[:2]) < SMALLEST_EDGE:

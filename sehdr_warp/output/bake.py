@@ -7,6 +7,7 @@ harmonics were never held to anything; an even cover of the sphere keeps the fit
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -106,11 +107,5 @@ def _thinned(positions: np.ndarray | None) -> np.ndarray:
 
 
 def _rows(gaussians: GaussianArrays, rows: slice) -> GaussianArrays:
-    arrays = (
-        gaussians.means,
-        gaussians.log_scales,
-        gaussians.quaternions,
-        gaussians.opacity_logits,
-        gaussians.harmonics,
-    )
-    return GaussianArrays(*(array[rows] for array in arrays), gaussians.color_model, gaussians.base_exposure_time)
+    names = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics")
+    return replace(gaussians, **{name: getattr(gaussians, name)[rows] for name in names})

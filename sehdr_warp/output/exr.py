@@ -84,10 +84,7 @@ def write_exr(
     header: Mapping[str, Any] | None = None,
     overwrite: bool = False,
 ) -> str:
-    """Writes a single-part file with ZIP compression; returns the pixel type of its colours, "half" or "float".
-
-    Parameters and errors as write_multipart_exr, for one part; with overwrite a file at `path` is replaced.
-    """
+    """write_multipart_exr for one part without a name; with overwrite a file at `path` is replaced."""
     return _write(Path(path), [Part(channels, header or {})], pixel, overwrite)
 
 

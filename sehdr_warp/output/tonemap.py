@@ -77,6 +77,4 @@ def expose(radiance: np.ndarray, stops: float, *, scale: float = 1.0) -> np.ndar
 def encode_srgb(linear: np.ndarray) -> np.ndarray:
     """IEC 61966-2-1 encoding of display-linear values, limited to [0, 1]; float32."""
     linear = np.clip(np.asarray(linear, np.float32), 0, 1)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** np.float32(1 / 2.4) - 0.055).astype(
-        np.float32
-    )
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** np.float32(1 / 2.4) - np.float32(0.055))

@@ -143,9 +143,8 @@ def _check(exposures: np.ndarray, values: np.ndarray, source: str):
             source, f"{exposures.shape} exposures and {values.shape} values are not 3 samples or more", remedy
         )
     for what, column in (("exposure", exposures), ("value", values)):
-        bad = np.flatnonzero(~np.isfinite(column))
-        if len(bad):
-            raise InputError(source, f"{what} {bad[0] + 1} is {column[bad[0]]}", remedy)
+        for bad in np.flatnonzero(~np.isfinite(column)):
+            raise InputError(source, f"{what} {bad + 1} is {column[bad]}", remedy)
     if exposures.min() < 0:
         raise InputError(source, f"exposure {exposures.min():.6g} is negative", remedy)
     steps = np.diff(np.unique(np.concatenate([[0.0], exposures])))
