@@ -101,7 +101,7 @@ def test_a_cpu_gets_the_iterations_that_fit_into_minutes(facts, monkeypatch):
     some, few, all_of_them = rule(small, config, CPU), rule(large, config, CPU), rule(small, config, GPU)
     assert all_of_them.fields == {"schedule.iterations": 30_000}
     assert few.fields == {"schedule.iterations": 1000}
-    assert "--max-size" in few.reason and "75 min on a CPU" in few.reason
+    assert "--max-size" in few.reason and "88 min on a CPU" in few.reason
     assert 1000 < some.fields["schedule.iterations"] <= 30_000
     assert cpu_step_seconds(large, config) > 50 * cpu_step_seconds(small, config)
 
