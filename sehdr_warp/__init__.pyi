@@ -9,11 +9,12 @@ from .output.ply import export
 from .output.render_views import render_views
 from .output.report import write_report
 from .response import Response, response_by_name, response_names
-from .scene import Camera, Scene, View, load_cameras, load_scene
+from .scene import Camera, Scene, View, embedded_scenes, load_cameras, load_scene
 from .scene.stack import calibrate
 from .splatting import Rendering, differentiable, rasterize, spherical_harmonics, ssim
 from .training.config import Config
-from .training.config_files import load_config
+from .training.config_files import load_config, preset_names
+from .training.plan import Plan, make_plan
 from .training.run import Run, load_run
 from .training.train import Step, Training, train
 
@@ -21,6 +22,7 @@ __all__ = [
     "Camera",
     "Config",
     "InputError",
+    "Plan",
     "Rendering",
     "Response",
     "Run",
@@ -32,12 +34,15 @@ __all__ = [
     "calibrate",
     "compare_runs",
     "differentiable",
+    "embedded_scenes",
     "evaluate",
     "export",
     "load_cameras",
     "load_config",
     "load_run",
     "load_scene",
+    "make_plan",
+    "preset_names",
     "rasterize",
     "render_views",
     "response_by_name",

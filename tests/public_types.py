@@ -15,6 +15,10 @@ config = sw.load_config("default")
 assert_type(config, sw.Config)
 assert_type(config.loss.ssim_weight, float)
 
+training = sw.Training(scene, "run", config)
+for step in training:
+    assert_type(step, sw.Step)
+    assert_type(step.psnr, float)
 run = sw.train(scene, "run", config)
 assert_type(run, sw.Run)
 assert_type(sw.load_run("run"), sw.Run)

@@ -54,7 +54,7 @@ SMALL = (
 )
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/rasterizer.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/python.md", "docs/rasterizer.md"])
 def test_python_blocks_run(page, tmp_path, monkeypatch):
     """One after another in one folder, at small sizes."""
     monkeypatch.chdir(tmp_path)

@@ -86,7 +86,7 @@ def write_report(run, scene: Scene, out: Path | str, *, view_count: int = 3, ove
         check_absent(out / name, overwrite)
     held_out = bool(scene.test_views)
     views = _chosen(scene.test_views or scene.train_views, view_count)
-    comparisons = [_compare(run, view, scene.views) for view in views]
+    comparisons = [compare(run, view, scene.views) for view in views]
     time = views[0].exposure_time
     brightest = max(comparisons, key=lambda comparison: float((comparison.photo > 0.99).mean()))
     figures = [
@@ -213,7 +213,8 @@ def _chosen(views: Sequence[View], count: int) -> list[View]:
     return [views[i] for i in sorted({round(i) for i in np.linspace(0, len(views) - 1, max(count, 1))})]
 
 
-def _compare(run, view: View, views: Sequence[View]) -> Comparison:
+def compare(run, view: View, views: Sequence[View]) -> Comparison:
+    """What comparison_figure shows of a view of the scene whose views are `views`."""
     hdr, confidence = _array(run.render(view.camera).hdr), run.render_confidence(view.camera)
     from_photo = np.asarray(run.response.decode(view.image)) / view.exposure_time
     between = _between(view, views)

@@ -134,7 +134,7 @@ class ToneMapped(AnalyticResponse):
     def _evaluate(self, exposure, with_slope):
         light, tone_slope = self._tone.evaluate(exposure, with_slope)
         value, slope = self._display._evaluate(light.clamp(0.0, 1.0), with_slope)
-        return value, slope * tone_slope if with_slope else None
+        return value, None if slope is None or tone_slope is None else slope * tone_slope
 
     def _invert(self, value):
         return self._tone.invert(self._display._invert(value))

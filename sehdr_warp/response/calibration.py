@@ -165,7 +165,7 @@ def _rising(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     root = cholesky(matrix)
     steps = np.tril(np.ones((256, 256)))
     lowest = np.r_[-np.inf, np.full(255, _LEAST_RISE)]
-    return steps @ lsq_linear(root @ steps, solve_triangular(root, right, trans="T"), (lowest, np.inf), tol=1e-6).x
+    return steps @ lsq_linear(root @ steps, solve_triangular(root, right, trans=1), (lowest, np.inf), tol=1e-6).x
 
 
 def _bends() -> np.ndarray:

@@ -60,6 +60,7 @@ def colour_response(encoding: str) -> Response:
     encoding that is not a camera's (undefined values, or white beyond 2^20).
     """
     import colour
+    from colour.utilities import suppress_warnings
 
     wanted = _key(encoding)
     matches = [name for name in colour.CCTF_ENCODINGS if _key(name) == wanted]
@@ -70,7 +71,7 @@ def colour_response(encoding: str) -> Response:
     name = matches[0]
 
     def encode(exposure):
-        with np.errstate(all="ignore"), colour.utilities.suppress_warnings(colour_warnings=True):
+        with np.errstate(all="ignore"), suppress_warnings(colour_warnings=True):
             return np.asarray(colour.CCTF_ENCODINGS[name](np.asarray(exposure, np.float64)), np.float64)
 
     # White: the first of these stops at which the encoding reaches 1, then by halves.

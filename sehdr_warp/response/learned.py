@@ -145,4 +145,5 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
     def _invert(self, value):
         return self.decode(value)
 
-    __repr__ = Response.__repr__
+    def __repr__(self) -> str:
+        return Response.__repr__(self)

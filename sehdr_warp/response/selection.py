@@ -189,7 +189,7 @@ def _bands(image) -> list[tuple[np.ndarray, np.ndarray]]:
     bands = [each / np.float64(white) for each in bands]
     if not all(np.isfinite(each).all() for each in bands):
         raise SehdrError("select_response: an image holds values that are not finite")
-    return [(each, ((each > 1.5 * CODE) & (each < 1 - 4.5 * CODE)).all(axis=2)) for each in bands]
+    return [(each, np.all((each > 1.5 * CODE) & (each < 1 - 4.5 * CODE), axis=2)) for each in bands]
 
 
 def _prior(response: Response, from_camera: bool) -> float:
@@ -220,10 +220,8 @@ def _highlights(images, logs: np.ndarray) -> np.ndarray:
 
 def _code_shares(images) -> np.ndarray:
     """[256] share of the values at each 8-bit code."""
-    counts = sum(
-        np.bincount(np.rint(255 * image.clip(0, 1)).astype(np.int64).ravel(), minlength=256) for image in images
-    )
-    return counts / counts.sum()
+    counts = [np.bincount(np.rint(255 * image.clip(0, 1)).astype(np.int64).ravel(), minlength=256) for image in images]
+    return np.sum(counts, axis=0) / np.sum(counts)
 
 
 def _span_surprise(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
