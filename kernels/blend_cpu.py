@@ -7,7 +7,7 @@ polynomial for the same reason: a call of libm's expf would break the vectorisat
 
 Forward, per pixel, with T the transmittance so far:
 
-    alpha = min(opacity exp(p), ALPHA_MAX),  counted if alpha > threshold and T (1 - alpha) > transmittance_min
+    alpha = min(opacity exp(p), ALPHA_MAX),  counted if alpha > threshold and T (1 - alpha) > TRANSMITTANCE_MIN
     image += alpha T feature;  T *= 1 - alpha
 
 A finished pixel stays finished. Its T is stored negated meanwhile, which saves a separate flag.
@@ -28,7 +28,7 @@ from functools import cache
 
 import warp as wp
 
-from .constants import ALPHA_MAX, EXPONENTIAL_DEGREE, TILE_SIZE, TRANSMITTANCE_MIN
+from .constants import ALPHA_MAX, TILE_SIZE, TRANSMITTANCE_MIN
 from .geometry import geometry, vector
 
 # Inlining everything and fusing multiply-adds is worth 1.3-1.6x here. The flags go to Warp's own LLVM.
@@ -36,34 +36,25 @@ COMPILER_FLAGS = (
     "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -ffp-contract=fast"
 )
 
-# exp(x) on [-0.7, 0] by degree, least squares in relative error at Chebyshev points: right to 8.0e-5, 2.8e-6, 8.1e-8.
-EXP_COEFFICIENTS = {
-    3: (0.9999195168923208, 0.9967870417802467, 0.4782788505244568, 0.11655155210021872),
-    4: (0.9999971969488872, 0.9998215577040321, 0.49808475553342596, 0.15919465587959297, 0.029182619768943582),
-    5: (
-        0.9999999185311941,
-        0.9999924147532289,
-        0.49988127666530136,
-        0.16596903052172265,
-        0.03976483434512436,
-        0.005842492519509847,
-    ),
-}
+# exp(x) on [-0.7, 0] by falling powers, least squares in relative error at Chebyshev points: right to 8.1e-8.
+EXP_COEFFICIENTS = (
+    0.005842492519509847, 0.03976483434512436, 0.16596903052172265, 0.49988127666530136, 0.9999924147532289,
+    0.9999999185311941,
+)
 
 
 @cache
-def row_functions(dtype, halvings: int, degree: int):
+def row_functions(dtype, halvings: int):
     """The type of a row of 16, and on rows: broadcast, comparison with zero, exp.
 
     halvings: the polynomial is taken at p / 2^halvings and squared as often, so that p may go down to -0.7 2^halvings.
-    degree: of the polynomial, one of EXP_COEFFICIENTS.
     float64 rows use the library's exponential: they are the reference, not the fast path.
     """
     row = vector(TILE_SIZE, dtype)
     real = dtype
     lowest = -0.7 * 2.0**halvings
-    coefficients = EXP_COEFFICIENTS[degree]
-    highest = coefficients[-1]
+    highest, *others = EXP_COEFFICIENTS
+    degree = len(others)
 
     @wp.func
     def spread(value: real) -> row:
@@ -90,7 +81,7 @@ def row_functions(dtype, halvings: int, degree: int):
             x = wp.max(p, row(real(lowest))) * real(wp.static(0.5**halvings))
             e = row(real(highest))
             for k in range(wp.static(degree)):
-                e = wp.cw_mul(e, x) + row(real(wp.static(coefficients[degree - 1 - k])))
+                e = wp.cw_mul(e, x) + row(real(wp.static(others[k])))
             for _ in range(wp.static(halvings)):
                 e = wp.cw_mul(e, e)
             return e
@@ -106,23 +97,17 @@ def _options(dtype) -> dict:
 
 
 @cache
-def forward_kernel(
-    dtype,
-    channels: int,
-    halvings: int,
-    transmittance_min: float = TRANSMITTANCE_MIN,
-    degree: int = EXPONENTIAL_DEGREE,
-):
+def forward_kernel(dtype, channels: int, halvings: int):
     """blend_forward over tiles, from `first` on: see the module's description.
 
-    halvings, degree: see row_functions; transmittance_min: where a pixel is finished
+    halvings: see row_functions
     ranges: [tiles] first and one past the last entry; entries: [M] Gaussians
     shapes: [N] (x, y, opacity, half-height); ellipses: [N] (conic a, b, c, level); features: [N, C]
     columns: tiles across; width, height: of the image; iota: one row, 0 to 15
     transmittance, accumulated, last: scratch of [tiles, 16] rows, [tiles, C, 16] rows and [tiles, 16] rows
     image: [H W, C]; left_over: [H W], the transmittance behind everything
     """
-    row, spread, step, exponential = row_functions(dtype, halvings, degree)
+    row, spread, step, exponential = row_functions(dtype, halvings)
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4
     size = TILE_SIZE
@@ -175,7 +160,7 @@ def forward_kernel(
                 t = transmittance[tile, j]
                 counted = wp.cw_mul(step(a - spread(alpha_threshold)), step(t))
                 weight = wp.cw_mul(wp.cw_mul(a, t), counted)
-                goes_on = step(t - weight - spread(real(transmittance_min)))
+                goes_on = step(t - weight - spread(real(TRANSMITTANCE_MIN)))
                 weight = wp.cw_mul(weight, goes_on)
                 # The pixel that this Gaussian finishes keeps its T, negated; finished ones have counted = 0.
                 finished = counted - wp.cw_mul(counted, goes_on)
@@ -204,7 +189,7 @@ def forward_kernel(
 
 
 @cache
-def backward_kernel(dtype, channels: int, halvings: int, degree: int = EXPONENTIAL_DEGREE):
+def backward_kernel(dtype, channels: int, halvings: int):
     """The adjoint of forward_kernel, whose arguments it shares.
 
     emission: [M] each entry's row in entry_gradients
@@ -213,7 +198,7 @@ def backward_kernel(dtype, channels: int, halvings: int, degree: int = EXPONENTI
     behind, weights, slopes: scratch of [tiles, 16] rows; incoming: scratch of [tiles, C, 16] rows
     entry_gradients: [M, C + 6], in the order of emission: features, conic a b c, x, y, opacity
     """
-    row, spread, step, exponential = row_functions(dtype, halvings, degree)
+    row, spread, step, exponential = row_functions(dtype, halvings)
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4
     size = TILE_SIZE

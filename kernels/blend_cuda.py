@@ -29,13 +29,13 @@ def padded_channels(channels: int) -> int:
     return (channels + 3) // 4 * 4
 
 
-def module_options(dtype, fast_math: bool = True) -> dict:
-    """fast_math: approximate division and exponential in float32; float64 is the reference and never has it."""
-    return {"fast_math": fast_math and dtype is wp.float32, "max_unroll": 64, "enable_backward": False}
+def module_options(dtype) -> dict:
+    """Approximate division and exponential in float32; float64 is the reference and never has them."""
+    return {"fast_math": dtype is wp.float32, "max_unroll": 64, "enable_backward": False}
 
 
 @cache
-def forward_kernel(dtype, channels: int, transmittance_min: float = TRANSMITTANCE_MIN, fast_math: bool = True):
+def forward_kernel(dtype, channels: int):
     """blend_forward over tiles x BLOCKS_PER_TILE x 32 threads.
 
     ranges: [tiles] first and one past the last entry; entries: [M] Gaussians; shapes: [N] (x, y, opacity, -);
@@ -53,7 +53,7 @@ def forward_kernel(dtype, channels: int, transmittance_min: float = TRANSMITTANC
         enable_backward=False,
         launch_bounds=BLOCK_DIM,
         grid_stride=False,
-        module_options=module_options(dtype, fast_math),
+        module_options=module_options(dtype),
     )
     def blend_forward(
         ranges: wp.array(dtype=wp.vec2i),
@@ -172,7 +172,7 @@ def forward_kernel(dtype, channels: int, transmittance_min: float = TRANSMITTANC
                     upper_a = wp.min(real(ALPHA_MAX), s[2] * wp.exp(g.splat_exponent(q[0], q[1], q[2], dx, dy)))
                     upper_next = upper_t - upper_t * upper_a
                     draw = upper_done == 0 and upper_a > alpha_threshold
-                    if draw and upper_next <= real(transmittance_min):
+                    if draw and upper_next <= real(TRANSMITTANCE_MIN):
                         upper_done = 1
                         draw = False
                     upper_w = real(0.0)
@@ -184,7 +184,7 @@ def forward_kernel(dtype, channels: int, transmittance_min: float = TRANSMITTANC
                     lower_a = wp.min(real(ALPHA_MAX), s[2] * wp.exp(g.splat_exponent(q[0], q[1], q[2], dx, dy)))
                     lower_next = lower_t - lower_t * lower_a
                     draw = lower_done == 0 and lower_a > alpha_threshold
-                    if draw and lower_next <= real(transmittance_min):
+                    if draw and lower_next <= real(TRANSMITTANCE_MIN):
                         lower_done = 1
                         draw = False
                     lower_w = real(0.0)

@@ -20,7 +20,7 @@ ROWS = 4
 
 
 @cache
-def backward_kernel(dtype, channels: int, fast_math: bool = True, ordered: bool = False):
+def backward_kernel(dtype, channels: int, ordered: bool):
     """blend_backward over tiles x BLOCKS_PER_TILE x 32 threads.
 
     As blend_cuda.forward_kernel, and image_gradient: [H W] vectors of C; transmittance_gradient: [H W];
@@ -45,7 +45,7 @@ def backward_kernel(dtype, channels: int, fast_math: bool = True, ordered: bool 
         enable_backward=False,
         launch_bounds=BLOCK_DIM,
         grid_stride=False,
-        module_options=module_options(dtype, fast_math),
+        module_options=module_options(dtype),
     )
     def blend_backward(
         ranges: wp.array(dtype=wp.vec2i),

@@ -14,9 +14,6 @@ ALPHA_MAX = 0.999
 # A pixel is finished before its transmittance would fall to this value.
 TRANSMITTANCE_MIN = 1.0e-4
 
-# Degree of the polynomial exponential on the CPU: 5 is right to float32's last bits.
-EXPONENTIAL_DEGREE = 5
-
 # Variance in square pixels added to every projected Gaussian: the pixel's own footprint.
 LOW_PASS = 0.3
 

@@ -35,10 +35,10 @@ def missing(device: torch.device) -> str | None:
 
 def rasterize_with_gsplat(
     means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics, width: int, height: int, *,
-    low_pass: float = LOW_PASS, antialiased: bool = False, capacity: int | None = None, style: object = None,
+    low_pass: float = LOW_PASS, antialiased: bool = False, capacity: int | None = None, deterministic: bool = False,
 ) -> Rendering:  # fmt: skip
-    """rasterize() by gsplat. capacity and style mean nothing there; there is no transmittance, and densification by
-    gradients cannot watch its centers."""
+    """rasterize() by gsplat. capacity and deterministic mean nothing there; there is no transmittance, and
+    densification by gradients cannot watch its centers."""
     from gsplat import rasterization
 
     fx, fy, cx, cy = intrinsics

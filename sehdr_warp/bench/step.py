@@ -98,7 +98,7 @@ def step_variant(trainer: Trainer) -> Variant:
     return Variant(lambda _: trainer.step(), prepare=between_changes)
 
 
-def plain_torch_rasterizer(*arguments, capacity=None, style=None, **options):
+def plain_torch_rasterizer(*arguments, capacity=None, deterministic=False, **options):
     """rasterize() in plain torch, for a field."""
     return rasterize_reference(*arguments, **options)
 

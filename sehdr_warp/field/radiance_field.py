@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from ..response import Response
 from ..scene import Camera
-from ..splatting import BlendStyle, Rendering, rasterize, spherical_harmonics
+from ..splatting import Rendering, rasterize, spherical_harmonics
 from .color_models import color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
@@ -95,7 +95,7 @@ class RadianceField(nn.Module):
         tone_map: str = "pixel",
         fusion: NeuralExposureFusion | None = None,
         antialiased: bool = False,
-        style: BlendStyle = BlendStyle(),
+        deterministic: bool = False,
     ):
         super().__init__()
         self.gaussians = gaussians
@@ -106,7 +106,7 @@ class RadianceField(nn.Module):
         self.color_model = color_model(radiance)
         self.tone_map = tone_map
         self.antialiased = antialiased
-        self.style = style
+        self.deterministic = deterministic
         self.register_buffer("confidence", None, persistent=False)
 
     def photograph(
@@ -224,5 +224,5 @@ class RadianceField(nn.Module):
             camera.height,
             antialiased=self.antialiased,
             capacity=capacity,
-            style=self.style,
+            deterministic=self.deterministic,
         )

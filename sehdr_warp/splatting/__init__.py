@@ -1,6 +1,5 @@
 """torch <-> Warp: differentiable splatting and the bridge that makes torch operations of Warp programs."""
 
-from .blending import BlendStyle
 from .bridge import Program, differentiable
 from .harmonics import spherical_harmonics
 from .rasterization import Rendering, rasterize
@@ -9,7 +8,6 @@ from .recording import GraphRecorder
 from .ssim import ssim, ssim_map
 
 __all__ = [
-    "BlendStyle",
     "GraphRecorder",
     "Program",
     "RecordedRasterizer",

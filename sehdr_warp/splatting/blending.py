@@ -2,37 +2,16 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
 
 from ..kernels import blend_cpu, blend_cuda, blend_cuda_adjoint
-from ..kernels.constants import EXPONENTIAL_DEGREE, TILE_SIZE, TRANSMITTANCE_MIN
+from ..kernels.constants import TILE_SIZE
 from ..kernels.tiles import tile_kernels
 from . import threads
 from .launching import launch, warp_scalar
 from .tile_lists import Emission, TileLists, pack_records
-
-
-@dataclass(frozen=True)
-class BlendStyle:
-    """How exactly the blend computes, where exactness can be traded for speed. Another value compiles another kernel.
-
-    transmittance_min: a pixel is finished before its transmittance would fall to this value; 0 never stops.
-    fast_math: CUDA, float32: approximate division and exponential.
-    deterministic: CUDA: gradients are summed in a fixed order, so that the same input gives the same bits; slower, and
-        the gradients of every (Gaussian, tile) pair take memory. The CPU always sums in a fixed order.
-    exponential_degree: CPU, float32: of the polynomial behind the exponential, 3 to 5.
-    """
-
-    transmittance_min: float = TRANSMITTANCE_MIN
-    fast_math: bool = True
-    deterministic: bool = False
-    exponential_degree: int = EXPONENTIAL_DEGREE
-
-
-DEFAULT_STYLE = BlendStyle()
 
 Adjoint = Callable[[tuple[torch.Tensor, torch.Tensor], torch.Tensor, torch.Tensor], torch.Tensor]
 """The backward pass: from the records made again, and the gradients by image and transmittance, to those by Gaussian,
@@ -51,7 +30,7 @@ def blend(
     width: int,
     height: int,
     alpha_threshold: float,
-    style: BlendStyle = DEFAULT_STYLE,
+    deterministic: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Blend features [N, C] over the tile lists: image [H, W, C] and the transmittance left [H, W].
 
@@ -60,22 +39,25 @@ def blend(
 
     records: pack_records()'s of these means2d, conics, opacities and extents, and of alpha_threshold. They are as large
     as what they are made of, so the backward pass makes them again instead of keeping them.
-    style: what trades accuracy for speed beside the threshold.
+    deterministic: on a GPU gradients are summed in a fixed order, as the CPU always does: slower, and the gradients of
+    every (Gaussian, tile) pair take memory.
     """
-    options = lists, records, width, height, alpha_threshold, style
+    options = lists, records, width, height, alpha_threshold, deterministic
     return _Blend.apply(means2d, conics, opacities, features, extents, *options)
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means2d, conics, opacities, features, extents, lists, records, width, height, threshold, style):
+    def forward(
+        ctx, means2d, conics, opacities, features, extents, lists, records, width, height, threshold, deterministic
+    ):
         features = features.detach()
         image = features.new_empty(height, width, features.shape[1])
         transmittance = features.new_empty(height, width)
         backend = blend_on_cuda if features.device.type == "cuda" else blend_on_cpu
         # Not the tensors that torch makes results of: the adjoint keeps one, and with it would keep itself.
         results = image.detach(), transmittance.detach()
-        ctx.adjoint = backend(features, lists, records, *results, threshold, style)
+        ctx.adjoint = backend(features, lists, records, *results, threshold, ordered)
         ctx.save_for_backward(means2d, conics, opacities, extents)
         ctx.sizes, ctx.threshold = (height, width, features.shape[1]), threshold
         ctx.set_materialize_grads(False)
@@ -103,13 +85,13 @@ class _Blend(torch.autograd.Function):
 
 
 def blend_on_cpu(
-    features, lists: TileLists, records, image, left_over, alpha_threshold: float, style: BlendStyle
+    features, lists: TileLists, records, image, left_over, alpha_threshold: float, deterministic: bool
 ) -> Adjoint:
     """Fill image [H, W, C] and left_over [H, W], the transmittance, tile by tile: balanced pieces, one piece to a
     thread at a time."""
     scalar = warp_scalar(features.dtype)
     height, width, channels = image.shape
-    halvings, degree = exponent_halvings(alpha_threshold), style.exponential_degree
+    halvings = exponent_halvings(alpha_threshold)
     tile_count, pieces = lists.columns * lists.rows, balanced_pieces(lists)
 
     def rows(*shape):
@@ -119,7 +101,7 @@ def blend_on_cpu(
     frame = features, lists.columns, width, height, alpha_threshold, iota
     transmittance, last = rows(TILE_SIZE), rows(TILE_SIZE)
     launch(
-        blend_cpu.forward_kernel(scalar, channels, halvings, style.transmittance_min, degree),
+        blend_cpu.forward_kernel(scalar, channels, halvings),
         tile_count,
         *(lists.ranges, lists.gaussians, *records, *frame),
         *(transmittance, rows(channels, TILE_SIZE), last, image.view(-1, channels), left_over),
@@ -130,7 +112,7 @@ def blend_on_cpu(
         scratch = rows(TILE_SIZE), rows(channels, TILE_SIZE), rows(TILE_SIZE), rows(TILE_SIZE)
         entry_gradients = features.new_empty(lists.entry_count, channels + 6)
         launch(
-            blend_cpu.backward_kernel(scalar, channels, halvings, degree),
+            blend_cpu.backward_kernel(scalar, channels, halvings),
             tile_count,
             *(lists.ranges, lists.gaussians, _emission(lists).places, *records, *frame, last),
             *(image_gradient.view(-1, channels), left_over_gradient, transmittance, *scratch, entry_gradients),
@@ -157,7 +139,7 @@ def balanced_pieces(lists: TileLists) -> list[tuple[int, int]]:
 
 
 def blend_on_cuda(
-    features, lists: TileLists, records, image, transmittance, alpha_threshold: float, style: BlendStyle
+    features, lists: TileLists, records, image, transmittance, alpha_threshold: float, deterministic: bool
 ) -> Adjoint:
     """Fill image [H, W, C] and transmittance [H, W] by block kernels (also on CPU fibers, where tests ask for them)."""
     scalar = warp_scalar(features.dtype)
@@ -180,16 +162,16 @@ def blend_on_cuda(
         launch(kernel, tile_count * blocks_per_tile * block, *arguments, block_dim=block)
 
     launch_blocks(
-        blend_cuda.forward_kernel(scalar, channels, style.transmittance_min, style.fast_math),
+        blend_cuda.forward_kernel(scalar, channels),
         blend_cuda.BLOCKS_PER_TILE,
         *(*by_gaussian(features, records), image, transmittance, last),
     )
 
     def backward(records, image_gradient: torch.Tensor, transmittance_gradient: torch.Tensor) -> torch.Tensor:
-        kernel = blend_cuda_adjoint.backward_kernel(scalar, channels, style.fast_math, style.deterministic)
+        kernel = blend_cuda_adjoint.backward_kernel(scalar, channels, deterministic)
         corners, sizes = blend_cuda_adjoint.BLOCKS_PER_TILE, (blend_cuda_adjoint.ROWS, channels + 6)
         given = *by_gaussian(kept.pop(), records), transmittance, last, image_gradient, transmittance_gradient, *sizes
-        if not style.deterministic:
+        if not deterministic:
             gathered = transmittance.new_zeros(count, channels + 6)
             launch_blocks(kernel, corners, *given, 0, lists.gaussians, gathered)
             return gathered

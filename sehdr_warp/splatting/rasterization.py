@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 
 from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR
-from .blending import DEFAULT_STYLE, BlendStyle, blend
+from .blending import blend
 from .checks import check_opacities, check_tensors, warn_of_scales, whole_number
 from .memory import memory_told
 from .projection import project
@@ -67,7 +67,7 @@ def rasterize(
     alpha_threshold: float = ALPHA_THRESHOLD,
     antialiased: bool = False,
     capacity: int | None = None,
-    style: BlendStyle = DEFAULT_STYLE,
+    deterministic: bool = False,
 ) -> Rendering:
     """Splat Gaussians with any number of feature channels onto one camera's image plane (3DGS, Kerbl et al. 2023).
 
@@ -83,7 +83,8 @@ def rasterize(
     antialiased: keep a Gaussian's energy under the low pass by lowering its opacity.
     capacity: room for this many (Gaussian, tile) pairs, from 1. On a GPU nothing then waits for the device, so that the
         call can be part of a CUDA graph; Rendering.overflow says whether the room was enough.
-    style: what trades exactness and repeatability for speed; BlendStyle(deterministic=True) repeats bits on a GPU.
+    deterministic: on a GPU, sum gradients in a fixed order, so that the same input gives the same bits; slower, and the
+        gradients of every (Gaussian, tile) pair take memory.
 
     All tensors share one device (CPU or CUDA) and one dtype (float32 or float64). Differentiable with respect to
     every tensor, camera included. On the CPU results repeat bit for bit, whatever the number of threads.
@@ -125,7 +126,7 @@ def rasterize(
         features = features.contiguous()
         means_, conics_, opacities_ = (tensor.detach() for tensor in (means2d, conics, opacities2d))
         records = pack_records(means_, conics_, opacities_, extents, alpha_threshold, features.detach())
-        emission = means.device.type == "cpu" or style.deterministic
+        emission = means.device.type == "cpu" or deterministic
         lists = build_tile_lists(records, depths.detach(), extents, width, height, capacity, emission=emission)
         image, transmittance = blend(
             means2d,
@@ -138,7 +139,7 @@ def rasterize(
             width=width,
             height=height,
             alpha_threshold=alpha_threshold,
-            style=style,
+            deterministic=deterministic,
         )
         radii = extents.amax(dim=1)
     return Rendering(image, transmittance, means2d, depths, radii, lists.entry_count, lists.overflow, lists.total)

@@ -9,7 +9,6 @@ from typing import TypedDict, Unpack
 
 import torch
 
-from .blending import BlendStyle
 from .rasterization import Rendering, rasterize
 from .recording import GraphRecorder
 
@@ -25,7 +24,7 @@ class Options(TypedDict, total=False):
     low_pass: float
     alpha_threshold: float
     antialiased: bool
-    style: BlendStyle
+    deterministic: bool
 
 
 class RecordedRasterizer:

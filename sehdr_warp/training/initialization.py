@@ -13,7 +13,6 @@ from ..response import Response, ToneMapper, response_by_name, responses_named
 from ..response.selection import select_response
 from ..scene import Scene, View
 from ..scene.exposure import made_by_camera
-from ..splatting import BlendStyle
 from .config import Config
 
 DEPTH_RANGE = (0.5, 3.0)
@@ -108,7 +107,7 @@ def assemble_field(gaussians: Gaussians, config: Config, response: Response, bas
         tone_map=config.model.tone_map,
         fusion=fusion,
         antialiased=config.model.antialiased,
-        style=BlendStyle(deterministic=config.deterministic),
+        deterministic=config.deterministic,
     )
 
 

@@ -7,7 +7,7 @@ import torch
 import warp as wp
 from torch.profiler import ProfilerActivity, profile
 
-from sehdr_warp.splatting import BlendStyle, blending
+from sehdr_warp.splatting import blending
 from sehdr_warp.splatting.blending import blend, blend_on_cuda
 from sehdr_warp.splatting.projection import project
 from sehdr_warp.splatting.reference import blend_reference
@@ -72,7 +72,7 @@ def test_block_kernels_match_the_reference(fibers, dtype, channels, deterministi
             width=scene.width,
             height=scene.height,
             alpha_threshold=threshold,
-            style=BlendStyle(deterministic=deterministic),
+            deterministic=deterministic,
         )
 
     image, transmittance = fibers(forward)
