@@ -48,9 +48,7 @@ def blend(
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx, means2d, conics, opacities, features, extents, lists, records, width, height, threshold, deterministic
-    ):
+    def forward(ctx, means2d, conics, opacities, features, extents, lists, records, width, height, threshold, ordered):
         features = features.detach()
         image = features.new_empty(height, width, features.shape[1])
         transmittance = features.new_empty(height, width)
