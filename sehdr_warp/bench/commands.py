@@ -3,12 +3,12 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from ..arguments import numbers, positive
-from ..errors import InputError, SehdrError
+from ..errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,20 +29,28 @@ class Timed(Output):
     """cpu or cuda:N; by default the first GPU if there is one."""
     repetitions: int = 30
     """Timed runs of each variant; slow ones have fewer on the CPU."""
-    budget: float = 10.0
-    """Seconds that one variant may take on the CPU."""
+
+    def timing(self) -> dict:
+        return {"device": _device(self.device), "repetitions": positive("--repetitions", self.repetitions)}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Kernels(Timed):
-    """Time the whole differentiable splat, forward and backward, against peers and the plain torch reference."""
+    """Time the whole differentiable splat, forward and backward, beside plain torch or, if it is installed, gsplat."""
 
     channels: str = "3,9,15"
     """Feature channels, separated by commas."""
     sizes: str | None = None
     """Gaussians@WIDTHxHEIGHT such as 20k@200x200, separated by commas."""
-    peers: bool = False
-    """Also time gsplat, where it is installed and there is a GPU."""
+
+    def measure(self):
+        from .kernels import COLUMNS, bench_kernels
+        from .splats import parse_size
+
+        timing = self.timing()
+        default = {"cuda": "50k@400x400,200k@800x800,1M@1600x1200", "cpu": "5k@200x200,20k@200x200"}
+        sizes = [parse_size(item) for item in (self.sizes or default[timing["device"].type]).split(",")]
+        return bench_kernels(sizes, numbers("--channels", self.channels, int, least=1), **timing), COLUMNS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,17 +62,26 @@ class Step(Timed):
     size: str | None = None
     """Gaussians@WIDTHxHEIGHT; by default 100k@400x400 on a GPU and 20k@200x200 on the CPU."""
 
+    def measure(self):
+        from .splats import parse_size
+        from .step import COLUMNS, bench_step
+
+        timing = self.timing()
+        size = parse_size(self.size or {"cuda": "100k@400x400", "cpu": "20k@200x200"}[timing["device"].type])
+        return bench_step(size, presets=_words(self.preset), **timing), COLUMNS
+
 
 @dataclass(frozen=True, kw_only=True)
 class Scale(Timed):
-    """Time and memory of splats and training steps over what grows, with slopes."""
+    """Time and memory of splats and training steps over Gaussians, pixels, channels and photos, with slopes."""
 
-    sweeps: str = "gaussians,pixels,channels,photos"
-    """What is varied, separated by commas."""
-    peers: bool = False
-    """Also measure gsplat, and the same step on its rasterizer, where it is installed and there is a GPU."""
     small: bool = False
     """Every second point, without the largest."""
+
+    def measure(self):
+        from .scale import COLUMNS, bench_scale
+
+        return bench_scale(small=self.small, **self.timing()), COLUMNS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,25 +94,28 @@ class Training(Output):
     """Training steps of both."""
     max_size: int | None = None
     """Longest side of the photos, in pixels; larger ones are reduced."""
-    seed: int = 0
-    """Seed of every random number."""
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
+
+    def measure(self):
+        from ..scene import load_scene
+        from .training import COLUMNS, bench_training
+
+        device, iterations = _device(self.device), positive("--iterations", self.iterations)
+        return bench_training(load_scene(self.data, max_size=self.max_size), device, iterations=iterations), COLUMNS
 
 
 @dataclass(frozen=True, kw_only=True)
 class Quality(Output):
-    """Train methods on scenes with HDR truth and compare; finished trainings in --out never run again."""
+    """Train methods on scenes with HDR truth and compare; finished trainings in --out never run again. LPIPS is judged
+    where SEHDR_LPIPS names a folder with its weights."""
 
     out: Path
     """Folder of the jobs and their results."""
     scenes: str = "embedded"
     """Folders with HDR truth in all views, embedded or embedded:NAME, separated by commas."""
     methods: str = "default,paper,hdr-gs,3dgs,truth"
-    """Presets or TOML files, separated by commas; empty for variants alone."""
-    variant: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """A method with other values, NAME:BASE:field=value,field=value, such as no-clip:default:loss.clipping=false; may
-    be given several times."""
+    """Presets or TOML files, separated by commas."""
     curves: str = "hdr-nerf"
     """Camera responses that expose the truth: names or files, separated by commas."""
     exposures: str = "2"
@@ -108,16 +128,42 @@ class Quality(Output):
     """Training steps; by default each preset's own."""
     max_size: int | None = None
     """Longest side of the views, in pixels."""
-    lpips: Path | None = None
-    """Folder with LPIPS weights, by default that of SEHDR_LPIPS; LPIPS is null without."""
-    flip: bool = False
-    """Also HDR-FLIP (pip install sehdr-warp[flip])."""
-    device: str | None = None
-    """cpu or cuda; by default cuda if there is a GPU."""
+    device: Literal["cpu", "cuda"] | None = None
+    """By default cuda if there is a GPU; CUDA_VISIBLE_DEVICES chooses among several."""
     jobs: int = 1
     """Trainings at one time, spread over the GPUs; more than one needs submitit."""
     slurm: str | None = None
     """Submit to SLURM, with these parameters, such as partition=gpu,time=240 (minutes)."""
+
+    def measure(self):
+        import torch
+
+        from .jobs import plan_jobs
+        from .quality import COLUMNS, run_jobs
+        from .results import new_result
+
+        device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")
+        lpips = os.environ.get("SEHDR_LPIPS") or None
+        jobs = plan_jobs(
+            _words(self.scenes),
+            _words(self.methods),
+            curves=_words(self.curves),
+            exposures=numbers("--exposures", self.exposures, int, least=0),
+            responses=_words(self.responses),
+            seeds=numbers("--seeds", self.seeds, int, least=0),
+            iterations=self.iterations and positive("--iterations", self.iterations),
+            max_size=self.max_size,
+            device=device,
+            lpips=lpips is not None,
+        )
+        how = {"at_once": positive("--jobs", self.jobs), "slurm": _pairs("--slurm", self.slurm)}
+        rows = run_jobs(jobs, self.out, device=device, lpips=lpips and os.path.abspath(lpips), **how)
+        result = new_result("quality", torch.device(device), {"jobs": self.jobs})
+        result["rows"] = [row for row in rows if "error" not in row]
+        for job, row in zip(jobs, rows, strict=True):
+            error = row.get("error")
+            result["checks"].append({"what": job.label, "passed": error is None, "error": error})
+        return result, COLUMNS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,14 +172,18 @@ class Responses(Output):
 
     data: tyro.conf.Positional[tuple[str, ...]] = ("embedded",)
     """Scenes with HDR truth."""
-    curves: str | None = None
-    """Responses that expose the scenes, separated by commas; by default HDR-NeRF's, four encodings, two film curves."""
+    curves: str = "hdr-nerf,srgb,gamma-2.2,rec709,filmic,aces,camera"
+    """Responses that expose the scenes, separated by commas."""
     exposures: int = 5
     """Exposures of each scene, each four times longer than the last."""
     max_size: int | None = None
     """Longest side of the scenes' photos, in pixels."""
-    seed: int = 0
-    """Seed of what the choice draws."""
+
+    def measure(self):
+        from .response import COLUMNS, bench_response
+
+        exposures = positive("--exposures", self.exposures)
+        return bench_response(self.data, _words(self.curves), exposures=exposures, max_size=self.max_size), COLUMNS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,126 +213,34 @@ def run_bench(command: Bench) -> None:
     """Measures, prints the table and writes the result; raises SehdrError if a check failed, after everything is
     written."""
     from ..files import check_absent
-    from .results import finish
 
     asked = command.benchmark
     if isinstance(asked, Report):
         from .report import write_reports
 
-        for path in write_reports(asked.folder):
-            print(path)
+        print(*write_reports(asked.folder), sep="\n")
         return
+    from .results import finish
+
     if asked.json is not None:
         check_absent(asked.json, asked.overwrite)
-    result, columns = _MEASURES[type(asked)](asked)
-    finish(result, asked.json, asked.overwrite, columns)
+    finish(*asked.measure(), asked.json, asked.overwrite)
 
 
-def _timed(asked: Timed) -> dict:
-    repetitions, budget = positive("--repetitions", asked.repetitions), positive("--budget", asked.budget)
-    return {"repetitions": repetitions, "budget": budget}
-
-
-def _kernels(asked: Kernels):
+def _device(name: str | None):
     from ..training.train import pick_device
-    from .kernels import COLUMNS, bench_kernels
-    from .splats import parse_size
 
-    device = pick_device(asked.device)
-    default = {"cuda": "50k@400x400,200k@800x800,1M@1600x1200", "cpu": "5k@200x200,20k@200x200"}[device.type]
-    sizes = [parse_size(item) for item in (asked.sizes or default).split(",")]
-    channels = numbers("--channels", asked.channels, int, least=1)
-    return bench_kernels(sizes, channels, device, peers=asked.peers, **_timed(asked)), COLUMNS
-
-
-def _step(asked: Step):
-    from ..training.train import pick_device
-    from .splats import parse_size
-    from .step import COLUMNS, bench_step
-
-    device = pick_device(asked.device)
-    size = parse_size(asked.size or {"cuda": "100k@400x400", "cpu": "20k@200x200"}[device.type])
-    return bench_step(size, device, presets=_words(asked.preset), **_timed(asked)), COLUMNS
-
-
-def _scale(asked: Scale):
-    from ..training.train import pick_device
-    from .scale import COLUMNS, bench_scale
-
-    device, names = pick_device(asked.device), _words(asked.sweeps)
-    return bench_scale(names, device, peers=asked.peers, small=asked.small, **_timed(asked)), COLUMNS
-
-
-def _training(asked: Training):
-    from ..scene import load_scene
-    from ..training.train import pick_device
-    from .training import COLUMNS, bench_training
-
-    device, iterations = pick_device(asked.device), positive("--iterations", asked.iterations)
-    scene = load_scene(asked.data, max_size=asked.max_size)
-    return bench_training(scene, device, iterations=iterations, seed=asked.seed), COLUMNS
-
-
-def _quality(asked: Quality):
-    import torch
-
-    from .jobs import choose_methods, plan_jobs
-    from .quality import COLUMNS, run_jobs
-    from .results import new_result
-
-    device = asked.device or ("cuda" if torch.cuda.is_available() else "cpu")
-    if device not in ("cpu", "cuda"):
-        raise SehdrError(f"--device {device}: not cpu or cuda; choose among GPUs with CUDA_VISIBLE_DEVICES")
-    lpips = asked.lpips or os.environ.get("SEHDR_LPIPS") or None
-    jobs = plan_jobs(
-        _words(asked.scenes),
-        choose_methods(_words(asked.methods), asked.variant),
-        curves=_words(asked.curves),
-        exposures=numbers("--exposures", asked.exposures, int, least=0),
-        responses=_words(asked.responses),
-        seeds=numbers("--seeds", asked.seeds, int, least=0),
-        iterations=None if asked.iterations is None else positive("--iterations", asked.iterations),
-        max_size=asked.max_size,
-        device=device,
-        judged_by=["lpips"] * (lpips is not None) + ["flip"] * asked.flip,
-    )
-    at_once = positive("--jobs", asked.jobs)
-    weights = None if lpips is None else str(Path(lpips).absolute())
-    rows = run_jobs(jobs, asked.out, device=device, at_once=at_once, slurm=_pairs(asked.slurm), lpips=weights)
-    result = new_result("quality", torch.device(device), {"jobs": asked.jobs})
-    result["rows"] = [row for row in rows if "error" not in row]
-    for row in rows:
-        what = row.get("label") or f"{row['scene']} {row['method']}"
-        result["checks"].append({"what": what, "passed": "error" not in row, "error": row.get("error")})
-    return result, COLUMNS
-
-
-def _responses(asked: Responses):
-    from .response import COLUMNS, CURVES, bench_response
-
-    curves = CURVES if asked.curves is None else _words(asked.curves)
-    exposures = positive("--exposures", asked.exposures)
-    return bench_response(asked.data, curves, exposures=exposures, max_size=asked.max_size, seed=asked.seed), COLUMNS
-
-
-_MEASURES = {
-    Kernels: _kernels,
-    Step: _step,
-    Scale: _scale,
-    Training: _training,
-    Quality: _quality,
-    Responses: _responses,
-}
+    return pick_device(name)
 
 
 def _words(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(item.strip() for item in text.split(",") if item.strip()))
 
 
-def _pairs(text: str | None) -> dict[str, str] | None:
+def _pairs(flag: str, text: str | None) -> dict[str, str] | None:
     if text is None:
         return None
     pairs = [item.partition("=") for item in _words(text)]
     if not all(name and equals for name, equals, _ in pairs):
-        raise InputError(f"--slurm {text}", "not name=value pairs", "write for example --slurm partition=gpu")
+        raise InputError(f"{flag} {text}", "not name=value pairs", f"write for example {flag} partition=gpu")
     return {name: value for name, _, value in pairs}

@@ -18,19 +18,22 @@ from ..training.config import Config
 from ..training.initialization import scene_extent
 from ..training.losses import image_loss
 from .splats import SplatScene
+from .timing import wait
 
 GSPLAT = "gsplat"
 BOUND = 1e-3
 """Largest relative difference of its image, or of a step's loss with it, from ours."""
 
 
-def missing(device: torch.device) -> str | None:
-    """Why gsplat cannot run here, in a line; None where it can."""
+def note_missing(result: dict, device: torch.device) -> bool:
+    """Whether gsplat can run here; a note in the result says why not."""
     if device.type != "cuda":
-        return "gsplat not compared: it needs CUDA"
+        result["notes"].append("gsplat not compared: it needs CUDA")
+        return False
     if importlib.util.find_spec("gsplat") is None:
-        return "gsplat not compared: not installed (pip install gsplat==1.5.3)"
-    return None
+        result["notes"].append("gsplat not compared: not installed (pip install gsplat==1.5.3)")
+        return False
+    return True
 
 
 def rasterize_with_gsplat(
@@ -90,12 +93,12 @@ def train_with_gsplat(scene: Scene, config: Config, device: torch.device, *, ste
         raise SehdrError(f"{scene.name} has no points; the comparison starts both sides from the same ones")
     torch.manual_seed(config.seed)
     densification, rates, schedule = config.densification, config.optimizer, config.schedule
-    extent = scene_extent(scene)
     start = Gaussians.from_points(
         torch.tensor(scene.points, dtype=torch.float32),
         torch.tensor(color_model("display").start(scene.point_colors, None), dtype=torch.float32),
         config.model.harmonics_degree,
     )
+    extent = scene_extent(scene)
     values = {
         "means": (start.means, rates.means * extent),
         "scales": (start.log_scales, rates.log_scales),
@@ -120,26 +123,25 @@ def train_with_gsplat(scene: Scene, config: Config, device: torch.device, *, ste
         refine_every=config.scaled(densification.every), reset_every=reset_every, verbose=False,
     )  # fmt: skip
     state = strategy.initialize_state(scene_scale=extent)
-    views = [_upload(view, device) for view in scene.train_views]
 
-    def render(pose, intrinsics, width, height, degree):
+    def render(view, degree):
         image, _, info = rasterization(
             params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid(),
-            torch.cat([params["sh0"], params["shN"]], 1), pose[None], intrinsics[None], width, height,
-            sh_degree=degree, packed=False, eps2d=LOW_PASS,
+            torch.cat([params["sh0"], params["shN"]], 1), *view.camera, sh_degree=degree, packed=False, eps2d=LOW_PASS,
         )  # fmt: skip
         return image[0], info
 
+    views = [_Uploaded(view, device) for view in scene.train_views]
     order, generator = [], torch.Generator().manual_seed(config.seed)
-    torch.cuda.synchronize(device)
+    wait(device)
     started = time.perf_counter()
     for step in range(steps or schedule.iterations):
         order = order or torch.randperm(len(views), generator=generator).tolist()
-        pose, intrinsics, photo, mask = views[order.pop()]
+        view = views[order.pop()]
         degree = min(step // config.scaled(schedule.harmonics_every), config.model.harmonics_degree)
-        image, info = render(pose, intrinsics, photo.shape[1], photo.shape[0], degree)
+        image, info = render(view, degree)
         strategy.step_pre_backward(params, optimizers, state, step, info)
-        image_loss(image, photo, mask, config.loss.form, config.loss.ssim_weight).backward()
+        image_loss(image, view.photo, view.mask, config.loss.form, config.loss.ssim_weight).backward()
         for optimizer in optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
@@ -147,13 +149,13 @@ def train_with_gsplat(scene: Scene, config: Config, device: torch.device, *, ste
         strategy.step_post_backward(params, optimizers, state, step, info, packed=False)
         if 0 < step < stop and step % reset_every == 0:
             reset_opa(params, optimizers, state, value=2 * densification.prune_opacity)
-    torch.cuda.synchronize(device)
+    wait(device)
     seconds = time.perf_counter() - started
     scores = []
     with torch.no_grad():
-        for pose, intrinsics, photo, mask in (_upload(view, device) for view in scene.test_views):
-            image, _ = render(pose, intrinsics, photo.shape[1], photo.shape[0], degree)
-            scores.append(psnr(image.clamp(0, 1), photo, None if mask is None else mask[..., 0]))
+        for view in (_Uploaded(view, device) for view in scene.test_views):
+            mask = None if view.mask is None else view.mask[..., 0]
+            scores.append(psnr(render(view, degree)[0].clamp(0, 1), view.photo, mask))
     return {
         "psnr_ldr": sum(scores) / len(scores) if scores else None,
         "train_seconds": seconds,
@@ -162,12 +164,15 @@ def train_with_gsplat(scene: Scene, config: Config, device: torch.device, *, ste
     }
 
 
-def _upload(view, device):
-    """Pose [4, 4], intrinsics [3, 3], photo [H, W, 3] and mask [H, W, 1] or None of a view."""
-    camera = view.camera
-    matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
-    pose, intrinsics = (
-        torch.tensor(value, dtype=torch.float32, device=device) for value in (camera.world_to_camera, matrix)
-    )
-    mask = None if view.mask is None else torch.tensor(view.mask, dtype=torch.float32, device=device)[..., None]
-    return pose, intrinsics, torch.tensor(view.image, device=device), mask
+class _Uploaded:
+    """A view on a device: photo [H, W, 3], mask [H, W, 1] or None, and the camera as gsplat takes it."""
+
+    def __init__(self, view, device):
+        def upload(value):
+            return torch.tensor(value, dtype=torch.float32, device=device)
+
+        camera = view.camera
+        matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+        self.camera = upload(camera.world_to_camera)[None], upload(matrix)[None], camera.width, camera.height
+        self.photo = upload(view.image)
+        self.mask = None if view.mask is None else upload(view.mask)[..., None]

@@ -1,22 +1,22 @@
-"""The jobs of `bench quality`: methods, every combination with scenes and exposures, and each job's folder and key."""
+"""The jobs of `bench quality`: every combination of methods with scenes and exposures, each with its folder and key."""
 
 import hashlib
-import itertools
 import json
 import logging
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 from ..errors import InputError, SehdrError
-from ..files import write_json
+from ..response import response_by_name
 from ..scene import embedded_folder, is_embedded
 from ..training.config import REFERENCE_ITERATIONS, Config
-from ..training.config_files import config_to_dict, load_config, override_config, preset_names, toml_value
+from ..training.config_files import config_to_dict, load_config, override_config, preset_names
 
 LOG = logging.getLogger(__name__)
-FORMAT = 2
+FORMAT = 3
 """Version of a job and of its result; others are run again."""
 RESULT, FAILURE = "result.json", "failure.json"
 TESTS, FIRST_TEST = 16, 100
@@ -29,53 +29,6 @@ UPPER_BOUND = "truth"
 """3DGS trained on the HDR truth, which every method is compared with."""
 WITH_TRUTH = ("truth", "paper-truth", "hdr-gs-truth")
 """Presets that see the HDR truth of the training views; no other method does."""
-
-
-@dataclass(frozen=True)
-class Method:
-    """What is trained: a preset (a name, or a TOML file), with overrides of dotted fields where it is a variant."""
-
-    name: str
-    preset: str
-    overrides: dict = field(default_factory=dict)
-
-    @property
-    def sees_truth(self) -> bool:
-        return self.preset in WITH_TRUTH
-
-
-def choose_methods(names: Iterable[str], variants: Sequence[str] = ()) -> list[Method]:
-    """The methods asked for, then their variants `NAME:BASE:field=value,field=value`, values as in TOML.
-
-    Raises:
-        SehdrError: for a name that is none, or comes twice. Fields and values are checked by load_config.
-    """
-    chosen = [_method(name) for name in names] + [_variant(text) for text in variants]
-    if not chosen:
-        raise SehdrError(f"no method is asked for; choose from {', '.join(preset_names())}, or give a variant")
-    for method in chosen:
-        if sum(other.name == method.name for other in chosen) > 1:
-            raise SehdrError(f"method {method.name} is asked for twice; give each variant a name of its own")
-    return chosen
-
-
-def _method(name: str) -> Method:
-    if name in preset_names():
-        return Method(name, name)
-    if name.endswith(".toml") and Path(name).is_file():
-        return Method(Path(name).stem, str(Path(name).absolute()))
-    raise SehdrError(f"method {name!r} is unknown; choose from {', '.join(preset_names())}, or give a TOML file")
-
-
-def _variant(text: str) -> Method:
-    name, _, rest = text.partition(":")
-    base, _, settings = rest.partition(":")
-    # Values may hold commas (lists): a new field starts where a name and an equals sign follow.
-    items = [item.partition("=") for item in re.split(r",(?=\s*[A-Za-z_][\w.]*\s*=)", settings) if item.strip()]
-    if not name or not base or not items or not all(equals for _, equals, _ in items):
-        raise SehdrError(f"--variant {text}: not NAME:BASE:field=value,...; write no-clip:default:loss.clipping=false")
-    overrides = {key.strip(): toml_value(value.strip()) for key, _, value in items}
-    return replace(_method(base), name=name, overrides=overrides)
 
 
 @dataclass(frozen=True)
@@ -98,19 +51,23 @@ class Job:
     def label(self) -> str:
         """The job in words."""
         config = self.config
-        return (
-            f"{config['scene']['name']} {config['curve']} exposure {config['exposure']} {config['method']} "
-            f"{config['response']} seed {config['seed']}"
-        )
+        where = f"{config['scene']['name']} {config['curve']} exposure {config['exposure']}"
+        return f"{where} {config['method']} {config['response']} seed {config['seed']}"
 
     def folder(self, out: Path) -> Path:
         """Readable, with the key at its end."""
         return out / "jobs" / f"{re.sub(r'[^A-Za-z0-9.]+', '-', self.label)[:100].strip('-')}-{self.key}"
 
+    def result(self, out: Path) -> dict | None:
+        """The complete result; None where there is none, or one that was cut short or is another config's."""
+        found = read_json(self.folder(out) / RESULT)
+        whole = isinstance(found, dict) and "figures" in found
+        return found if whole and (found.get("format"), found.get("key")) == (FORMAT, self.key) else None
+
 
 def plan_jobs(
     scenes: Sequence[str],
-    methods: Sequence[Method],
+    methods: Sequence[str],
     *,
     curves: Sequence[str] = ("hdr-nerf",),
     exposures: Sequence[int] = (2,),
@@ -119,34 +76,36 @@ def plan_jobs(
     iterations: int | None = None,
     max_size: int | None = None,
     device: str = "cpu",
-    judged_by: Sequence[str] = (),
+    lpips: bool = False,
 ) -> list[Job]:
     """Every combination. Methods that learn the response have one job for known and blind together; those that take
     nothing from photos have none that is blind.
 
     Args:
-        scenes: folders with HDR truth, or names that load_scene knows. curves: responses that expose the truth.
-        exposures: places in the ladder. iterations: None is the preset's own, or its plan's.
-        device: kind, "cpu" or "cuda". judged_by: further measures, `lpips` and `flip`.
+        scenes: folders with HDR truth, or names that load_scene knows. methods: presets, or TOML files.
+        curves: responses that expose the truth. exposures: places in the ladder.
+        iterations: None is the preset's own, or its plan's. device: kind, "cpu" or "cuda". lpips: whether it is judged.
 
     Raises:
         InputError, SehdrError: for a preset, field, curve or folder that cannot be used, before anything runs.
     """
-    from ..response import response_by_name
-
-    for exposure in exposures:
-        if not 0 <= exposure < EXPOSURES:
-            raise SehdrError(f"exposure {exposure} is not one of 0 to {EXPOSURES - 1}")
-    for response in responses:
-        if response not in (KNOWN, BLIND):
-            raise SehdrError(f"response {response!r} is not one of {KNOWN}, {BLIND}")
-    for note in itertools.chain.from_iterable(response_by_name(curve).notes for curve in curves):
-        LOG.info("%s", note)
+    for asked, known, what in (
+        (exposures, range(EXPOSURES), "exposure {} is not one of 0 to 4"),
+        (responses, (KNOWN, BLIND), "response {!r} is not one of known, blind"),
+    ):
+        for item in asked:
+            if item not in known:
+                raise SehdrError(what.format(item))
+    for curve in curves:
+        for note in response_by_name(curve).notes:
+            LOG.info("%s", note)
     found = {place: {"name": _scene_name(place), "sha256": _digest(place)} for place in dict.fromkeys(scenes)}
     if len({scene["name"] for scene in found.values()}) < len(found):
         raise SehdrError("two scenes have one name; rename a folder so that tables can tell them apart")
+    if len({Path(method).stem for method in methods}) < len(methods):
+        raise SehdrError("two methods have one name; rename a TOML file so that tables can tell them apart")
     jobs = []
-    for method, seed, place, curve, exposure, response in itertools.product(
+    for method, seed, place, curve, exposure, response in product(
         methods, *(dict.fromkeys(items) for items in (seeds, scenes, curves, exposures, responses))
     ):
         config = _training(method, iterations, seed)
@@ -157,57 +116,41 @@ def plan_jobs(
         elif config.loss.ldr_weight == 0 and response == BLIND:
             continue
         named = {KNOWN: curve, BLIND: "auto"}.get(response, config.response.name)
-        trained = override_config(config, {"response.name": named}, method.preset)
+        trained = override_config(config, {"response.name": named}, method)
         decided = {
             "format": FORMAT,
             "scene": found[place] | {"max_size": max_size},
             "curve": curve,
             "curve_sha256": _digest(curve) if Path(curve).is_file() else None,
             "exposure": exposure,
-            "method": method.name,
-            "preset": method.preset,
-            "overrides": method.overrides,
-            "sees_truth": method.sees_truth,
+            "method": Path(method).stem,
+            "sees_truth": method in WITH_TRUTH,
             "response": response,
             "seed": seed,
             "device": device,
-            "judged_by": sorted(judged_by),
+            "lpips": lpips,
             "training": json.loads(json.dumps(config_to_dict(trained))),
         }
         jobs.append(Job(decided, place if is_embedded(place) else str(Path(place).absolute())))
     if not jobs:
-        raise SehdrError("none of the methods makes sense without the response; add known to --responses")
+        raise SehdrError(
+            f"there is nothing to train: choose methods from {', '.join(preset_names())}; those that take nothing from "
+            "photos need known in --responses"
+        )
     return jobs
 
 
-def _training(method: Method, iterations: int | None, seed: int) -> Config:
+def _training(method: str, iterations: int | None, seed: int) -> Config:
     """The method's training, tested on a log scale of its length; what is stated is no plan's to change."""
-    stated = method.overrides | ({} if iterations is None else {"schedule.iterations": iterations})
+    stated = {} if iterations is None else {"schedule.iterations": iterations}
     steps = {max(1, round(REFERENCE_ITERATIONS * FIRST_TEST ** (-k / (TESTS - 1)))) for k in range(TESTS)}
-    config = load_config(method.preset, {"seed": seed, **stated})
+    config = load_config(method, {"seed": seed, **stated})
     times = {"schedule.evaluate_at": sorted(steps), "schedule.checkpoint_every": REFERENCE_ITERATIONS}
-    keep = sorted({*config.plan.keep, *stated, "response.name"})
-    return override_config(config, times | {"plan.keep": keep}, method.preset)
+    return override_config(config, times | {"plan.keep": sorted({*config.plan.keep, *stated, "response.name"})}, method)
 
 
-def read_result(folder: Path) -> dict | None:
-    """The job's complete result; None where there is none, or one that was cut short or is another config's."""
-    result = _read_json(folder / RESULT)
-    whole = isinstance(result, dict) and result.get("format") == FORMAT and "figures" in result
-    return result if whole and folder.name.endswith(str(result.get("key"))) else None
-
-
-def read_failure(folder: Path) -> dict | None:
-    """Why the last attempt of a job failed: {"run", "error"}; None if it did not."""
-    failure = _read_json(folder / FAILURE)
-    return failure if isinstance(failure, dict) and isinstance(failure.get("error"), str) else None
-
-
-def write_failure(folder: Path, run: str, error: str) -> None:
-    write_json(folder / FAILURE, {"run": run, "error": " ".join(error.split())[:1000]}, overwrite=True)
-
-
-def _read_json(path: Path):
+def read_json(path: Path):
+    """What a JSON file holds; None where it is missing or damaged."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -221,12 +164,10 @@ def _scene_name(place: str) -> str:
 def _digest(place: str) -> str:
     """A hash of a file, or of all files of a folder or embedded scene with their names."""
     folder = embedded_folder(place) if is_embedded(place) else Path(place)
-    if folder.is_file():
-        return hashlib.sha256(folder.read_bytes()).hexdigest()
-    if not folder.is_dir():
+    if not folder.exists():
         raise InputError(place, "no such folder", "give folders with HDR truth, or embedded")
     digest = hashlib.sha256()
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+    for path in sorted(path for path in [folder, *folder.rglob("*")] if path.is_file()):
         digest.update(str(path.relative_to(folder)).encode() + b"\0")
         with open(path, "rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())

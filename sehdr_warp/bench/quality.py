@@ -1,39 +1,41 @@
 """`bench quality`: every job trained and evaluated once, several at a time, and their results as rows."""
 
 import contextlib
-import gc
 import logging
-import secrets
 import shutil
-import time
 import traceback
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import cycle
 from pathlib import Path
 
+import torch
 from filelock import FileLock, Timeout
 
 from ..errors import InputError, SehdrError
+from ..evaluation.evaluate import evaluate
 from ..files import write_json
+from ..response import response_by_name
 from ..scene import Scene, load_scene
-from .jobs import EXPOSURES, FACTOR, FAILURE, FORMAT, RESULT, Job, read_failure, read_result, write_failure
+from ..synth.expose import expose, exposure_ladder
+from ..training.config import Config
+from ..training.config_files import config_from_dict, override_config
+from ..training.train import train
+from .jobs import EXPOSURES, FACTOR, FAILURE, FORMAT, RESULT, Job, read_json
+from .timing import Variant, forget_peaks, time_variants
 
 LOG = logging.getLogger(__name__)
 WARM_UP_ITERATIONS = 30
 """Of a training that is thrown away before the first of its kind in a process: kernels are compiled and loaded, on a
 GPU steps are recorded. All schedules scale with the length, so every part of a training is in it."""
-NEAR_FINAL = 0.1
-"""dB below the final held-out figure that count as reaching it."""
-RENDER_SECONDS, RENDERS = 1.0, 100
-"""A render is timed for so long or so often, whichever ends first."""
 LONGEST_DAYS = 30
 COLUMNS = {
     "scene": "", "curve": "", "exposure": "d", "method": "", "response": "", "seed": "d", "gt-max dB=gt_max": ".2f",
     "aligned dB=aligned": ".2f", "SSIM=ssim": ".4f", "LDR dB=ldr": ".2f", "clipped=clipped": ".2f",
     "well-exposed=well_exposed": ".2f", "seconds": ".1f", "MiB=peak_memory_bytes": "MiB", "Gaussians=gaussians": ",d",
-    "error": "",
 }  # fmt: skip
+_warm: set[str] = set()
 
 
 def run_jobs(
@@ -53,19 +55,20 @@ def run_jobs(
         slurm: parameters of SLURM jobs such as {"partition": "gpu"}, None for this machine.
         lpips: folder of weights.
     """
-    run = secrets.token_hex(8)
-    open_jobs = [job for job in jobs if read_result(job.folder(out)) is None]
+    open_jobs = [job for job in jobs if job.result(out) is None]
     LOG.info("%d jobs, %d of them to do", len(jobs), len(open_jobs))
+    for job in open_jobs:
+        (job.folder(out) / FAILURE).unlink(missing_ok=True)
     at_once = max(1, min(at_once, len(open_jobs)))
     if open_jobs and at_once == 1 and slurm is None:
-        work(open_jobs, out, run, device, 1, lpips)
+        work(open_jobs, out, device, 1, lpips)
     elif open_jobs:
-        _submit(open_jobs, out, run, device, at_once, slurm, lpips)
+        _submit(open_jobs, out, device, at_once, slurm, lpips)
     rows = []
     for job in jobs:
-        result, failure = read_result(job.folder(out)), read_failure(job.folder(out))
-        lost = {"label": job.label, "error": failure["error"] if failure else "no worker was left to run it"}
-        rows.append(row_of(result) if result else lost)
+        result, failure = job.result(out), read_json(job.folder(out) / FAILURE) or {}
+        error = failure.get("error", "no worker was left to run it")
+        rows.append(row_of(result) if result else {"label": job.label, "error": error})
     return rows
 
 
@@ -73,7 +76,7 @@ def row_of(result: dict) -> dict:
     """A result as one flat row: what was trained, its figures, and its held-out tests as [seconds, dB]."""
     config, figures = result["config"], result["figures"]
     hdr, regions = figures["protocol"], figures["regions"]
-    names = ("curve", "exposure", "method", "preset", "overrides", "sees_truth", "response", "seed", "device")
+    names = ("curve", "exposure", "method", "sees_truth", "response", "seed", "device")
     return {
         "scene": config["scene"]["name"],
         **{name: config[name] for name in names},
@@ -83,7 +86,6 @@ def row_of(result: dict) -> dict:
         "aligned": hdr["aligned"]["psnr_mu"],
         "ssim": hdr["gt-max"]["ssim_mu"],
         "lpips": hdr["gt-max"]["lpips_mu"],
-        "flip": hdr["gt-max"].get("hdr_flip"),
         "ldr": figures["ldr"]["psnr"],
         "clipped": regions["clipped"]["psnr_mu"]["aligned"],
         "well_exposed": regions["well-exposed"]["psnr_mu"]["aligned"],
@@ -92,7 +94,6 @@ def row_of(result: dict) -> dict:
         "confidence": figures["confidence"]["spearman_log2"],
         "chosen": figures["response"],
         "seconds": figures["train_seconds"],
-        "seconds_to_final": figures["seconds_to_final"],
         "peak_memory_bytes": figures["peak_memory_bytes"],
         "gaussians": figures["gaussians"],
         "renders_per_second": figures["renders_per_second"],
@@ -101,7 +102,7 @@ def row_of(result: dict) -> dict:
     }
 
 
-def _submit(jobs, out: Path, run: str, device: str, at_once: int, slurm: dict | None, lpips: str | None) -> None:
+def _submit(jobs, out: Path, device: str, at_once: int, slurm: dict | None, lpips: str | None) -> None:
     """Workers by submitit, each taking job after job; returns when all have ended."""
     try:
         import submitit
@@ -110,149 +111,104 @@ def _submit(jobs, out: Path, run: str, device: str, at_once: int, slurm: dict | 
             "submitit starts several jobs at once and is not installed; pip install 'sehdr-warp[slurm]', or take "
             "--jobs 1"
         ) from None
-    gpus = 0
-    if device == "cuda" and slurm is None:
-        import torch
-
-        gpus = torch.cuda.device_count()
-    submitted = []
-    for worker in range(at_once):
+    gpus = torch.cuda.device_count() if device == "cuda" and slurm is None else 0
+    shared = -(-at_once // gpus) if gpus else at_once if slurm is None else 1
+    workers = []
+    for index in range(at_once):
         executor = submitit.AutoExecutor(folder=out / "logs", cluster="local" if slurm is None else "slurm")
         executor.update_parameters(timeout_min=LONGEST_DAYS * 24 * 60, name="sehdr-warp")
         if gpus:
-            executor.update_parameters(gpus_per_node=1, visible_gpus=[worker % gpus])
+            executor.update_parameters(gpus_per_node=1, visible_gpus=[index % gpus])
         elif slurm is not None:
             one = {"gpus_per_node": 1} if device == "cuda" else {}
-            own = {f"slurm_{key}" if key != "timeout_min" else key: value for key, value in slurm.items()}
+            own = {key if key == "timeout_min" else f"slurm_{key}": value for key, value in slurm.items()}
             executor.update_parameters(**one, **own)
-        shared = -(-at_once // gpus) if gpus else at_once if slurm is None else 1
-        submitted.append(executor.submit(work, jobs, out.absolute(), run, device, shared, lpips))
+        workers.append(executor.submit(work, jobs, out.absolute(), device, shared, lpips))
     try:
-        for job in submitted:
-            job.wait()
-            if error := job.exception():
+        for worker in workers:
+            worker.wait()
+            if error := worker.exception():
                 LOG.warning("a worker ended early: %s", str(error).strip().splitlines()[-1])
     except BaseException:
-        for job in submitted:
-            job.cancel()
+        for worker in workers:
+            worker.cancel()
         raise
 
 
-def work(jobs: Sequence[Job], out: Path, run: str, device: str, shared_by: int, lpips: str | None) -> None:
+def work(jobs: Sequence[Job], out: Path, device: str, shared_by: int, lpips: str | None) -> None:
     """A worker: takes the jobs that nobody is at, one after the other. Whoever holds the lock of a job's folder is at
     it; the operating system lets go of it when a worker dies, however it dies."""
-    runner = Runner("cuda:0" if device == "cuda" else device, shared_by=shared_by, lpips=lpips)
     for job in jobs:
         folder = job.folder(out)
         folder.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(Timeout), FileLock(folder / "lock", timeout=0):
-            if read_result(folder) is not None or (read_failure(folder) or {}).get("run") == run:
+            if job.result(out) is not None or (folder / FAILURE).exists():
                 continue
-            # Stays if this process is killed: then no other worker of this run tries, and dies, again.
-            write_failure(folder, run, "its process ended without a result")
+            # Stays if this process is killed: then no other worker tries, and dies, again.
+            _write_failure(folder, "its process ended without a result")
             try:
-                write_json(folder / RESULT, runner.run(job, folder), overwrite=True)
-                (folder / FAILURE).unlink(missing_ok=True)
+                result = run_job(job, folder, "cuda:0" if device == "cuda" else device, lpips)
+                write_json(folder / RESULT, result | {"shared_by": shared_by}, overwrite=True)
+                (folder / FAILURE).unlink()
                 LOG.info("%s: done", job.label)
             except SehdrError as error:
-                write_failure(folder, run, str(error))
+                _write_failure(folder, str(error))
             except Exception as error:
                 traceback.print_exc()
-                write_failure(folder, run, f"{type(error).__name__}: {error}")
+                _write_failure(folder, f"{type(error).__name__}: {error}")
                 if device == "cuda":
                     raise  # the device may be spoilt for this process; other workers go on
 
 
-class Runner:
-    """Runs jobs in this process; scenes, photos and kernels are kept from job to job."""
+def _write_failure(folder: Path, error: str) -> None:
+    write_json(folder / FAILURE, {"error": " ".join(error.split())[:1000]}, overwrite=True)
 
-    def __init__(self, device: str, *, shared_by: int = 1, lpips: str | None = None):
-        self.device, self.shared_by, self.lpips = device, shared_by, lpips
-        self._warm: set[str] = set()
 
-    def run(self, job: Job, folder: Path) -> dict:
-        """Trains, evaluates and returns the result as it is to be written.
+def run_job(job: Job, folder: Path, device: str, lpips: str | None) -> dict:
+    """Trains, evaluates and returns the result as it is to be written. Scenes, photos and kernels stay for the next.
 
-        Raises:
-            SehdrError: where the scene has no truth, the training diverges, or a file cannot be used.
-        """
-        from ..evaluation.evaluate import evaluate
-        from ..training.config_files import config_from_dict
-        from ..training.train import train
+    Raises:
+        SehdrError: where the scene has no truth, the training diverges, or a file cannot be used.
+    """
+    config, out = job.config, folder / "run"
+    scene, training = exposed(job), config_from_dict(job.config["training"], job.label)
+    # A method that learns from photos alone sees no truth in the training views.
+    views = tuple(replace(view, hdr=None) if view.split == "train" else view for view in scene.views)
+    shown = scene if config["sees_truth"] else replace(scene, views=views)
+    _warm_up(shown, training, folder / "warm-up", device)
+    shutil.rmtree(out, ignore_errors=True)
+    forget_peaks(torch.device(device))
+    run = train(shown, out, training, device=device)
+    peak = torch.cuda.max_memory_allocated(device) if device.startswith("cuda") else None
+    figures = evaluate(run, scene, lpips_weights=lpips if config["lpips"] else None)
+    figures.pop("views")
+    figures |= {
+        "response": run.response.name,
+        "peak_memory_bytes": peak,
+        "renders_per_second": _render_rate(run, scene),
+    }
+    curve = run.metrics()
+    shutil.rmtree(out, ignore_errors=True)
+    return {"format": FORMAT, "key": job.key, "config": config, "figures": figures, "curve": curve}
 
-        config, out = job.config, folder / "run"
-        scene = exposed(job)
-        shown = scene if config["sees_truth"] else without_training_truth(scene)
-        training = config_from_dict(config["training"], job.label)
-        self._warm_up(shown, training, folder)
-        shutil.rmtree(out, ignore_errors=True)
-        self._forget_peaks()
-        run = train(shown, out, training, device=self.device)
-        peak = self._peak_memory()
-        weights = self.lpips if "lpips" in config["judged_by"] else None
-        figures = evaluate(run, scene, lpips_weights=weights, flip="flip" in config["judged_by"])
-        figures.pop("views")
-        curve = run.metrics()
-        figures |= {
-            "response": run.response.name,
-            "seconds_to_final": seconds_to_final(curve, run.train_seconds),
-            "peak_memory_bytes": peak,
-            "renders_per_second": self._render_rate(run, scene),
-        }
-        shutil.rmtree(out, ignore_errors=True)
-        return {"format": FORMAT, "key": job.key, "label": job.label, "shared_by": self.shared_by, "config": config,
-                "figures": figures, "curve": curve}  # fmt: skip
 
-    def _warm_up(self, scene: Scene, config, folder: Path) -> None:
-        from ..training.config_files import override_config
-        from ..training.train import train
+def _warm_up(scene: Scene, config: Config, scratch: Path, device: str) -> None:
+    # What is compiled depends on the shape of the computation, not on seeds, rates or lengths.
+    shape = repr((config.model, config.response.name == "learned", config.fusion, config.densification.strategy))
+    if shape not in _warm:
+        short = override_config(config, {"schedule.iterations": WARM_UP_ITERATIONS, "plan.enabled": False})
+        shutil.rmtree(scratch, ignore_errors=True)
+        train(scene, scratch, short, device=device)
+        shutil.rmtree(scratch, ignore_errors=True)
+        _warm.add(shape)
 
-        # What is compiled depends on the shape of the computation, not on seeds, rates or lengths.
-        shape = repr((config.model, config.response.name == "learned", config.fusion, config.densification.strategy))
-        if shape in self._warm:
-            return
-        short = {"schedule.iterations": WARM_UP_ITERATIONS, "plan.enabled": False}
-        scratch = folder / "warm-up"
-        try:
-            shutil.rmtree(scratch, ignore_errors=True)
-            train(scene, scratch, override_config(config, short), device=self.device)
-        finally:
-            shutil.rmtree(scratch, ignore_errors=True)
-        self._warm.add(shape)
 
-    def _forget_peaks(self) -> None:
-        gc.collect()
-        if self.device.startswith("cuda"):
-            import torch
-
-            torch.cuda.init()  # before a first use torch has no peaks to forget, and says so by an error
-            torch.cuda.empty_cache()
-            torch.cuda.reset_peak_memory_stats(self.device)
-
-    def _peak_memory(self) -> int | None:
-        """Bytes of torch's tensors on a GPU; None on the CPU."""
-        import torch
-
-        return torch.cuda.max_memory_allocated(self.device) if self.device.startswith("cuda") else None
-
-    def _render_rate(self, run, scene: Scene) -> float:
-        """HDR renders of held-out views per second, called one after the other."""
-        import torch
-
-        from .timing import wait
-
-        device = torch.device(self.device)
-        cameras = [view.camera for view in scene.test_views or scene.train_views]
-        with torch.no_grad():
-            for camera in cameras[:3]:
-                run.render(camera)
-            wait(device)
-            started, count = time.perf_counter(), 0
-            while count < RENDERS and time.perf_counter() - started < RENDER_SECONDS:
-                run.render(cameras[count % len(cameras)])
-                wait(device)
-                count += 1
-        return count / (time.perf_counter() - started)
+@torch.no_grad()
+def _render_rate(run, scene: Scene) -> float:
+    """HDR renders of held-out views per second, called one after the other."""
+    cameras = cycle([view.camera for view in scene.test_views or scene.train_views])
+    variant = Variant(lambda: run.render(next(cameras)))
+    return 1e3 / time_variants({"render": variant}, run.device, budget=1.0)["render"]["mean_ms"]
 
 
 def exposed(job: Job) -> Scene:
@@ -263,9 +219,6 @@ def exposed(job: Job) -> Scene:
 
 @lru_cache(maxsize=8)
 def _exposed(place: str, max_size: int | None, curve: str, exposure: int) -> Scene:
-    from ..response import response_by_name
-    from ..synth.expose import expose, exposure_ladder
-
     truth, response = _true_scene(place, max_size), response_by_name(curve)
     return expose(truth, response, exposure_ladder(truth, response, EXPOSURES, FACTOR)[exposure])
 
@@ -279,19 +232,3 @@ def _true_scene(place: str, max_size: int | None) -> Scene:
             problem = f"view {view.name} has no HDR truth"
             raise InputError(place, problem, "only scenes with truth in every view can be benchmarked")
     return scene
-
-
-def without_training_truth(scene: Scene) -> Scene:
-    """The scene as a method that learns from photos alone may see it: no truth in the training views."""
-    return replace(scene, views=tuple(replace(v, hdr=None) if v.split == "train" else v for v in scene.views))
-
-
-def seconds_to_final(curve: Sequence[dict], total: float) -> float:
-    """The first test from which on the held-out HDR figure stays within 0.1 dB of the last; else the LDR one."""
-    key = "psnr_mu" if all("psnr_mu" in line for line in curve) else "psnr_ldr"
-    reached = total
-    for line in reversed(curve):
-        if line.get(key) is None or line[key] < curve[-1][key] - NEAR_FINAL:
-            break
-        reached = line["seconds"]
-    return min(reached, total)

@@ -18,46 +18,46 @@ RESULTS, TRIED = "results", "tried.csv"
 
 @dataclass(frozen=True)
 class Page:
-    """A report on results/NAME.json: its text, the tables of a result, and the plots, each (ending, title, draw)."""
+    """A report on results/NAME.json: its text, the tables of a result, and a plot with its caption."""
 
     name: str
     title: str
     text: str
     tables: Callable[[dict], Iterable[str]]
-    plots: tuple[tuple[str, str, Callable[[dict, Path], None]], ...] = ()
+    caption: str = ""
+    draw: Callable[[dict, Path], None] | None = None
 
 
 def write_reports(folder: Path) -> list[Path]:
-    """Writes a page, with its plots, for each result in folder/results and for folder/tried.csv, and an index.
+    """Writes a page, with its plot, for each result in folder/results and for folder/tried.csv, and an index.
 
     Raises:
         InputError: for a folder without results, and for a result that cannot be read.
     """
-    found = {page.name: folder / RESULTS / f"{page.name}.json" for page in PAGES}
-    if not any(path.is_file() for path in found.values()):
+    pages = {page: folder / RESULTS / f"{page.name}.json" for page in PAGES}
+    pages = {page: path for page, path in pages.items() if path.is_file()}
+    if not pages:
         raise InputError(folder, "holds no results", "name the folder with results/*.json, such as docs/reports")
     written, index = [], []
-    for page in PAGES:
-        if not found[page.name].is_file():
-            continue
-        result = _read(found[page.name])
+    for page, path in pages.items():
+        result = _read(path)
+        machine = result["machine"]
         parts = [f"# {page.title}", page.text, f"```sh\n{result['command']}\n```", machine_line(result) + "."]
-        for ending, title, draw in page.plots:
-            picture = folder / f"{page.name}{ending}.png"
-            with atomic_path(picture, overwrite=True) as path:
-                draw(result, path)
+        if page.draw:
+            picture = folder / f"{page.name}.png"
+            with atomic_path(picture, overwrite=True) as temporary:
+                page.draw(result, temporary)
             written.append(picture)
-            parts.append(f"![{title}]({picture.name})")
-        parts += [*page.tables(result), *result["notes"]]
-        written.append(_write(folder / f"{page.name}.md", parts))
-        index.append({"report": f"[{page.title}]({page.name}.md)", "machine": _short_machine(result)})
+            parts.append(f"![{page.caption}]({picture.name})")
+        written.append(_write(folder / f"{page.name}.md", [*parts, *page.tables(result), *result["notes"]]))
+        name = machine["gpu"]["name"] if machine["gpu"] else f"{machine['cpu']}, {machine['cores']} cores"
+        index.append({"report": f"[{page.title}]({page.name}.md)", "machine": name})
     if (folder / TRIED).is_file():
         written.append(_write(folder / "tried.md", _tried_page(folder / TRIED)))
         index.append({"report": "[Tried and lost](tried.md)"})
     text = "What was measured. `sehdr-warp bench report` makes these pages of `results/*.json` and `tried.csv`."
-    columns = {"report": "", "machine": ""}
-    written.append(_write(folder / "README.md", ["# Reports", text, markdown_table(index, columns)]))
-    return written
+    table = markdown_table(index, {"report": "", "machine": ""})
+    return [*written, _write(folder / "README.md", ["# Reports", text, table])]
 
 
 def _read(path: Path) -> dict:
@@ -76,43 +76,27 @@ def _write(path: Path, parts: Sequence[str]) -> Path:
     return path
 
 
-def _short_machine(result: dict) -> str:
-    return (result["machine"]["gpu"] or {}).get(
-        "name"
-    ) or f"{result['machine']['cpu']}, {result['machine']['cores']} cores"
+def _groups(rows: Iterable[dict], *fields: str) -> dict[tuple, list[dict]]:
+    """Rows by the values of these fields, in the order of their first."""
+    groups: dict[tuple, list[dict]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[field] for field in fields), []).append(row)
+    return groups
 
 
-def _unique(rows: Iterable[dict], *fields: str) -> list[tuple]:
-    return list(dict.fromkeys(tuple(row[field] for field in fields) for row in rows))
-
-
-def _chosen(rows: Iterable[dict], **values) -> list[dict]:
-    return [row for row in rows if all(row[field] == value for field, value in values.items())]
-
-
-def _pivot(rows: Sequence[dict], place: Sequence[str], over: str, value: str) -> tuple[list[dict], list[str]]:
-    """Rows of one place each, with the value of each `over` as a field of its name; and these names."""
-    names = [name for (name,) in _unique(rows, over)]
-    made = []
-    for key in _unique(rows, *place):
-        here = dict(zip(place, key, strict=True))
-        made.append(here | {row[over]: row[value] for row in _chosen(rows, **here)})
-    return made, names
-
-
-_SIZE = {"Gaussians=gaussians": ",d", "width": "d", "height": "d"}
+def _pivot(rows: Sequence[dict], places: dict[str, str], over: str, value: str, form: str) -> str:
+    """A table with a row for each place, and a column for the value of each `over`. places: as columns of a table."""
+    fields = [key.partition("=")[2] or key for key in places]
+    found = _groups(rows, *fields).items()
+    made = [dict(zip(fields, key, strict=True)) | {row[over]: row[value] for row in here} for key, here in found]
+    return markdown_table(made, places | dict.fromkeys((row[over] for row in rows), form))
 
 
 def _kernel_tables(result: dict) -> Iterable[str]:
-    for (passing,) in _unique(result["rows"], "pass"):
-        rows, names = _pivot(
-            _chosen(result["rows"], **{"pass": passing}),
-            ("gaussians", "width", "height", "channels"),
-            "implementation",
-            "median_ms",
-        )
+    places = {"Gaussians=gaussians": ",d", "width": "d", "height": "d", "C=channels": "d"}
+    for (passing,), rows in _groups(result["rows"], "pass").items():
         yield f"## {passing.capitalize()}, median ms"
-        yield markdown_table(rows, _SIZE | {"C=channels": "d"} | dict.fromkeys(names, ".3f"))
+        yield _pivot(rows, places, "implementation", "median_ms", ".3f")
     yield _checks_line(result)
 
 
@@ -126,14 +110,12 @@ def _step_tables(result: dict) -> Iterable[str]:
 def _scale_tables(result: dict) -> Iterable[str]:
     from .scale import COLUMNS
 
-    for (sweep,) in _unique(result["rows"], "sweep"):
+    for (sweep,), rows in _groups(result["rows"], "sweep").items():
         yield f"## Over {sweep}"
-        yield markdown_table(_chosen(result["rows"], sweep=sweep), {k: v for k, v in COLUMNS.items() if k != "sweep"})
+        yield markdown_table(rows, {key: form for key, form in COLUMNS.items() if key != "sweep"})
     yield "## Slopes of the logarithms, whole and at the large end"
-    fields = ("sweep", "rasterizer=implementation", "what", "quantity")
-    yield markdown_table(
-        result["slopes"], dict.fromkeys(fields, "") | {"slope": ".2f", "at the large end=slope_large": ".2f"}
-    )
+    columns = dict.fromkeys(("sweep", "rasterizer=implementation", "what", "quantity"), "")
+    yield markdown_table(result["slopes"], columns | {"slope": ".2f", "at the large end=slope_large": ".2f"})
     yield _checks_line(result)
 
 
@@ -151,32 +133,27 @@ _QUALITY = {
 
 
 def _quality_tables(result: dict) -> Iterable[str]:
-    rows = result["rows"]
-    places = ("scene", "curve", "exposure", "seed", "device")
-    bounds = {tuple(row[p] for p in places): row["gt_max"] for row in rows if row["method"] == UPPER_BOUND}
-    for curve, response in _unique([row for row in rows if row["response"] != LEARNED], "curve", "response"):
+    rows, places = result["rows"], ("scene", "curve", "exposure", "seed", "device")
+    bounds = _groups([row for row in rows if row["method"] == UPPER_BOUND], *places)
+    for row in rows:
+        (bound, *_) = bounds.get(tuple(row[field] for field in places), [row])
+        row["to_bound"] = None if bound is row else row["gt_max"] - bound["gt_max"]
+    for curve, response in _groups([row for row in rows if row["response"] != LEARNED], "curve", "response"):
         members = [row for row in rows if row["curve"] == curve and row["response"] in (response, LEARNED)]
-        yield f"## Curve {curve}, response {response}"
         table = []
-        for (method,) in _unique(members, "method"):
-            mine = _chosen(members, method=method)
-            pairs = [(row["gt_max"], bounds.get(tuple(row[p] for p in places))) for row in mine]
-            gains = [value - bound for value, bound in pairs if None not in (value, bound)]
+        for (method,), mine in _groups(members, "method").items():
             line = {"method": method, "n": len(mine), "worst": min(row["gt_max"] for row in mine)}
-            line["to_bound"] = fmean(gains) if gains and method != UPPER_BOUND else None
             for field in (key.partition("=")[2] or key for key in _QUALITY):
-                if field in mine[0] and field not in line:
-                    values = [row[field] for row in mine if row[field] is not None]
-                    line[field] = fmean(values) if values else None
+                values = [row[field] for row in mine if field not in line and row[field] is not None]
+                line |= {field: fmean(values)} if values else {}
             table.append(line)
+        yield f"## Curve {curve}, response {response}"
         yield markdown_table(table, _QUALITY)
         yield "gt-max by scene and exposure, mean over seeds, dB:"
-        means = []
-        for key in _unique(members, "scene", "exposure", "method"):
-            here = dict(zip(("scene", "exposure", "method"), key, strict=True))
-            means.append(here | {"dB": fmean(row["gt_max"] for row in _chosen(members, **here))})
-        by_scene, names = _pivot(means, ("scene", "exposure"), "method", "dB")
-        yield markdown_table(by_scene, {"scene": "", "exposure": "d"} | dict.fromkeys(names, ".2f"))
+        fields = ("scene", "exposure", "method")
+        groups = _groups(members, *fields).items()
+        means = [dict(zip(fields, key)) | {"dB": fmean(row["gt_max"] for row in here)} for key, here in groups]
+        yield _pivot(means, {"scene": "", "exposure": "d"}, "method", "dB", ".2f")
     shared = max(row["shared_by"] for row in rows)
     if shared > 1:
         yield f"{shared} trainings shared a device: seconds and renders / s are those of a shared one."
@@ -189,43 +166,33 @@ def _response_tables(result: dict) -> Iterable[str]:
 
 
 def _stability_tables(result: dict) -> Iterable[str]:
-    readings = [
-        {"group": row["group"], "case": row["case"]} | reading | {"part": (reading["error"] or 0) / reading["bound"]}
-        for row in result["rows"]
-        for reading in row["readings"]
-        if reading["bound"] > 0
-    ]
     groups = []
-    for (group,) in _unique(result["rows"], "group"):
-        mine = _chosen(readings, group=group)
-        cases = _chosen(result["rows"], group=group)
-        line = {"group": group, "cases": len(cases), "bounds": sum(len(row["readings"]) for row in cases)}
-        if mine:
-            worst = max(mine, key=lambda reading: reading["part"])
-            line |= {"median": median(reading["part"] for reading in mine), "worst": worst["part"]}
-            line["which"] = f"{worst['case']}: {worst['quantity']}"
+    for (group,), cases in _groups(result["rows"], "group").items():
+        readings = [(case["case"], reading) for case in cases for reading in case["readings"]]
+        parts = [((r["error"] or 0) / r["bound"], f"{case}: {r['quantity']}") for case, r in readings if r["bound"] > 0]
+        line = {"group": group, "cases": len(cases), "bounds": len(readings)}
+        if parts:
+            line["worst"], line["which"] = max(parts, key=lambda part: part[0])
+            line["median"] = median(part for part, _ in parts)
         groups.append(line)
-    yield "Errors over their bounds:"
-    yield markdown_table(
-        groups, {"group": "", "cases": "d", "bounds": "d", "median": ".2f", "worst": ".2f", "which": ""}
-    )
-    yield markdown_table(result["rows"], {"case": "", "what": "", "note": ""})
+    columns = {"group": "", "cases": "d", "bounds": "d", "median": ".2f", "worst": ".2f", "which": ""}
     failed = [row["case"] for row in result["rows"] if not row["holds"]]
+    yield "Errors over their bounds:"
+    yield markdown_table(groups, columns)
+    yield markdown_table(result["rows"], {"case": "", "what": "", "note": ""})
     yield f"Failed: {', '.join(failed)}." if failed else "All bounds hold."
 
 
 def _tried_page(path: Path) -> list[str]:
     with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+        topics = _groups(csv.DictReader(file), "topic")
     columns = {"option": "", "idea": "", "gave": "", "on": ""}
     text = (
         "Ideas that were built, measured and taken out again, or never turned on. dB are differences in held-out "
         "mu-law PSNR under `gt-max` to the same training without, where nothing else is said; 0.2 dB are within chance."
     )
-    parts = ["# Tried and lost", text]
-    for (topic,) in _unique(rows, "topic"):
-        parts += [f"## {topic}", markdown_table(_chosen(rows, topic=topic), columns)]
-    return parts
+    tables = [part for (topic,), rows in topics.items() for part in (f"## {topic}", markdown_table(rows, columns))]
+    return ["# Tried and lost", text, *tables]
 
 
 PAGES = (
@@ -238,7 +205,8 @@ PAGES = (
         "the photo, aligned; *LDR* is the simulated photo. *known*: the method is told the curve; *blind*: it is not; "
         "methods that learn the response stand in both. Exposures are numbered from the shortest, four times apart.",
         _quality_tables,
-        (("", "Held-out HDR error over training time", plots.plot_quality),),
+        "Held-out HDR error over training time",
+        plots.plot_quality,
     ),
     Page(
         "kernels",
@@ -247,7 +215,8 @@ PAGES = (
         "graph, as inside a training step; *RecordedRasterizer*: called from Python, two graphs behind each call; "
         "without a word: `rasterize()` called from Python, whose launches set the pace of small scenes on a GPU.",
         _kernel_tables,
-        (("", "Median times over channels", plots.plot_kernels),),
+        "Median times over channels",
+        plots.plot_kernels,
     ),
     Page(
         "step",
@@ -263,7 +232,8 @@ PAGES = (
         "One quantity varied, the others held. Splats are forward and backward, called from Python; steps are of the "
         "preset `paper`, nine channels in one pass, without densification; gsplat's are the same with its rasterizer.",
         _scale_tables,
-        (("", "Time and peak memory over what is varied", plots.plot_scale),),
+        "Time and peak memory over what is varied",
+        plots.plot_scale,
     ),
     Page(
         "response",
@@ -279,6 +249,7 @@ PAGES = (
         "Stiff and extreme cases in float32 against float64. A bound is what disturbing every number between stages by "
         "8 units of float32's rounding does to the float64 result (Monte Carlo arithmetic, Parker 1997).",
         _stability_tables,
-        (("", "Error against float64 over four axes; dotted: bounds", plots.plot_stability),),
+        "Error against float64 over four axes; dotted: bounds",
+        plots.plot_stability,
     ),
 )

@@ -1,7 +1,7 @@
 """The plots of `bench report`: matplotlib figures that need no display, saved small."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import cycle
 from pathlib import Path
 
@@ -16,13 +16,13 @@ SMALLEST = 2.0**-28
 def plot_kernels(result: dict, path: Path) -> None:
     """Median times over channels: a panel for each size, a line for each implementation, forward and backward."""
     rows = [row for row in result["rows"] if row["pass"] != "forward"]
-    sizes = list(dict.fromkeys((row["gaussians"], row["width"], row["height"]) for row in rows))
+    sizes = _unique((row["gaussians"], row["width"], row["height"]) for row in rows)
     figure, (panels,) = _panels(1, len(sizes))
     for axes, size in zip(panels, sizes, strict=True):
         here = [row for row in rows if (row["gaussians"], row["width"], row["height"]) == size]
-        for name, color in zip(dict.fromkeys(row["implementation"] for row in here), cycle(COLORS)):
+        for name, color in zip(_unique(row["implementation"] for row in here), cycle(COLORS)):
             points = sorted((row["channels"], row["median_ms"]) for row in here if row["implementation"] == name)
-            axes.plot(*zip(*points, strict=True), color=color, marker="o", markersize=3, label=name)
+            axes.plot(*zip(*points, strict=True), "o-", color=color, markersize=3, label=name)
         title = f"{size[0]:,} Gaussians, {size[1]} x {size[2]}"
         axes.set(title=title, xlabel="channels", ylabel="forward + backward, ms", yscale="log")
     _save(figure, path, legend_of=panels)
@@ -31,19 +31,15 @@ def plot_kernels(result: dict, path: Path) -> None:
 def plot_scale(result: dict, path: Path) -> None:
     """Median times and, below, peak memory over what is varied; both axes in decades."""
     rows = result["rows"]
-    names = list(dict.fromkeys(row["sweep"] for row in rows))
-    lines = list(dict.fromkeys((row["implementation"], row["what"]) for row in rows))
+    names = _unique(row["sweep"] for row in rows)
+    lines = _unique((row["implementation"], row["what"]) for row in rows)
     figure, panels = _panels(2, len(names))
-    measures = (("median_ms", "median, ms", 1.0), ("peak_memory_bytes", "peak, MiB", 2.0**-20))
-    for panel_row, (field, unit, scale) in zip(panels, measures, strict=True):
+    for panel_row, field, unit in zip(panels, ("median_ms", "peak_memory_bytes"), ("median, ms", "peak, bytes")):
         for axes, name in zip(panel_row, names, strict=True):
-            for (who, what), color in zip(lines, cycle(COLORS)):
-                key = (name, who, what)
-                here = [row for row in rows if (row["sweep"], row["implementation"], row["what"]) == key]
-                points = [(row["varied"], row[field] * scale) for row in here if row.get(field)]
-                if points:
-                    label = f"{who}: {what}"
-                    axes.plot(*zip(*points, strict=True), color=color, marker="o", markersize=3, label=label)
+            for line, color in zip(lines, cycle(COLORS)):
+                here = [row for row in rows if (row["sweep"], row["implementation"], row["what"]) == (name, *line)]
+                if points := [(row["varied"], row[field]) for row in here if row.get(field)]:
+                    axes.plot(*zip(*points, strict=True), "o-", color=color, markersize=3, label=": ".join(line))
             axes.set(xlabel=name, ylabel=unit, xscale="log", yscale="log")
     _save(figure, path, legend_of=panels[0])
 
@@ -51,14 +47,12 @@ def plot_scale(result: dict, path: Path) -> None:
 def plot_quality(result: dict, path: Path) -> None:
     """Mean held-out PSNR over training seconds, a panel for each curve and response, a line for each method."""
     rows = [row for row in result["rows"] if row["tests"]]
-    tables = list(dict.fromkeys((row["curve"], row["response"]) for row in rows if row["response"] != "learned"))
+    tables = _unique((row["curve"], row["response"]) for row in rows if row["response"] != "learned")
     figure, (panels,) = _panels(1, len(tables))
-    methods = list(dict.fromkeys(row["method"] for row in rows))
     for axes, (curve, response) in zip(panels, tables, strict=True):
-        for name, color in zip(methods, cycle(COLORS)):
-            kinds = (response, "learned")
-            here = [r["tests"] for r in rows if (r["curve"], r["method"]) == (curve, name) and r["response"] in kinds]
-            if here:
+        members = [row for row in rows if row["curve"] == curve and row["response"] in (response, "learned")]
+        for name, color in zip(_unique(row["method"] for row in rows), cycle(COLORS)):
+            if here := [row["tests"] for row in members if row["method"] == name]:
                 axes.plot(*error_over_time(here), color=color, label=name)
         axes.set(title=f"{curve}, {response}", xlabel="training seconds", ylabel="held-out HDR PSNR, dB", xscale="log")
     _save(figure, path, legend_of=panels)
@@ -80,16 +74,20 @@ def error_over_time(trainings: Sequence[Sequence], count: int = 60) -> tuple[np.
 def plot_stability(result: dict, path: Path) -> None:
     """Errors as solid lines over each sweep, their bounds as dotted ones of the same color."""
     figure, panels = _panels(2, 2)
-    for axes, sweep in zip([axes for row in panels for axes in row], result["sweeps"], strict=False):
-        for name, color in zip(sweep["readings"], cycle(COLORS)):
-            errors, bounds = zip(*sweep["readings"][name], strict=True)
+    for axes, sweep in zip(panels.flat, result["sweeps"], strict=False):
+        for (name, readings), color in zip(sweep["readings"].items(), cycle(COLORS)):
+            errors, bounds = zip(*readings, strict=True)
             drawn = [max(error or 0.0, SMALLEST) for error in errors]
-            axes.plot(sweep["values"], drawn, color=color, marker="o", markersize=3, label=name)
-            axes.plot(sweep["values"], bounds, color=color, linestyle=":", linewidth=1)
+            axes.plot(sweep["values"], drawn, "o-", color=color, markersize=3, label=name)
+            axes.plot(sweep["values"], bounds, ":", color=color, linewidth=1)
         scale = "log" if sweep["values"][-1] > 1000 else "linear"
         axes.set(xlabel=sweep["label"], ylabel="relative error", xscale=scale, yscale="log")
         axes.legend(frameon=False, fontsize=7)
     _save(figure, path)
+
+
+def _unique(items: Iterable) -> list:
+    return list(dict.fromkeys(items))
 
 
 def _panels(rows: int, columns: int):

@@ -26,7 +26,7 @@ def new_result(benchmark: str, device: torch.device, settings: dict) -> dict:
         "benchmark": benchmark,
         "command": shlex.join(["sehdr-warp", *sys.argv[1:]]),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "machine": describe_machine(device),
+        "machine": _describe_machine(device),
         "settings": settings,
         "rows": [],
         "checks": [],
@@ -34,7 +34,7 @@ def new_result(benchmark: str, device: torch.device, settings: dict) -> dict:
     }
 
 
-def describe_machine(device: torch.device) -> dict:
+def _describe_machine(device: torch.device) -> dict:
     """Processor, GPU, driver and versions; what cannot be found out is None."""
     affinity = getattr(os, "sched_getaffinity", None)
     machine = {
@@ -43,7 +43,7 @@ def describe_machine(device: torch.device) -> dict:
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        "versions": {name: package_version(name) for name in _PACKAGES},
+        "versions": {name: _version(name) for name in _PACKAGES},
         "gpu": None,
     }
     if device.type == "cuda":
@@ -51,6 +51,30 @@ def describe_machine(device: torch.device) -> dict:
         driver = {"driver": _driver_version(), "cuda": torch.version.cuda}
         machine["gpu"] = {"name": properties.name, "memory_bytes": properties.total_memory} | driver
     return machine
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _cpu_model() -> str | None:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return (models or [platform.processor()])[0] or None
+
+
+def _driver_version() -> str | None:
+    command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=20, check=True).stdout.split()[0]
+    except (OSError, subprocess.SubprocessError, IndexError):
+        return None
 
 
 def machine_line(result: dict) -> str:
@@ -63,89 +87,52 @@ def machine_line(result: dict) -> str:
     return f"{place}; {versions}; {result['date'][:10]}"
 
 
-def package_version(name: str) -> str | None:
-    """The installed version of a package, or None."""
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return None
+def check(what: str, against: str, difference: float, bound: float) -> dict:
+    """One comparison of a result; a difference that is not a number does not pass."""
+    values = {"what": what, "against": against, "difference": difference, "bound": bound}
+    return values | {"passed": difference <= bound}
 
 
-def finish(result: dict, json: Path | None, overwrite: bool, columns: dict[str, str]) -> None:
-    """Writes and prints a result. Raises SehdrError for checks that failed, after everything is out.
-
-    Args:
-        columns: field of a row to a format, as markdown_table takes them.
-    """
+def finish(result: dict, columns: dict[str, str], json: Path | None, overwrite: bool) -> None:
+    """Writes and prints a result; columns as markdown_table() takes them. Raises SehdrError for checks that failed,
+    after everything is out."""
     if json is not None:
         write_json(json, result, overwrite)
     print(machine_line(result), markdown_table(result["rows"], columns), *result["notes"], sep="\n\n")
     failed = [check for check in result["checks"] if not check["passed"]]
-    if failed and "error" in failed[0]:
-        raise SehdrError(
-            f"{len(failed)} of {len(result['checks'])} jobs failed, the first with: {failed[0]['error']} "
-            f"({failed[0]['what']}); the same command tries them again"
-        )
-    if failed:
-        worst = max(failed, key=lambda check: check["difference"] / check["bound"])
-        raise SehdrError(
-            f"{len(failed)} of {len(result['checks'])} checks failed; the worst: {worst['what']} differs from "
-            f"{worst['against']} by {worst['difference']:.1e}, more than {worst['bound']:.0e}: do not use these times"
-        )
-
-
-def check(what: str, against: str, difference: float, bound: float) -> dict:
-    """One comparison of a result; a difference that is not a number does not pass."""
-    return {"what": what, "against": against, "difference": difference, "bound": bound,
-            "passed": difference <= bound}  # fmt: skip
+    if not failed:
+        return
+    count = f"{len(failed)} of {len(result['checks'])}"
+    if "error" in failed[0]:
+        first = f"{failed[0]['error']} ({failed[0]['what']})"
+        raise SehdrError(f"{count} jobs failed, the first with: {first}; the same command tries them again")
+    worst = max(failed, key=lambda check: check["difference"] / check["bound"])
+    raise SehdrError(
+        f"{count} checks failed; the worst: {worst['what']} differs from {worst['against']} by "
+        f"{worst['difference']:.1e}, more than {worst['bound']:.0e}: do not use these times"
+    )
 
 
 def markdown_table(rows: Sequence[dict], columns: dict[str, str]) -> str:
     """Aligned Markdown. columns: `field` or `title=field` to a format: as of format(), or MiB, or "" for text; a column
     without any value is left out, and so is a value that a row lacks."""
-    shown = [(*_title(key), form) for key, form in columns.items()]
+    parted = [(*key.partition("="), form) for key, form in columns.items()]
+    shown = [(title, field or title, form) for title, _, field, form in parted]
     shown = [column for column in shown if any(row.get(column[1]) is not None for row in rows)]
-    if not rows or not shown:
+    if not shown:
         return "There are no results."
-    cells = [[_cell(row.get(field), form) for _, field, form in shown] for row in rows]
-    widths = [max(2, *map(len, column)) for column in zip([title for title, _, _ in shown], *cells, strict=True)]
+    lines = [
+        [title for title, _, _ in shown],
+        *([_cell(row.get(field), form) for _, field, form in shown] for row in rows),
+    ]
+    widths = [max(2, *map(len, column)) for column in zip(*lines, strict=True)]
     text = [form == "" for _, _, form in shown]
-
-    def line(values):
-        padded = (v.ljust(w) if t else v.rjust(w) for v, w, t in zip(values, widths, text, strict=True))
-        return "| " + " | ".join(padded) + " |"
-
-    rule = ("-" * w if t else "-" * (w - 1) + ":" for w, t in zip(widths, text, strict=True))
-    return "\n".join([line([title for title, _, _ in shown]), "| " + " | ".join(rule) + " |", *map(line, cells)])
-
-
-def _title(key: str) -> tuple[str, str]:
-    title, equals, field = key.partition("=")
-    return (title, field) if equals else (key, key)
+    lines.insert(1, ["-" * w if t else "-" * (w - 1) + ":" for w, t in zip(widths, text, strict=True)])
+    padded = ([v.ljust(w) if t else v.rjust(w) for v, w, t in zip(line, widths, text, strict=True)] for line in lines)
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in padded)
 
 
 def _cell(value, form: str) -> str:
     if value is None:
         return "-"
-    if form == "MiB":
-        return f"{value / 2**20:,.0f}"
-    return f"{value:{form}}"
-
-
-def _cpu_model() -> str | None:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or None
-
-
-def _driver_version() -> str | None:
-    command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return (done.stdout.splitlines() or [""])[0].strip() or None
+    return f"{value / 2**20:,.0f}" if form == "MiB" else f"{value:{form}}"

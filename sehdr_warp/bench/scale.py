@@ -1,28 +1,27 @@
 """`bench scale`: how time and memory of splats and training steps grow with Gaussians, pixels, channels and photos."""
 
 import logging
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
-from ..errors import SehdrError
 from ..splatting.memory import held_by_warp
 from ..training.config_files import load_config
-from .gsplat_peer import BOUND, GSPLAT, gsplat_renderer, missing, rasterize_with_gsplat
-from .kernels import OURS, compared, differs, image_and_gradients, render, render_reference
+from .gsplat_peer import BOUND, GSPLAT, gsplat_renderer, note_missing, rasterize_with_gsplat
+from .kernels import OURS, against_float64, against_gsplat, render, splat_variant
 from .results import check, new_result
-from .splats import Size, SplatScene, make_photo_scene, make_splat_scene
-from .step import forget_peaks, held_memory, make_trainer, step_variant
-from .timing import Variant, peak_memory, time_variants
+from .splats import Size, make_photo_scene, make_splat_scene
+from .step import make_trainer, time_step
+from .timing import forget_peaks, peak_memory, time_variants
 
 LOG = logging.getLogger(__name__)
 COMPARED_CHANNELS = 9
 """gsplat stands beside ours at this count."""
 STEP_VIEWS, STEP_PRESET = 2, "paper"
 """The preset with three color sets, nine channels in one pass."""
-STEP, SPLAT = "training step", "splat"
+REFERENCE_GAUSSIANS = 1000
 STEEPEST = 1.2
 """A slope above it, at the large end of a sweep, is steeper than linear; 2 is quadratic."""
 LARGE_END = 3
@@ -67,36 +66,20 @@ def sweeps(device_type: str, small: bool = False) -> dict[str, list[Point]]:
     return {name: points[:-1:2] if small else points for name, points in found.items()}
 
 
-def bench_scale(
-    names: Sequence[str], device: torch.device, *, peers: bool, repetitions: int, budget: float, small: bool = False
-) -> dict:
-    """A result: a row for each splat and training step at each point, and `slopes` of their logarithms.
-
-    Args:
-        names: of sweeps(). peers: gsplat's splat, and the same step on its rasterizer, beside ours.
-    """
-    known = sweeps(device.type, small)
-    for name in names:
-        if name not in known:
-            raise SehdrError(f"--sweeps {','.join(names)}: {name!r} is none; use {', '.join(known)}")
-    settings = {"device": str(device), "sweeps": list(names), "repetitions": repetitions, "preset": STEP_PRESET}
+def bench_scale(device: torch.device, *, repetitions: int, small: bool = False) -> dict:
+    """A result: a row for each splat and training step at each point, and `slopes` of their logarithms."""
+    settings = {"device": str(device), "repetitions": repetitions, "small": small, "preset": STEP_PRESET}
     result = new_result("scale", device, settings)
-    reason = missing(device) if peers else "gsplat not compared: not asked for (--peers)"
-    result["notes"] += [reason] if reason else []
-    for name in names:
-        for point in known[name]:
-            peer = reason is None and point.channels == COMPARED_CHANNELS
-            rows = [] if name == "photos" else _splat_rows(point, device, peer, repetitions, budget, result["checks"])
-            forget_peaks(device)
-            if point.photos:
-                rows += _step_rows(point, device, peer, repetitions, budget, result["checks"])
-                forget_peaks(device)
-            size = point.size
+    peer = note_missing(result, device)
+    for name, points in sweeps(device.type, small).items():
+        for point in points:
+            compared, size = peer and point.channels == COMPARED_CHANNELS, point.size
+            rows = [] if name == "photos" else _splat_rows(point, device, compared, repetitions, result["checks"])
+            rows += _step_rows(point, device, compared, repetitions, result["checks"]) if point.photos else []
             place = {"sweep": name, "varied": point.varied(name), "gaussians": size.gaussians, "width": size.width}
             place |= {"height": size.height, "channels": point.channels, "photos": point.photos or None}
             result["rows"] += [place | row for row in rows]
-            shown = (f"{row['what']} {row['median_ms']:.2f} ms" for row in rows if row["implementation"] == OURS)
-            LOG.info("%s %d: %s", name, point.varied(name), ", ".join(shown))
+            LOG.info("%s %d: done", name, point.varied(name))
     result["slopes"] = fit_slopes(result["rows"])
     result["notes"].append(verdict(result["slopes"]))
     return result
@@ -113,18 +96,14 @@ def fit_slopes(rows: Sequence[dict]) -> list[dict]:
                 series.setdefault(key, []).append((row["varied"], row[field]))
     fields = ("sweep", "implementation", "what", "quantity")
     return [
-        dict(zip(fields, key, strict=True)) | {"slope": slope(points), "slope_large": slope(points[-LARGE_END:])}
+        dict(zip(fields, key, strict=True)) | {"slope": _slope(points), "slope_large": _slope(points[-LARGE_END:])}
         for key, points in series.items()
         if len(points) > 1
     ]
 
 
-def slope(points: Sequence[tuple[float, float]]) -> float:
-    """Least squares of log y on log x; at least two points, all positive, not all of one x."""
-    xs, ys = zip(*((math.log(x), math.log(y)) for x, y in points), strict=True)
-    mean_x, mean_y = sum(xs) / len(xs), sum(ys) / len(ys)
-    over, under = zip(*(((x - mean_x) * (y - mean_y), (x - mean_x) ** 2) for x, y in zip(xs, ys, strict=True)))
-    return sum(over) / sum(under)
+def _slope(points: Sequence[tuple[float, float]]) -> float:
+    return float(np.polyfit(*np.log(points).T, 1)[0])
 
 
 def verdict(slopes: Sequence[dict]) -> str:
@@ -139,55 +118,39 @@ def verdict(slopes: Sequence[dict]) -> str:
     return head + "; ".join(lines) + "."
 
 
-def _splat_rows(point: Point, device, peer: bool, repetitions: int, budget: float, checks: list[dict]) -> list[dict]:
+def _splat_rows(point: Point, device: torch.device, peer: bool, repetitions: int, checks: list[dict]) -> list[dict]:
     scene = make_splat_scene(point.size, point.channels, device)
-    if not any(c["what"] == f"{OURS}, {point.channels} channels: image" for c in checks):
-        small = make_splat_scene(scene.size.reduced(1000), point.channels, device)
-        truth = image_and_gradients(render_reference, small.to("cpu", torch.float64))
-        name = f"{OURS}, {point.channels} channels"
-        checks += compared(name, "float64", image_and_gradients(render, small), truth)
-    renderers = {OURS: lambda: render(scene)}
+    name = f"{OURS}, {point.channels} channels"
+    if not any(made["what"].startswith(f"{name}:") for made in checks):
+        checks += against_float64(scene, REFERENCE_GAUSSIANS, name)
+    variants = {OURS: splat_variant(lambda: render(scene), scene)}
     if peer:
-        renderers[GSPLAT] = gsplat_renderer(scene)
-        with torch.no_grad():
-            checks.append(check("gsplat: image", OURS, differs(renderers[GSPLAT](), render(scene)), BOUND))
-    return _timed(renderers, scene, device, repetitions, budget)
-
-
-def _timed(renderers: dict, scene: SplatScene, device, repetitions: int, budget: float) -> list[dict]:
-    cotangent = scene.cotangent()
-    variants = {
-        who: Variant(lambda _, call=call: call().backward(cotangent), prepare=scene.clear)
-        for who, call in renderers.items()
-    }
+        variants[GSPLAT] = splat_variant(gsplat_renderer(scene), scene)
+        checks.append(against_gsplat(scene))
     rows = []
-    for who, timing in time_variants(variants, device, repetitions=repetitions, budget=budget).items():
+    for who, timing in time_variants(variants, device, repetitions=repetitions).items():
         # Warp's own scratch stays from the largest call so far, so for ours this is an upper bound.
-        held = held_by_warp(device) if who == OURS else 0
-        memory = peak_memory(variants[who], device) + held
-        rows.append({"implementation": who, "what": SPLAT} | timing | {"peak_memory_bytes": memory})
+        memory = peak_memory(variants[who], device) + (held_by_warp(device) if who == OURS else 0)
+        rows.append({"implementation": who, "what": "splat"} | timing | {"peak_memory_bytes": memory})
     return rows
 
 
-def _step_rows(point: Point, device, peer: bool, repetitions: int, budget: float, checks: list[dict]) -> list[dict]:
-    """Whole training steps on photos of this size; on a GPU memory is all that is held, photos, parameters and
-    optimizer included. Without densification, which would watch gradients that gsplat gives in another form; steps of
-    gsplat are launched, since they cannot be recorded."""
+def _step_rows(point: Point, device: torch.device, peer: bool, repetitions: int, checks: list[dict]) -> list[dict]:
+    """Whole training steps on photos of this size. Without densification, which would watch gradients that gsplat
+    gives in another form; steps of gsplat are launched, since they cannot be recorded."""
     scene = make_photo_scene(point.size, point.photos, device)
     rows, losses = [], {}
-    for who, rasterizer in [(OURS, None), *([(GSPLAT, rasterize_with_gsplat)] if peer else [])]:
-        forget_peaks(device)
-        fixed = {"densification.stop": 0, "densification.max_gaussians": point.size.gaussians + 1}
-        config = load_config(STEP_PRESET, fixed | {"schedule.recorded": who == OURS})
-        trainer = make_trainer(scene, config, device, rasterizer)
-        variant = step_variant(trainer)
-        variant.once()
-        losses[who] = trainer.loss
-        row = {"implementation": who, "what": STEP}
-        row |= time_variants({who: variant}, device, repetitions=repetitions, budget=budget)[who]
-        row["peak_memory_bytes"] = held_memory(device) if device.type == "cuda" else peak_memory(variant, device)
-        rows.append(row)
-        del trainer, variant
+    for who, rasterizer in {OURS: None, GSPLAT: rasterize_with_gsplat}.items():
+        if who == OURS or peer:
+            forget_peaks(device)
+            fixed = {"densification.stop": 0, "densification.max_gaussians": point.size.gaussians + 1}
+            config = load_config(STEP_PRESET, fixed | {"schedule.recorded": who == OURS})
+            trainer = make_trainer(scene, config, device, rasterizer)
+            trainer.step()
+            losses[who] = trainer.loss
+            rows.append({"implementation": who, "what": "training step"} | time_step(trainer, repetitions))
+            del trainer
+    forget_peaks(device)
     if peer:
         difference = abs(losses[GSPLAT] - losses[OURS]) / abs(losses[OURS])
         checks.append(check("gsplat: loss of the first step", OURS, difference, BOUND))

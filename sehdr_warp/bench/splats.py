@@ -60,6 +60,10 @@ class SplatScene:
         return (*self.leaves, self.world_to_camera, self.intrinsics, self.size.width, self.size.height)
 
     @property
+    def channels(self) -> int:
+        return self.leaves[-1].shape[1]
+
+    @property
     def device(self) -> torch.device:
         return self.leaves[0].device
 
@@ -77,7 +81,7 @@ class SplatScene:
     def cotangent(self) -> torch.Tensor:
         """[H, W, C] in [0, 1), the gradient that a loss would send back; alike on every device and in every dtype."""
         generator = torch.Generator().manual_seed(1)
-        shape = self.size.height, self.size.width, self.leaves[-1].shape[1]
+        shape = self.size.height, self.size.width, self.channels
         return torch.rand(shape, generator=generator).to(self.leaves[0])
 
 
@@ -119,7 +123,10 @@ def make_photo_scene(size: Size, views: int = 18, device: str | torch.device = "
     field = RadianceField(gaussians, response, base_time=EXPOSURE_TIME)
     photos = []
     for index in range(views):
-        camera = _camera(2 * np.pi * index / views, size)
+        angle, focal = 2 * np.pi * index / views, 1.1 * size.width
+        # From a circle at height 1.6, towards the middle of the balls.
+        pose = look_at([3.5 * np.cos(angle), 3.5 * np.sin(angle), 1.6], (0.0, 0.0, 0.4))
+        camera = Camera(size.width, size.height, focal, focal, size.width / 2, size.height / 2, pose)
         codes = codes_of(field.render_ldr(camera).cpu().numpy(), 8)
         photos.append(View(f"v_{index}", codes, camera, EXPOSURE_TIME, "train"))
     colors = np.asarray(response.encode(np.exp(log_exposure)), dtype=np.float32)
@@ -138,10 +145,3 @@ def _surfaces(count: int, rng) -> tuple[np.ndarray, np.ndarray]:
     points = centers[ball] + radii[ball, None] * direction
     points[on_floor] = np.concatenate([rng.uniform(-2, 2, (on_floor.sum(), 2)), np.zeros((on_floor.sum(), 1))], axis=1)
     return points, tints[which] + 0.4 * np.sin(9 * points).sum(axis=1, keepdims=True)
-
-
-def _camera(angle: float, size: Size, radius: float = 3.5) -> Camera:
-    """On a circle at height 1.6, looking at the middle of the balls."""
-    pose = look_at([radius * np.cos(angle), radius * np.sin(angle), 1.6], (0.0, 0.0, 0.4))
-    focal = 1.1 * size.width
-    return Camera(size.width, size.height, focal, focal, size.width / 2, size.height / 2, pose)

@@ -1,6 +1,5 @@
 """`bench step`: a whole training step (photograph, losses, gradients, optimizer, densification) of a preset."""
 
-import gc
 import logging
 import math
 import statistics
@@ -10,18 +9,18 @@ from itertools import pairwise
 
 import torch
 
+from ..field.radiance_field import CameraTensors
 from ..kernels.constants import TILE_SIZE
 from ..scene import Scene
-from ..splatting.memory import held_by_warp
 from ..splatting.reference import rasterize_reference
 from ..training.config import Config
-from ..training.config_files import load_config
+from ..training.config_files import load_config, override_config
 from ..training.initialization import choose_response, make_field
 from ..training.trainer import Trainer
 from .kernels import OURS, PLAIN_TORCH, PLAIN_TORCH_BYTES
 from .results import check, new_result
 from .splats import Size, make_photo_scene
-from .timing import Variant, peak_memory, summary, time_variants, wait
+from .timing import Variant, forget_peaks, held_memory, peak_memory, summary, time_variants, wait
 
 LOG = logging.getLogger(__name__)
 LAUNCHED = "sehdr-warp, launched"
@@ -40,9 +39,7 @@ COLUMNS = {
 }  # fmt: skip
 
 
-def bench_step(
-    size: Size, device: torch.device, *, presets: Sequence[str], repetitions: int, budget: float, views: int = 18
-) -> dict:
+def bench_step(size: Size, device: torch.device, *, presets: Sequence[str], repetitions: int, views: int = 18) -> dict:
     """Steps of each preset in the thick of its training (all degrees of the harmonics, densification going on) on
     synthetic photos, recorded and launched on a GPU, beside the plain torch rasterizer on the CPU; a result."""
     settings = {"device": str(device), "presets": list(presets), "repetitions": repetitions, "views": views}
@@ -53,11 +50,10 @@ def bench_step(
         config = load_config(preset, {"densification.max_gaussians": size.gaussians * 11 // 10 + 1})
         fits = _pairs(scene, make_trainer(scene, config, device)) * 16 * 4 <= PLAIN_TORCH_BYTES
         if fits or device.type == "cuda":
-            result["checks"] += [c | {"what": f"{preset}: {c['what']}"} for c in _checks(scene, config, device, fits)]
-        rows = _rows_on_cuda if device.type == "cuda" else _rows_on_cpu
-        made = rows(scene, config, device, repetitions, budget, fits)
-        result["rows"] += [{"preset": preset, "width": size.width, "height": size.height} | row for row in made]
-        LOG.info("%s: %.3f ms", preset, made[0]["median_ms"])
+            result["checks"] += _checks(scene, config, device, fits, preset)
+        place = {"preset": preset, "width": size.width, "height": size.height}
+        result["rows"] += [place | row for row in _rows(scene, config, device, repetitions, fits)]
+        LOG.info("%s: done", preset)
     return result
 
 
@@ -73,8 +69,7 @@ def make_trainer(scene: Scene, config: Config, device: torch.device, rasterizer:
     """A trainer in the thick of its training, with opacities spread as training spreads them. rasterizer: in place of
     ours."""
     field = make_field(scene, config, choose_response(scene, config), device)
-    if rasterizer is not None:
-        field.rasterizer = rasterizer
+    field.rasterizer = rasterizer or field.rasterizer
     generator = torch.Generator().manual_seed(config.seed)
     opacities = 0.05 + 0.9 * torch.rand(field.gaussians.count, generator=generator) ** 1.5
     jitter = torch.randn(field.gaussians.count, 3, generator=generator)
@@ -95,28 +90,17 @@ def step_variant(trainer: Trainer) -> Variant:
         if trainer.iteration + 1 >= first + trainer.config.scaled(trainer.config.densification.every):
             trainer.iteration = first
 
-    return Variant(lambda _: trainer.step(), prepare=between_changes)
+    return Variant(trainer.step, prepare=between_changes)
 
 
-def plain_torch_rasterizer(*arguments, capacity=None, deterministic=False, **options):
-    """rasterize() in plain torch, for a field."""
-    return rasterize_reference(*arguments, **options)
+def time_step(trainer: Trainer, repetitions: int) -> dict:
+    """Times of a step by itself, and its memory: on a GPU all that is held, on the CPU what the step adds."""
+    variant, device = step_variant(trainer), trainer.device
+    timing = time_variants({"step": variant}, device, repetitions=repetitions)["step"]
+    return timing | {"peak_memory_bytes": held_memory(device) or peak_memory(variant, device)}
 
 
-def held_memory(device: torch.device) -> int:
-    """The most that torch and Warp held at once since the peaks were last forgotten, bytes."""
-    return torch.cuda.max_memory_allocated(device) + held_by_warp(device)
-
-
-def forget_peaks(device: torch.device) -> None:
-    """What is left of the measurement before must not count as the next one's."""
-    gc.collect()
-    if device.type == "cuda":
-        torch.cuda.empty_cache()
-        torch.cuda.reset_peak_memory_stats(device)
-
-
-def time_steps(trainer: Trainer, repetitions: int) -> dict:
+def _time_row_of_steps(trainer: Trainer, repetitions: int) -> dict:
     """Steps on a GPU without a pause between them: their spacing on the device, and the host's time for each."""
     variant, device = step_variant(trainer), trainer.device
     for _ in range(20):
@@ -132,36 +116,31 @@ def time_steps(trainer: Trainer, repetitions: int) -> dict:
         host.append((time.perf_counter() - started) * 1e3)
         event.record()
     wait(device)
-    return summary([a.elapsed_time(b) for a, b in pairwise(events)]) | {"host_ms": statistics.median(host)}
+    timing = summary([a.elapsed_time(b) for a, b in pairwise(events)]) | {"host_ms": statistics.median(host)}
+    return timing | {"peak_memory_bytes": held_memory(device)}
 
 
-def _rows_on_cuda(scene, config, device, repetitions, budget, fits) -> list[dict]:
+def _rows(scene: Scene, config: Config, device: torch.device, repetitions: int, fits: bool) -> list[dict]:
+    variants = {OURS: (True, None)}
+    if device.type == "cuda":
+        variants[LAUNCHED] = (False, None)
+    elif fits:
+        variants[PLAIN_TORCH] = (True, _plain_torch)
     rows = []
-    for name, recorded in ((OURS, True), (LAUNCHED, False)):
+    for name, (recorded, rasterizer) in variants.items():
         forget_peaks(device)
-        chosen = config.model_copy(update={"schedule": config.schedule.model_copy(update={"recorded": recorded})})
-        trainer = make_trainer(scene, chosen, device)
-        row = {"implementation": name, "gaussians": trainer.field.gaussians.count} | time_steps(trainer, repetitions)
-        row["peak_memory_bytes"] = held_memory(device)
-        rows.append(row | (_amortized(trainer) if recorded else {}))
+        trainer = make_trainer(scene, override_config(config, {"schedule.recorded": recorded}), device, rasterizer)
+        row = {"implementation": name, "gaussians": trainer.field.gaussians.count}
+        row |= (_time_row_of_steps if device.type == "cuda" else time_step)(trainer, repetitions)
+        row |= {"ours_over_this": rows[0]["median_ms"] / row["median_ms"]} if rows else _amortized(trainer)
+        rows.append(row)
         del trainer
     return rows
 
 
-def _rows_on_cpu(scene, config, device, repetitions, budget, fits) -> list[dict]:
-    trainers = {OURS: make_trainer(scene, config, device)}
-    if fits:
-        trainers[PLAIN_TORCH] = make_trainer(scene, config, device, plain_torch_rasterizer)
-    variants = {name: step_variant(trainer) for name, trainer in trainers.items()}
-    timings = time_variants(variants, device, repetitions=repetitions, budget=budget)
-    rows = []
-    for name, timing in timings.items():
-        row = {"implementation": name, "gaussians": trainers[name].field.gaussians.count} | timing
-        row["peak_memory_bytes"] = peak_memory(variants[name], device)
-        ratio = None if name == OURS else timings[OURS]["median_ms"] / timing["median_ms"]
-        rows.append(row | {"ours_over_this": ratio})
-    rows[0] |= _amortized(trainers[OURS])
-    return rows
+def _plain_torch(*arguments, capacity=None, deterministic=False, **options):
+    """rasterize() in plain torch, for a field."""
+    return rasterize_reference(*arguments, **options)
 
 
 def _amortized(trainer: Trainer) -> dict:
@@ -177,29 +156,26 @@ def _amortized(trainer: Trainer) -> dict:
     return {"amortized_ms": mean, "amortized_steps": steps, "gaussians_after": trainer.field.gaussians.count}
 
 
-def _checks(scene: Scene, config: Config, device: torch.device, fits: bool) -> list[dict]:
+def _checks(scene: Scene, config: Config, device: torch.device, fits: bool, preset: str) -> list[dict]:
     """The loss of the first and of a later step beside the plain torch rasterizer's or, where that would not fit, the
     CPU's kernels."""
     ours = make_trainer(scene, config, device)
-    other = make_trainer(scene, config, torch.device("cpu"), plain_torch_rasterizer if fits else None)
-    losses = []
-    for _ in range(CHECKED_STEPS):
+    other = make_trainer(scene, config, torch.device("cpu"), _plain_torch if fits else None)
+    made = []
+    for step in range(1, CHECKED_STEPS + 1):
         ours.step()
         other.step()
-        losses.append((ours.loss, other.loss))
-    made = []
-    for step, bound in ((1, FIRST_LOSS_BOUND), (CHECKED_STEPS, LATER_LOSS_BOUND)):
-        mine, truth = losses[step - 1]
-        difference = abs(mine - truth) / max(abs(truth), 1e-12)
+        difference = abs(ours.loss - other.loss) / max(abs(other.loss), 1e-12)
         difference = difference if math.isfinite(difference) else math.inf
-        made.append(check(f"loss of step {step}", PLAIN_TORCH if fits else "the CPU's kernels", difference, bound))
+        if step in (1, CHECKED_STEPS):
+            bound = FIRST_LOSS_BOUND if step == 1 else LATER_LOSS_BOUND
+            against = PLAIN_TORCH if fits else "the CPU's kernels"
+            made.append(check(f"{preset}: loss of step {step}", against, difference, bound))
     return made
 
 
 def _pairs(scene: Scene, trainer: Trainer) -> int:
     """Pixel-Gaussian pairs of the first photo."""
-    from ..field.radiance_field import CameraTensors
-
     camera = CameraTensors.of(scene.train_views[0].camera, trainer.device)
     with torch.no_grad():
         return trainer.field.photograph(camera, trainer.field.base_time).rendering.entry_count * TILE_SIZE**2

@@ -6,14 +6,15 @@ backwards. How far that moves the result is what float32 may cost here, whatever
 passes if its error stays within it. Nothing of the kernel's own result enters its bound.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 UNIT = 2.0**-24
-"""float32's unit of rounding."""
+TINY = torch.finfo(torch.float32).tiny
+"""float32's unit of rounding, and its smallest normal number."""
 ROUNDINGS = 8
 """Roundings allowed between two interfaces: the longest chain of operations there, project(), has about 40 in a row,
 whose errors partly cancel."""
@@ -53,52 +54,43 @@ class _Disturb(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, generator):
         ctx.generator = generator
-        return x * _factors(x, generator)
+        noise = torch.rand(x.shape, generator=generator, dtype=torch.float64)
+        return x * (1 + (2 * noise - 1) * (ROUNDINGS * UNIT))
 
     @staticmethod
     def backward(ctx, gradient):
-        return gradient * _factors(gradient, ctx.generator), None
+        return _Disturb.apply(gradient, ctx.generator), None
 
 
-def _factors(x: Tensor, generator: torch.Generator) -> Tensor:
-    noise = torch.rand(x.shape, generator=generator, dtype=torch.float64)
-    return 1 + (2 * noise - 1) * (ROUNDINGS * UNIT)
-
-
-def _disturbance(draw: int) -> Callable[[Tensor], Tensor]:
-    """Disturbs tensors with new random numbers at each call; draw 0 leaves them as they are."""
-    generator = torch.Generator().manual_seed(draw)
-    return (lambda x: _Disturb.apply(x, generator)) if draw else lambda x: x
-
-
-def as_float32(tensors: list[Tensor]) -> list[Tensor]:
+def as_float32(tensors: Iterable[Tensor]) -> list[Tensor]:
     """float64 tensors of numbers that float32 holds exactly: both precisions then get the same problem."""
     return [tensor.float().double() for tensor in tensors]
 
 
-def _upstream(tensor: Tensor, seed: int) -> Tensor:
-    """Fixed weights in [0.5, 1.5] for a result, so that a scalar's gradient sees each of its numbers."""
-    return 0.5 + torch.rand(tensor.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def _measured(function, tensors: list[Tensor], wanted: list[int]) -> dict[str, Tensor]:
-    """The results of function(*tensors) by name, then the gradients of their weighted sum by the wanted tensors, by
-    their number; all float64 on the CPU."""
-    leaves = [t.detach().clone().requires_grad_(i in wanted) for i, t in enumerate(tensors)]
+def _results(function, tensors: list[Tensor], wanted: dict[str, int]) -> dict[str, Tensor]:
+    """The results of function(*tensors) by name, then the gradients by the wanted tensors (by name, with their place)
+    of the results' sum with fixed weights in [0.5, 1.5]; all float64 on the CPU."""
+    leaves = [t.detach().clone().requires_grad_(i in wanted.values()) for i, t in enumerate(tensors)]
     outputs = function(*leaves)
     if wanted:
-        sum((out * _upstream(out, 7 + i).to(out)).sum() for i, out in enumerate(outputs.values())).backward()
-    gradients = {f"{i}": torch.zeros_like(leaves[i]) if leaves[i].grad is None else leaves[i].grad for i in wanted}
-    return {name: value.detach().double().cpu() for name, value in (outputs | gradients).items()}
+        total = 0.0
+        for seed, out in enumerate(outputs.values(), 7):
+            weights = torch.rand(out.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+            total = total + (out * (0.5 + weights).to(out)).sum()
+        total.backward()
+    for name, place in wanted.items():
+        gradient = leaves[place].grad
+        outputs = outputs | {f"d/d {name}": torch.zeros_like(leaves[place]) if gradient is None else gradient}
+    return {name: value.detach().double().cpu() for name, value in outputs.items()}
 
 
 def compare(
     function,
-    truth,
     tensors: dict[str, Tensor],
     device: torch.device,
     *,
-    gradients: tuple[str, ...] = (),
+    truth=None,
+    gradients: Sequence[str] = (),
     elementwise: bool = False,
     floor: float = 0.0,
     extra: float = 0.0,
@@ -108,43 +100,35 @@ def compare(
 
     Args:
         function: function(*tensors) -> dict of results by name.
-        truth: truth(disturb, *tensors) -> the same, which passes what crosses a stage's border through disturb.
         tensors: float64 values by name. gradients: names by which the derivative is compared too.
+        truth: truth(disturb, *tensors) -> the same, which passes what crosses a stage's border through disturb; by
+            default the function itself, disturbed in its arguments alone.
         elementwise: the largest relative error of any number, rather than the relative error of the whole in norm.
         floor: numbers below it are compared absolutely, in units of it.
         extra: added to every bound, for what the kernel's arithmetic costs beside disturbed interfaces; the case says
             why. label: what becomes of a quantity's name.
     """
-    names, values = list(tensors), as_float32(list(tensors.values()))
-    wanted = [names.index(name) for name in gradients]
-    ours = _measured(function, [v.to(device, torch.float32) for v in values], wanted)
-    runs = []
-    for draw in range(DRAWS + 1):
-        disturb = _disturbance(draw)
-        runs.append(_measured(lambda *t, d=disturb: truth(d, *map(d, t)), values, wanted))
-    measure = _elementwise if elementwise else _in_norm
+
+    def error(value: Tensor, exact: Tensor) -> float:
+        if elementwise:
+            return float(((value - exact).abs() / exact.abs().clamp_min(floor or TINY)).max())
+        return float((value - exact).norm()) / (max(float(exact.norm()), floor) or 1.0)
+
+    def run(draw: int) -> dict[str, Tensor]:
+        generator = torch.Generator().manual_seed(draw)
+        disturb = (lambda x: _Disturb.apply(x, generator)) if draw else lambda x: x
+        return _results(lambda *t: truth(disturb, *map(disturb, t)), values, wanted)
+
+    truth = truth or (lambda _, *t: function(*t))
+    names, values = list(tensors), as_float32(tensors.values())
+    wanted = {name: names.index(name) for name in gradients}
+    ours = _results(function, [v.to(device, torch.float32) for v in values], wanted)
+    exact, *disturbed = map(run, range(DRAWS + 1))
     readings = []
-    for key, exact in runs[0].items():
-        effect = max(measure(run[key], exact, floor) for run in runs[1:])
-        quantity = f"d/d {names[int(key)]}" if key.isdecimal() else key
-        error, bound = measure(ours[key], exact, floor), 2 * effect + ROUNDINGS * UNIT + extra
-        readings.append(Reading(label.format(quantity), error, bound))
+    for name, value in exact.items():
+        bound = 2 * max(error(other[name], value) for other in disturbed) + ROUNDINGS * UNIT + extra
+        readings.append(Reading(label.format(name), error(ours[name], value), bound))
     return readings
-
-
-def compare_alike(function, tensors: dict[str, Tensor], device: torch.device, **options) -> list[Reading]:
-    """compare() of a function whose float64 truth is itself, disturbed in its arguments alone."""
-    return compare(function, lambda _, *t: function(*t), tensors, device, **options)
-
-
-def _in_norm(value: Tensor, exact: Tensor, floor: float) -> float:
-    size = max(float(exact.norm()), floor)
-    return float((value - exact).norm()) / size if size > 0 else float(value.norm())
-
-
-def _elementwise(value: Tensor, exact: Tensor, floor: float) -> float:
-    size = exact.abs().clamp_min(floor or torch.finfo(torch.float32).tiny)
-    return float(((value - exact).abs() / size).max())
 
 
 def count(quantity: str, wrong: int | Tensor) -> Reading:

@@ -1,4 +1,4 @@
-"""The whole catalogue, and a run of it: measured case by case, printed as a table."""
+"""The whole catalogue, and a run of it: measured case by case, printed as a table; and sweeps over what is stiff."""
 
 import logging
 import math
@@ -11,7 +11,7 @@ from ..errors import SehdrError
 from ..response import response_by_name
 from .case import Case, Reading
 from .light_cases import LIGHT_CASES, encode_readings
-from .splat_cases import POISON_CASES, SPLAT_CASES, Splats, compare_splat, overlapping
+from .splat_cases import POISON_CASES, SPLAT_CASES, Splats, compare_splat, overlap
 from .training_cases import TRAINING_CASES
 
 LOG = logging.getLogger(__name__)
@@ -24,14 +24,14 @@ def choose_cases(names: str | None, quick: bool) -> list[tuple[str, Case]]:
     take a moment. Raises SehdrError for a name that is not known."""
     if names is None:
         return [(group, case) for group, case in CASES if case.quick or not quick]
-    chosen = []
+    chosen = {}
     for name in (part.strip() for part in names.split(",")):
-        found = [item for item in CASES if name in (item[0], item[1].name)]
+        found = {case.name: (group, case) for group, case in CASES if name in (group, case.name)}
         if not found:
             known = ", ".join([*GROUPS, *(case.name for _, case in CASES)])
             raise SehdrError(f"--cases {name:.60}: no such case; take some of {known}")
-        chosen += [item for item in found if item not in chosen]
-    return chosen
+        chosen |= found
+    return list(chosen.values())
 
 
 def run_cases(cases: Sequence[tuple[str, Case]], device: torch.device) -> list[dict]:
@@ -39,7 +39,7 @@ def run_cases(cases: Sequence[tuple[str, Case]], device: torch.device) -> list[d
 
     torch runs on one thread, so that the figures do not depend on the machine's cores.
     """
-    rows, threads = [], torch.get_num_threads()
+    rows, threads, bounds, begun = [], torch.get_num_threads(), 0, time.perf_counter()
     torch.set_num_threads(1)
     print(f"{'case':17} {'quantity':42} {'error':>9} {'bound':>9}  verdict")
     try:
@@ -48,20 +48,16 @@ def run_cases(cases: Sequence[tuple[str, Case]], device: torch.device) -> list[d
             readings = case.measure(device)
             row = {"case": case.name, "group": group, "what": case.what, "note": case.note or None}
             row |= {"seconds": round(time.perf_counter() - started, 3), "holds": all(r.holds for r in readings)}
-            rows.append(row | {"readings": [_values(reading) for reading in readings]})
+            rows.append(row | {"readings": [vars(reading) | {"holds": reading.holds} for reading in readings]})
+            bounds += len(readings)
             for place, reading in enumerate(readings):
                 numbers = f"{_number(reading.error)} {_number(reading.bound)}  {'ok' if reading.holds else 'FAILED'}"
                 print(f"{'' if place else case.name:17} {reading.quantity:42.42} {numbers}")
     finally:
         torch.set_num_threads(threads)
     failed = sum(not row["holds"] for row in rows)
-    bounds, seconds = (sum(values) for values in zip(*((len(row["readings"]), row["seconds"]) for row in rows)))
-    print(f"{len(rows)} cases, {bounds} bounds, {failed} failed, {seconds:.1f} s")
+    print(f"{len(rows)} cases, {bounds} bounds, {failed} failed, {time.perf_counter() - begun:.1f} s")
     return rows
-
-
-def _values(reading: Reading) -> dict:
-    return {"quantity": reading.quantity, "error": reading.error, "bound": reading.bound, "holds": reading.holds}
 
 
 def _number(value: float) -> str:
@@ -73,16 +69,13 @@ def _needle(ratio: float, device) -> list[Reading]:
 
 
 def _radiance_range(decades: float, device) -> list[Reading]:
-    splats = Splats(40, spread=1.0)
+    splats = Splats(40, spread=1.0).lit(-0.5 * decades, 0.5 * decades)
     splats.opacities *= 0.5
-    order = torch.randperm(40, generator=torch.Generator().manual_seed(1))
-    splats.features[:] = 10.0 ** ((order / 39 - 0.5) * decades).double()[:, None]
     return compare_splat(splats, device)
 
 
 def _overlap(number: float, device) -> list[Reading]:
-    splats, options = overlapping(int(number), 5.0 / number, 1e-7)  # together they cover a pixel to 1 - e^-5
-    return compare_splat(splats, device, **options)
+    return overlap(int(number), 5.0 / number, 1e-7)(device)  # together they cover a pixel to 1 - e^-5
 
 
 def _exposure(stops: float, device) -> list[Reading]:
@@ -110,9 +103,8 @@ def run_sweeps(device: torch.device) -> list[dict]:
     for label, values, measure, kept in SWEEPS:
         LOG.info("%s", label)
         readings: dict[str, list] = {name: [] for name in kept}
-        for value in values:
-            for reading in measure(value, device):
-                if reading.quantity in kept:
-                    readings[reading.quantity].append((reading.error, reading.bound))
+        for reading in (reading for value in values for reading in measure(value, device)):
+            if reading.quantity in kept:
+                readings[reading.quantity].append((reading.error, reading.bound))
         found.append({"label": label, "values": values, "readings": readings})
     return found

@@ -35,13 +35,10 @@ def run_check(command: Check) -> None:
     if command.json is not None:
         check_absent(command.json, command.overwrite)
     device, cases = pick_device(command.device), choose_cases(command.cases, command.quick)
-    result = new_result("stability", device, {"device": str(device)})
-    result["rows"] = run_cases(cases, device)
+    result = new_result("stability", device, {"device": str(device)}) | {"rows": run_cases(cases, device)}
     result["sweeps"] = run_sweeps(device) if command.sweeps else []
     if command.json is not None:
         write_json(command.json, result, command.overwrite)
     if failed := [row["case"] for row in result["rows"] if not row["holds"]]:
-        raise SehdrError(
-            f"{len(failed)} of {len(cases)} cases exceed their bounds on {device}: {', '.join(failed)}; please report "
-            "them with the device and its driver"
-        )
+        count = f"{len(failed)} of {len(cases)} cases exceed their bounds on {device}"
+        raise SehdrError(f"{count}: {', '.join(failed)}; please report them with the device and its driver")

@@ -13,7 +13,7 @@ from ..response.table import TabulatedResponse
 from ..splatting import ssim
 from ..training.config import LossConfig
 from ..training.losses import CODE, Target, code_scale, ldr_loss
-from .case import ROUNDINGS, UNIT, Case, Reading, compare_alike, count, not_finite
+from .case import ROUNDINGS, UNIT, Case, Reading, compare, count, not_finite
 
 CURVES = ("linear", "gamma-2.2", "srgb", "rec709", "reinhard-gamma", "filmic", "aces")
 BRACKETS = (1 / 8, 1 / 4, 1.0, 8.0, 16.0)
@@ -25,14 +25,14 @@ def encode_readings(curve: Response, device, exposures, **options) -> list[Readi
     # A filmic curve's derivative is the difference of terms that are up to 50 times as large (x near its white).
     extra = 64 * UNIT if curve.name in ("filmic", "aces") else 0.0
     options = {"elementwise": True, "extra": extra, "label": f"{curve.name} {{}}"} | options
-    return compare_alike(lambda x: {"f": curve.encode(x)}, {"x": exposures}, device, **options)
+    return compare(lambda x: {"f": curve.encode(x)}, {"x": exposures}, device, **options)
 
 
 def _response_readings(curve: Response, device, exposures, **options) -> list[Reading]:
     """Photo, its derivative where asked for, and the exposure that the photo decodes to, of one curve."""
     values = torch.linspace(curve.black + 2 * CODE, curve.peak - 2 * CODE, 97, dtype=torch.float64)
     given = {"elementwise": True, "floor": 1e-6, "label": f"{curve.name} {{}}"}
-    decoded = compare_alike(lambda v: {"decode": curve.decode(v)}, {"v": values}, device, **given)
+    decoded = compare(lambda v: {"decode": curve.decode(v)}, {"v": values}, device, **given)
     return [*encode_readings(curve, device, exposures, floor=1e-6, **options), *decoded]
 
 
@@ -113,7 +113,7 @@ def _fusion_case(sigma: float, gain: float):
             return {"fused": torch.func.functional_call(fusion, parameters, (log_base,))}
 
         # Each logit is rounded by itself, at its own size; what differs by that much, the softmax sees as a factor.
-        readings = compare_alike(fused, tensors, device, gradients=("last",), extra=ROUNDINGS * UNIT * gain / 10)
+        readings = compare(fused, tensors, device, gradients=("last",), extra=ROUNDINGS * UNIT * gain / 10)
         given = {name: t.to(device, torch.float32).requires_grad_() for name, t in tensors.items()}
         fused(*given.values())["fused"].sum().backward()
         return [*readings, count("derivatives not finite", not_finite(*(t.grad for t in given.values())))]
@@ -138,16 +138,13 @@ def _sigma_limits(device):
 
 def _photos(device):
     """The loss and its derivative."""
-    generator = torch.Generator().manual_seed(0)
-    noise = torch.rand(24, 20, 3, generator=generator, dtype=torch.float64)
-    spot = torch.zeros(24, 20, 3, dtype=torch.float64)
+    noise = torch.rand(24, 20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    spot = torch.zeros_like(noise)
     spot[11, 7] = 1.0
-    readings = []
+    readings, tensors = [], {"prediction": 0.05 + 0.9 * noise}
     for name, photo in (("clipped", torch.ones_like(noise)), ("black", torch.zeros_like(noise)), ("one pixel", spot)):
-        readings += compare_alike(
-            lambda prediction, photo=photo: {"loss": _loss(prediction, photo)},
-            {"prediction": 0.05 + 0.9 * noise}, device, gradients=("prediction",), label=f"{name} {{}}",
-        )  # fmt: skip
+        given = {"gradients": ("prediction",), "label": f"{name} {{}}"}
+        readings += compare(lambda x, photo=photo: {"loss": _loss(x, photo)}, tensors, device, **given)
     for name, photo, value in (("above white", 1.0, 3.0), ("below black", 0.0, -1.0)):
         prediction = torch.full((8, 8, 3), value, device=device, requires_grad=True)
         _loss(prediction, torch.full((8, 8, 3), photo, device=device)).backward()
@@ -175,7 +172,7 @@ def _similarity(device):
     ):
         a, b = change(torch.rand(shape, generator=generator, dtype=torch.float64))
         given = {"gradients": ("a",), "extra": VARIANCE_ERROR, "label": f"{name} {{}}"}
-        readings += compare_alike(lambda a, b: {"ssim": ssim(a, b)}, {"a": a, "b": b}, device, **given)
+        readings += compare(lambda a, b: {"ssim": ssim(a, b)}, {"a": a, "b": b}, device, **given)
     return readings
 
 

@@ -20,13 +20,13 @@ from sehdr_warp.splatting import rasterize
 from ..refusals import call, refused
 from ..training.toy import toy_scene
 
-KERNELS = ["bench", "kernels", "--device", "cpu", "--sizes", "200@40x33", "--repetitions", "3", "--budget", "1"]
+KERNELS = ["bench", "kernels", "--device", "cpu", "--sizes", "200@40x33", "--repetitions", "3"]
 CPU = torch.device("cpu")
-BRIEF = {"repetitions": 1, "budget": 0.01}
+BRIEF = {"repetitions": 1}
 
 
 def test_kernels_report_times_checks_and_machine(tmp_path, capsys):
-    assert call(*KERNELS, "--channels", "3,4", "--peers", "--json", tmp_path / "a.json") == 0
+    assert call(*KERNELS, "--channels", "3,4", "--json", tmp_path / "a.json") == 0
     result = json.loads((tmp_path / "a.json").read_text())
     assert (result["schema"], result["benchmark"]) == (2, "kernels")
     # The installed metadata may leave out the build that torch names, such as +cu130.
@@ -74,7 +74,6 @@ def test_arguments_that_do_not_fit_are_named_before_anything_is_measured(tmp_pat
     ):
         assert message in refused(capfd, "bench", "kernels", "--device", "cpu", *arguments)
     assert (tmp_path / "a.json").read_text() == "mine"
-    assert "'pixel' is none" in refused(capfd, "bench", "scale", "--device", "cpu", "--sweeps", "pixel")
 
 
 def test_sizes_are_read_and_reduced():
@@ -87,15 +86,15 @@ def test_sizes_are_read_and_reduced():
 
 
 def test_variants_take_turns_and_slow_ones_run_less_often():
-    ran, seconds = [], {"fast": 0.0, "slow": 0.02}
+    ran, prepared, seconds = [], [], {"fast": 0.0, "slow": 0.02}
 
     def variant(name):
-        def run(prepared):
-            assert prepared == f"for {name}"
+        def run():
+            assert prepared.pop() == name
             ran.append(name)
             time.sleep(seconds[name])
 
-        return Variant(run, prepare=lambda: f"for {name}")
+        return Variant(run, prepare=lambda: prepared.append(name))
 
     timings = time_variants({name: variant(name) for name in seconds}, CPU, repetitions=12, budget=0.11)
     assert timings["fast"]["repetitions"] == 12
@@ -105,7 +104,7 @@ def test_variants_take_turns_and_slow_ones_run_less_often():
 
 
 def test_peak_memory_counts_what_is_held_at_once():
-    def run(_):
+    def run():
         for _ in range(3):
             a = torch.empty(1_000_000, dtype=torch.float32)
             b = torch.empty(500_000, dtype=torch.float32)
@@ -115,7 +114,7 @@ def test_peak_memory_counts_what_is_held_at_once():
 
 
 def test_step_times_whole_steps_and_checks_their_loss(tmp_path, capsys):
-    command = ["bench", "step", "--device", "cpu", "--size", "400@40x32", "--repetitions", "3", "--budget", "1"]
+    command = ["bench", "step", "--device", "cpu", "--size", "400@40x32", "--repetitions", "3"]
     assert call(*command, "--preset", "default", "--json", tmp_path / "a.json") == 0
     result = json.loads((tmp_path / "a.json").read_text())
     ours, plain = result["rows"]
@@ -139,7 +138,7 @@ def test_a_step_with_another_loss_fails(monkeypatch):
     monkeypatch.setattr(step, "rasterize_reference", other)
     result = step.bench_step(Size(300, 40, 32), CPU, presets=["default"], views=4, **BRIEF)
     with pytest.raises(SehdrError, match="loss of step 1"):
-        finish(result, None, False, step.COLUMNS)
+        finish(result, step.COLUMNS, None, False)
 
 
 def fake_gsplat(monkeypatch):
@@ -161,7 +160,7 @@ def fake_gsplat(monkeypatch):
 
     monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
     for module in (kernels, scale):
-        monkeypatch.setattr(module, "missing", lambda device: None)
+        monkeypatch.setattr(module, "note_missing", lambda result, device: True)
 
 
 def test_gsplat_draws_what_we_draw(monkeypatch):
@@ -177,10 +176,9 @@ def test_gsplat_draws_what_we_draw(monkeypatch):
     gradients = [torch.autograd.grad(drawn.image.square().sum(), scene.leaves) for drawn in (ours, theirs)]
     for mine, other in zip(*gradients, strict=True):
         torch.testing.assert_close(other, mine, rtol=1e-3, atol=1e-3)
-    result = kernels.bench_kernels([Size(150, 40, 32)], [5], CPU, peers=True, **BRIEF)
+    result = kernels.bench_kernels([Size(150, 40, 32)], [5], CPU, **BRIEF)
     assert {row["implementation"] for row in result["rows"]} == {"sehdr-warp", "gsplat", "plain torch"}
     assert all(check["passed"] for check in result["checks"])
-    assert gsplat_peer.missing(CPU) == "gsplat not compared: it needs CUDA"
 
 
 def test_scale_has_splats_steps_memory_slopes_and_gsplat(monkeypatch):
@@ -188,7 +186,7 @@ def test_scale_has_splats_steps_memory_slopes_and_gsplat(monkeypatch):
     points = [scale.Point(Size(count, 48, 40)) for count in (200, 800)]
     photos = [scale.Point(Size(200, 48, 40), photos=count) for count in (2, 3)]
     monkeypatch.setattr(scale, "sweeps", lambda *_: {"gaussians": points, "photos": photos})
-    result = scale.bench_scale(["gaussians", "photos"], CPU, peers=True, **BRIEF)
+    result = scale.bench_scale(CPU, **BRIEF)
     rows = [(r["sweep"], r["varied"], r["implementation"], r["what"]) for r in result["rows"]]
     both = ("sehdr-warp", "gsplat")
     assert sorted(rows) == sorted(
@@ -237,7 +235,7 @@ def test_training_puts_gsplat_beside_ours(monkeypatch):
     ours = bench_training(toy_scene(), CPU, iterations=20)
     assert ours["notes"] == ["gsplat not compared: it needs CUDA"] and calls == []
     assert ours["rows"][0]["iterations"] == 20 and 5 < ours["rows"][0]["psnr_ldr"] < 60
-    monkeypatch.setattr("sehdr_warp.bench.training.missing", lambda device: None)
+    monkeypatch.setattr("sehdr_warp.bench.training.note_missing", lambda result, device: True)
     both = bench_training(toy_scene(), CPU, iterations=5)
     assert [row["implementation"] for row in both["rows"]] == ["sehdr-warp", "gsplat"]
     assert calls == [40, None], "it is warmed up before it is timed"

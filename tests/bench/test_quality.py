@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from sehdr_warp.bench import quality
-from sehdr_warp.bench.jobs import FAILURE, FORMAT, RESULT, Job, choose_methods, plan_jobs, read_result
-from sehdr_warp.bench.quality import Runner, exposed, run_jobs, seconds_to_final
+from sehdr_warp.bench.jobs import FAILURE, FORMAT, RESULT, Job, plan_jobs
+from sehdr_warp.bench.quality import exposed, run_job, run_jobs
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.files import write_json
 
@@ -21,8 +21,8 @@ FINE, DIVERGES, BREAKS, DIES = range(4)
 SMALL = ["bench", "quality", "--device", "cpu", "--max-size", "32", "--iterations", "12"]
 
 
-def jobs(methods=("default",), variants=(), **changes) -> list[Job]:
-    return plan_jobs(["embedded"], choose_methods(methods, variants), **{"iterations": 10} | changes)
+def jobs(methods=("default",), **changes) -> list[Job]:
+    return plan_jobs(["embedded"], methods, **{"iterations": 10} | changes)
 
 
 def made_up(job: Job, psnr: float = 30.0) -> dict:
@@ -36,7 +36,7 @@ def made_up(job: Job, psnr: float = 30.0) -> dict:
         },
         "confidence": {"spearman_log2": 0.6},
         "response": "srgb",
-        **dict.fromkeys(("train_seconds", "seconds_to_final", "renders_per_second"), 2.0),
+        **dict.fromkeys(("train_seconds", "renders_per_second"), 2.0),
         **dict.fromkeys(("peak_memory_bytes", "gaussians"), 5000),
         "iterations": 10,
     }
@@ -44,22 +44,17 @@ def made_up(job: Job, psnr: float = 30.0) -> dict:
     return {"format": FORMAT, "key": job.key, "shared_by": 1, "config": job.config, "figures": figures, "curve": curve}
 
 
-class StubRunner:
-    """Trainings that take no time: the seed says what becomes of a job."""
-
-    def __init__(self, *_, **__):
-        pass
-
-    def run(self, job, folder):
-        with open(folder.parent.parent / "ran.txt", "a") as file:
-            file.write(f"{job.config['seed']}\n")
-        if job.config["seed"] == DIVERGES:
-            raise SehdrError("iteration 7: not finite")
-        if job.config["seed"] == BREAKS:
-            raise RuntimeError("a defect")
-        if job.config["seed"] == DIES:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return made_up(job)
+def run_stub(job, folder, *_):
+    """A training that takes no time: the seed says what becomes of a job."""
+    with open(folder.parent.parent / "ran.txt", "a") as file:
+        file.write(f"{job.config['seed']}\n")
+    if job.config["seed"] == DIVERGES:
+        raise SehdrError("iteration 7: not finite")
+    if job.config["seed"] == BREAKS:
+        raise RuntimeError("a defect")
+    if job.config["seed"] == DIES:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return made_up(job)
 
 
 def ran(out) -> list[int]:
@@ -67,9 +62,11 @@ def ran(out) -> list[int]:
     return sorted(map(int, path.read_text().split())) if path.exists() else []
 
 
-def test_jobs_are_every_combination_and_their_keys_tell_them_apart():
+def test_jobs_are_every_combination_and_their_keys_tell_them_apart(tmp_path):
     changes = {"exposures": (0, 4), "responses": ("known", "blind"), "seeds": (0, 1)}
-    made = jobs(("default", "truth", "hdr-gs"), ["plain:default:loss.clipping=false,loss.ssim_weight=0.1"], **changes)
+    plain = tmp_path / "plain.toml"
+    plain.write_text('base = "default"\n[loss]\nclipping = false\nssim_weight = 0.1\n')
+    made = jobs(("default", "truth", "hdr-gs", str(plain)), **changes)
     # The upper bound learns from truth and hdr-gs learns the curve: blind they would be the same trainings again.
     assert len(made) == 2 * 2 * (2 + 1 + 1 + 2)
     assert len({job.key for job in made}) == len({job.folder(Path()) for job in made}) == len(made)
@@ -88,12 +85,11 @@ def test_jobs_are_every_combination_and_their_keys_tell_them_apart():
 def test_what_cannot_be_planned_is_named(capfd, tmp_path):
     write_blender(tmp_path / "photos", 6)
     for arguments, message in (
-        (["--methods", "nope"], "method 'nope' is unknown"),
-        (["--methods", "default,default", "--variant", "default:default:seed=1"], "asked for twice"),
-        (["--variant", "x:default"], "--variant x:default: not NAME:BASE"),
+        (["--methods", "nope"], "nope: no such preset or file"),
+        (["--methods", "default,elsewhere/default.toml"], "two methods have one name"),
         (["--exposures", "5"], "exposure 5 is not one of 0 to 4"),
         (["--responses", "seen"], "response 'seen' is not one of known, blind"),
-        (["--methods", "truth", "--responses", "blind"], "none of the methods makes sense"),
+        (["--methods", "truth", "--responses", "blind"], "there is nothing to train"),
         (["--scenes", tmp_path / "nowhere"], "no such folder"),
         (["--jobs", "0"], "--jobs 0: not positive"),
         (["--slurm", "gpu"], "not name=value pairs"),
@@ -106,20 +102,20 @@ def test_what_cannot_be_planned_is_named(capfd, tmp_path):
 
 
 def test_finished_jobs_never_run_again_and_damaged_results_do(tmp_path, monkeypatch):
-    monkeypatch.setattr(quality, "Runner", StubRunner)
+    monkeypatch.setattr(quality, "run_job", run_stub)
     asked = jobs(seeds=(FINE, 7, 8))
     assert [row["gt_max"] for row in run_jobs(asked, tmp_path, device="cpu")] == [30.0] * 3
     folders = [job.folder(tmp_path) for job in asked]
     whole = (folders[1] / RESULT).read_bytes()
     (folders[1] / RESULT).write_bytes(whole[: len(whole) // 2])
     (folders[2] / RESULT).write_text(json.dumps(json.loads((folders[2] / RESULT).read_text()) | {"key": "other"}))
-    assert [read_result(folder) is not None for folder in folders] == [True, False, False]
+    assert [job.result(tmp_path) is not None for job in asked] == [True, False, False]
     rows = run_jobs(asked, tmp_path, device="cpu")
     assert ran(tmp_path) == [FINE, 7, 7, 8, 8] and not any("error" in row for row in rows)
 
 
 def test_a_job_that_fails_costs_itself_alone_and_is_tried_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(quality, "Runner", StubRunner)
+    monkeypatch.setattr(quality, "run_job", run_stub)
     asked = jobs(seeds=(DIVERGES, BREAKS, 7))
     rows = run_jobs(asked, tmp_path, device="cpu")
     assert [row.get("error") for row in rows] == ["iteration 7: not finite", "RuntimeError: a defect", None]
@@ -141,7 +137,7 @@ def test_submitit_runs_several_at_once_and_outlives_one_that_dies(tmp_path, monk
 
 
 def _run_stubbed(work, arguments):
-    work.__globals__["Runner"] = StubRunner
+    work.__globals__["run_job"] = run_stub
     return work(*arguments)
 
 
@@ -159,10 +155,10 @@ def test_only_methods_with_truth_see_that_of_training_views(tmp_path, monkeypatc
         seen["test"] = {view.hdr is not None for view in scene.test_views}
         raise SehdrError("seen enough")
 
-    monkeypatch.setattr("sehdr_warp.training.train.train", look)
+    monkeypatch.setattr(quality, "train", look)
     for name, truth in (("default", False), ("truth", True), ("paper", False), ("hdr-gs-truth", True)):
         with pytest.raises(SehdrError, match="seen enough"):
-            Runner("cpu").run(jobs((name,), max_size=32)[0], tmp_path)
+            run_job(jobs((name,), max_size=32)[0], tmp_path, "cpu", None)
         assert seen == {"train": {truth}, "test": {True}}, name
 
 
@@ -170,12 +166,6 @@ def test_exposures_are_four_times_apart_and_photos_follow():
     dark, bright = (exposed(jobs(exposures=(place,), max_size=32)[0]) for place in (1, 2))
     assert bright.views[0].exposure_time == pytest.approx(4 * dark.views[0].exposure_time)
     assert bright.views[0].image.mean() > 1.3 * dark.views[0].image.mean()
-
-
-def test_the_time_to_the_final_figure():
-    curve = [{"seconds": 1.0, "psnr_mu": 20.0}, {"seconds": 2.0, "psnr_mu": 29.95}, {"seconds": 9.0, "psnr_mu": 30.0}]
-    assert seconds_to_final(curve, 10.0) == 2.0
-    assert seconds_to_final([{"seconds": 3.0, "psnr_ldr": 20.0}], 2.5) == 2.5
 
 
 def test_one_training_from_the_command_line(tmp_path, capsys):
@@ -193,4 +183,4 @@ def test_one_training_from_the_command_line(tmp_path, capsys):
 
 def test_a_scene_that_lost_its_place_is_told(tmp_path):
     with pytest.raises(InputError, match="is not here"):
-        plan_jobs(["embedded:nowhere"], choose_methods(["default"]))
+        plan_jobs(["embedded:nowhere"], ["default"])

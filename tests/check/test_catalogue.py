@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sehdr_warp.check import catalogue, splat_cases
-from sehdr_warp.check.case import Case, Reading, compare_alike
+from sehdr_warp.check.case import Case, Reading, compare
 from sehdr_warp.errors import SehdrError
 from tests.refusals import call, refused
 
@@ -51,9 +51,9 @@ def test_bounds_follow_the_condition_not_the_result():
     """1 - x next to 1: the error of the float32 result is allowed only as far as x's own rounding causes it."""
     near = {"x": torch.full((5,), 1 - 2.0**-12, dtype=torch.float64)}
     far = {"x": torch.full((5,), 0.5, dtype=torch.float64)}
-    ill, well = (compare_alike(lambda x: {"y": 1 - x}, x, CPU)[0] for x in (near, far))
+    ill, well = (compare(lambda x: {"y": 1 - x}, x, CPU)[0] for x in (near, far))
     assert ill.bound > 100 * well.bound and ill.holds and well.holds
-    off = compare_alike(lambda x: {"y": (1 - x) * (1.0001 if x.dtype == torch.float32 else 1)}, far, CPU)[0]
+    off = compare(lambda x: {"y": (1 - x) * (1.0001 if x.dtype == torch.float32 else 1)}, far, CPU)[0]
     assert not off.holds and off.bound == well.bound
     assert not Reading("x", float("nan"), 1.0).holds
 
