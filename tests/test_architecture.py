@@ -24,7 +24,7 @@ ALLOWED = {
     "scene": ANY | {"response"},
     "field": ANY | {"scene", "response", "splatting"},
     "output": ANY | {"scene", "field.exposure"},
-    "evaluation": ANY | {"scene", "splatting.ssim", "output.names"},
+    "evaluation": ANY | {"scene", "splatting.ssim", "output.names", "output.charts"},
     "training": ANY | {"scene", "response", "field", "splatting", "evaluation.metrics", "evaluation.protocols"},
     "synth": ANY | {"scene", "response", "output.exr", "output.images", "field.exposure"},
     "check": ANY | {"bench.results", "kernels.constants", "scene", "response", "field", "splatting", "training"},

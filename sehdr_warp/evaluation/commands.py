@@ -12,22 +12,39 @@ from tyro.conf import Positional
 from ..training.commands import ensured_scene, open_run
 
 
-@dataclass(frozen=True)
-class Evaluate:
+@dataclass(frozen=True, kw_only=True)
+class _Figures:
+    json: Path | None = None
+    """Also write the figures to this file; - prints them on standard output in place of the table."""
+    lpips: Path | None = None
+    """Folder with LPIPS weights; without, LPIPS is null."""
+    overwrite: bool = False
+    """Replace the file of --json."""
+
+    def tell(self, figures: Callable[[], dict]) -> None:
+        """Computes once it is known that the result can be written; prints and writes it."""
+        from ..files import check_absent, write_json
+        from .table import format_table
+
+        to_file = self.json is not None and str(self.json) != "-"
+        if to_file:
+            check_absent(self.json, self.overwrite)
+        result = figures()
+        if to_file:
+            write_json(self.json, result, self.overwrite)
+        print(format_table(result) if self.json is None or to_file else json.dumps(result))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(_Figures):
     """Compare a trained scene with its held-out photos and, where there is some, with HDR truth."""
 
     run: Positional[Path]
     """Folder of a run."""
-    json: Path | None = None
-    """Also write the figures to this file; - prints them on standard output in place of the table."""
     data: str | None = None
     """The photos, if they have moved since the training."""
-    lpips: Path | None = None
-    """Folder with LPIPS weights; without, LPIPS is null."""
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
-    overwrite: bool = False
-    """Replace the file of --json."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +63,8 @@ class Compare:
     """Replace files that exist."""
 
 
-@dataclass(frozen=True)
-class Score:
+@dataclass(frozen=True, kw_only=True)
+class Score(_Figures):
     """Score a folder of EXR pictures of any origin against the HDR truth of a set."""
 
     folder: Positional[Path]
@@ -56,12 +73,6 @@ class Score:
     """The set: a folder with HDR truth, or an embedded scene."""
     max_size: int | None = None
     """Longest side of the truth in pixels, as the pictures have it; larger truth is reduced."""
-    json: Path | None = None
-    """Also write the figures to this file; - prints them on standard output in place of the table."""
-    lpips: Path | None = None
-    """Folder with LPIPS weights; without, LPIPS is null."""
-    overwrite: bool = False
-    """Replace the file of --json."""
 
 
 def run_evaluate(asked: Evaluate) -> None:
@@ -72,7 +83,7 @@ def run_evaluate(asked: Evaluate) -> None:
         run = open_run(asked.run, asked.device)
         return evaluate(run, ensured_scene(run, asked.data), lpips_weights=asked.lpips)
 
-    _tell(figures, asked)
+    asked.tell(figures)
 
 
 def run_score(asked: Score) -> None:
@@ -80,39 +91,27 @@ def run_score(asked: Score) -> None:
     from ..scene import load_scene
     from .score import score_folder
 
-    _tell(
-        lambda: score_folder(asked.folder, load_scene(asked.truth, max_size=asked.max_size), lpips_weights=asked.lpips),
-        asked,
-    )
+    def figures():
+        return score_folder(asked.folder, load_scene(asked.truth, max_size=asked.max_size), lpips_weights=asked.lpips)
+
+    asked.tell(figures)
 
 
 def run_compare(asked: Compare) -> None:
     """Prints the table and writes what was asked for."""
     from ..files import atomic_path, check_absent
-    from .compare import compare_runs, comparison_csv, comparison_figure, comparison_latex, comparison_table
+    from ..output.charts import training_chart
+    from .compare import compare_runs, comparison_csv, comparison_latex, comparison_table
 
     for path in filter(None, (asked.plot, asked.csv, asked.latex)):
         check_absent(path, asked.overwrite)
     rows = compare_runs([open_run(path, "cpu") for path in asked.runs])
-    for path, write in ((asked.csv, comparison_csv), (asked.latex, comparison_latex)):
+    for path, text in ((asked.csv, comparison_csv), (asked.latex, comparison_latex)):
         if path is not None:
             with atomic_path(path, asked.overwrite) as file:
-                file.write_text(write(rows), encoding="utf-8")
+                file.write_text(text(rows), encoding="utf-8")
     if asked.plot is not None:
         with atomic_path(asked.plot, asked.overwrite) as file:
-            comparison_figure(rows).savefig(file, dpi=140, facecolor="white", format="png")
+            chart = training_chart({row.label: row.curves for row in rows})
+            chart.savefig(file, dpi=140, facecolor="white", format="png")
     print(comparison_table(rows))
-
-
-def _tell(figures: Callable[[], dict], asked: Evaluate | Score) -> None:
-    """Computes once it is known that the result can be written."""
-    from ..files import check_absent, write_json
-    from .table import format_table
-
-    to_file = asked.json is not None and str(asked.json) != "-"
-    if to_file:
-        check_absent(asked.json, asked.overwrite)
-    result = figures()
-    if to_file:
-        write_json(asked.json, result, asked.overwrite)
-    print(format_table(result) if asked.json is None or to_file else json.dumps(result))

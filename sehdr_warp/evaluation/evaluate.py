@@ -4,7 +4,6 @@ import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
 
 import torch
 
@@ -22,38 +21,25 @@ PERFECT = "there is no error at all, so the PSNR is infinite"
 log = logging.getLogger(__name__)
 
 
-class Pictures(Protocol):
-    """Predictions of views. facts: plain values about them, for the result."""
-
-    facts: dict
-
-    def hdr(self, view: View) -> torch.Tensor:
-        """[H, W, 3] scene-linear radiance."""
-
-    def ldr(self, view: View) -> torch.Tensor | None:
-        """[H, W, 3] simulated photo in [0, 1], or None where there is none."""
-
-    def doubt(self, view: View) -> tuple[torch.Tensor, float] | None:
-        """Confidence [H, W] in [0, 1], and the radiance that a photo shows as black; None where it is not known."""
-
-
 class RunPictures:
-    """What a trained run renders."""
+    """What a trained run predicts for views. facts: plain values about it, for the result."""
 
     def __init__(self, run):
         self.run = run
         names = {"train_seconds": "train_seconds", "gaussians": "gaussian_count", "iterations": "iterations"}
         self.facts = {key: getattr(run, name) for key, name in names.items()}
 
-    def hdr(self, view):
+    def hdr(self, view: View) -> torch.Tensor:
+        """[H, W, 3] scene-linear radiance."""
         return self.run.render(view.camera).hdr
 
-    def ldr(self, view):
+    def ldr(self, view: View) -> torch.Tensor | None:
+        """[H, W, 3] simulated photo in [0, 1]; None where there is none."""
         return self.run.render_ldr(view.camera, view.exposure_time)
 
-    def doubt(self, view):
-        render = getattr(self.run, "render_confidence", None)
-        confidence = render(view.camera) if render else None
+    def doubt(self, view: View) -> tuple[torch.Tensor, float] | None:
+        """Confidence [H, W] in [0, 1], and the radiance that a photo shows as black; None where it is not known."""
+        confidence = self.run.render_confidence(view.camera)
         if confidence is None:
             return None
         black = self.run.response.decode(torch.full((1, 3), DARKEST_CODE, device=confidence.device))
@@ -66,9 +52,7 @@ def evaluate(
     scene: Scene,
     *,
     lpips_weights: Path | str | None = None,
-    protocols: Sequence[str] = PROTOCOLS,
     peak_luminance: float = PEAK_LUMINANCE,
-    white_percentile: float = 100.0,
     flip: bool = False,
 ) -> dict:
     """Render the scene's test views with a trained run and compare them with the photos and the HDR truth.
@@ -78,8 +62,7 @@ def evaluate(
         scene: the views, at the exposure that was trained on. Without test views the training views are taken, and
             "split" says so.
         lpips_weights: a folder, see load_lpips.
-        protocols: names out of PROTOCOLS.
-        peak_luminance, white_percentile: how PU21 maps the truth to cd/m^2, see pu21_metrics.
+        peak_luminance: cd/m^2 at which PU21 shows the truth's maximum.
         flip: also HDR-FLIP under each protocol's scale, where flip-evaluator is installed; slow.
 
     Returns:
@@ -92,33 +75,44 @@ def evaluate(
         are of whole images; views with an empty mask are left out.
 
     Raises:
-        SehdrError: for a scene without views, images that disagree with their camera, a render that is not finite or an
-            unknown protocol.
+        SehdrError: for a scene without views, images that disagree with their camera or a render that is not finite.
         InputError: for LPIPS weights that cannot be read.
     """
-    options = {"peak_luminance": peak_luminance, "white_percentile": white_percentile}
-    return Evaluation(RunPictures(run), scene, run.device, lpips_weights, protocols, options, flip).result()
+    options = {"lpips_weights": lpips_weights, "peak_luminance": peak_luminance, "flip": flip}
+    return Evaluation(RunPictures(run), scene, run.device, **options).result()
 
 
 class Evaluation:
-    """One comparison of pictures with a scene's views."""
+    """One comparison of pictures, which predict like RunPictures, with a scene's views.
 
-    def __init__(self, pictures: Pictures, scene, device, lpips_weights, names, pu21_mapping, flip, views=None):
-        for name in names:
-            if name not in PROTOCOLS:
-                raise SehdrError(f"protocol = {name!r} is unknown; choose from {', '.join(PROTOCOLS)}")
-        self.pictures, self.scene, self.names = pictures, scene, tuple(names)
-        self.pu21_mapping, self.split = pu21_mapping, "test" if scene.test_views else "train"
+    views: by default the test views, else the training views. scale_views: those that tell the scale of "aligned", by
+    default the training views.
+    """
+
+    def __init__(
+        self,
+        pictures,
+        scene: Scene,
+        device,
+        *,
+        views: Sequence[View] | None = None,
+        scale_views: Sequence[View] | None = None,
+        lpips_weights=None,
+        peak_luminance: float = PEAK_LUMINANCE,
+        flip: bool = False,
+    ):
+        self.pictures, self.scene, self.device = pictures, scene, torch.device(device)
+        self.split = "test" if scene.test_views else "train"
         given = (scene.test_views or scene.train_views) if views is None else views
         self.views = [view for view in given if view.mask is None or view.mask.any()]
-        self.scale_views = scene.train_views
         if not self.views:
             raise SehdrError(f"scene {scene.name!r} has no views to evaluate; check its splits and masks")
-        self.device = torch.device(device)
+        voting = scene.train_views if scale_views is None else scale_views
+        self.scale_views = [view for view in voting if view.hdr is not None]
         self.lpips, self.lpips_reason = load_lpips(lpips_weights, self.device)
-        self.with_flip = flip
+        self.peak_luminance, self.with_flip = peak_luminance, flip
         self.flip, self.flip_reason = load_flip() if flip else (None, None)
-        self.regions = {region: _RegionErrors(self.names) for region in metrics.REGIONS}
+        self.regions = {region: _RegionErrors() for region in metrics.REGIONS}
         self.ranking = ErrorRanking()
 
     def result(self) -> dict:
@@ -131,30 +125,25 @@ class Evaluation:
         truths = [row for row, view in zip(rows, self.views) if view.hdr is not None]
         missing = None if truths else f"the {self.split} views hold no HDR truth"
         hdr, pu21 = {}, {}
-        for name in self.names:
-            reason = missing or (scale_reason if name == "aligned" else None)
-            if reason:
-                hdr[name] = {"psnr_mu": None, "ssim_mu": None, "lpips_mu": None, "views": 0, "reason": reason}
+        for name in PROTOCOLS:
+            if reason := missing or (scale_reason if name == "aligned" else None):
+                hdr[name] = dict.fromkeys(("psnr_mu", "ssim_mu", "lpips_mu")) | {"views": 0, "reason": reason}
                 hdr[name] |= {"hdr_flip": None} if self.with_flip else {}
                 pu21[name] = {"psnr": None, "ssim": None, "reason": reason}
                 continue
-            hdr[name] = _mean([row["protocol"][name] for row in truths]) | {"views": len(truths)}
-            pu21[name] = _mean([row["pu21"][name] for row in truths])
-            self._explain(hdr[name], "lpips_mu")
+            hdr[name] = self._explained(_mean([row["protocol"][name] for row in truths])) | {"views": len(truths)}
             hdr[name] |= {"flip_reason": self.flip_reason} if self.flip_reason else {}
-        if "aligned" in hdr:
-            hdr["aligned"]["scale"] = scale
+            pu21[name] = _mean([row["pu21"][name] for row in truths])
+        hdr["aligned"]["scale"] = scale
         ldr = _mean([row["ldr"] for row in rows])
         if ldr["psnr"] is None:
             ldr["reason"] = "the folder holds radiance, no simulated photos"
-        else:
-            self._explain(ldr, "lpips")
         result = {
             "scene": self.scene.name,
             "split": self.split,
             "protocol": hdr,
-            "pu21": pu21 | self.pu21_mapping,
-            "ldr": ldr,
+            "pu21": pu21 | {"peak_luminance": self.peak_luminance},
+            "ldr": ldr if "reason" in ldr else self._explained(ldr),
             "regions": {region: errors.result(missing) for region, errors in self.regions.items()},
             "confidence": self.ranking.result() | ({"reason": missing} if missing else {}),
             "views": rows,
@@ -164,9 +153,9 @@ class Evaluation:
 
     def _scale(self) -> tuple[float | None, str | None]:
         """The one factor of the scene for `aligned`, or why there is none."""
-        if "aligned" not in self.names or not any(view.hdr is not None for view in self.views):
+        if not any(view.hdr is not None for view in self.views):
             return None, None
-        views = [view for view in self.scale_views if view.hdr is not None]
+        views = self.scale_views
         if not views:
             return None, "no training view holds HDR truth to fit the scale on"
         log.info("fitting the scale on %d views", len(views))
@@ -191,41 +180,35 @@ class Evaluation:
         return None if array is None else torch.tensor(array, dtype=torch.float32, device=self.device)
 
     def _view(self, view: View, scale: float | None) -> dict:
+        """The figures of one view; its part in the regions and the ranking is added to theirs."""
         hdr, truth = self._render(view)
         photo, mask = self._tensor(view.image), self._tensor(view.mask)
         row = {"name": view.name, "ldr": dict.fromkeys(("psnr", "ssim", "lpips")), "protocol": {}, "pu21": {}}
         regions = metrics.region_masks(photo)
-        weights = {name: region if mask is None else region * mask for name, region in regions.items()}
-        counted = float(photo.shape[0] * photo.shape[1] if mask is None else mask.sum())
-        encoded = self.pictures.ldr(view)
-        if encoded is not None:
-            encoded = _inside(encoded.detach().float(), photo, mask)
-            figures = {"psnr": metrics.psnr(encoded, photo, mask), "ssim": metrics.ssim(encoded, photo, mask)}
-            row["ldr"] = figures | {"lpips": self._lpips(encoded, photo)}
-        for region, weight in weights.items():
-            self.regions[region].add_ldr(encoded, photo, weight, counted)
-        if truth is None:
-            return row
-        if doubt := self.pictures.doubt(view):
+        pooled = []
+        if (encoded := self.pictures.ldr(view)) is not None:
+            pair = _inside((encoded.detach().float(), photo), mask)
+            row["ldr"] = {"psnr": metrics.psnr(*pair, mask), "ssim": metrics.ssim(*pair, mask)}
+            row["ldr"]["lpips"] = self._lpips(*pair)
+            pooled.append(("ldr", *pair))
+        if truth is not None and (doubt := self.pictures.doubt(view)):
             self.ranking.add(doubt[0], hdr, truth, regions["well-exposed"], doubt[1], mask)
-        for name in self.names:
+        for name in PROTOCOLS if truth is not None else ():
             if name == "aligned" and scale is None:
                 continue
-            factor = scale if name == "aligned" else 1.0
-            pair = tone_map(name, hdr, truth, mask, scale=factor)
-            pair = (_inside(pair[0], pair[1], mask), pair[1])
+            pair = _inside(tone_map(name, hdr, truth, mask, scale=scale), mask)
             row["protocol"][name] = {
                 "psnr_mu": tone_mapped_psnr(name, *pair, mask),
                 "ssim_mu": metrics.ssim(*pair, mask),
                 "lpips_mu": self._lpips(*pair),
             }
-            linear = normalise(name, hdr, truth, mask, scale=factor)
-            linear = (_inside(linear[0], linear[1], mask), linear[1])
-            row["pu21"][name] = metrics.pu21_metrics(*linear, mask, **self.pu21_mapping)
+            linear = _inside(normalise(name, hdr, truth, mask, scale=scale), mask)
+            row["pu21"][name] = metrics.pu21_metrics(*linear, mask, peak_luminance=self.peak_luminance)
             if self.with_flip:
                 row["protocol"][name]["hdr_flip"] = self.flip(*linear) if self.flip else None
-            for region, weight in weights.items():
-                self.regions[region].add_hdr(name, *pair, weight)
+            pooled.append((name, *pair))
+        for region, inside in regions.items():
+            self.regions[region].add(inside if mask is None else inside * mask, mask, pooled)
         return row
 
     def _lpips(self, prediction, truth) -> float | None:
@@ -233,51 +216,44 @@ class Evaluation:
             return None
         return self.lpips(prediction, truth)
 
-    def _explain(self, figures: dict, key: str) -> None:
-        """Say beside a missing LPIPS why it is missing."""
-        if figures[key] is None:
-            small = f"a view is smaller than {SMALLEST_EDGE} pixels"
-            figures["lpips_reason"] = self.lpips_reason or small
+    def _explained(self, figures: dict) -> dict:
+        """The figures, and beside a missing LPIPS why it is missing."""
+        if None not in (figures.get("lpips", 0), figures.get("lpips_mu", 0)):
+            return figures
+        return figures | {"lpips_reason": self.lpips_reason or f"a view is smaller than {SMALLEST_EDGE} pixels"}
 
 
 class _RegionErrors:
     """Squared errors of one region, pooled over views: a view may have few of its pixels, or none."""
 
-    def __init__(self, names):
-        self.pixels = self.weight = self.ldr = 0.0
-        self.hdr = dict.fromkeys(names, (0.0, 0.0))
+    def __init__(self):
+        self.inside = self.counted = 0.0
+        self.errors: dict[str, tuple[float, float]] = {}
 
-    def add_ldr(self, prediction, truth, weight, counted: float) -> None:
-        """Counts the region; prediction None leaves its photo error unknown."""
-        error, total = metrics.squared_error(truth if prediction is None else prediction, truth, weight)
-        self.pixels += counted
-        self.weight += total
-        self.ldr += math.nan if prediction is None else float(error.mean())
-
-    def add_hdr(self, name, prediction, truth, weight) -> None:
-        error, total = metrics.squared_error(prediction, truth, weight)
-        before = self.hdr[name]
-        self.hdr[name] = (before[0] + float(error.mean()), before[1] + total)
+    def add(self, weight, mask, pairs) -> None:
+        """weight: [H, W] of the region, 0 outside the mask. pairs: (name, prediction, truth) to be compared in it."""
+        self.inside += float(weight.sum())
+        self.counted += weight.numel() if mask is None else float(mask.sum())
+        for name, prediction, truth in pairs:
+            error, total = metrics.squared_error(prediction, truth, weight)
+            before = self.errors.get(name, (0.0, 0.0))
+            self.errors[name] = (before[0] + float(error.mean()), before[1] + total)
 
     def result(self, missing: str | None) -> dict:
-        figures = {
-            "fraction": self.weight / self.pixels,
-            "psnr_ldr": metrics.decibels(self.ldr / self.weight if self.weight else math.nan),
-            "psnr_mu": {
-                name: metrics.decibels(error / weight if weight else math.nan)
-                for name, (error, weight) in self.hdr.items()
-            },
-        }
-        if not self.weight:
-            figures["reason"] = "no pixel of the photos lies in this region"
-        elif missing:
-            figures["reason"] = missing
-        return figures
+        reason = missing if self.inside else "no pixel of the photos lies in this region"
+        figures = {"fraction": self.inside / self.counted, "psnr_ldr": self._decibels("ldr")}
+        figures["psnr_mu"] = {name: self._decibels(name) for name in PROTOCOLS}
+        return figures | ({"reason": reason} if reason else {})
+
+    def _decibels(self, name: str) -> float:
+        error, weight = self.errors.get(name, (0.0, 0.0))
+        return metrics.decibels(error / weight if weight else math.nan)
 
 
-def _inside(prediction: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
-    """The prediction where the mask counts, the truth elsewhere: windows that cross the border then see no error."""
-    return prediction if mask is None else torch.lerp(truth, prediction, mask[..., None].to(truth))
+def _inside(pair: tuple[torch.Tensor, torch.Tensor], mask: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+    """Prediction and truth, the prediction as the truth outside the mask: windows across its border see no error."""
+    prediction, truth = pair
+    return (prediction if mask is None else torch.lerp(truth, prediction, mask[..., None].to(truth))), truth
 
 
 def _mean(rows: list[dict]) -> dict:
@@ -291,16 +267,13 @@ def _mean(rows: list[dict]) -> dict:
 def _plain(value):
     """The same tree without NaN and infinity, which JSON does not know; an infinite PSNR gets a reason beside it."""
     if isinstance(value, dict):
-        perfect = any(key.startswith("psnr") and math.inf in _values(item) for key, item in value.items())
+        figures = [item for key, item in value.items() if key.startswith("psnr")]
+        perfect = any(math.inf in (item.values() if isinstance(item, dict) else [item]) for item in figures)
         reason = {"reason": PERFECT} if perfect and "reason" not in value else {}
         return {key: _plain(item) for key, item in value.items()} | reason
     if isinstance(value, list):
         return [_plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _values(item) -> list:
-    return list(item.values()) if isinstance(item, dict) else [item]
 
 
 def _line(number: int, count: int, row: dict) -> str:

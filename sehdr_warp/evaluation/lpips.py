@@ -39,25 +39,12 @@ class _Fire(nn.Module):
 
 def _squeezenet_features() -> nn.Sequential:
     """SqueezeNet 1.1 up to its last fire module, layers numbered as in torchvision."""
-
-    def pool():
-        return nn.MaxPool2d(3, 2, ceil_mode=True)
-
-    return nn.Sequential(
-        nn.Conv2d(3, 64, 3, stride=2),
-        nn.ReLU(),
-        pool(),
-        _Fire(64, 16, 64),
-        _Fire(128, 16, 64),
-        pool(),
-        _Fire(128, 32, 128),
-        _Fire(256, 32, 128),
-        pool(),
-        _Fire(256, 48, 192),
-        _Fire(384, 48, 192),
-        _Fire(384, 64, 256),
-        _Fire(512, 64, 256),
-    )
+    fires = ((64, 16, 64), (128, 16, 64)), ((128, 32, 128), (256, 32, 128))
+    last = ((256, 48, 192), (384, 48, 192), (384, 64, 256), (512, 64, 256))
+    layers = [nn.Conv2d(3, 64, 3, stride=2), nn.ReLU()]
+    for stage in (*fires, last):
+        layers += [nn.MaxPool2d(3, 2, ceil_mode=True), *(_Fire(*shape) for shape in stage)]
+    return nn.Sequential(*layers)
 
 
 class Lpips:
@@ -108,8 +95,11 @@ def load_lpips(folder: Path | str | None = None, device: torch.device | str = "c
         beside = f"; the heads for {' and '.join(others)} have no backbone here" if others else ""
         return None, f"{folder} lacks {missing}{beside}"
     features = _squeezenet_features()
-    state = {name.removeprefix("features."): value for name, value in _tensors(backbones[0]).items()}
-    state = {name: value for name, value in state.items() if not name.startswith("classifier.")}
+    state = {
+        name.removeprefix("features."): value
+        for name, value in _tensors(backbones[0]).items()
+        if not name.startswith("classifier.")
+    }
     try:
         features.load_state_dict(state)
     except RuntimeError as error:

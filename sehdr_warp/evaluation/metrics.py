@@ -46,10 +46,10 @@ def psnr(
     channels_apart: the mean of each channel's PSNR in place of the PSNR of the mean error.
     """
     error, weight = squared_error(prediction, truth, mask)
-    if channels_apart:
-        values = [decibels(float(channel) / weight if weight else math.nan, peak) for channel in error]
-        return sum(values) / len(values)
-    return decibels(float(error.sum()) / (weight * len(error)) if weight else math.nan, peak)
+    if not weight:
+        return math.nan
+    means = error if channels_apart else error.mean(0, keepdim=True)
+    return math.fsum(decibels(float(mean) / weight, peak) for mean in means) / len(means)
 
 
 def squared_error(
@@ -59,16 +59,14 @@ def squared_error(
     squared = (prediction.double() - truth.double()) ** 2
     if mask is None:
         return squared.sum((0, 1)), float(squared.shape[0] * squared.shape[1])
+    weights = mask.double()[..., None]
     # What the mask leaves out may be anything: 0 times NaN would be NaN.
-    weighted = torch.where(mask[..., None] > 0, squared * mask.double()[..., None], 0.0)
-    return weighted.sum((0, 1)), float(mask.double().sum())
+    return torch.where(weights > 0, squared * weights, 0.0).sum((0, 1)), float(weights.sum())
 
 
 def decibels(mean_squared_error: float, peak: float = 1.0) -> float:
     """10 log10(peak^2 / mean_squared_error); infinity for 0, NaN for NaN."""
-    if mean_squared_error == 0:
-        return math.inf
-    return 10 * math.log10(peak**2 / mean_squared_error)
+    return math.inf if mean_squared_error == 0 else 10 * math.log10(peak**2 / mean_squared_error)
 
 
 def ssim(
@@ -102,37 +100,23 @@ def pu21_metrics(
     mask: torch.Tensor | None = None,
     *,
     peak_luminance: float = 1000.0,
-    white_percentile: float = 100.0,
 ) -> dict[str, float]:
     """PSNR of PU21-encoded colour and SSIM of PU21-encoded luminance.
 
     prediction, truth: [H, W, 3] relative radiance in one unit, Rec.709 primaries. PU21 needs absolute values: the
-    white_percentile-th percentile of the truth's largest channel (100: its maximum) is shown at peak_luminance
-    cd/m^2, and the prediction by the same factor. Returns {"psnr": dB, "ssim": ...}, both with peak 256.
+    truth's maximum is shown at peak_luminance cd/m^2, and the prediction by the same factor.
+    Returns {"psnr": dB, "ssim": ...}, both with peak 256.
     """
-    brightest = truth.double().amax(2)
-    brightest = brightest if mask is None else brightest[mask > 0]
-    if brightest.numel() == 0:
-        return {"psnr": math.nan, "ssim": math.nan}
-    white = float(percentile(brightest, white_percentile))
+    counted = truth if mask is None else truth[mask > 0]
+    white = float(counted.max()) if counted.numel() else 0.0
     factor = peak_luminance / white if white > 0 else 1.0
-    shown, reference = prediction.double() * factor, truth.double() * factor
-    weights = shown.new_tensor(LUMINANCE)
+    shown = [image.double() * factor for image in (prediction, truth)]
+    weights = shown[0].new_tensor(LUMINANCE)
+    gray = [pu21_encode((image @ weights)[..., None]) for image in shown]
     return {
-        "psnr": psnr(pu21_encode(shown), pu21_encode(reference), mask, peak=PU21_PEAK),
-        "ssim": ssim(
-            pu21_encode((shown @ weights)[..., None]),
-            pu21_encode((reference @ weights)[..., None]),
-            mask,
-            peak=PU21_PEAK,
-        ),
+        "psnr": psnr(*map(pu21_encode, shown), mask, peak=PU21_PEAK),
+        "ssim": ssim(*gray, mask, peak=PU21_PEAK),
     }
-
-
-def percentile(values: torch.Tensor, percent: float) -> torch.Tensor:
-    """The value below which `percent` of the values lie (nearest rank); any number of values."""
-    rank = math.ceil(percent / 100 * values.numel())
-    return values.flatten().kthvalue(min(max(rank, 1), values.numel())).values
 
 
 def region_masks(photo: torch.Tensor) -> dict[str, torch.Tensor]:

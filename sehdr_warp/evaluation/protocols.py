@@ -35,7 +35,7 @@ def normalise(
     truth: torch.Tensor,
     mask: torch.Tensor | None = None,
     *,
-    scale: float = 1.0,
+    scale: float | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Relative radiance of prediction and truth, [H, W, 3] float64 each, the truth's maximum at 1; not yet limited.
 
@@ -46,7 +46,7 @@ def normalise(
         raise ValueError(f"protocol {protocol!r} is not one of {', '.join(PROTOCOLS)}")
     prediction, truth = prediction.double(), truth.double()
     unit = _maximum(truth, mask)
-    own = {"gt-max": unit, "self-max": _maximum(prediction, mask), "aligned": unit / scale}[protocol]
+    own = {"gt-max": unit, "self-max": _maximum(prediction, mask), "aligned": unit / (scale or 1.0)}[protocol]
     return prediction / own, truth / unit
 
 
@@ -56,7 +56,7 @@ def tone_map(
     truth: torch.Tensor,
     mask: torch.Tensor | None = None,
     *,
-    scale: float = 1.0,
+    scale: float | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """The mu-law images that the protocol compares, [H, W, 3] float64 in [0, 1]; arguments as in normalise."""
     prediction, truth = (mu_law(image) for image in normalise(protocol, prediction, truth, mask, scale=scale))
@@ -95,18 +95,24 @@ def fit_scale(
         if mask is not None:
             valid &= (mask > 0.5)[..., None]
         clipped = torch.zeros_like(valid) if photo is None else region_masks(photo)["clipped"][..., None]
-        votes.append(_log_ratios(prediction, truth, valid & ~clipped))
+        votes.append(log_ratios(prediction, truth, valid & ~clipped))
         if sum(map(len, votes)) < LEAST_VOTES:
-            guesses.append(_log_ratios(prediction, truth, valid & clipped))
+            guesses.append(log_ratios(prediction, truth, valid & clipped))
     if sum(map(len, votes)) < LEAST_VOTES:
         votes += guesses
-    joined = torch.cat(votes) if votes else torch.zeros(0)
-    return float(joined.median().exp()) if len(joined) else None
+    return median_factor(votes)
 
 
-def _log_ratios(prediction: torch.Tensor, truth: torch.Tensor, chosen: torch.Tensor) -> torch.Tensor:
+def log_ratios(prediction: torch.Tensor, truth: torch.Tensor, chosen: torch.Tensor) -> torch.Tensor:
+    """[K] log(truth / prediction) of the chosen values, evenly spaced where they are too many."""
     ratios = (truth[chosen] / prediction[chosen]).log()
     return ratios[:: max(1, -(-len(ratios) // VOTES_PER_VIEW))].cpu()
+
+
+def median_factor(votes: list[torch.Tensor]) -> float | None:
+    """exp of the median of what log_ratios gave for several views; None without votes."""
+    joined = torch.cat(votes) if votes else torch.zeros(0)
+    return float(joined.median().exp()) if len(joined) else None
 
 
 def _maximum(image: torch.Tensor, mask: torch.Tensor | None) -> float:

@@ -1,10 +1,10 @@
-"""Whether confidence ranks errors: Spearman's correlation between doubt (1 - confidence) and the true error of
-pixels."""
+"""Whether confidence ranks errors: Spearman's correlation between doubt (1 - confidence) and pixels' true error."""
 
 import torch
 from torch import Tensor
 
 from .metrics import mu_law
+from .protocols import log_ratios, median_factor
 
 MOST_PIXELS = 16384
 """Taken from one view, evenly spaced."""
@@ -13,8 +13,7 @@ DARKEST_CODE = 0.5 / 255
 
 
 class ErrorRanking:
-    """Gathers confidence, render and truth of the pixels of held-out views; all views of a scene are ranked
-    together."""
+    """Gathers confidence, render and truth of held-out views' pixels; all views of a scene are ranked together."""
 
     def __init__(self):
         self._views: list[tuple[Tensor, Tensor, Tensor, Tensor, float, float]] = []
@@ -34,7 +33,7 @@ class ErrorRanking:
         counted = torch.ones_like(well_exposed) if mask is None else mask > 0.5
         unit = float(truth[counted].max()) if bool(counted.any()) else 0.0
         step = max(1, -(-int(counted.sum()) // MOST_PIXELS))
-        images = (confidence, prediction.float().clamp_min(0), truth.float(), well_exposed)
+        images = (confidence.double(), prediction.double().clamp_min(0), truth.double(), well_exposed)
         self._views.append((*(image[counted][::step].cpu() for image in images), darkest, unit or 1.0))
 
     def result(self) -> dict:
@@ -44,42 +43,32 @@ class ErrorRanking:
         log2    |log2((scale prediction + black) / (truth + black))|, black = scale darkest, stops
         mu      |mu-law(scale prediction) - mu-law(truth)|, both over the largest truth of the view
 
-        scale takes the renders to the truth by the median over the well-exposed pixels that are ranked.
+        scale takes the renders to the truth by the median over the well-exposed pixels that are ranked; else it is 1.
         """
         figures = dict.fromkeys(("spearman_log2", "spearman_mu", "mean", "scale")) | {"pixels": 0}
         confidence = torch.cat([view[0] for view in self._views]) if self._views else torch.zeros(0)
         if not len(confidence):
             return figures | {"reason": "the run's confidence was not measured"}
-        scale = self._scale()
-        errors = {"log2": [], "mu": []}
+        votes = []
+        for _, prediction, truth, well_exposed, *_ in self._views:
+            votes.append(log_ratios(prediction, truth, (prediction > 0) & (truth > 0) & well_exposed[:, None]))
+        scale = median_factor(votes) or 1.0
+        stops, steps = [], []
         for _, prediction, truth, _, darkest, unit in self._views:
-            black = scale * darkest
-            ratio = (scale * prediction.double() + black) / (truth.double() + black)
-            errors["log2"].append(ratio.log2().abs().mean(1))
-            difference = mu_law(scale * prediction.double() / unit) - mu_law(truth.double() / unit)
-            errors["mu"].append(difference.abs().mean(1))
-        for name, values in errors.items():
-            figures[f"spearman_{name}"] = spearman(1 - confidence.double(), torch.cat(values))
+            ratio = (scale * prediction + scale * darkest) / (truth + scale * darkest)
+            stops.append(ratio.log2().abs().mean(1))
+            steps.append((mu_law(scale * prediction / unit) - mu_law(truth / unit)).abs().mean(1))
         figures |= {"mean": float(confidence.mean()), "pixels": len(confidence), "scale": scale}
+        for name, errors in (("log2", stops), ("mu", steps)):
+            figures[f"spearman_{name}"] = spearman(1 - confidence, torch.cat(errors))
         if figures["spearman_log2"] is None:
             figures["reason"] = "all pixels have one confidence or one error"
         return figures
-
-    def _scale(self) -> float:
-        """exp of the median of log(truth / prediction) over well-exposed pixels; 1 where there are none."""
-        ratios = []
-        for _, prediction, truth, well_exposed, _, _ in self._views:
-            lit = (prediction > 0) & (truth > 0) & well_exposed[:, None]
-            ratios.append((truth[lit].double() / prediction[lit].double()).log())
-        joined = torch.cat(ratios)
-        return float(joined.median().exp()) if len(joined) else 1.0
 
 
 def spearman(first: Tensor, second: Tensor) -> float | None:
     """Spearman's rank correlation of two [K] tensors, ties at their mean rank; None where one of them is constant."""
     from scipy.stats import rankdata
 
-    ranks = [torch.from_numpy(rankdata(values.numpy())) for values in (first, second)]
-    ranks = [values - values.mean() for values in ranks]
-    size = ranks[0].norm() * ranks[1].norm()
-    return float(ranks[0] @ ranks[1] / size) if size > 0 else None
+    ranks = torch.stack([torch.from_numpy(rankdata(values.numpy())) for values in (first, second)])
+    return float(torch.corrcoef(ranks)[0, 1]) if bool((ranks.std(1) > 0).all()) else None

@@ -9,7 +9,7 @@ from ..errors import InputError
 from ..output.names import safe_names
 from ..scene import Scene
 from ..scene.hdr_files import read_hdr
-from .evaluate import PEAK_LUMINANCE, PROTOCOLS, Evaluation
+from .evaluate import Evaluation
 
 log = logging.getLogger(__name__)
 
@@ -60,18 +60,16 @@ def score_folder(
         raise InputError(truth.name, "its views hold no HDR truth", "give a set with truth")
     views = [view for view in wanted if view.name in files]
     if not views:
-        place = (
-            f"holds no {names[wanted[0].name]}.exr or other picture of a view" if folder.is_dir() else "is no folder"
-        )
-        raise InputError(folder, place, f"name the EXR files as the {len(wanted)} views of {truth.name}")
+        fault = f"holds no {names[wanted[0].name]}.exr or other picture of a view"
+        fault = fault if folder.is_dir() else "is no folder"
+        raise InputError(folder, fault, f"name the EXR files as the {len(wanted)} views of {truth.name}")
     missing = [view.name for view in wanted if view.name not in files]
     extra = sorted(set(found) - set(names.values()))
     for what, which in (("views have no file", missing), ("files are of no view", extra)):
         if which:
             log.warning("%d %s: %s", len(which), what, ", ".join(which[:5]) + (", ..." if len(which) > 5 else ""))
-    pu21 = {"peak_luminance": PEAK_LUMINANCE, "white_percentile": 100.0}
-    evaluation = Evaluation(FolderPictures(folder, files), truth, "cpu", lpips_weights, PROTOCOLS, pu21, flip, views)
     training = [view for view in truth.train_views if view.name in files and view.hdr is not None]
-    evaluation.scale_views = training or views
+    options = {"views": views, "scale_views": training or views, "lpips_weights": lpips_weights, "flip": flip}
+    evaluation = Evaluation(FolderPictures(folder, files), truth, "cpu", **options)
     more = {"missing": missing, "extra": extra, "scale_from": "train" if training else "scored"}
     return evaluation.result() | more

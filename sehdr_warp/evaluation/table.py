@@ -1,54 +1,54 @@
-"""An evaluation as text."""
+"""Figures as text in columns."""
+
+from collections.abc import Sequence
+from itertools import zip_longest
+
+
+def columns(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
+    """One line a row: cells under each other, the first `left` of them flush left, the others flush right."""
+    widths = [max(map(len, cells)) for cells in zip_longest(*rows, fillvalue="")]
+    sides = [str.ljust] * left + [str.rjust] * (len(widths) - left)
+    return ["  ".join(side(cell, width) for side, cell, width in zip(sides, row, widths)) for row in rows]
 
 
 def format_table(result: dict) -> str:
     """The figures of evaluate() as a table for a terminal; missing ones are dashes, with the reasons below."""
-    lines = [f"{result['scene']}: {len(result['views'])} {result['split']} views, {_origin(result)}", ""]
-    lines.append(f"{'':<22}{'PSNR':>8}{'SSIM':>9}{'LPIPS':>9}")
+    origin = result.get("folder") or (
+        f"{result['gaussians']:,} Gaussians, {result['iterations']:,} iterations in {result['train_seconds']:.1f} s"
+    )
+    rows = [["", "PSNR", "SSIM", "LPIPS"]]
     if "folder" not in result:
-        lines.append(_row("LDR", result["ldr"], ("psnr", "ssim", "lpips")))
+        rows.append(_row("LDR", result["ldr"]))
     # Sets without truth have no HDR figures: seven lines of dashes would say less than the reason below.
     names = list(result["protocol"]) if any(figures["views"] for figures in result["protocol"].values()) else []
-    for name in names:
-        lines.append(_row(f"HDR mu-law {name}", result["protocol"][name], ("psnr_mu", "ssim_mu", "lpips_mu")))
-    for name in names:
-        lines.append(_row(f"HDR PU21 {name}", result["pu21"][name], ("psnr", "ssim")))
-    lines += ["", f"{'region of the photo':<22}{'share':>8}{'LDR':>9}" + "".join(f"{name:>10}" for name in names)]
+    rows += [_row(f"HDR mu-law {name}", result["protocol"][name], "_mu") for name in names]
+    rows += [_row(f"HDR PU21 {name}", result["pu21"][name]) for name in names]
+    regions = [["region of the photo", "share", "LDR", *names]]
     for region, figures in result["regions"].items():
         values = [figures["psnr_ldr"], *(figures["psnr_mu"][name] for name in names)]
-        text = "".join(_number(value, width, 2) for value, width in zip(values, [9] + [10] * len(names)))
-        lines.append(f"{region:<22}{figures['fraction']:>8.1%}{text}")
+        regions.append([region, f"{figures['fraction']:.1%}", *(_number(value, 2) for value in values)])
+    lines = [f"{result['scene']}: {len(result['views'])} {result['split']} views, {origin}", "", *columns(rows)]
+    lines += ["", *columns(regions)]
     ranking = result["confidence"]
     if ranking["spearman_log2"] is not None:
         correlations = f"{ranking['spearman_log2']:.2f} (log2), {ranking['spearman_mu']:.2f} (mu-law)"
         lines += ["", f"confidence ranks errors: {correlations}; mean confidence {ranking['mean']:.2f}"]
-    lines += ["", *_notes(result)]
-    return "\n".join(lines)
+    return "\n".join([*lines, "", *_notes(result, bool(names))])
 
 
-def _origin(result: dict) -> str:
-    if "folder" in result:
-        return result["folder"]
-    facts = f"{result['gaussians']:,} Gaussians, {result['iterations']:,} iterations"
-    return f"{facts} in {result['train_seconds']:.1f} s"
+def _row(label: str, figures: dict, suffix: str = "") -> list[str]:
+    digits = {f"psnr{suffix}": 2, f"ssim{suffix}": 4, f"lpips{suffix}": 4}
+    return [label, *(_number(figures[key], count) for key, count in digits.items() if key in figures)]
 
 
-def _row(label: str, figures: dict, keys: tuple[str, ...]) -> str:
-    widths, digits = (8, 9, 9), (2, 4, 4)
-    return f"{label:<22}" + "".join(_number(figures[k], w, d) for k, w, d in zip(keys, widths, digits))
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
-def _number(value: float | None, width: int, digits: int) -> str:
-    return f"{'-':>{width}}" if value is None else f"{value:>{width}.{digits}f}"
-
-
-def _notes(result: dict) -> list[str]:
-    pu21 = result["pu21"]
-    white = "maximum" if pu21["white_percentile"] == 100 else f"{pu21['white_percentile']:g}th percentile"
-    has_truth = any(figures["views"] for figures in result["protocol"].values())
-    notes = [f"PU21: the {white} of each view's truth is shown at {pu21['peak_luminance']:g} cd/m^2."] * has_truth
-    scale = result["protocol"].get("aligned", {}).get("scale")
-    if scale is not None:
+def _notes(result: dict, has_truth: bool) -> list[str]:
+    peak = result["pu21"]["peak_luminance"]
+    notes = [f"PU21: the maximum of each view's truth is shown at {peak:g} cd/m^2."] * has_truth
+    if (scale := result["protocol"]["aligned"].get("scale")) is not None:
         where = "the scored views" if result.get("scale_from") == "scored" else "the training photos"
         notes.append(f"aligned: radiance times {scale:.4g}, fitted on what {where} do not show clipped.")
     if result["lpips_backbone"]:

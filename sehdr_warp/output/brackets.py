@@ -9,14 +9,14 @@ from typing import Self
 
 import numpy as np
 
-from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera
 
 from ..field.exposure import Exposure, Items, read_exposures
 from ..files import atomic_folder, atomic_path, write_json
 from .colorspace import color_space, from_rec709
-from .exr import Part, exr_header, stored_pixel_type, write_exr, write_multipart_exr
-from .images import exposure_exif, quantize, write_jpeg, write_png
+from .exr import Part, check_finite, exr_header, stored_pixel_type, write_exr, write_multipart_exr
+from .images import exposure_exif, quantize, write_picture
 from .names import safe_names
 
 LDR_FORMATS = ("jpeg", "png", "png16")
@@ -60,20 +60,19 @@ def bracket_exposures(
 ) -> tuple[Exposure, ...]:
     """The exposures of a bracket, ascending.
 
-    Args:
-        base_time: seconds at 0 EV.
-        exposures: items of field/exposure.py's grammar, such as "1/125, -2ev, 8x"; numbers are seconds.
-        evs: shorthand for stops, such as "-4,-2,0" or [-4, -2, 0]. Exactly one of both.
+    base_time: seconds at 0 EV. exposures: items of field/exposure.py's grammar, such as "1/125, -2ev, 8x"; numbers are
+    seconds. evs: shorthand for stops, such as "-4,-2,0" or [-4, -2, 0]. Exactly one of both.
 
-    Raises:
-        SehdrError: naming the value, where both or none are given, an item cannot be read or comes twice, or a time is
-            outside 1e-6 to 1e6 seconds.
+    Raises SehdrError, naming the value, where both or none are given, an item cannot be read or comes twice, or a time
+    is outside 1e-6 to 1e6 seconds.
     """
     if (evs is None) == (exposures is None):
         count = "both were given" if evs is not None else "neither was given"
         raise SehdrError(f"brackets need evs or exposures, and {count}; give one of them")
-    field = "exposures" if evs is None else "evs"
-    items = exposures if evs is None else [f"{str(ev).strip()}ev" for ev in _items(evs)]
+    field, items = "exposures", exposures
+    if evs is not None:
+        stops = [ev for ev in evs.split(",") if ev.strip()] if isinstance(evs, str) else evs
+        field, items = "evs", [f"{str(ev).strip()}ev" for ev in stops]
     made = read_exposures(items, base_time, field)
     for exposure in made:
         if not _SHORTEST <= exposure.time <= _LONGEST:
@@ -81,10 +80,6 @@ def bracket_exposures(
                 f"{field}: {exposure.time:.6g} s ({exposure.ev:+g} EV) is outside {_SHORTEST:g} to {_LONGEST:g} seconds"
             )
     return made
-
-
-def _items(given: Items) -> list:
-    return [item for item in given.split(",") if item.strip()] if isinstance(given, str) else list(given)
 
 
 def write_brackets(
@@ -115,15 +110,8 @@ def write_brackets(
     Raises SehdrError for unusable exposures or options, InputError where something would be replaced (unless
     overwrite) or a pixel is not finite.
     """
-    options = BracketOptions(
-        bracket_exposures(base_time, evs=evs, exposures=exposures),
-        base_time,
-        colorspace,
-        pixel,
-        multipart,
-        ldr,
-        response,
-    )
+    made = bracket_exposures(base_time, evs=evs, exposures=exposures)
+    options = BracketOptions(made, base_time, colorspace, pixel, multipart, ldr, response)
     pairs = list(views.items() if isinstance(views, Mapping) else views)
     with BracketFolder(out, options, overwrite=overwrite) as folder:
         for safe, (name, radiance) in zip(safe_names([name for name, _ in pairs]), pairs, strict=True):
@@ -157,108 +145,66 @@ class BracketFolder:
     def __exit__(self, *error) -> bool | None:
         return self._stack.__exit__(*error)
 
-    def _finish(self, kind, error, trace) -> None:
-        if kind is None:
-            write_json(self._manifest, self._describe())
-
     def add(self, name: str, radiance: np.ndarray, camera: Camera | None = None) -> str:
         """Writes the bracket of one view under a name that is safe for files; returns the pixel type of its files."""
         options = self.options
-        radiance = _checked(self.out / "brackets" / name, radiance)
+        radiance = np.asarray(radiance, np.float64)
+        if radiance.shape[2:] != (3,):
+            raise ValueError(f"radiance has shape {radiance.shape}, not [H, W, 3]")
+        check_finite(self.out / "brackets" / name, radiance, "{count} radiances")
         linear = from_rec709(radiance, options.colorspace)
         pixels = [linear * exposure.time for exposure in options.exposures]
         # One type for all exposures of a view, so that their ratios keep one precision.
         pixel = stored_pixel_type(pixels, options.pixel)
-        parts = [
-            Part(
-                dict(zip("RGB", np.moveaxis(image, 2, 0), strict=True)),
-                exr_header(
-                    colorspace=options.colorspace,
-                    exposure_time=exposure.time,
-                    camera=camera,
-                    captured=options.captured,
-                    provenance={
-                        **(options.provenance or {}),
-                        "view": name,
-                        "ev": repr(exposure.ev),
-                        "baseExposureTime": repr(options.base_time),
-                    },
-                ),
-                f"b{index}_{exposure.label}",
+        parts, entries = [], []
+        for index, (exposure, image) in enumerate(zip(options.exposures, pixels, strict=True)):
+            label = f"b{index}_{exposure.label}"
+            facts = {"view": name, "ev": repr(exposure.ev), "baseExposureTime": repr(options.base_time)}
+            header = exr_header(
+                colorspace=options.colorspace,
+                exposure_time=exposure.time,
+                camera=camera,
+                captured=options.captured,
+                provenance={**(options.provenance or {}), **facts},
             )
-            for index, (image, exposure) in enumerate(zip(pixels, options.exposures, strict=True))
-        ]
+            parts.append(Part(dict(zip("RGB", np.moveaxis(image, 2, 0), strict=True)), header, label))
+            file = f"{name}.exr" if options.multipart else f"{name}/{name}_{label}.exr"
+            entry = {"index": index, "exposure_time": exposure.time, "ev": exposure.ev, "file": f"brackets/{file}"}
+            if options.multipart:
+                entry["part"] = index
+            else:
+                write_exr(self._folder / file, parts[-1].channels, pixel=pixel, header=header)
+            if options.ldr:
+                entry["ldr_file"] = self._write_photo(f"{name}/{name}_{label}", radiance, exposure)
+            entries.append(entry)
         if options.multipart:
-            stored = [f"{name}.exr"] * len(parts)
-            write_multipart_exr(self._folder / stored[0], parts, pixel=pixel)
-        else:
-            stored = [f"{name}/{name}_{part.name}.exr" for part in parts]
-            for file, part in zip(stored, parts, strict=True):
-                write_exr(self._folder / file, part.channels, pixel=pixel, header=part.header)
-        self.files += [self.out / "brackets" / file for file in dict.fromkeys(stored)]
-        photos = self._write_photos(name, radiance)
-        self._views.append(
-            {
-                "view": name,
-                "pixel": pixel,
-                "exposures": [
-                    {
-                        "index": index,
-                        "exposure_time": exposure.time,
-                        "ev": exposure.ev,
-                        "file": f"brackets/{file}",
-                        **({"part": index} if options.multipart else {}),
-                        **({"ldr_file": photos[index]} if photos else {}),
-                    }
-                    for index, (exposure, file) in enumerate(zip(options.exposures, stored, strict=True))
-                ],
-            }
-        )
+            write_multipart_exr(self._folder / f"{name}.exr", parts, pixel=pixel)
+        self.files += [self.out / file for file in dict.fromkeys(entry["file"] for entry in entries)]
+        self._views.append({"view": name, "pixel": pixel, "exposures": entries})
         return pixel
 
-    def _write_photos(self, name: str, radiance: np.ndarray) -> list[str]:
-        options, files = self.options, []
-        if not options.ldr:
-            return files
-        captured = options.captured.strftime("%Y:%m:%d %H:%M:%S") if options.captured else None
-        for index, exposure in enumerate(options.exposures):
-            encoded = options.response.encode(radiance * exposure.time)
-            exif = exposure_exif(exposure.time, bias=exposure.ev, captured=captured)
-            file = f"{name}/{name}_b{index}_{exposure.label}.{'jpg' if options.ldr == 'jpeg' else 'png'}"
-            if options.ldr == "jpeg":
-                write_jpeg(self._ldr_folder / file, quantize(encoded), exif=exif)
-            else:
-                write_png(self._ldr_folder / file, quantize(encoded, 16 if options.ldr == "png16" else 8), exif=exif)
-            files.append(f"brackets_ldr/{file}")
-        return files
-
-    def _describe(self) -> dict:
+    def _write_photo(self, stem: str, radiance: np.ndarray, exposure: Exposure) -> str:
+        """Writes what the response makes of an exposure; returns the file's name in the manifest."""
         options = self.options
-        return {
-            "format": MANIFEST_FORMAT,
-            "software": "sehdr-warp",
-            "units": "relative scene-linear radiance times exposure_time (seconds)",
-            "color_space": options.colorspace,
-            "base_exposure_time": options.base_time,
-            "multipart": options.multipart,
-            "response": getattr(options.response, "name", None),
-            "ldr": options.ldr,
-            "provenance": dict(options.provenance or {}),
-            "views": self._views,
-        }
+        exif = exposure_exif(exposure.time, bias=exposure.ev, captured=options.captured)
+        codes = quantize(options.response.encode(radiance * exposure.time), 16 if options.ldr == "png16" else 8)
+        file = f"{stem}.{'jpg' if options.ldr == 'jpeg' else 'png'}"
+        write_picture(self._ldr_folder / file, codes, exif=exif)
+        return f"brackets_ldr/{file}"
 
-
-def _checked(path: Path, radiance: np.ndarray) -> np.ndarray:
-    radiance = np.asarray(radiance, np.float64)
-    if radiance.ndim != 3 or radiance.shape[2] != 3:
-        raise ValueError(f"radiance has shape {radiance.shape}, not [H, W, 3]")
-    bad = ~np.isfinite(radiance)
-    if bad.any():
-        row, column, channel = (int(i) for i in np.argwhere(bad)[0])
-        raise InputError(
-            path,
-            f"{int(bad.sum())} radiances are not finite, the first {'RGB'[channel]} = {radiance[row, column, channel]}"
-            f" at x={column}, y={row}",
-            "such views are not written; train again from an earlier checkpoint or with another seed",
-        )
-    return radiance
+    def _finish(self, kind, error, trace) -> None:
+        options = self.options
+        if kind is None:
+            described = {
+                "format": MANIFEST_FORMAT,
+                "software": "sehdr-warp",
+                "units": "relative scene-linear radiance times exposure_time (seconds)",
+                "color_space": options.colorspace,
+                "base_exposure_time": options.base_time,
+                "multipart": options.multipart,
+                "response": getattr(options.response, "name", None),
+                "ldr": options.ldr,
+                "provenance": dict(options.provenance or {}),
+                "views": self._views,
+            }
+            write_json(self._manifest, described)

@@ -1,6 +1,7 @@
 """Camera paths for films: an orbit about what the photos look at, and a smooth way through the photos' places."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -26,14 +27,14 @@ def common_focus(cameras: Sequence[Camera]) -> np.ndarray | None:
     return focus if np.median(np.sum((focus - positions) * forward, axis=1)) > 0 else None
 
 
-def orbit(cameras: Sequence[Camera], count: int, *, focus_distance: float) -> list[Camera]:
+def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[Camera]:
     """A closed path of `count` cameras about the common focus of the given ones, upright, all looking at it.
 
-    Where the given cameras go round the focus, the path is a circle of their mean radius and height. Else it is an
-    oval within their spread (azimuth and elevation about the focus, at the mean distance), so that it shows nothing
-    that no photo saw. Size and intrinsics are those of the camera nearest to the middle.
+    Where the given cameras go round the focus, a circle of their mean radius and height; else an oval within their
+    spread (azimuth and elevation about the focus, at the mean distance), which shows nothing that no photo saw. Size
+    and intrinsics are those of the camera nearest to the middle.
 
-    focus_distance: how far ahead the focus is taken to lie where the optical axes are parallel; world units, positive.
+    focus_distance: of the focus ahead where the optical axes are parallel; world units, positive.
     Raises SehdrError without cameras or for a count outside 1 to 100 000.
     """
     _check(cameras, count)
@@ -51,7 +52,8 @@ def orbit(cameras: Sequence[Camera], count: int, *, focus_distance: float) -> li
     horizontal = np.hypot(offsets @ back, offsets @ right)
     azimuths = np.arctan2(offsets @ right, offsets @ back)
     turn = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    if _largest_gap(azimuths) < _ROUND_GAP:
+    ordered = np.sort(azimuths)
+    if np.diff(ordered, append=ordered[0] + 2 * np.pi).max() < _ROUND_GAP:
         azimuth = turn
         ring, height = np.full(count, horizontal.mean()), np.full(count, (offsets @ up).mean())
     else:
@@ -79,19 +81,16 @@ def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
     positions = _positions(cameras)
     rotations = Rotation.from_matrix(np.stack([camera.camera_to_world[:3, :3] for camera in cameras]))
     size = max(float(np.ptp(positions, axis=0).max()), 1e-9)
-    steps = [
-        np.linalg.norm(b - a) / size + (p.inv() * q).magnitude()
-        for a, b, p, q in zip(positions, positions[1:], rotations, list(rotations)[1:], strict=False)
-    ]
-    keep = np.concatenate([[True], np.array(steps) > 1e-6]) if steps else np.array([True])
-    times = np.concatenate([[0.0], np.cumsum(np.array(steps))])[keep]
+    moves = np.linalg.norm(np.diff(positions, axis=0), axis=1) / size
+    steps = np.append(0.0, moves + (rotations[:-1].inv() * rotations[1:]).magnitude()) if len(cameras) > 1 else [0.0]
+    keep = np.append(True, np.array(steps[1:]) > 1e-6)
+    times = np.cumsum(steps)[keep]
     if len(times) == 1:
-        return [_moved(cameras[0], cameras[0].camera_to_world)] * count
+        return [cameras[0]] * count
     at = np.linspace(0, times[-1], count)
-    places = CubicSpline(times, positions[keep])(at)
-    turns = RotationSpline(times, rotations[keep])(at).as_matrix()
     poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = turns, places
+    poses[:, :3, :3] = RotationSpline(times, rotations[keep])(at).as_matrix()
+    poses[:, :3, 3] = CubicSpline(times, positions[keep])(at)
     return [_moved(cameras[0], pose) for pose in poses]
 
 
@@ -116,11 +115,6 @@ def _unit(vector: np.ndarray, *, fallback: np.ndarray) -> np.ndarray:
     return vector / length if length > 1e-6 else fallback / np.linalg.norm(fallback)
 
 
-def _largest_gap(angles: np.ndarray) -> float:
-    ordered = np.sort(angles)
-    return float(np.max(np.diff(ordered, append=ordered[0] + 2 * np.pi)))
-
-
 def _look_at(position: np.ndarray, focus: np.ndarray, up: np.ndarray) -> np.ndarray:
     """[4, 4] camera to world, OpenCV axes."""
     forward = _unit(focus - position, fallback=np.array([0.0, 0, 1]))
@@ -131,7 +125,4 @@ def _look_at(position: np.ndarray, focus: np.ndarray, up: np.ndarray) -> np.ndar
 
 
 def _moved(camera: Camera, camera_to_world: np.ndarray) -> Camera:
-    rotation = camera_to_world[:3, :3].T
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ camera_to_world[:3, 3]
-    return Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, pose)
+    return replace(camera, world_to_camera=np.linalg.inv(camera_to_world))

@@ -1,7 +1,7 @@
 """Linear color spaces of the output, by colour-science: from the package's linear Rec.709 by a 3 x 3 matrix."""
 
-from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,49 +11,34 @@ from sehdr_warp.errors import SehdrError
 _REC709 = (0.640, 0.330, 0.300, 0.600, 0.150, 0.060, 0.3127, 0.3290)
 
 
-@dataclass(frozen=True)
-class ColorSpace:
-    """A linear, scene-referred RGB space.
-
-    Attributes:
-        name: as on the command line.
-        dataset: in colour.RGB_COLOURSPACES.
-        interop_id: the Color Interop Forum's name, which OpenEXR stores as `colorInteropID`; None if it has none.
-    """
+class ColorSpace(NamedTuple):
+    """A linear, scene-referred RGB space: its name on the command line, its name in colour.RGB_COLOURSPACES, and the
+    Color Interop Forum's, which OpenEXR stores as `colorInteropID`; None if it has none."""
 
     name: str
     dataset: str
     interop_id: str | None
 
 
-_SPACES = {
-    space.name: space
-    for space in (
-        ColorSpace("rec709", "ITU-R BT.709", "lin_rec709_scene"),
-        ColorSpace("acescg", "ACEScg", "lin_ap1_scene"),
-        ColorSpace("aces2065-1", "ACES2065-1", "lin_ap0_scene"),
-        ColorSpace("rec2020", "ITU-R BT.2020", "lin_rec2020_scene"),
-        ColorSpace("display-p3", "Display P3", "lin_p3d65_scene"),
-        ColorSpace("dci-p3", "DCI-P3", None),
-    )
-}
-_ALIASES = {
-    "bt709": "rec709",
-    "srgb": "rec709",
-    "ap1": "acescg",
-    "ap0": "aces2065-1",
-    "bt2020": "rec2020",
-    "p3-d65": "display-p3",
-}
+SPACES = (
+    ColorSpace("rec709", "ITU-R BT.709", "lin_rec709_scene"),
+    ColorSpace("acescg", "ACEScg", "lin_ap1_scene"),
+    ColorSpace("aces2065-1", "ACES2065-1", "lin_ap0_scene"),
+    ColorSpace("rec2020", "ITU-R BT.2020", "lin_rec2020_scene"),
+    ColorSpace("display-p3", "Display P3", "lin_p3d65_scene"),
+    ColorSpace("dci-p3", "DCI-P3", None),
+)
+_ALIASES = {"bt709": "rec709", "srgb": "rec709", "ap1": "acescg", "ap0": "aces2065-1", "bt2020": "rec2020"}
+_ALIASES["p3-d65"] = "display-p3"
 
 
 def color_space(name: str) -> ColorSpace:
     """The space of a name or alias (`ap0`, `ap1`, `bt709`, `bt2020`, ...), in any case; SehdrError if unknown."""
     key = name.strip().lower()
-    key = _ALIASES.get(key, key)
-    if key not in _SPACES:
-        raise SehdrError(f"color space {name!r} is not known; choose one of {', '.join(_SPACES)}")
-    return _SPACES[key]
+    for space in SPACES:
+        if space.name == _ALIASES.get(key, key):
+            return space
+    raise SehdrError(f"color space {name!r} is not known; choose one of {', '.join(space.name for space in SPACES)}")
 
 
 @cache
@@ -73,9 +58,7 @@ def matrix_from_rec709(name: str) -> np.ndarray:
     """
     import colour
 
-    matrix = colour.matrix_RGB_to_RGB(_dataset("rec709"), _dataset(name), "Bradford")
-    matrix.setflags(write=False)
-    return matrix
+    return colour.matrix_RGB_to_RGB(_dataset("rec709"), _dataset(name), "Bradford")
 
 
 def from_rec709(rgb: np.ndarray, name: str) -> np.ndarray:
@@ -85,7 +68,6 @@ def from_rec709(rgb: np.ndarray, name: str) -> np.ndarray:
     return rgb if color_space(name).name == "rec709" else rgb @ matrix_from_rec709(name).T
 
 
-@cache
 def _dataset(name: str):
     """colour-science's space, with matrices of its primaries: the published ones are rounded to four digits."""
     import colour

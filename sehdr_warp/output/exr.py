@@ -1,6 +1,6 @@
 """Scene-linear OpenEXR files, single and multi-part, with the metadata that HDR tools read.
 
-In every file that this package writes, a colour pixel is radiance times `expTime` (1 second for a radiance picture).
+In every file that this package writes, a color pixel is radiance times `expTime` (1 second for a radiance picture).
 docs/formats.md lists the attributes and the conventions of the matrices.
 """
 
@@ -21,12 +21,12 @@ from sehdr_warp.scene.images import MAX_PIXELS
 
 from ..files import atomic_path
 from .colorspace import chromaticities, color_space
+from .images import EXIF_TIME
 
 HALF_MAX = 65504.0
 """The largest value of a 16-bit float (IEEE 754 binary16)."""
 
-PIXEL_TYPES = ("half", "float")
-
+_TYPES = {"half": np.float16, "float": np.float32}
 # OpenCV axes (+y down, +z forward) to the axes of worldToCamera (+y up, -z forward).
 _FLIP_Y_Z = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -35,9 +35,8 @@ _FLIP_Y_Z = np.diag([1.0, -1.0, -1.0, 1.0])
 class Part:
     """One picture of a file.
 
-    channels: name -> [H, W] numbers, all of one shape and finite: R, G, B, A, Z, and any other.
-    header: OpenEXR attributes besides the pixels' own, such as exr_header() makes.
-    name: the part's name; needed where a file has several, and then unique.
+    channels: name -> [H, W] finite numbers, all of one shape: R, G, B, A, Z, and any other. header: OpenEXR attributes
+    besides the pixels' own, such as exr_header() makes. name: needed where a file has several parts, and then unique.
     """
 
     channels: Mapping[str, np.ndarray]
@@ -55,10 +54,9 @@ def exr_header(
 ) -> dict[str, Any]:
     """OpenEXR attributes for a picture.
 
-    exposure_time: seconds, `expTime`: what radiance was multiplied by.
-    camera: gives `worldToCamera`, `worldToNDC`, `screenWindowCenter`, `screenWindowWidth` and `pixelAspectRatio`.
-    captured: local time, `capDate`.
-    provenance: text by key; stored as `sehdr:<key>`.
+    exposure_time: seconds, `expTime`: what radiance was multiplied by. camera: gives `worldToCamera`, `worldToNDC`,
+    `screenWindowCenter`, `screenWindowWidth` and `pixelAspectRatio`. captured: local time, `capDate`. provenance: text
+    by key, `sehdr:<key>`.
     """
     space = color_space(colorspace)
     header: dict[str, Any] = {"chromaticities": chromaticities(space.name), "sehdr:colorSpace": space.name}
@@ -70,10 +68,8 @@ def exr_header(
     if camera is not None:
         header.update(_camera_attributes(camera))
     if captured is not None:
-        header["capDate"] = captured.strftime("%Y:%m:%d %H:%M:%S")
-    for key, value in (provenance or {}).items():
-        header[f"sehdr:{key}"] = str(value)
-    return header
+        header["capDate"] = captured.strftime(EXIF_TIME)
+    return header | {f"sehdr:{key}": str(value) for key, value in (provenance or {}).items()}
 
 
 def write_exr(
@@ -89,7 +85,7 @@ def write_exr(
 
 
 def write_multipart_exr(path: Path | str, parts: Sequence[Part], *, pixel: str = "half") -> str:
-    """Writes a file of several named parts with ZIP compression; returns the pixel type of the colours.
+    """Writes a file of several named parts with ZIP compression; returns the pixel type of the colors.
 
     pixel: "half" or "float". Numbers are rounded once, to the nearest. Where half cannot hold a value (above 65504 in
     size), all channels of the file are float instead, and each part's `sehdr:pixelType` says so: nothing is clipped.
@@ -111,15 +107,15 @@ def read_exr(path: Path | str, *, max_pixels: int = MAX_PIXELS) -> tuple[np.ndar
     """
     channels, header = read_exr_channels(Path(path), max_pixels=max_pixels)
     if not channels:
-        raise InputError(path, "has no channels", "export it with colour channels")
+        raise InputError(path, "has no channels", "export it with color channels")
     names = tuple(sorted(channels, key=lambda name: ("RGBA".find(name) if name in ("R", "G", "B", "A") else 4, name)))
     return np.stack([channels[name] for name in names], axis=2), names, header
 
 
 def stored_pixel_type(arrays: Sequence[np.ndarray], pixel: str = "half") -> str:
     """The type that holds all values unclipped: `pixel`, or "float" where half would overflow."""
-    if pixel not in PIXEL_TYPES:
-        raise ValueError(f"pixel type {pixel!r} is not one of {PIXEL_TYPES}")
+    if pixel not in _TYPES:
+        raise ValueError(f"pixel type {pixel!r} is not one of {', '.join(_TYPES)}")
     return "float" if pixel == "float" or any(_largest(array) > HALF_MAX for array in arrays) else "half"
 
 
@@ -128,12 +124,22 @@ def _write(path: Path, parts: Sequence[Part], pixel: str, overwrite: bool = Fals
 
     for part in parts:
         _check(path, part)
-    colours = [array for part in parts for name, array in part.channels.items() if not _is_depth(name)]
-    stored = stored_pixel_type(colours, pixel)
-    said = stored if stored == pixel else "float, since half would overflow 65504"
+    stored = stored_pixel_type([a for part in parts for name, a in part.channels.items() if not _is_depth(name)], pixel)
+    written = []
+    for part in parts:
+        header = {
+            "compression": OpenEXR.ZIP_COMPRESSION,
+            "type": OpenEXR.scanlineimage,
+            "software": f"sehdr-warp {__version__}",
+            "sehdr:version": __version__,
+            "sehdr:pixelType": stored if stored == pixel else "float, since half would overflow 65504",
+            **part.header,
+        }
+        types = {name: np.float32 if _is_depth(name) else _TYPES[stored] for name in part.channels}
+        channels = {name: np.ascontiguousarray(array, types[name]) for name, array in part.channels.items()}
+        written.append(OpenEXR.Part(header, channels, *filter(None, [part.name])))
     with atomic_path(path, overwrite) as temporary:
         try:
-            written = [_openexr_part(part, stored, said) for part in parts]
             with OpenEXR.File(written) as file:
                 file.write(str(temporary))
         except (RuntimeError, ValueError, TypeError) as error:
@@ -142,44 +148,31 @@ def _write(path: Path, parts: Sequence[Part], pixel: str, overwrite: bool = Fals
     return stored
 
 
-def _openexr_part(part: Part, stored: str, said: str):
-    import OpenEXR
-
-    header = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-        "software": f"sehdr-warp {__version__}",
-        "sehdr:version": __version__,
-        "sehdr:pixelType": said,
-        **part.header,
-    }
-    dtype = {"half": np.float16, "float": np.float32}
-    channels = {
-        name: np.ascontiguousarray(np.asarray(array).astype(dtype["float" if _is_depth(name) else stored]))
-        for name, array in part.channels.items()
-    }
-    return OpenEXR.Part(header, channels, part.name) if part.name else OpenEXR.Part(header, channels)
-
-
 def _check(path: Path, part: Part) -> None:
     shapes = {np.shape(array) for array in part.channels.values()}
-    if len(shapes) != 1 or len(next(iter(shapes))) != 2 or 0 in next(iter(shapes)):
+    if len(shapes) != 1 or len(shape := next(iter(shapes))) != 2 or 0 in shape:
         raise ValueError(f"channels have the shapes {sorted(shapes)}, not one [H, W]")
     for name, array in part.channels.items():
-        bad = ~np.isfinite(array)
-        if bad.any():
-            row, column = (int(i) for i in np.argwhere(bad)[0])
-            where = f"part {part.name}, channel {name}" if part.name else f"channel {name}"
-            raise InputError(
-                path,
-                f"{where}: {int(bad.sum())} values are not finite, the first {array[row, column]}"
-                f" at x={column}, y={row}",
-                "such pictures are not written; train again from an earlier checkpoint or with another seed",
-            )
+        where = f"part {part.name}, channel {name}" if part.name else f"channel {name}"
+        check_finite(path, np.asarray(array), f"{where}: {{count}} values")
         if _largest(array) > float(np.finfo(np.float32).max):
             raise InputError(
-                path, f"channel {name} reaches {_largest(array):.3g}, past 32-bit floats", "scale the radiance down"
+                path, f"{where} reaches {_largest(array):.3g}, past 32-bit floats", "scale the radiance down"
             )
+
+
+def check_finite(path: Path, image: np.ndarray, what: str) -> None:
+    """Raises InputError for NaN and infinity in [H, W] or [H, W, 3]; what: of the image, with {count} for how many."""
+    bad = ~np.isfinite(image)
+    if bad.any():
+        place = tuple(int(i) for i in np.argwhere(bad)[0])
+        channel = f"{'RGB'[place[2]]} = " if len(place) == 3 else ""
+        raise InputError(
+            path,
+            f"{what.format(count=int(bad.sum()))} are not finite, the first {channel}{image[place]}"
+            f" at x={place[1]}, y={place[0]}",
+            "such pictures are not written; train again from an earlier checkpoint or with another seed",
+        )
 
 
 def _largest(array: np.ndarray) -> float:
@@ -192,17 +185,15 @@ def _is_depth(name: str) -> bool:
 
 def _camera_attributes(camera: Camera) -> dict[str, Any]:
     """Matrices act on row vectors (p M), as all of OpenEXR's do."""
-    view = _FLIP_Y_Z @ camera.world_to_camera
-    x, y = camera.cx / camera.width, camera.cy / camera.height
     # x and y run over [0, 1] from the top left corner; z is the distance along the axis; w divides.
-    to_ndc = np.array(
-        [[camera.fx / camera.width, 0, x, 0], [0, camera.fy / camera.height, y, 0], [0, 0, 1, 0], [0, 0, 1, 0]],
-        np.float64,
-    )
+    to_ndc = np.zeros((4, 4))
+    to_ndc[0, [0, 2]] = np.array([camera.fx, camera.cx]) / camera.width
+    to_ndc[1, [1, 2]] = np.array([camera.fy, camera.cy]) / camera.height
+    to_ndc[2:, 2] = 1
     # The screen window lies at distance 1; its axes point to the camera's left and up.
     center = ((camera.cx - camera.width / 2) / camera.fx, (camera.cy - camera.height / 2) / camera.fy)
     return {
-        "worldToCamera": np.ascontiguousarray(view.T, np.float32),
+        "worldToCamera": np.ascontiguousarray((_FLIP_Y_Z @ camera.world_to_camera).T, np.float32),
         "worldToNDC": np.ascontiguousarray((to_ndc @ camera.world_to_camera).T, np.float32),
         "screenWindowCenter": np.array(center, np.float32),
         "screenWindowWidth": camera.width / camera.fx,

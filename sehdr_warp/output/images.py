@@ -2,6 +2,7 @@
 
 import struct
 import zlib
+from datetime import datetime
 from fractions import Fraction
 from pathlib import Path
 
@@ -12,25 +13,22 @@ from PIL.TiffImagePlugin import IFDRational
 from ..files import atomic_path
 
 _EXIF_IFD, _EXPOSURE_TIME, _EXPOSURE_BIAS, _SOFTWARE, _DATE = 0x8769, 0x829A, 0x9204, 0x0131, 0x9003
+EXIF_TIME = "%Y:%m:%d %H:%M:%S"
 
 
 def quantize(values: np.ndarray, bits: int = 8) -> np.ndarray:
-    """Encoded values in [0, 1] to code values, rounded to nearest: uint8 or uint16. Values outside are limited.
-
-    Raises ValueError for NaN or another number of bits.
-    """
-    if bits not in (8, 16):
-        raise ValueError(f"{bits} bits: PNG has 8 or 16")
+    """Encoded values in [0, 1] to code values, rounded to nearest: uint8 or (16 bits) uint16. Values outside are
+    limited; NaN raises ValueError."""
     if np.isnan(values).any():
         raise ValueError("the picture holds NaN")
     white = 2**bits - 1
     return np.rint(np.clip(values, 0, 1) * np.float64(white)).astype(np.uint8 if bits == 8 else np.uint16)
 
 
-def exposure_exif(exposure_time: float, *, bias: float | None = None, captured: str | None = None) -> Image.Exif:
+def exposure_exif(exposure_time: float, *, bias: float | None = None, captured: datetime | None = None) -> Image.Exif:
     """EXIF with ExposureTime as the nearest rational of 32 bits: seconds.
 
-    bias: ExposureBiasValue in stops. captured: DateTimeOriginal, `YYYY:MM:DD hh:mm:ss`.
+    bias: ExposureBiasValue in stops. captured: DateTimeOriginal.
     """
     exif = Image.Exif()
     exif[_SOFTWARE] = "sehdr-warp"
@@ -39,45 +37,35 @@ def exposure_exif(exposure_time: float, *, bias: float | None = None, captured: 
     if bias is not None:
         details[_EXPOSURE_BIAS] = IFDRational(Fraction(bias).limit_denominator(10**6))
     if captured is not None:
-        details[_DATE] = captured
+        details[_DATE] = captured.strftime(EXIF_TIME)
     return exif
 
 
-def write_png(path: Path | str, codes: np.ndarray, *, exif: Image.Exif | None = None) -> None:
-    """Writes [H, W] grey or [H, W, 3] RGB code values, uint8 or uint16.
+def write_picture(path: Path | str, codes: np.ndarray, *, exif: Image.Exif | None = None) -> None:
+    """Writes [H, W] gray or [H, W, 3] RGB code values as PNG (uint8, uint16) or, by a .jpg suffix, JPEG (uint8) without
+    chroma subsampling.
 
     Raises InputError and SehdrError as atomic_path does, ValueError for another shape or type.
     """
-    _check(codes, (np.uint8, np.uint16))
+    jpeg = Path(path).suffix == ".jpg"
+    allowed = (np.uint8,) if jpeg else (np.uint8, np.uint16)
+    if codes.dtype not in allowed or codes.shape[2:] not in ((), (3,)) or codes.ndim < 2 or 0 in codes.shape:
+        raise ValueError(f"code values are {codes.dtype} {codes.shape}, not [H, W] or [H, W, 3] of {allowed}")
+    options = {"quality": 98, "subsampling": 0} if jpeg else {}
     with atomic_path(path) as temporary:
-        if codes.dtype == np.uint8:
-            Image.fromarray(codes).save(temporary, format="PNG", exif=exif)
-        else:
+        if codes.dtype == np.uint16:
             temporary.write_bytes(_png16(codes, exif))
+        else:
+            Image.fromarray(codes).save(temporary, exif=Image.Exif() if exif is None else exif, **options)
 
 
-def write_jpeg(path: Path | str, codes: np.ndarray, *, exif: Image.Exif | None = None) -> None:
-    """Writes [H, W] grey or [H, W, 3] RGB uint8 code values, without chroma subsampling.
-
-    Raises InputError and SehdrError as atomic_path does, ValueError for another shape or type.
-    """
-    _check(codes, (np.uint8,))
-    with atomic_path(path) as temporary:
-        options = {} if exif is None else {"exif": exif}
-        Image.fromarray(codes).save(temporary, format="JPEG", quality=98, subsampling=0, **options)
-
-
-def _check(codes: np.ndarray, dtypes: tuple) -> None:
-    if (
-        codes.dtype not in dtypes
-        or not (codes.ndim == 2 or (codes.ndim == 3 and codes.shape[2] == 3))
-        or 0 in codes.shape
-    ):
-        raise ValueError(f"code values are {codes.dtype} {codes.shape}, not [H, W] or [H, W, 3] of {dtypes}")
+def as_array(value) -> np.ndarray:
+    """A torch tensor on any device, or an array, as an array."""
+    return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
 
 
 def _png16(codes: np.ndarray, exif: Image.Exif | None) -> bytes:
-    """A 16-bit PNG, which Pillow cannot write in colour (PNG specification, 3rd edition: sections 5, 9 and 11.3.3)."""
+    """A 16-bit PNG, which Pillow cannot write in color (PNG specification, 3rd edition: sections 5, 9 and 11.3.3)."""
     height, width = codes.shape[:2]
     rows = codes.astype(">u2").reshape(height, -1).view(np.uint8).reshape(height, -1)
     filtered = np.empty((height, 1 + rows.shape[1]), np.uint8)

@@ -1,4 +1,4 @@
-"""A trained scene as PLY: scene-linear for HDR tools, or baked to display colours for the viewers of 3DGS."""
+"""A trained scene as PLY: scene-linear for HDR tools, or baked to display colors for the viewers of 3DGS."""
 
 import logging
 from collections.abc import Callable
@@ -9,14 +9,13 @@ import numpy as np
 from sehdr_warp.errors import SehdrError
 
 from ..files import check_absent
-from .bake import bake
-from .gaussian_file import GaussianArrays, write_gaussians
+from .gaussians import GaussianArrays, bake, write_gaussians
 
 log = logging.getLogger(__name__)
 KINDS = ("hdr", "ldr")
 
 _HARMONIC_0 = 0.5 / np.sqrt(np.pi)
-# A degree of the harmonics that changes no colour by more than this part is not stored: a half float rounds by more.
+# A degree of the harmonics that changes no color by more than this part is not stored: a half float rounds by more.
 _UNSEEN = 1e-4
 # Radiance below this is written as this: its logarithm must be finite.
 _DARKEST = 1e-12
@@ -34,13 +33,11 @@ def export(
 ) -> Path:
     """Writes the Gaussians of a trained run as PLY; returns the path.
 
-    Args:
-        kind: "hdr": scene-linear radiance, see hdr_gaussians; "ldr": display colors, see ldr_gaussians.
-        exposure_time: of "ldr", seconds; by default the one the scene was photographed at.
+    kind: "hdr": scene-linear radiance, see hdr_gaussians; "ldr": display colors, see ldr_gaussians.
+    exposure_time: of "ldr", seconds; by default the one the scene was photographed at.
 
-    Raises:
-        SehdrError: for another kind, or an exposure time that is not positive.
-        InputError: where the file exists (unless overwrite) or a value is not finite.
+    Raises SehdrError for another kind or an exposure time that is not positive, InputError where the file exists
+    (unless overwrite) or a value is not finite.
     """
     if kind not in KINDS:
         raise SehdrError(f"PLY kind {kind!r} is not one of {', '.join(KINDS)}")
@@ -56,10 +53,10 @@ def export(
 
 
 def without_unseen_degrees(gaussians: GaussianArrays) -> GaussianArrays:
-    """The Gaussians without their highest degrees, as far as these change no colour of any of them, in any direction,
-    by more than a ten-thousandth (with "display": of white).
+    """The Gaussians without the highest degrees that change no color by more than a ten-thousandth ("display": of
+    white) in any direction.
 
-    A degree l with coefficients c changes a colour by at most |c| sqrt((2 l + 1) / (4 pi)) (addition theorem).
+    A degree l with coefficients c changes a color by at most |c| sqrt((2 l + 1) / (4 pi)) (addition theorem).
     """
     harmonics, degree = gaussians.harmonics.astype(np.float64), gaussians.degree
     scale = np.abs(_HARMONIC_0 * harmonics[:, 0]) if gaussians.color_model == "linear" else 1.0
@@ -69,20 +66,20 @@ def without_unseen_degrees(gaussians: GaussianArrays) -> GaussianArrays:
         if not (largest <= _UNSEEN * scale).all():  # NaN counts as seen, and is refused by name when it is written.
             break
         degree -= 1
-    kept = np.ascontiguousarray(gaussians.harmonics[:, : (degree + 1) ** 2])
-    return gaussians if degree == gaussians.degree else gaussians.with_colors(kept, gaussians.color_model)
+    return gaussians.with_colors(gaussians.harmonics[:, : (degree + 1) ** 2], gaussians.color_model)
 
 
 def hdr_gaussians(run) -> GaussianArrays:
     """The scene-linear Gaussians of a run.
 
     Exact for models whose harmonics are exposures or their logarithms. With fused brackets, or harmonics of encoded
-    values, harmonics are fitted to the logarithm of the radiance (output/bake.py).
+    values, harmonics are fitted to the logarithm of the radiance (see bake).
     """
     stored, to_radiance = _stored(run)
     if to_radiance is not None:
-        seen_from = _train_positions(run)
-        return bake(stored, lambda c: np.log(np.maximum(to_radiance(c), _DARKEST)), "log", camera_positions=seen_from)
+        return bake(
+            stored, lambda c: np.log(np.maximum(to_radiance(c), _DARKEST)), "log", camera_positions=_seen_from(run)
+        )
     harmonics = stored.harmonics.astype(np.float64)
     if stored.color_model == "linear":
         return stored.with_colors(harmonics / run.exposure_time, "linear")
@@ -91,7 +88,7 @@ def hdr_gaussians(run) -> GaussianArrays:
 
 
 def ldr_gaussians(run, exposure_time: float | None = None) -> GaussianArrays:
-    """Display colours of a run at an exposure time in seconds: what its response makes of each Gaussian's radiance.
+    """Display colors of a run at an exposure time in seconds: what its response makes of each Gaussian's radiance.
 
     The encoded values are shown as sRGB, as the photos were. Viewers blend these, not radiance, so half-covered edges
     of very bright things come out darker than in a rendered photo. Degree and geometry are kept.
@@ -103,13 +100,12 @@ def ldr_gaussians(run, exposure_time: float | None = None) -> GaussianArrays:
     if stored.color_model == "display" and time == run.exposure_time:
         return stored
     radiance = to_radiance or (lambda exposure: exposure / run.exposure_time)
-    return bake(
-        stored, lambda c: run.response.encode(radiance(c) * time), "display", camera_positions=_train_positions(run)
-    )
+    shown = lambda color: run.response.encode(radiance(color) * time)  # noqa: E731
+    return bake(stored, shown, "display", camera_positions=_seen_from(run))
 
 
 def _stored(run) -> tuple[GaussianArrays, Colors | None]:
-    """The run's Gaussians in the colours of its model (exposures at the base time, or encoded values), and how these
+    """The run's Gaussians in the colors of its model (exposures at the base time, or encoded values), and how these
     become radiance; None where radiance is the exposure over the base time."""
     tensors = {name: value.cpu().numpy() for name, value in run.model.gaussians.tensors().items()}
     harmonics = np.concatenate([tensors["harmonics_dc"], tensors["harmonics_rest"]], axis=1)
@@ -130,5 +126,5 @@ def _fuse(run, exposure: np.ndarray) -> np.ndarray:
     return fused.cpu().numpy().reshape(exposure.shape).astype(np.float64)
 
 
-def _train_positions(run) -> np.ndarray:
+def _seen_from(run) -> np.ndarray:
     return np.array([entry.camera.position for entry in run.cameras if entry.split == "train"])

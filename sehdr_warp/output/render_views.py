@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from datetime import datetime
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from .brackets import BracketFolder, BracketOptions, bracket_exposures
 from .camera_paths import interpolate, orbit
 from .colorspace import from_rec709
 from .exr import exr_header, write_exr
-from .images import quantize, write_png
+from .images import as_array, quantize, write_picture
 from .names import safe_names
 from .tonemap import ToneMap, fit_tone_map
 
@@ -30,22 +29,8 @@ PATHS = ("orbit", "interpolate")
 _FIT_VIEWS, _FIT_SIZE = 4, 160
 
 
-class RenderableRun(Protocol):
-    """What is needed of a trained run. cameras: entries with name, split, camera; exposure_time: base, seconds."""
-
-    cameras: Sequence
-    response: object
-    exposure_time: float
-
-    def render(self, camera: Camera):
-        """hdr [H, W, 3] scene-linear radiance, alpha [H, W], depth [H, W]."""
-
-    def render_confidence(self, camera: Camera):
-        """[H, W] in [0, 1], how far the photos vouch for what is seen; None where that was not measured."""
-
-
 def render_views(
-    run: RenderableRun,
+    run,
     out: Path | str,
     *,
     cameras: str | Path = "test",
@@ -75,8 +60,9 @@ def render_views(
     wanted = evs is not None or exposures is not None
     if (multipart or ldr_brackets) and not wanted:
         raise SehdrError("brackets were asked for without exposures; give evs (--evs=-2,0,2) or exposures")
+    made = bracket_exposures(run.exposure_time, evs=evs, exposures=exposures) if wanted else ()
     options = BracketOptions(
-        bracket_exposures(run.exposure_time, evs=evs, exposures=exposures) if wanted else (),
+        made,
         run.exposure_time,
         colorspace,
         pixel,
@@ -95,28 +81,24 @@ def render_views(
         tone_map = fit_run_tone_map(run, [camera for _, camera in views])
         for index, (name, camera) in enumerate(views, start=1):
             rendered = run.render(camera)
-            hdr, layers = _array(rendered.hdr), {"A": _array(rendered.alpha), "Z": _array(rendered.depth)}
+            hdr, layers = as_array(rendered.hdr), {"A": as_array(rendered.alpha), "Z": as_array(rendered.depth)}
             confidence = run.render_confidence(camera)
             if confidence is not None:
-                layers["confidence"] = _array(confidence)
+                layers["confidence"] = as_array(confidence)
             elif index == 1:
                 log.info("without a confidence channel: `sehdr-warp report` measures it, from the photos")
             stored = {_write_hdr(hdr_folder / f"{name}.exr", hdr, layers, camera, options)}
-            write_png(preview_folder / f"{name}.png", quantize(tone_map(hdr)))
+            write_picture(preview_folder / f"{name}.png", quantize(tone_map(hdr)))
             if brackets is not None:
                 stored.add(brackets.add(name, hdr, camera))
             log.info("%s (%d of %d)", name, index, len(views))
             if stored != {pixel}:
                 log.info("%s: holds values above 65504, which half cannot; written as float", name)
-    files = [
-        out / folder / f"{name}.{suffix}"
-        for folder, suffix in (("hdr", "exr"), ("preview", "png"))
-        for name, _ in views
-    ]
+    files = [out / place.format(name) for place in ("hdr/{}.exr", "preview/{}.png") for name, _ in views]
     return files if brackets is None else files + brackets.files + [out / "brackets.json"]
 
 
-def select_cameras(run: RenderableRun, cameras: str | Path, *, count: int = 60) -> list[tuple[str, Camera]]:
+def select_cameras(run, cameras: str | Path, *, count: int = 60) -> list[tuple[str, Camera]]:
     """Named cameras: "train", "test", "all", "orbit", "interpolate" (see render_views) or a JSON file.
 
     Names are safe for files and all different.
@@ -124,32 +106,25 @@ def select_cameras(run: RenderableRun, cameras: str | Path, *, count: int = 60) 
     """
     text = str(cameras)
     if text in SPLITS:
-        entries = [entry for entry in run.cameras if text in (entry.split, "all")]
-        if not entries:
-            raise SehdrError(
-                f"the run has no {text} views; choose other cameras (train, test, all, orbit or a JSON file)"
-            )
-        names = safe_names([entry.name for entry in entries])
-        return list(zip(names, [entry.camera for entry in entries], strict=True))
-    if text in PATHS:
+        named = [(entry.name, entry.camera) for entry in run.cameras if text in (entry.split, "all")]
+        if not named:
+            raise SehdrError(f"the run has no {text} views; choose other cameras ({', '.join(SPLITS + PATHS)}, a file)")
+    elif text in PATHS:
         seen = [entry.camera for entry in run.cameras if entry.split == "train"]
-        path = (
-            interpolate(seen, count)
-            if text == "interpolate"
-            else orbit(seen, count, focus_distance=_focus_distance(run, seen))
-        )
+        path = interpolate(seen, count) if text == "interpolate" else orbit(seen, count, _focus_distance(run, seen))
         digits = max(3, len(str(count - 1)))
         return [(f"{text}_{index:0{digits}d}", camera) for index, camera in enumerate(path)]
-    if not Path(cameras).is_file():
+    elif Path(cameras).is_file():
+        named = load_cameras(Path(cameras))
+    else:
         raise SehdrError(f"cameras {text!r} are neither a file nor one of {', '.join(SPLITS + PATHS)}")
-    named = load_cameras(Path(cameras))
     return list(zip(safe_names([name for name, _ in named]), [camera for _, camera in named], strict=True))
 
 
-def fit_run_tone_map(run: RenderableRun, cameras: Sequence[Camera]) -> ToneMap:
+def fit_run_tone_map(run, cameras: Sequence[Camera]) -> ToneMap:
     """One tone map for a set of views, from small renders of up to four of them, evenly chosen."""
     chosen = [cameras[i] for i in sorted({round(i) for i in np.linspace(0, len(cameras) - 1, _FIT_VIEWS)})]
-    return fit_tone_map([_array(run.render(_small(camera)).hdr) for camera in chosen])
+    return fit_tone_map([as_array(run.render(_small(camera)).hdr) for camera in chosen])
 
 
 def _write_hdr(path: Path, hdr, layers: dict, camera: Camera, options: BracketOptions) -> str:
@@ -165,19 +140,11 @@ def _write_hdr(path: Path, hdr, layers: dict, camera: Camera, options: BracketOp
     return write_exr(path, channels, pixel=options.pixel, header=header)
 
 
-def _array(value) -> np.ndarray:
-    """A torch tensor on any device, or an array, as an array."""
-    return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
-
-
-def _provenance(run: RenderableRun) -> dict[str, str]:
+def _provenance(run) -> dict[str, str]:
     """Text for the EXR attributes `sehdr:<key>`: what the picture was made from, as far as the run knows."""
-    known = {
-        "scene": getattr(run, "scene_name", None),
-        "iterations": getattr(run, "iterations", None),
-        "response": getattr(run.response, "name", None),
-    }
-    return {key: str(value) for key, value in known.items() if value is not None} | {"units": "relative radiance"}
+    response = getattr(run.response, "name", "")
+    known = {"scene": run.scene_name, "iterations": run.iterations, "response": response, "units": "relative radiance"}
+    return {key: str(value) for key, value in known.items() if value not in (None, "")}
 
 
 def _small(camera: Camera) -> Camera:
@@ -185,10 +152,10 @@ def _small(camera: Camera) -> Camera:
     return camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
 
 
-def _focus_distance(run: RenderableRun, cameras: Sequence[Camera]) -> float:
+def _focus_distance(run, cameras: Sequence[Camera]) -> float:
     """The median depth in a small render of the middle camera; 1 where nothing is seen."""
     if not cameras:
         return 1.0
-    depth = _array(run.render(_small(cameras[len(cameras) // 2])).depth)
+    depth = as_array(run.render(_small(cameras[len(cameras) // 2])).depth)
     depth = depth[depth > 0]
     return float(np.median(depth)) if depth.size else 1.0

@@ -9,13 +9,7 @@ import pytest
 
 import sehdr_warp as sw
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.evaluation.compare import (
-    compare_runs,
-    comparison_csv,
-    comparison_figure,
-    comparison_latex,
-    comparison_table,
-)
+from sehdr_warp.evaluation.compare import compare_runs, comparison_csv, comparison_latex, comparison_table
 from sehdr_warp.evaluation.evaluate import evaluate
 from sehdr_warp.evaluation.table import format_table
 from sehdr_warp.output.exr import write_exr
@@ -52,15 +46,6 @@ def test_runs_that_differ_by_their_seed_share_a_row(tmp_path):
     assert float(found[0]["psnr_ldr_sd"]) == pytest.approx(2**0.5) and found[1]["psnr_ldr_sd"] == ""
     latex = comparison_latex(rows)
     assert r"26.00 $\pm$ 1.41" in latex and r"room\_1" in latex and latex.count(r"\\") == 3
-
-
-def test_the_chart_has_a_line_for_every_run_and_a_name_for_every_row(tmp_path):
-    rows = compare_runs([trained(tmp_path / name, seed=seed) for seed, name in enumerate("ab")])
-    rows += compare_runs([trained(tmp_path / "c", iterations=50, mu=(None, None))])
-    figure = comparison_figure(rows)
-    assert [len(axes.get_lines()) for axes in figure.axes] == [3, 2]
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a and 1 more", "c"]
-    assert figure.axes[1].get_lines()[0].get_xydata().tolist() == [[8.0, 30.0]]
 
 
 def test_what_cannot_be_compared_is_one_line(tmp_path):

@@ -1,6 +1,6 @@
 """HDR-FLIP, where it is installed and where it is not."""
 
-import builtins
+import sys
 
 import pytest
 import torch
@@ -9,21 +9,7 @@ from sehdr_warp.evaluation.evaluate import evaluate
 from sehdr_warp.evaluation.flip import load_flip
 from sehdr_warp.evaluation.table import format_table
 
-from ..training.toy import toy_field, toy_scene
-
-
-class ToyRun:
-    train_seconds, gaussian_count, iterations, device = 1.0, 60, 10, "cpu"
-
-    def __init__(self, factor: float):
-        self.field, self.factor = toy_field(), factor
-
-    def render(self, camera):
-        rendered = self.field.render(camera)
-        return type(rendered)(rendered.hdr * self.factor, rendered.alpha, rendered.depth)
-
-    def render_ldr(self, camera, seconds):
-        return self.field.render_ldr(camera, seconds)
+from .test_evaluate import VIEWS, run, scene
 
 
 def test_flip_is_zero_for_equal_images_and_grows_with_the_error():
@@ -36,21 +22,14 @@ def test_flip_is_zero_for_equal_images_and_grows_with_the_error():
 
 def test_evaluate_gives_flip_under_each_protocols_scale():
     pytest.importorskip("flip_evaluator")
-    result = evaluate(ToyRun(2.0), toy_scene(), flip=True)["protocol"]
+    result = evaluate(run(lambda hdr: hdr * 2), scene(VIEWS), flip=True)["protocol"]
     # A global factor is taken out by `aligned`, and by nothing else.
     assert result["aligned"]["hdr_flip"] < 0.01 < result["gt-max"]["hdr_flip"]
-    assert "hdr_flip" not in evaluate(ToyRun(1.0), toy_scene())["protocol"]["gt-max"]
+    assert "hdr_flip" not in evaluate(run(), scene(VIEWS))["protocol"]["gt-max"]
 
 
 def test_without_the_package_flip_is_null_with_a_reason(monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *arguments, **options):
-        if name == "flip_evaluator":
-            raise ImportError(name)
-        return real(name, *arguments, **options)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    result = evaluate(ToyRun(1.0), toy_scene(), flip=True)
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    result = evaluate(run(), scene(VIEWS), flip=True)
     assert result["protocol"]["gt-max"]["hdr_flip"] is None
     assert "pip install sehdr-warp[flip]" in format_table(result)

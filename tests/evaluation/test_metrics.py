@@ -2,13 +2,11 @@
 
 import math
 
-import cv2
-import numpy as np
 import pytest
 import scipy.ndimage
 import torch
 
-from sehdr_warp.evaluation.metrics import mu_law, percentile, psnr, pu21_encode, pu21_metrics, region_masks, ssim
+from sehdr_warp.evaluation.metrics import mu_law, psnr, pu21_encode, pu21_metrics, region_masks, ssim
 
 
 def noisy_pair(shape=(48, 61, 3), noise=0.1, seed=0):
@@ -19,15 +17,7 @@ def noisy_pair(shape=(48, 61, 3), noise=0.1, seed=0):
 
 def test_mu_law_is_the_papers_equation():
     values = torch.tensor([0.0, 1e-4, 0.01, 0.5, 1.0, -3.0, 7.0], dtype=torch.float64)
-    expected = [
-        0.0,
-        math.log(1.5) / math.log(5001),
-        math.log(51) / math.log(5001),
-        math.log(2501) / math.log(5001),
-        1.0,
-        0.0,
-        1.0,
-    ]
+    expected = [math.log(value) / math.log(5001) for value in (1, 1.5, 51, 2501, 5001, 1, 5001)]
     assert mu_law(values).tolist() == pytest.approx(expected, abs=1e-15)
     assert mu_law(torch.tensor(0.1, dtype=torch.float64), mu=10).item() == pytest.approx(math.log(2) / math.log(11))
 
@@ -37,11 +27,6 @@ def test_psnr_of_a_known_offset():
     assert psnr(truth + 0.125, truth) == pytest.approx(20 * math.log10(8), abs=1e-6)
     assert psnr((truth + 0.125) * 255, truth * 255, peak=255.0) == pytest.approx(20 * math.log10(8), abs=1e-6)
     assert psnr(truth, truth) == math.inf
-
-
-def test_psnr_equals_opencv():
-    prediction, truth = noisy_pair()
-    assert psnr(prediction, truth) == pytest.approx(cv2.PSNR(prediction.numpy(), truth.numpy(), R=1.0), abs=1e-4)
 
 
 def test_psnr_of_channels_apart():
@@ -56,8 +41,9 @@ def test_masks_weigh_the_pixels():
     mask = torch.zeros(48, 61)
     mask[5:20, 10:40] = 1
     assert psnr(prediction, truth, mask) == pytest.approx(psnr(prediction[5:20, 10:40], truth[5:20, 10:40]), abs=1e-9)
-    spoilt = torch.where(mask[..., None] > 0, prediction, 1 - prediction)
-    assert psnr(spoilt, truth, mask) == psnr(prediction, truth, mask)
+    for poison in (math.nan, math.inf, 3e38):
+        spoilt = torch.where(mask[..., None] > 0, prediction, poison)
+        assert psnr(spoilt, truth, mask) == psnr(prediction, truth, mask)
     half = mask * 0.5
     assert psnr(prediction, truth, half) == pytest.approx(psnr(prediction, truth, mask), abs=1e-9)
     assert ssim(prediction, truth, half) == pytest.approx(ssim(prediction, truth, mask), abs=1e-9)
@@ -88,14 +74,6 @@ def test_pu21_has_its_published_anchors():
     assert (rising.diff() > 0).all()
 
 
-def test_pu21_encoding_inverts_by_its_own_decoding():
-    p = [0.353487901, 0.3734658629, 8.277049286e-05, 0.9062562627, 0.09150303166, 0.9099517204, 596.3148142]
-    luminance = np.logspace(-2, 4, 50)
-    power = np.maximum(pu21_encode(torch.tensor(luminance)).numpy() / p[6] + p[5], 0) ** (1 / p[4])
-    decoded = (np.maximum(power - p[0], 0) / (p[1] - p[2] * power)) ** (1 / p[3])
-    np.testing.assert_allclose(decoded, luminance, rtol=1e-6)
-
-
 def test_pu21_maps_the_truths_maximum_to_the_peak():
     truth = torch.full((20, 20, 3), 0.5)
     truth[0, 0, 1] = 2.0
@@ -105,19 +83,12 @@ def test_pu21_maps_the_truths_maximum_to_the_peak():
     error = (1199 * (levels[1] - levels[0]) ** 2 + (levels[3] - levels[2]) ** 2) / 1200
     assert figures["psnr"] == pytest.approx(10 * math.log10(256**2 / error), abs=1e-4)
     assert 0.9 < figures["ssim"] < 1
-    # The unit of radiance does not matter, the peak does; a percentile leaves the one bright pixel out.
+    # The unit of radiance does not matter, the peak does.
     assert pu21_metrics(prediction * 7, truth * 7, peak_luminance=400.0) == pytest.approx(figures, abs=1e-4)
     assert pu21_metrics(prediction, truth, peak_luminance=4000.0)["psnr"] != pytest.approx(figures["psnr"], abs=0.1)
-    lower = pu21_metrics(prediction, truth, peak_luminance=400.0, white_percentile=99.0)
-    assert lower["psnr"] != pytest.approx(figures["psnr"], abs=0.1)
     assert pu21_metrics(truth, truth)["psnr"] == math.inf
     assert all(math.isnan(value) for value in pu21_metrics(truth, truth, torch.zeros(20, 20)).values())
     assert math.isfinite(pu21_metrics(truth, truth * 0)["psnr"])
-
-
-def test_percentile_is_the_nearest_rank():
-    values = torch.arange(1.0, 101.0)[torch.randperm(100)]
-    assert [percentile(values, p).item() for p in (0, 1, 50, 99.5, 100)] == [1, 1, 50, 100, 100]
 
 
 def test_regions_part_the_photo():

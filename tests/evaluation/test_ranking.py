@@ -36,17 +36,6 @@ def test_the_scale_is_that_of_well_exposed_pixels():
     assert result["mean"] == pytest.approx(float(torch.exp2(-stops).mean()))
 
 
-def test_the_unit_of_the_render_does_not_matter():
-    truth, stops = images()
-    wrong = 2 ** (stops[..., None] + torch.rand(truth.shape, generator=torch.Generator().manual_seed(3)))
-    figures = []
-    for unit in (1.0, 64.0):
-        ranking = ErrorRanking()
-        ranking.add(torch.exp2(-stops), unit * truth * wrong, truth, stops == 0, 0.3 * unit)
-        figures.append(ranking.result()["spearman_log2"])
-    assert figures[1] == pytest.approx(figures[0], abs=1e-6)
-
-
 def test_masked_pixels_do_not_count():
     truth, stops = images()
     prediction = truth * 2 ** stops[..., None]

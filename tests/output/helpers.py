@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from plyfile import PlyData
 
-from sehdr_warp.output.gaussian_file import GaussianArrays
+from sehdr_warp.output.gaussians import GaussianArrays
 from sehdr_warp.scene import Camera, look_at
 
 

@@ -17,12 +17,9 @@ from .test_exr import read_openimageio
 EXIF_IFD, EXPOSURE_TIME, EXPOSURE_BIAS = 0x8769, 0x829A, 0x9204
 
 
-def test_evs_are_stops_above_the_base_and_ascend():
+def test_exposures_ascend_and_are_of_the_one_grammar():
     made = bracket_exposures(0.5, evs=[2, -4, 0])
     assert [(e.time, e.ev, e.label) for e in made] == [(1 / 32, -4, "ev-4.0"), (0.5, 0, "ev+0.0"), (2, 2, "ev+2.0")]
-
-
-def test_exposures_are_of_the_one_grammar():
     for given in ([8, 0.125], "1/8, 8s", "1/4x,+4ev"):
         assert [(e.time, e.ev) for e in bracket_exposures(0.5, exposures=given)] == [(0.125, -2), (8, 4)]
     assert bracket_exposures(0.5, evs="-2,4") == bracket_exposures(0.5, evs=[4, -2])
@@ -31,17 +28,12 @@ def test_exposures_are_of_the_one_grammar():
 
 @pytest.mark.parametrize(
     "given, message",
-    [
+    [  # The grammar's own refusals are field's to test.
         ({"evs": [0], "exposures": [1]}, "both were given"),
         ({}, "neither was given"),
-        ({"evs": []}, "evs: the list is empty"),
         ({"evs": [0, float("nan")]}, "evs: 'nanev' is no exposure"),
-        ({"exposures": [1, float("inf")]}, "exposures: inf is no exposure"),
-        ({"exposures": [0.5, 0]}, "exposures: 0 is no exposure above 0"),
-        ({"exposures": "-2"}, "exposures: '-2' is no exposure above 0"),
         ({"exposures": [2, 1, "4x"]}, "exposures: 2 s is given twice"),
         ({"evs": [1, 1.0]}, "evs: 1 s is given twice"),
-        ({"evs": [1e9]}, "evs: '1000000000.0ev' is no exposure"),
         ({"evs": "0,two"}, "evs: 'twoev' is no exposure"),
         ({"exposures": [1e-30]}, "exposures: 1e-30 s .* is outside"),
     ],
@@ -90,12 +82,6 @@ def test_manifest_lists_what_was_written(tmp_path):
             _, spec = read_openimageio(tmp_path / exposure["file"])
             assert spec.get_float_attribute("ExposureTime") == exposure["exposure_time"]
             assert float(spec.get_string_attribute("sehdr:ev")) == exposure["ev"]
-
-
-def test_names_sort_by_exposure(tmp_path):
-    files = write_brackets(tmp_path, {"v": radiance()}, 0.5, evs=[4, -4, 0, 2, -2])
-    times = [read_exr(file)[2]["expTime"] for file in sorted(files)]
-    assert times == sorted(times)
 
 
 def test_multipart_holds_all_exposures_of_a_view(tmp_path):
@@ -172,19 +158,10 @@ def test_unusable_options():
         write_brackets("x", {}, 1, evs=[0], colorspace="cmyk")
 
 
-def smooth_radiance():
-    """Smooth, five decades, for merging: neighbours share a code value."""
-    y, x = np.mgrid[:96, :128] / 96
-    return np.stack([10 ** (4 * x / 1.33 - 2 + 0.2 * c * np.sin(5 * y)) for c in (0.5, 1, 1.5)], axis=2)
-
-
-def well_exposed(photos):
-    return np.any([(photo > 32) & (photo < 224) for photo in photos], axis=0)
-
-
 def test_debevec_merge_through_the_response_gives_back_the_radiance(tmp_path):
     """Debevec and Malik 1997, Eq. 6, with the known response and the times that EXIF states."""
-    image = smooth_radiance()
+    y, x = np.mgrid[:96, :128] / 96
+    image = np.stack([10 ** (4 * x / 1.33 - 2 + 0.2 * c * np.sin(5 * y)) for c in (0.5, 1, 1.5)], axis=2)
     write_brackets(tmp_path, {"v": image}, 0.5, evs=range(-6, 7, 2), ldr="png", response=GammaResponse())
     photos, times = [], []
     for file in sorted((tmp_path / "brackets_ldr" / "v").iterdir()):
@@ -196,23 +173,8 @@ def test_debevec_merge_through_the_response_gives_back_the_radiance(tmp_path):
         for p, t in zip(photos, times, strict=True)
     ]
     merged = np.exp(np.sum(np.multiply(weights, logs), axis=0) / np.maximum(np.sum(weights, axis=0), 1e-9))
-    seen = well_exposed(photos)
+    seen = np.any([(photo > 32) & (photo < 224) for photo in photos], axis=0)
     assert seen.mean() > 0.9
     ratio = merged[seen] / image[seen]
     assert np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.005
     assert np.median(ratio) == pytest.approx(1, abs=0.005)
-
-
-def test_opencv_debevec_merge_agrees(tmp_path):
-    cv2 = pytest.importorskip("cv2")
-    image = smooth_radiance()
-    write_brackets(tmp_path, {"v": image}, 0.5, evs=range(-6, 7, 2), ldr="png", response=GammaResponse())
-    files = sorted((tmp_path / "brackets_ldr" / "v").iterdir())
-    photos = [read_ldr(file).pixels for file in files]
-    times = [float(Image.open(file).getexif().get_ifd(EXIF_IFD)[EXPOSURE_TIME]) for file in files]
-    curve = np.maximum(GammaResponse().decode(np.arange(256) / 255), 1e-6).astype(np.float32)
-    curve = np.repeat(curve[:, None, None], 3, axis=2)
-    merged = cv2.createMergeDebevec().process(photos, np.array(times, np.float32), curve)
-    seen = well_exposed(photos)
-    ratio = merged[seen] / image[seen]
-    assert np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.005

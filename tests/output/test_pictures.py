@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sehdr_warp.output.images import exposure_exif, quantize, write_jpeg, write_png
+from sehdr_warp.output.images import exposure_exif, quantize, write_picture
 from sehdr_warp.output.tonemap import ToneMap, encode_srgb, expose, fit_tone_map
 from sehdr_warp.scene.images import read_ldr
 
@@ -12,7 +12,7 @@ from .helpers import radiance
 @pytest.mark.parametrize("exif", [None, exposure_exif(0.5)])
 def test_png_gives_back_its_codes(tmp_path, bits, exif):
     codes = np.random.default_rng(0).integers(0, 2**bits, (7, 5, 3)).astype(f"uint{bits}")
-    write_png(tmp_path / "a.png", codes, exif=exif)
+    write_picture(tmp_path / "a.png", codes, exif=exif)
     np.testing.assert_array_equal(read_ldr(tmp_path / "a.png").pixels, codes)
 
 
@@ -21,7 +21,7 @@ def test_other_readers_see_16_bits(tmp_path):
     for shape in ((7, 5, 3), (7, 5)):
         codes = np.random.default_rng(0).integers(0, 2**16, shape).astype(np.uint16)
         file = tmp_path / f"{codes.ndim}.png"
-        write_png(file, codes, exif=exposure_exif(2.0))
+        write_picture(file, codes, exif=exposure_exif(2.0))
         found = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(found[..., ::-1] if codes.ndim == 3 else found, codes)
 
@@ -29,7 +29,7 @@ def test_other_readers_see_16_bits(tmp_path):
 def test_jpeg_is_close_and_keeps_colour_detail(tmp_path):
     ramp = np.linspace(0, 255, 64)
     codes = np.stack(np.broadcast_arrays(ramp[:, None], ramp[None], 255 - ramp[:, None]), 2).astype(np.uint8)
-    write_jpeg(tmp_path / "a.jpg", codes)
+    write_picture(tmp_path / "a.jpg", codes)
     assert np.abs(read_ldr(tmp_path / "a.jpg").pixels.astype(int) - codes).max() <= 4
 
 
@@ -38,10 +38,8 @@ def test_quantize_rounds_and_limits():
     assert quantize(np.array([0.5]), 16) == 32768
     with pytest.raises(ValueError, match="NaN"):
         quantize(np.array([np.nan]))
-    with pytest.raises(ValueError, match="12 bits"):
-        quantize(np.zeros(1), 12)
     with pytest.raises(ValueError, match="float64"):
-        write_png("never.png", np.zeros((2, 2, 3)))
+        write_picture("never.png", np.zeros((2, 2, 3)))
 
 
 def test_srgb_matches_colour_science():

@@ -28,6 +28,13 @@ def test_layout_on_disk(tmp_path, logged):
     assert logged == ["t_0 (1 of 2)", "t_1 (2 of 2)"]
 
 
+def test_brackets_cost_no_render(tmp_path):
+    plain, bracketed = AnalyticRun(), AnalyticRun()
+    render_views(plain, tmp_path / "plain")
+    render_views(bracketed, tmp_path / "brackets", evs=[-4, -2, -1, 0, 1, 2, 4], ldr_brackets="png")
+    assert plain.rendered == bracketed.rendered
+
+
 def test_hdr_file_holds_what_was_rendered(tmp_path):
     run = AnalyticRun()
     render_views(run, tmp_path, pixel="float")
@@ -45,10 +52,11 @@ def test_hdr_file_holds_what_was_rendered(tmp_path):
     assert Image.open(tmp_path / "preview" / "t_0.png").size == (entry.camera.width, entry.camera.height)
 
 
-def test_without_confidence_there_is_no_channel_and_a_line_says_so(tmp_path, logged):
+def test_lines_say_that_confidence_is_missing_and_values_are_past_half(tmp_path, logged):
     run = AnalyticRun()
-    run.confident = False
+    run.confident, run.gain = False, 1e5
     render_views(run, tmp_path)
+    assert "t_0: holds values above 65504, which half cannot; written as float" in logged
     assert read_exr(tmp_path / "hdr" / "t_0.exr")[1] == ("R", "G", "B", "A", "Z")
     assert sum("without a confidence channel" in line for line in logged) == 1
 
@@ -82,13 +90,6 @@ def test_a_bad_pixel_leaves_nothing_new(tmp_path, multipart):
     with pytest.raises(InputError, match="not finite"):
         render_views(run, tmp_path / "deep" / "out", evs=[0], multipart=multipart)
     assert not (tmp_path / "deep").exists()
-
-
-def test_values_past_half_are_said(tmp_path, logged):
-    run = AnalyticRun()
-    run.gain = 1e5
-    render_views(run, tmp_path)
-    assert "t_0: holds values above 65504, which half cannot; written as float" in logged
 
 
 def test_options_that_do_nothing_are_refused(tmp_path):
@@ -136,7 +137,7 @@ def sees(view, point):
 @pytest.mark.parametrize("degrees", [60, 360])
 def test_orbit_looks_at_the_focus_smoothly(degrees):
     given = arc(12, degrees)
-    path = orbit(given, 48, focus_distance=1)
+    path = orbit(given, 48, 1)
     positions = np.stack([view.position for view in path])
     for view in path:
         np.testing.assert_allclose(sees(view, np.zeros(3)), (view.cx, view.cy), atol=1e-6)
@@ -176,4 +177,4 @@ def test_paths_need_cameras():
     with pytest.raises(SehdrError, match="no training views"):
         interpolate([], 3)
     with pytest.raises(SehdrError, match="path of 0 views"):
-        orbit(arc(3, 30), 0, focus_distance=1)
+        orbit(arc(3, 30), 0, 1)

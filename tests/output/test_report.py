@@ -3,7 +3,8 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.output.report import Comparison, comparison_figure, stops_figure, training_figure, write_report
+from sehdr_warp.output.charts import training_chart
+from sehdr_warp.output.report import Comparison, comparison_figure, stops_figure, write_report
 from sehdr_warp.scene import Scene, View, codes_of
 
 from .helpers import AnalyticRun
@@ -21,16 +22,8 @@ def make(folder, *, truth=True, splits=("train", "test", "test"), metrics=METRIC
     for entry in run.cameras:
         hdr = run.render(entry.camera).hdr
         image = run.response.encode(hdr * entry.exposure_time).astype(np.float32)
-        views.append(
-            View(
-                entry.name,
-                codes_of(image, 16),
-                entry.camera,
-                entry.exposure_time,
-                entry.split,
-                hdr=hdr if truth else None,
-            )
-        )
+        known = {"hdr": hdr} if truth else {}
+        views.append(View(entry.name, codes_of(image, 16), entry.camera, entry.exposure_time, entry.split, **known))
     return run, Scene("sky", "photos", tuple(views), np.zeros((0, 3)), np.zeros((0, 3), np.float32))
 
 
@@ -55,6 +48,9 @@ def test_without_test_views_and_metrics(tmp_path):
     run, scene = make(tmp_path, splits=("train", "train"), metrics=None)
     files = write_report(run, scene, tmp_path / "report", view_count=1)
     assert [file.name for file in files] == ["comparison.png", "stops.png"]
+    empty = Scene("none", "photos", (), np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+    with pytest.raises(SehdrError, match="no views"):
+        write_report(run, empty, tmp_path / "empty")
 
 
 def test_nothing_is_replaced_unless_asked(tmp_path):
@@ -67,21 +63,16 @@ def test_nothing_is_replaced_unless_asked(tmp_path):
     write_report(run, scene, tmp_path, overwrite=True)
 
 
-def test_empty_scene_is_one_line(tmp_path):
-    run, _ = make(tmp_path)
-    empty = Scene("none", "photos", (), np.zeros((0, 3)), np.zeros((0, 3), np.float32))
-    with pytest.raises(SehdrError, match="no views"):
-        write_report(run, empty, tmp_path / "report")
-
-
-def test_training_plot_draws_the_figures():
-    figure = training_figure(METRICS)
-    axes = figure.axes[0]
-    drawn = [line.get_xydata().tolist() for line in axes.get_lines()]
-    assert drawn == [[[1.5, 20.0], [3.0, 26.0]], [[1.5, 18.0], [3.0, 25.5]]]
-    assert [line.get_label() for line in axes.get_lines()] == ["LDR  26.0 dB", "HDR (mu-law)  25.5 dB"]
-    only = [{"seconds": 1.0, "psnr_ldr": 20.0}]
-    assert len(training_figure(only).axes[0].get_lines()) == 1
+def test_the_chart_has_a_line_for_every_run_and_a_name_for_every_row():
+    figure = training_chart({"sky": [METRICS]})
+    drawn = [[line.get_xydata().tolist() for line in axes.get_lines()] for axes in figure.axes]
+    assert drawn == [[[[1.5, 20.0], [3.0, 26.0]]], [[[1.5, 18.0], [3.0, 25.5]]]]
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles == ["Photos: 26.0 dB", "HDR, mu-law (gt-max): 25.5 dB"] and not figure.legends
+    only = [{"seconds": 1.0, "psnr_ldr": 20.0}, {"iteration": 3}]
+    figure = training_chart({"a and 1 more": [METRICS, METRICS], "c": [only]})
+    assert [len(axes.get_lines()) for axes in figure.axes] == [3, 2]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a and 1 more", "c"]
 
 
 def test_stops_show_what_the_photo_lost(tmp_path):
@@ -111,13 +102,8 @@ def test_the_new_view_lies_halfway_to_the_nearest(tmp_path):
     np.testing.assert_allclose(seen[-1], between, atol=1e-9)
     comparison = Comparison("v", scene.views[0].image, *[scene.views[0].hdr] * 3, None, scene.views[0].hdr * 2)
     titles = [text.get_text() for text in comparison_figure([comparison], 0.5, "").texts]
-    assert titles[:5] == [
-        "Held-out photo",
-        "Photo at \N{MINUS SIGN}4 EV",
-        "HDR scene at \N{MINUS SIGN}4 EV",
-        "Truth at \N{MINUS SIGN}4 EV",
-        "New view, tone-mapped",
-    ]
+    darker = [f"{what} at \N{MINUS SIGN}4 EV" for what in ("Photo", "HDR scene", "Truth")]
+    assert titles[:5] == ["Held-out photo", *darker, "New view, tone-mapped"]
 
 
 def test_confidence_stands_beside_the_scene(tmp_path):

@@ -1,0 +1,57 @@
+"""Charts of trainings: held-out error against time."""
+
+from collections.abc import Mapping, Sequence
+
+# Hues that the colour-blind tell apart (Okabe and Ito).
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31")
+INK, QUIET, RULE = "#1f2328", "#6a737d", "#e1e4e8"
+PANELS = {"psnr_ldr": "Photos", "psnr_mu": "HDR, mu-law (gt-max)"}
+"""Figures of a line of metrics.jsonl, and what their panels are called."""
+STYLE = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["Inter", "Helvetica Neue", "Arial", "DejaVu Sans"],
+    "font.size": 9,
+    "text.color": INK,
+    "axes.labelcolor": QUIET,
+    "xtick.color": QUIET,
+    "ytick.color": QUIET,
+    "axes.edgecolor": RULE,
+}
+
+
+def training_points(curve: Sequence[Mapping], key: str) -> list[tuple[float, float]]:
+    """(seconds, dB) of the lines of metrics.jsonl that have both."""
+    return [(line["seconds"], line[key]) for line in curve if line.get(key) is not None and "seconds" in line]
+
+
+def training_chart(rows: Mapping[str, Sequence[Sequence[Mapping]]]):
+    """A matplotlib Figure: held-out PSNR against training seconds, a panel for each of PANELS that has figures.
+
+    rows: label -> the metrics of one run, or of several that differ by their seed. One color a row, one line a run; of
+    a single row the last figure stands in the panel's title.
+    """
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    keys = [key for key in PANELS if any(training_points(c, key) for curves in rows.values() for c in curves)]
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(4.6 * max(len(keys), 1) + 1.6 * (len(rows) > 1), 3.8), layout="constrained")
+        handles = {}
+        for place, key in enumerate(keys, 1):
+            axes = figure.add_subplot(1, len(keys), place)
+            title = PANELS[key]
+            for number, (label, curves) in enumerate(rows.items()):
+                style = {"color": COLORS[number % len(COLORS)], "linestyle": "-" if number < len(COLORS) else "--"}
+                for points in filter(None, (training_points(curve, key) for curve in curves)):
+                    (handles[label],) = axes.plot(*zip(*points, strict=True), marker=".", linewidth=1.6, **style)
+                    title = f"{PANELS[key]}: {points[-1][1]:.1f} dB" if len(rows) == len(curves) == 1 else title
+            axes.set_title(title, loc="left", fontsize=10, fontweight="bold")
+            axes.set_xlabel("training time, seconds")
+            axes.set_ylabel("held-out PSNR, dB")
+            axes.set_xlim(left=0)
+            axes.grid(axis="y", color=RULE, linewidth=0.8)
+            axes.tick_params(length=0)
+            axes.spines[["top", "right", "left"]].set_visible(False)
+        if len(rows) > 1:
+            figure.legend(handles.values(), handles.keys(), loc="outside right upper", frameon=False, fontsize=8.5)
+        return figure
