@@ -14,7 +14,7 @@ import platform
 import re
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -22,36 +22,13 @@ from typing import Any
 from sehdr_warp.errors import InputError, SehdrError
 
 _REPLACE = "choose another place, or ask for it to be replaced (--overwrite)"
-_WRITE_ERRORS = frozenset(
-    getattr(errno, name)
-    for name in (
-        "ENOSPC",
-        "EDQUOT",
-        "EFBIG",
-        "EROFS",
-        "EACCES",
-        "EPERM",
-        "EIO",
-        "ENAMETOOLONG",
-        "ENOTDIR",
-        "EISDIR",
-        "EMFILE",
-    )
-    if hasattr(errno, name)
-)
-
+_REFUSALS = "ENOSPC EDQUOT EFBIG EROFS EACCES EPERM EIO ENAMETOOLONG ENOTDIR EISDIR EMFILE"
+_WRITE_ERRORS = {getattr(errno, name) for name in _REFUSALS.split() if hasattr(errno, name)}
 
 # The largest text or model file that is read whole. The biggest COLMAP models in use (Mip-NeRF 360, city captures)
 # stay well under it; a larger one is far more likely a wrong file than a scene.
 MAX_FILE_BYTES = 4 << 30
 MAX_JSON_BYTES = 256 << 20
-
-
-@contextmanager
-def _in_place(path: Path) -> Iterator[list[Path]]:
-    """Makes the parents of `path`, yields those made, and says in one line why a write is refused."""
-    with writing(path):
-        yield _make_parents(path)
 
 
 @contextmanager
@@ -65,20 +42,14 @@ def atomic_path(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     full or the folder is not writable.
     """
     path = Path(path)
-    _remove_stale(path)
-    check_absent(path, overwrite)
-    with _in_place(path) as made:
-        temporary = _beside(path)
-        try:
-            yield temporary
-            _sync(temporary)
-            check_absent(path, overwrite)
-            os.replace(temporary, path)
-            _sync(path.parent)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            _remove_empty(made)
-            raise
+
+    def put(temporary: Path) -> None:
+        _sync(temporary)
+        check_absent(path, overwrite)
+        os.replace(temporary, path)
+
+    with _written_beside(path, lambda: check_absent(path, overwrite), put) as temporary:
+        yield temporary
 
 
 @contextmanager
@@ -92,25 +63,40 @@ def atomic_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     or the parent is not writable.
     """
     path = Path(path)
-    _remove_stale(path)
-    check_absent_folder(path, overwrite)
-    with _in_place(path) as made:
-        temporary = _beside(path)
+
+    def put(temporary: Path) -> None:
+        for folder, _, names in os.walk(temporary):
+            for place in (*names, "."):
+                _sync(Path(folder, place))
+        check_absent_folder(path, overwrite)
+        _swap_in(temporary, path)
+
+    with _written_beside(path, lambda: check_absent_folder(path, overwrite), put) as temporary:
         try:
             temporary.mkdir()
             yield temporary
-            for folder, _, names in os.walk(temporary):
-                for name in names:
-                    _sync(Path(folder, name))
-                _sync(Path(folder))
-            check_absent_folder(path, overwrite)
-            _swap_in(temporary, path)
-        except BaseException as error:
+        except SehdrError as error:
             # Whoever writes into the folder names files by its temporary name, which means nothing to the user.
-            if isinstance(error, SehdrError):
-                error.args = tuple(str(item).replace(str(temporary), str(path)) for item in error.args)
-            shutil.rmtree(temporary, ignore_errors=True)
-            _remove_empty(made)
+            error.args = tuple(str(item).replace(str(temporary), str(path)) for item in error.args)
+            raise
+
+
+@contextmanager
+def _written_beside(path: Path, check: Callable[[], None], put: Callable[[Path], None]) -> Iterator[Path]:
+    """Yields a temporary name beside `path`, then calls put(name); where either raises, all that was made goes."""
+    _remove_stale(path)
+    check()
+    with writing(path):
+        made, temporary = _make_parents(path), _beside(path)
+        try:
+            yield temporary
+            put(temporary)
+            _sync(path.parent)
+        except BaseException:
+            _remove(temporary)
+            with suppress(OSError):  # Someone else has put a file there in the meantime.
+                for folder in made:
+                    folder.rmdir()
             raise
 
 
@@ -129,9 +115,8 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     try:
         size = path.stat().st_size
         if size > limit:
-            raise InputError(
-                path, f"{size} bytes is more than the limit of {limit}", "check that this is the right file"
-            )
+            problem = f"{size} bytes is more than the limit of {limit}"
+            raise InputError(path, problem, "check that this is the right file")
         data = path.read_bytes()
     except FileNotFoundError:
         raise InputError(path, "file not found", "check the data folder") from None
@@ -170,23 +155,21 @@ def contained(folder: Path, name: str, source: Path) -> Path:
     """
     if not isinstance(name, str) or not name or "\0" in name:
         raise InputError(source, f"file name {name!r} is not usable", "correct the entry")
-    remedy = f"use a path relative to {folder} without '..'"
+    problem = None
     if PurePosixPath(name).is_absolute() or PureWindowsPath(name).drive or PureWindowsPath(name).root:
-        raise InputError(source, f"file name {_short(name)} is absolute", remedy)
-    if ".." in PurePosixPath(name.replace("\\", "/")).parts:
-        raise InputError(source, f"file name {_short(name)} contains '..'", remedy)
-    try:
-        path = folder / name
-        inside = path.resolve().is_relative_to(folder.resolve())
-    except (OSError, ValueError, RuntimeError) as error:
-        raise InputError(source, f"file name {_short(name)} cannot be resolved ({error})", remedy) from None
-    if not inside:
-        raise InputError(source, f"file name {_short(name)} leads outside the data folder", remedy)
-    return path
-
-
-def _short(name: str) -> str:
-    return repr(name if len(name) <= 80 else name[:77] + "...")
+        problem = "is absolute"
+    elif ".." in PurePosixPath(name.replace("\\", "/")).parts:
+        problem = "contains '..'"
+    else:
+        try:
+            if not (folder / name).resolve().is_relative_to(folder.resolve()):
+                problem = "leads outside the data folder"
+        except (OSError, ValueError, RuntimeError) as error:
+            problem = f"cannot be resolved ({error})"
+    if problem:
+        short = repr(name if len(name) <= 80 else name[:77] + "...")
+        raise InputError(source, f"file name {short} {problem}", f"use a path relative to {folder} without '..'")
+    return folder / name
 
 
 def check_absent(path: Path | str, overwrite: bool = False) -> None:
@@ -245,17 +228,19 @@ def _remove_stale(path: Path) -> None:
         found = [match for name in os.listdir(path.parent) if (match := names.fullmatch(name))]
     except OSError:  # No such folder yet, or not ours to read.
         return
-    for match in found:
-        left = path.parent / match[0]
-        if _runs(int(match[2])):
-            continue
-        if match[3] == "tmp" or (match[1] + (match[4] or "") == path.name and path.exists()):
-            shutil.rmtree(left, ignore_errors=True)
-            with suppress(OSError):
-                left.unlink(missing_ok=True)
-        elif match[1] + (match[4] or "") == path.name:
+    for match in (match for match in found if not _runs(int(match[2]))):
+        left, ours = path.parent / match[0], match[1] + (match[4] or "") == path.name
+        if match[3] == "tmp" or (ours and path.exists()):
+            _remove(left)
+        elif ours:
             with suppress(OSError):  # Another process was as quick.
                 os.rename(left, path)
+
+
+def _remove(path: Path) -> None:
+    shutil.rmtree(path, ignore_errors=True)
+    with suppress(OSError):
+        path.unlink(missing_ok=True)
 
 
 def _runs(process: int) -> bool:
@@ -287,17 +272,8 @@ def _make_parents(path: Path) -> list[Path]:
     return missing
 
 
-def _remove_empty(folders: list[Path]) -> None:
-    for folder in folders:
-        try:
-            folder.rmdir()
-        except OSError:  # Someone else has put a file there in the meantime.
-            return
-
-
 def _swap_in(temporary: Path, path: Path) -> None:
-    old = _beside(path, "old")
-    replaced = path.exists()
+    old, replaced = _beside(path, "old"), path.exists()
     if replaced:
         os.rename(path, old)
     try:

@@ -85,6 +85,32 @@ def write_blender(folder: Path, count: int = 6, *, rgba: bool = False, size=(40,
     (folder / "transforms.json").write_text(json.dumps(values))
 
 
+def write_llff(folder: Path, count: int = 6, size=(64, 48), focal: float = 50.0) -> list[np.ndarray]:
+    """images/ and poses_bounds.npy as LLFF's imgs2poses writes them; returns the world_to_camera matrices."""
+    (folder / "images").mkdir()
+    poses, rows = arc_poses(count), []
+    for i, pose in enumerate(poses):
+        Image.fromarray(pattern(*size, seed=i)).save(folder / "images" / f"{i:03d}.png")
+        right, down, forward, position = np.linalg.inv(pose)[:3].T
+        matrix = np.stack([down, right, -forward, position, [size[1], size[0], focal]], axis=1)
+        rows.append([*matrix.ravel(), 1.0, 10.0])
+    np.save(folder / "poses_bounds.npy", np.array(rows))
+    return poses
+
+
+def write_ply(path: Path, points, colors=None) -> None:
+    """Points and, where given, their 8-bit colors as text."""
+    rows = [[*point, *color] for point, color in zip(points, colors or [()] * len(points))]
+    names = [f"float {axis}" for axis in "xyz"] + [f"uchar {name}" for name in ("red", "green", "blue")]
+    lines = [
+        "ply",
+        "format ascii 1.0",
+        f"element vertex {len(rows)}",
+        *(f"property {n}" for n in names[: len(rows[0])]),
+    ]
+    path.write_text("\n".join([*lines, "end_header", *(" ".join(map(str, row)) for row in rows), ""]))
+
+
 def room_views(
     shared: Path, *, room: str = "room", weights=(1.0, 1.0, 1.0), size: int = 200, count: int | None = None
 ) -> list[RadianceView]:

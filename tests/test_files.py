@@ -46,12 +46,6 @@ def test_file_that_appears_meanwhile_is_kept(tmp_path):
     assert listing(tmp_path) == ["a.txt"]
 
 
-def test_a_folder_is_never_replaced_by_a_file(tmp_path):
-    (tmp_path / "a").mkdir()
-    with pytest.raises(InputError, match="is a folder"), atomic_path(tmp_path / "a", overwrite=True):
-        pass
-
-
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
 def test_failure_leaves_nothing_new_and_keeps_the_old(tmp_path, error):
     (tmp_path / "old.txt").write_text("old")
@@ -77,8 +71,11 @@ def test_full_disk_is_one_line(tmp_path):
     assert listing(tmp_path) == []
 
 
-def test_parent_that_is_a_file_is_one_line(tmp_path):
+def test_what_is_in_the_way_is_one_line(tmp_path):
+    (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="is a folder"), atomic_path(tmp_path / "folder", overwrite=True):
+        pass
     with pytest.raises(SehdrError, match="is a file"), atomic_path(tmp_path / "file" / "a.txt"):
         pass
 
@@ -88,14 +85,6 @@ def test_long_names_fit_the_file_system(tmp_path):
     with atomic_path(tmp_path / name) as temporary:
         temporary.write_text("x")
     assert (tmp_path / name).exists()
-
-
-def test_folder_appears_whole(tmp_path):
-    with atomic_folder(tmp_path / "set") as folder:
-        (folder / "sub").mkdir()
-        (folder / "sub" / "a").write_text("1")
-        assert not (tmp_path / "set").exists()
-    assert listing(tmp_path) == ["set", "set/sub", "set/sub/a"]
 
 
 def test_folder_replaces_whole_or_not_at_all(tmp_path):
@@ -113,11 +102,14 @@ def test_folder_replaces_whole_or_not_at_all(tmp_path):
     assert listing(tmp_path) == ["set", "set/new"]
 
 
-def test_empty_folder_counts_as_absent(tmp_path):
-    (tmp_path / "set").mkdir()
-    with atomic_folder(tmp_path / "set") as folder:
-        (folder / "a").write_text("1")
-    assert os.listdir(tmp_path / "set") == ["a"]
+def test_folder_appears_whole_where_none_or_an_empty_one_stood(tmp_path):
+    (tmp_path / "empty").mkdir()
+    for name in ("empty", "new"):
+        with atomic_folder(tmp_path / name) as folder:
+            (folder / "sub").mkdir()
+            (folder / "sub" / "a").write_text("1")
+            assert not list((tmp_path / name).glob("*"))
+        assert listing(tmp_path / name) == ["sub", "sub/a"]
 
 
 def test_json_has_no_nan(tmp_path):
@@ -128,11 +120,13 @@ def test_json_has_no_nan(tmp_path):
     assert listing(tmp_path) == ["a.json"]
 
 
+HEAD = "import os, signal; from pathlib import Path; from sehdr_warp import files\n"
+DIE = "def die(*_, **__): os.kill(os.getpid(), signal.SIGKILL)\n"
+
+
 def killed(code, folder):
     """Runs code in a process that is killed where it says so; the names it left."""
-    head = "import os, signal; from pathlib import Path; from sehdr_warp import files\n"
-    die = "def die(*_, **__): os.kill(os.getpid(), signal.SIGKILL)\n"
-    result = subprocess.run([sys.executable, "-c", head + die + code], cwd=folder, timeout=60, check=False)
+    result = subprocess.run([sys.executable, "-c", HEAD + DIE + code], cwd=folder, timeout=60, check=False)
     assert result.returncode == -signal.SIGKILL
     return sorted(os.listdir(folder))
 
@@ -152,28 +146,25 @@ with files.atomic_folder(Path("set")) as folder, files.atomic_path(Path("a.txt")
     assert listing(tmp_path) == [".a.12345678.tmp.txt", "a.txt"]
 
 
-@pytest.mark.parametrize("place", ["before", "after"])
-def test_a_folder_that_was_being_replaced_by_a_killed_process_is_never_lost(tmp_path, place):
+@pytest.mark.parametrize(
+    "hook, left, kept",
+    [
+        ("rename = os.rename\nos.rename = lambda a, b: (rename(a, b), die())", 2, "set/old"),
+        ("files.shutil.rmtree = die", 1, "set/new"),
+    ],
+)
+def test_a_folder_that_was_being_replaced_by_a_killed_process_is_never_lost(tmp_path, hook, left, kept):
     """Killed between the two renames, or before what was set aside is removed."""
     (tmp_path / "set").mkdir()
     (tmp_path / "set" / "old").write_text("1")
-    hook = {
-        "before": "rename = os.rename\nos.rename = lambda a, b: (rename(a, b), die())",
-        "after": "files.shutil.rmtree = die",
-    }[place]
-    code = (
-        hook
-        + """
+    code = """
 with files.atomic_folder(Path("set"), overwrite=True) as folder:
     (folder / "new").write_text("1")
 """
-    )
-    assert (
-        len([name for name in killed(code, tmp_path) if name.startswith(".set.")]) == {"before": 2, "after": 1}[place]
-    )
+    assert len([name for name in killed(hook + code, tmp_path) if name.startswith(".set.")]) == left
     with pytest.raises(InputError, match="exists already"), atomic_folder(tmp_path / "set"):
         pass
-    assert listing(tmp_path) == ["set", {"before": "set/old", "after": "set/new"}[place]]
+    assert listing(tmp_path) == ["set", kept]
 
 
 def test_what_another_process_is_writing_is_left_alone(tmp_path):
@@ -183,9 +174,8 @@ with files.atomic_path(Path("a.txt"), overwrite=True) as file:
     print(flush=True)
     input()
 """
-    head = "from pathlib import Path; from sehdr_warp import files\n"
     with subprocess.Popen(
-        [sys.executable, "-c", head + code], cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-c", HEAD + code], cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as other:
         other.stdout.readline()
         with atomic_path(tmp_path / "a.txt") as temporary:

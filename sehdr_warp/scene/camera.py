@@ -45,8 +45,8 @@ class Camera:
         object.__setattr__(self, "world_to_camera", pose)
         if self.width < 1 or self.height < 1:
             raise ValueError(f"image size {self.width} x {self.height} is not positive")
-        if not np.isfinite([self.fx, self.fy, self.cx, self.cy]).all():
-            raise ValueError(f"camera fx, fy, cx, cy = {self.fx}, {self.fy}, {self.cx}, {self.cy} are not finite")
+        if not np.isfinite(self.intrinsics).all():
+            raise ValueError(f"camera fx, fy, cx, cy = {self.intrinsics.tolist()} are not finite")
         if self.fx <= 0 or self.fy <= 0:
             raise ValueError(f"focal lengths ({self.fx}, {self.fy}) are not positive")
         if pose.shape != (4, 4) or not np.isfinite(pose).all():

@@ -1,6 +1,8 @@
 """Cameras to render from, as JSON."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -36,47 +38,42 @@ def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
         raise InputError(path, "has none of cameras, camera_path and frames", "export cameras as the manual describes")
     if not cameras:
         raise InputError(path, "lists no cameras", "add at least one")
-    for i, (_, camera) in enumerate(cameras):
-        _check_size(camera.width, camera.height, i, path)
     names = [name.lower() for name, _ in cameras]
     if len(set(names)) < len(names):
         twice = min((name for name in names if names.count(name) > 1), key=natural_key)
         raise InputError(path, f"camera name {twice!r} is used twice", "give every camera its own name")
+    for i, (name, camera) in enumerate(cameras):
+        if not name or any(letter in name for letter in "/\\\0") or name in (".", "..") or len(name) > 200:
+            raise InputError(path, f"camera name {name!r:.60} cannot name a file", "use letters, digits, '_' and '-'")
+        if camera.width * camera.height > MAX_PIXELS:
+            problem = f"camera {i} is {camera.width} x {camera.height}"
+            raise InputError(path, problem, f"use sizes of 1 to {MAX_PIXELS} pixels")
     return cameras
 
 
-def _own(entry, index: int, path: Path) -> tuple[str, Camera]:
+@contextmanager
+def _usable(index: int, path: Path) -> Iterator[None]:
     try:
-        name = str(entry.get("name", f"{index:04d}"))
-        camera = Camera.from_dict(entry.get("camera", entry))
+        yield
     except KeyError as error:
         raise InputError(path, f"camera {index} has no {error.args[0]}", "add the field") from None
-    except (ValueError, TypeError, AttributeError, OverflowError) as error:
+    except (ValueError, TypeError, AttributeError, OverflowError, ZeroDivisionError) as error:
         raise InputError(path, f"camera {index} cannot be used ({str(error)[:120]})", "correct the camera") from None
-    if not name or any(letter in name for letter in "/\\\0") or name in (".", "..") or len(name) > 200:
-        raise InputError(path, f"camera name {name!r:.60} cannot name a file", "use letters, digits, '_' and '-'")
-    return name, camera
+
+
+def _own(entry, index: int, path: Path) -> tuple[str, Camera]:
+    with _usable(index, path):
+        return str(entry.get("name", f"{index:04d}")), Camera.from_dict(entry.get("camera", entry))
 
 
 def _nerfstudio(entry, index: int, values: dict, path: Path) -> tuple[str, Camera]:
     """An entry of camera_path.json: camera_to_world (OpenGL axes, 16 numbers by rows) and fov (vertical, degrees)."""
-    try:
-        width, height = int(values["render_width"]), int(values["render_height"])
+    with _usable(index, path):
+        width, height, fov = int(values["render_width"]), int(values["render_height"]), float(entry["fov"])
         matrix = np.array(entry["camera_to_world"], dtype=np.float64).reshape(4, 4)
-        fov = float(entry["fov"])
-    except (KeyError, ValueError, TypeError, OverflowError) as error:
-        missing = isinstance(error, KeyError)
-        problem = f": {error.args[0]} is missing" if missing else f" cannot be used ({str(error)[:120]})"
-        raise InputError(path, f"camera {index}{problem}", "export the camera path again") from None
-    if not 1e-6 <= fov < 180:
-        raise InputError(path, f"camera {index} has fov {fov}", "use degrees between 0 and 180")
-    _check_size(width, height, index, path)
-    matrix[:3, 1:3] *= -1
-    pose = pose_from_camera_to_world(matrix, path, f"camera {index}")
-    focal = 0.5 * height / math.tan(math.radians(fov) / 2)
-    return f"{index:04d}", Camera(width, height, focal, focal, width / 2, height / 2, pose)
-
-
-def _check_size(width: int, height: int, index: int, path: Path) -> None:
-    if width < 1 or height < 1 or width * height > MAX_PIXELS:
-        raise InputError(path, f"camera {index} is {width} x {height}", f"use sizes of 1 to {MAX_PIXELS} pixels")
+        if not 1e-6 <= fov < 180:
+            raise InputError(path, f"camera {index} has fov {fov}", "use degrees between 0 and 180")
+        matrix[:3, 1:3] *= -1
+        focal = 0.5 * height / math.tan(math.radians(fov) / 2)
+        pose = pose_from_camera_to_world(matrix, path, f"camera {index}")
+        return f"{index:04d}", Camera(width, height, focal, focal, width / 2, height / 2, pose)

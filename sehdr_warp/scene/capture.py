@@ -47,12 +47,10 @@ class Shot:
 class Capture:
     """A data folder as read.
 
-    format: as Scene.format.
+    format, points, point_colors, notes: as Scene's. name, folder: what was asked for, and where it lies.
     alpha: what transparency means: "background" (nothing there: composite over black light) or "mask" (not observed).
     holdout: (every so many views, from this one) is held out in the protocol that the layout is published with; None
         for a layout without one.
-    points: [P, 3] float64; point_colors: [P, 3] float32 in [0, 1].
-    name, folder: what was asked for, and where it lies.
     times_known: False where no file stated exposure times.
     """
 
@@ -74,20 +72,16 @@ class Capture:
 
 def pose_from_quaternion(quaternion, translation, source: Path, name: str) -> np.ndarray:
     """[4, 4] world_to_camera from COLMAP's (w, x, y, z) and t; InputError where not finite or zero."""
-    quaternion, translation = np.asarray(quaternion, np.float64), np.asarray(translation, np.float64)
-    if not (np.isfinite(quaternion).all() and np.isfinite(translation).all()):
+    from scipy.spatial.transform import Rotation
+
+    quaternion, pose = np.asarray(quaternion, np.float64), np.eye(4)
+    pose[:3, 3] = translation
+    if not (np.isfinite(quaternion).all() and np.isfinite(pose).all()):
         raise InputError(source, f"pose of {name!r:.90} is not finite", "remove the image or export the model again")
     length = np.linalg.norm(quaternion)
     if not 1e-8 < length < 1e8:
         raise InputError(source, f"quaternion of {name!r:.90} has length {length:g}", "export the model again")
-    w, x, y, z = quaternion / length
-    pose = np.eye(4)
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    pose[:3, 3] = translation
+    pose[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
     return pose
 
 
@@ -98,17 +92,13 @@ def pose_from_camera_to_world(matrix, source: Path, name: str) -> np.ndarray:
     matrix of another shape, values that are not finite, scale, shear or reflection.
     """
     remedy = "export the poses again without scale"
-    try:
-        matrix = np.array(matrix, dtype=np.float64)
-    except (ValueError, TypeError, OverflowError):
-        raise InputError(source, f"pose of {name!r:.90} is not a matrix of numbers", remedy) from None
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
         raise InputError(source, f"pose of {name!r:.90} is not a finite 4 x 4 matrix", remedy)
     u, stretch, vt = np.linalg.svd(matrix[:3, :3])
     rotation = u @ vt
     if np.abs(stretch - 1).max() > 1e-3 or np.linalg.det(rotation) < 0:
-        raise InputError(source, f"pose of {name!r:.90} is no rotation (stretch {np.round(stretch, 4).tolist()})",
-                         remedy)  # fmt: skip
+        problem = f"pose of {name!r:.90} is no rotation (stretch {np.round(stretch, 4).tolist()})"
+        raise InputError(source, problem, remedy)
     if not np.abs(matrix[:3, 3]).max() < 1e12:
         raise InputError(source, f"position of {name!r:.90} is {matrix[:3, 3].tolist()}", "check the units")
     pose = np.eye(4)

@@ -1,12 +1,11 @@
-"""COLMAP's sparse models, binary and text, read with every count and name checked before it is trusted.
+"""COLMAP's sparse models, binary and text (https://colmap.github.io/format.html), read as files that may be hostile.
 
-Formats: https://colmap.github.io/format.html. A count may not promise more records than the bytes left can hold,
-names are terminated and at most 4096 bytes long, values are finite, quaternions are not zero.
+A count may not promise more records than the bytes left can hold, names are terminated and at most 4096 bytes long,
+values are finite, quaternions are not zero.
 """
 
-import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,13 +14,10 @@ import numpy as np
 from ..errors import InputError
 from ..files import read_bytes, read_text
 from .capture import pose_from_quaternion
-from .lens import CAMERA_MODELS, PARAMETER_COUNTS, Lens
+from .lens import CAMERA_MODELS, Lens
 
 MAX_NAME_BYTES = 4096
 _REMEDY = "export the model again with COLMAP"
-_UNDISTORT = "undistort with COLMAP first"
-_COUNT, _CAMERA, _IMAGE, _POINT = (struct.Struct(layout) for layout in ("<Q", "<IiQQ", "<I7dI", "<Q3d3BdQ"))
-_OBSERVATION_BYTES, _TRACK_ELEMENT_BYTES = 24, 8
 
 
 @dataclass(frozen=True)
@@ -50,32 +46,33 @@ def find_model(folder: Path) -> Path | None:
 
 
 def read_model(folder: Path) -> SparseModel:
-    """Read cameras, images and (where present) points3D from a folder, binary files before text files.
+    """Cameras, images and (where present) points3D of a folder, binary files before text files.
 
     Raises InputError where a file is missing, empty, damaged or truncated, or holds values that cannot be.
     """
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
-    paths = [folder / f"{name}{'.bin' if binary else '.txt'}" for name in ("cameras", "images")]
+    camera_path, image_path = (folder / f"{name}{'.bin' if binary else '.txt'}" for name in ("cameras", "images"))
     cameras: dict[int, Lens] = {}
-    for number, lens in (_cameras_binary if binary else _cameras_text)(paths[0]):
+    for number, *lens in _cameras_binary(camera_path) if binary else _records(camera_path, "a camera", _camera):
         if number in cameras:
-            raise InputError(paths[0], f"camera {number} is listed twice", _REMEDY)
-        cameras[number] = lens
+            raise InputError(camera_path, f"camera {number} is listed twice", _REMEDY)
+        cameras[number] = Lens(*lens, camera_path)
     images: dict[str, ModelImage] = {}
-    for values, number, name in (_images_binary if binary else _images_text)(paths[1]):
+    # In text a line of observations follows each image; it is empty, or missing at the end, where there are none.
+    for pose, number, name in _images_binary(image_path) if binary else _records(image_path, "an image", _image, 2):
         if not name or len(name.encode("utf-8", "replace")) > MAX_NAME_BYTES:
             problem = f"image name {name[:40]!r} is empty or longer than {MAX_NAME_BYTES} bytes"
-            raise InputError(paths[1], problem, "rename the image")
+            raise InputError(image_path, problem, "rename the image")
         if name in images:
-            raise InputError(paths[1], f"image {name!r:.90} is listed twice", _REMEDY)
+            raise InputError(image_path, f"image {name!r:.90} is listed twice", _REMEDY)
         if number not in cameras:
-            raise InputError(paths[1], f"image {name!r:.90} has camera {number}, which is not listed", _REMEDY)
-        images[name] = ModelImage(name, number, pose_from_quaternion(values[:4], values[4:], paths[1], name))
+            raise InputError(image_path, f"image {name!r:.90} has camera {number}, which is not listed", _REMEDY)
+        images[name] = ModelImage(name, number, pose_from_quaternion(pose[:4], pose[4:], image_path, name))
     return SparseModel(cameras, tuple(images.values()), *read_points(folder))
 
 
 def read_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """[P, 3] float64 places and [P, 3] float32 colours in [0, 1] of points3D.bin, .txt or .ply; else none."""
+    """[P, 3] float64 places and [P, 3] float32 colors in [0, 1] of points3D.bin, .txt or .ply; else none."""
     readers = {".bin": _points_binary, ".txt": _points_text, ".ply": read_ply_points}
     for name in ("points3D.bin", "points3D.txt", "points3D.ply", "points3d.ply"):
         if (path := folder / name).is_file():
@@ -84,18 +81,17 @@ def read_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Places and colours of a PLY file's vertices; grey where it has no colours. InputError where it is damaged."""
+    """Places and colors of a PLY file's vertices; grey where it has no colors. InputError where it is damaged."""
     from plyfile import PlyData
 
     read_bytes(path)
     try:
         vertex = PlyData.read(str(path))["vertex"].data
         points = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        colors = np.full(points.shape, 0.5)
         if {"red", "green", "blue"} <= set(vertex.dtype.names):
             colors = np.stack([vertex[name] for name in ("red", "green", "blue")], axis=1)
             colors = colors / 255 if np.issubdtype(colors.dtype, np.integer) else colors
-        else:
-            colors = np.full(points.shape, 0.5)
     # plyfile has no exception of its own for what damaged files do to it.
     except Exception as error:  # noqa: BLE001
         raise InputError(path, f"cannot be read as PLY points ({error!r:.120})", "export the points again") from None
@@ -115,20 +111,25 @@ class _Bytes:
     def __init__(self, path: Path):
         self.path, self.data, self.position = path, read_bytes(path), 0
 
-    def take(self, layout: struct.Struct) -> tuple:
-        if self.position + layout.size > len(self.data):
+    def take(self, layout: str) -> tuple:
+        size = struct.calcsize(layout)
+        if self.position + size > len(self.data):
             raise InputError(self.path, f"ends early, at byte {len(self.data)}", _REMEDY)
-        values = layout.unpack_from(self.data, self.position)
-        self.position += layout.size
-        return values
+        self.position += size
+        return struct.unpack_from(layout, self.data, self.position - size)
 
     def count(self, smallest: int) -> int:
         """A 64-bit count of records of at least so many bytes each."""
-        (count,) = self.take(_COUNT)
+        (count,) = self.take("<Q")
         left = len(self.data) - self.position
         if count * smallest > left:
             raise InputError(self.path, f"count {count} needs {count * smallest} bytes, but {left} are left", _REMEDY)
         return count
+
+    def skip_list(self, size: int) -> None:
+        """Passes over a count and its records of so many bytes each."""
+        count = self.count(size)
+        self.position += count * size
 
     def name(self) -> str:
         end = self.data.find(b"\0", self.position, self.position + MAX_NAME_BYTES + 1)
@@ -141,96 +142,70 @@ class _Bytes:
         except UnicodeDecodeError:
             raise InputError(self.path, f"image name {raw[:40]!r} is not UTF-8 text", "rename the image") from None
 
-    def skip(self, size: int) -> None:
-        self.position += size
 
-
-def _cameras_binary(path: Path) -> Iterator[tuple[int, Lens]]:
+def _cameras_binary(path: Path) -> Iterator[tuple]:
     file = _Bytes(path)
-    for _ in range(file.count(_CAMERA.size + 3 * 8)):
-        number, model, width, height = file.take(_CAMERA)
+    for _ in range(file.count(24 + 3 * 8)):
+        number, model, width, height = file.take("<IiQQ")
         if model not in CAMERA_MODELS:
-            raise InputError(path, f"camera {number} has the unknown model {model}", _UNDISTORT)
+            raise InputError(path, f"camera {number} has the unknown model {model}", "undistort with COLMAP first")
         name, count = CAMERA_MODELS[model]
-        yield number, Lens(name, width, height, file.take(struct.Struct(f"<{count}d")), path)
+        yield number, name, width, height, file.take(f"<{count}d")
 
 
-def _images_binary(path: Path) -> Iterator[tuple[tuple, int, str]]:
+def _images_binary(path: Path) -> Iterator[tuple]:
     file = _Bytes(path)
-    for _ in range(file.count(_IMAGE.size + 1 + 8)):
-        _, *values, camera_id = file.take(_IMAGE)
+    for _ in range(file.count(64 + 1 + 8)):
+        _, *pose, camera_id = file.take("<I7dI")
         name = file.name()
-        file.skip(file.count(_OBSERVATION_BYTES) * _OBSERVATION_BYTES)
-        yield values, camera_id, name
+        file.skip_list(24)
+        yield pose, camera_id, name
 
 
 def _points_binary(path: Path) -> tuple[np.ndarray, np.ndarray]:
     file = _Bytes(path)
-    count = file.count(_POINT.size)
-    points, colors = np.empty((count, 3)), np.empty((count, 3), np.float32)
-    for i in range(count):
-        _, x, y, z, red, green, blue, _, track = file.take(_POINT)
-        if track * _TRACK_ELEMENT_BYTES > len(file.data) - file.position:
-            raise InputError(path, f"track length {track} of point {i} goes past the end", _REMEDY)
-        file.skip(track * _TRACK_ELEMENT_BYTES)
-        points[i], colors[i] = (x, y, z), (red, green, blue)
-    return _checked_points(points, colors / np.float32(255), path)
+    table = np.empty((file.count(43 + 8), 6))
+    for row in table:
+        row[:] = file.take("<Q3d3Bd")[1:7]
+        file.skip_list(8)
+    return _checked_points(table[:, :3], table[:, 3:] / 255, path)
 
 
-def _numbered_lines(path: Path) -> Iterator[tuple[int, str]]:
-    return enumerate(read_text(path).splitlines(), start=1)
-
-
-def _is_record(line: str) -> bool:
-    return bool(line.strip()) and not line.startswith("#")
-
-
-def _broken(path: Path, number: int, line: str, what: str) -> InputError:
-    return InputError(path, f"line {number} is not {what}: {line[:60]!r}", _REMEDY)
-
-
-def _cameras_text(path: Path) -> Iterator[tuple[int, Lens]]:
-    for number, line in _numbered_lines(path):
-        if not _is_record(line):
-            continue
-        fields = line.split()
-        try:
-            camera_id, model, width, height = int(fields[0]), fields[1], int(fields[2]), int(fields[3])
-            params = tuple(float(value) for value in fields[4:])
-        except (ValueError, IndexError):
-            raise _broken(path, number, line, "a camera (id, model, width, height, parameters)") from None
-        if model not in PARAMETER_COUNTS:
-            raise InputError(path, f"line {number} has the unknown camera model {model!r:.40}", _UNDISTORT)
-        yield camera_id, Lens(model, width, height, params, path)
-
-
-def _images_text(path: Path) -> Iterator[tuple[list[float], int, str]]:
-    lines = _numbered_lines(path)
+def _records(path: Path, what: str, parse: Callable[[str], tuple], lines_each: int = 1) -> Iterator[tuple]:
+    """parse(line) of a text file's lines but empty ones and comments; ValueError becomes an InputError."""
+    lines = enumerate(read_text(path).splitlines(), start=1)
     for number, line in lines:
-        if not _is_record(line):
+        if not line.strip() or line.startswith("#"):
             continue
-        fields = line.split(maxsplit=9)
         try:
-            values = [float(value) for value in fields[1:8]]
-            camera_id, name = int(fields[8]), fields[9].strip()
-        except (ValueError, IndexError):
-            raise _broken(path, number, line, "an image (id, quaternion, translation, camera, name)") from None
-        next(lines, None)  # the observations; an empty line, or none at the end of the file, where there are none
-        yield values, camera_id, name
+            yield parse(line)
+        except ValueError:
+            raise InputError(path, f"line {number} is not {what}: {line[:60]!r}", _REMEDY) from None
+        if lines_each == 2:
+            next(lines, None)
+
+
+def _camera(line: str) -> tuple:
+    number, model, width, height, *params = line.split()
+    return int(number), model, int(width), int(height), tuple(map(float, params))
+
+
+def _image(line: str) -> tuple:
+    _, *pose, camera_id, name = line.split(maxsplit=9)
+    if len(pose) != 7:
+        raise ValueError
+    return [float(value) for value in pose], int(camera_id), name.strip()
+
+
+def _point(line: str) -> tuple:
+    _, x, y, z, *color = line.split(maxsplit=7)[:7]
+    color = [int(value) for value in color]
+    if len(color) != 3 or not 0 <= min(color) <= max(color) <= 255:
+        raise ValueError
+    return float(x), float(y), float(z), *color
 
 
 def _points_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    rows = []
-    for number, line in _numbered_lines(path):
-        if not _is_record(line):
-            continue
-        try:
-            row = [float(value) for value in line.split(maxsplit=7)[1:4]]
-            row += [int(value) for value in line.split(maxsplit=7)[4:7]]
-        except ValueError:
-            raise _broken(path, number, line, "a point (id, x, y, z, r, g, b, ...)") from None
-        if len(row) != 6 or not all(0 <= value <= 255 for value in row[3:]) or not all(map(math.isfinite, row[:3])):
-            raise _broken(path, number, line, "a point with finite x, y, z and colours in 0..255")
-        rows.append(row)
+    rows = list(_records(path, "a point with x, y, z and colors in 0..255", _point))
     table = np.array(rows, np.float64).reshape(-1, 6)
-    return table[:, :3], table[:, 3:].astype(np.float32) / np.float32(255)
+    return _checked_points(table[:, :3], table[:, 3:] / 255, path)

@@ -1,9 +1,9 @@
 """From shots to views: decode, orient, undistort and scale, every average taken over light by one response."""
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from .hdr_files import hdr_size, read_hdr
 from .images import EncodedImage, image_sizes, read_ldr, read_mask
 from .lens import Lens, Undistortion
 from .names import unique_names
-from .resample import area_average, limited_size, restore_clipping
+from .resample import area_average, limited_size
 from .types import Scene, View, codes_of
 
 if TYPE_CHECKING:
@@ -30,11 +30,8 @@ def develop(capture: Capture, response: "Response", max_size: int | None = None)
     keeps its codes; others become uint16.
     Raises InputError where a file is damaged, sizes disagree, or the photos show nothing but black or white.
     """
-    developer, views = _Developer(max_size, response, capture.alpha), []
-    for i, (shot, name) in enumerate(zip(capture.shots, unique_names(capture.shots), strict=True)):
-        if i % 10 == 0:
-            _log.info("reading views %d to %d of %d", i + 1, min(i + 10, len(capture.shots)), len(capture.shots))
-        views.append(developer.view(shot, name))
+    developer, names = _Developer(max_size, response, capture.alpha), unique_names(capture.shots)
+    views = [developer.view(shot, names[i]) for i, shot in told("reading views", capture.shots)]
     check_content(((view.codes, view.mask) for view in views if view.split == "train"), capture.folder)
     return Scene(capture.name, capture.format, tuple(views), capture.points, capture.point_colors,
                  capture.times_known, capture.notes, response=response)  # fmt: skip
@@ -60,6 +57,14 @@ def check_content(photos: Iterable[tuple[np.ndarray, np.ndarray | None]], folder
                          "or choose another exposure index")  # fmt: skip
 
 
+def told(doing: str, items: Sequence) -> Iterator[tuple[int, Any]]:
+    """enumerate(items), with a line to the log before every tenth."""
+    for i, item in enumerate(items):
+        if i % 10 == 0:
+            _log.info("%s %d to %d of %d", doing, i + 1, min(i + 10, len(items)), len(items))
+        yield i, item
+
+
 def as_photographed(shot: Shot, *, oriented: bool = False) -> EncodedImage:
     """A shot's codes before anything is undistorted or averaged; of a set of truth alone, HDR-NeRF's photo of it."""
     if not shot.derived:
@@ -81,38 +86,34 @@ class _Developer:
 
     def view(self, shot: Shot, name: str) -> View:
         """The shot's view; raises InputError where a file is damaged or its size disagrees with the camera's."""
-        if shot.derived:
-            return self._derived(shot, name)
-        lens, oriented = fitted_lens(shot)
-        working = lens if lens.is_pinhole else _working_lens(lens, self.max_size)
-        undistortion = None if lens.is_pinhole else self._undistortion(working)
-        full = lens.pinhole(shot.world_to_camera) if undistortion is None else undistortion.camera(shot.world_to_camera)
+        lens, oriented = (shot.lens, False) if shot.derived else fitted_lens(shot)
+        bent = not (lens.is_pinhole or shot.derived)
+        working = _working_lens(lens, self.max_size) if bent else lens
+        undistortion = self._undistortion(working) if bent else None
+        full = undistortion.camera(shot.world_to_camera) if bent else lens.pinhole(shot.world_to_camera)
         camera = full.resized(*limited_size(full.width, full.height, self.max_size))
 
+        def warped(image: np.ndarray) -> np.ndarray:
+            """[H, W] or [H, W, C] at the photo's size -> float32 at the camera's, undistorted."""
+            return _shrunk(undistortion.apply(_shrunk(image, working)) if bent else image, camera)
+
+        hdr = None if shot.hdr is None else warped(_read_truth(shot.hdr, lens, camera, bent))
+        if shot.derived:  # HDR-NeRF's photo of the truth, at the final size.
+            codes = _photo_of_truth(hdr, shot.exposure_time)
+            return View(name, codes, camera, shot.exposure_time, shot.split, None, hdr, Path(shot.image))
         encoded = as_photographed(shot, oriented=oriented)
         codes, alpha = encoded.pixels, encoded.alpha
-        masks = [] if undistortion is None or undistortion.outside is None else [_shrunk(~undistortion.outside, camera)]
+        masks = [] if not bent or undistortion.outside is None else [_shrunk(~undistortion.outside, camera)]
         if shot.mask is not None:
-            masks.append(_warped(_fitted_mask(shot.mask, lens, oriented), working, undistortion, camera))
+            masks.append(warped(_fitted_mask(shot.mask, lens, oriented)))
         if alpha is not None and self.alpha == "mask":
-            masks.append(_warped(alpha, working, undistortion, camera))
+            masks.append(warped(alpha))
             alpha = None
-        if undistortion is not None or alpha is not None or (camera.width, camera.height) != (lens.width, lens.height):
-            codes = self._resampled(codes, alpha, working, undistortion, camera)
-        mask = None
-        if masks:
-            mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32)
-            mask = None if mask.min() >= 1 - 1e-6 else mask
-        hdr = None if shot.hdr is None else _truth(shot.hdr, lens, working, undistortion, camera)
+        if bent or alpha is not None or (camera.width, camera.height) != (lens.width, lens.height):
+            codes = self._averaged(codes, alpha, warped)
+        mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32) if masks else None
+        mask = None if mask is None or mask.min() >= 1 - 1e-6 else mask
         return View(name, codes, camera, shot.exposure_time, shot.split, mask, hdr, Path(shot.image))
-
-    def _derived(self, shot: Shot, name: str) -> View:
-        """A view of truth alone; its photo is HDR-NeRF's, in 8 bits, at the final size."""
-        camera = shot.lens.pinhole(shot.world_to_camera)
-        camera = camera.resized(*limited_size(camera.width, camera.height, self.max_size))
-        hdr = _truth(shot.hdr, shot.lens, shot.lens, None, camera)
-        codes = _photo_of_truth(hdr, shot.exposure_time)
-        return View(name, codes, camera, shot.exposure_time, shot.split, None, hdr, Path(shot.image))
 
     def _undistortion(self, lens: Lens) -> Undistortion:
         # Sets mostly share one lens; its map is as large as an image, so only the last one is kept.
@@ -120,7 +121,7 @@ class _Developer:
             self._last = lens, Undistortion(lens)
         return self._last[1]
 
-    def _resampled(self, codes, alpha, working: Lens, undistortion, camera: Camera) -> np.ndarray:
+    def _averaged(self, codes: np.ndarray, alpha: np.ndarray | None, warped: Callable) -> np.ndarray:
         levels = int(np.iinfo(codes.dtype).max)
         if levels not in self._tables:
             light = self.response.decode(np.arange(levels + 1, dtype=np.float64) / levels)
@@ -129,8 +130,9 @@ class _Developer:
         clipped = (codes == levels).astype(np.float32)
         if alpha is not None:
             light, clipped = light * alpha[:, :, None], clipped * alpha[:, :, None]
-        image = self.response.encode(_warped(light, working, undistortion, camera))
-        return codes_of(restore_clipping(image, _warped(clipped, working, undistortion, camera)), 16)
+        # A mean over clipped samples is a lower bound. With half of the area clipped it says little, and white ("at
+        # least this bright") is the honest value; with less the mean stays, a slight underestimate.
+        return codes_of(np.where(warped(clipped) >= 0.5, np.float32(1.0), self.response.encode(warped(light))), 16)
 
 
 def _working_lens(lens: Lens, max_size: int | None) -> Lens:
@@ -143,26 +145,18 @@ def _working_lens(lens: Lens, max_size: int | None) -> Lens:
     return lens if factor < 2 else lens.resized(round(lens.width / factor), round(lens.height / factor))
 
 
-def _warped(image: np.ndarray, working: Lens, undistortion: Undistortion | None, camera: Camera) -> np.ndarray:
-    """[H, W] or [H, W, C] at the photo's size -> float32 at the camera's, undistorted."""
-    if undistortion is None:
-        return _shrunk(image, camera)
-    return _shrunk(undistortion.apply(_shrunk(image, working)), camera)
-
-
 def _shrunk(image: np.ndarray, to: Lens | Camera) -> np.ndarray:
     return area_average(image.astype(np.float32, copy=False), to.width, to.height)
 
 
-def _truth(path: Path, lens: Lens, working: Lens, undistortion: Undistortion | None, camera: Camera) -> np.ndarray:
-    width, height = hdr_size(path)
-    same = (width, height) == (lens.width, lens.height)
+def _read_truth(path: Path, lens: Lens, camera: Camera, bent: bool) -> np.ndarray:
+    size = hdr_size(path)
     # Truth may be rendered larger than the photos (HDR-NeRF's evaluation averages it down); never smaller.
-    larger = width >= camera.width and height >= camera.height and _same_aspect((width, height), lens)
-    if not (same or (larger and undistortion is None)):
-        raise InputError(path, f"HDR truth is {width} x {height}, the photo {lens.width} x {lens.height}",
+    larger = size[0] >= camera.width and size[1] >= camera.height and _same_aspect(size, lens)
+    if size != (lens.width, lens.height) and (bent or not larger):
+        raise InputError(path, f"HDR truth is {size[0]} x {size[1]}, the photo {lens.width} x {lens.height}",
                          "render the truth at the photo's size, or remove it")  # fmt: skip
-    return _warped(read_hdr(path), working, undistortion, camera)
+    return read_hdr(path)
 
 
 def fitted_lens(shot: Shot) -> tuple[Lens, bool]:
@@ -173,15 +167,12 @@ def fitted_lens(shot: Shot) -> tuple[Lens, bool]:
     """
     lens = shot.lens
     stored, turned = image_sizes(shot.image)
-    choices = {None: ((stored, False), (turned, True)), True: ((turned, True),), False: ((stored, False),)}[
-        shot.oriented
-    ]
-    for (width, height), oriented in choices:
-        if (width, height) == (lens.width, lens.height):
-            return lens, oriented
-    for (width, height), oriented in choices:
-        for factor in range(2, 17):
-            if abs(lens.width / factor - width) < 1 and abs(lens.height / factor - height) < 1:
+    choices = [(stored, False), (turned, True)] if shot.oriented is None else [(turned, True)]
+    for factor in range(1, 17):
+        for (width, height), oriented in choices:
+            if factor == 1 and (width, height) == (lens.width, lens.height):
+                return lens, oriented
+            if factor > 1 and abs(lens.width / factor - width) < 1 and abs(lens.height / factor - height) < 1:
                 return lens.resized(width, height), oriented
     raise InputError(shot.image, f"image is {stored[0]} x {stored[1]}, its camera {lens.width} x {lens.height}",
                      "use the images that the cameras were solved for")  # fmt: skip
@@ -190,10 +181,9 @@ def fitted_lens(shot: Shot) -> tuple[Lens, bool]:
 def _fitted_mask(path: Path, lens: Lens, oriented: bool) -> np.ndarray:
     mask = read_mask(path, oriented=oriented)
     height, width = mask.shape
-    if (width, height) == (lens.width, lens.height):
-        return mask
-    if width > lens.width and height > lens.height and _same_aspect((width, height), lens):
-        return area_average(mask, lens.width, lens.height)
+    larger = width > lens.width and height > lens.height and _same_aspect((width, height), lens)
+    if larger or (width, height) == (lens.width, lens.height):
+        return _shrunk(mask, lens)
     raise InputError(path, f"mask is {width} x {height}, its image {lens.width} x {lens.height}",
                      "make the mask at the image's size")  # fmt: skip
 

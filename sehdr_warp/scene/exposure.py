@@ -22,22 +22,16 @@ def choose_exposure(shots: tuple[Shot, ...], index: int | None, source: Path) ->
     index: the exposure's number in the file names; None takes the middle one (of an even count the longer).
     Raises InputError where no view has the number.
     """
-    keys = sorted({shot.exposure_key for shot in shots if shot.exposure_key is not None})
+    keys, asked = sorted({shot.exposure_key for shot in shots} - {None}), f"exposure index {index} asked for"
     if not keys:
         if index not in (None, 0):
-            raise InputError(source, f"exposure index {index} asked for, but each view has one exposure",
-                             "leave the exposure index out")  # fmt: skip
+            raise InputError(source, f"{asked}, but each view has one exposure", "leave the exposure index out")
         return list(shots), []
-    notes = []
-    if index is None:
-        chosen = keys[len(keys) // 2]
-        if len(keys) > 1:
-            notes = [f"each view has {len(keys)} exposures {keys}; took the middle one, index {chosen}"]
-    elif index in keys:
-        chosen = index
-    else:
-        raise InputError(source, f"exposure index {index} asked for, but the exposures are {keys}",
-                         f"choose one of {keys[0]} to {keys[-1]}")  # fmt: skip
+    chosen, notes = keys[len(keys) // 2] if index is None else index, []
+    if chosen not in keys:
+        raise InputError(source, f"{asked}, but the exposures are {keys}", f"choose one of {keys[0]} to {keys[-1]}")
+    if index is None and len(keys) > 1:
+        notes = [f"each view has {len(keys)} exposures {keys}; took the middle one, index {chosen}"]
     taken = [shot for shot in shots if shot.exposure_key in (None, chosen)]
     missing = sorted({shot.view for shot in shots} - {shot.view for shot in taken})
     if missing:
@@ -53,28 +47,27 @@ def with_exposure_times(shots: list[Shot], source: Path) -> tuple[list[Shot], bo
     differ in sensitivity or aperture keep their ratio of recorded light. With none at all, each is 1 second.
     Raises InputError for a time that is not positive and finite, and where only some photos state one.
     """
-    stated = [shot.exposure_time for shot in shots]
-    notes = []
-    if any(time is None for time in stated):
+    stated, notes = [shot.exposure_time for shot in shots], []
+    if None in stated:
         listed = _listed_times(shots, source)
         stated = [listed.get(s.image.name) if time is None else time for time, s in zip(stated, shots, strict=True)]
-    if all(time is None for time in stated):
+    if set(stated) == {None}:
         stated, notes = _exif_times(shots)
     for shot, time in zip(shots, stated, strict=True):
         if time is not None and not (math.isfinite(time) and time > 0):
             raise InputError(shot.image, f"exposure time {time} s is not positive and finite", _REMEDY)
-    if all(time is None for time in stated):
+    known, absent = set(stated) != {None}, [shot for shot, time in zip(shots, stated, strict=True) if time is None]
+    if not known:
         notes.append("no exposure times were found: each view counts as 1 s")
-        return [replace(shot, exposure_time=1.0) for shot in shots], False, notes
-    absent = [shot for shot, time in zip(shots, stated, strict=True) if time is None]
-    if absent:
-        raise InputError(absent[0].image, f"exposure time is absent in {len(absent)} of {len(shots)} images",
-                         "state every image's seconds in exposures.json, or strip them all")  # fmt: skip
+        stated = [1.0] * len(shots)
+    elif absent:
+        problem = f"exposure time is absent in {len(absent)} of {len(shots)} images"
+        raise InputError(absent[0].image, problem, "state all in exposures.json, or strip them all")
     shortest, longest = min(stated), max(stated)
     if longest > shortest * 1.01:
         stops = math.log2(longest / shortest)
         notes.append(f"exposures differ: {shortest:g} to {longest:g} s ({stops:.1f} stops); each view keeps its own")
-    return [replace(shot, exposure_time=float(time)) for shot, time in zip(shots, stated, strict=True)], True, notes
+    return [replace(shot, exposure_time=float(time)) for shot, time in zip(shots, stated, strict=True)], known, notes
 
 
 def parse_seconds(value, source: Path, field: str) -> float:
@@ -129,8 +122,8 @@ def exif_exposure(path: Path) -> tuple[float | None, float | None, float | None]
     try:
         with open_image(path) as image:
             table = image.getexif().get_ifd(_EXIF_IFD)
-            time, apex = _number(table.get(_EXPOSURE_TIME)), _number(table.get(_SHUTTER_APEX))
-            speed, aperture = _number(table.get(_SPEED)), _number(table.get(_F_NUMBER))
+            tags = (_EXPOSURE_TIME, _SHUTTER_APEX, _SPEED, _F_NUMBER)
+            time, apex, speed, aperture = (_number(table.get(tag)) for tag in tags)
     except EXIF_ERRORS:
         return None, None, None
     if time is None and apex is not None and math.isfinite(apex) and abs(apex) < 64:
@@ -142,21 +135,14 @@ def exif_exposure(path: Path) -> tuple[float | None, float | None, float | None]
 
 def made_by_camera(sources: Sequence[Path | None]) -> bool:
     """Whether most of the files are a camera's own: JPEGs whose EXIF states an exposure time or f-number."""
-    made = 0
-    for path in sources:
-        if path is not None and Path(path).suffix.lower() in (".jpg", ".jpeg") and Path(path).is_file():
-            time, _, aperture = exif_exposure(Path(path))
-            made += time is not None or aperture is not None
+    photos = (path for path in sources if path and path.suffix.lower() in (".jpg", ".jpeg") and path.is_file())
+    made = sum(any(exif_exposure(photo)[::2]) for photo in photos)
     return 2 * made > len(sources)
 
 
 def _number(value) -> float | None:
-    if isinstance(value, tuple):
-        value = value[0] if value else None
-    if value is None:
-        return None
     try:
-        return float(value)
+        return float(value[0] if isinstance(value, tuple) and value else value)
     except ZeroDivisionError:
         return math.nan
     except (TypeError, ValueError):

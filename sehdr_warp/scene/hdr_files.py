@@ -38,18 +38,16 @@ def read_hdr(path: Path, *, keep_negative: bool = False) -> np.ndarray:
         pixels = _read_radiance(path)
     else:
         channels, _ = read_exr_channels(path)
-        known = (("R", "G", "B"), ("r", "g", "b"), ("Y",) * 3, ("V",) * 3)
-        names = next((names for names in known if set(names) <= set(channels)), None)
+        names = next((names for names in ("RGB", "rgb", "YYY", "VVV") if set(names) <= set(channels)), None)
         if names is None:
             found = f"has the channels {sorted(channels)[:8]}, not R, G, B"
-            raise InputError(path, found, "export it with colour channels")
+            raise InputError(path, found, "export it with color channels")
         pixels = np.stack([channels[name] for name in names], axis=2)
     bad = ~np.isfinite(pixels)
     if bad.any():
         row, column, channel = (int(i) for i in np.argwhere(bad)[0])
         place = f"one {'RGB'[channel]} = {pixels[row, column, channel]} at x={column}, y={row}"
-        raise InputError(path, f"{int(bad.any(axis=2).sum())} pixels not finite, {place}",
-                         "render or export the image again")  # fmt: skip
+        raise InputError(path, f"{int(bad.any(axis=2).sum())} pixels not finite, {place}", _REMEDY)
     return pixels if keep_negative else np.maximum(pixels, 0.0)
 
 
@@ -61,7 +59,7 @@ def read_exr_channels(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[dict
     """
     import OpenEXR
 
-    (x0, y0), (width, height) = _exr_window(path, max_pixels)
+    origin, (width, height) = _exr_window(path, max_pixels)
     try:
         with silent_stderr(), OpenEXR.File(str(path), separate_channels=True) as file:
             # A file whose pixels end early leaves no part behind instead of raising.
@@ -71,17 +69,13 @@ def read_exr_channels(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[dict
             stored = {name: channel.pixels for name, channel in file.channels().items()}
     except _EXR_ERRORS as error:
         raise InputError(path, f"cannot be read as OpenEXR ({error})", DAMAGED) from None
-    left, top = (int(a) - b for a, b in zip(header["dataWindow"][0], (x0, y0), strict=True))
+    left, top = (int(a) - b for a, b in zip(header["dataWindow"][0], origin, strict=True))
     channels = {}
     for name, pixels in stored.items():
-        if pixels is None or pixels.ndim != 2:
-            continue
-        full = np.zeros((height, width), np.float32)
-        rows = slice(max(top, 0), min(top + pixels.shape[0], height))
-        columns = slice(max(left, 0), min(left + pixels.shape[1], width))
-        if rows.start < rows.stop and columns.start < columns.stop:
-            full[rows, columns] = pixels[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
-        channels[name] = full
+        if pixels is not None and pixels.ndim == 2:
+            shown = pixels[max(-top, 0) : max(height - top, 0), max(-left, 0) : max(width - left, 0)]
+            channels[name] = np.zeros((height, width), np.float32)
+            channels[name][max(top, 0) :, max(left, 0) :][: shown.shape[0], : shown.shape[1]] = shown
     return channels, header
 
 
@@ -162,8 +156,9 @@ def _read_row(codes: np.ndarray, position: int, row: np.ndarray) -> int:
                 return -1
             count, repeated = int(codes[position]), codes[position] > 128
             count -= 128 * repeated
-            values = codes[position + 1 : position + 2 if repeated else position + 1 + count]
-            if count == 0 or filled + count > width or len(values) < (1 if repeated else count):
+            stored = 1 if repeated else count
+            values = codes[position + 1 : position + 1 + stored]
+            if count == 0 or filled + count > width or len(values) < stored:
                 return -1
             row[filled : filled + count, channel] = values
             filled += count

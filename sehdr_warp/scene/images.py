@@ -17,16 +17,6 @@ HDR_SUFFIXES = (".exr", ".hdr")
 DAMAGED = "copy or export the image again"
 EXIF_ERRORS = (OSError, SyntaxError, ValueError, KeyError, TypeError, EOFError, MemoryError, struct.error)
 """What Pillow raises for damaged EXIF; the pixels may still be good."""
-# EXIF's orientations, as what turns [H, W, ...] arrays upright.
-_TURNS = {
-    2: lambda a: a[:, ::-1],
-    3: lambda a: a[::-1, ::-1],
-    4: lambda a: a[::-1],
-    5: lambda a: a.swapaxes(0, 1),
-    6: lambda a: a.swapaxes(0, 1)[:, ::-1],
-    7: lambda a: a.swapaxes(0, 1)[::-1, ::-1],
-    8: lambda a: a.swapaxes(0, 1)[::-1],
-}
 
 
 @dataclass(frozen=True)
@@ -60,10 +50,10 @@ def read_ldr(path: Path, *, oriented: bool = False) -> EncodedImage:
     with open_image(path) as image:
         try:
             arrays = _decode(image, path)
-            turn = _TURNS.get(_orientation(image), lambda a: a) if oriented else lambda a: a
+            turn = _orientation(image) if oriented else 1
         except (OSError, SyntaxError, ValueError, EOFError, MemoryError, Image.DecompressionBombError) as error:
             raise InputError(path, f"cannot be decoded ({error})", DAMAGED) from None
-    return EncodedImage(*(None if array is None else np.ascontiguousarray(turn(array)) for array in arrays))
+    return EncodedImage(*(None if array is None else _upright(array, turn) for array in arrays))
 
 
 def read_mask(path: Path, *, oriented: bool = False) -> np.ndarray:
@@ -116,8 +106,8 @@ def _decode(image: Image.Image, path: Path) -> tuple[np.ndarray, np.ndarray | No
     if image.mode.startswith("I"):
         values = np.asarray(image)
         if values.min() < 0 or values.max() > 65535:
-            problem = f"32-bit values up to {int(values.max())} have no known white"
-            raise InputError(path, problem, "export it with 16 bits")
+            found = f"32-bit values up to {int(values.max())} have no known white"
+            raise InputError(path, found, "export it with 16 bits")
         return _split(values.astype(np.uint16))
     if image.mode == "F":
         raise InputError(path, "holds floating-point values, not encoded ones", "export it as PNG or JPEG")
@@ -146,6 +136,13 @@ def _low_byte_tiles(image: Image.Image) -> list | None:
         mode = f"{layout};{other[depth]}"
         tiles.append(tile._replace(args=mode if isinstance(tile.args, str) else (mode, *tile.args[1:])))
     return tiles or None
+
+
+def _upright(array: np.ndarray, orientation: int) -> np.ndarray:
+    """[H, W, ...] turned as EXIF's orientation says: 5 to 8 lie on their side, then rows or columns are backwards."""
+    array = array.swapaxes(0, 1) if orientation in (5, 6, 7, 8) else array
+    array = array[::-1] if orientation in (3, 4, 7, 8) else array
+    return np.ascontiguousarray(array[:, ::-1] if orientation in (2, 3, 6, 7) else array)
 
 
 def _orientation(image: Image.Image) -> int:

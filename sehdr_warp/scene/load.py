@@ -25,12 +25,9 @@ if TYPE_CHECKING:
     from ..response import Response
 
 _log = logging.getLogger("sehdr_warp.scene")
-_HOLDOUT = 8
-"""Every eighth view is held out: the habit of LLFF, Mip-NeRF 360 and 3DGS."""
-_FEWEST_FOR_TEST = 5
-"""Below this many views none can be spared for testing."""
-_MOST_JUDGED = 24
-"""Photos that a response is chosen from, evenly spread: they give about as many edges as are looked at."""
+_HOLDOUT = 8  # Every eighth view is held out: the habit of LLFF, Mip-NeRF 360 and 3DGS.
+_FEWEST_FOR_TEST = 5  # Below this many views none can be spared for testing.
+_MOST_JUDGED = 24  # Photos that a response is chosen from: they give about as many edges as are looked at.
 
 
 def load_scene(
@@ -49,18 +46,15 @@ def load_scene(
     path: a folder (COLMAP, transforms.json, HDR-NeRF synthetic or real, HDR-GS, LLFF, or bare photos), "embedded"
         for the room that comes with the package, or "embedded:NAME" for another of embedded_scenes().
     response: the camera's: a name, a file or an object; "auto" chooses it from the training photos' codes by `method`
-        among `candidates` (names and files; none: the built-in ones), see response.selection; "learned" stands for
-        sRGB here.
-    exposure_index: the number of the exposure to take where each view has several (the k of `<view>_<k>.png`); None
-        takes the middle one and says so in the notes.
+        among `candidates` (names and files; none: the built-in ones); "learned" stands for sRGB here.
+    exposure_index: the exposure to take where each view has several (the k of `<view>_<k>.png`); None: the middle one.
     max_size: longest side of the views in pixels; None keeps the photos' sizes. Averages are exact areas, of light
         for photos and of values for truth and masks; a value of 1 stays 1 where half of its area was clipped.
     holdout: every so many views is held out, 0 for none, whatever the set states; None keeps the set's split, or the
         protocol of its layout, or takes the middle of every eight. Sets of fewer than 5 views have no test view.
     cache: a folder where structure from motion keeps its results; None is the user's ($SEHDR_CACHE).
 
-    Returns a Scene in the set's own world coordinates. Points come from the set; where it has poses alone they are
-    triangulated from the training views, and where that finds nothing there are none, with a note.
+    Returns a Scene in the set's own world coordinates; where the set has poses alone, points are triangulated.
     Raises InputError where a file is missing, damaged or hostile, sizes disagree, an exposure is impossible, fewer
     than two training views remain, or the photos show nothing but black or white.
     """
@@ -69,13 +63,13 @@ def load_scene(
     capture = read_capture(path, exposure_index=exposure_index, holdout=holdout, cache=cache)
     chosen_by = (method, tuple(map(str, candidates))) if isinstance(response, str) and response == "auto" else None
     curve = choose_response(capture, method, candidates) if chosen_by else _named(response)
-    scene = develop(capture, curve, max_size)
+    scene = replace(develop(capture, curve, max_size), chosen_by=chosen_by)
     if len(scene.points):
-        return replace(scene, chosen_by=chosen_by)
+        return scene
     points, colors = triangulate(capture, cache)
     found = f"triangulated {len(points)} from the training views" if len(points) else "none could be triangulated"
-    note = f"the set has no points; {found}"
-    return replace(scene, points=points, point_colors=colors, notes=(*scene.notes, note), chosen_by=chosen_by)
+    notes = (*scene.notes, f"the set has no points; {found}")
+    return replace(scene, points=points, point_colors=colors, notes=notes)
 
 
 def read_capture(
@@ -147,12 +141,12 @@ def _folder(path: Path | str) -> Path:
     if is_embedded(path):
         return embedded_folder(str(path))
     folder = Path(path)
-    if not folder.exists():
-        raise InputError(folder, "not found", "give a folder of photos, or 'embedded'")
-    if not folder.is_dir():
-        raise InputError(folder, "is not a folder", "give the folder that holds the photos")
     try:
         empty = not any(folder.iterdir())
+    except FileNotFoundError:
+        raise InputError(folder, "not found", "give a folder of photos, or 'embedded'") from None
+    except NotADirectoryError:
+        raise InputError(folder, "is not a folder", "give the folder that holds the photos") from None
     except OSError as error:
         raise InputError(folder, f"cannot be read ({error.strerror or error})", "check its rights") from None
     if empty:
@@ -162,22 +156,19 @@ def _folder(path: Path | str) -> Path:
 
 def _read(folder: Path, cache: Path | str | None) -> Capture:
     """The first layout that fits, the most telling one first."""
-    if is_hdr_nerf(folder):
-        return read_hdr_nerf(folder)
-    if (folder / "poses_bounds_exps.npy").is_file():
-        return read_hdr_nerf_real(folder)
-    if is_hdr_gs(folder):
-        return read_hdr_gs(folder)
     model = find_model(folder)
-    if model is not None and model.is_relative_to(folder / "sparse") and image_folder(folder) is not None:
-        return read_colmap(folder)
-    if has_transforms(folder):
-        return read_transforms(folder)
-    if model is not None:
-        return read_colmap(folder)
-    if (folder / "poses_bounds.npy").is_file():
-        return read_llff(folder)
-    return read_photos(folder, cache)
+    beside = model is not None and model.is_relative_to(folder / "sparse") and image_folder(folder) is not None
+    readers = (
+        (is_hdr_nerf(folder), read_hdr_nerf),
+        ((folder / "poses_bounds_exps.npy").is_file(), read_hdr_nerf_real),
+        (is_hdr_gs(folder), read_hdr_gs),
+        (beside, read_colmap),
+        (has_transforms(folder), read_transforms),
+        (model is not None, read_colmap),
+        ((folder / "poses_bounds.npy").is_file(), read_llff),
+    )
+    reader = next((reader for fits, reader in readers if fits), None)
+    return reader(folder) if reader else read_photos(folder, cache)
 
 
 def _with_splits(shots: list[Shot], capture: Capture, holdout: int | None) -> tuple[list[Shot], tuple[str, ...]]:
@@ -198,8 +189,7 @@ def _held_out(count: int, step: int | None, published: tuple[int, int] | None) -
     if step == 0 or count < _FEWEST_FOR_TEST:
         return set()
     if published is not None:
-        every, offset = published
-        step = step or every
-        return set(range(min(offset, step - 1), count, step))
+        every, offset = step or published[0], published[1]
+        return set(range(min(offset, every - 1), count, every))
     step = step or _HOLDOUT
-    return {i for i in range(step // 2, count, step) if i < count - 1} or {count // 2}
+    return set(range(step // 2, count - 1, step)) or {count // 2}

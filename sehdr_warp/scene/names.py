@@ -5,7 +5,10 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..errors import InputError
+from ..files import contained
 from .capture import Shot
+from .images import LDR_SUFFIXES
 
 
 def natural_key(name: str) -> tuple:
@@ -13,16 +16,38 @@ def natural_key(name: str) -> tuple:
     return tuple((1, int(part), part) if part.isdecimal() else (0, 0, part) for part in re.split(r"(\d+)", name))
 
 
+def view_and_exposure(stem: str) -> tuple[str, int | None]:
+    """The view and the exposure's number of `<view>_<k>`; None for a name without one."""
+    match = re.fullmatch(r"(.+)_(\d{1,3})", stem)
+    return (match[1], int(match[2])) if match else (stem, None)
+
+
 def sibling(path: Path, suffixes: tuple[str, ...]) -> Path | None:
     """The file of the same stem beside `path` with one of the suffixes in either case, or None."""
-    for suffix in suffixes:
-        for candidate in (path.with_suffix(suffix), path.with_suffix(suffix.upper())):
-            try:
-                if candidate.is_file():
-                    return candidate
-            except (OSError, ValueError):  # A name from a data file that no file can have.
-                return None
-    return None
+    candidates = (path.with_suffix(spelled) for suffix in suffixes for spelled in (suffix, suffix.upper()))
+    try:
+        return next((candidate for candidate in candidates if candidate.is_file()), None)
+    except (OSError, ValueError):  # A name from a data file that no file can have.
+        return None
+
+
+def photo_beside(hdr: Path) -> Path:
+    """The encoded photo of the same stem beside an HDR image; InputError where there is none."""
+    photo = sibling(hdr, LDR_SUFFIXES)
+    if photo is None and not hdr.is_file():
+        raise InputError(hdr, "image file not found", "copy the whole set")
+    if photo is None:
+        raise InputError(hdr, "is the view's only image, and no encoded (LDR) photo lies beside it",
+                         "put the photo (PNG, JPEG or TIFF) of the same name beside it")  # fmt: skip
+    return photo
+
+
+def mask_of(folder: Path, name: str, source: Path) -> Path | None:
+    """The mask of the image called `name`: `masks/<name>.png` (COLMAP's habit) or `masks/<stem>.png`."""
+    places = (
+        contained(folder / "masks", mask, source) for mask in (f"{name}.png", str(Path(name).with_suffix(".png")))
+    )
+    return next((place for place in places if place.is_file()), None)
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:

@@ -9,12 +9,13 @@ from .capture import Capture, Shot
 from .colmap_model import SparseModel, find_model, read_model
 from .exposure import parse_seconds
 from .images import HDR_SUFFIXES, LDR_SUFFIXES
-from .names import natural_key, sibling
+from .names import mask_of, natural_key, photo_beside, sibling, view_and_exposure
 
 # The images of reduced copies of a set lie in images_2 ... images_8; the full ones are taken where they are there.
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 # HDR-NeRF's synthetic exposures, which HDR-GS's folders do not state (its train_synthetic.py holds them as constants).
 _HDR_GS_SECONDS = (0.125, 0.5, 2.0, 8.0, 32.0)
+_REMEDY = "copy the images that COLMAP used"
 
 
 def image_folder(folder: Path) -> Path | None:
@@ -23,31 +24,31 @@ def image_folder(folder: Path) -> Path | None:
 
 def read_colmap(folder: Path) -> Capture:
     """One shot for each image of the model, in the natural order of the names."""
-    model, source, images = _model_and_images(folder)
+    model, source = _model(folder)
+    images = image_folder(folder)
+    if images is None:
+        raise InputError(folder / "images", "folder not found", "put the photos that COLMAP used there")
     shots, absent = [], []
     for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
         image = contained(images, entry.name, source)
-        hdr = None
         if image.suffix.lower() in HDR_SUFFIXES:
-            hdr, image = image, sibling(image, LDR_SUFFIXES)
-            if image is None:
-                raise InputError(hdr, "is the view's only image, and no encoded (LDR) photo lies beside it",
-                                 "put the photo (PNG, JPEG or TIFF) of the same name beside it")  # fmt: skip
+            hdr, image = image, photo_beside(image)
         elif not image.is_file():
             absent.append(entry.name)
             continue
         else:
             beside = (sibling(folder / name / image.name, HDR_SUFFIXES) for name in ("hdr", "exr"))
             hdr = next((file for file in beside if file), None)
-        mask, lens = _mask(folder, entry.name, source), model.cameras[entry.camera_id]
+        mask, lens = mask_of(folder, entry.name, source), model.cameras[entry.camera_id]
         shots.append(Shot(image.stem, image, lens, entry.world_to_camera, mask=mask, hdr=hdr))
     if not shots:
-        raise InputError(images, f"none of the model's {len(absent)} images is here (the first is {absent[0]!r:.90})",
-                         "copy the images that COLMAP used")  # fmt: skip
-    notes = ()
-    if absent:
-        notes = (f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ...",)
-    return Capture("colmap", tuple(shots), holdout=(8, 0), points=model.points, point_colors=model.colors, notes=notes)
+        problem = f"none of the model's {len(absent)} images is here (the first is {absent[0]!r:.90})"
+        raise InputError(images, problem, _REMEDY)
+    left_out = (
+        f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ..." if absent else ""
+    )
+    return Capture("colmap", tuple(shots), holdout=(8, 0), points=model.points, point_colors=model.colors,
+                   notes=(left_out,) if absent else ())  # fmt: skip
 
 
 def is_hdr_gs(folder: Path) -> bool:
@@ -57,62 +58,45 @@ def is_hdr_gs(folder: Path) -> bool:
 
 def read_hdr_gs(folder: Path) -> Capture:
     """HDR-GS's synthetic layout: `images/<v>_<e>.png`, `exr/<v>.exr`, and a model with one image of each view."""
-    model, source, images = _model_and_images(folder)
-    exposures = _exposures_by_view(images)
-    count = 1 + max(key for files in exposures.values() for key in files)
-    seconds, notes = _hdr_gs_seconds(folder, count)
-    shots, placed = [], set()
-    for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
-        view = re.sub(r"_\d+$", "", contained(images, entry.name, source).stem)
-        if view in placed or view not in exposures:
-            continue
-        placed.add(view)
-        hdr = sibling(folder / "exr" / f"{view}.exr", HDR_SUFFIXES)
-        for key, image in sorted(exposures[view].items()):
-            camera, time = (model.cameras[entry.camera_id], entry.world_to_camera), seconds[key] if seconds else None
-            shots.append(Shot(view, image, *camera, exposure_key=key, exposure_time=time, hdr=hdr))
+    model, poses = poses_by_view(folder)
+    exposures = _exposures_by_view(folder / "images")
+    seconds, notes = _hdr_gs_seconds(folder, 1 + max(key for files in exposures.values() for key in files))
+    shots = [
+        Shot(view, image, *camera, exposure_key=key, exposure_time=seconds[key] if seconds else None,
+             hdr=sibling(folder / "exr" / f"{view}.exr", HDR_SUFFIXES))
+        for view, camera in poses.items()
+        for key, image in sorted(exposures.get(view, {}).items())
+    ]  # fmt: skip
     if not shots:
-        raise InputError(source, "none of the model's images is in images/", "copy the images that COLMAP used")
+        raise InputError(find_model(folder), "none of the model's images is in images/", _REMEDY)
     return Capture("hdr-gs", tuple(shots), alpha="background", holdout=(2, 1), points=model.points,
                    point_colors=model.colors, notes=notes)  # fmt: skip
 
 
 def poses_by_view(folder: Path) -> tuple[SparseModel, dict[str, tuple]]:
-    """The model and, for each view (names without `_<exposure>`), its lens and pose."""
-    model_folder = find_model(folder)
-    model = read_model(model_folder)
+    """The model and, for each view (names without `_<exposure>`) in natural order, its lens and pose."""
+    model, source = _model(folder)
     poses = {}
-    for entry in model.images:
-        view = re.sub(r"_\d+$", "", Path(entry.name).stem)
+    for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
+        view = re.sub(r"_\d+$", "", contained(folder, entry.name, source).stem)
         poses.setdefault(view, (model.cameras[entry.camera_id], entry.world_to_camera))
     return model, poses
 
 
-def _model_and_images(folder: Path) -> tuple[SparseModel, Path, Path]:
-    model_folder = find_model(folder)
-    model = read_model(model_folder)
+def _model(folder: Path) -> tuple[SparseModel, Path]:
+    source = find_model(folder)
+    model = read_model(source)
     if not model.images:
-        raise InputError(model_folder, "the model has no registered views", "run structure from motion again")
-    images = image_folder(folder)
-    if images is None:
-        raise InputError(folder / "images", "folder not found", "put the photos that COLMAP used there")
-    return model, model_folder, images
-
-
-def _mask(folder: Path, name: str, source: Path) -> Path | None:
-    """`masks/<name>.png` (COLMAP's habit) or `masks/<stem>.png`."""
-    for candidate in (f"{name}.png", str(Path(name).with_suffix(".png"))):
-        if (path := contained(folder / "masks", candidate, source)).is_file():
-            return path
-    return None
+        raise InputError(source, "the model has no registered views", "run structure from motion again")
+    return model, source
 
 
 def _exposures_by_view(images: Path) -> dict[str, dict[int, Path]]:
     found: dict[str, dict[int, Path]] = {}
     for image in images.iterdir():
-        match = re.fullmatch(r"(.+)_(\d{1,3})", image.stem)
-        if match and image.suffix.lower() in LDR_SUFFIXES:
-            found.setdefault(match[1], {})[int(match[2])] = image
+        view, key = view_and_exposure(image.stem)
+        if key is not None and image.suffix.lower() in LDR_SUFFIXES:
+            found.setdefault(view, {})[key] = image
     return found
 
 

@@ -1,6 +1,6 @@
 """LLFF's pose files: `poses_bounds_exps.npy` of HDR-NeRF's real sets and plain `poses_bounds.npy`."""
 
-import re
+import io
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ from .capture import Capture, Shot, pose_from_camera_to_world
 from .colmap_model import find_model
 from .images import LDR_SUFFIXES
 from .lens import Lens
-from .names import list_images
+from .names import list_images, view_and_exposure
 from .read_colmap import poses_by_view
 
 _REMEDY = "export the poses again with LLFF's imgs2poses"
@@ -26,22 +26,17 @@ def read_hdr_nerf_real(folder: Path) -> Capture:
     path = folder / "poses_bounds_exps.npy"
     rows = _rows(path, 18)
     images = _images(folder / "input_images", path, len(rows))
-    points = {}
-    poses = None
+    points, poses = {}, None
     if find_model(folder) is not None:
         model, poses = poses_by_view(folder)
         points = {"points": model.points, "point_colors": model.colors}
     shots, absent = [], set()
     for row, image in zip(rows, images, strict=True):
-        match = re.fullmatch(r"(.+)_(\d{1,3})", image.stem)
-        view, key = (match[1], int(match[2])) if match else (image.stem, None)
-        if poses is None:
-            lens, pose = _camera(row, path, image.name)
-        elif view in poses:
-            lens, pose = poses[view]
-        else:
+        view, key = view_and_exposure(image.stem)
+        if poses is not None and view not in poses:
             absent.add(view)
             continue
+        lens, pose = _camera(row, path, image.name) if poses is None else poses[view]
         shots.append(Shot(view, image, lens, pose, exposure_key=key, exposure_time=float(row[17])))
     notes = (f"{len(absent)} views are not in the sparse model and were left out",) if absent else ()
     return Capture("hdr-nerf-real", tuple(shots), holdout=(2, 1), notes=notes, **points)
@@ -51,29 +46,26 @@ def read_llff(folder: Path) -> Capture:
     """`images/` with `poses_bounds.npy` [n, 17], rows in the order of the sorted file names."""
     path = folder / "poses_bounds.npy"
     rows = _rows(path, 17)
-    shots = []
-    for row, image in zip(rows, _images(folder / "images", path, len(rows)), strict=True):
-        shots.append(Shot(image.stem, image, *_camera(row, path, image.name)))
+    images = _images(folder / "images", path, len(rows))
+    shots = (Shot(image.stem, image, *_camera(row, path, image.name)) for row, image in zip(rows, images, strict=True))
     return Capture("llff", tuple(shots), holdout=(8, 0))
 
 
 def _rows(path: Path, width: int) -> np.ndarray:
-    """[n, width] float64; the header's shape is checked against the file's size before any memory is asked for."""
-    import io
-    import tokenize
-
+    """[n, width] float64; the shape is checked against the file's size before any memory is asked for."""
     data = io.BytesIO(read_bytes(path, 1 << 28))
     try:
         version = np.lib.format.read_magic(data)
         reader = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, fortran, dtype = reader(data)
+        shape, _, dtype = reader(data)
         left = data.getbuffer().nbytes - data.tell()
         if dtype.kind != "f" or len(shape) != 2 or shape[1] != width or shape[0] * width * dtype.itemsize != left:
             raise ValueError(f"shape {shape} of {dtype}, {left} bytes")
-        values = np.frombuffer(data.read(), dtype).reshape(shape, order="F" if fortran else "C").astype(np.float64)
-    except (ValueError, EOFError, SyntaxError, TypeError, RecursionError, MemoryError, tokenize.TokenError) as error:
+        data.seek(0)
+        return np.lib.format.read_array(data, allow_pickle=False).astype(np.float64)
+    # NumPy parses the header as Python; what that raises for damaged ones is open-ended.
+    except Exception as error:  # noqa: BLE001
         raise InputError(path, f"is not an [n, {width}] array of numbers ({str(error)[:80]})", _REMEDY) from None
-    return values
 
 
 def _images(folder: Path, path: Path, count: int) -> list[Path]:

@@ -14,9 +14,10 @@ from .exposure import parse_seconds
 from .hdr_files import hdr_size
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, image_sizes
 from .lens import Lens
-from .names import sibling
+from .names import photo_beside, sibling
 
 _REMEDY = "correct the file or export it again"
+_INCOMPLETE = "copy the whole set"
 
 
 def has_transforms(folder: Path) -> bool:
@@ -33,23 +34,21 @@ def read_transforms(folder: Path) -> Capture:
         files = [(folder / "transforms.json", None)]
     else:
         other = "test" if (folder / "transforms_test.json").is_file() else "val"
-        files = [(folder / f"transforms_{name}.json", split) for name, split in (("train", "train"), (other, "test"))]
+        files = [(folder / "transforms_train.json", "train"), (folder / f"transforms_{other}.json", "test")]
     shots, points, colors = [], np.zeros((0, 3)), np.zeros((0, 3), np.float32)
     for path, split in files:
         if split == "test" and not path.is_file():
             continue
         values = read_json(path)
-        named = _named_splits(values, path)
-        for name, frame in frames_of(values, path):
-            shots.append(_frame_shot(folder, path, values, frame, name, split or named.get(name)))
+        frames = frames_of(values, path)
+        named = _named_splits(values, frames)
+        shots += [_frame_shot(folder, path, values, frame, name, split or named.get(name)) for name, frame in frames]
         if not len(points):
             points, colors = _points(folder, path, values)
-    notes = ()
-    if any(shot.split for shot in shots) and not all(shot.split for shot in shots):
-        kept = [shot for shot in shots if shot.split]
+    kept, notes = [shot for shot in shots if shot.split], ()
+    if 0 < len(kept) < len(shots):
         notes = (f"{len(shots) - len(kept)} frames belong to neither the train nor the test split and were left out",)
-        shots = kept
-    return Capture("transforms", tuple(shots), alpha="background", points=points, point_colors=colors, notes=notes)
+    return Capture("transforms", tuple(kept or shots), "background", points=points, point_colors=colors, notes=notes)
 
 
 def read_hdr_nerf(folder: Path) -> Capture:
@@ -67,47 +66,34 @@ def read_hdr_nerf(folder: Path) -> Capture:
         if split == "test" and not path.is_file():
             continue
         values, times = read_json(path), _exposures_of(read_json(times_path), times_path)
-        derived = _states_derived_photos(values, path)
+        stated = values.get("photo_response")
+        if stated not in (None, DERIVED_PHOTOS):
+            raise InputError(path, f"photo_response is {stated!r:.40}", f"only {DERIVED_PHOTOS!r} can be derived")
         for place, (name, frame) in enumerate(frames_of(values, path)):
-            stated = times.get(_plain(name))
-            if not stated:
+            exposures = times.get(_plain(name))
+            if not exposures:
                 problem = f"has no exposure time for {name!r:.90}"
                 raise InputError(times_path, problem, "list <file_path>_<k>.png: seconds")
-            hdr = sibling(folder / f"{split}_hdr" / f"hdr_{place:03d}.exr", HDR_SUFFIXES)
-            matrix = frame_pose(frame, path, name)
-            if derived:
-                if hdr is None:
-                    raise InputError(folder / f"{split}_hdr" / f"hdr_{place:03d}.exr", "HDR truth not found",
-                                     "copy the whole set")  # fmt: skip
-                lens = frame_lens(values, frame, hdr, path)
-                shots += [
-                    Shot(Path(_plain(name)).name, hdr, lens, matrix, exposure_key=key, exposure_time=time, split=split,
-                         hdr=hdr, derived=True)
-                    for key, (_, time) in sorted(stated.items())
-                ]  # fmt: skip
-                continue
-            present = [(k, contained(folder, file, times_path), t) for k, (file, t) in sorted(stated.items())]
-            present = [entry for entry in present if entry[1].is_file()]
+            truth = folder / f"{split}_hdr" / f"hdr_{place:03d}.exr"
+            hdr, pose = sibling(truth, HDR_SUFFIXES), frame_pose(frame, path, name)
+            if stated and hdr is None:
+                raise InputError(truth, "HDR truth not found", _INCOMPLETE)
+            present = []
+            for key, (file, time) in sorted(exposures.items()):
+                image = hdr if stated else contained(folder, file, times_path)
+                if image.is_file():
+                    lens, view = frame_lens(values, frame, image, path), Path(_plain(name)).name
+                    present.append(Shot(view, image, lens, pose, key, time, split, hdr=hdr, derived=bool(stated)))
             if not present:
-                absent = folder / f"{_plain(name)}_{min(stated)}.png"
-                raise InputError(absent, "image file not found", "copy the whole set")
-            shots += [
-                Shot(Path(_plain(name)).name, image, frame_lens(values, frame, image, path), matrix, exposure_key=key,
-                     exposure_time=time, split=split, hdr=hdr)
-                for key, image, time in present
-            ]  # fmt: skip
+                absent = folder / f"{_plain(name)}_{min(exposures)}.png"
+                raise InputError(absent, "image file not found", _INCOMPLETE)
+            shots += present
     points, colors = _sparse_points(folder)
-    return Capture("hdr-nerf", tuple(shots), alpha="background", points=points, point_colors=colors)
-
-
-def _states_derived_photos(values: dict, path: Path) -> bool:
-    stated = values.get("photo_response")
-    if stated is not None and stated != DERIVED_PHOTOS:
-        raise InputError(path, f"photo_response is {stated!r:.40}", f"only {DERIVED_PHOTOS!r} can be derived")
-    return stated is not None
+    return Capture("hdr-nerf", tuple(shots), "background", points=points, point_colors=colors)
 
 
 def frames_of(values: dict, path: Path) -> list[tuple[str, dict]]:
+    """(file_path, frame) of each frame; InputError where there is none."""
     frames = values.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(path, "has no frames", _REMEDY)
@@ -117,49 +103,46 @@ def frames_of(values: dict, path: Path) -> list[tuple[str, dict]]:
     return [(frame["file_path"], frame) for frame in frames]
 
 
-def _named_splits(values: dict, path: Path) -> dict[str, str]:
+def _named_splits(values: dict, frames: list[tuple[str, dict]]) -> dict[str, str]:
     """Each frame's split where the file says so: nerfstudio's <split>_filenames, or a frame's own "split"."""
     known = ("train", "test", "val")
-    named = {name: frame["split"] for name, frame in frames_of(values, path) if frame.get("split") in known}
-    for key, split in (("train_filenames", "train"), ("val_filenames", "val"), ("test_filenames", "test")):
-        listed = values.get(key)
+    named = {name: frame["split"] for name, frame in frames if frame.get("split") in known}
+    for split in ("train", "val", "test"):
+        listed = values.get(f"{split}_filenames")
         if isinstance(listed, list):
             named.update({name: split for name in listed if isinstance(name, str)})
-    held_out = "test" if "test" in named.values() else "val"
-    kept = {"train": "train", held_out: "test"}
+    kept = {"train": "train", "test" if "test" in named.values() else "val": "test"}
     return {name: kept[split] for name, split in named.items() if split in kept}
 
 
 def _frame_shot(folder: Path, path: Path, values: dict, frame: dict, name: str, split: str | None) -> Shot:
-    image = contained(folder, name, path)
+    image, hdr = contained(folder, name, path), None
     if image.suffix.lower() not in (*LDR_SUFFIXES, *HDR_SUFFIXES):
         # Blender's file_path has no ending; a dot in the stem must not be taken for one.
-        found = sibling(image.with_name(image.name + ".png"), LDR_SUFFIXES)
-        if found is None:
-            raise InputError(image.with_name(image.name + ".png"), "image file not found", "copy the whole set")
-        image = found
-    hdr = None
-    if image.suffix.lower() in HDR_SUFFIXES:
-        hdr, image = image, sibling(image, LDR_SUFFIXES)
-        if image is None and not hdr.is_file():
-            raise InputError(hdr, "image file not found", "copy the whole set")
+        stated = image.with_name(image.name + ".png")
+        image = sibling(stated, LDR_SUFFIXES)
         if image is None:
-            raise InputError(hdr, "is the frame's only image, and no encoded (LDR) photo lies beside it",
-                             "put the photo (PNG, JPEG or TIFF) of the same name beside it")  # fmt: skip
-    mask = frame.get("mask_path")
-    time = frame.get("exposure_time")
-    return Shot(
-        image.stem, image, frame_lens(values, frame, image, path), frame_pose(frame, path, name),
-        exposure_time=None if time is None else parse_seconds(time, path, name), split=split,
-        mask=None if mask is None else contained(folder, mask, path), hdr=hdr,
-    )  # fmt: skip
+            raise InputError(stated, "image file not found", _INCOMPLETE)
+    if image.suffix.lower() in HDR_SUFFIXES:
+        hdr, image = image, photo_beside(image)
+    lens, pose = frame_lens(values, frame, image, path), frame_pose(frame, path, name)
+    mask, time = frame.get("mask_path"), frame.get("exposure_time")
+    mask = None if mask is None else contained(folder, mask, path)
+    time = None if time is None else parse_seconds(time, path, name)
+    return Shot(image.stem, image, lens, pose, exposure_time=time, split=split, mask=mask, hdr=hdr)
+
+
+def _matrix(values) -> np.ndarray:
+    """The array that JSON values spell; one of no elements where they spell none."""
+    try:
+        return np.array(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return np.zeros(0)
 
 
 def frame_pose(frame: dict, path: Path, name: str) -> np.ndarray:
-    try:
-        matrix = np.array(frame.get("transform_matrix"), dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        matrix = np.zeros(0)
+    """[4, 4] world_to_camera of a frame's transform_matrix; InputError where it is no pose."""
+    matrix = _matrix(frame.get("transform_matrix"))
     if matrix.shape in ((4, 4), (3, 4)):
         # OpenGL's camera looks along -z with y up; OpenCV's along +z with y down.
         matrix[:3, 1:3] *= -1
@@ -167,59 +150,56 @@ def frame_pose(frame: dict, path: Path, name: str) -> np.ndarray:
 
 
 def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Lens:
-    def number(*keys: str) -> float | None:
-        for key in keys:
-            value = frame.get(key, values.get(key))
-            if value is not None:
-                if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
-                    raise InputError(path, f"{key} = {value!r:.40} is not a finite number", _REMEDY)
-                return float(value)
-        return None
+    """The lens of a frame, whose values win over the file's; the size is the image's where neither states it."""
+
+    def number(key: str) -> float | None:
+        value = frame.get(key, values.get(key))
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
+            raise InputError(path, f"{key} = {value!r:.40} is not a finite number", _REMEDY)
+        return float(value)
+
+    def focal(key: str, angle_key: str, length: float) -> float | None:
+        if (stated := number(key)) is not None:
+            return stated
+        angle = number(angle_key) or 0.0
+        return 0.5 * length / math.tan(0.5 * angle) if 0 < angle < math.pi else None
 
     width, height = number("w"), number("h")
     if width is None or height is None:
         if image is None:
             raise InputError(path, "states no image size", "add w and h")
         width, height = hdr_size(image) if image.suffix.lower() in HDR_SUFFIXES else image_sizes(image)[0]
-    fx, fy = number("fl_x"), number("fl_y")
-    if fx is None and (angle := number("camera_angle_x")) is not None and 0 < angle < math.pi:
-        fx = 0.5 * width / math.tan(0.5 * angle)
-    if fy is None and (angle := number("camera_angle_y")) is not None and 0 < angle < math.pi:
-        fy = 0.5 * height / math.tan(0.5 * angle)
+    fx, fy = focal("fl_x", "camera_angle_x", width), focal("fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
         raise InputError(path, "states no focal length", "add camera_angle_x (radians, below pi) or fl_x (pixels)")
-    fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
     cx, cy = number("cx"), number("cy")
-    pinhole = (fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
+    pinhole = (fy if fx is None else fx, fx if fy is None else fy, width / 2 if cx is None else cx,
+               height / 2 if cy is None else cy)  # fmt: skip
     k1, k2, k3, k4, p1, p2 = (number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model = frame.get("camera_model", values.get("camera_model", "OPENCV"))
     if model == "OPENCV_FISHEYE" or frame.get("is_fisheye", values.get("is_fisheye")) is True:
-        model, params = "OPENCV_FISHEYE", (*pinhole, k1, k2, k3, k4)
+        model, bent = "OPENCV_FISHEYE", (k1, k2, k3, k4)
     elif model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL"):
         raise InputError(path, f"camera_model {model!r:.40} is not supported", "use OPENCV, OPENCV_FISHEYE or PINHOLE")
     elif k4:
         raise InputError(path, f"k4 = {k4} of a perspective camera is not supported", "undistort the images first")
     elif k3:
-        model, params = "FULL_OPENCV", (*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+        model, bent = "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
     else:
-        model, params = "OPENCV", (*pinhole, k1, k2, p1, p2)
-    return Lens(model, int(width), int(height), params, path)
+        model, bent = "OPENCV", (k1, k2, p1, p2)
+    return Lens(model, int(width), int(height), (*pinhole, *bent), path)
 
 
 def _points(folder: Path, path: Path, values: dict) -> tuple[np.ndarray, np.ndarray]:
     """ply_file_path (in the frames' coordinates), or nerfstudio's COLMAP model moved by applied_transform."""
     name = values.get("ply_file_path")
-    if isinstance(name, str):
-        ply = contained(folder, name, path)
-        if ply.is_file():
-            return read_ply_points(ply)
+    if isinstance(name, str) and (ply := contained(folder, name, path)).is_file():
+        return read_ply_points(ply)
     points, colors = _sparse_points(folder)
-    applied = values.get("applied_transform")
-    if len(points) and applied is not None:
-        try:
-            matrix = np.array(applied, dtype=np.float64)
-        except (TypeError, ValueError):
-            matrix = np.zeros(0)
+    if len(points) and values.get("applied_transform") is not None:
+        matrix = _matrix(values["applied_transform"])
         if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
             raise InputError(path, "applied_transform is not a finite 3 x 4 matrix", _REMEDY)
         points = points @ matrix[:3, :3].T + matrix[:3, 3]
@@ -227,12 +207,9 @@ def _points(folder: Path, path: Path, values: dict) -> tuple[np.ndarray, np.ndar
 
 
 def _sparse_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    for place in (find_model(folder), folder / "sparse" / "0", folder / "sparse", folder):
-        if place is not None:
-            points, colors = read_points(place)
-            if len(points):
-                return points, colors
-    return np.zeros((0, 3)), np.zeros((0, 3), np.float32)
+    places = (find_model(folder), folder / "sparse" / "0", folder / "sparse", folder)
+    clouds = (read_points(place) for place in places if place is not None)
+    return next((cloud for cloud in clouds if len(cloud[0])), (np.zeros((0, 3)), np.zeros((0, 3), np.float32)))
 
 
 def _plain(name: str) -> str:

@@ -6,6 +6,7 @@ package's bounded reader. Results go to a cache folder under a key made of all t
 
 import contextlib
 import hashlib
+import itertools
 import json
 import logging
 import math
@@ -20,7 +21,7 @@ from PIL import Image
 from ..errors import InputError, SehdrError
 from .capture import Capture, Shot
 from .colmap_model import SparseModel, read_model
-from .develop import as_photographed, fitted_lens
+from .develop import as_photographed, fitted_lens, told
 from .images import EXIF_ERRORS, open_image, read_ldr, read_mask
 from .lens import Lens
 from .types import encoded_values
@@ -31,9 +32,8 @@ _log = logging.getLogger("sehdr_warp.scene")
 MAX_SIDE = 1200
 _SEED = 0
 _VERSION = 2
-# Up to here every pair is matched; beyond, each photo with its neighbours by name (a walk or a video).
+# Up to here every pair is matched; beyond, each photo with its neighbors by name (a walk or a video).
 _EXHAUSTIVE_LIMIT = 150
-_CHUNK = 8
 
 
 def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> SparseModel:
@@ -48,10 +48,11 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Spar
     def solve(work: Path, result: Path) -> None:
         sizes, small = _write_photos(photos, work / "images")
         database = work / "database.db"
-        for group in _same_camera(photos, sizes):
-            focal = _focal_prior(photos[group[0]], small[group[0]])
-            width, height = small[group[0]]
-            params = (focal, width / 2, height / 2, 0.0)
+        groups: dict[tuple, list[int]] = {}  # One set of intrinsics for a size, a device and a focal length.
+        for i, photo in enumerate(photos):
+            groups.setdefault((sizes[i], small[i], _device(photo)), []).append(i)
+        for (_, (width, height), device), group in groups.items():
+            params = (_focal_prior(device[-1], width, height), width / 2, height / 2, 0.0)
             _extract(database, work / "images", [_name(i) for i in group], "SIMPLE_RADIAL", params)
         _match(database, len(photos))
         model = _map(database, work, len(photos), photos[0].parent)
@@ -67,7 +68,7 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Spar
 
 
 def triangulate(capture: Capture, cache: Path | str | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """[P, 3] points and [P, 3] colours of the training photos, whose cameras are known; P is 0 where nothing matches.
+    """[P, 3] points and [P, 3] colors of the training photos, whose cameras are known; P is 0 where nothing matches.
 
     Features are found on the photos stretched to full range (a short exposure is nearly black as it is), at no more
     than MAX_SIDE pixels; poses stay as they are. cache: as reconstruct's.
@@ -84,10 +85,8 @@ def triangulate(capture: Capture, cache: Path | str | None = None) -> tuple[np.n
 
         lenses = _write_shots(shots, work / "images")
         database = work / "database.db"
-        for i, lens in enumerate(lenses):
-            if i % _CHUNK == 0:
-                _log.info("finding features in photos %d to %d of %d", i + 1, min(i + _CHUNK, len(shots)), len(shots))
-            _extract(database, work / "images", [_name(i)], lens.model, lens.params, told=False)
+        for i, lens in told("finding features in photos", lenses):
+            _extract(database, work / "images", [_name(i)], lens.model, lens.params)
         _match(database, len(shots))
         _log.info("triangulating points from the known poses")
         model = _known_poses(database, shots)
@@ -123,13 +122,12 @@ def _cached(cache: Path | str | None, name: str, solve: Callable[[Path, Path], N
         return
     made = not folder.exists()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            if cache is not None:
+                raise
         kept = os.access(folder, os.W_OK)
-    except OSError as error:
-        kept = False
-        if cache is not None:
-            raise _unwritable(folder, error) from None
-    try:
         with tempfile.TemporaryDirectory(prefix="sehdr-sfm-", dir=folder if kept else None) as work:
             result = Path(work) / "result"
             (Path(work) / "model").mkdir()
@@ -140,23 +138,18 @@ def _cached(cache: Path | str | None, name: str, solve: Callable[[Path, Path], N
                 return
             try:
                 os.replace(result, folder / name)
-            except OSError:
-                # Another process finished the same work first; its result is as good.
+            except OSError:  # Another process finished the same work first; its result is as good.
                 if not (folder / name).is_dir():
                     raise
     except BaseException as error:
         if made:
             with contextlib.suppress(OSError):  # Not empty, or never made.
                 folder.rmdir()
-        if not isinstance(error, OSError):
-            raise
-        raise _unwritable(folder, error) from None
+        if isinstance(error, OSError):
+            problem = f"structure from motion cannot write ({error.strerror or error})"
+            raise SehdrError(f"{folder}: {problem}; free some space or choose another cache (SEHDR_CACHE)") from None
+        raise
     yield folder / name
-
-
-def _unwritable(folder: Path, error: OSError) -> SehdrError:
-    return SehdrError(f"{folder}: structure from motion cannot write ({error.strerror or error}); "
-                      "free some space or choose another cache (SEHDR_CACHE)")  # fmt: skip
 
 
 def _digest(path: Path) -> str:
@@ -179,12 +172,10 @@ def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tup
     """Oriented 8-bit copies of at most MAX_SIDE pixels; returns the oriented full sizes and the copies' sizes."""
     folder.mkdir()
     sizes, small, shown = [], [], False
-    for i, photo in enumerate(photos):
-        if i % _CHUNK == 0:
-            _log.info("reading photos %d to %d of %d", i + 1, min(i + _CHUNK, len(photos)), len(photos))
-        image = Image.fromarray(_bytes(read_ldr(photo, oriented=True).pixels))
-        sizes.append(image.size)
-        image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
+    for i, photo in told("reading photos", photos):
+        codes = read_ldr(photo, oriented=True).pixels
+        image = _reduced(codes)
+        sizes.append(codes.shape[1::-1])
         small.append(image.size)
         values = np.asarray(image)
         shown |= bool(((values > 2) & (values < 253)).mean() > 1e-3)
@@ -195,19 +186,14 @@ def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tup
     return sizes, small
 
 
-def _bytes(codes: np.ndarray) -> np.ndarray:
-    return codes if codes.dtype == np.uint8 else (codes >> 8).astype(np.uint8)
-
-
 def _write_shots(shots: Sequence[Shot], folder: Path) -> list[Lens]:
     """8-bit copies of at most MAX_SIDE pixels, stretched and masked; returns the lenses at the copies' sizes."""
     folder.mkdir()
     lenses = []
-    for i, shot in enumerate(shots):
+    for i, shot in told("reading photos", shots):
         lens, oriented = (shot.lens, False) if shot.derived else fitted_lens(shot)
         image = as_photographed(shot, oriented=oriented)
-        light = Image.fromarray(_bytes(image.pixels))
-        light.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
+        light = _reduced(image.pixels)
         values = encoded_values(np.asarray(light))
         values = values / max(float(np.percentile(values, 99.5)), 1 / 255)
         for mask in (image.alpha, None if shot.mask is None else read_mask(shot.mask, oriented=oriented)):
@@ -219,42 +205,41 @@ def _write_shots(shots: Sequence[Shot], folder: Path) -> list[Lens]:
     return lenses
 
 
-def _same_camera(photos, sizes) -> list[list[int]]:
-    """Indices of photos that one set of intrinsics describes: same size, device and focal length by EXIF."""
-    groups: dict[tuple, list[int]] = {}
-    for i, photo in enumerate(photos):
-        groups.setdefault((tuple(sizes[i]), *map(str, _device(photo))), []).append(i)
-    return list(groups.values())
+def _reduced(codes: np.ndarray) -> Image.Image:
+    """An 8-bit picture of at most MAX_SIDE pixels."""
+    image = Image.fromarray(codes if codes.dtype == np.uint8 else (codes >> 8).astype(np.uint8))
+    image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
+    return image
 
 
-def _focal_prior(photo: Path, size: tuple[int, int]) -> float:
+def _focal_prior(equivalent: str, width: int, height: int) -> float:
     """Pixels: from EXIF's 35 mm equivalent (whose diagonal is 43.27 mm), or COLMAP's guess of 1.2 longest sides."""
-    equivalent = _device(photo)[-1]
-    if isinstance(equivalent, int | float) and 4 <= equivalent <= 2000:
-        return float(equivalent) / 43.27 * math.hypot(*size)
-    return 1.2 * max(size)
+    with contextlib.suppress(ValueError):
+        if 4 <= float(equivalent) <= 2000:
+            return float(equivalent) / 43.27 * math.hypot(width, height)
+    return 1.2 * max(width, height)
 
 
-def _device(photo: Path) -> tuple:
-    """EXIF's maker, model, focal length and its 35 mm equivalent; None where EXIF does not say or is damaged."""
+def _device(photo: Path) -> tuple[str, ...]:
+    """EXIF's maker, model, focal length and its 35 mm equivalent, as text; "None" where EXIF does not say."""
     with open_image(photo) as image:
         try:
             exif = image.getexif()
             lens = exif.get_ifd(0x8769)
+            return str(exif.get(0x010F)), str(exif.get(0x0110)), str(lens.get(0x920A)), str(lens.get(0xA405))
         except EXIF_ERRORS:
-            return None, None, None, None
-    return exif.get(0x010F), exif.get(0x0110), lens.get(0x920A), lens.get(0xA405)
+            return ("None",) * 4
 
 
-def _extract(database: Path, images: Path, names: list[str], model: str, params, told: bool = True) -> None:
-    """Features of images that share one camera, a few at a time so that progress can be told."""
+def _extract(database: Path, images: Path, names: list[str], model: str, params) -> None:
+    """Features of images that share one camera."""
     import pycolmap
 
     stated = ",".join(f"{value:.17g}" for value in params)
     reader = pycolmap.ImageReaderOptions(camera_model=model, camera_params=stated)
-    for start in range(0, len(names), _CHUNK):
-        part = names[start : start + _CHUNK]
-        if told:
+    for start in range(0, len(names), 8):  # Each on a core of its own.
+        part = names[start : start + 8]
+        if len(names) > 1:
             _log.info("finding features in photos %d to %d of %d", start + 1, start + len(part), len(names))
         with _quiet():
             pycolmap.extract_features(
@@ -262,23 +247,21 @@ def _extract(database: Path, images: Path, names: list[str], model: str, params,
             )
         if start == 0:
             with pycolmap.Database.open(database) as opened:
-                shared = next(image.camera_id for image in opened.read_all_images() if image.name == part[0])
-            reader.existing_camera_id = shared
+                reader.existing_camera_id = max(image.camera_id for image in opened.read_all_images())
 
 
 def _match(database: Path, count: int) -> None:
     import pycolmap
 
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = _SEED
+    options = {"verification_options": pycolmap.TwoViewGeometryOptions(), "device": pycolmap.Device.cpu}
+    options["verification_options"].ransac.random_seed = _SEED
     _log.info("matching features between %d photos", count)
     with _quiet():
         if count <= _EXHAUSTIVE_LIMIT:
-            pycolmap.match_exhaustive(database, verification_options=verification, device=pycolmap.Device.cpu)
+            pycolmap.match_exhaustive(database, **options)
         else:
             pairing = pycolmap.SequentialPairingOptions(overlap=20, quadratic_overlap=True)
-            pycolmap.match_sequential(database, pairing_options=pairing, verification_options=verification,
-                                      device=pycolmap.Device.cpu)  # fmt: skip
+            pycolmap.match_sequential(database, pairing_options=pairing, **options)
 
 
 def _seed(options) -> None:
@@ -299,11 +282,10 @@ def _map(database: Path, work: Path, count: int, source: Path):
             options.mapper.init_min_num_inliers = 50
             options.mapper.abs_pose_min_num_inliers = 15
             _log.info("placing the photos again with weaker conditions")
-        placed = [2]
+        placed = itertools.count(3)
 
         def next_image(placed=placed) -> None:
-            placed[0] += 1
-            _log.info("placed %d of %d photos", placed[0], count)
+            _log.info("placed %d of %d photos", next(placed), count)
 
         output = work / f"model{int(patient)}"
         output.mkdir()
@@ -311,9 +293,8 @@ def _map(database: Path, work: Path, count: int, source: Path):
             models = pycolmap.incremental_mapping(
                 database, work / "images", output, options, next_image_callback=next_image
             )
-        for model in models.values():
-            if best is None or model.num_reg_images() > best.num_reg_images():
-                best = model
+        found = [*([] if best is None else [best]), *models.values()]
+        best = max(found, key=lambda model: model.num_reg_images(), default=None)
         if best is not None and best.num_reg_images() == count:
             return best
     if best is None or best.num_reg_images() < 2:
@@ -337,7 +318,7 @@ def _known_poses(database: Path, shots: Sequence[Shot]):
 
 
 def _sampled_colors(model, shots: Sequence[Shot], lenses: Sequence[Lens]) -> tuple[np.ndarray, np.ndarray]:
-    """Places and the mean colour of the photos' pixels where each point was seen, encoded."""
+    """Places and the mean color of the photos' pixels where each point was seen, encoded."""
     seen: dict[int, list[tuple[int, float, float]]] = {}
     points = list(model.points3D.values())
     for number, point in enumerate(points):

@@ -34,12 +34,8 @@ class Stack:
 def read_stack(folder: Path | str, times: Sequence[float] | None = None) -> Stack:
     """The stack in a folder of photos.
 
-    Args:
-        times: seconds, in the order of the files' names; by default exposures.json's, or EXIF's (which also counts ISO
-            and f-number).
-
-    Raises:
-        InputError: for a folder without photos, a photo without a time, or another number of times.
+    times: seconds, in the order of the files' names; by default exposures.json's, or EXIF's (which counts ISO and
+        f-number too). Raises InputError for a folder without photos, or where there is not one time for each.
     """
     folder = Path(folder)
     files = list_images(folder, LDR_SUFFIXES) if folder.is_dir() else []
@@ -68,16 +64,12 @@ def calibrate(
 ) -> "Response":
     """The response of the camera that took an exposure stack (Debevec and Malik 1997); exposure 1 is white.
 
-    Args:
-        stack: a folder of photos, or what read_stack makes of one.
-        times: as read_stack takes them.
-        channel: "red", "green" or "blue" alone; by default one curve for all three.
-        out: a CSV file for the curve, which `response_by_name` reads; a plot goes beside it, with the suffix .png.
+    stack, times: a folder of photos, or what read_stack makes of one; as read_stack takes them.
+    channel: "red", "green" or "blue" alone; by default one curve for all three.
+    out: a CSV file for the curve, which `response_by_name` reads; a plot goes beside it, with the suffix .png.
 
     What it finds is logged: the residual, channels that clearly differ, photos that are off their times.
-
-    Raises:
-        InputError: for a stack that tells nothing, with the reason, or an existing file (unless overwrite).
+    Raises InputError for a stack that tells nothing, with the reason, or an existing file (unless overwrite).
     """
     from ..files import atomic_path, check_absent
     from ..response.calibration import calibrate_codes
@@ -111,11 +103,10 @@ def _tell(found: "Calibration", stack: Stack, channel: str | None) -> None:
     if channel is None and max(spread.values(), default=0.0) > CHANNELS_DIFFER:
         said = ", ".join(f"{name} {value:.2f}" for name, value in spread.items())
         log.warning("the channels' curves differ from the shared one, stops: %s; --channel takes one alone", said)
-    for file, offset in zip(stack.files, found.photo_offsets, strict=True):
-        if abs(offset) > WRONG_TIME:
-            log.warning(
-                "%s is %.2f stops %s than its time says", file.name, abs(offset), "brighter" if offset > 0 else "darker"
-            )
+    for file, off in zip(stack.files, found.photo_offsets, strict=True):
+        if abs(off) > WRONG_TIME:
+            side = "brighter" if off > 0 else "darker"
+            log.warning("%s is %.2f stops %s than its time says", file.name, abs(off), side)
 
 
 def _plot(found: "Calibration", stack: Stack, path: Path) -> None:
@@ -128,18 +119,11 @@ def _plot(found: "Calibration", stack: Stack, path: Path) -> None:
     axes.plot(np.log2(exposures), values * 255, ".", color="#9aa4ae", markersize=2, label="samples", rasterized=True)
     codes = np.arange(1, 256)
     axes.plot(np.log2(found.response.decode(codes / 255)), codes, color="#0072b2", linewidth=1.8, label="response")
-    axes.set_xlabel("exposure, stops from white")
-    axes.set_ylabel("8-bit code")
+    axes.set(xlabel="exposure, stops from white", ylabel="8-bit code", ylim=(0, 260))
     axes.set_xlim(left=max(axes.get_xlim()[0], -14))
-    axes.set_ylim(0, 260)
     axes.grid(color="#e1e4e8", linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    span = math.log2(max(stack.times) / min(stack.times))
-    axes.set_title(
-        f"{found.response.name}: {len(stack.files)} photos over {span:.1f} stops, residual {found.residual:.3f} stops",
-        loc="left",
-        fontsize=10,
-    )
+    span = f"{len(stack.files)} photos over {math.log2(max(stack.times) / min(stack.times)):.1f} stops"
+    title = f"{found.response.name}: {span}, residual {found.residual:.3f} stops"
+    axes.set_title(title, loc="left", fontsize=10)
     axes.legend(frameon=False, loc="upper left", markerscale=4)
     figure.savefig(path, dpi=140, facecolor="white", format="png")

@@ -4,12 +4,39 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
+import torch
+from PIL import Image
+from plyfile import PlyData, PlyElement
+from scipy.io import savemat
 
-from tests.make_scenes import pattern, write_blender, write_colmap, write_reinhard
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.field.gaussians import Gaussians
+from sehdr_warp.output.exr import Part, read_exr, write_exr, write_multipart_exr
+from sehdr_warp.response import response_by_name
+from sehdr_warp.scene import load_cameras, load_scene
+from sehdr_warp.scene.colmap_model import read_ply_points
+from sehdr_warp.scene.exposure import exif_exposure
+from sehdr_warp.scene.hdr_files import hdr_size, read_hdr
+from sehdr_warp.scene.images import image_sizes, read_ldr, read_mask
+from sehdr_warp.scene.read_colmap import read_colmap
+from sehdr_warp.scene.read_llff import read_llff
+from sehdr_warp.scene.read_transforms import read_hdr_nerf, read_transforms
+from sehdr_warp.synth.photo_set import RadianceView
+from sehdr_warp.training.config_files import load_config
+from sehdr_warp.training.initialization import assemble_field
+from sehdr_warp.training.run import load_run
+from sehdr_warp.training.run_folder import RunFolder
+from sehdr_warp.training.train import Training
+from sehdr_warp.training.trainer import Trainer
+from tests.make_scenes import pattern, write_blender, write_colmap, write_llff, write_reinhard
+from tests.output.helpers import camera
+from tests.training.toy import orbit_camera, toy_scene
 
 
 @dataclass(frozen=True)
@@ -27,92 +54,56 @@ class Reader:
     repair: Callable[[Path], None] | None = None
 
 
-def _colmap(folder: Path, binary: bool) -> None:
-    write_colmap(folder, 4, binary=binary, size=(24, 16), params=(20.0, 21.0, 12.0, 8.0))
+def each(*readers: Callable[[Path], object]) -> Callable[[Path], None]:
+    """Tries every reader on every file, though some raise: the first error is raised at the end."""
+
+    def read_all(folder: Path) -> None:
+        problem = None
+        for path in sorted(folder.iterdir()):
+            for read in readers:
+                try:
+                    read(path)
+                except SehdrError as error:
+                    problem = problem or error
+        if problem:
+            raise problem
+
+    return read_all
 
 
-def _read_colmap(folder: Path):
-    from sehdr_warp.scene.read_colmap import read_colmap
-
-    return read_colmap(folder)
+def _colmap(binary: bool) -> Callable[[Path], None]:
+    return lambda folder: write_colmap(folder, 4, binary=binary, size=(24, 16), params=(20.0, 21.0, 12.0, 8.0))
 
 
 def _transforms(folder: Path) -> None:
     write_blender(folder, 4, size=(16, 12), fl_x=20.0, fl_y=20.0, w=16, h=12, k1=0.01, train_filenames=["images/r_0"])
 
 
-def _read_transforms(folder: Path):
-    from sehdr_warp.scene.read_transforms import read_transforms
-
-    return read_transforms(folder)
-
-
 def _hdr_nerf(folder: Path) -> None:
-    from sehdr_warp.synth.photo_set import RadianceView
-    from tests.training.toy import orbit_camera
-
     view = orbit_camera(0.0, 16)
-    views = [
-        RadianceView(f"r_{i}", view, np.full((16, 16, 3), 0.1 * i + 0.1), ("train", "test")[i % 2]) for i in (0, 1)
-    ]
+    radiance = [np.full((16, 16, 3), 0.1 * i + 0.1) for i in (0, 1)]
+    views = [RadianceView(f"r_{i}", view, radiance[i], ("train", "test")[i]) for i in (0, 1)]
     write_reinhard(folder, views, [0.5, 2.0], points=(np.eye(3), np.eye(3)))
 
 
-def _load_scene(folder: Path):
-    from sehdr_warp.scene import load_scene
-
-    return load_scene(folder, response="srgb")
-
-
 def _exposures(folder: Path) -> None:
-    _colmap(folder, False)
+    _colmap(False)(folder)
     names = sorted(path.name for path in (folder / "images").iterdir())
     (folder / "exposures.json").write_text(json.dumps({name: 0.01 * (i + 1) for i, name in enumerate(names)}))
 
 
-def _llff(folder: Path) -> None:
-    from tests.scene.test_llff import write_llff
-
-    write_llff(folder, 4, size=(16, 12))
-
-
-def _read_llff(folder: Path):
-    from sehdr_warp.scene.read_llff import read_llff
-
-    return read_llff(folder)
-
-
 def _points(folder: Path) -> None:
-    from plyfile import PlyData, PlyElement
-
     rows = np.zeros(6, [(n, "f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")])
     for name, text in (("binary", False), ("text", True)):
         PlyData([PlyElement.describe(rows, "vertex")], text=text).write(str(folder / f"{name}.ply"))
 
 
-def _read_points(folder: Path):
-    from sehdr_warp.scene.colmap_model import read_ply_points
-
-    return each(folder, "*.ply", read_ply_points)
-
-
 def _exr(folder: Path) -> None:
-    from sehdr_warp.output.exr import Part, write_exr, write_multipart_exr
-
     pixels = np.linspace(0, 3, 8 * 6 * 3, dtype=np.float32).reshape(6, 8, 3)
     channels = {name: pixels[..., i] for i, name in enumerate("RGB")}
     write_exr(folder / "half.exr", channels)
     write_exr(folder / "float.exr", channels, pixel="float")
     write_multipart_exr(folder / "parts.exr", [Part(channels, name="a"), Part(channels, name="b")])
-
-
-def _read_exr(folder: Path):
-    from sehdr_warp.output.exr import read_exr
-    from sehdr_warp.scene.hdr_files import hdr_size, read_hdr
-
-    each(folder, "*.exr", hdr_size)
-    each(folder, "*.exr", read_hdr)
-    return each(folder, "*.exr", read_exr)
 
 
 def _radiance(folder: Path) -> None:
@@ -122,22 +113,13 @@ def _radiance(folder: Path) -> None:
     (folder / "flat.hdr").write_bytes(header.replace(b"X 9", b"X 3") + bytes(range(120, 168)))
 
 
-def _read_radiance(folder: Path):
-    from sehdr_warp.scene.hdr_files import read_hdr
-
-    return each(folder, "*.hdr", read_hdr)
-
-
 def _photos(folder: Path) -> None:
-    from PIL import Image
-
     picture = Image.fromarray(pattern(12, 10))
     tags = Image.Exif()
     tags[0x0112] = 6
     tags.get_ifd(0x8769)[33434] = 0.01
-    picture.save(folder / "a.jpg", exif=tags)
-    picture.save(folder / "a.png", exif=tags)
-    picture.save(folder / "a.tif", exif=tags)
+    for name in ("a.jpg", "a.png", "a.tif"):
+        picture.save(folder / name, exif=tags)
     picture.save(folder / "a.webp")
     picture.convert("RGBA").save(folder / "b.png")
     picture.convert("P").save(folder / "c.png")
@@ -145,40 +127,12 @@ def _photos(folder: Path) -> None:
     Image.fromarray(np.arange(120, dtype=np.uint16).reshape(10, 12)).save(folder / "d.png")
 
 
-def _read_photos(folder: Path):
-    from sehdr_warp.scene.exposure import exif_exposure
-    from sehdr_warp.scene.images import image_sizes, read_ldr, read_mask
-
-    each(folder, "*", image_sizes)
-    each(folder, "*", read_mask)
-    each(folder, "*", exif_exposure)
-    return each(folder, "*", lambda path: read_ldr(path, oriented=True))
-
-
 def _config(folder: Path) -> None:
-    from importlib import resources
-
     (folder / "own.toml").write_text('base = "paper"\nseed = 3\n[schedule]\niterations = 100\nevaluate_at = [1, 2]\n')
     (folder / "all.toml").write_text((resources.files("sehdr_warp.configs") / "default.toml").read_text())
 
 
-def _read_config(folder: Path):
-    from sehdr_warp.training.config_files import load_config
-
-    return each(folder, "*.toml", load_config)
-
-
 def _run(folder: Path) -> None:
-    import torch
-
-    from sehdr_warp.field.gaussians import Gaussians
-    from sehdr_warp.response import response_by_name
-    from sehdr_warp.training.config_files import load_config
-    from sehdr_warp.training.initialization import assemble_field
-    from sehdr_warp.training.run_folder import RunFolder
-    from sehdr_warp.training.trainer import Trainer
-    from tests.training.toy import toy_scene
-
     config = load_config("paper", {"schedule.iterations": 10})
     gaussians = Gaussians.from_points(torch.rand(4, 3), torch.zeros(4, 3), 3)
     scene = toy_scene(2, 8)
@@ -192,33 +146,23 @@ def _run(folder: Path) -> None:
 
 
 def _read_run(folder: Path):
-    from sehdr_warp.training.run import load_run
-
     run = load_run(folder)
     return run.metrics(), run.summary(), run.degree
 
 
-def _read_resume(folder: Path):
-    """What --resume reads."""
-    from sehdr_warp.training.train import Training
-    from tests.training.toy import toy_scene
-
+def _resume(folder: Path):
     return Training(toy_scene(2, 8), folder, device="cpu", resume=True)
 
 
 def _resign(folder: Path) -> None:
     for path in folder.glob("checkpoints/*/checkpoint.json"):
-        try:
+        with suppress(OSError, ValueError, TypeError, RecursionError):
             values = json.loads(path.read_bytes())
             data = (path.parent / "state.safetensors").read_bytes()
             path.write_text(json.dumps(values | {"sha256": hashlib.sha256(data).hexdigest()}))
-        except (OSError, ValueError, TypeError, RecursionError):
-            pass
 
 
 def _responses(folder: Path) -> None:
-    from scipy.io import savemat
-
     x = np.linspace(0, 1, 9)
     y = x**0.5
     row = " ".join(f"{v:.4f}" for v in x)
@@ -232,65 +176,50 @@ def _responses(folder: Path) -> None:
     savemat(folder / "m.mat", {"B": np.stack([y, y]), "I": np.stack([x, x])})
 
 
-def _read_responses(folder: Path):
-    from sehdr_warp.response import response_by_name
-
+def _read_response(path: Path):
     selectors = {"dorf.txt": ":1", "emor.txt": ":0.1", "m.mat": ":0"}
-
-    def read(path: Path):
-        curve = response_by_name(f"{path}{selectors.get(path.name, '')}")
-        return curve.decode(curve.encode(np.array([0.0, 0.2, 3.0]))), curve.white
-
-    return each(folder, "*", read)
+    curve = response_by_name(f"{path}{selectors.get(path.name, '')}")
+    return curve.decode(curve.encode(np.array([0.0, 0.2, 3.0]))), curve.white
 
 
 def _cameras(folder: Path) -> None:
-    from tests.output.helpers import camera
-
     view = camera(16, 12).to_dict()
     (folder / "own.json").write_text(json.dumps({"cameras": [{"name": "a", **view}, {"camera": view}]}))
     path = [{"camera_to_world": np.eye(4).ravel().tolist(), "fov": 50}]
     (folder / "studio.json").write_text(json.dumps({"render_width": 8, "render_height": 6, "camera_path": path}))
 
 
-def _read_cameras(folder: Path):
-    from sehdr_warp.scene.camera_files import load_cameras
-
-    return each(folder, "*.json", load_cameras)
+def _load(folder: Path):
+    return load_scene(folder, response="srgb")
 
 
-def each(folder: Path, pattern_: str, read):
-    """read(path) of every file, though some raise: the first error is raised at the end."""
-    from sehdr_warp.errors import SehdrError
-
-    problem = None
-    for path in sorted(folder.glob(pattern_)):
-        try:
-            read(path)
-        except SehdrError as error:
-            problem = problem or error
-    if problem:
-        raise problem
+def _read_photo(path: Path):
+    return read_ldr(path, oriented=True)
 
 
+def _llff(folder: Path) -> None:
+    write_llff(folder, 4, size=(16, 12))
+
+
+_RUN_FILES = ("*.json", "metrics.jsonl")
 READERS = {
-    "colmap-binary": Reader(lambda f: _colmap(f, True), ("sparse/0/*.bin",), _read_colmap),
-    "colmap-text": Reader(lambda f: _colmap(f, False), ("sparse/0/*.txt",), _read_colmap, text=True),
-    "transforms": Reader(_transforms, ("transforms.json",), _read_transforms, text=True),
-    "hdr-nerf": Reader(_hdr_nerf, ("*.json", "sparse/0/*"), _read_transforms, text=True),
-    "exposures": Reader(_exposures, ("exposures.json",), _load_scene, text=True),
-    "scene": Reader(_transforms, ("transforms.json", "images/*"), _load_scene, text=True),
-    "llff": Reader(_llff, ("poses_bounds.npy",), _read_llff),
-    "ply-points": Reader(_points, ("*.ply",), _read_points, text=True),
-    "exr": Reader(_exr, ("*.exr",), _read_exr),
-    "radiance": Reader(_radiance, ("*.hdr",), _read_radiance),
-    "photos": Reader(_photos, ("*",), _read_photos),
-    "config": Reader(_config, ("*.toml",), _read_config, text=True),
-    "run": Reader(_run, ("*.json", "metrics.jsonl"), _read_run, text=True),
+    "colmap-binary": Reader(_colmap(True), ("sparse/0/*.bin",), read_colmap),
+    "colmap-text": Reader(_colmap(False), ("sparse/0/*.txt",), read_colmap, text=True),
+    "transforms": Reader(_transforms, ("transforms.json",), read_transforms, text=True),
+    "hdr-nerf": Reader(_hdr_nerf, ("*.json", "sparse/0/*"), read_hdr_nerf, text=True),
+    "exposures": Reader(_exposures, ("exposures.json",), _load, text=True),
+    "scene": Reader(_transforms, ("transforms.json", "images/*"), _load, text=True),
+    "llff": Reader(_llff, ("poses_bounds.npy",), read_llff),
+    "ply-points": Reader(_points, ("*.ply",), each(read_ply_points), text=True),
+    "exr": Reader(_exr, ("*.exr",), each(hdr_size, read_hdr, read_exr)),
+    "radiance": Reader(_radiance, ("*.hdr",), each(read_hdr)),
+    "photos": Reader(_photos, ("*",), each(image_sizes, read_mask, exif_exposure, _read_photo)),
+    "config": Reader(_config, ("*.toml",), each(load_config), text=True),
+    "run": Reader(_run, _RUN_FILES, _read_run, text=True),
     "checkpoint": Reader(_run, ("checkpoints/*/*",), _read_run, text=True, repair=_resign),
-    "resume": Reader(_run, ("*.json", "metrics.jsonl", "checkpoints/*/*"), _read_resume, text=True, repair=_resign),
-    "responses": Reader(_responses, ("*",), _read_responses, text=True),
-    "cameras": Reader(_cameras, ("*.json",), _read_cameras, text=True),
+    "resume": Reader(_run, (*_RUN_FILES, "checkpoints/*/*"), _resume, text=True, repair=_resign),
+    "responses": Reader(_responses, ("*",), each(_read_response), text=True),
+    "cameras": Reader(_cameras, ("*.json",), each(load_cameras), text=True),
 }
 
 

@@ -13,11 +13,7 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.hdr_files import hdr_size, read_hdr
 from sehdr_warp.scene.images import image_sizes, read_ldr
-from sehdr_warp.scene.resample import (
-    area_average,
-    limited_size,
-    restore_clipping,
-)
+from sehdr_warp.scene.resample import area_average, limited_size
 
 RNG = np.random.default_rng(1)
 
@@ -148,11 +144,6 @@ def test_area_average_is_exact(width, height, data):
     fine = image.repeat(small[1], axis=0).repeat(small[0], axis=1)
     expected = fine.reshape(small[1], height, small[0], width, 2).mean(axis=(1, 3))
     np.testing.assert_allclose(area_average(image, *small), expected, atol=1e-5)
-
-
-def test_clipping_survives_where_it_covers_half():
-    share = np.array([0.0, 0.49, 0.5, 1.0])
-    np.testing.assert_array_equal(restore_clipping(np.full(4, 0.7, np.float32), share), np.float32([0.7, 0.7, 1, 1]))
 
 
 def test_limited_size():

@@ -17,25 +17,15 @@ from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import _held_out
 from sehdr_warp.scene.names import natural_key, unique_names
 from sehdr_warp.scene.sfm import reconstruct
-from tests.make_scenes import load, write_blender, write_colmap
+from tests.make_scenes import load, write_blender, write_colmap, write_ply
 
 _TIME, _NUMBER, _ISO, _APEX = 33434, 33437, 34855, 37377
 
 
 def test_exif_times_count_sensitivity_and_aperture(tmp_path):
-    settings = [
-        (1 / 100, 100, 4),
-        (1 / 50, 100, 4),
-        (1 / 100, 200, 4),
-        (1 / 100, 100, 8),
-        (1 / 200, 400, 4),
-        (1, 100, 4),
-    ]
-    write_colmap(
-        tmp_path,
-        name="{:03d}.jpg",
-        exif={i: {_TIME: t, _ISO: iso, _NUMBER: n} for i, (t, iso, n) in enumerate(settings)},
-    )
+    settings = [(0.01, 100, 4), (0.02, 100, 4), (0.01, 200, 4), (0.01, 100, 8), (0.005, 400, 4), (1, 100, 4)]
+    exif = {i: {_TIME: t, _ISO: iso, _NUMBER: n} for i, (t, iso, n) in enumerate(settings)}
+    write_colmap(tmp_path, name="{:03d}.jpg", exif=exif)
     scene = load(tmp_path)
     light = [t * iso / 100 * (4 / n) ** 2 for t, iso, n in settings]
     np.testing.assert_allclose([view.exposure_time for view in scene.views], light, rtol=1e-5)
@@ -72,8 +62,7 @@ def test_splits(tmp_path):
 
 def test_layouts_without_a_protocol_hold_out_the_middle_of_each_block(tmp_path):
     write_blender(tmp_path, 13, ply_file_path="p.ply")
-    (tmp_path / "p.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
-                                    "property float z\nend_header\n0 0 0\n")  # fmt: skip
+    write_ply(tmp_path / "p.ply", [(0, 0, 0)])
     scene = load(tmp_path)
     assert [view.name for view in scene.test_views] == ["r_4"], "not the last of the arc"
     assert "1 of 13 views are held out for testing: r_4" in scene.notes
@@ -183,8 +172,8 @@ def test_embedded_scene_loads():
 
 
 def test_the_room_is_light_and_transforms_need_no_pycolmap(tmp_path):
-    """Also where lenses distort; triangulating points does need it."""
-    write_blender(tmp_path, k1=-0.1)
+    """Unless lenses distort or points are to be triangulated."""
+    write_blender(tmp_path)
     write_colmap(tmp_path / "colmap")
     heavy = "{'torch', 'warp', 'pycolmap', 'OpenEXR', 'scipy', 'matplotlib', 'colour'}"
     code = f"import sys, sehdr_warp.scene as s; print(sorted({heavy} & set(sys.modules)))\n"

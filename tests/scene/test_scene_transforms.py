@@ -16,8 +16,10 @@ from tests.make_scenes import (
     room_views,
     write_blender,
     write_colmap,
+    write_llff,
+    write_ply,
     write_room,
-)
+)  # fmt: skip
 
 
 def _edit(folder, **fields):
@@ -27,10 +29,7 @@ def _edit(folder, **fields):
 
 def test_blender_poses_become_opencv(tmp_path):
     write_blender(tmp_path, 9, ply_file_path="cloud.ply")
-    (tmp_path / "cloud.ply").write_text(
-        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
-        "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n0 0 0 255 0 0\n1 2 3 0 0 51\n"
-    )
+    write_ply(tmp_path / "cloud.ply", [(0, 0, 0), (1, 2, 3)], [(255, 0, 0), (0, 0, 51)])
     scene = load(tmp_path)
     assert [view.name for view in scene.test_views] == ["r_4"] and scene.format == "transforms"
     for view, pose in zip(scene.views, arc_poses(9), strict=True):
@@ -45,6 +44,15 @@ def test_transparent_pixels_show_black_light(tmp_path):
     view = load(tmp_path, cache=tmp_path / "cache").views[0]
     assert view.image[:, :20].max() == 0 and view.mask is None
     np.testing.assert_allclose(view.image[:, 20:], pattern(40, 30, 0)[:, 20:] / 255, atol=1e-6)
+
+
+def test_clipping_survives_where_it_covers_half(tmp_path):
+    write_blender(tmp_path)
+    photo = np.full((30, 40, 3), 128, np.uint8)
+    photo[::2, :20] = photo[::2, 20::2] = 255
+    Image.fromarray(photo).save(tmp_path / "images" / "r_0.png")
+    image = load(tmp_path, max_size=20, cache=tmp_path / "cache").views[0].image
+    assert image[:, :10].min() == 1 and image[:, 10:].min() > 0.5 and image[:, 10:].max() < 0.9
 
 
 def test_frame_values_win_over_the_files(tmp_path):
@@ -102,7 +110,7 @@ def test_exr_alone_is_refused_and_beside_a_photo_is_truth(tmp_path):
     scene = load(tmp_path, cache=tmp_path / "cache")
     assert [view.hdr.max() for view in scene.views] == [1, 2, 3, 4, 5, 6]
     (tmp_path / "images" / "r_2.png").unlink()
-    with pytest.raises(InputError, match=r"r_2.exr: is the frame's only image"):
+    with pytest.raises(InputError, match=r"r_2.exr: is the view's only image"):
         load(tmp_path)
 
 
@@ -169,26 +177,50 @@ def test_impossible_exposures_are_refused(room, tmp_path, value, message):
 
 
 def test_hdr_nerf_real_layout(tmp_path):
+    poses, seconds = write_llff(tmp_path, size=(40, 30)), (0.1, 0.4, 1.6)
     (tmp_path / "input_images").mkdir()
-    rows = []
-    for i, pose in enumerate(arc_poses(6)):
-        for k, seconds in enumerate((0.1, 0.4, 1.6)):
-            Image.fromarray(pattern(40, 30, i)).save(tmp_path / "input_images" / f"{i:03d}_{k}.jpg", quality=95)
-            right, down, forward, position = np.linalg.inv(pose)[:3].T
-            matrix = np.stack([down, right, -forward, position, [120, 160, 200]], axis=1)
-            rows.append([*matrix.ravel(), 1.0, 9.0, seconds])
-    np.save(tmp_path / "poses_bounds_exps.npy", np.array(rows))
+    for i in range(6):
+        for k in range(3):
+            (tmp_path / "input_images" / f"{i:03d}_{k}.png").symlink_to(tmp_path / "images" / f"{i:03d}.png")
+    rows = np.load(tmp_path / "poses_bounds.npy").repeat(3, axis=0)
+    rows = np.concatenate([rows, np.tile(seconds, 6)[:, None]], axis=1)
+    np.save(tmp_path / "poses_bounds_exps.npy", rows)
     scene = load(tmp_path, exposure_index=1, cache=tmp_path / "cache")
     assert scene.format == "hdr-nerf-real" and [view.name for view in scene.test_views] == ["001", "003", "005"]
-    for view, pose in zip(scene.views, arc_poses(6), strict=True):
+    for view, pose in zip(scene.views, poses, strict=True):
         np.testing.assert_allclose(view.camera.world_to_camera, pose, atol=1e-9)
         assert view.exposure_time == 0.4 and (view.camera.fx, view.camera.cx) == (50, 20)
-    np.save(tmp_path / "poses_bounds_exps.npy", np.array(rows)[:, :17])
+    np.save(tmp_path / "poses_bounds_exps.npy", rows[:, :17])
     with pytest.raises(InputError, match=r"not an \[n, 18\] array"):
         load(tmp_path)
     with (tmp_path / "poses_bounds_exps.npy").open("wb") as file:
         np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (1 << 40, 18)})
     with pytest.raises(InputError, match=r"not an \[n, 18\] array"):
+        load(tmp_path)
+
+
+def test_llffs_axes_size_and_focal_length(tmp_path):
+    poses = write_llff(tmp_path)
+    scene = load(tmp_path, cache=tmp_path / "cache")
+    assert scene.format == "llff" and [view.name for view in scene.views] == [f"{i:03d}" for i in range(6)]
+    for i, (view, pose) in enumerate(zip(scene.views, poses, strict=True)):
+        np.testing.assert_allclose(view.camera.world_to_camera, pose, atol=1e-9)
+        assert (view.camera.width, view.camera.height, view.camera.fx, view.camera.cx) == (64, 48, 50.0, 32.0)
+        np.testing.assert_allclose(view.image, pattern(64, 48, seed=i) / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda rows: rows[:-1], "5 rows for 6 images"),
+        (lambda rows: rows[:, :-1], "is not an \\[n, 17\\] array"),
+        (lambda rows: np.where(np.arange(17) == 3, np.nan, rows), "is not finite"),
+    ],
+)
+def test_llff_rows_that_do_not_fit_are_refused(tmp_path, spoil, message):
+    write_llff(tmp_path)
+    np.save(tmp_path / "poses_bounds.npy", spoil(np.load(tmp_path / "poses_bounds.npy")))
+    with pytest.raises(InputError, match=message):
         load(tmp_path)
 
 
@@ -223,7 +255,7 @@ def test_cameras_from_every_kind_of_file(tmp_path):
         ('{"cameras": []}', "no cameras"),
         ('{"cameras": [{"width": 4}]}', "has no height"),
         ('{"cameras": [5]}', "cannot be used"),
-        ('{"camera_path": [{}], "render_width": 4, "render_height": 4}', "camera_to_world is missing"),
+        ('{"camera_path": [{}], "render_width": 4, "render_height": 4}', "has no fov"),
     ],
 )
 def test_bad_camera_files_are_refused(tmp_path, content, message):
