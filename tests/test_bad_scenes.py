@@ -21,21 +21,9 @@ def data(tmp_path):
 
 
 @pytest.fixture
-def binary(tmp_path):
-    write_colmap(tmp_path / "data", binary=True)
-    return tmp_path / "data"
-
-
-@pytest.fixture
 def frames(tmp_path):
     write_blender(tmp_path / "data")
     return tmp_path / "data"
-
-
-def replace_bytes(path, old: bytes, new: bytes):
-    content = path.read_bytes()
-    assert old in content
-    path.write_bytes(content.replace(old, new, 1))
 
 
 def png_chunk(kind: bytes, content: bytes) -> bytes:
@@ -105,64 +93,55 @@ def test_colmap_text(data, capfd, case):
     assert words in train_refused(capfd, data)
 
 
+def put(at: int, layout: str, *values):
+    """What packs values over a file's bytes from `at` on."""
+    new = struct.pack(layout, *values)
+    return lambda content: content[:at] + new + content[at + len(new) :]
+
+
+def observations(content: bytes) -> bytes:
+    return put(content.index(b"000.png") + 8, "<Q", 2**61)(content)
+
+
+PICKLE = b"cos\nsystem\n(S'id'\ntR."
 COLMAP_BINARY = {
     "cameras truncated": ("cameras.bin", lambda content: content[:20], "cameras.bin"),
     "cameras empty": ("cameras.bin", lambda content: b"", "empty"),
-    "huge camera count": ("cameras.bin", lambda content: struct.pack("<Q", 2**60) + content[8:], "count"),
-    "huge image count": ("images.bin", lambda content: struct.pack("<Q", 2**63 + 5) + content[8:], "count"),
-    "huge point count": ("points3D.bin", lambda content: struct.pack("<Q", 2**40) + content[8:], "count"),
-    "unterminated name": (
-        "images.bin",
-        lambda content: content[: content.index(b"000.png")] + b"a" * 9000,
-        "no end within",
-    ),
-    "huge count of observations": (
-        "images.bin",
-        lambda content: (
-            content[: (end := content.index(b"000.png") + 8)] + struct.pack("<Q", 2**61) + content[end + 8 :]
-        ),
-        "count",
-    ),
-    "zero quaternion": ("images.bin", lambda content: content[:12] + bytes(32) + content[44:], "quaternion"),
-    "no images": ("images.bin", lambda content: struct.pack("<Q", 0), "no registered views"),
+    "huge camera count": ("cameras.bin", put(0, "<Q", 2**60), "count"),
+    "huge image count": ("images.bin", put(0, "<Q", 2**63 + 5), "count"),
+    "huge point count": ("points3D.bin", put(0, "<Q", 2**40), "count"),
+    "huge track": ("points3D.bin", put(8 + 43, "<Q", 2**61), "count"),
+    "unterminated name": ("images.bin", lambda c: c[: c.index(b"000.png")] + b"a" * 9000, "no end within"),
+    "huge count of observations": ("images.bin", observations, "count"),
+    "zero quaternion": ("images.bin", put(12, "<4d", 0, 0, 0, 0), "quaternion"),
+    "no images": ("images.bin", put(0, "<Q", 0), "no registered views"),
     "name leaves": ("images.bin", lambda content: content.replace(b"000.png", b"../etc/p"), "'..'"),
-    "images are a pickle": (
-        "images.bin",
-        lambda content: b"\x80\x04\x95" + b"cos\nsystem\n(S'id'\ntR." * 9,
-        "images.bin",
-    ),
-    "unknown camera model": (
-        "cameras.bin",
-        lambda content: content[:12] + struct.pack("<i", 77) + content[16:],
-        "77",
-    ),
-    "NaN pose": ("images.bin", lambda content: content[:12] + struct.pack("<d", float("nan")) + content[20:], "finite"),
+    "images are a pickle": ("images.bin", lambda content: b"\x80\x04\x95" + PICKLE * 9, "images.bin"),
+    "unknown camera model": ("cameras.bin", put(12, "<i", 77), "77"),
+    "NaN pose": ("images.bin", put(12, "<d", float("nan")), "finite"),
 }
 
 
 @pytest.mark.parametrize("case", COLMAP_BINARY)
-def test_colmap_binary(binary, capfd, case):
+def test_colmap_binary(tmp_path, capfd, case):
     name, change, words = COLMAP_BINARY[case]
-    path = binary / "sparse" / "0" / name
+    write_colmap(tmp_path / "data", binary=True)
+    path = tmp_path / "data" / "sparse" / "0" / name
     path.write_bytes(change(path.read_bytes()))
-    assert words in train_refused(capfd, binary)
+    assert words in train_refused(capfd, tmp_path / "data")
 
 
-def _save_exr(path, pixels, **header):
+def _truth(data, value=0.5):
     import OpenEXR
 
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
+    pixels = np.full((48, 64, 3), 0.5, np.float32)
+    pixels[7, 3, 1] = value
+    (data / "hdr").mkdir(exist_ok=True)
+    path = data / "hdr" / "001.exr"
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, {"RGB": pixels}) as file:
         file.write(str(path))
-
-
-def _truth(data, value=None):
-    pixels = np.full((48, 64, 3), 0.5, np.float32)
-    if value is not None:
-        pixels[7, 3, 1] = value
-    (data / "hdr").mkdir(exist_ok=True)
-    _save_exr(data / "hdr" / "001.exr", pixels)
-    return data / "hdr" / "001.exr"
+    return path
 
 
 def _huge_window(path):
@@ -174,19 +153,23 @@ def _huge_window(path):
     path.write_bytes(content)
 
 
+def photo(content):
+    """What puts bytes, or what is made of the photo's own, in the place of one photo."""
+
+    def change(data):
+        path = data / "images" / "002.png"
+        path.write_bytes(content(path.read_bytes()) if callable(content) else content)
+
+    return change
+
+
 PHOTOS = {
-    "empty": (lambda data: (data / "images" / "002.png").write_bytes(b""), "002.png"),
-    "truncated": (
-        lambda data: (data / "images" / "002.png").write_bytes((data / "images" / "002.png").read_bytes()[:900]),
-        "002.png",
-    ),
-    "a pickle": (lambda data: (data / "images" / "002.png").write_bytes(b"cos\nsystem\n(S'id'\ntR."), "002.png"),
-    "a bomb": (lambda data: (data / "images" / "002.png").write_bytes(png_bomb(100_000, 100_000)), "100000 x 100000"),
-    "a bomb of stated size": (lambda data: (data / "images" / "002.png").write_bytes(png_bomb(64, 48)), "002.png"),
-    "another size": (
-        lambda data: Image.new("RGB", (30, 40), "grey").save(data / "images" / "002.png"),
-        "30 x 40",
-    ),
+    "empty": (photo(b""), "002.png"),
+    "truncated": (photo(lambda content: content[:900]), "002.png"),
+    "a pickle": (photo(PICKLE), "002.png"),
+    "a bomb": (photo(png_bomb(100_000, 100_000)), "100000 x 100000"),
+    "a bomb of stated size": (photo(png_bomb(64, 48)), "002.png"),
+    "another size": (lambda data: Image.new("RGB", (30, 40), "grey").save(data / "images" / "002.png"), "30 x 40"),
     "a mask of another size": (
         lambda data: ((data / "masks").mkdir(), Image.new("L", (30, 40)).save(data / "masks" / "002.png")),
         "30 x 40",
