@@ -61,8 +61,8 @@ class ExposeTruth:
 class PackTruth:
     """Write rendered truth as half floats, small enough to ship, and measure what that costs."""
 
-    truth: Positional[Path]
-    """Folder of a rendered scene."""
+    folder: Positional[Path]
+    """Of a rendered scene."""
     out: Path
     """Folder for the small set."""
     compression: Literal["zip", "piz", "dwab"] = "dwab"
@@ -89,14 +89,15 @@ def run_synth(command: Synth) -> None:
 
 
 def _render(asked: RenderTruth) -> None:
-    from .mitsuba_variant import load_mitsuba
-    from .render import Settings, render_scene
+    from .render import Settings, load_mitsuba, render_scene
     from .scenes import recipes_named
 
     recipes = recipes_named(asked.name)
-    width, height = _size(asked.size)
+    width, _, height = asked.size.partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise SehdrError(f"--size {asked.size}: is not WIDTHxHEIGHT in pixels; write for example --size 200x200")
     views = numbers("--views", asked.views, int)
-    settings = Settings(width, height, asked.samples, asked.seed, views, asked.denoise)
+    settings = Settings(int(width), int(height), asked.samples, asked.seed, views, asked.denoise)
     mi = load_mitsuba(asked.variant)
     LOG.info("Mitsuba %s, %s", mi.__version__, mi.variant())
     for recipe in recipes:
@@ -108,8 +109,7 @@ def _expose(asked: ExposeTruth) -> None:
     from ..files import check_absent_folder
     from ..response import response_by_name
     from ..scene import load_scene
-    from .expose import SensorNoise, exposure_ladder
-    from .photo_set import write_photo_set
+    from .expose import SensorNoise, exposure_ladder, write_photo_set
 
     response = response_by_name(asked.response)
     for note in response.notes:
@@ -130,10 +130,9 @@ def _expose(asked: ExposeTruth) -> None:
 
 
 def _pack(asked: PackTruth) -> None:
-    from .pack import pack_truth
+    from .truth import pack_truth
 
-    options = {"compression": asked.compression, "level": asked.level, "overwrite": asked.overwrite}
-    packing = pack_truth(asked.truth, asked.out, **options)
+    packing = pack_truth(**vars(asked))
     print(
         f"{asked.out}: {packing['bytes'] / 1e6:.2f} MB, relative error {100 * packing['relative_error']:.2f} %, "
         f"{packing['mu_law_psnr']:.1f} dB (mu-law)"
@@ -141,10 +140,3 @@ def _pack(asked: PackTruth) -> None:
 
 
 _ACTIONS = {RenderTruth: _render, ExposeTruth: _expose, PackTruth: _pack}
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, cross, height = text.partition("x")
-    if not (cross and width.isdecimal() and height.isdecimal()):
-        raise SehdrError(f"--size {text}: is not WIDTHxHEIGHT in pixels; write for example --size 200x200")
-    return int(width), int(height)

@@ -1,44 +1,35 @@
-"""Photos of HDR truth: exposure, sensor noise, camera response, quantisation."""
+"""Photos of HDR truth: exposure, sensor noise, camera response, quantization; and whole sets of them.
 
+A `response` is any object with `clips`, `clip_exposure`, `white` and `encode` as response.Response has them.
+"""
+
+import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from ..errors import InputError
-from ..scene import Scene, View, codes_of
+from ..files import atomic_folder, atomic_path, write_json
+from ..output.exr import write_exr
+from ..scene import Camera, Scene, View, codes_of
 
 # Mertens et al. 2007, "Exposure Fusion": a value's well-exposedness is a Gaussian around one half.
-_WELL_EXPOSED_CENTRE, _WELL_EXPOSED_SIGMA = 0.5, 0.2
+_WELL_EXPOSED_CENTER, _WELL_EXPOSED_SIGMA = 0.5, 0.2
 # Enough samples for a ladder to a hundredth of a stop, whatever the number and size of the views.
 _MOST_SAMPLES = 200_000
 _STEPS_PER_STOP = 16
 
 
-class Curve(Protocol):
-    """What is needed of a camera response (model.response.Response has it), on NumPy arrays."""
-
-    @property
-    def clips(self) -> bool: ...
-
-    @property
-    def clip_exposure(self) -> float: ...
-
-    @property
-    def white(self) -> float: ...
-
-    def encode(self, exposure: np.ndarray) -> np.ndarray: ...
-
-
 @dataclass(frozen=True)
 class SensorNoise:
-    """Shot noise and read noise of a linear sensor.
+    """Shot noise and read noise of a linear sensor, in electrons.
 
-    full_well: electrons at saturation, that is at the response's clip_exposure; for a curve that only approaches its
-        peak, at the exposure that is stored as the brightest 8-bit code (Response.white). At least 1.
-    read_noise: standard deviation in electrons, at least 0.
+    full_well: at the response's clip_exposure; for a curve that only approaches its peak, at Response.white.
+    read_noise: standard deviation.
     """
 
     full_well: float = 20_000.0
@@ -51,86 +42,89 @@ class SensorNoise:
             raise InputError("sensor noise", f"read noise of {self.read_noise:g} electrons", "give 0 or more")
 
 
+@dataclass(frozen=True)
+class RadianceView:
+    """name: the view's stem (`r_0`); radiance: [H, W, 3] scene-linear, >= 0; split: "train" or "test"."""
+
+    name: str
+    camera: Camera
+    radiance: np.ndarray
+    split: str
+
+
 def expose(
     scene: Scene,
-    response: Curve,
+    response,
     exposure_time: float | Sequence[float],
     *,
     noise: SensorNoise | None = None,
     bits: int = 8,
     seed: int = 0,
 ) -> Scene:
-    """The scene as photographed: each image becomes response.encode(hdr * exposure_time), rounded to `bits` bits.
+    """The scene as photographed: each photo becomes response.encode(hdr * exposure_time), rounded to `bits` (1 to 16).
 
-    scene: every view has truth (View.hdr), which is kept.
-    exposure_time: seconds, positive; one for all views or one for each.
-    noise: applied to the linear exposure, before the response; None for none. Photons and read-out are drawn for each
-        view from (seed, its name), so a view's photo does not depend on which others there are.
-    bits: of a stored value, 1 to 16.
+    scene: every view has truth (View.hdr), which is kept. exposure_time: seconds; one for all views or one for each.
+    noise: applied to the exposure before the response, drawn for each view from (seed, its name).
+    Each point takes its new color from the training view whose old photo showed it most nearly in its old color, since
+    that view is the likeliest to see it unoccluded; one outside of all training views keeps its own.
 
-    Points keep their places. Each takes its new colour from the training view whose old photo showed it most nearly in
-    its old colour, since that view is the likeliest to see it unoccluded; one outside of all training views keeps its
-    own.
-
-    Raises InputError for a view without truth or an impossible time, ValueError for impossible bits or counts.
+    Raises InputError for a view without truth or an impossible time, ValueError for impossible bits.
     """
     times = np.broadcast_to(np.asarray(exposure_time, np.float64), len(scene.views))
     if not (np.isfinite(times).all() and (times > 0).all()):
         raise InputError(scene.name, f"exposure time {times.min():g} s is not positive and finite", "give seconds")
     if not 1 <= bits <= 16:
         raise ValueError(f"{bits} bits are not 1 to 16")
-    views = tuple(
-        replace(view, codes=_photo(scene, view, response, time, noise, bits, seed), exposure_time=float(time))
-        for view, time in zip(scene.views, times, strict=True)
-    )
-    colors = _recoloured(scene, views)
-    return replace(scene, views=views, point_colors=colors, exposure_times_known=True, response=None, chosen_by=None)
+    levels, views = 2**bits - 1, []
+    for view, time in zip(scene.views, times, strict=True):
+        exposure = _truth(scene, view).astype(np.float64) * time
+        if noise is not None:
+            rng = np.random.default_rng([seed, zlib.crc32(view.name.encode())])
+            exposure = _noisy(exposure, response.clip_exposure if response.clips else response.white, noise, rng)
+        codes = codes_of(np.round(np.clip(response.encode(exposure), 0.0, 1.0) * levels) / levels)
+        views.append(replace(view, codes=codes, exposure_time=float(time)))
+    made = {"views": tuple(views), "point_colors": _recolored(scene, views), "exposure_times_known": True}
+    return replace(scene, **made, response=None, chosen_by=None)
 
 
-def exposure_ladder(scene: Scene, response: Curve, count: int = 5, factor: float = 4.0) -> tuple[float, ...]:
+def exposure_ladder(scene: Scene, response, count: int = 5, factor: float = 4.0) -> tuple[float, ...]:
     """`count` exposure times, each `factor` times the last, around a well exposed one.
 
-    The middle time (of an even count, the geometric mean of the two in the middle) is the one that maximises the mean
-    well-exposedness exp(-(Z - 0.5)^2 / (2 * 0.2^2)) of the encoded values Z over the truth of the training views
-    (Mertens et al. 2007), to a sixteenth of a stop. What the photos show decides, not the brightest lamp.
+    The middle time (of an even count, the geometric mean of the two in the middle) maximizes the mean well-exposedness
+    exp(-(Z - 0.5)^2 / (2 * 0.2^2)) of the encoded values Z over the truth of the training views (Mertens et al. 2007),
+    to a sixteenth of a stop. What the photos show decides, not the brightest lamp.
 
     Raises InputError where a training view has no truth or all of it is black, ValueError for a count or factor that
     makes no ladder.
     """
+    truth = [_truth(scene, view) for view in scene.train_views]
+    return ladder_of(scene.name, truth, response.encode, count, factor)
+
+
+def ladder_of(name: str, images: Sequence[np.ndarray], encode: Callable, count: int = 5, factor: float = 4.0):
+    """exposure_ladder of radiance images through a curve; name: of what they show, for errors."""
     if count < 1 or not 1.0 < factor < 1e6:
         raise ValueError(f"{count} exposures {factor} times apart make no ladder")
-    radiance = np.concatenate([_truth(scene, view).ravel() for view in scene.train_views])
+    radiance = np.concatenate([image.ravel() for image in images])
     radiance = radiance[:: -(-len(radiance) // _MOST_SAMPLES)].astype(np.float64)
     lit = radiance[radiance > 0]
     if not len(lit):
-        raise InputError(scene.name, "the truth of the training views is black", "render it with light")
+        raise InputError(name, "the truth of the training views is black", "render it with light")
+
+    def well_exposedness(stop: float) -> float:
+        away = (encode(radiance * 2.0**stop) - _WELL_EXPOSED_CENTER) / _WELL_EXPOSED_SIGMA
+        return float(np.exp(-0.5 * away**2).mean())
+
     low, high = (np.log2(np.percentile(lit, share)) for share in (1, 99))
     # From the brightest parts at black to the darkest at white.
-    stops = np.arange(-high - 12, -low + 12, 1 / _STEPS_PER_STOP)
-    middle = 2.0 ** max(stops, key=lambda stop: _well_exposedness(response.encode(radiance * 2.0**stop)))
+    middle = 2.0 ** max(np.arange(-high - 12, -low + 12, 1 / _STEPS_PER_STOP), key=well_exposedness)
     return tuple(float(middle * factor ** (k - (count - 1) / 2)) for k in range(count))
-
-
-def _well_exposedness(values: np.ndarray) -> float:
-    return float(np.exp(-0.5 * ((values - _WELL_EXPOSED_CENTRE) / _WELL_EXPOSED_SIGMA) ** 2).mean())
 
 
 def _truth(scene: Scene, view: View) -> np.ndarray:
     if view.hdr is None:
         raise InputError(scene.name, f"view {view.name} has no HDR truth", "only scenes with truth can be exposed")
     return view.hdr
-
-
-def _photo(
-    scene: Scene, view: View, response: Curve, time: float, noise: SensorNoise | None, bits: int, seed: int
-) -> np.ndarray:
-    exposure = _truth(scene, view).astype(np.float64) * time
-    if noise is not None:
-        saturation = response.clip_exposure if response.clips else response.white
-        rng = np.random.default_rng([seed, zlib.crc32(view.name.encode())])
-        exposure = _noisy(exposure, saturation, noise, rng)
-    levels = 2**bits - 1
-    return codes_of(np.round(np.clip(response.encode(exposure), 0.0, 1.0) * levels) / levels)
 
 
 def _noisy(exposure: np.ndarray, saturation: float, noise: SensorNoise, rng: np.random.Generator) -> np.ndarray:
@@ -141,8 +135,8 @@ def _noisy(exposure: np.ndarray, saturation: float, noise: SensorNoise, rng: np.
     return np.clip(electrons, 0.0, noise.full_well) * (saturation / noise.full_well)
 
 
-def _recoloured(scene: Scene, views: tuple[View, ...]) -> np.ndarray:
-    """[P, 3] float32 colours of the points in the new photos."""
+def _recolored(scene: Scene, views: Sequence[View]) -> np.ndarray:
+    """[P, 3] float32 colors of the points in the new photos."""
     colors = scene.point_colors.astype(np.float32).copy()
     nearest = np.full(len(colors), np.inf)
     for old, new in zip(scene.views, views, strict=True):
@@ -162,3 +156,97 @@ def _recoloured(scene: Scene, views: tuple[View, ...]) -> np.ndarray:
         nearest[place] = difference
         colors[place] = new.image[row[place], column[place]]
     return colors
+
+
+def write_photo_set(scene: Scene, out: Path, response, times: Sequence[float], *, noise=None, seed=0, overwrite=False):
+    """Write an HDR-NeRF synthetic set of a scene with truth: photos at each time (seconds), poses, truth and points.
+
+    Noise is drawn anew for each time. Points have the colors of the middle time.
+    Raises InputError for a scene without truth, an impossible time, or cameras that the layout cannot hold.
+    """
+    if not times:
+        raise InputError(scene.name, "no exposure times are given", "give one or more, in seconds")
+    exposed = [expose(scene, response, time, noise=noise, seed=seed * len(times) + k) for k, time in enumerate(times)]
+    views = [RadianceView(view.name, view.camera, view.hdr, view.split) for view in scene.views]
+    points = (scene.points, exposed[len(times) // 2].point_colors) if len(scene.points) else None
+    photos = [[view.image for view in photographed.views] for photographed in exposed]
+    with atomic_folder(out, overwrite) as folder:
+        write_hdr_nerf_scene(folder, views, times, photos, points=points)
+
+
+def write_hdr_nerf_scene(
+    folder: Path,
+    views: Sequence[RadianceView],
+    exposure_times: Sequence[float],
+    photos: Sequence[Sequence[np.ndarray]],
+    *,
+    points: tuple[np.ndarray, np.ndarray] | None = None,
+) -> None:
+    """Write a set that load_scene reads, with HDR-NeRF's file names.
+
+    exposure_times: seconds. photos: at each time one of each view, [H, W, 3] encoded in [0, 1], stored in 8 bits.
+    points: ([P, 3] places, [P, 3] colors in [0, 1]). Truth is stored as half floats where they hold it.
+    Raises InputError for a camera that the layout cannot hold.
+    """
+    counts = {"train": 0, "test": 0}
+    for index, view in enumerate(views):
+        (folder / view.split).mkdir(parents=True, exist_ok=True)
+        for k, taken in enumerate(photos):
+            code = (np.clip(taken[index], 0.0, 1.0) * 255 + 0.5).astype(np.uint8)
+            Image.fromarray(code).save(folder / view.split / f"{view.name}_{k}.png")
+        write_radiance(truth_path(folder, view.split, counts[view.split]), view.radiance)
+        counts[view.split] += 1
+    write_tables(folder, views, exposure_times, points)
+
+
+def truth_path(folder: Path, split: str, place: int) -> Path:
+    """The EXR of a split's frame number `place`."""
+    return folder / f"{split}_hdr" / f"hdr_{place:03d}.exr"
+
+
+def write_radiance(path: Path, radiance: np.ndarray, **options) -> None:
+    """[H, W, 3] as OpenEXR; options: as write_exr takes them."""
+    write_exr(path, dict(zip("RGB", np.moveaxis(radiance, 2, 0), strict=True)), overwrite=True, **options)
+
+
+def write_tables(folder: Path, views: Sequence[RadianceView], times: Sequence[float], points, **stated) -> None:
+    """A set's poses, times and points: all but its pictures. stated: more of transforms_<split>.json.
+
+    Raises InputError for cameras that differ, or have no square pixels or centered principal point.
+    """
+    for split in ("train", "test"):
+        chosen = [view for view in views if view.split == split]
+        frames, exposures = [], {}
+        for view in chosen:
+            matrix = view.camera.camera_to_world.copy()
+            matrix[:3, 1:3] *= -1  # To OpenGL's axes.
+            frames.append({"file_path": f"./{split}/{view.name}", "transform_matrix": matrix.tolist()})
+            exposures |= {f"./{split}/{view.name}_{k}.png": float(time) for k, time in enumerate(times)}
+        if chosen:
+            head = {"camera_angle_x": _view_angle(views), **stated, "frames": frames}
+            write_json(folder / f"transforms_{split}.json", head, overwrite=True)
+            write_json(folder / f"exposure_{split}.json", exposures, overwrite=True)
+    if points is not None:
+        _write_points(folder / "points3d.ply", *points)
+
+
+def _view_angle(views: Sequence[RadianceView]) -> float:
+    angles = {2 * math.atan(0.5 * view.camera.width / view.camera.fx) for view in views}
+    for camera in (view.camera for view in views):
+        centered = np.allclose([camera.cx, camera.cy], [camera.width / 2, camera.height / 2], atol=1e-6)
+        if len(angles) > 1 or not centered or not np.isclose(camera.fx, camera.fy, rtol=1e-9):
+            problem = "has cameras that differ, or without square pixels and a centered principal point"
+            raise InputError("the set", problem, "expose a set in HDR-NeRF's layout")
+    return angles.pop()
+
+
+def _write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
+    from plyfile import PlyData, PlyElement
+
+    kinds = [(axis, "f4") for axis in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    columns = [*np.asarray(points).T, *np.clip(np.round(np.asarray(colors).T * 255), 0, 255)]
+    vertices = np.empty(len(points), kinds)
+    for (name, _), column in zip(kinds, columns, strict=True):
+        vertices[name] = column
+    with atomic_path(path, overwrite=True) as temporary:
+        PlyData([PlyElement.describe(vertices, "vertex")]).write(str(temporary))

@@ -1,11 +1,14 @@
-"""Renders a scene's views by path tracing, view by view, resumable, and writes the set of truth."""
+"""Renders a scene's views by path tracing with Mitsuba 3, view by view, resumable, and writes the set of truth."""
 
+import importlib.util
 import json
 import logging
+import subprocess
+import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -13,21 +16,69 @@ import numpy as np
 from .. import __version__
 from ..errors import InputError, SehdrError
 from ..files import atomic_path, write_json
-from ..output.exr import exr_header, read_exr, write_exr
+from ..output.exr import exr_header
 from ..scene import Camera
+from ..scene.hdr_files import read_hdr
 from .cameras import VIEWS, make_cameras, split_of
-from .denoise import Denoiser, check_denoiser, denoiser_version
-from .photo_set import RadianceView
+from .expose import RadianceView, truth_path, write_radiance
 from .scenes import Recipe
-from .stage import Stage
-from .truth_set import truth_path, write_truth_tables
+from .stage import Stage, two_sided
+from .truth import write_truth_tables
 
 LOG = logging.getLogger(__name__)
-# Samples of one launch, over all pixels: what fits memory (the wavefront variants hold every ray at once).
-_RAYS = {"cuda_ad_rgb": 2**24, "llvm_ad_rgb": 2**21, "scalar_rgb": 2**40}
+# From the fastest: an NVIDIA GPU with OptiX in its driver, LLVM 16 or later, plain C++ on all cores. With each, the
+# samples of one launch over all pixels that fit memory: the wavefront variants hold every ray at once.
+VARIANTS = {"cuda_ad_rgb": 2**24, "llvm_ad_rgb": 2**21, "scalar_rgb": 2**40}
+DENOISERS = ("none", "oidn")
+# Rays of a pixel for the denoiser's guides, to the first surface only.
+_GUIDE_SAMPLES = 64
 # Surface points kept of each training view.
 _POINTS_OF_A_VIEW = 1200
 _OPENCV_TO_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's camera: +x left, +y up, +z forward.
+_WHITE = {"type": "rgb", "value": [1.0, 1.0, 1.0]}
+
+# An LLVM that is too old ends the whole process, and a driver without OptiX fails at the first ray: hence a process of
+# its own, and a render in it.
+_PROBE = """
+import sys, mitsuba as mi
+mi.set_variant(sys.argv[1])
+scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "light": {"type": "constant"},
+    "ball": {"type": "sphere"},
+    "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}}})
+import numpy as np
+assert np.isfinite(np.array(mi.render(scene, spp=1))).all()
+"""
+
+
+def load_mitsuba(variant: str = "auto"):
+    """The mitsuba module with a variant set: one of VARIANTS, or "auto" for the first that works here.
+
+    Raises SehdrError where Mitsuba is missing, or the variant does not run on this machine.
+    """
+    if importlib.util.find_spec("mitsuba") is None:
+        raise SehdrError("Mitsuba 3 renders the scenes and is not installed; pip install 'sehdr-warp[synth]'")
+    if variant == "auto":
+        variant = next((name for name in [*VARIANTS][:-1] if _probe(name) is None), "scalar_rgb")
+    elif (reason := _probe(variant)) is not None:
+        raise SehdrError(f"--variant {variant}: does not run here ({reason}); take auto or scalar_rgb")
+    import mitsuba
+
+    mitsuba.set_variant(variant)
+    return mitsuba
+
+
+def _probe(variant: str, seconds: float = 120.0) -> str | None:
+    """None where a variant renders on this machine, else why it does not, in a line."""
+    command = [sys.executable, "-c", _PROBE, variant]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)
+    except subprocess.TimeoutExpired:
+        return f"no picture within {seconds:.0f} s"
+    if done.returncode == 0:
+        return None
+    lines = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+    telling = [line for line in lines if "rror" in line or "LLVM" in line or "could not" in line.lower()]
+    return f"{(telling or lines or ['no message'])[-1]:.160}"
 
 
 @dataclass(frozen=True)
@@ -35,7 +86,7 @@ class Settings:
     """What the pixels of a set depend on.
 
     width, height: pixels; samples: light paths of a pixel, to be multiplied by the recipe's effort; seed: of geometry,
-    textures and paths; views: numbers in [0, 35) or None for all; denoise: one of denoise.DENOISERS.
+    textures and paths; views: numbers in [0, 35) or None for all; denoise: one of DENOISERS.
     """
 
     width: int = 200
@@ -55,29 +106,33 @@ class Settings:
         wrong = [view for view in self.views or () if not 0 <= view < VIEWS]
         if wrong or self.views == ():
             raise SehdrError(f"--views {wrong}: views are numbered from 0 to {VIEWS - 1}")
-        check_denoiser(self.denoise)
+        if self.denoise not in DENOISERS:
+            raise SehdrError(f"--denoise {self.denoise:.40}: is not one of {', '.join(DENOISERS)}")
+        if self.denoise == "oidn" and importlib.util.find_spec("pyoidn") is None:
+            remedy = "pip install 'sehdr-warp[synth]', or take --denoise none"
+            raise SehdrError(f"Open Image Denoise is not installed; {remedy}")
 
 
-def render_scene(mi, recipe: Recipe, out: Path | str, settings: Settings) -> Path:
+def render_scene(mi, recipe: Recipe, out: Path, settings: Settings) -> Path:
     """Render `out`/<name>: finished views are kept, so a run that was stopped goes on. Returns the folder.
 
     mi: from load_mitsuba. Each view is the mean of its paths a pixel under a box filter, without clamping: unbiased
-    but for paths longer than the recipe's depth, which all views lack alike. The halves of the samples, compared, give
-    the noise of that mean (in synth.json). Settings.denoise "oidn" then trades most of it for a bias of the denoiser's.
+    but for paths longer than the recipe's depth. The halves of the samples, compared, give the noise of that mean (in
+    synth.json). Settings.denoise "oidn" then trades most of it for a bias of the denoiser's.
 
     A seed gives the same things and lights again. The paths, and with them the noise, may differ: Mitsuba does not
     number its lights in the same order each time.
 
     Raises InputError where the folder holds a set of other settings, SehdrError where a pixel is not finite.
     """
-    folder = Path(out) / recipe.name
-    chosen = sorted(settings.views or range(VIEWS))
+    folder = out / recipe.name
     _claim(folder, recipe, settings)
     cameras = make_cameras(recipe.layout, settings.width, settings.height)
-    places, counts = {}, {"train": 0, "test": 0}
-    for view in chosen:
-        places[view] = truth_path(folder, split_of(view), counts[split_of(view)])
-        counts[split_of(view)] += 1
+    chosen = sorted(settings.views or range(VIEWS))
+    places = {}
+    for split in ("train", "test"):
+        views = [view for view in chosen if split_of(view) == split]
+        places |= {view: truth_path(folder, split, place) for place, view in enumerate(views)}
     missing = [view for view in chosen if not (places[view].is_file() and _aside(folder, view).is_file())]
     if len(missing) < len(chosen):
         LOG.info("%s: %d of %d views are there already", recipe.name, len(chosen) - len(missing), len(chosen))
@@ -134,37 +189,34 @@ def _check_light(radiance: np.ndarray, found: str, remedy: str) -> None:
         raise SehdrError(f"{found} pixels that are not finite or negative; {remedy}")
 
 
-def _render_view(mi, scene, recipe: Recipe, camera: Camera, view: int, settings: Settings, denoiser: Denoiser | None,
-                 path: Path, aside: Path) -> str:  # fmt: skip
+def _render_view(mi, scene, recipe, camera, view: int, settings, denoiser, path: Path, aside: Path) -> str:
     started = time.perf_counter()
     sensor = _sensor(mi, camera)
     tracer = mi.load_dict({"type": "path", "max_depth": recipe.depth, "rr_depth": 6})
-    halves = [np.zeros((camera.height, camera.width, 3)) for _ in range(2)]
+    halves, counts = np.zeros((2, camera.height, camera.width, 3)), [0, 0]
     samples = settings.samples * recipe.effort
-    largest = max(1, _RAYS[mi.variant()] // (camera.width * camera.height))
+    largest = max(1, VARIANTS[mi.variant()] // (camera.width * camera.height))
     launches = 2 * -(-samples // (2 * largest))
-    counts = [0, 0]
     for turn in range(launches):
         share = samples * (turn + 1) // launches - samples * turn // launches
         seed = ((settings.seed * VIEWS + view) * 4096 + turn) % 2**32
         image = mi.render(scene, sensor=sensor, integrator=tracer, spp=share, seed=seed)
         halves[turn % 2] += np.array(image, np.float64)[..., :3] * share
         counts[turn % 2] += share
-    radiance = (sum(halves) / samples).astype(np.float32)
+    radiance = (halves.sum(0) / samples).astype(np.float32)
     _check_light(radiance, f"{recipe.name}: view {view} has", "take another --seed")
-    noise = _noise(*(half / count for half, count in zip(halves, counts, strict=True)))
+    noise = _noise(halves[0] / counts[0], halves[1] / counts[1])
     if denoiser is not None:
         radiance = denoiser(radiance, sensor, (settings.seed * VIEWS + view) % 2**32)
         _check_light(radiance, f"{recipe.name}: view {view}, denoised, has", "take --denoise none, with more --samples")
     seconds = time.perf_counter() - started
-    found = {"seconds": seconds, "noise": noise, "largest": radiance.max()}
+    found = {"seconds": seconds, "noise": noise}
     if split_of(view) == "train":
         found |= _surface_points(mi, scene, sensor, radiance, view)
     with atomic_path(aside, overwrite=True) as temporary:
         np.savez_compressed(temporary, **found)
     header = exr_header(camera=camera, provenance={"scene": recipe.name, "samples": str(samples)})
-    channels = dict(zip("RGB", np.moveaxis(radiance, 2, 0), strict=True))
-    write_exr(path, channels, pixel="float", header=header, overwrite=True)
+    write_radiance(path, radiance, pixel="float", header=header)
     return f"{seconds:.1f} s, {radiance.min():.3g} to {radiance.max():.4g}, noise {-20 * np.log10(noise + 1e-9):.1f} dB"
 
 
@@ -186,33 +238,77 @@ def _surface_points(mi, scene, sensor, radiance: np.ndarray, view: int) -> dict[
 
 
 def _finish(mi, recipe: Recipe, folder: Path, settings: Settings, cameras: dict[int, Camera], places: dict[int, Path]):
-    views, points, colours, seconds, noise = [], [], [], [], []
+    views, figures = [], []
     for view, camera in cameras.items():
-        pixels, _, _ = read_exr(places[view])
-        views.append(RadianceView(f"r_{view}", camera, pixels[..., :3], split_of(view)))
+        views.append(RadianceView(f"r_{view}", camera, read_hdr(places[view]), split_of(view)))
         with np.load(_aside(folder, view)) as found:
-            seconds.append(float(found["seconds"]))
-            noise.append(float(found["noise"]))
-            if "points" in found:
-                points.append(found["points"])
-                colours.append(found["radiance"])
+            figures.append(dict(found))
+    luminance = np.concatenate([(view.radiance @ [0.2126, 0.7152, 0.0722]).ravel() for view in views])
+    low, high = np.maximum(np.percentile(luminance, [1, 99.9]), 1e-30)
     making = asdict(settings) | {
         "scene": recipe.name,
         "title": recipe.title,
         "paths_of_a_pixel": settings.samples * recipe.effort,
         "generator": f"sehdr-warp {__version__}, Mitsuba {mi.__version__}, {mi.variant()}",
-        "seconds": sum(seconds),
-        "noise_db": -20 * float(np.log10(np.sqrt(np.mean(np.square(noise))) + 1e-9)),
-        "decades": dynamic_range([view.radiance for view in views]),
+        "seconds": float(sum(found["seconds"] for found in figures)),
+        "noise_db": -10 * float(np.log10(np.mean([found["noise"] ** 2 for found in figures]) + 1e-18)),
+        # Of luminance, between the 1st and the 99.9th percentile.
+        "decades": float(np.log10(high / low)),
     }
-    empty = [np.zeros((0, 3), np.float32)]
     if settings.denoise == "oidn":
-        making["denoiser"] = denoiser_version()
-    write_truth_tables(folder, views, np.concatenate(points or empty), np.concatenate(colours or empty), making)
+        making["denoiser"] = f"Open Image Denoise (pyoidn {version('pyoidn')})"
+    empty = np.zeros((0, 3), np.float32)
+    cloud = (np.concatenate([empty, *(f[key] for f in figures if key in f)]) for key in ("points", "radiance"))
+    write_truth_tables(folder, views, *cloud, making)
 
 
-def dynamic_range(images: Sequence[np.ndarray]) -> float:
-    """Decades of luminance (Rec.709) between the 1st and the 99.9th percentile over all pixels."""
-    luminance = np.concatenate([(image @ np.array([0.2126, 0.7152, 0.0722])).ravel() for image in images])
-    low, high = np.percentile(luminance, [1, 99.9])
-    return float(np.log10(max(high, 1e-30) / max(low, 1e-30)))
+class Denoiser:
+    """Denoises the views of one scene by Open Image Denoise.
+
+    The guides are each pixel's albedo and shading normal: they hold edges and textures, and have no light in them, so
+    hardly any noise. Where more than half of a pixel's radiance comes straight from a light or the sky it is kept as
+    rendered: such light has no path noise, and at 10^5 times its surroundings a filter would spill it.
+
+    mi: the imported mitsuba module with its variant set. items, scene: what Stage collected, and loaded.
+    """
+
+    def __init__(self, mi, items: dict, scene):
+        self.mi, self.scene = mi, scene
+        self.guides_of = mi.load_dict(guide_items(items))
+        self.guides = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,facing:sh_normal"})
+        self.straight = mi.load_dict({"type": "path", "max_depth": 1})
+
+    def __call__(self, radiance: np.ndarray, sensor, seed: int) -> np.ndarray:
+        """[H, W, 3] >= 0, of the same sensor -> the same, denoised, >= 0."""
+        options = {"sensor": sensor, "spp": _GUIDE_SAMPLES, "seed": seed}
+        guides = np.array(self.mi.render(self.guides_of, integrator=self.guides, **options), np.float32)[..., -6:]
+        straight = np.array(self.mi.render(self.scene, integrator=self.straight, **options), np.float32)[..., :3]
+        return denoise(radiance, guides[..., :3], guides[..., 3:], straight)
+
+
+def denoise(radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray, straight: np.ndarray) -> np.ndarray:
+    """radiance, straight (of it, what lights and the sky send to the camera themselves): [H, W, 3] >= 0; albedo in
+    [0, 1]; normal in [-1, 1]."""
+    import pyoidn
+
+    images = radiance, np.clip(albedo, 0, 1), np.clip(normal, -1, 1)
+    found = pyoidn.denoise(*(np.ascontiguousarray(image, np.float32) for image in images), hdr=True, clean_aux=True)
+    lit = straight.sum(-1) > 0.5 * radiance.sum(-1)
+    return np.where(lit[..., None], radiance, np.maximum(found, 0)).astype(np.float32)
+
+
+def guide_items(items: dict) -> dict:
+    """A scene for albedo and normals: every surface diffuse, of its own or a varnish's albedo, or white; the sky a
+    white ball beyond all things and within the cameras' far plane."""
+    white, made = two_sided(type="diffuse", reflectance=_WHITE), {}
+    for name, item in items.items():
+        if not isinstance(item, dict):
+            made[name] = item
+        elif item["type"] == "envmap":
+            made[name] = {"type": "sphere", "radius": 500.0, "flip_normals": True, "bsdf": white}
+        elif "bsdf" in item:
+            layer = {} if "emitter" in item else item["bsdf"].get("layer", {})
+            paint = layer.get("reflectance") or layer.get("diffuse_reflectance") or _WHITE
+            plain = {key: value for key, value in item.items() if key != "emitter"}
+            made[name] = plain | {"bsdf": two_sided(type="diffuse", reflectance=paint)}
+    return made

@@ -27,7 +27,7 @@ from sehdr_warp.scene.images import image_sizes, read_ldr, read_mask
 from sehdr_warp.scene.read_colmap import read_colmap
 from sehdr_warp.scene.read_llff import read_llff
 from sehdr_warp.scene.read_transforms import read_hdr_nerf, read_transforms
-from sehdr_warp.synth.photo_set import RadianceView
+from sehdr_warp.synth.expose import RadianceView
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.initialization import assemble_field
 from sehdr_warp.training.run import load_run

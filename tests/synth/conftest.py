@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from sehdr_warp.output.exr import write_exr
 from sehdr_warp.synth.cameras import Grid, make_cameras, split_of
-from sehdr_warp.synth.photo_set import RadianceView
-from sehdr_warp.synth.truth_set import truth_path, write_truth_tables
+from sehdr_warp.synth.expose import RadianceView, truth_path, write_radiance
+from sehdr_warp.synth.truth import write_truth_tables
 
 VIEWS = 6
 
@@ -23,8 +22,7 @@ def write_truth(folder, size=32, scale=1.0, peak=None):
         if peak is not None:
             radiance[3, 5] = peak
         split = split_of(index)
-        channels = dict(zip("RGB", np.moveaxis(radiance, 2, 0), strict=True))
-        write_exr(truth_path(folder, split, counts[split]), channels, pixel="float")
+        write_radiance(truth_path(folder, split, counts[split]), radiance, pixel="float")
         counts[split] += 1
         views.append(RadianceView(f"r_{index}", camera, radiance, split))
     points = rng.uniform(-1, 1, (200, 3)).astype(np.float32)

@@ -4,7 +4,7 @@ import numpy as np
 
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
-from sehdr_warp.synth import mitsuba_variant
+from sehdr_warp.synth import render
 from sehdr_warp.synth.expose import expose
 from tests import refusals
 from tests.refusals import call
@@ -76,6 +76,6 @@ def test_render_refuses_in_a_line(tmp_path, capfd):
 
 
 def test_a_missing_renderer_is_named_with_its_remedy(tmp_path, capfd, monkeypatch):
-    monkeypatch.setattr(mitsuba_variant.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(render.importlib.util, "find_spec", lambda name: None)
     assert "pip install 'sehdr-warp[synth]'" in refused(capfd, "render", "study", "--out", tmp_path)
     assert not any(tmp_path.iterdir())

@@ -8,12 +8,12 @@ import pytest
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene.hdr_files import read_hdr
-from sehdr_warp.synth import denoise
+from sehdr_warp.synth import render
 from sehdr_warp.synth.cameras import make_cameras
-from sehdr_warp.synth.render import Settings, _render_view, render_scene
+from sehdr_warp.synth.expose import truth_path
+from sehdr_warp.synth.render import Settings, _render_view, denoise, guide_items, load_mitsuba, render_scene
 from sehdr_warp.synth.scenes import RECIPES
 from sehdr_warp.synth.stage import Stage
-from sehdr_warp.synth.truth_set import truth_path
 
 
 def reflectance(item):
@@ -30,7 +30,7 @@ def test_guides_see_albedo_and_white_for_what_has_none(tmp_path):
     stage.add(type="envmap", sampling_weight=1.0)
     stage.sun((0, 0, -1), (1, 1, 1))
     matt, varnished, metal, glass, lamp, sky = [
-        item for item in denoise.guide_items(stage.items).values() if isinstance(item, dict)
+        item for item in guide_items(stage.items).values() if isinstance(item, dict)
     ]
     assert reflectance(matt) == reflectance(varnished) == paint and matt["radius"] == 2.0
     assert all(reflectance(item)["value"] == white for item in (metal, glass, lamp, sky))
@@ -51,11 +51,11 @@ def textured():
 def test_noise_goes_and_texture_stays(textured):
     truth, rendered, albedo = textured
     facing = np.broadcast_to(np.float32([0, 0, 1]), truth.shape)
-    found = denoise.denoise(rendered, albedo, facing, np.zeros_like(truth))
+    found = denoise(rendered, albedo, facing, np.zeros_like(truth))
     assert found.dtype == np.float32 and found.min() >= 0
     before, after = (np.sqrt(np.mean((image / truth - 1) ** 2)) for image in (rendered, found))
     assert after < 0.25 * before
-    blind = denoise.denoise(rendered, np.ones_like(albedo), facing, np.zeros_like(truth))
+    blind = denoise(rendered, np.ones_like(albedo), facing, np.zeros_like(truth))
     assert after < 0.5 * np.sqrt(np.mean((blind / truth - 1) ** 2)), "the guides hold the texture"
 
 
@@ -65,7 +65,7 @@ def test_light_seen_itself_is_kept(textured):
     straight = np.zeros_like(rendered)
     straight[40:43, 40:43] = 4000.0
     straight[10, 10] = 0.4 * rendered[10, 10]
-    found = denoise.denoise(rendered, albedo, np.zeros_like(albedo), straight)
+    found = denoise(rendered, albedo, np.zeros_like(albedo), straight)
     np.testing.assert_array_equal(found[40:43, 40:43], rendered[40:43, 40:43])
     assert (found[10, 10] != rendered[10, 10]).any()
 
@@ -73,7 +73,7 @@ def test_light_seen_itself_is_kept(textured):
 def test_an_unknown_or_missing_denoiser_is_refused(monkeypatch):
     with pytest.raises(SehdrError, match="--denoise median: is not one of none, oidn"):
         Settings(denoise="median")
-    monkeypatch.setattr(denoise.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(render.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(SehdrError, match=r"pip install 'sehdr-warp\[synth\]', or take --denoise none"):
         Settings(denoise="oidn")
     Settings(denoise="none")
@@ -107,8 +107,6 @@ def test_pixels_that_are_no_light_are_refused_before_and_after_denoising(tmp_pat
 def test_a_denoised_scene_says_so_and_is_nearer_to_many_paths(tmp_path):
     pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
     pytest.importorskip("pyoidn", reason="Open Image Denoise is not installed")
-    from sehdr_warp.synth.mitsuba_variant import load_mitsuba
-
     mi, images, making = load_mitsuba("scalar_rgb"), {}, {}
     for kind, samples in (("none", 64), ("oidn", 4)):
         folder = render_scene(mi, RECIPES["study"], tmp_path / kind, Settings(24, 24, samples, 0, (0,), kind))

@@ -7,8 +7,9 @@ import pytest
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_scene
-from sehdr_warp.synth import stage, textures
+from sehdr_warp.synth import render, stage, textures
 from sehdr_warp.synth.cameras import VIEWS, Arc, Grid, make_cameras, split_of
+from sehdr_warp.synth.render import Settings, load_mitsuba
 from sehdr_warp.synth.scenes import RECIPES
 
 TEXTURES = ("wood", "brick", "checker", "wallpaper", "plaster", "painting", "globe", "ground", "books")
@@ -82,18 +83,14 @@ def test_half_of_the_scenes_have_each_layout_and_18_views_train():
 @pytest.fixture(scope="module")
 def mitsuba():
     pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
-    from sehdr_warp.synth.mitsuba_variant import load_mitsuba
-
     return load_mitsuba("scalar_rgb")
 
 
 @pytest.fixture(scope="module")
 def rendered(mitsuba, tmp_path_factory):
     """The smallest scene, three views of 24 x 24 pixels."""
-    from sehdr_warp.synth.render import Settings, render_scene
-
     settings = Settings(24, 24, 8, 5, (0, 1, 34))
-    return render_scene(mitsuba, RECIPES["night"], tmp_path_factory.mktemp("synth"), settings), settings
+    return render.render_scene(mitsuba, RECIPES["night"], tmp_path_factory.mktemp("synth"), settings), settings
 
 
 def test_a_rendered_scene_loads(rendered):
@@ -121,8 +118,6 @@ def test_points_lie_where_their_colour_is_seen(rendered):
 
 
 def test_finished_views_are_not_rendered_again(rendered, mitsuba, monkeypatch, caplog):
-    from sehdr_warp.synth import render
-
     folder, settings = rendered
     path = folder / "train_hdr" / "hdr_001.exr"
     kept, before = (folder / "train_hdr" / "hdr_000.exr").stat().st_mtime_ns, load_scene(folder).views
@@ -142,7 +137,5 @@ def test_finished_views_are_not_rendered_again(rendered, mitsuba, monkeypatch, c
 
 
 def test_other_settings_do_not_mix(rendered, mitsuba):
-    from sehdr_warp.synth.render import Settings, render_scene
-
     with pytest.raises(InputError, match="other settings"):
-        render_scene(mitsuba, RECIPES["night"], rendered[0].parent, Settings(24, 24, 9, 5, (0, 1, 34)))
+        render.render_scene(mitsuba, RECIPES["night"], rendered[0].parent, Settings(24, 24, 9, 5, (0, 1, 34)))
