@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -33,21 +32,9 @@ COLUMNS = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Point:
-    """Where a sweep measures. photos: of its training step; 0 for none."""
-
-    size: Size
-    channels: int = COMPARED_CHANNELS
-    photos: int = STEP_VIEWS
-
-    def varied(self, sweep: str) -> int:
-        size = self.size
-        return {"gaussians": size.gaussians, "pixels": size.width * size.height}.get(sweep) or getattr(self, sweep)
-
-
-def sweeps(device_type: str, small: bool = False) -> dict[str, list[Point]]:
-    """The points of each sweep, ascending. small: every second one, up to a moderate size."""
+def sweeps(device_type: str, small: bool = False) -> dict[str, list[tuple[int, Size, int, int]]]:
+    """The points of each sweep, ascending: what is varied, then size, channels, and photos of the training step (0 for
+    none). small: every second point, up to a moderate size."""
     if device_type == "cuda":
         counts = (10_000, 30_000, 100_000, 300_000, 1_000_000, 2_500_000, 5_000_000)
         sides = ((200, 200), (400, 400), (800, 800), (1600, 1200), (2560, 1440), (3840, 2160))
@@ -58,10 +45,10 @@ def sweeps(device_type: str, small: bool = False) -> dict[str, list[Point]]:
         channels, photos = (3, 6, 9, 16, 24, 48), (2, 8, 32)
         image, many, few = (200, 200), 5000, Size(5000, 200, 200)
     found = {
-        "gaussians": [Point(Size(count, *image)) for count in counts],
-        "pixels": [Point(Size(many, *side)) for side in sides],
-        "channels": [Point(few, count, 0) for count in channels],
-        "photos": [Point(few, COMPARED_CHANNELS, count) for count in photos],
+        "gaussians": [(count, Size(count, *image), COMPARED_CHANNELS, STEP_VIEWS) for count in counts],
+        "pixels": [(w * h, Size(many, w, h), COMPARED_CHANNELS, STEP_VIEWS) for w, h in sides],
+        "channels": [(count, few, count, 0) for count in channels],
+        "photos": [(count, few, COMPARED_CHANNELS, count) for count in photos],
     }
     return {name: points[:-1:2] if small else points for name, points in found.items()}
 
@@ -72,14 +59,14 @@ def bench_scale(device: torch.device, *, repetitions: int, small: bool = False) 
     result = new_result("scale", device, settings)
     peer = note_missing(result, device)
     for name, points in sweeps(device.type, small).items():
-        for point in points:
-            compared, size = peer and point.channels == COMPARED_CHANNELS, point.size
-            rows = [] if name == "photos" else _splat_rows(point, device, compared, repetitions, result["checks"])
-            rows += _step_rows(point, device, compared, repetitions, result["checks"]) if point.photos else []
-            place = {"sweep": name, "varied": point.varied(name), "gaussians": size.gaussians, "width": size.width}
-            place |= {"height": size.height, "channels": point.channels, "photos": point.photos or None}
+        for varied, size, channels, photos in points:
+            given = device, peer and channels == COMPARED_CHANNELS, repetitions, result["checks"]
+            rows = [] if name == "photos" else _splat_rows(size, channels, *given)
+            rows += _step_rows(size, photos, *given) if photos else []
+            place = {"sweep": name, "varied": varied, "gaussians": size.gaussians, "width": size.width}
+            place |= {"height": size.height, "channels": channels, "photos": photos or None}
             result["rows"] += [place | row for row in rows]
-            LOG.info("%s %d: done", name, point.varied(name))
+            LOG.info("%s %d: done", name, varied)
     result["slopes"] = fit_slopes(result["rows"])
     result["notes"].append(verdict(result["slopes"]))
     return result
@@ -118,9 +105,9 @@ def verdict(slopes: Sequence[dict]) -> str:
     return head + "; ".join(lines) + "."
 
 
-def _splat_rows(point: Point, device: torch.device, peer: bool, repetitions: int, checks: list[dict]) -> list[dict]:
-    scene = make_splat_scene(point.size, point.channels, device)
-    name = f"{OURS}, {point.channels} channels"
+def _splat_rows(size: Size, channels: int, device, peer: bool, repetitions: int, checks: list[dict]) -> list[dict]:
+    scene = make_splat_scene(size, channels, device)
+    name = f"{OURS}, {channels} channels"
     if not any(made["what"].startswith(f"{name}:") for made in checks):
         checks += against_float64(scene, REFERENCE_GAUSSIANS, name)
     variants = {OURS: splat_variant(lambda: render(scene), scene)}
@@ -135,15 +122,15 @@ def _splat_rows(point: Point, device: torch.device, peer: bool, repetitions: int
     return rows
 
 
-def _step_rows(point: Point, device: torch.device, peer: bool, repetitions: int, checks: list[dict]) -> list[dict]:
+def _step_rows(size: Size, photos: int, device, peer: bool, repetitions: int, checks: list[dict]) -> list[dict]:
     """Whole training steps on photos of this size. Without densification, which would watch gradients that gsplat
     gives in another form; steps of gsplat are launched, since they cannot be recorded."""
-    scene = make_photo_scene(point.size, point.photos, device)
+    scene = make_photo_scene(size, photos, device)
     rows, losses = [], {}
     for who, rasterizer in {OURS: None, GSPLAT: rasterize_with_gsplat}.items():
         if who == OURS or peer:
             forget_peaks(device)
-            fixed = {"densification.stop": 0, "densification.max_gaussians": point.size.gaussians + 1}
+            fixed = {"densification.stop": 0, "densification.max_gaussians": size.gaussians + 1}
             config = load_config(STEP_PRESET, fixed | {"schedule.recorded": who == OURS})
             trainer = make_trainer(scene, config, device, rasterizer)
             trainer.step()

@@ -1,7 +1,8 @@
 """The catalogue's splats: shapes, places, opacities, overlap, radiance, and poison in their arguments."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import product
 
 import torch
@@ -13,6 +14,7 @@ from ..splatting.reference import blend_reference, project_reference, rasterize_
 from .case import ROUNDINGS, UNIT, Case, Reading, as_float32, compare, count, not_finite
 
 NAMES = ("means", "log_scales", "quaternions", "opacities", "features", "world_to_camera", "intrinsics")
+SIZES = ((1, 1), (17, 33), (15, 1), (1, 50))
 POISON = (math.nan, math.inf, -math.inf, 3e38, -3e38, 1e-40)
 
 
@@ -101,32 +103,55 @@ def overlap(number: int, opacity: float, threshold: float):
     return measure
 
 
-def _changed(number: int, change: Callable[[Splats], object]):
-    """Splats that a function changes, compared."""
+def _compared(*makes: Callable[[], Splats], labels: Sequence[str] = ("{}",)):
+    """What each of the functions makes, compared."""
 
     def measure(device):
-        splats = Splats(number)
-        change(splats)
-        return compare_splat(splats, device)
+        given = zip(makes, labels, strict=True)
+        return [reading for make, label in given for reading in compare_splat(make(), device, label=label)]
 
     return measure
 
 
-def _mix_scales(splats: Splats) -> None:
+def _mixed_scales() -> Splats:
+    splats = Splats(60)
     splats.log_scales[:] = torch.linspace(math.log(1e-7), math.log(1e4), 60, dtype=torch.float64)[:, None]
     splats.log_scales += torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)
     splats.opacities[:] = torch.where(splats.log_scales[:, 0] > 0, 0.02, splats.opacities)  # the large ones faint
+    return splats
 
 
-def _near_threshold(splats: Splats) -> None:
-    step = ALPHA_THRESHOLD
+def _near_threshold() -> Splats:
+    splats, step = Splats(12), ALPHA_THRESHOLD
     given = [0.0, 0.5 * step, step * (1 - 1e-6), step, step * (1 + 1e-3), 0.5, 0.998, 0.999, 0.9995, 1.0, 1.0, 0.1]
     splats.opacities[:] = torch.tensor(given, dtype=torch.float64)
+    return splats
 
 
-def _move_away(splats: Splats) -> None:
+def _far_away() -> Splats:
+    splats = Splats(30)
     splats.means *= 1e6
     splats.log_scales += math.log(1e6)
+    return splats
+
+
+def _light_behind(radiance: float) -> Splats:
+    """Dim Gaussians, whose own gradients are to stay."""
+    splats = Splats(30, spread=0.8)
+    splats.opacities *= 0.4
+    splats.features[:] = 1e-8
+    splats.features[splats.means[:, 2].argmax()] = radiance
+    return splats
+
+
+def _on_borders() -> Splats:
+    splats = Splats(16, width=33, height=17)
+    focal_x, focal_y, cx, cy = splats.intrinsics
+    x = torch.tensor([0.0, 33.0, 16.5, 16.5, 0.0, 33.0, 33.0, 0.0, -3.0, 36.0, 16.0, 16.0, -0.01, 33.01, 8.0, 25.0])
+    y = torch.tensor([8.5, 8.5, 0.0, 17.0, 0.0, 17.0, 0.0, 17.0, 8.0, 8.0, -3.0, 20.0, 17.01, -0.01, 0.01, 16.99])
+    splats.means[:, 0] = (x - cx) / focal_x * splats.means[:, 2]
+    splats.means[:, 1] = (y - cy) / focal_y * splats.means[:, 2]
+    return splats
 
 
 def _near_plane(device):
@@ -144,16 +169,6 @@ def _near_plane(device):
     return [*readings, count("drawn behind the near plane", (splats.draw(device).visible.cpu() & behind).sum())]
 
 
-def _border(device):
-    splats = Splats(16, width=33, height=17)
-    focal_x, focal_y, cx, cy = splats.intrinsics
-    x = torch.tensor([0.0, 33.0, 16.5, 16.5, 0.0, 33.0, 33.0, 0.0, -3.0, 36.0, 16.0, 16.0, -0.01, 33.01, 8.0, 25.0])
-    y = torch.tensor([8.5, 8.5, 0.0, 17.0, 0.0, 17.0, 0.0, 17.0, 8.0, 8.0, -3.0, 20.0, 17.01, -0.01, 0.01, 16.99])
-    splats.means[:, 0] = (x - cx) / focal_x * splats.means[:, 2]
-    splats.means[:, 1] = (y - cy) / focal_y * splats.means[:, 2]
-    return compare_splat(splats, device)
-
-
 def _equal_depths(device):
     """Their order is that of their indices, on every device and in every run."""
     splats = Splats(60)
@@ -161,25 +176,6 @@ def _equal_depths(device):
     readings = compare_splat(splats, device, ties=True)
     differing = (splats.draw(device).image != splats.draw(device).image).sum()
     return [*readings, count("numbers that differ between two runs", differing)]
-
-
-def _dim_before_bright(device):
-    """The dim Gaussians' own gradients, with a light 1e16 times brighter behind, and without."""
-    splats = Splats(30, spread=0.8)
-    splats.opacities *= 0.4
-    light, readings = splats.means[:, 2].argmax(), []
-    for bright, label in ((1e8, "{}"), (1e-8, "{}, dim alone")):
-        splats.features[:] = 1e-8
-        splats.features[light] = bright
-        readings += compare_splat(splats, device, label=label)
-    return readings
-
-
-def _sizes(device):
-    readings = []
-    for width, height in ((1, 1), (17, 33), (15, 1), (1, 50)):
-        readings += compare_splat(Splats(30, width, height), device, label=f"{{}} {width} x {height}")
-    return readings
 
 
 def _quaternions(device):
@@ -297,31 +293,33 @@ def _poisoned_others(device):
 
 
 SPLAT_CASES = (
-    Case("scale-tiny", "standard deviations from 1e-7", _changed(24, lambda s: s.scaled(1e-7, 2e-7, 5e-7))),
+    Case("scale-tiny", "standard deviations from 1e-7", _compared(lambda: Splats(24).scaled(1e-7, 2e-7, 5e-7))),
     Case("scale-huge", "standard deviations from 1e4: each covers the image",
-         _changed(24, lambda s: s.scaled(1e4, 2e4, 5e4)),
+         _compared(lambda: Splats(24).scaled(1e4, 2e4, 5e4)),
          note="a Gaussian wider than about 4e9 pixels overflows the determinant and is culled"),
-    Case("scale-mixed", "standard deviations from 1e-7 to 1e4 in one image", _changed(60, _mix_scales)),
-    Case("needle", "needles, 1e6 times longer than thick", _changed(24, lambda s: s.scaled(1e1, 1e-5, 1e-5)),
+    Case("scale-mixed", "standard deviations from 1e-7 to 1e4 in one image", _compared(_mixed_scales)),
+    Case("needle", "needles, 1e6 times longer than thick", _compared(lambda: Splats(24).scaled(1e1, 1e-5, 1e-5)),
          note="the conic's three terms cancel along a needle: error grows with the square of the distance in pixels"),
-    Case("disc", "discs, 1e6 times wider than thick", _changed(24, lambda s: s.scaled(1e1, 1e1, 1e-5))),
+    Case("disc", "discs, 1e6 times wider than thick", _compared(lambda: Splats(24).scaled(1e1, 1e1, 1e-5))),
     Case("near-plane", "at, before and behind the near plane", _near_plane),
-    Case("border", "centers on and beyond the image's borders", _border),
-    Case("subpixel", "a thousandth of a pixel wide", _changed(24, lambda s: s.scaled(1e-4, 2e-5, 5e-5))),
-    Case("opacity", "opacity 0, 1/255, 0.999, 1 and next to them", _changed(12, _near_threshold)),
+    Case("border", "centers on and beyond the image's borders", _compared(_on_borders)),
+    Case("subpixel", "a thousandth of a pixel wide", _compared(lambda: Splats(24).scaled(1e-4, 2e-5, 5e-5))),
+    Case("opacity", "opacity 0, 1/255, 0.999, 1 and next to them", _compared(_near_threshold)),
     Case("overlap-100k", "10^5 Gaussians in one tile, all counted", overlap(100_000, 5e-5, 1e-6), quick=False),
     Case("overlap-opaque", "10^4 Gaussians in one tile, finished early", overlap(10_000, 0.02, ALPHA_THRESHOLD)),
     Case("equal-depths", "60 Gaussians at one depth", _equal_depths),
-    Case("radiance-dark", "radiance from 1e-12 to 1e-8", _changed(50, lambda s: s.lit(-12, -8))),
-    Case("radiance-bright", "radiance from 1e5 to 1e9", _changed(50, lambda s: s.lit(5, 9))),
-    Case("radiance-range", "radiance from 1e-12 to 1e9 in one image", _changed(50, lambda s: s.lit(-12, 9))),
-    Case("decades", "16 decades of radiance within a pixel", _dim_before_bright),
-    Case("image-sizes", "images of 1 x 1 and of odd size", _sizes),
+    Case("radiance-dark", "radiance from 1e-12 to 1e-8", _compared(lambda: Splats(50).lit(-12, -8))),
+    Case("radiance-bright", "radiance from 1e5 to 1e9", _compared(lambda: Splats(50).lit(5, 9))),
+    Case("radiance-range", "radiance from 1e-12 to 1e9 in one image", _compared(lambda: Splats(50).lit(-12, 9))),
+    Case("decades", "16 decades of radiance within a pixel",
+         _compared(partial(_light_behind, 1e8), partial(_light_behind, 1e-8), labels=("{}", "{}, dim alone"))),
+    Case("image-sizes", "images of 1 x 1 and of odd size",
+         _compared(*(partial(Splats, 30, *size) for size in SIZES), labels=[f"{{}} {w} x {h}" for w, h in SIZES])),
     Case("quaternions", "unnormalized, zero and huge quaternions", _quaternions),
     Case("far-1e3", "scene and camera 1e3 units from the origin", _far(1e3)),
     Case("far-1e6", "scene and camera 1e6 units from the origin", _far(1e6),
          note="float32 places are 0.06 units apart there: move the scene to the origin before training"),
-    Case("far-away", "1e6 units before the camera, and as large", _changed(30, _move_away)),
+    Case("far-away", "1e6 units before the camera, and as large", _compared(_far_away)),
     Case("harmonics", "spherical harmonics from 1e-6 to 1e6 units, and at the camera", _harmonics),
 )  # fmt: skip
 POISON_CASES = (

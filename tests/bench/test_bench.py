@@ -183,8 +183,8 @@ def test_gsplat_draws_what_we_draw(monkeypatch):
 
 def test_scale_has_splats_steps_memory_slopes_and_gsplat(monkeypatch):
     fake_gsplat(monkeypatch)
-    points = [scale.Point(Size(count, 48, 40)) for count in (200, 800)]
-    photos = [scale.Point(Size(200, 48, 40), photos=count) for count in (2, 3)]
+    points = [(count, Size(count, 48, 40), 9, 2) for count in (200, 800)]
+    photos = [(count, Size(200, 48, 40), 9, count) for count in (2, 3)]
     monkeypatch.setattr(scale, "sweeps", lambda *_: {"gaussians": points, "photos": photos})
     result = scale.bench_scale(CPU, **BRIEF)
     rows = [(r["sweep"], r["varied"], r["implementation"], r["what"]) for r in result["rows"]]
@@ -219,8 +219,8 @@ def test_a_quadratic_stage_is_found_and_a_linear_one_is_not():
 def test_sweeps_ascend():
     for device in ("cuda", "cpu"):
         for small in (False, True):
-            for name, points in scale.sweeps(device, small).items():
-                varied = [point.varied(name) for point in points]
+            for points in scale.sweeps(device, small).values():
+                varied = [point[0] for point in points]
                 assert varied == sorted(set(varied)) and varied
 
 
