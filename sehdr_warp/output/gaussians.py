@@ -38,7 +38,7 @@ class GaussianArrays:
 
     means [N, 3] world; log_scales [N, 3], natural logarithm of the standard deviations; quaternions [N, 4] (w x y z);
     opacity_logits [N]; harmonics [N, K, 3] with K = (degree + 1)^2, degree 0 to 3.
-    color_model: one of COLOR_MODELS. base_exposure_time: seconds at which the scene was photographed.
+    color_model: one of COLOR_MODELS. base_time: seconds at which the scene was photographed.
     """
 
     means: np.ndarray
@@ -47,7 +47,7 @@ class GaussianArrays:
     opacity_logits: np.ndarray
     harmonics: np.ndarray
     color_model: str
-    base_exposure_time: float
+    base_time: float
 
     @property
     def degree(self) -> int:
@@ -160,7 +160,7 @@ def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: b
                 "such scenes are not written; train again from an earlier checkpoint or with another seed",
             )
         table[name] = values
-    time = f"sehdr:base_exposure_time {gaussians.base_exposure_time!r}"
+    time = f"sehdr:base_exposure_time {gaussians.base_time!r}"
     comments = [f"sehdr:color_model {gaussians.color_model}", time]
     with atomic_path(path, overwrite) as temporary, temporary.open("wb") as file:
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=comments).write(file)

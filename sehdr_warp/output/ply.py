@@ -82,8 +82,8 @@ def hdr_gaussians(run) -> GaussianArrays:
         )
     harmonics = stored.harmonics.astype(np.float64)
     if stored.color_model == "linear":
-        return stored.with_colors(harmonics / run.exposure_time, "linear")
-    harmonics[:, 0] -= np.log(run.exposure_time) / _HARMONIC_0
+        return stored.with_colors(harmonics / run.base_time, "linear")
+    harmonics[:, 0] -= np.log(run.base_time) / _HARMONIC_0
     return stored.with_colors(harmonics, "log")
 
 
@@ -93,13 +93,13 @@ def ldr_gaussians(run, exposure_time: float | None = None) -> GaussianArrays:
     The encoded values are shown as sRGB, as the photos were. Viewers blend these, not radiance, so half-covered edges
     of very bright things come out darker than in a rendered photo. Degree and geometry are kept.
     """
-    time = run.exposure_time if exposure_time is None else float(exposure_time)
+    time = run.base_time if exposure_time is None else float(exposure_time)
     if not (np.isfinite(time) and time > 0):
         raise SehdrError(f"exposure time {time:g} is not positive and finite; give seconds")
     stored, to_radiance = _stored(run)
-    if stored.color_model == "display" and time == run.exposure_time:
+    if stored.color_model == "display" and time == run.base_time:
         return stored
-    radiance = to_radiance or (lambda exposure: exposure / run.exposure_time)
+    radiance = to_radiance or (lambda exposure: exposure / run.base_time)
     shown = lambda color: run.response.encode(radiance(color) * time)  # noqa: E731
     return bake(stored, shown, "display", camera_positions=_seen_from(run))
 
@@ -110,9 +110,9 @@ def _stored(run) -> tuple[GaussianArrays, Colors | None]:
     tensors = {name: value.cpu().numpy() for name, value in run.model.gaussians.tensors().items()}
     harmonics = np.concatenate([tensors["harmonics_dc"], tensors["harmonics_rest"]], axis=1)
     geometry = (tensors[name] for name in ("means", "log_scales", "quaternions", "opacity_logits"))
-    gaussians = GaussianArrays(*geometry, harmonics, run.model.color_model.name, run.exposure_time)
+    gaussians = GaussianArrays(*geometry, harmonics, run.model.color_model.name, run.base_time)
     if run.model.color_model.encoded:
-        return gaussians, lambda encoded: run.response.decode(np.clip(encoded, 0, 1)) / run.exposure_time
+        return gaussians, lambda encoded: run.response.decode(np.clip(encoded, 0, 1)) / run.base_time
     return gaussians, None if run.model.fusion is None else lambda exposure: _fuse(run, exposure)
 
 

@@ -60,10 +60,10 @@ def render_views(
     wanted = evs is not None or exposures is not None
     if (multipart or ldr_brackets) and not wanted:
         raise SehdrError("brackets were asked for without exposures; give evs (--evs=-2,0,2) or exposures")
-    made = bracket_exposures(run.exposure_time, evs=evs, exposures=exposures) if wanted else ()
+    made = bracket_exposures(run.base_time, evs=evs, exposures=exposures) if wanted else ()
     options = BracketOptions(
         made,
-        run.exposure_time,
+        run.base_time,
         colorspace,
         pixel,
         multipart,

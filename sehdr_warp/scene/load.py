@@ -108,24 +108,35 @@ def choose_response(capture: Capture, method: str = "posterior", candidates: Seq
     Photos are up to 24 of the training views, evenly spread; for method "paper" a random one. candidates: names, and
     files of one curve or of many; none: the built-in ones. Raises InputError where photos show nothing.
     """
-    from ..response import responses_named
-    from ..response.selection import select_response
-
     shots = capture.training
-    judged = shots[:: -(-len(shots) // _MOST_JUDGED)]
-    if method == "paper":
-        judged = (shots[int(np.random.default_rng(0).integers(len(shots)))],)
-    _log.info("choosing the response from %d photos", len(judged))
     photos = []
-    for shot in judged:
+    for shot in photos_to_judge(shots, method):
         image = as_photographed(shot)
         if image.alpha is not None:  # What is not there has no colour.
             image.pixels[image.alpha < 1] = 0
         photos.append(image.pixels)
     check_content(((codes, None) for codes in photos), capture.folder)
+    return best_response(photos, [None if shot.derived else shot.image for shot in shots], method, candidates)
+
+
+def photos_to_judge(photos: Sequence, method: str) -> Sequence:
+    """Those of the training photos that a response is chosen from."""
+    chosen = photos[:: -(-len(photos) // _MOST_JUDGED)]
+    if method == "paper":
+        chosen = (photos[int(np.random.default_rng(0).integers(len(photos)))],)
+    _log.info("choosing the response from %d photos", len(chosen))
+    return chosen
+
+
+def best_response(
+    codes: list[np.ndarray], files: list[Path | None], method: str, candidates: Sequence[str]
+) -> "Response":
+    """The candidate that fits the codes of photos_to_judge best; files: of all training photos."""
+    from ..response import responses_named
+    from ..response.selection import select_response
+
     known = [response for name in candidates for response in responses_named(name)] or None
-    camera = made_by_camera([None if shot.derived else shot.image for shot in shots])
-    return select_response(photos, known, method=method, from_camera=camera).response
+    return select_response(codes, known, method=method, from_camera=made_by_camera(files)).response
 
 
 def _named(response: "str | Path | Response") -> "Response":

@@ -1,7 +1,8 @@
 """How the number of Gaussians changes during training.
 
-GradientDensification is adaptive density control (3DGS, section 5.2, with the constants of its code); relocation.py
-holds 3DGS-MCMC. Both change the Gaussians only through Gaussians.keep / append / overwrite, which carry Adam's state.
+GradientDensification is adaptive density control (3DGS, section 5.2, with the constants of its code); Relocation is 3D
+Gaussian Splatting as Markov Chain Monte Carlo (NeurIPS 2024). Both change the Gaussians only through Gaussians.keep /
+append / overwrite, which carry Adam's state.
 """
 
 import math
@@ -9,31 +10,36 @@ import math
 import torch
 from torch import Tensor
 
-from ..field.gaussians import Gaussians
+from ..field.gaussians import PARAMETER_NAMES, Gaussians
 from ..splatting import Rendering
-from ..splatting.training_step import add_gradient_statistics
-from .config import Config
+from ..splatting.training_step import add_gradient_statistics, add_position_noise
+from .config import Config, DensificationConfig
 
 SPLIT_SHRINK = 1.6
 """The two halves of a split are this much smaller (3DGS: 0.8 times the number of halves)."""
-
 SHORTEST_INTERVAL = 20
 """Iterations between changes are never fewer, however short the training: gradients need photos to be means of."""
 SHORTEST_RESET = 300
 """Where resets would come closer together they are left out: opacities would not recover in between."""
+MOST_COPIES = 51
+"""A Gaussian is shared by at most this many at once, as in the authors' code: the binomial sums stay exact."""
+MOST_GROWTH = 1.0
+"""A change adds at most as many as there are: each then shares with one other in the mean."""
+SEED_STEP = 1_000_003
+"""Seeds of trainings are this far apart in the seeds of their noise, one for each iteration."""
 
 
 class Densification:
-    """What the trainer asks of a strategy; by itself it changes nothing."""
+    """What the trainer asks of a strategy; by itself it changes nothing.
 
-    def __init__(self, config: Config, extent: float):
-        self.config = config
-        self.options = config.densification
-        self.extent = extent
+    extent: of the scene, world units. pixels: of all training photos. most: the count that no change exceeds.
+    """
+
+    def __init__(self, config: Config, extent: float, pixels: int):
+        self.config, self.options, self.extent = config, config.densification, extent
         self.most = self.options.max_gaussians
         self.start, self.stop, self.every, self.reset_every = (
-            config.scaled(number)
-            for number in (self.options.start, self.options.stop, self.options.every, self.options.reset_every)
+            config.scaled(getattr(self.options, name)) for name in ("start", "stop", "every", "reset_every")
         )
         self.every = max(self.every, SHORTEST_INTERVAL)
 
@@ -69,10 +75,8 @@ class GradientDensification(Densification):
     """Clones small and splits large Gaussians where the image pulls at them, prunes the faint and the huge, and
     resets opacities now and then so that only what is needed grows back."""
 
-    def __init__(self, config: Config, extent: float):
-        super().__init__(config, extent)
-        self.gradient_sum: Tensor | None = None
-        self.seen: Tensor | None = None
+    gradient_sum: Tensor | None = None
+    seen: Tensor | None = None
 
     def needs_gradients(self, iteration: int) -> bool:
         return iteration < self.stop
@@ -83,26 +87,25 @@ class GradientDensification(Densification):
 
     @torch.no_grad()
     def observe(self, rendering: Rendering, width: int, height: int, usable: Tensor) -> None:
-        gradient = rendering.means2d.grad
         statistics = self.gradient_sum, self.seen
-        add_gradient_statistics(gradient, rendering.radii, usable, width, height, *statistics)
-
-    def change(self, iteration: int, gaussians: Gaussians, optimizer: torch.optim.Optimizer, generator) -> bool:
-        changed = False
-        if self._is_due(iteration) and self.gradient_sum is not None:
-            gradient = self.gradient_sum / self.seen.clamp_min(1)
-            self._grow(gaussians, gradient, optimizer, generator)
-            self._prune(gaussians, optimizer, oversized=iteration > self.reset_every)
-            self.gradient_sum = self.seen = None
-            changed = True
-        if iteration < self.stop and iteration % self.reset_every == 0 and self.reset_every >= SHORTEST_RESET:
-            self._reset_opacities(gaussians, optimizer)
-        return changed
+        add_gradient_statistics(rendering.means2d.grad, rendering.radii, usable, width, height, *statistics)
 
     @torch.no_grad()
+    def change(self, iteration: int, gaussians: Gaussians, optimizer: torch.optim.Optimizer, generator) -> bool:
+        changed = self._is_due(iteration) and self.gradient_sum is not None
+        if changed:
+            self._grow(gaussians, self.gradient_sum / self.seen.clamp_min(1), optimizer, generator)
+            self._prune(gaussians, optimizer, oversized=iteration > self.reset_every)
+            self.gradient_sum = self.seen = None
+        if iteration < self.stop and iteration % self.reset_every == 0 and self.reset_every >= SHORTEST_RESET:
+            opacity = 2 * self.options.prune_opacity
+            logits = gaussians.opacity_logits.clamp_max(math.log(opacity / (1 - opacity)))
+            gaussians.overwrite({"opacity_logits": logits}, optimizer=optimizer)
+        return changed
+
     def _grow(self, gaussians: Gaussians, gradient: Tensor, optimizer, generator) -> None:
         wanted = gradient > self.options.grow_gradient
-        room = self.options.max_gaussians - gaussians.count
+        room = self.most - gaussians.count
         if int(wanted.sum()) > room:
             if room <= 0:
                 return
@@ -112,23 +115,19 @@ class GradientDensification(Densification):
         clones, parents = (wanted & small).nonzero()[:, 0], (wanted & ~small).nonzero()[:, 0]
         if len(clones) + len(parents) == 0:
             return
-        added = [gaussians.rows(clones)]
-        added += [self._half(gaussians, parents, generator) for _ in range(2)]
-        kept = torch.ones_like(wanted).index_fill_(0, parents, False)
+        added = [gaussians.rows(clones), *(self._half(gaussians, parents, generator) for _ in range(2))]
         if len(parents):
-            gaussians.keep(kept, optimizer)
-        gaussians.append({name: torch.cat([rows[name] for rows in added]) for name in added[0]}, optimizer)
+            gaussians.keep(torch.ones_like(wanted).index_fill_(0, parents, False), optimizer)
+        gaussians.append({name: torch.cat([rows[name] for rows in added]) for name in PARAMETER_NAMES}, optimizer)
 
     def _half(self, gaussians: Gaussians, parents: Tensor, generator) -> dict[str, Tensor]:
         """One smaller Gaussian for each parent, at a point drawn from it."""
         rows = gaussians.rows(parents)
         normal = torch.randn(len(parents), 3, generator=generator, device=parents.device)
-        offsets = rotate(rows["quaternions"], normal * rows["log_scales"].exp())
-        rows["means"] += offsets
+        rows["means"] += rotate(rows["quaternions"], normal * rows["log_scales"].exp())
         rows["log_scales"] -= math.log(SPLIT_SHRINK)
         return rows
 
-    @torch.no_grad()
     def _prune(self, gaussians: Gaussians, optimizer, oversized: bool) -> None:
         unwanted = gaussians.opacities() < self.options.prune_opacity
         if oversized:
@@ -136,17 +135,94 @@ class GradientDensification(Densification):
         if 0 < int(unwanted.sum()) < gaussians.count:
             gaussians.keep(~unwanted, optimizer)
 
-    @torch.no_grad()
-    def _reset_opacities(self, gaussians: Gaussians, optimizer) -> None:
-        value = 2 * self.options.prune_opacity
-        ceiling = math.log(value / (1 - value))
-        gaussians.overwrite({"opacity_logits": gaussians.opacity_logits.clamp_max(ceiling)}, optimizer=optimizer)
-
     def state(self) -> dict[str, Tensor]:
         return {} if self.gradient_sum is None else {"gradient_sum": self.gradient_sum, "seen": self.seen}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         self.gradient_sum, self.seen = state.get("gradient_sum"), state.get("seen")
+
+
+class Relocation(Densification):
+    """Dead Gaussians move to where living ones are, in a way that keeps the image; the count grows by a fixed part up to
+    the budget; noise on the positions of the faint ones explores. No opacity resets, no gradient statistics.
+
+    A start with more Gaussians than the budget keeps its count: they move, and none are added.
+    """
+
+    def __init__(self, config: Config, extent: float, pixels: int):
+        super().__init__(config, extent, pixels)
+        self.most = gaussian_budget(self.options, pixels)
+        self._sums = _relocation_sums()
+
+    @torch.no_grad()
+    def change(self, iteration: int, gaussians: Gaussians, optimizer: torch.optim.Optimizer, generator) -> bool:
+        if not self._is_due(iteration):
+            return False
+        opacities = gaussians.opacities()
+        dead = opacities <= self.options.prune_opacity
+        moved, alive = dead.nonzero()[:, 0], (~dead).nonzero()[:, 0]
+        if len(moved) and len(alive):
+            chosen = alive[_draw(opacities[alive], len(moved), generator)]
+            self._share(gaussians, chosen, optimizer)
+            # In the authors' code the moved ones keep their Adam state, and only those that share lose it.
+            for name, values in gaussians.rows(chosen).items():
+                getattr(gaussians, name)[moved] = values
+        added = self.next_count(iteration, gaussians.count) - gaussians.count
+        if added > 0:
+            chosen = _draw(gaussians.opacities(), added, generator)
+            self._share(gaussians, chosen, optimizer)
+            gaussians.append(gaussians.rows(chosen), optimizer)
+        return added > 0
+
+    def next_count(self, iteration: int, count: int) -> int:
+        """How many Gaussians there are after the change at an iteration: more by `growth`, or by as much as takes the
+        count to the budget by the last change, at most MOST_GROWTH."""
+        growth = self.options.growth
+        if growth and count < self.most:
+            left = (self.stop - 1) // self.every - iteration // self.every + 1
+            growth = max(growth, min((self.most / count) ** (1 / left) - 1, MOST_GROWTH))
+        return max(count, min(self.most, math.ceil((1 + growth) * count)))
+
+    def perturb(self, iteration: int, gaussians: Gaussians, means_rate: float) -> None:
+        if self.options.noise:
+            add_position_noise(
+                gaussians.means,
+                gaussians.log_scales,
+                gaussians.quaternions,
+                gaussians.opacity_logits,
+                strength=self.options.noise * means_rate,
+                # Of the iteration and not of a running generator, so that a resumed training draws what it would have.
+                seed=(self.config.seed * SEED_STEP + iteration) % 2**31,
+            )
+
+    def _share(self, gaussians: Gaussians, chosen: Tensor, optimizer) -> None:
+        """Makes each chosen Gaussian the n-th part of itself, n = 1 + how often it was chosen (equation 9)."""
+        copies = torch.bincount(chosen, minlength=gaussians.count)
+        index = copies.nonzero()[:, 0]
+        parts = (copies[index] + 1).clamp_max(MOST_COPIES)
+        opacity = gaussians.opacities()[index].clamp_max(1 - 1e-6)
+        part = 1 - (1 - opacity) ** (1 / parts)
+        powers = part[:, None].double() ** torch.arange(1, MOST_COPIES + 1, device=part.device)
+        total = (self._sums.to(part.device)[parts - 1] * powers).sum(1)
+        shrink = (opacity.double() / total).clamp(1e-3, 1.0).float()
+        logits = torch.logit(part.clamp(self.options.prune_opacity, 1 - 1e-6))
+        scales = gaussians.log_scales[index] + shrink.log()[:, None]
+        gaussians.overwrite({"opacity_logits": logits, "log_scales": scales}, index, optimizer)
+        for name in ("means", "quaternions", "harmonics_dc", "harmonics_rest"):
+            gaussians.forget(name, index, optimizer)
+
+
+def make_densification(config: Config, extent: float, pixels: int) -> Densification:
+    """The strategy that config.densification.strategy names."""
+    strategies = {"relocation": Relocation, "gradient": GradientDensification}
+    return strategies[config.densification.strategy](config, extent, pixels)
+
+
+def gaussian_budget(options: DensificationConfig, pixels: int) -> int:
+    """The most Gaussians that relocation makes for training photos of so many pixels in all."""
+    return (
+        min(options.max_gaussians, int(options.budget * math.sqrt(pixels))) if options.budget else options.max_gaussians
+    )
 
 
 def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
@@ -157,11 +233,19 @@ def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
     return vectors + scalar * cross + torch.linalg.cross(axis, cross)
 
 
-def make_densification(config: Config, extent: float, pixels: int) -> Densification:
-    """The strategy that config.densification.strategy names; extent: the scene's, in world units; pixels: of all
-    training photos."""
-    from .relocation import Relocation
+def _draw(weights: Tensor, count: int, generator) -> Tensor:
+    """[count] indices drawn in proportion to weights, with replacement; by bisection, for any number of weights."""
+    steps = weights.double().cumsum(0)
+    uniform = torch.rand(count, generator=generator, device=weights.device, dtype=torch.float64)
+    return torch.searchsorted(steps, uniform * steps[-1]).clamp_max(len(weights) - 1)
 
-    if config.densification.strategy == "relocation":
-        return Relocation(config, extent, pixels)
-    return GradientDensification(config, extent)
+
+def _relocation_sums() -> Tensor:
+    """[MOST_COPIES, MOST_COPIES] float64; row n - 1 dotted with (o, o^2, ...) is the denominator of equation 9 for n:
+    sum over i <= n and k < i of binomial(i - 1, k) (-1)^k o^(k + 1) / sqrt(k + 1)."""
+    rows = torch.zeros(MOST_COPIES, MOST_COPIES, dtype=torch.float64)
+    for n in range(1, MOST_COPIES + 1):
+        for k in range(n):
+            # The binomials of a column sum to one binomial (hockey stick).
+            rows[n - 1, k] = math.comb(n, k + 1) * (-1) ** k / math.sqrt(k + 1)
+    return rows

@@ -9,22 +9,17 @@ from ..field.exposure import exposure_times
 from ..field.fusion import NeuralExposureFusion
 from ..field.gaussians import Gaussians
 from ..field.radiance_field import RadianceField
-from ..response import Response, ToneMapper, response_by_name, responses_named
-from ..response.selection import select_response
+from ..response import Response, ToneMapper, response_by_name
 from ..scene import Scene, View
-from ..scene.exposure import made_by_camera
+from ..scene.load import best_response, photos_to_judge
 from .config import Config
 
 DEPTH_RANGE = (0.5, 3.0)
 """Depths of drawn points in units of the distance to where the cameras look. Nearer ones stay as veils before the
-cameras: on the embedded room a start at 0.15 costs 14 dB. Preferring points on whose colour the photos agree does not
-pay there."""
-
-MOST_JUDGED = 24
-"""Photos that a response is chosen from, evenly spread: they give about as many edges as are looked at."""
+cameras: on the embedded room a start at 0.15 costs 14 dB."""
 
 
-def base_exposure_time(scene: Scene) -> float:
+def base_time(scene: Scene) -> float:
     """dt_1: the median exposure time of the training photos, seconds."""
     return float(np.median([view.exposure_time for view in scene.train_views]))
 
@@ -33,72 +28,52 @@ def scene_extent(scene: Scene) -> float:
     """The radius of the training cameras around their mean, plus a tenth (3DGS); for cameras at one place, a tenth of
     the distance to the points. World units, positive."""
     positions = np.stack([view.camera.position for view in scene.train_views])
-    centre = positions.mean(0)
-    radius = 1.1 * float(np.linalg.norm(positions - centre, axis=1).max())
+    center = positions.mean(0)
+    radius = 1.1 * float(np.linalg.norm(positions - center, axis=1).max())
     if radius > 1e-6:
         return radius
     if len(scene.points):
-        return max(0.1 * float(np.median(np.linalg.norm(scene.points - centre, axis=1))), 1e-6)
+        return max(0.1 * float(np.median(np.linalg.norm(scene.points - center, axis=1))), 1e-6)
     return 1.0
 
 
 def choose_response(scene: Scene, config: Config) -> Response:
-    """The response that the config names; for "auto" the candidate that fits the training photos best; for
-    "learned" one to be learned."""
-    name = config.response.name
-    if name == "learned":
-        return ToneMapper(seed=config.seed)
-    return _selected(scene, config) if name == "auto" else response_by_name(name)
-
-
-def _selected(scene: Scene, config: Config) -> Response:
-    """The response that the scene was developed with, if chosen as the config asks; else one chosen from its views."""
+    """The response that the config names; "learned": one to be learned; "auto": the one that the scene was developed
+    with, if it was chosen as the config asks, else the one that fits its views best."""
     options = config.response
+    if options.name == "learned":
+        return ToneMapper(seed=config.seed)
+    if options.name != "auto":
+        return response_by_name(options.name)
     if scene.response is not None and scene.chosen_by == (options.method, options.candidates):
         return scene.response
-    candidates = [response for name in options.candidates for response in responses_named(name)] or None
     views = scene.train_views
-    photos = [view.codes for view in views]
-    if options.method == "paper":
-        photos = [photos[int(np.random.default_rng(config.seed).integers(len(photos)))]]
-    return select_response(
-        photos[:: -(-len(photos) // MOST_JUDGED)],
-        candidates,
-        method=options.method,
-        from_camera=made_by_camera([view.source for view in views]),
-        seed=config.seed,
-    ).response
+    codes = [view.codes for view in photos_to_judge(views, options.method)]
+    return best_response(codes, [view.source for view in views], options.method, options.candidates)
 
 
 def make_field(scene: Scene, config: Config, response: Response, device: torch.device | str) -> RadianceField:
     """The field at iteration 0. Raises InputError for a scene that cannot be trained."""
-    check_scene(scene)
+    check_views(scene)
     rng = np.random.default_rng(config.seed)
-    points, colours = (scene.points, scene.point_colors) if len(scene.points) else random_points(scene, config, rng)
-    budget = config.densification.max_gaussians
-    if len(points) > budget:
-        chosen = np.sort(rng.choice(len(points), budget, replace=False))
-        points, colours = points[chosen], colours[chosen]
-    dc = color_model(config.model.radiance).start(colours, response)
-    gaussians = Gaussians.from_points(
-        torch.tensor(points, dtype=torch.float32),
-        torch.tensor(dc, dtype=torch.float32),
-        config.model.harmonics_degree,
-    )
-    return assemble_field(gaussians, config, response, base_exposure_time(scene)).to(device)
+    points, colors = (scene.points, scene.point_colors) if len(scene.points) else random_points(scene, config, rng)
+    most = config.densification.max_gaussians
+    if len(points) > most:
+        chosen = np.sort(rng.choice(len(points), most, replace=False))
+        points, colors = points[chosen], colors[chosen]
+    dc = color_model(config.model.radiance).start(colors, response)
+    points, dc = (torch.tensor(values, dtype=torch.float32) for values in (points, dc))
+    gaussians = Gaussians.from_points(points, dc, config.model.harmonics_degree)
+    return assemble_field(gaussians, config, response, base_time(scene)).to(device)
 
 
 def assemble_field(gaussians: Gaussians, config: Config, response: Response, base_time: float) -> RadianceField:
     """Gaussians, response and a freshly seeded fusion as the config says."""
     fusion, options = None, config.fusion
     if options.enabled:
-        fusion = NeuralExposureFusion(
-            response,
-            exposure_times(base_time, options.exposures),
-            base_time,
-            radiance_scale=1.0 / base_time if options.radiance_scale == "base" else 1.0,
-            seed=config.seed,
-        )
+        scale = 1.0 / base_time if options.radiance_scale == "base" else 1.0
+        times = exposure_times(base_time, options.exposures)
+        fusion = NeuralExposureFusion(response, times, base_time, radiance_scale=scale, seed=config.seed)
     return RadianceField(
         gaussians,
         response,
@@ -111,22 +86,20 @@ def assemble_field(gaussians: Gaussians, config: Config, response: Response, bas
     )
 
 
-def check_scene(scene: Scene) -> None:
+def check_views(scene: Scene) -> None:
     """Raises InputError for a scene without views enough, or whose photos say nothing about light."""
     views = scene.train_views
     if len(views) < 2:
-        raise InputError(
-            scene.name, f"{len(views)} training view(s)", "a scene needs at least two photos from different places"
-        )
-    images = [view.image for view in views]
-    if max(float(image.max()) for image in images) <= 1 / 255:
+        remedy = "a scene needs at least two photos from different places"
+        raise InputError(scene.name, f"{len(views)} training view(s)", remedy)
+    if all(view.codes.max() <= view.levels / 255 for view in views):
         raise InputError(scene.name, "every training photo is black", "use a longer exposure")
-    if min(float(image.min()) for image in images) >= 254 / 255:
+    if all(view.codes.min() >= view.levels * 254 / 255 for view in views):
         raise InputError(scene.name, "every training photo is white", "use a shorter exposure")
 
 
 def random_points(scene: Scene, config: Config, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Points [N, 3] where at least two training cameras look, and their mean encoded colours [N, 3].
+    """Points [N, 3] where at least two training cameras look, and their mean encoded colors [N, 3].
 
     Drawn along the cameras' rays, uniform in inverse depth. Raises SehdrError if no two cameras share what they see.
     """
@@ -134,15 +107,15 @@ def random_points(scene: Scene, config: Config, rng: np.random.Generator) -> tup
     distance, found, total = focus_distance(views), [], 0
     for _ in range(8):
         points = points_on_rays(views, count, distance, rng)
-        seen, mean = colours_in_views(points, views)
+        seen, mean = colors_in_views(points, views)
         found.append((points[seen >= 2], mean[seen >= 2]))
         total += len(found[-1][0])
         if total >= count:
             break
     if total < 4:
         raise SehdrError(f"{scene.name}: no two training cameras look at the same place; check the poses")
-    points, colours = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
-    return points, colours
+    points, colors = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
+    return points, colors
 
 
 def focus_distance(views: tuple[View, ...]) -> float:
@@ -172,18 +145,23 @@ def points_on_rays(views, count: int, distance: float, rng: np.random.Generator)
     return points
 
 
-def colours_in_views(points: np.ndarray, views: tuple[View, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """How many photos show each point [N], and the mean of their encoded values there [N, 3]; occlusion is not known
-    and not considered."""
+def pixels_of(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Row and column [P] of the pixels that points [P, 3] fall on, and whether the view shows them; occlusion is not
+    known and not considered."""
+    camera = view.camera
+    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    depth = np.where(local[:, 2] > 1e-9, local[:, 2], np.nan)
+    with np.errstate(invalid="ignore"):
+        column = np.floor(camera.fx * local[:, 0] / depth + camera.cx)
+        row = np.floor(camera.fy * local[:, 1] / depth + camera.cy)
+        return row, column, (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+
+
+def colors_in_views(points: np.ndarray, views: tuple[View, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """How many photos show each point [N], and the mean of their encoded values there [N, 3]."""
     seen, total = np.zeros(len(points)), np.zeros((len(points), 3))
     for view in views:
-        camera = view.camera
-        local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        depth = np.where(local[:, 2] > 1e-9, local[:, 2], np.nan)
-        with np.errstate(invalid="ignore"):
-            column = np.floor(camera.fx * local[:, 0] / depth + camera.cx)
-            row = np.floor(camera.fy * local[:, 1] / depth + camera.cy)
-            inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        row, column, inside = pixels_of(points, view)
         seen[inside] += 1
         total[inside] += view.image[row[inside].astype(int), column[inside].astype(int)]
     return seen, total / np.maximum(seen, 1)[:, None]

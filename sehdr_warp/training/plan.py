@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import asdict, dataclass
+from operator import attrgetter
 
 import torch
 
@@ -12,11 +13,11 @@ from ..field.exposure import exposure_times, is_seconds
 from ..scene import Scene
 from ..splatting.threads import thread_count
 from .config import Config
-from .config_files import config_to_dict, override_config
-from .initialization import base_exposure_time
+from .config_files import override_config
+from .densification import gaussian_budget
+from .initialization import base_time
 from .machine import pick_device
 from .plan_scene import SceneFacts, check_scene, measure_scene
-from .relocation import gaussian_budget
 
 PASSES = 900
 """Steps on each photo. A second look at the same photos teaches less and less, and in the end their noise."""
@@ -29,11 +30,13 @@ CPU_PIXEL, CPU_GAUSSIAN = 1.5e-6, 2.3e-6
 REACH = 2.0**16
 """Brackets farther from the photos' exposure than this are black or white in all pixels of 8 bits and some headroom."""
 
+Choice = tuple[dict[str, object], str, str]
+"""What a rule decides: fields of the config and their values, the choice in words, and the figures it rests on."""
+
 
 @dataclass(frozen=True)
 class Decision:
-    """name: of RULES. fields: dotted names of the config and their values. choice: in words; reason: with the figures
-    it rests on."""
+    """name: of RULES; the rest: see Choice."""
 
     name: str
     fields: dict[str, object]
@@ -43,11 +46,8 @@ class Decision:
 
 @dataclass(frozen=True)
 class Plan:
-    """What was decided about a scene.
-
-    config: the config with the decisions in it, ready to be trained. facts: what they rest on. decisions: in the order
-    of RULES. kept: fields that a decision would have changed and the user had given.
-    """
+    """config: ready to be trained. decisions: in the order of RULES. kept: fields that a decision would have changed and
+    the user had given."""
 
     config: Config
     facts: SceneFacts
@@ -56,15 +56,20 @@ class Plan:
 
     def to_dict(self) -> dict:
         """Plain values, for plan.json and --json."""
-        return {
-            "decisions": [asdict(decision) for decision in self.decisions],
-            "kept": self.kept,
-            "facts": asdict(self.facts),
-        }
+        decisions = [asdict(decision) for decision in self.decisions]
+        return {"decisions": decisions, "kept": self.kept, "facts": asdict(self.facts)}
 
     def table(self) -> str:
         """All decisions as lines: what, which values, and why."""
-        return format_plan(self.to_dict())
+        name, choice = (max(len(getattr(row, column)) for row in self.decisions) for column in ("name", "choice"))
+        lines = []
+        for row in self.decisions:
+            lines.append(f"{row.name:{name}}  {row.choice:{choice}}  {row.reason}")
+            if row.fields:
+                values = ", ".join(f"{path} = {json.dumps(value)}" for path, value in row.fields.items())
+                lines.append(f"{'':{name}}  {'':{choice}}  -> {values}")
+        kept = (f"kept as given: {path} = {json.dumps(value)}" for path, value in self.kept.items())
+        return "\n".join([*lines, *kept])
 
     def lines(self) -> Iterator[str]:
         """One line for each decision that changes something."""
@@ -76,9 +81,8 @@ class Plan:
 
 
 def make_plan(scene: Scene, config: Config, device: str | torch.device | None = None) -> Plan:
-    """Reads a scene and decides what its training on a device can leave out, on top of a config.
-
-    The fields in config.plan.keep stay as they are. The plan's own config has plan.enabled off.
+    """Decides what a scene's training on a device can leave out, on top of a config but for the fields in
+    config.plan.keep.
 
     Raises InputError for a scene that no plan makes sense for, and for kept values that the scene contradicts.
     """
@@ -88,21 +92,18 @@ def make_plan(scene: Scene, config: Config, device: str | torch.device | None = 
     check_fields(scene, facts, config, config.plan.keep)
     planned, decisions, kept = config, [], {}
     for name, rule in RULES.items():
-        decision = rule(facts, planned, device)
-        current = {path: _field(planned, path) for path in decision.fields}
+        fields, choice, reason = rule(facts, planned, device)
+        kept |= {path: attrgetter(path)(planned) for path in fields if path in config.plan.keep}
         changes = {
-            path: value
-            for path, value in decision.fields.items()
-            if path not in config.plan.keep and value != current[path]
+            path: value for path, value in fields.items() if path not in kept and value != attrgetter(path)(planned)
         }
-        kept |= {path: current[path] for path in decision.fields if path in config.plan.keep}
-        decisions.append(Decision(name, changes, decision.choice, decision.reason))
+        decisions.append(Decision(name, changes, choice, reason))
         planned = override_config(planned, changes, f"{scene.name}: plan of {name}")
     planned = override_config(planned, {"plan.enabled": False}, scene.name)
     return Plan(planned, facts, tuple(decisions), kept)
 
 
-def apply_plan(scene: Scene, config: Config, device: str | torch.device | None = None) -> tuple[Config, Plan | None]:
+def apply_plan(scene: Scene, config: Config, device: torch.device) -> tuple[Config, Plan | None]:
     """The config to train a scene with, and its plan where config.plan asks for one; without, the fields in plan.keep
     are checked against the scene all the same. Raises InputError as make_plan does."""
     if config.plan.enabled:
@@ -113,31 +114,14 @@ def apply_plan(scene: Scene, config: Config, device: str | torch.device | None =
     return config, None
 
 
-def format_plan(values: dict) -> str:
-    """A table of Plan.to_dict()'s decisions."""
-    rows = []
-    for decision in values["decisions"]:
-        fields = ", ".join(f"{path} = {json.dumps(value)}" for path, value in decision["fields"].items())
-        rows.append((decision["name"], decision["choice"], fields, decision["reason"]))
-    name, choice = (max(len(row[column]) for row in rows) for column in (0, 1)) if rows else (0, 0)
-    lines = []
-    for row in rows:
-        lines.append(f"{row[0]:{name}}  {row[1]:{choice}}  {row[3]}")
-        if row[2]:
-            lines.append(f"{'':{name}}  {'':{choice}}  -> {row[2]}")
-    for path, value in values["kept"].items():
-        lines.append(f"kept as given: {path} = {json.dumps(value)}")
-    return "\n".join(lines)
-
-
 def check_fields(scene: Scene, facts: SceneFacts, config: Config, given: Collection[str]) -> None:
     """Raises InputError, with both values, for fields that the user gave and the scene contradicts. given: names."""
 
     def refuse(path: str, problem: str, remedy: str) -> None:
-        raise InputError(scene.name, f"{path} = {json.dumps(_field(config, path))}, but {problem}", remedy)
+        raise InputError(scene.name, f"{path} = {json.dumps(attrgetter(path)(config))}, but {problem}", remedy)
 
     if "fusion.exposures" in given:
-        base = base_exposure_time(scene)
+        base = base_time(scene)
         timed = [item for item in config.fusion.exposures if is_seconds(item)]
         if timed and not scene.exposure_times_known:
             remedy = "write multiples of the photos' exposure (1/8x) or stops from it (-3ev)"
@@ -149,50 +133,52 @@ def check_fields(scene: Scene, facts: SceneFacts, config: Config, given: Collect
     if {"loss.hdr_truth", "loss.linear_weight", "loss.hdr_weight"} & set(given) and not facts.truths:
         problem = f"0 of {facts.photos} training photos have HDR truth"
         for path in ("loss.hdr_truth", "loss.hdr_weight"):
-            if _field(config, path) and not config.loss.predictor:
+            if attrgetter(path)(config) and not config.loss.predictor:
                 refuse(path, problem, "take a scene with HDR truth, leave the field out, or use --predict-hdr")
     if "densification.max_gaussians" in given and config.densification.max_gaussians < facts.points:
         problem = f"the scene starts from {facts.points} points"
         refuse("densification.max_gaussians", problem, f"use {facts.points} or more, or leave the field out")
 
 
-def _response(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
+def _response(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     name = config.response.name
     if name != "auto":
-        reason = "learned with the scene" if name == "learned" else f"{name} was named"
-        return Decision("response", {}, "no search", reason)
+        return {}, "no search", "learned with the scene" if name == "learned" else f"{name} was named"
     made = "a camera made the files" if facts.from_camera else "nothing says what made the files"
-    return Decision(
-        "response", {}, "search", f"no curve was named, and {made}: it is chosen from {facts.photos} photos"
-    )
+    return {}, "search", f"no curve was named, and {made}: it is chosen from {facts.photos} photos"
 
 
-def _brackets(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
+def _brackets(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     darker, brighter = (2 if facts.clipped < 0.001 else 4), (2 if facts.black < 0.001 else 4)
     reason = (
         f"{facts.clipped:.1%} of the pixels clip, {facts.black:.1%} are black: look at -{darker} to +{brighter} EV "
         f"(render --evs=-{darker},0,{brighter}); all are scalings of one render, made at export"
     )
     if not config.fusion.enabled:
-        return Decision("brackets", {}, "plain scaling", reason)
+        return {}, "plain scaling", reason
     fields: dict[str, object] = {"fusion.enabled": False}
-    if config.loss.linear_weight > 0 and not (config.loss.hdr_truth and (facts.truths or config.loss.predictor)):
+    if not _truth(facts, config):
         fields["loss.linear_weight"] = 0.0
     reason = f"{len(config.fusion.exposures)} brackets of one base hold no light of their own; {reason}"
-    return Decision("brackets", fields, "plain scaling", reason)
+    return fields, "plain scaling", reason
 
 
-def _linear_loss(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
+def _truth(facts: SceneFacts, config: Config) -> bool:
+    """Whether the linear loss has truth to compare with."""
+    return config.loss.hdr_truth and bool(facts.truths or config.loss.predictor)
+
+
+def _linear_loss(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     shown = f"{facts.truths} of {facts.photos} photos have HDR truth"
     if config.loss.linear_weight == 0:
-        return Decision("linear-loss", {}, "none", f"loss.linear_weight = 0; {shown}")
-    if config.loss.hdr_truth and (facts.truths or config.loss.predictor):
-        return Decision("linear-loss", {}, "against truth", shown)
+        return {}, "none", f"loss.linear_weight = 0; {shown}"
+    if _truth(facts, config):
+        return {}, "against truth", shown
     fields: dict[str, object] = {"loss.linear_weight": 0.0}
-    return Decision("linear-loss", fields, "none", f"{shown}: against its own brackets a base learns nothing")
+    return fields, "none", f"{shown}: against its own brackets a base learns nothing"
 
 
-def _densification(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
+def _densification(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     options = config.densification
     most = gaussian_budget(options, facts.pixels)
     reason = f"densification.max_gaussians = {options.max_gaussians}"
@@ -201,16 +187,16 @@ def _densification(facts: SceneFacts, config: Config, device: torch.device) -> D
     if options.strategy == "relocation":
         start = facts.points or config.model.initial_count
         choice = f"relocation grows to at most {most}" if start < most else "relocation without growth"
-        return Decision("densification", {}, choice, f"{reason}; {start} to start with")
+        return {}, choice, f"{reason}; {start} to start with"
     # Relocation has this budget by itself; densification by gradients stops nowhere.
     most = min(options.max_gaussians, max(most, 2 * facts.points))
     fields: dict[str, object] = {"densification.max_gaussians": most}
     if config.model.initial_count > most // 2 and not facts.points:
         fields["model.initial_count"] = max(100, most // 2)
-    return Decision("densification", fields, f"{most} Gaussians", f"{reason}; {facts.points} points to start from")
+    return fields, f"{most} Gaussians", f"{reason}; {facts.points} points to start from"
 
 
-def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
+def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     preset = config.schedule.iterations
     wanted = min(preset, math.ceil(max(FEWEST_ITERATIONS, PASSES * facts.photos) / 100) * 100)
     reason = f"{PASSES} steps on each of {facts.photos} photos, at least {FEWEST_ITERATIONS}, at most {preset}"
@@ -223,17 +209,17 @@ def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Deci
             reason = f"about {_minutes(wanted * step)} on a CPU with {thread_count()} threads; --iterations for more"
             if wanted == CPU_FEWEST and wanted * step > 2 * CPU_SECONDS:
                 reason += ", --max-size for smaller photos and less time"
-    return Decision("iterations", {"schedule.iterations": wanted}, f"{wanted}", reason)
+    return {"schedule.iterations": wanted}, f"{wanted}", reason
 
 
-def _confidence(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
+def _confidence(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     unsure = facts.clipped + facts.black
     choice = "worth a look" if unsure >= 0.001 or facts.seen < 4 else "high throughout"
     reason = f"{unsure:.1%} of the pixels state a bound alone, and a place is seen by {facts.seen:.1f} photos"
-    return Decision("confidence", {}, choice, reason)
+    return {}, choice, reason
 
 
-RULES: dict[str, Callable[[SceneFacts, Config, torch.device], Decision]] = {
+RULES: dict[str, Callable[[SceneFacts, Config, torch.device], Choice]] = {
     "response": _response,
     "brackets": _brackets,
     "linear-loss": _linear_loss,
@@ -254,8 +240,3 @@ def cpu_step_seconds(facts: SceneFacts, config: Config) -> float:
 
 def _minutes(seconds: float) -> str:
     return f"{max(1, round(seconds / 60))} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
-def _field(config: Config, path: str):
-    part, name = path.split(".")
-    return config_to_dict(config)[part][name]

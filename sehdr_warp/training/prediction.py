@@ -16,9 +16,7 @@ from ..scene import Scene, View
 from ..scene.hdr_files import read_hdr
 from ..scene.images import HDR_SUFFIXES
 
-Predictor = Callable[[View], tuple[str, np.ndarray]]
-"""From a view to where its prediction comes from, and the prediction [H, W, 3]."""
-
+BUILT_IN = "kovaleski-oliveira"
 NETWORK_SUFFIXES = (".pt", ".onnx")
 SATURATED = 254 / 255
 """A channel at least this bright is taken to be clipped (Rempel et al. 2007, for photos)."""
@@ -29,36 +27,30 @@ SPATIAL_SIGMA, RANGE_SIGMA = 150 / 1920, 25 / 255
 REC709 = np.array([0.2126, 0.7152, 0.0722])
 
 
-def predictor_names() -> list[str]:
-    """The predictors that need no file."""
-    return ["kovaleski-oliveira"]
-
-
 def check_predictor(name: str | Path) -> None:
-    """Raises InputError unless `name` is one of predictor_names(), a folder, or a .pt or .onnx file."""
+    """Raises InputError unless `name` is the built-in one, a folder, or a .pt or .onnx file."""
     path = Path(name)
-    if str(name) in predictor_names() or path.is_dir() or (path.suffix.lower() in NETWORK_SUFFIXES and path.is_file()):
+    if str(name) == BUILT_IN or path.is_dir() or (path.suffix.lower() in NETWORK_SUFFIXES and path.is_file()):
         return
     problem = "is neither TorchScript (.pt) nor ONNX (.onnx)" if path.is_file() else "no such predictor, folder or file"
-    raise InputError(name, problem, f"use {' or '.join(predictor_names())}, a folder of .exr files, or a network")
+    raise InputError(name, problem, f"use {BUILT_IN}, a folder of .exr files, or a network")
 
 
-def predicted_scene(scene: Scene, predictor: str | Path | None = None, response: Response | None = None) -> Scene:
+def predicted_scene(scene: Scene, predictor: str | Path = BUILT_IN, response: Response | None = None) -> Scene:
     """The scene with predictions as the HDR of its training views, whatever truth they had; test views keep theirs.
 
-    predictor: one of predictor_names() (default: the first); a folder that holds for every training view NAME.exr or
-        NAME.hdr, NAME being the view's or its photo's, at the view's size; or a network in TorchScript (.pt) or ONNX
-        (.onnx, needs onnxruntime) that takes encoded values [1, 3, H, W] in [0, 1] to linear ones of the same shape.
+    predictor: the built-in one; a folder that holds for every training view NAME.exr or NAME.hdr, NAME being the
+        view's or its photo's, at the view's size; or a network in TorchScript (.pt) or ONNX (.onnx, needs onnxruntime)
+        that takes encoded values [1, 3, H, W] in [0, 1] to linear ones of the same shape.
     response: what linearises the photos for the built-in predictor; by default, and where it is a learned one, sRGB.
 
     Raises InputError naming file and view for a prediction that is missing, of another size, not finite, negative or
     black; SehdrError where onnxruntime is not installed.
     """
-    predictor = predictor_names()[0] if predictor is None else predictor
     check_predictor(predictor)
     if response is None or response.learnable:
         response = response_by_name("srgb")
-    predict = _predictor(predictor, response)
+    predict = _predictor(Path(predictor), response)
     views = tuple(_predicted(view, *predict(view)) if view.split == "train" else view for view in scene.views)
     return replace(scene, views=views, predictor=str(predictor))
 
@@ -67,16 +59,12 @@ def kovaleski_oliveira(encoded: np.ndarray, response: Response) -> np.ndarray:
     """Exposures [H, W, 3] from encoded values [H, W, 3] in [0, 1]: linearised, then brighter around what is clipped.
 
     Source: Kovaleski and Oliveira, High-quality brightness enhancement functions for real-time reverse tone mapping
-    (The Visual Computer, 2009), after Rempel et al., Ldr2Hdr (SIGGRAPH 2007): the mask of clipped pixels, smoothed by a
-    cross-bilateral filter that follows the edges of the photo's luminance, raises exposures by up to 4. What they do
-    for a display's black and white levels is left out, as is the noise filter.
+    (The Visual Computer, 2009): the mask of clipped pixels, smoothed by a cross-bilateral filter that follows the edges
+    of the photo's luminance, raises exposures by up to 4. Their noise filter and display levels are left out.
     """
-    luminance = encoded @ REC709
-    clipped = (encoded >= SATURATED).any(axis=2)
-    enhancement = 1 + (BRIGHTEST - 1) * cross_bilateral(
-        clipped.astype(np.float64), luminance, SPATIAL_SIGMA * encoded.shape[1], RANGE_SIGMA
-    )
-    return np.asarray(response.decode(encoded.astype(np.float64))) * enhancement[..., None]
+    clipped = (encoded >= SATURATED).any(axis=2).astype(np.float64)
+    halo = cross_bilateral(clipped, encoded @ REC709, SPATIAL_SIGMA * encoded.shape[1], RANGE_SIGMA)
+    return response.decode(encoded.astype(np.float64)) * (1 + (BRIGHTEST - 1) * halo)[..., None]
 
 
 def cross_bilateral(values: np.ndarray, guide: np.ndarray, spatial_sigma: float, range_sigma: float) -> np.ndarray:
@@ -95,22 +83,21 @@ def cross_bilateral(values: np.ndarray, guide: np.ndarray, spatial_sigma: float,
     return total / np.maximum(weight, 1e-12)
 
 
-def _predictor(name: str | Path, response: Response) -> Predictor:
-    path = Path(name)
-    if str(name) in predictor_names():
-        return lambda view: (str(name), kovaleski_oliveira(view.image, response))
+def _predictor(path: Path, response: Response) -> Callable[[View], tuple[Path, np.ndarray]]:
+    """From a view to where its prediction comes from, and the prediction [H, W, 3]."""
+    if str(path) == BUILT_IN:
+        return lambda view: (path, kovaleski_oliveira(view.image, response))
     if path.is_dir():
         return lambda view: _from_folder(path, view)
     network = _torchscript(path) if path.suffix.lower() == ".pt" else _onnx(path)
-    return lambda view: (str(path), _through_network(network, path, view))
+    return lambda view: (path, _through_network(network, path, view))
 
 
-def _predicted(view: View, source: str, prediction: np.ndarray) -> View:
+def _predicted(view: View, source: Path, prediction: np.ndarray) -> View:
     """The view with a sound prediction as its HDR; InputError for another."""
-    size = view.image.shape
     problem = None
-    if prediction.shape != size:
-        problem = f"is {_shown(prediction.shape)}, and the view is {_shown(size)}"
+    if prediction.shape != view.codes.shape:
+        problem = f"is {_size(prediction)}, and the view is {_size(view.codes)}"
     elif not np.isfinite(prediction).all():
         problem = f"has {int((~np.isfinite(prediction)).any(axis=2).sum())} pixels that are not finite"
     elif prediction.min() < 0:
@@ -122,34 +109,30 @@ def _predicted(view: View, source: str, prediction: np.ndarray) -> View:
     return replace(view, hdr=(prediction / view.exposure_time).astype(np.float32))
 
 
-def _from_folder(folder: Path, view: View) -> tuple[str, np.ndarray]:
+def _from_folder(folder: Path, view: View) -> tuple[Path, np.ndarray]:
     stems = dict.fromkeys([view.name, *([] if view.source is None else [view.source.stem])])
     tried = [folder / f"{stem}{suffix}" for stem in stems for suffix in HDR_SUFFIXES]
     path = next((path for path in tried if path.is_file()), None)
     if path is None:
-        raise InputError(
-            folder,
-            f"holds no prediction for view {view.name} ({', '.join(path.name for path in tried)})",
-            "predict every training view, and name the file as the view",
-        )
+        names = ", ".join(path.name for path in tried)
+        remedy = "predict every training view, and name the file as the view"
+        raise InputError(folder, f"holds no prediction for view {view.name} ({names})", remedy)
     try:
-        return str(path), read_hdr(path, keep_negative=True)
+        return path, read_hdr(path, keep_negative=True)
     except InputError as error:
         raise SehdrError(f"view {view.name}: {error}") from None
 
 
 def _through_network(network: Callable, path: Path, view: View) -> np.ndarray:
     """The network's output for a view as [H, W, 3]; InputError if it fails or gives another shape."""
-    encoded = np.ascontiguousarray(view.image.transpose(2, 0, 1)[None], dtype=np.float32)
+    encoded = np.ascontiguousarray(view.image.transpose(2, 0, 1)[None])
     remedy = "it must take [1, 3, H, W] to [1, 3, H, W]"
     try:
         output = network(encoded)
     # Whatever a network raises, a user wants to know which network and which view.
     except Exception as error:  # noqa: BLE001
-        reason = (str(error).strip().splitlines() or [repr(error)])[-1]
-        raise InputError(
-            path, f"fails on view {view.name}, {_shown(view.image.shape)} ({reason:.200})", remedy
-        ) from None
+        problem = f"fails on view {view.name}, {_size(view.codes)} ({_reason(error, -1)})"
+        raise InputError(path, problem, remedy) from None
     if not isinstance(output, np.ndarray) or output.shape[:2] != (1, 3) or output.ndim != 4:
         found = list(output.shape) if isinstance(output, np.ndarray) else type(output).__name__
         raise InputError(path, f"gives {found} for view {view.name}, not {list(encoded.shape)}", remedy)
@@ -167,8 +150,7 @@ def _torchscript(path: Path) -> Callable:
             warnings.simplefilter("ignore", DeprecationWarning)
             module = torch.jit.load(str(path), map_location="cpu").eval()
     except (RuntimeError, ValueError, OSError) as error:
-        reason = str(error).strip().splitlines()[0]
-        raise InputError(path, f"is not TorchScript ({reason:.200})", "save it with torch.jit.save") from None
+        raise InputError(path, f"is not TorchScript ({_reason(error)})", "save it with torch.jit.save") from None
 
     @torch.no_grad()
     def run(encoded: np.ndarray):
@@ -187,11 +169,14 @@ def _onnx(path: Path) -> Callable:
         session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     # onnxruntime's own exceptions have no common base but this.
     except Exception as error:  # noqa: BLE001
-        reason = (str(error).strip().splitlines() or [repr(error)])[0]
-        raise InputError(path, f"is not a usable ONNX network ({reason:.200})", "export it again") from None
+        raise InputError(path, f"is not a usable ONNX network ({_reason(error)})", "export it again") from None
     name = session.get_inputs()[0].name
     return lambda encoded: session.run(None, {name: encoded})[0]
 
 
-def _shown(shape: tuple[int, ...]) -> str:
-    return f"{shape[1]} x {shape[0]}"
+def _reason(error: Exception, line: int = 0) -> str:
+    return (str(error).strip().splitlines() or [repr(error)])[line][:200]
+
+
+def _size(image: np.ndarray) -> str:
+    return f"{image.shape[1]} x {image.shape[0]}"

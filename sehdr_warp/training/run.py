@@ -13,10 +13,9 @@ from ..field.gaussians import PARAMETER_NAMES, Gaussians
 from ..field.radiance_field import RadianceField, RenderedView
 from ..response import Response
 from ..scene import Camera, Scene
-from .checkpoint import Checkpoint
 from .config import Config
 from .initialization import assemble_field
-from .run_folder import CameraEntry, RunFolder
+from .run_folder import CameraEntry, Checkpoint, RunFolder
 
 log = logging.getLogger(__name__)
 
@@ -25,24 +24,15 @@ class Run:
     """A trained scene.
 
     path, folder: where it is. config: the choices it was trained with. model: the RadianceField, on `device`.
-    cameras: the views of the scene, in its order. response: the camera's curve. exposure_time: the base one, seconds.
+    cameras: the views of the scene, in its order. response: the camera's curve. base_time: the photos' exposure, seconds.
     iterations, train_seconds: how far the training was. checkpoint_hash: of the tensors it was loaded from.
     data: where the photos were, for load_scene; may be empty.
     """
 
-    def __init__(
-        self,
-        folder: RunFolder,
-        config: Config,
-        model: RadianceField,
-        cameras: tuple[CameraEntry, ...],
-        info: dict,
-        values: dict,
-    ):
+    def __init__(self, folder: RunFolder, config: Config, model: RadianceField, info: dict, values: dict):
         self.folder, self.path = folder, folder.path
-        self.config = config
-        self.model = model
-        self.cameras = cameras
+        self.config, self.model = config, model
+        self.cameras: tuple[CameraEntry, ...] = folder.read_cameras()
         self.iterations: int = values["iteration"]
         self.train_seconds: float = values["seconds"]
         self.checkpoint_hash: str = values["sha256"]
@@ -54,7 +44,7 @@ class Run:
         return self.model.response
 
     @property
-    def exposure_time(self) -> float:
+    def base_time(self) -> float:
         return self.model.base_time
 
     @property
@@ -110,20 +100,17 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
     info, config = folder.read_info(), folder.read_config()
     checkpoint = folder.newest_checkpoint()
     if checkpoint is None:
-        remedy = "train again, or continue with --resume"
-        raise InputError(folder.checkpoints, "holds no complete checkpoint", remedy)
+        raise InputError(folder.checkpoints, "holds no complete checkpoint", "train again, or continue with --resume")
     model = field_from_checkpoint(checkpoint, config, info)
     model.confidence = folder.read_confidence(checkpoint)
-    model = model.to(device)
-    model.requires_grad_(False)
-    return Run(folder, config, model, folder.read_cameras(), info, checkpoint.values)
+    return Run(folder, config, model.to(device).requires_grad_(False), info, checkpoint.values)
 
 
 def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) -> RadianceField:
     """The RadianceField that a checkpoint holds, on the CPU; raises InputError if tensors are missing or do not fit."""
     try:
         gaussians = Gaussians(*(checkpoint.tensors[f"gaussians.{name}"] for name in PARAMETER_NAMES))
-        field = assemble_field(gaussians, config, Response.from_dict(info["response"]), info["base_exposure_time"])
+        field = assemble_field(gaussians, config, Response.from_dict(info["response"]), info["base_time"])
         learned = field.response if field.response.learnable else None
         for name, part in (("fusion.", field.fusion), ("response.", learned)):
             if part is not None:

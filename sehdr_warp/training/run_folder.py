@@ -5,11 +5,15 @@ scene.json                  cameras of all views, splits, exposure times, names:
 run.json                    response, base exposure time, version, where the photos were
 plan.json                   what was left out and why, where a plan was made
 metrics.jsonl               one line for each evaluation
-checkpoints/                see checkpoint.py
+checkpoints/iteration_N/    tensors as safetensors, values as JSON with the hash of the tensors
 confidence.safetensors      how far the photos vouch for each Gaussian, and of which checkpoint
 summary.json                times, memory and counts, when the training ended
+
+A checkpoint is written beside its final place, flushed to the disk and renamed: what a killed process left is never
+mistaken for one. Nothing is pickled.
 """
 
+import hashlib
 import json
 import math
 import reprlib
@@ -22,15 +26,18 @@ from torch import Tensor
 from ..errors import InputError, SehdrError
 from ..field.confidence import Evidence
 from ..field.radiance_field import RadianceField
-from ..files import atomic_path, write_json, writing
+from ..files import atomic_folder, atomic_path, write_json, writing
 from ..response import Response
 from ..scene import Camera, Scene
 from ..scene.images import MAX_PIXELS
-from .checkpoint import FORMAT, Checkpoint, first_not_finite, newest_checkpoint, refuse_format, write_checkpoint
 from .config import Config
 from .config_files import config_to_dict, read_config_json
 
+FORMAT = 2
+"""Version of what a run holds; a reader refuses others."""
+TENSORS, VALUES = "state.safetensors", "checkpoint.json"
 _REMEDY = "the run is damaged: train again"
+_OLDER = "remove this folder to use an older checkpoint, or train again"
 
 
 @dataclass(frozen=True)
@@ -43,8 +50,20 @@ class CameraEntry:
     exposure_time: float
 
 
+@dataclass(frozen=True)
+class Checkpoint:
+    """One checkpoint as read: named tensors on the CPU, and plain values."""
+
+    path: Path
+    tensors: dict[str, Tensor]
+    values: dict
+
+
 class RunFolder:
-    """The files of one training at a path; nothing is read or made before it is asked for."""
+    """The files of one training at a path; nothing is read or made before it is asked for.
+
+    What cannot be read is an InputError with the file, and the field where there is one.
+    """
 
     def __init__(self, path: Path | str):
         self.path = Path(path)
@@ -66,25 +85,26 @@ class RunFolder:
         if not self.path.exists() or not any(self.path.iterdir()):
             return False
         if not resume and not overwrite:
-            raise InputError(
-                self.path, "exists and is not empty", "choose another folder, or use --resume or --overwrite"
-            )
+            remedy = "choose another folder, or use --resume or --overwrite"
+            raise InputError(self.path, "exists and is not empty", remedy)
         self.require()
         return resume
 
     def require(self) -> None:
         """Raises InputError if this is not the folder of a training."""
-        remedy = "give the folder that `sehdr-warp train --out` wrote"
+        problem = None
         if not self.path.is_dir():
-            raise InputError(self.path, "no such folder", remedy)
-        if not any(self.path.iterdir()):
-            raise InputError(self.path, "is an empty folder", remedy)
-        if not self.config.is_file():
-            raise InputError(self.path, f"is not a run (no {self.config.name})", remedy)
+            problem = "no such folder"
+        elif not any(self.path.iterdir()):
+            problem = "is an empty folder"
+        elif not self.config.is_file():
+            problem = f"is not a run (no {self.config.name})"
+        if problem:
+            raise InputError(self.path, problem, "give the folder that `sehdr-warp train --out` wrote")
 
     def begin(self, scene: Scene, config: Config, field: RadianceField, data: dict, plan: dict | None) -> None:
         """Makes the folder, or removes the run in it, and writes what does not change during the training; config.json
-        last: its presence says that the folder is a run. Raises InputError if the folder cannot be made."""
+        last: its presence says that the folder is a run."""
         from .. import __version__
 
         try:
@@ -100,7 +120,7 @@ class RunFolder:
             "version": __version__,
             "scene": scene.name,
             "data": data,
-            "base_exposure_time": field.base_time,
+            "base_time": field.base_time,
             "response": field.response.to_dict(),
         }
         if plan is not None:
@@ -110,22 +130,22 @@ class RunFolder:
         write_json(self.config, config_to_dict(config), overwrite=True)
 
     def read_config(self) -> Config:
-        """The config of the training; raises InputError."""
+        """The config of the training."""
         self.read_info()
         return read_config_json(self.config)
 
     def read_info(self) -> dict:
-        """What run.json holds; raises InputError, also for a run of another version's format."""
+        """What run.json holds; InputError also for a run of another version's format."""
         info = _read_json(self.info)
-        refuse_format(self.path, info)
-        for name, kind in (("scene", str), ("data", dict), ("base_exposure_time", int | float), ("response", dict)):
+        _refuse_format(self.path, info)
+        for name, kind in (("scene", str), ("data", dict), ("base_time", int | float), ("response", dict)):
             if name not in info:
                 raise InputError(self.info, f"lacks the field {name}", _REMEDY)
             if not isinstance(info[name], kind):
                 raise InputError(self.info, f"{name} = {reprlib.repr(info[name])} is of the wrong type", _REMEDY)
-        time = info["base_exposure_time"]
+        time = info["base_time"]
         if not 0 < time < math.inf or time > 1e300:
-            problem = f"base_exposure_time = {reprlib.repr(time)} is not a positive number of seconds"
+            problem = f"base_time = {reprlib.repr(time)} is not a positive number of seconds"
             raise InputError(self.info, problem, _REMEDY)
         try:
             Response.from_dict(info["response"])
@@ -134,7 +154,7 @@ class RunFolder:
         return info
 
     def read_cameras(self) -> tuple[CameraEntry, ...]:
-        """The views in scene.json; raises InputError."""
+        """The views in scene.json."""
         try:
             return tuple(_camera_entry(view) for view in _read_json(self.scene)["views"])
         except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -148,16 +168,13 @@ class RunFolder:
                 problem = f"its {name} differ from those of {scene.name}"
                 raise InputError(self.scene, problem, "resume with the same data, --max-size and --holdout")
 
-    def read_plan(self) -> dict | None:
-        """The plan that the run was trained by, as Plan.to_dict gave it; None without one, or where it is damaged."""
-        from .plan import format_plan
-
+    def read_decisions(self) -> list[dict]:
+        """The decisions of the run's plan, as Plan.to_dict gave them; none without a plan, or where it is damaged."""
         try:
-            values = json.loads(self.plan.read_text(encoding="utf-8"))
-            format_plan(values)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            return None
-        return values
+            decisions = json.loads(self.plan.read_text(encoding="utf-8"))["decisions"]
+            return [{"name": d["name"], "choice": d["choice"], "fields": dict(d["fields"])} for d in decisions]
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            return []
 
     def read_summary(self) -> dict:
         """Times, memory and counts of the training; empty if it has not ended."""
@@ -192,27 +209,57 @@ class RunFolder:
             beside.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
 
     def write_checkpoint(self, tensors: dict[str, Tensor], values: dict, *, kept: int) -> Path:
-        return write_checkpoint(self.checkpoints, tensors, values, kept=kept)
+        """Writes iteration_N from a state with the value "iteration", then deletes all but the newest `kept`.
+
+        Later checkpoints go too: a training that is at N was resumed from an earlier one because they are damaged.
+        Where that of N exists and is sound it is left alone. Raises SehdrError if the disk refuses; checkpoints that
+        exist are untouched then.
+        """
+        from safetensors.torch import save
+
+        final = self.checkpoints / f"iteration_{values['iteration']:08d}"
+        if not _is_sound(final):
+            for leftover in self.checkpoints.glob(".iteration_*"):
+                shutil.rmtree(leftover, ignore_errors=True)
+            data = save({name: value.detach().cpu().contiguous() for name, value in tensors.items()})
+            stated = values | {"format": FORMAT, "sha256": hashlib.sha256(data).hexdigest()}
+            with atomic_folder(final, overwrite=True) as beside:
+                (beside / TENSORS).write_bytes(data)
+                (beside / VALUES).write_text(json.dumps(stated, indent=1) + "\n", encoding="utf-8")
+        folders = self._newest_first()
+        place = folders.index(final)
+        for other in folders[:place] + folders[place + kept :]:
+            shutil.rmtree(other, ignore_errors=True)
+        return final
 
     def newest_checkpoint(self) -> Checkpoint | None:
-        return newest_checkpoint(self.checkpoints)
+        """The newest complete checkpoint, None if there is none; damaged ones, and ones with numbers that are not
+        finite, are passed over, unless all are: then the newest one's InputError is raised."""
+        problem = None
+        for path in self._newest_first():
+            try:
+                return read_checkpoint(path)
+            except InputError as error:
+                problem = problem or error
+        if problem is not None:
+            raise problem
+        return None
+
+    def _newest_first(self) -> list[Path]:
+        return sorted(self.checkpoints.glob("iteration_*"), reverse=True)
 
     def write_confidence(self, evidence: Evidence, checkpoint_hash: str) -> None:
         """Writes the evidence, in place of an earlier one. Raises SehdrError if the disk refuses."""
         from safetensors.torch import save
 
-        tensors = {name: getattr(evidence, name) for name in ("seen", "stops", "clipped")}
-        tensors["confidence"] = evidence.confidence()
+        tensors = {**vars(evidence), "confidence": evidence.confidence()}
         stated = {"format": str(FORMAT), "checkpoint": checkpoint_hash}
         data = save({name: value.float().cpu().contiguous() for name, value in tensors.items()}, stated)
         with atomic_path(self.confidence, overwrite=True) as beside:
             beside.write_bytes(data)
 
     def read_confidence(self, checkpoint: Checkpoint) -> Tensor | None:
-        """[N] in [0, 1] of a checkpoint's Gaussians; None where there is none, or one of another checkpoint.
-
-        Raises InputError for a file that is damaged.
-        """
+        """[N] in [0, 1] of a checkpoint's Gaussians; None where there is none, or one of another checkpoint."""
         from safetensors import SafetensorError, safe_open
 
         path = self.confidence
@@ -230,9 +277,40 @@ class RunFolder:
         count = len(checkpoint.tensors["gaussians.means"])
         if tuple(confidence.shape) != (count,) or not confidence.is_floating_point():
             raise InputError(path, f"confidence has shape {tuple(confidence.shape)}, not {(count,)}", remedy)
-        if first_not_finite({"confidence": confidence}) or not bool(((confidence >= 0) & (confidence <= 1)).all()):
+        if not bool(((confidence >= 0) & (confidence <= 1)).all()):  # as NaN is not
             raise InputError(path, "confidence holds values outside of 0 to 1", remedy)
         return confidence.float()
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """One checkpoint; raises InputError if a file is missing, damaged, of another format, or holds NaN or infinity."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    values = _read_json(path / VALUES, _OLDER)
+    _refuse_format(path / VALUES, values)
+    for name, kind in (("iteration", int), ("seconds", int | float)):
+        if not isinstance(values.get(name), kind) or not 0 <= values[name] < math.inf:
+            problem = f"{name} = {reprlib.repr(values.get(name))} is not a number from 0"
+            raise InputError(path / VALUES, problem, _OLDER)
+    try:
+        data = (path / TENSORS).read_bytes()
+        if hashlib.sha256(data).hexdigest() != values.get("sha256"):
+            raise InputError(path / TENSORS, f"its SHA-256 is not the {values.get('sha256')} of {VALUES}", _OLDER)
+        tensors = load(data)
+    except OSError as error:
+        raise InputError(path / TENSORS, f"cannot be read ({error.strerror})", _OLDER) from None
+    except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
+        raise InputError(path / TENSORS, f"not safetensors ({error})", _OLDER) from None
+    if (name := first_not_finite(tensors)) is not None:
+        raise InputError(path / TENSORS, f"{name} holds values that are not finite", _OLDER)
+    return Checkpoint(path, tensors, values)
+
+
+def first_not_finite(tensors: dict[str, Tensor]) -> str | None:
+    """The name of the first tensor that holds NaN or infinity, None if all numbers are finite."""
+    floats = ((name, tensor) for name, tensor in tensors.items() if tensor.is_floating_point())
+    return next((name for name, tensor in floats if not bool(tensor.isfinite().all())), None)
 
 
 def describe_scene(scene: Scene) -> dict:
@@ -266,13 +344,29 @@ def _camera_entry(view: dict) -> CameraEntry:
     return CameraEntry(str(view["name"]), str(view["split"]), camera, time)
 
 
-def _read_json(path: Path) -> dict:
+def _is_sound(path: Path) -> bool:
+    try:
+        return bool(read_checkpoint(path))
+    except InputError:
+        return False
+
+
+def _refuse_format(path: Path, values: dict) -> None:
+    """Raises InputError for values of another format than this version's."""
+    found = values.get("format")
+    if found == 1:
+        raise InputError(path, "was made by version 0.1, whose runs this version does not read", "train again")
+    if found != FORMAT:
+        raise InputError(path, f"format = {reprlib.repr(found)} is not {FORMAT}", _REMEDY)
+
+
+def _read_json(path: Path, remedy: str = _REMEDY) -> dict:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", _REMEDY) from None
+        raise InputError(path, f"cannot be read ({error.strerror})", remedy) from None
     except (ValueError, RecursionError) as error:
-        raise InputError(path, f"not valid JSON ({error})", _REMEDY) from None
+        raise InputError(path, f"not valid JSON ({error})", remedy) from None
     if not isinstance(values, dict):
-        raise InputError(path, "is not a JSON object", _REMEDY)
+        raise InputError(path, "is not a JSON object", remedy)
     return values

@@ -12,7 +12,6 @@ from ..errors import InputError, SehdrError
 from ..response import Response
 from ..scene import Scene
 from ..splatting.memory import memory_told
-from .checkpoint import first_not_finite
 from .config import Config
 from .config_files import config_to_dict, load_config, override_config
 from .heldout import evaluate_views
@@ -21,7 +20,7 @@ from .machine import device_name, interruptible, peak_memory, pick_device, torch
 from .plan import apply_plan
 from .prediction import predicted_scene
 from .run import Run, field_from_checkpoint, load_run
-from .run_folder import RunFolder
+from .run_folder import RunFolder, first_not_finite
 from .trainer import Trainer
 
 log = logging.getLogger(__name__)
@@ -110,7 +109,7 @@ class Training:
         self.config = self.trainer.config
         self.total = self.config.schedule.iterations
         self._first = self.iteration
-        self._pace: float | None = None
+        self._pace = 0.0
         self._stopped = False
         self._run: Run | None = None
         self._writer = make_writer and make_writer(str(self.folder.tensorboard))
@@ -177,18 +176,17 @@ class Training:
             if save and iteration < self.total:
                 self._checkpoint()
         if self._writer is not None and iteration % max(1, self.total // 200) == 0:
-            trainer = self.trainer
-            self._log(
-                "train", {"loss": trainer.loss, "psnr": trainer.psnr(), "gaussians": trainer.field.gaussians.count}
-            )
-        left = None
-        # The first step compiles kernels, which says nothing of the pace; later ones weigh more as Gaussians grow.
-        if iteration > self._first + 1:
-            spent = self.seconds - before
-            done = iteration - self._first - 1
-            self._pace = spent if self._pace is None else self._pace + (spent - self._pace) / min(done, 100)
-            left = self._pace * (self.total - iteration)
-        return Step(self, left)
+            step = Step(self, None)
+            self._log("train", {name: getattr(step, name) for name in ("loss", "psnr", "gaussians")})
+        done = iteration - self._first - 1
+        if done == 0:  # It compiled kernels, which says nothing of the pace.
+            return Step(self, None)
+        self._pace += (self.seconds - before - self._pace) / min(done, 100)
+        # With all the Gaussians that it may have, a step takes about twice as long as at the start.
+        strategy = self.trainer.densification
+        growing = self.trainer.field.gaussians.count < strategy.most
+        ahead = max(0.0, 1 - iteration / strategy.stop) if growing else 0.0
+        return Step(self, self._pace * (1 + ahead) * (self.total - iteration))
 
     def _wait(self) -> None:
         """Lets the device finish, as part of the training's time."""
@@ -200,12 +198,12 @@ class Training:
         self._wait()
         self.trainer.check()
         self._checkpoint()
-        trainer, plan = self.trainer, self.folder.read_plan()
+        trainer, decisions = self.trainer, self.folder.read_decisions()
         self.folder.write_summary(
             {
                 "iteration": trainer.iteration,
                 "finished": trainer.iteration >= self.total,
-                "plan": plan and {decision["name"]: decision["choice"] for decision in plan["decisions"]},
+                "plan": {decision["name"]: decision["choice"] for decision in decisions} or None,
                 "train_seconds": round(self.seconds, 3),
                 "gaussians": trainer.field.gaussians.count,
                 "skipped_steps": trainer.skipped_steps,
@@ -277,8 +275,7 @@ class Training:
         info, saved = folder.read_info(), folder.read_config()
         if config is not None and config.plan.enabled:
             # As it was planned then: on another machine the same config may be planned otherwise.
-            plan = folder.read_plan() or {"decisions": ()}
-            fields = {path: value for decision in plan["decisions"] for path, value in decision["fields"].items()}
+            fields = {path: value for made in folder.read_decisions() for path, value in made["fields"].items()}
             config = override_config(config, fields | {"plan.enabled": False})
         if config is not None and config != saved:
             remedy = "resume with the run's own config, or train anew"
@@ -337,8 +334,7 @@ def as_config(config: Config | str | Path | Mapping) -> Config:
 
 
 def with_predictions(scene: Scene, config: Config, response: Response) -> Scene:
-    """The scene as the loss may see it: where loss.predictor names one, its predictions stand in for the truth of the
-    training views, unless they are predictions already."""
+    """The scene as the loss may see it: predictions in place of truth where loss.predictor names where from."""
     if not config.loss.predictor or scene.predictor is not None:
         return scene
     return predicted_scene(scene, config.loss.predictor, response)
@@ -353,12 +349,12 @@ def _sizes(scene: Scene, trainer: Trainer | None = None) -> tuple[int, int, int]
 def _first_difference(saved: Config, given: Config) -> str:
     old, new = config_to_dict(saved), config_to_dict(given)
     for part, values in old.items():
+        one = {part: (values, new[part])}
         if isinstance(values, dict):
-            for name, value in values.items():
-                if new[part][name] != value:
-                    return f"{part}.{name} = {value!r}, but {new[part][name]!r} was asked for"
-        elif new[part] != values:
-            return f"{part} = {values!r}, but {new[part]!r} was asked for"
+            one = {f"{part}.{name}": (value, new[part][name]) for name, value in values.items()}
+        for path, (before, after) in one.items():
+            if before != after:
+                return f"{path} = {before!r}, but {after!r} was asked for"
     return "the config differs"
 
 

@@ -45,7 +45,7 @@ def test_round_trip_is_exact(tmp_path, degree, color_model):
     read = read_gaussians(tmp_path / "a.ply")
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(read, name), getattr(written, name))
-    assert (read.color_model, read.base_exposure_time, read.degree) == (color_model, 0.5, degree)
+    assert (read.color_model, read.base_time, read.degree) == (color_model, 0.5, degree)
 
 
 def test_names_and_order_are_those_of_the_reference_release(tmp_path):
@@ -135,7 +135,7 @@ def test_hdr_ply_is_the_radiance_exactly(tmp_path, radiance):
     run = StoredRun(radiance)
     assert export(run, tmp_path / "hdr.ply") == tmp_path / "hdr.ply"
     read = read_gaussians(tmp_path / "hdr.ply")
-    assert read.color_model == radiance and read.base_exposure_time == 0.25
+    assert read.color_model == radiance and read.base_time == 0.25
     directions = sphere_directions(20)
     np.testing.assert_allclose(
         evaluate_colors(read, directions), run.exposures(directions) / 0.25, rtol=1e-5, atol=1e-7

@@ -6,7 +6,12 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.training.checkpoint import newest_checkpoint, read_checkpoint, write_checkpoint
+from sehdr_warp.training.run_folder import RunFolder, read_checkpoint
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return RunFolder(tmp_path)
 
 
 def state(iteration):
@@ -18,9 +23,9 @@ def state(iteration):
     return tensors, {"iteration": iteration, "order": [2, 0], "seconds": 1.25}
 
 
-def test_round_trip(tmp_path):
+def test_round_trip(folder):
     tensors, values = state(7)
-    path = write_checkpoint(tmp_path / "c", tensors, values, kept=1)
+    path = folder.write_checkpoint(tensors, values, kept=1)
     read = read_checkpoint(path)
     assert {name: value.dtype for name, value in read.tensors.items()} == {
         name: value.dtype for name, value in tensors.items()
@@ -30,49 +35,49 @@ def test_round_trip(tmp_path):
     assert sorted(p.name for p in path.iterdir()) == ["checkpoint.json", "state.safetensors"]
 
 
-def test_only_the_newest_are_kept(tmp_path):
+def test_only_the_newest_are_kept(folder):
     for iteration in (9, 10, 100):
-        write_checkpoint(tmp_path, *state(iteration), kept=2)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["iteration_00000010", "iteration_00000100"]
-    assert newest_checkpoint(tmp_path).values["iteration"] == 100
+        folder.write_checkpoint(*state(iteration), kept=2)
+    assert sorted(p.name for p in folder.checkpoints.iterdir()) == ["iteration_00000010", "iteration_00000100"]
+    assert folder.newest_checkpoint().values["iteration"] == 100
 
 
-def test_a_damaged_newest_falls_back(tmp_path):
+def test_a_damaged_newest_falls_back(folder):
     for iteration in (1, 2):
-        write_checkpoint(tmp_path, *state(iteration), kept=2)
-    file = tmp_path / "iteration_00000002" / "state.safetensors"
+        folder.write_checkpoint(*state(iteration), kept=2)
+    file = folder.checkpoints / "iteration_00000002" / "state.safetensors"
     data = bytearray(file.read_bytes())
     data[-1] ^= 1
     file.write_bytes(data)
-    assert newest_checkpoint(tmp_path).values["iteration"] == 1
+    assert folder.newest_checkpoint().values["iteration"] == 1
     with pytest.raises(InputError, match="SHA-256"):
         read_checkpoint(file.parent)
     # Written again, the damaged one is replaced.
-    write_checkpoint(tmp_path, *state(2), kept=2)
-    assert newest_checkpoint(tmp_path).values["iteration"] == 2
+    folder.write_checkpoint(*state(2), kept=2)
+    assert folder.newest_checkpoint().values["iteration"] == 2
 
 
-def test_what_a_killed_writer_left_is_no_checkpoint(tmp_path):
-    left = tmp_path / ".iteration_00000005.123.tmp"
+def test_what_a_killed_writer_left_is_no_checkpoint(folder):
+    left = folder.checkpoints / ".iteration_00000005.123.tmp"
     left.mkdir(parents=True)
     (left / "state.safetensors").write_bytes(b"half")
-    assert newest_checkpoint(tmp_path) is None
-    write_checkpoint(tmp_path, *state(6), kept=1)
+    assert folder.newest_checkpoint() is None
+    folder.write_checkpoint(*state(6), kept=1)
     assert not left.exists()
 
 
 @pytest.mark.parametrize("text,words", [("{", "JSON"), ("[]", "JSON object"), ('{"format": 99}', "format = 99")])
-def test_bad_values_are_named(tmp_path, text, words):
-    path = write_checkpoint(tmp_path, *state(1), kept=1)
+def test_bad_values_are_named(folder, text, words):
+    path = folder.write_checkpoint(*state(1), kept=1)
     (path / "checkpoint.json").write_text(text)
     with pytest.raises(InputError, match=words):
-        newest_checkpoint(tmp_path)
+        folder.newest_checkpoint()
 
 
-def test_a_wrong_tensor_file_with_a_right_hash_is_refused(tmp_path):
+def test_a_wrong_tensor_file_with_a_right_hash_is_refused(folder):
     import hashlib
 
-    path = write_checkpoint(tmp_path, *state(1), kept=1)
+    path = folder.write_checkpoint(*state(1), kept=1)
     values = json.loads((path / "checkpoint.json").read_text())
     (path / "state.safetensors").write_bytes(b"not safetensors")
     values["sha256"] = hashlib.sha256(b"not safetensors").hexdigest()
@@ -81,18 +86,18 @@ def test_a_wrong_tensor_file_with_a_right_hash_is_refused(tmp_path):
         read_checkpoint(path)
 
 
-def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):
+def test_a_full_disk_loses_nothing(folder, monkeypatch):
     import errno
     import os
 
-    write_checkpoint(tmp_path, *state(1), kept=1)
+    folder.write_checkpoint(*state(1), kept=1)
 
     def refuse(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("sehdr_warp.files.os.fsync", refuse)
     with pytest.raises(SehdrError, match="No space"):
-        write_checkpoint(tmp_path, *state(2), kept=1)
+        folder.write_checkpoint(*state(2), kept=1)
     monkeypatch.undo()
-    assert [p.name for p in tmp_path.iterdir()] == ["iteration_00000001"]
-    assert newest_checkpoint(tmp_path).values["iteration"] == 1
+    assert [p.name for p in folder.checkpoints.iterdir()] == ["iteration_00000001"]
+    assert folder.newest_checkpoint().values["iteration"] == 1

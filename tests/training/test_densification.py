@@ -10,7 +10,7 @@ from sehdr_warp.field.gaussians import PARAMETER_NAMES, Gaussians
 from sehdr_warp.splatting import rasterize
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.densification import GradientDensification, make_densification, rotate
-from sehdr_warp.training.relocation import Relocation, _draw, _relocation_sums
+from sehdr_warp.training.densification import Relocation, _draw, _relocation_sums
 
 EXTENT = 2.0
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.training.checkpoint import newest_checkpoint
+from sehdr_warp.training.run_folder import RunFolder
 from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
 
@@ -40,7 +40,7 @@ def test_a_state_that_is_not_finite_is_never_saved_and_resume_goes_back(scene, t
         after(patch, 15, spoil)
         with pytest.raises(SehdrError, match="iteration 20: gaussians.means is not finite .*--resume"):
             train(scene, tmp_path / "run", config(), device="cpu")
-    assert newest_checkpoint(tmp_path / "run" / "checkpoints").values["iteration"] == 10
+    assert RunFolder(tmp_path / "run").newest_checkpoint().values["iteration"] == 10
     run = train(scene, tmp_path / "run", device="cpu", resume=True)
     assert torch.equal(run.model.gaussians.means, whole.model.gaussians.means)
 
@@ -66,7 +66,7 @@ def test_a_checkpoint_with_nan_is_passed_over(scene, tmp_path):
     (newest / "state.safetensors").write_bytes(data)
     values = json.loads((newest / "checkpoint.json").read_text()) | {"sha256": hashlib.sha256(data).hexdigest()}
     (newest / "checkpoint.json").write_text(json.dumps(values))
-    assert newest_checkpoint(newest.parent).values["iteration"] == 20
+    assert RunFolder(tmp_path / "run").newest_checkpoint().values["iteration"] == 20
 
 
 def test_huge_gradients_leave_finite_parameters(scene):

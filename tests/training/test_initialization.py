@@ -1,4 +1,4 @@
-"""Where a training starts: extents, focus, drawn points, colours, and the choice of a response."""
+"""Where a training starts: extents, focus, drawn points, colors, and the choice of a response."""
 
 import dataclasses
 
@@ -10,9 +10,9 @@ from sehdr_warp.field.color_models import color_model
 from sehdr_warp.response import response_by_name
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.initialization import (
-    base_exposure_time,
+    base_time,
     choose_response,
-    colours_in_views,
+    colors_in_views,
     focus_distance,
     random_points,
     scene_extent,
@@ -39,19 +39,19 @@ def test_cameras_at_one_place_have_an_extent(scene):
 
 def test_drawn_points_are_seen_and_repeat(scene):
     config = load_config("default", {"model.initial_count": 500})
-    points, colours = random_points(scene, config, np.random.default_rng(0))
+    points, colors = random_points(scene, config, np.random.default_rng(0))
     again, _ = random_points(scene, config, np.random.default_rng(0))
-    seen, mean = colours_in_views(points, scene.train_views)
-    assert len(points) == len(colours) == 500 and (seen >= 2).all() and np.array_equal(points, again)
-    np.testing.assert_allclose(mean, colours)
+    seen, mean = colors_in_views(points, scene.train_views)
+    assert len(points) == len(colors) == 500 and (seen >= 2).all() and np.array_equal(points, again)
+    np.testing.assert_allclose(mean, colors)
 
 
-def test_colours_are_those_at_the_projections(scene):
+def test_colors_are_those_at_the_projections(scene):
     view = scene.views[0]
     camera = orbit_camera(0.0)
     point = camera.camera_to_world @ [0.5 / camera.fx * 4, 0.5 / camera.fy * 4, 4.0, 1.0]
     behind = camera.camera_to_world @ [0.0, 0.0, -4.0, 1.0]
-    seen, mean = colours_in_views(np.stack([point[:3], behind[:3]]), (view,))
+    seen, mean = colors_in_views(np.stack([point[:3], behind[:3]]), (view,))
     assert seen.tolist() == [1, 0]
     np.testing.assert_allclose(mean[0], view.image[16, 16], rtol=1e-6)
 
@@ -69,7 +69,7 @@ def test_cameras_back_to_back_share_nothing():
 
 
 @pytest.mark.parametrize("radiance", ["log", "linear", "display"])
-def test_start_colours_invert_the_colour_model(radiance):
+def test_start_colors_invert_the_colour_model(radiance):
     srgb, encoded = response_by_name("srgb"), np.array([[0.2, 0.5, 0.9]])
     value = color_model(radiance).start(encoded, srgb)
     shown = {
@@ -86,7 +86,7 @@ def test_start_colours_invert_the_colour_model(radiance):
 def test_base_time_is_the_median_of_training(scene):
     times = [0.1, 0.2, 0.4, 8.0]
     views = tuple(dataclasses.replace(v, exposure_time=t) for v, t in zip(scene.train_views, times, strict=False))
-    assert base_exposure_time(dataclasses.replace(scene, views=views)) == pytest.approx(0.3)
+    assert base_time(dataclasses.replace(scene, views=views)) == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize("method", ["posterior", "paper"])

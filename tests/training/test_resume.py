@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from sehdr_warp.training.checkpoint import Checkpoint, newest_checkpoint
+from sehdr_warp.training.run_folder import Checkpoint, RunFolder
 from sehdr_warp.training.initialization import choose_response, make_field
 from sehdr_warp.training.run import field_from_checkpoint
 from sehdr_warp.training.train import train
@@ -64,11 +64,11 @@ def test_resume_is_exact(scene, tmp_path, strategy):
     config = configuration(strategy)
     train(scene, tmp_path / "whole", config, device="cpu")
     kill_after_checkpoint(tmp_path / "killed", strategy)
-    assert newest_checkpoint(tmp_path / "killed" / "checkpoints").values["iteration"] == 60
+    assert RunFolder(tmp_path / "killed").newest_checkpoint().values["iteration"] == 60
     # The statistics of a densification interval that the kill cut in two (50 to 75) are part of the state.
     run = train(scene, tmp_path / "killed", device="cpu", resume=True)
-    whole = newest_checkpoint(tmp_path / "whole" / "checkpoints")
-    resumed = newest_checkpoint(tmp_path / "killed" / "checkpoints")
+    whole = RunFolder(tmp_path / "whole").newest_checkpoint()
+    resumed = RunFolder(tmp_path / "killed").newest_checkpoint()
     assert run.config == config and resumed.values["iteration"] == 120
     assert whole.tensors.keys() == resumed.tensors.keys()
     for name, value in whole.tensors.items():
@@ -110,7 +110,7 @@ def test_a_trainer_continues_from_its_state(scene):
         _steps(whole, 45)
         tensors, values = whole.state()
         tensors = {name: value.clone() for name, value in tensors.items()}
-        info = {"response": whole.field.response.to_dict(), "base_exposure_time": whole.field.base_time}
+        info = {"response": whole.field.response.to_dict(), "base_time": whole.field.base_time}
         field = field_from_checkpoint(Checkpoint(Path("memory"), tensors, values), config, info)
         resumed = Trainer(scene, config, field)
         resumed.load_state(tensors, values)

@@ -80,7 +80,7 @@ def test_the_default_gets_radiance_right(scene, tmp_path):
     run = train(scene, tmp_path / "run", quick(), device="cpu")
     last = run.metrics()[-1]
     assert last["psnr_ldr"] > 20 and last["psnr_mu"] > 20
-    assert run.exposure_time == EXPOSURE_TIME and run.gaussian_count == last["gaussians"]
+    assert run.base_time == EXPOSURE_TIME and run.gaussian_count == last["gaussians"]
 
 
 def test_a_scene_without_points_starts_from_drawn_ones(tmp_path):
