@@ -143,8 +143,8 @@ class GradientDensification(Densification):
 
 
 class Relocation(Densification):
-    """Dead Gaussians move to where living ones are, in a way that keeps the image; the count grows by a fixed part up to
-    the budget; noise on the positions of the faint ones explores. No opacity resets, no gradient statistics.
+    """Dead Gaussians move to where living ones are, in a way that keeps the image; the count grows by a fixed part up
+    to the budget; noise on the positions of the faint ones explores. No opacity resets, no gradient statistics.
 
     A start with more Gaussians than the budget keeps its count: they move, and none are added.
     """

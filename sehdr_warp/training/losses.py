@@ -28,9 +28,8 @@ ANCHOR = 0.5
 class Target:
     """One training photo on the device.
 
-    codes: [H, W, 3] as code_tensor() holds them; scale: what they are worth, see code_scale; mask: [H, W, 1] in [0, 1]
-    or None; exposure_truth: [H, W, 3] true radiance times the base time, or None.
-    index: [1], int64, on the device; then codes is a stack [V, H, W, 3] that has the photo at this place.
+    codes: [H, W, 3] as code_tensor() holds them; or with an index [1], int64, a stack [V, H, W, 3] that has the photo
+    there. scale: what they are worth. mask: [H, W, 1] in [0, 1]. exposure_truth: [H, W, 3] radiance times base time.
     """
 
     codes: Tensor
@@ -56,8 +55,7 @@ def code_scale(
     """How photos are compared: in the mu-law of the exposures that the response decodes, or without one as encoded.
 
     white: the largest code, 255 or 65535. clipping: it says `at least white less half a code`, and 0 says `at most half
-    a code`: without the half a response that never quite reaches white would be pulled up for ever. Half a code is that
-    of 8 bits for 16 too, since those are mostly averages of 8 bits.
+    a code`; the half, of 8 bits for 16 too, keeps a response that never quite reaches white from being pulled up.
     """
     values = torch.arange(white + 1, dtype=torch.float64) / white
     if response is None:
@@ -68,11 +66,8 @@ def code_scale(
 
 
 def image_loss(prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str, weight: float) -> Tensor:
-    """L1 + weight (1 - SSIM) ("sum", SeHDR's equation 11) or (1 - weight) L1 + weight (1 - SSIM) ("blend", 3DGS).
-
-    prediction, truth: [H, W, 3], truth without a gradient; mask: [H, W, 1] or None: pixels outside count nothing in L1
-    and as equal in SSIM.
-    """
+    """L1 + weight (1 - SSIM) ("sum", SeHDR's equation 11) or (1 - weight) L1 + weight (1 - SSIM) ("blend", 3DGS), of
+    [H, W, 3]; pixels outside of the mask [H, W, 1] count nothing in L1 and as equal in SSIM."""
     distance_weight = 1.0 if form == "sum" else 1 - weight
     if mask is None and weight:
         return image_distance(prediction, truth, distance_weight, weight)
@@ -84,8 +79,7 @@ def image_loss(prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str
 
 
 def ldr_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor:
-    """The photo against the simulated one, L_LDR, on the target's scale, and where the camera saturated only as far as
-    the photo can tell."""
+    """L_LDR, on the target's scale, and where the camera saturated only as far as the photo can tell."""
     image = photo.light if target.scale.mu else photo.encoded
     seen, truth = clipped_residual(image, target.codes, target.scale, target.index)
     return image_loss(seen, truth, target.mask, config.form, config.ssim_weight)
@@ -99,8 +93,7 @@ def compares_light(config: LossConfig, field: RadianceField) -> bool:
 
 @lru_cache(maxsize=16)
 def mu_of_knee(response: Response) -> float:
-    """The mu whose knee, white / mu, is the exposure of code KNEE of 255: the same place among the codes for any
-    curve, where one mu would leave all shadows of a curve that never clips below it."""
+    """The mu whose knee, white / mu, is the exposure of code KNEE of 255, for any curve."""
     return response.white / max(float(response.decode(KNEE / 255)), 1e-12)
 
 
@@ -121,17 +114,13 @@ def mu_law(exposure: Tensor, white: float, mu: float = MU) -> Tensor:
 
 def anchor_loss(mapper: ToneMapper) -> Tensor:
     """Mean over channels of (f(1) - ANCHOR)^2: photos of one exposure leave a learned f's scale open, and it drifts.
-
-    Source: the unit exposure loss of HDR-NeRF (CVPR 2022), which GaussHDR (CVPR 2025) keeps, as its value for
-    photos.
-    """
-    log_unit = mapper.weights[0].new_zeros(1, 3)
-    return (mapper.encode_log(log_unit) - ANCHOR).square().mean()
+    Source: the unit exposure loss of HDR-NeRF (CVPR 2022)."""
+    return (mapper.encode_log(mapper.weights[0].new_zeros(1, 3)) - ANCHOR).square().mean()
 
 
 def linear_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor | None:
-    """SeHDR's L_linear: base exposure against true exposure where there is truth (and hdr_truth is on), else against
-    the fused one; None where there is nothing to compare."""
+    """SeHDR's L_linear: base exposure against the true one where hdr_truth is on and there is any, else against the
+    fused one; None where there is nothing to compare."""
     if config.hdr_truth and target.exposure_truth is not None:
         return image_loss(photo.base, target.exposure_truth, target.mask, config.form, config.ssim_weight)
     if photo.base is photo.exposure:
@@ -141,18 +130,14 @@ def linear_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor
 
 
 def hdr_loss(photo: Photograph, target: Target, config: LossConfig, largest: float) -> Tensor:
-    """The HDR colour's exposure against the true one, both divided by `largest`, in the mu-law.
-
-    largest: the greatest true exposure of the training views, see largest_truth. Source: HDR-GS's HDR loss, which
-    divides each image by its own maximum instead, and with that leaves the scale of the scene open.
-    """
+    """The HDR color's exposure against the true one, both divided by the greatest of all views, in the mu-law. HDR-GS
+    divides each image by its own maximum, and with that leaves the scale of the scene open."""
     images = photo.exposure / largest, target.exposure_truth / largest
     return image_loss(*(mu_law(image, 1.0) for image in images), target.mask, config.form, config.ssim_weight)
 
 
 def needed_colours(config: LossConfig, has_truth: bool) -> frozenset[str]:
-    """What RadianceField.photograph must render besides the photo for data_loss of a view with or without HDR truth:
-    a colour set that nothing is compared with costs channels of every blend."""
+    """What photograph() must render besides the photo for data_loss of a view with or without HDR truth."""
     wanted = set()
     if config.hdr_weight > 0 and has_truth:
         wanted.add("exposure")

@@ -23,35 +23,30 @@ def pick_device(device: str | torch.device | None) -> torch.device:
         made = torch.device(device)
         torch.empty(0, device=made)
     except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(
-            f"device {device}", f"cannot be used ({reason})", "use cpu, or cuda:N of a GPU that torch sees"
-        ) from None
+        problem = f"cannot be used ({str(error).splitlines()[0]})"
+        raise InputError(f"device {device}", problem, "use cpu, or cuda:N of a GPU that torch sees") from None
     return torch.device("cuda", made.index or 0) if made.type == "cuda" else made
 
 
-def device_name(device: torch.device) -> str:
-    """What runs the training, for a report."""
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu ({thread_count()} threads)"
-
-
-def peak_memory(device: torch.device) -> dict[str, int]:
-    """Largest memory so far, bytes: of this process, and on a GPU of torch's tensors there."""
-    peaks = {}
+def machine_figures(device: torch.device) -> dict:
+    """The device's name, and the largest memory so far, bytes: of this process, and on a GPU of torch's tensors."""
+    cuda = device.type == "cuda"
+    name = torch.cuda.get_device_name(device) if cuda else f"cpu ({thread_count()} threads)"
+    figures: dict = {"device": name}
     if sys.platform != "win32":
         import resource
 
         unit = 1 if sys.platform == "darwin" else 1024
-        peaks["peak_memory_bytes"] = unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    if device.type == "cuda":
-        peaks["peak_gpu_memory_bytes"] = torch.cuda.max_memory_allocated(device)
-    return peaks
+        figures["peak_memory_bytes"] = unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    if cuda:
+        figures["peak_gpu_memory_bytes"] = torch.cuda.max_memory_allocated(device)
+    return figures
 
 
 @contextmanager
 def torch_settings(deterministic: bool) -> Iterator[None]:
     """torch on one thread: its sums then do not depend on the machine's cores, and a CPU training repeats bit for bit.
-    It costs nothing: the work is in the kernels, which have threads of their own, and torch's would stand in their way.
+    It costs nothing: the work is in the kernels, which have threads of their own.
 
     deterministic: also torch's sums on a GPU in a fixed order.
     """

@@ -1,5 +1,7 @@
 """Adam over the Gaussians and the fusion, with 3DGS's learning rates."""
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor
 
@@ -28,11 +30,9 @@ class Adam(torch.optim.Adam):
             skipped = parameters[0].new_zeros(())
         for parameter in parameters:
             if not self.state[parameter]:
-                self.state[parameter] = {
-                    "step": torch.zeros((), device=parameter.device),
-                    "exp_avg": torch.zeros_like(parameter, memory_format=torch.contiguous_format),
-                    "exp_avg_sq": torch.zeros_like(parameter, memory_format=torch.contiguous_format),
-                }
+                moments = (torch.zeros_like(parameter, memory_format=torch.contiguous_format) for _ in range(2))
+                self.state[parameter] = {"step": torch.zeros((), device=parameter.device)}
+                self.state[parameter] |= zip(("exp_avg", "exp_avg_sq"), moments, strict=True)
         # With lists on both sides: to add one tensor to many, torch reads it on the host, which no recording allows.
         made = 1 - skipped if self.made is None else self.made
         torch._foreach_add_([self.state[p]["step"] for p in parameters], [made] * len(parameters))
@@ -55,11 +55,8 @@ class Adam(torch.optim.Adam):
 
 
 def make_optimizer(field: RadianceField, config: Config, extent: float) -> Adam:
-    """One parameter group, with its name, for each parameter of the Gaussians, one for the fusion, one for a
-    learned response.
-
-    On a GPU its steps can be recorded in a CUDA graph: counters and rates live on the device.
-    """
+    """One named group for each parameter of the Gaussians, one for the fusion, one for a learned response. On a GPU
+    counters and rates live on the device, so that steps can be recorded in a CUDA graph."""
     device = field.gaussians.means.device
     rates = {name: getattr(config.optimizer, name) for name in PARAMETER_NAMES}
     rates["means"] *= extent
@@ -67,12 +64,10 @@ def make_optimizer(field: RadianceField, config: Config, extent: float) -> Adam:
     if field.fusion is not None:
         groups.append({"name": "fusion", "params": list(field.fusion.parameters()), "lr": config.optimizer.fusion})
     if field.response.learnable:
-        groups.append(
-            {"name": "response", "params": list(field.response.parameters()), "lr": config.optimizer.response}
-        )
-    for group in groups:
-        if device.type == "cuda":
-            group["lr"] = torch.tensor(group["lr"], device=device)
+        learned = list(field.response.parameters())
+        groups.append({"name": "response", "params": learned, "lr": config.optimizer.response})
+    for group in groups if device.type == "cuda" else ():
+        group["lr"] = torch.tensor(group["lr"], device=device)
     return Adam(groups, eps=EPSILON, fused=True, capturable=device.type == "cuda")
 
 
@@ -94,11 +89,7 @@ def set_means_rate(optimizer: torch.optim.Adam, rate: float) -> None:
 
 def guarded_step(optimizer: torch.optim.Adam, loss: Tensor, incomplete: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """One step of Adam, or none if the loss or a gradient is not finite or the rendering was incomplete; decided on the
-    device, without waiting for it.
-
-    Returns two scalar float tensors: 1 if something was not finite, and 1 if the step was made, 0 if it was skipped for
-    either reason.
-    """
+    device, without waiting for it. Two scalar float tensors: 1 if something was not finite; 1 if the step was made."""
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
     norms = torch.stack(torch._foreach_norm(gradients))
     nonfinite, skipped, made = judge_step(loss, norms, incomplete)
@@ -110,22 +101,22 @@ def guarded_step(optimizer: torch.optim.Adam, loss: Tensor, incomplete: Tensor |
 
 def optimizer_tensors(optimizer: torch.optim.Adam) -> dict[str, Tensor]:
     """Adam's state as named tensors, `<group>.<index>.<key>`, for a checkpoint."""
-    tensors = {}
-    for group in optimizer.param_groups:
-        for index, parameter in enumerate(group["params"]):
-            for key, value in optimizer.state.get(parameter, {}).items():
-                tensors[f"{group['name']}.{index}.{key}"] = value
-    return tensors
+    states = {prefix: optimizer.state.get(parameter, {}) for prefix, parameter in _named(optimizer)}
+    return {f"{prefix}{key}": value for prefix, state in states.items() for key, value in state.items()}
 
 
 def load_optimizer_tensors(optimizer: torch.optim.Adam, tensors: dict[str, Tensor]) -> None:
     """Takes up what optimizer_tensors gave."""
+    for prefix, parameter in _named(optimizer):
+        state = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+        if state:
+            optimizer.state[parameter] = {
+                key: value.to(parameter.device, copy=True).reshape(() if key == "step" else parameter.shape)
+                for key, value in state.items()
+            }
+
+
+def _named(optimizer: torch.optim.Adam) -> Iterator[tuple[str, Tensor]]:
     for group in optimizer.param_groups:
         for index, parameter in enumerate(group["params"]):
-            prefix = f"{group['name']}.{index}."
-            state = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
-            if state:
-                optimizer.state[parameter] = {
-                    key: value.to(parameter.device, copy=True).reshape(() if key == "step" else parameter.shape)
-                    for key, value in state.items()
-                }
+            yield f"{group['name']}.{index}.", parameter

@@ -46,8 +46,8 @@ class Decision:
 
 @dataclass(frozen=True)
 class Plan:
-    """config: ready to be trained. decisions: in the order of RULES. kept: fields that a decision would have changed and
-    the user had given."""
+    """config: ready to be trained. decisions: in the order of RULES. kept: fields that a decision would have changed
+    and the user had given."""
 
     config: Config
     facts: SceneFacts

@@ -27,7 +27,7 @@ class SceneFacts:
     pixels: of all photos together. from_camera: whether a camera made the files. truths: photos with HDR truth.
     points: sparse points. seen: mean number of photos whose field of view holds a probe.
     overlap: part of the probes, or of places along the cameras' rays if that is more, that two photos show.
-    clipped, black: part of the pixels with a channel at white, with all at 0. contrast: standard deviation of all codes.
+    clipped, black: part of the pixels with a channel at white, with all at 0. contrast: deviation of all codes.
     """
 
     photos: int
@@ -76,21 +76,17 @@ def _light(view: View) -> tuple[float, float, float, float]:
 
 def check_scene(scene: Scene, facts: SceneFacts) -> None:
     """Raises InputError for a scene that no training can make sense of."""
-    few = f"{facts.photos} training photos: depth and light cannot be told apart from so few"
-    flat = f"all photos show a single colour (standard deviation {255 * facts.contrast:.2f} of 255): nothing to match"
-    apart = f"the photos share no view: {facts.overlap:.1%} of the places that one shows are in the field of view of another"
-    for refused, problem, remedy in (
-        (
-            facts.photos < FEWEST_PHOTOS,
-            few,
-            f"take {FEWEST_PHOTOS} or more photos from different places, better 20",
-        ),
-        (facts.contrast < LEAST_CONTRAST, flat, "check that the files are the photos, and their exposure"),
-        (
-            facts.overlap < LEAST_OVERLAP,
-            apart,
-            "check the poses and the axes' convention, or take photos that overlap by a half",
-        ),
-    ):
-        if refused:
-            raise InputError(scene.name, problem, remedy)
+    problem = None
+    if facts.photos < FEWEST_PHOTOS:
+        problem = f"{facts.photos} training photos: depth and light cannot be told apart from so few"
+        remedy = f"take {FEWEST_PHOTOS} or more photos from different places, better 20"
+    elif facts.contrast < LEAST_CONTRAST:
+        spread = f"standard deviation {255 * facts.contrast:.2f} of 255"
+        problem = f"all photos show a single colour ({spread}): nothing to match"
+        remedy = "check that the files are the photos, and their exposure"
+    elif facts.overlap < LEAST_OVERLAP:
+        places = f"{facts.overlap:.1%} of the places that one shows"
+        problem = f"the photos share no view: {places} are in the field of view of another"
+        remedy = "check the poses and the axes' convention, or take photos that overlap by a half"
+    if problem:
+        raise InputError(scene.name, problem, remedy)

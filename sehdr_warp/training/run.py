@@ -24,7 +24,7 @@ class Run:
     """A trained scene.
 
     path, folder: where it is. config: the choices it was trained with. model: the RadianceField, on `device`.
-    cameras: the views of the scene, in its order. response: the camera's curve. base_time: the photos' exposure, seconds.
+    cameras: the views of the scene, in its order. response: the camera's curve. base_time: seconds.
     iterations, train_seconds: how far the training was. checkpoint_hash: of the tensors it was loaded from.
     data: where the photos were, for load_scene; may be empty.
     """

@@ -16,7 +16,7 @@ from .config import Config
 from .config_files import config_to_dict, load_config, override_config
 from .heldout import evaluate_views
 from .initialization import choose_response, make_field
-from .machine import device_name, interruptible, peak_memory, pick_device, torch_settings
+from .machine import interruptible, machine_figures, pick_device, torch_settings
 from .plan import apply_plan
 from .prediction import predicted_scene
 from .run import Run, field_from_checkpoint, load_run
@@ -208,8 +208,7 @@ class Training:
                 "gaussians": trainer.field.gaussians.count,
                 "skipped_steps": trainer.skipped_steps,
                 "steps_without_room": trainer.steps_without_room,
-                "device": device_name(self.device),
-                **peak_memory(self.device),
+                **machine_figures(self.device),
             }
         )
         scores = [(line["psnr_ldr"], line["iteration"]) for line in self.folder.read_metrics() if "psnr_ldr" in line]

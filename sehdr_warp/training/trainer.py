@@ -37,16 +37,14 @@ MOST_SKIPPED = 20
 class Trainer:
     """Field, optimizer, densification, random generators and view order of a training, and how they advance.
 
-    iteration: steps done. loss: of the last step, read from the device on demand.
-
     Everything that decides the next step is in state(): a trainer that load_state()s it continues bit for bit on the
     CPU. No global random state is used.
     """
 
     def __init__(self, scene: Scene, config: Config, field: RadianceField):
-        self.config = config
-        self.field = field
+        self.config, self.field = config, field
         self.iteration = 0
+        """Steps done."""
         self.device = field.gaussians.means.device
         self.extent = scene_extent(scene)
         self.optimizer = make_optimizer(field, config, self.extent)
@@ -65,7 +63,7 @@ class Trainer:
         recorded = self.device.type == "cuda" and config.schedule.recorded
         self._recorder = GraphRecorder(self.device) if recorded else None
         self._launched: set = set()
-        self._room = GraphCapacity(self.device)
+        self._capacity = GraphCapacity(self.device)
         self._loss: Tensor | None = None
         self._last_index = 0
 
@@ -76,11 +74,12 @@ class Trainer:
 
     @property
     def loss(self) -> float:
+        """Of the last step, read from the device."""
         return float("nan") if self._loss is None else float(self._loss)
 
     @torch.no_grad()
     def psnr(self) -> float:
-        """PSNR of the simulated photo of the last step's view, by the scene as it is now, against the photo, dB."""
+        """dB, of the last step's view as the scene shows it now, against its photo."""
         view = self._training_views()[self._last_index]
         with self._launching():
             photo = self.field.photograph(view.camera, view.exposure_time, degree=self.degree).encoded
@@ -94,7 +93,7 @@ class Trainer:
     @property
     def steps_without_room(self) -> int:
         """Recorded steps of this process that were left out because a photo needed more room than they had."""
-        return self._room.lacked
+        return self._capacity.lacked
 
     def step(self) -> None:
         """One photo, one step. Raises SehdrError if more than MOST_SKIPPED steps had to be skipped."""
@@ -117,20 +116,21 @@ class Trainer:
                 self._loss = self._optimise(views[index], watched)
         self.densification.perturb(self.iteration, gaussians, rate)
         count = gaussians.count
-        if self.densification.change(self.iteration, gaussians, self.optimizer, self._generator):
-            self._forget_recording(gaussians.count / max(1, count))
+        changed = self.densification.change(self.iteration, gaussians, self.optimizer, self._generator)
+        if changed and self._recorder is not None:
+            # Other Gaussians need about so many times the room.
+            self._recorder.invalidate()
+            self._capacity.change(gaussians.count / max(1, count))
         if self.iteration % CHECK_EVERY == 0:
             self.check()
 
     def _optimise(self, view: TrainingView, watched: bool, capacity: int | None = None) -> Tensor:
-        """Photograph, compare, differentiate, step. Returns the loss.
-
-        With a capacity all of it works on fixed memory and nothing waits for the device.
-        """
-        target, camera, exposure_time = view.target, view.camera, view.exposure_time
+        """Photograph, compare, differentiate, step; the loss. With a capacity all of it works on fixed memory and
+        nothing waits for the device."""
+        target, camera = view.target, view.camera
         photo = self.field.photograph(
             camera,
-            exposure_time,
+            view.exposure_time,
             degree=self.degree,
             also=needed_colours(self.config.loss, target.exposure_truth is not None),
             capacity=capacity,
@@ -152,9 +152,9 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         self._skipped += nonfinite
         if capacity is None:
-            self._room.launched(rendering.entry_count)
+            self._capacity.launched(rendering.entry_count)
         else:
-            self._room.note(rendering.pair_count, rendering.overflow)
+            self._capacity.note(rendering.pair_count, rendering.overflow)
         return loss.detach()
 
     def _can_record(self, views, kind) -> bool:
@@ -163,7 +163,7 @@ class Trainer:
             return False
         if self.field.color_model.encoded and not isinstance(views.times, float):
             return False
-        ready = kind in self._launched and self._room.known
+        ready = kind in self._launched and self._capacity.known
         self._launched.add(kind)
         return ready
 
@@ -172,13 +172,10 @@ class Trainer:
         return nullcontext() if self._recorder is None else self._recorder.launching()
 
     def _replay(self, views: ViewStack, index: int, watched: bool, kind) -> Tensor:
-        capacity = self._room.capacity()
+        capacity = self._capacity.capacity()
         self._index.fill_(index)
         try:
-            return self._recorder.run(
-                kind,
-                lambda: self._optimise(views.at(self._index), watched, capacity),
-            )
+            return self._recorder.run(kind, lambda: self._optimise(views.at(self._index), watched, capacity))
         except RuntimeError as error:
             if bytes_asked_for(error):
                 raise
@@ -188,12 +185,6 @@ class Trainer:
                 f"({str(error).splitlines()[0]}); train with --set schedule.recorded=false, which is slower"
             ) from error
 
-    def _forget_recording(self, growth: float) -> None:
-        """The Gaussians are others, `growth` times as many: they will need about so many times the room."""
-        if self._recorder is not None:
-            self._recorder.invalidate()
-            self._room.change(growth)
-
     def check(self) -> None:
         """Raises SehdrError if more than MOST_SKIPPED steps were skipped."""
         if self.skipped_steps > MOST_SKIPPED:
@@ -201,7 +192,7 @@ class Trainer:
                 f"iteration {self.iteration}: {self.skipped_steps} steps had a loss or gradient that is not finite, "
                 f"more than {MOST_SKIPPED}; lower the learning rates or check photos and cameras"
             )
-        if self._recorder is not None and self._room.look():
+        if self._recorder is not None and self._capacity.look():
             # Steps without room for all pairs changed nothing; record again with what they needed.
             self._recorder.invalidate()
 
@@ -216,19 +207,14 @@ class Trainer:
             "generators": {"order": self._order_generator.get_state(), "device": self._generator.get_state()},
         }
         tensors = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
-        values = {
-            "iteration": self.iteration,
-            "order": list(self._order),
-            "skipped_steps": self.skipped_steps,
-        }
+        values = {"iteration": self.iteration, "order": list(self._order), "skipped_steps": self.skipped_steps}
         return tensors, values
 
     def load_state(self, tensors: dict[str, Tensor], values: dict) -> None:
         """Takes up what state() gave; the field's Gaussians must already be those of the state."""
         load_optimizer_tensors(self.optimizer, _part(tensors, "optimizer"))
-        self.densification.load_state(
-            {name: value.to(self.device) for name, value in _part(tensors, "densification").items()}
-        )
+        statistics = {name: value.to(self.device) for name, value in _part(tensors, "densification").items()}
+        self.densification.load_state(statistics)
         generators = _part(tensors, "generators")
         self._order_generator.set_state(generators["order"].cpu())
         if self._generator.get_state().numel() == generators["device"].numel():
@@ -241,7 +227,15 @@ class Trainer:
 
     def _training_views(self) -> ViewStack | list[TrainingView]:
         if self._stack is None:
-            views = self._upload()
+            loss, response = self.config.loss, self.field.response
+            views = training_views(
+                self._views,
+                self.field.base_time,
+                self.device,
+                truth=loss.uses_hdr,
+                clipping=loss.clipping,
+                light=response if compares_light(loss, self.field) else None,
+            )
             # Only recorded steps need what they read in one place.
             self._stack = (None if self._recorder is None else ViewStack.of(views)) or views
         return self._stack
@@ -251,17 +245,6 @@ class Trainer:
         if not self._order:
             self._order = torch.randperm(count, generator=self._order_generator).tolist()
         return self._order.pop()
-
-    def _upload(self) -> list[TrainingView]:
-        loss, field = self.config.loss, self.field
-        return training_views(
-            self._views,
-            field.base_time,
-            self.device,
-            truth=loss.uses_hdr,
-            clipping=loss.clipping,
-            light=field.response if compares_light(loss, field) else None,
-        )
 
 
 def _part(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:

@@ -9,8 +9,14 @@ import torch
 from sehdr_warp.field.gaussians import PARAMETER_NAMES, Gaussians
 from sehdr_warp.splatting import rasterize
 from sehdr_warp.training.config_files import load_config
-from sehdr_warp.training.densification import GradientDensification, make_densification, rotate
-from sehdr_warp.training.densification import Relocation, _draw, _relocation_sums
+from sehdr_warp.training.densification import (
+    GradientDensification,
+    Relocation,
+    _draw,
+    _relocation_sums,
+    make_densification,
+    rotate,
+)
 
 EXTENT = 2.0
 

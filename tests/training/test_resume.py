@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from sehdr_warp.training.run_folder import Checkpoint, RunFolder
 from sehdr_warp.training.initialization import choose_response, make_field
 from sehdr_warp.training.run import field_from_checkpoint
+from sehdr_warp.training.run_folder import Checkpoint, RunFolder
 from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
 
