@@ -1,9 +1,8 @@
 """How far the photos vouch for a scene's light: what each Gaussian's weight fell on in the training views.
 
 The sum over a photo's pixels of (weight of a Gaussian) x (number at the pixel) is the derivative of the blend with
-respect to that Gaussian's feature, so the splat's own adjoint gathers it for all Gaussians in one pass a view. What is
-gathered is how uncertain each pixel leaves its light, in stops; see pixel_uncertainty. docs/confidence.md has the
-measurements.
+respect to that Gaussian's feature, so the splat's own adjoint gathers it for all Gaussians in one pass a view. The
+number is how uncertain the pixel leaves its light, in stops; see pixel_uncertainty.
 """
 
 from collections.abc import Sequence
@@ -17,14 +16,13 @@ from ..scene import View
 from .radiance_field import CameraTensors, RadianceField
 
 CLIPPED_STOPS = 1.0
-"""Uncertainty of a pixel that is clipped in all channels, which is known to be white or brighter and no more."""
+"""Uncertainty of a pixel that is clipped in all channels."""
 PARTLY_CLIPPED_STOPS = 0.25
-"""Uncertainty of a clipped channel beside one that is not: the others say where the light is, this one its hue."""
+"""Of a clipped channel beside one that is not: the others say where the light is, this one its hue."""
 MOST_STOPS = 4.0
 """A misfit counts no more than this: 1/16 of the confidence already says that nothing is known."""
 LEAST_SEEN = 0.01
-"""Pixels of blending weight, over all training photos, at which a Gaussian has half of the confidence that its photos
-give it."""
+"""Pixels of blending weight, over all photos, at which a Gaussian has half of the confidence that they give it."""
 MOST_VIEWS = 200
 """Training views that are looked at, evenly chosen: more change the means little."""
 
@@ -33,11 +31,9 @@ _HALF_CODE = 0.5 / 255
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the training photos say of each of N Gaussians.
+    """What the training photos say of each of N Gaussians; [N] each.
 
-    seen: [N] pixels, the sum of its blending weights over the photos. stops: [N] mean uncertainty of these pixels,
-    from 0.
-    clipped: [N] in [0, 1], the share of their colour values that were clipped.
+    seen: pixels, the sum of its blending weights. stops: their mean uncertainty. clipped: the share of their values.
     """
 
     seen: Tensor
@@ -45,8 +41,7 @@ class Evidence:
     clipped: Tensor
 
     def confidence(self) -> Tensor:
-        """[N] in [0, 1]: 2^-stops, times seen / (seen + LEAST_SEEN). 1: observed unclipped, and the scene agrees; 1/2:
-        light known to a factor of two; 0: never seen."""
+        """[N] in [0, 1]. 1: observed unclipped, and the scene agrees; 1/2: known to a factor of two; 0: never seen."""
         return torch.exp2(-self.stops) * self.seen / (self.seen + LEAST_SEEN)
 
 
@@ -83,8 +78,8 @@ def gather_evidence(
 ) -> Evidence:
     """What the photos of some views say of a field's Gaussians; where a view has a mask, only where it counts.
 
-    degree: of the harmonics. truth: the field was trained on HDR truth, which is then what was observed where a view
-    has it: nothing is clipped, and the misfit is all the doubt.
+    truth: the field was trained on HDR truth, which is then what was observed where a view has it: nothing is clipped,
+    and the misfit is all the doubt.
     """
     device = field.gaussians.means.device
     total = torch.zeros(field.gaussians.count, 3, device=device)

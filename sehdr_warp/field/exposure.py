@@ -42,16 +42,12 @@ class Exposure:
 
 
 def read_exposures(items: Items, base_time: float | None, field: str = "exposures") -> tuple[Exposure, ...]:
-    """Exposures, ascending, from items of the grammar above.
+    """Exposures, ascending, from items of the grammar above, given as a sequence or separated by commas.
 
-    Args:
-        items: a sequence, or one string of items separated by commas.
-        base_time: the photos' exposure, seconds; None where there are no photos and only seconds can be meant (`ev` is
-            then relative to 1 s).
-        field: what the items are called in errors.
+    base_time: the photos' exposure, seconds; None where there are no photos: only seconds can be meant, and `ev` is
+    relative to 1 s. field: what the items are called in errors.
 
-    Raises:
-        SehdrError: with the item, for one in no known form, not positive or not finite, or given twice.
+    Raises SehdrError with the item for one in no known form, not positive or not finite, or given twice.
     """
     if base_time is not None:
         base_time = _positive(base_time, "base exposure time")
@@ -112,17 +108,9 @@ def _positive(time: float, field: str) -> float:
 
 
 def bracket_log_radiance(log_base: "torch.Tensor", times: Sequence[float], base_time: float) -> "torch.Tensor":
-    """log c^{l_j} = log c^{l_1} + log dt_j - log dt_1 (SeHDR, section 3.2, natural logarithm).
+    """[n, ...]: log c^{l_j} = log c^{l_1} + log dt_j - log dt_1 (SeHDR, section 3.2), from log_base [...].
 
-    Args:
-        log_base: [...] log of the linear radiance at the input exposure, c^{l_1} = E dt_1; any shape, such as [N, 3].
-        times: n exposure times dt_j, and base_time dt_1, in seconds.
-
-    Returns:
-        [n, ...]: exp of it is the linear radiance at each exposure.
-
-    Raises:
-        SehdrError: for a time that is not positive.
+    times: n exposure times dt_j, and base_time dt_1, in seconds; SehdrError for one that is not positive.
     """
     shifts = [math.log(_positive(time, "times")) - math.log(_positive(base_time, "base_time")) for time in times]
     offsets = _on_device(tuple(shifts), log_base.dtype, log_base.device)

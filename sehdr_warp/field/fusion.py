@@ -1,9 +1,8 @@
 """From base radiance to HDR radiance: neural exposure fusion (SeHDR, section 3.3).
 
-Every bracket is the base scaled by a known ratio, so for a fixed response and fixed exposures the fused value is a
-function of one number: the log radiance of the base, for each channel by itself. NeuralExposureFusion can therefore
-evaluate its equations on a table over that number and interpolate, at a cost that does not grow with the Gaussians'
-number; gradients reach the MLPs, the sigmas and the radiances through the table.
+Every bracket is the base scaled by a known ratio, so the fused value is a function of one number: the log radiance of
+the base, for each channel by itself. The equations are evaluated on a table over that number and interpolated, at a
+cost that does not grow with the Gaussians; gradients reach the MLPs, the sigmas and the radiances through the table.
 """
 
 import math
@@ -35,16 +34,13 @@ class NeuralExposureFusion(nn.Module):
     gamma = exp(-(f(c^{l_p}) - 0.5)^2 / (2 sigma_c^2)), sigma_c learnable for each channel, and one MLP a channel:
     2 -> width -> 1 with ReLU between and no function at the end.
 
-    response: f. Used with its extension beyond the clip point, so that f, and with it the result, may pass 1 there.
-    times: n exposure times in seconds; base_time: dt_1.
-    radiance_scale: what the fused value, which is at most 1, is multiplied by; > 0.
-    seed: of the MLPs' initial weights.
+    response: f, with its extension beyond the clip point. times: n exposure times, seconds; base_time: dt_1.
+    radiance_scale: what the fused value, which is at most 1, is multiplied by; > 0. seed: of the MLPs' start.
     width: hidden units of each MLP, as in HDR-GS's tone mapper. sigma: initial standard deviation.
 
-    forward() applies the equations to NODES values of the log radiance, with cubic (Catmull-Rom) interpolation between
-    them; exact() to every Gaussian.
-    Parameters: log_sigma [3]; weights and biases, one stack over the three channels for each layer. All state is in
-    state_dict(). Raises SehdrError for times or a scale that are not positive.
+    forward() applies the equations to NODES values of the log radiance, with Catmull-Rom interpolation between them,
+    constant below and a line above; exact() to every Gaussian. Parameters: log_sigma [3]; weights and biases, one stack
+    over the three channels for each layer. Raises SehdrError for times or a scale that are not positive.
     """
 
     def __init__(
@@ -74,7 +70,9 @@ class NeuralExposureFusion(nn.Module):
 
     def forward(self, log_base: torch.Tensor) -> torch.Tensor:
         """[N, 3] scene-linear radiance c^h from [N, 3] log c^{l_1}, the log of the radiance at the input exposure."""
-        return self.tabulated(log_base)
+        step = (self._high - self._low) / (NODES - 1)
+        table = fuse_exposures(self._encoded_at_nodes(log_base, step), *self._learned(), scale=self.radiance_scale)
+        return interpolate(table, self._low, step, log_base)
 
     def exact(self, log_base: torch.Tensor) -> torch.Tensor:
         """As forward, by the equations themselves for every Gaussian: what the table stands for."""
@@ -98,12 +96,6 @@ class NeuralExposureFusion(nn.Module):
     def _fuse(self, log_base):
         weights, encoded = self.fusion_weights(log_base)
         return self.radiance_scale * (weights * encoded).sum(dim=0)
-
-    def tabulated(self, log_base: torch.Tensor) -> torch.Tensor:
-        """As forward: Catmull-Rom between the table's nodes; below them constant, above a line in log radiance."""
-        step = (self._high - self._low) / (NODES - 1)
-        table = fuse_exposures(self._encoded_at_nodes(log_base, step), *self._learned(), scale=self.radiance_scale)
-        return interpolate(table, self._low, step, log_base)
 
     def _encoded_at_nodes(self, like, step):
         """[n, nodes + 2, 3] the encoded brackets at the table's nodes; kept, unless the curve is itself learned."""

@@ -19,13 +19,10 @@ PARAMETER_NAMES = ("means", "log_scales", "quaternions", "opacity_logits", "harm
 class Gaussians(nn.Module):
     """N anisotropic 3D Gaussians with a view-dependent colour.
 
-    means: [N, 3] world coordinates.
-    log_scales: [N, 3] natural logarithms of the standard deviations along the own axes, world units.
-    quaternions: [N, 4] (w, x, y, z), of any length but zero; normalised where they are used.
-    opacity_logits: [N]; the opacity is their sigmoid.
+    means: [N, 3] world coordinates. log_scales: [N, 3] natural logarithms of the standard deviations, world units.
+    quaternions: [N, 4] (w, x, y, z), of any length but zero. opacity_logits: [N]; the opacity is their sigmoid.
     harmonics_dc, harmonics_rest: [N, 1, 3] and [N, K - 1, 3], real spherical harmonics of degree 0 and above,
-        K = (degree + 1)^2. What their sum over a direction means is the RadianceField's choice: with radiance "log"
-        the logarithm of the exposure at the field's base time.
+        K = (degree + 1)^2. What their sum means is the color model's choice.
     """
 
     def __init__(self, means, log_scales, quaternions, opacity_logits, harmonics_dc, harmonics_rest):
@@ -47,8 +44,8 @@ class Gaussians(nn.Module):
     ) -> "Gaussians":
         """Isotropic Gaussians at points, sized by their neighbours (3DGS, section 5.1).
 
-        points: [N, 3] float32, N >= 1; dc: [N, 3] values of the constant part of the colour (harmonic times
-        coefficient); opacity in (0, 1); scale multiplies the root mean square distance to three neighbours.
+        points: [N, 3] float32, N >= 1; dc: [N, 3] constant part of the color (harmonic times coefficient); scale
+        multiplies the root mean square distance to three neighbours.
         """
         count = points.shape[0]
         extent = max(float((points - points.mean(0)).norm(dim=1).max()), 1e-6)
@@ -93,24 +90,19 @@ class Gaussians(nn.Module):
 
     def append(self, rows: dict[str, Tensor], optimizer: torch.optim.Optimizer | None = None) -> None:
         """Adds M Gaussians, given as by rows(); their optimizer state starts at zero."""
-        for name in PARAMETER_NAMES:
-            added = rows[name]
-            value = torch.cat([getattr(self, name).detach(), added])
-            self._exchange(
-                name, value, optimizer, lambda state, added=added: torch.cat([state, torch.zeros_like(added)])
-            )
+        for name, old in self.tensors().items():
+            nothing = torch.zeros_like(rows[name])
+            self._exchange(name, torch.cat([old, rows[name]]), optimizer, lambda m, new=nothing: torch.cat([m, new]))
 
     def overwrite(
         self, rows: dict[str, Tensor], index: Tensor | None = None, optimizer: torch.optim.Optimizer | None = None
     ) -> None:
         """Writes values of some parameters in place, at an index or mask [N] or everywhere, and zeroes the optimizer
         state there."""
-        with torch.no_grad():
-            for name, values in rows.items():
-                where = slice(None) if index is None else index
-                parameter = getattr(self, name)
-                parameter[where] = values
-                self.forget(name, where, optimizer)
+        where = slice(None) if index is None else index
+        for name, values in rows.items():
+            getattr(self, name).detach()[where] = values
+            self.forget(name, where, optimizer)
 
     def forget(self, name: str, where, optimizer: torch.optim.Optimizer | None) -> None:
         """Zeroes a parameter's optimizer state at an index, mask or slice."""
@@ -137,8 +129,8 @@ def _moments(optimizer, parameter: nn.Parameter) -> dict[str, Tensor]:
 
 
 def neighbour_distances(points: Tensor) -> Tensor:
-    """[N, 3] float64 on the CPU: exact distances from each point to its three nearest others; infinite where there are
-    fewer. points: [N, 3]. Raises SehdrError for a point that is not finite."""
+    """[N, 3] float64: exact distances from each point to its three nearest others. Raises SehdrError for a point that
+    is not finite."""
     positions = points.detach().double().cpu().numpy()
     finite = np.isfinite(positions).all(1)
     if not finite.all():

@@ -39,16 +39,13 @@ class CameraTensors:
 
 @dataclass(frozen=True)
 class Photograph:
-    """A differentiable simulated photo.
+    """A differentiable simulated photo; images [H, W, 3], None where they were not asked for.
 
-    encoded: [H, W, 3] encoded values, extended beyond [0, 1] as by Response.encode_extended; None where they were not
-        asked for.
-    exposure: [H, W, 3] of the HDR colour at the base time (I^h dt_1 of the paper); None where colors are encoded, and
-        where neither it nor the photo was asked for.
-    base: [H, W, 3] of the base colour at the base time (I^b); the same tensor as `exposure` without fusion.
-    rendering: what the rasteriser knows: alpha, projected means, radii.
-    light: [H, W, 3] exposure of this photo, which the response encoded; None where colours are encoded before they are
-        composited.
+    encoded: encoded values, extended beyond [0, 1] as by Response.encode_extended.
+    exposure: of the HDR color at the base time (I^h dt_1 of the paper); None where colors are encoded.
+    base: of the base color at the base time (I^b); the same tensor as `exposure` without fusion.
+    rendering: what the rasterizer knows: alpha, projected means, radii.
+    light: exposure of this photo, which the response encoded; None where colors are encoded before they are composited.
     """
 
     encoded: Tensor | None
@@ -75,13 +72,10 @@ class RenderedView:
 class RadianceField(nn.Module):
     """A scene: Gaussians, the camera response that photographed them, and, where used, the fusion of brackets.
 
-    base_time: dt_1, seconds.
-    rasterizer: rasterize(), or what takes its arguments in its place.
-    radiance: the name of the color model (color_models.py).
-    tone_map: "pixel": f(sum of weighted x); "gaussian": sum of weighted f(x), as the paper composites.
-    fusion: the paper's brackets and their fusion, at the same base time; without, the HDR colour is the base colour.
-    confidence: [N] in [0, 1] of a trained scene, how far its photos vouch for each Gaussian (model/confidence.py); None
-        where it was not measured.
+    base_time: dt_1, seconds. rasterizer: rasterize(), or what takes its arguments in its place.
+    radiance: the name of the color model. tone_map: "pixel": f(sum of weighted x); "gaussian": sum of weighted f(x), as
+    the paper composites. fusion: at the same base time; without, the HDR color is the base color.
+    confidence: [N] in [0, 1], how far the photos vouch for each Gaussian; None where it was not measured.
     """
 
     def __init__(
@@ -119,9 +113,8 @@ class RadianceField(nn.Module):
         capacity: int | None = None,
         encode: bool = True,
     ) -> Photograph:
-        """A photo of exposure_time seconds, harmonics up to `degree`; also: which of "exposure" and "base" are
-        wanted, each a colour set more to render where the photo does not need it; capacity: as rasterize() takes it;
-        encode: False leaves a photo that has an exposure at that."""
+        """A photo of exposure_time seconds, harmonics up to `degree`; also: which of "exposure" and "base" are wanted;
+        capacity: as rasterize() takes it; encode: False leaves a photo that has an exposure at that."""
         ratio = exposure_time / self.base_time
         if self.color_model.encoded:
             rendering = self._rasterize(camera, self._colors(camera, degree)[0], capacity)
@@ -138,12 +131,10 @@ class RadianceField(nn.Module):
         # Not split where it is one: the split's derivative would be a copy.
         parts = rendering.image.split(3, dim=2) if len(sets) > 1 else (rendering.image,)
         images = dict(zip(sets, parts, strict=True))
-        light = None if self.tone_map == "gaussian" else images["fused"] * ratio
-        if light is None:
-            encoded = images["encoded"]
-        else:
+        encoded, exposure, light = images.get("encoded"), images.get("fused"), None
+        if self.tone_map == "pixel":
+            light = exposure * ratio
             encoded = self.response.encode_extended(light) if encode else None
-        exposure = images.get("fused")
         return Photograph(encoded, exposure, images.get("base", exposure), rendering, light)
 
     @torch.no_grad()
@@ -152,13 +143,15 @@ class RadianceField(nn.Module):
         tensors = CameraTensors.of(camera, self.gaussians.means.device)
         pose = tensors.world_to_camera
         depth = self.gaussians.means @ pose[2, :3, None] + pose[2, 3]
-        rendering = self._rasterize(tensors, torch.cat([self._inference_colours(tensors, degree), depth], dim=1))
-        colours, depth = rendering.image[..., :3], rendering.image[..., 3]
-        if self.color_model.encoded:
-            colours = self.response.decode(colours.clamp(0, 1))
+        encoded = self.color_model.encoded
+        colors = self._colors(tensors, degree)[0] if encoded else self._exposures(tensors, degree)[1]
+        rendering = self._rasterize(tensors, torch.cat([colors, depth], dim=1))
+        colors, depth = rendering.image[..., :3], rendering.image[..., 3]
+        if encoded:
+            colors = self.response.decode(colors.clamp(0, 1))
         alpha = rendering.alpha
         depth = torch.where(alpha > 1e-3, depth / alpha.clamp_min(1e-3), torch.zeros_like(depth))
-        return RenderedView(colours / self.base_time, alpha, depth)
+        return RenderedView(colors / self.base_time, alpha, depth)
 
     @torch.no_grad()
     def render_ldr(self, camera: Camera, exposure_time: float | None = None, *, degree: int | None = None) -> Tensor:
@@ -169,8 +162,8 @@ class RadianceField(nn.Module):
 
     @torch.no_grad()
     def render_confidence(self, camera: Camera) -> Tensor | None:
-        """[H, W] in [0, 1]: the mean confidence of what a camera sees, weighted as the light is; 0 where alpha is not
-        above 0.001. None where it was not measured."""
+        """[H, W] in [0, 1]: the mean confidence of what a camera sees, 0 where alpha is not above 0.001; None where it
+        was not measured."""
         if self.confidence is None:
             return None
         # As wide as a training's features, though one channel is meant: no further kernel is compiled.
@@ -187,9 +180,6 @@ class RadianceField(nn.Module):
             features = images.new_zeros(self.gaussians.count, images.shape[2]).requires_grad_()
             blended = self._rasterize(camera, features).image
             return torch.autograd.grad(blended, features, images)[0]
-
-    def _inference_colours(self, camera: CameraTensors, degree: int | None) -> Tensor:
-        return self._colors(camera, degree)[0] if self.color_model.encoded else self._exposures(camera, degree)[1]
 
     def _colors(self, camera: CameraTensors, degree: int | None) -> tuple[Tensor, Tensor | None]:
         gaussians = self.gaussians

@@ -30,8 +30,8 @@ class TrainingView:
 class ViewStack:
     """V training views of one size in shared memory: [i] is view i; at() takes the view whose number is on the device.
 
-    cameras: [V, 24], each view's pose [4, 4], intrinsics [4], position [3] and a 0; times: exposure times in seconds
-    [V], float32, or one float where all are equal; targets: as of one view, each of its images [V, ...].
+    cameras: [V, 24], each view's pose [4, 4], intrinsics [4], position [3] and a 0. times: seconds [V], or one float
+    where all are equal. targets: as of one view, each of its images [V, ...].
     """
 
     width: int
@@ -76,8 +76,8 @@ class ViewStack:
         return replace(view, target=replace(view.target, codes=self.targets.codes[index]))
 
     def at(self, index: Tensor) -> TrainingView:
-        """The view whose number is in index [1], int64, on the views' device; its exposure time may be a tensor. The
-        photo stays in the stack until it is asked for: here taking is copying."""
+        """The view whose number is in index [1], int64, on the views' device. The photo stays in the stack until it is
+        asked for: here taking is copying."""
         time = self.times if isinstance(self.times, float) else one_of(self.times, index)
         view = self._view(lambda values: one_of(values, index), time)
         return replace(view, target=replace(view.target, index=index))
@@ -92,21 +92,18 @@ class ViewStack:
 
 def largest_truth(scene: Scene, loss: LossConfig) -> float:
     """The greatest radiance in the HDR truth of the training views, where it counts; 1.0 where the loss needs none.
-
-    Raises InputError naming the scene and the field of the config where truth that the loss needs is missing or black.
-    """
+    Raises InputError naming scene and field where truth that the loss needs is missing or black."""
     if not loss.uses_hdr:
         return 1.0
     field = f"loss.hdr_weight = {loss.hdr_weight}" if loss.hdr_weight > 0 else "loss.hdr_truth = true"
     remedy = "take a scene with HDR truth, a preset that needs none, or --predict-hdr"
     given = [view for view in scene.train_views if view.hdr is not None]
+    lacking = [view.name for view in scene.train_views if view.hdr is None]
     if not given:
         raise InputError(scene.name, f"no training view has the HDR truth that {field} needs", remedy)
-    if loss.ldr_weight == 0:
-        for view in scene.train_views:
-            if view.hdr is None:
-                problem = f"view {view.name} lacks the HDR truth that {field} needs where loss.ldr_weight = 0.0"
-                raise InputError(scene.name, problem, remedy)
+    if loss.ldr_weight == 0 and lacking:
+        problem = f"view {lacking[0]} lacks the HDR truth that {field} needs where loss.ldr_weight = 0.0"
+        raise InputError(scene.name, problem, remedy)
     counted = (view.hdr if view.mask is None else view.hdr[view.mask > 0] for view in given)
     largest = max((float(radiance.max()) for radiance in counted if radiance.size), default=0.0)
     if not largest > 0:
@@ -123,8 +120,7 @@ def training_views(
     clipping: bool = True,
     light: Response | None = None,
 ) -> list[TrainingView]:
-    """The views on a device. truth: also upload HDR truth; light: the response by which exposures are compared, None
-    for encoded values; clipping: as code_scale takes it."""
+    """The views on a device. truth: also upload HDR truth; light: the response by which exposures are compared."""
     deep = any(view.codes.dtype == np.uint16 for view in views)
     scale = code_scale(65535 if deep else 255, light, device, clipping=clipping)
     made = []

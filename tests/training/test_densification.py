@@ -48,7 +48,7 @@ def rendering_with(gradient, visible):
 def gradient_strategy(**options):
     values = {"densification.strategy": "gradient"}
     values |= {f"densification.{name}": value for name, value in options.items()}
-    return GradientDensification(load_config("default", values), EXTENT)
+    return GradientDensification(load_config("default", values), EXTENT, 1)
 
 
 def observe(strategy, gradients):
