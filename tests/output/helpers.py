@@ -51,7 +51,7 @@ class AnalyticRun:
     """Stands for a trained run: a sky whose radiance depends on the viewing direction, six decades of it."""
 
     response = GammaResponse()
-    exposure_time = 0.5
+    base_time = 0.5
     scene_name = "sky"
     iterations = 7
 

@@ -114,7 +114,7 @@ class StoredRun:
     """A run as export sees it, with tensors."""
 
     response = GammaResponse()
-    exposure_time = 0.25
+    base_time = 0.25
 
     def __init__(self, radiance="log", fusion=None):
         self.arrays = gaussians(color_model=radiance)
