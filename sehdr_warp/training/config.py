@@ -218,11 +218,6 @@ class Config(_Table):
         return min(self.model.harmonics_degree, iteration // self.scaled(self.schedule.harmonics_every))
 
 
-def stated(iteration: float, iterations: int) -> int:
-    """The number to write in a config of so many iterations for what is to happen at an iteration of its own."""
-    return max(1, round(iteration * REFERENCE_ITERATIONS / iterations))
-
-
 def _contradictions(config: Config) -> Iterator[str]:
     """One line for each pair of fields that contradict each other."""
     model, fusion, loss = config.model, config.fusion, config.loss

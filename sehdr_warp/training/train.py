@@ -55,7 +55,7 @@ class Step:
 
 
 class Training:
-    """A training that is driven from outside: iterate over it, and each step is made as it is asked for.
+    """A training, step by step: iterate over it, and each step is made as it is asked for.
 
         training = Training(scene, "run", "fast")
         for step in training:
@@ -72,8 +72,8 @@ class Training:
         config: a Config, a preset's name or file, or a mapping of fields that differ from the default preset; by
             default that preset, or, resuming, the run's own config.
         device: "cpu", "cuda:0", ...; by default the first GPU if there is one.
-        resume: continue the run in `out` from its newest complete checkpoint; with the same scene and config the result
-            is, on the CPU, bit for bit that of an uninterrupted training. A folder without a run starts one.
+        resume: continue the run in `out`, if there is one, from its newest complete checkpoint: on the CPU the result
+            is bit for bit that of an uninterrupted training.
         overwrite: replace the run in `out`.
         tensorboard: event files in out/tensorboard (needs the extra `tensorboard`).
         data: how load_scene made the scene ("path", "exposure_index", "max_size" ...), saved to load it again.
@@ -298,10 +298,10 @@ class Training:
 
     def _crowded(self) -> Iterator[str]:
         """What to know of a training with more start points than it may have, or may add to."""
-        count, most = self.trainer.field.gaussians.count, self.config.densification.max_gaussians
-        if self.iteration == 0 and len(self.scene.points) > most:
-            yield f"{len(self.scene.points)} start points: drawn from, for densification.max_gaussians = {most}"
-        budget = self.trainer.densification.most
+        count, budget = self.trainer.field.gaussians.count, self.trainer.densification.most
+        points, most = len(self.scene.points), self.config.densification.max_gaussians
+        if self.iteration == 0 and points > most:
+            yield f"{points} start points: drawn from, for densification.max_gaussians = {most}"
         if count > budget:
             yield (
                 f"{count} Gaussians are more than relocation's budget of {budget} for these photos: they move, and "

@@ -11,7 +11,6 @@ from sehdr_warp.splatting import rasterize
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.densification import (
     GradientDensification,
-    Relocation,
     _draw,
     _relocation_sums,
     make_densification,
@@ -256,9 +255,3 @@ def test_draws_follow_the_weights():
     drawn = _draw(torch.tensor([1.0, 0.0, 3.0]), 40_000, torch.Generator().manual_seed(0))
     counts = torch.bincount(drawn, minlength=3) / 40_000
     torch.testing.assert_close(counts, torch.tensor([0.25, 0.0, 0.75]), atol=0.01, rtol=0)
-
-
-def test_strategies_by_name():
-    assert isinstance(relocation(), Relocation)
-    gradient = load_config("default", {"densification.strategy": "gradient"})
-    assert isinstance(make_densification(gradient, EXTENT, 1), GradientDensification)

@@ -38,8 +38,10 @@ train(toy_scene(), sys.argv[2], configuration(sys.argv[3]), device="cpu")
 
 
 def configuration(strategy):
-    preset = "paper" if strategy == "paper" else "default"
-    strategies = {} if strategy == "paper" else {"densification.strategy": strategy}
+    preset = strategy if strategy in ("paper", "hdr-gs") else "default"
+    strategies = {"densification.strategy": strategy} if preset == "default" else {}
+    if preset == "hdr-gs":
+        strategies = {"response.name": "learned"}
     fixed = {"schedule.iterations": 120, "densification.every": 25}
     return load_unscaled(preset, QUICK | fixed | strategies)
 
@@ -101,8 +103,9 @@ def test_resume_of_a_finished_run_changes_nothing(scene, tmp_path):
     assert first.metrics() == again.metrics()
 
 
-def test_a_trainer_continues_from_its_state(scene):
-    config = configuration("gradient")
+@pytest.mark.parametrize("strategy", ["gradient", "hdr-gs"])
+def test_a_trainer_continues_from_its_state(scene, strategy):
+    config = configuration(strategy)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

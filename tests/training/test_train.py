@@ -71,16 +71,11 @@ def test_every_variant_learns(scene, tmp_path, variant):
     # The perceptrons of the fusion take longer than this to find their weights.
     gain = 0.8 if run.config.fusion.enabled else 3.0
     assert last["psnr_ldr"] > first["psnr_ldr"] + gain
+    assert last["psnr_mu"] > 20 or variant != "default"
     assert last["seconds"] > first["seconds"] > 0
+    assert run.base_time == EXPOSURE_TIME and run.gaussian_count == last["gaussians"]
     assert run.summary()["finished"] and run.summary()["skipped_steps"] == 0
     assert np.isfinite(run.render(run.cameras[0].camera).hdr.numpy()).all()
-
-
-def test_the_default_gets_radiance_right(scene, tmp_path):
-    run = train(scene, tmp_path / "run", quick(), device="cpu")
-    last = run.metrics()[-1]
-    assert last["psnr_ldr"] > 20 and last["psnr_mu"] > 20
-    assert run.base_time == EXPOSURE_TIME and run.gaussian_count == last["gaussians"]
 
 
 def test_a_scene_without_points_starts_from_drawn_ones(tmp_path):
@@ -261,22 +256,14 @@ def test_photos_without_light_or_shadow_are_refused(scene, tmp_path, value, word
         train(dataclasses.replace(scene, views=views), tmp_path / "run", quick(), device="cpu")
 
 
-def test_one_view_is_refused_and_leaves_no_run(scene, tmp_path):
+def test_one_view_is_refused_and_the_folder_stays_as_it_is(scene, tmp_path):
+    one = dataclasses.replace(scene, views=scene.views[:1])
     with pytest.raises(InputError, match="1 training view"):
-        train(dataclasses.replace(scene, views=scene.views[:1]), tmp_path / "run", quick(), device="cpu")
+        train(one, tmp_path / "run", quick(), device="cpu")
     assert not (tmp_path / "run").exists()
-
-
-def test_a_failed_overwrite_keeps_the_old_run(scene, tmp_path):
     train(scene, tmp_path / "run", quick(**{"schedule.iterations": 2}), device="cpu")
     with pytest.raises(InputError):
-        train(
-            dataclasses.replace(scene, views=scene.views[:1]),
-            tmp_path / "run",
-            quick(),
-            device="cpu",
-            overwrite=True,
-        )
+        train(one, tmp_path / "run", quick(), device="cpu", overwrite=True)
     assert load_run(tmp_path / "run").iterations == 2
 
 

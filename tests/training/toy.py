@@ -7,7 +7,7 @@ from sehdr_warp.field.gaussians import Gaussians
 from sehdr_warp.field.radiance_field import RadianceField
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
-from sehdr_warp.training.config import Config, stated
+from sehdr_warp.training.config import REFERENCE_ITERATIONS, Config
 from sehdr_warp.training.config_files import config_to_dict, load_config
 
 EXPOSURE_TIME = 0.25
@@ -47,6 +47,11 @@ def toy_scene(view_count: int = 8, size: int = 32, with_points: bool = True) -> 
     colors = np.full((len(points), 3), 0.5, dtype=np.float32)
     chosen = slice(None) if with_points else slice(0)
     return Scene("toy", "transforms", tuple(views), points[chosen], colors[chosen])
+
+
+def stated(iteration: float, iterations: int) -> int:
+    """The number to write in a config of so many iterations for what is to happen at an iteration of its own."""
+    return max(1, round(iteration * REFERENCE_ITERATIONS / iterations))
 
 
 def load_unscaled(preset: str = "default", overrides: dict | None = None, length: int | None = None) -> Config:
