@@ -36,8 +36,8 @@ def parse(options: type[Options], words: list[str], program: str) -> Options:
     if details and "--help-all" in words:
         words = ["--help"]
     elif details and {"-h", "--help"} & set(words):
-        hidden = [(name, tyro.conf.Suppress[_hints(options)[name]], dataclasses.field(default_factory=dict))
-                  for name in details]  # fmt: skip
+        none = dataclasses.field(default_factory=dict)
+        hidden = [(name, tyro.conf.Suppress[_hints(options)[name]], none) for name in details]
         short = dataclasses.make_dataclass(options.__name__, hidden, bases=(options,), frozen=True)
         short.__doc__ = options.__doc__
         try:
@@ -135,18 +135,15 @@ def _one_line(told: str) -> str:
     title, *lines = re.sub(r"\x1b\[[0-9;]*m", "", told).splitlines() or [""]
     # Two columns of border, drawn or blank; without drawing there is a rule below the title.
     lines = [line[2:].rstrip(" │") for line in lines]
-    lines = list(
-        itertools.takewhile(lambda line: not re.fullmatch("[-─]{4,}.*", line), lines[not lines[0].strip("-") :])
-    )
+    lines = lines[not lines[0].strip("-") :]
+    lines = list(itertools.takewhile(lambda line: not re.match("[-─]{4}", line), lines))
     if "Required options" in title:
         # Names stand four columns in, their help deeper.
         names = [line.strip() for line in lines if re.match(r" {4}\S", line)]
         return f"{lines[0].strip(' :').replace('Missing from ', '')} needs {', '.join(names)}"
     text = " ".join(" ".join(lines).split())
-    for pattern, shorter in _SHORTER:
-        if re.fullmatch(pattern, text):
-            return re.sub(pattern, shorter, text)
-    return text
+    found = ((re.fullmatch(pattern, text), shorter) for pattern, shorter in _SHORTER)
+    return next((match.expand(shorter) for match, shorter in found if match), text)
 
 
 def numbers(flag: str, text: str | None, kind: type = float, least: float = -math.inf) -> tuple | None:
@@ -161,9 +158,8 @@ def numbers(flag: str, text: str | None, kind: type = float, least: float = -mat
     except ValueError:
         wanted = "whole numbers" if kind is int else "numbers"
         wanted += f" from {least:g}" if least > -math.inf else ""
-        raise InputError(
-            f"{flag} {text}", f"not {wanted} separated by commas", f"write for example {flag}=1,2"
-        ) from None
+        problem = f"not {wanted} separated by commas"
+        raise InputError(f"{flag} {text}", problem, f"write for example {flag}=1,2") from None
     return found
 
 

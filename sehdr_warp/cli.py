@@ -8,7 +8,6 @@ import os
 import sys
 from collections.abc import Callable
 from importlib import import_module
-from typing import NamedTuple
 
 from . import __version__
 from .errors import SehdrError, UsageError, did_you_mean
@@ -16,53 +15,44 @@ from .errors import SehdrError, UsageError, did_you_mean
 PROGRAM = "sehdr-warp"
 
 
-class Command(NamedTuple):
-    """Where a command is: a module of the package, its dataclass of options, and the function that runs them."""
-
-    module: str
-    options: str
-    run: str
-
-
 COMMANDS = {
     "train and use a scene": {
-        "train": Command("training.commands", "Train", "run_train"),
-        "render": Command("output.commands", "Render", "run_render"),
-        "eval": Command("evaluation.commands", "Evaluate", "run_evaluate"),
-        "report": Command("output.commands", "Report", "run_report"),
-        "export": Command("output.commands", "Export", "run_export"),
-        "compare": Command("evaluation.commands", "Compare", "run_compare"),
-        "score": Command("evaluation.commands", "Score", "run_score"),
+        "train": ("training.commands", "Train", "run_train"),
+        "render": ("output.commands", "Render", "run_render"),
+        "eval": ("evaluation.commands", "Evaluate", "run_evaluate"),
+        "report": ("output.commands", "Report", "run_report"),
+        "export": ("output.commands", "Export", "run_export"),
+        "compare": ("evaluation.commands", "Compare", "run_compare"),
+        "score": ("evaluation.commands", "Score", "run_score"),
     },
     "what there is to choose from": {
-        "presets": Command("training.commands", "Presets", "run_presets"),
-        "config": Command("training.commands", "ShowConfig", "run_config"),
-        "calibrate": Command("response.commands", "Calibrate", "run_calibrate"),
-        "responses": Command("response.commands", "Responses", "run_responses"),
-        "scenes": Command("scene.commands", "Scenes", "run_scenes"),
+        "presets": ("training.commands", "Presets", "run_presets"),
+        "config": ("training.commands", "ShowConfig", "run_config"),
+        "calibrate": ("response.commands", "Calibrate", "run_calibrate"),
+        "responses": ("response.commands", "Responses", "run_responses"),
+        "scenes": ("scene.commands", "Scenes", "run_scenes"),
     },
     "measure and make": {
-        "check": Command("check.commands", "Check", "run_check"),
-        "bench": Command("bench.commands", "Bench", "run_bench"),
-        "synth": Command("synth.commands", "Synth", "run_synth"),
-        "completion": Command("completion", "Completion", "run_completion"),
+        "check": ("check.commands", "Check", "run_check"),
+        "bench": ("bench.commands", "Bench", "run_bench"),
+        "synth": ("synth.commands", "Synth", "run_synth"),
+        "completion": ("completion", "Completion", "run_completion"),
     },
 }
-"""Every command, under the headings of the help."""
+"""Every command, under the headings of the help: its module, dataclass of options, and the function that runs them."""
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs a command line and exits: 0 done, 1 an error the user can act on, 2 wrong usage, 130 interrupted, 141 nobody
     reads its output any more."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    debug = "--debug" in words
     try:
         try:
             _run([word for word in words if word != "--debug"])
         finally:
             sys.stdout.flush()
     except SehdrError as error:
-        if debug:
+        if "--debug" in words:
             import traceback
 
             traceback.print_exc()
@@ -80,7 +70,11 @@ def main(arguments: list[str] | None = None) -> None:
 
 def command_options() -> dict[str, type]:
     """The dataclass of options of every command, by its name."""
-    return {name: _load(command)[0] for group in COMMANDS.values() for name, command in group.items()}
+    return {name: _load(command)[0] for name, command in _commands().items()}
+
+
+def _commands() -> dict[str, tuple[str, str, str]]:
+    return {name: command for group in COMMANDS.values() for name, command in group.items()}
 
 
 def _run(words: list[str]) -> None:
@@ -109,16 +103,16 @@ def parse_command(words: list[str]) -> tuple[Callable, object]:
     from .arguments import parse
 
     name, *rest = words
-    known = {name: command for group in COMMANDS.values() for name, command in group.items()}
-    if name not in known:
+    if name not in (known := _commands()):
         raise UsageError(f"no command {name}{did_you_mean(name, known)}; {PROGRAM} --help lists them")
     options, run = _load(known[name])
     return run, parse(options, rest, f"{PROGRAM} {name}")
 
 
-def _load(command: Command):
-    module = import_module(f".{command.module}", __package__)
-    return getattr(module, command.options), getattr(module, command.run)
+def _load(command: tuple[str, str, str]):
+    module, options, run = command
+    found = import_module(f".{module}", __package__)
+    return getattr(found, options), getattr(found, run)
 
 
 def _help() -> str:
@@ -131,26 +125,25 @@ def _help() -> str:
     for heading, group in COMMANDS.items():
         lines.append(f"{heading}:")
         for name, command in group.items():
-            lines += textwrap.wrap(_summary(command), width, initial_indent=f"  {name:<12}", subsequent_indent=" " * 14)
+            told = _summary(*command[:2])
+            lines += textwrap.wrap(told, width, initial_indent=f"  {name:<12}", subsequent_indent=" " * 14)
         lines.append("")
-    return "\n".join([*lines, *_CLOSING])
+    lines += [
+        f"First try:  {PROGRAM} train embedded --out runs/first",
+        f"{PROGRAM} COMMAND --help explains it. Every command takes -q (quiet),",
+        "--verbose, and --debug (where an error comes from). --version prints it.",
+    ]
+    return "\n".join(lines)
 
 
-def _summary(command: Command) -> str:
+def _summary(module: str, options: str) -> str:
     """The first sentence of a command's help, read from the source: importing every room takes seconds."""
     import ast
     from pathlib import Path
 
-    source = Path(__file__).parent.joinpath(*command.module.split(".")).with_suffix(".py").read_text(encoding="utf-8")
-    defined = next(node for node in ast.parse(source).body if getattr(node, "name", None) == command.options)
+    source = Path(__file__).parent.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8")
+    defined = next(node for node in ast.parse(source).body if getattr(node, "name", None) == options)
     return " ".join((ast.get_docstring(defined) or "").split()).partition(". ")[0].removesuffix(".")
-
-
-_CLOSING = (
-    f"First try:  {PROGRAM} train embedded --out runs/first",
-    f"{PROGRAM} COMMAND --help explains it. Every command takes -q (quiet),",
-    "--verbose, and --debug (where an error comes from). --version prints it.",
-)
 
 
 def _tell(line: str) -> None:

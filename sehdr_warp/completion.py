@@ -32,10 +32,7 @@ def run_completion(asked: Completion) -> None:
 
     own = Path(os.environ.get("SHELL", "bash")).name
     shell = asked.shell or (own if own in ("bash", "zsh", "fish", "tcsh") else "bash")
-    choices = [
-        Annotated[options, tyro.conf.subcommand(name)]  # type: ignore[valid-type]
-        for name, options in command_options().items()
-    ]
+    choices = [Annotated[options, tyro.conf.subcommand(name)] for name, options in command_options().items()]
     commands = functools.reduce(operator.or_, choices)
     with suppress(SystemExit):
         tyro.cli(commands, prog=PROGRAM, args=["--tyro-write-completion", shell, "-"], config=MARKERS)

@@ -19,10 +19,7 @@ __all__ = [
 
 
 def response_names() -> dict[str, str]:
-    """The responses with a formula, each with a line that says what it stands for.
-
-    Besides, response_by_name takes `gamma-G`, `colour:NAME` (the encodings of colour-science) and files.
-    """
+    """The responses with a formula, each with a line that says what it stands for."""
     return dict(DESCRIPTIONS)
 
 
@@ -40,11 +37,10 @@ def response_by_name(text: str | Path) -> Response:
     text = str(text).strip()
     if text.lower().startswith("colour:"):
         return colour_response(text.split(":", 1)[1])
+    if _is_file(text):
+        return response_from_file(Path(text))
     path, _, selector = text.rpartition(":")
-    for candidate, chosen in ((text, None), (path, selector)):
-        if candidate and _is_file(candidate):
-            return response_from_file(Path(candidate), chosen)
-    return analytic_response(text)
+    return response_from_file(Path(path), selector) if _is_file(path) else analytic_response(text)
 
 
 def responses_named(text: str | Path) -> list[Response]:

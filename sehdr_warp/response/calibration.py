@@ -64,17 +64,25 @@ def calibrate_codes(
         channel: "red", "green" or "blue" alone; None finds one curve for all three.
         name: of the response, and of the stack in errors.
 
-    Raises:
-        InputError: for a stack that tells nothing, with the reason.
+    Raises InputError for a stack that tells nothing, with the reason.
     """
     if channel not in (None, *CHANNELS):
         raise InputError(name, f"channel {channel!r} is not one of {', '.join(CHANNELS)}", "name one, or none for all")
     stops = np.log2(np.asarray(times, np.float64))
-    _check(photos, stops, name)
-    codes = np.stack([_eight_bit(photo) for photo in photos]).reshape(len(photos), -1, 3)
+    if len(photos) < 2 or len(photos) != len(stops):
+        raise InputError(name, f"{len(photos)} photo(s) with {len(stops)} time(s) are no exposure stack", _REMEDY)
+    if not np.isfinite(stops).all() or np.ptp(stops) < 0.1:
+        raise InputError(name, "every photo has the same exposure time", _REMEDY)
+    if len({photo.shape for photo in photos}) > 1:
+        raise InputError(name, "its photos differ in size", "give photos of one size from a tripod")
+    codes = [photo if photo.dtype == np.uint8 else np.rint(photo / 257.0).astype(np.uint8) for photo in photos]
+    codes = np.stack(codes).reshape(len(photos), -1, 3)
     rng = np.random.default_rng(0)
     codes = codes[:, rng.permutation(codes.shape[1])[:_MOST_PIXELS]]
-    _check_order(codes, stops, name)
+    order = np.argsort(stops, kind="stable")
+    darker = np.diff(codes.mean(axis=(1, 2))[order]) < -2
+    if darker[np.diff(stops[order]) > 0.1].any():
+        raise InputError(name, "a photo of longer exposure is darker than one of shorter", "correct the exposure times")
     chosen = slice(None) if channel is None else [CHANNELS.index(channel)]
     taken = codes[..., chosen].reshape(len(photos), -1)
     curve, residuals, weights, light = _solve(taken, stops, name)
@@ -92,26 +100,6 @@ def calibrate_codes(
         tuple((weights * residuals).sum(1) / np.maximum(weights.sum(1), 1e-9)),
         samples,
     )
-
-
-def _eight_bit(photo: np.ndarray) -> np.ndarray:
-    return photo if photo.dtype == np.uint8 else np.rint(photo / 257.0).astype(np.uint8)
-
-
-def _check(photos, stops: np.ndarray, name: str) -> None:
-    if len(photos) < 2 or len(photos) != len(stops):
-        raise InputError(name, f"{len(photos)} photo(s) with {len(stops)} time(s) are no exposure stack", _REMEDY)
-    if not np.isfinite(stops).all() or np.ptp(stops) < 0.1:
-        raise InputError(name, "every photo has the same exposure time", _REMEDY)
-    if len({photo.shape for photo in photos}) > 1:
-        raise InputError(name, "its photos differ in size", "give photos of one size from a tripod")
-
-
-def _check_order(codes: np.ndarray, stops: np.ndarray, name: str) -> None:
-    order = np.argsort(stops, kind="stable")
-    darker = np.diff(codes.mean(axis=(1, 2))[order]) < -2
-    if darker[np.diff(stops[order]) > 0.1].any():
-        raise InputError(name, "a photo of longer exposure is darker than one of shorter", "correct the exposure times")
 
 
 def _spread(codes: np.ndarray, stops: np.ndarray, shared: np.ndarray) -> float:
@@ -136,7 +124,12 @@ def _solve(codes: np.ndarray, stops: np.ndarray, name: str):
     start *= (start > 0).sum(0) >= 2
     if (start > 0).any(0).sum() < 256:
         raise InputError(name, "hardly a pixel is well exposed in two photos", "give photos of closer exposure times")
-    bends, weights, places = _bends(), start, codes.astype(np.int64)
+    # Second derivatives of the curve, each with the root of its step, so that squares sum to an integral. They are over
+    # nearly the logit of the code: near black and white cameras' curves are almost straight on it.
+    axis = np.log((_CODES + 1.0) / (280.0 - _CODES))
+    bends = np.diff(np.diff(np.eye(256), axis=0) / np.diff(axis)[:, None], axis=0)
+    bends /= np.sqrt(0.5 * (axis[2:] - axis[:-2]))[:, None]
+    weights, places = start, codes.astype(np.int64)
     for _ in range(_ROUNDS):
         total = np.maximum(weights.sum(0), 1e-12)
         offset = stops[:, None] - (weights * stops[:, None]).sum(0) / total
@@ -166,13 +159,3 @@ def _rising(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     steps = np.tril(np.ones((256, 256)))
     lowest = np.r_[-np.inf, np.full(255, _LEAST_RISE)]
     return steps @ lsq_linear(root @ steps, solve_triangular(root, right, trans=1), (lowest, np.inf), tol=1e-6).x
-
-
-def _bends() -> np.ndarray:
-    """[254, 256] second derivatives of a curve, each with the root of its step, so that squares sum to an integral.
-
-    They are over nearly the logit of the code: near black and white cameras' curves are almost straight on it.
-    """
-    axis = np.log((_CODES + 1.0) / (280.0 - _CODES))
-    slopes = np.diff(np.eye(256), axis=0) / np.diff(axis)[:, None]
-    return np.diff(slopes, axis=0) / np.sqrt(0.5 * (axis[2:] - axis[:-2]))[:, None]

@@ -13,8 +13,8 @@ from ..splatting.response_curves import FormulaCurve, encode_with_slope
 
 # Half of one 8-bit code value: an encoded value nearer to white than this is stored as 255.
 HALF_CODE = 0.5 / 255
-# Rise of encode_extended beyond the clip point for each factor of e in exposure. A tenth of what a gamma curve rises
-# just below white: enough for a gradient, too little for a clipped highlight to cost much where no hinge is used.
+# Rise of encode_extended beyond the clip point for each factor of e in exposure: a tenth of a gamma curve's just below
+# white. Enough for a gradient, too little for a clipped highlight to cost much where no hinge is used.
 EXTENSION_SLOPE = 0.05
 # Exposures to start from are at least this: a logarithm needs one above 0.
 START_FLOOR = 1e-6
@@ -25,16 +25,16 @@ class Response(ABC):
 
     Sources: SeHDR, Eq. 1 (Z = f(E dt)); Grossberg and Nayar 2004 for the normalisation of tabulated curves.
 
-    name: what response_by_name takes, or the curve's source.
-    black: f(0), in [0, 1).
-    peak: the largest value that the curve takes or approaches, at most 1.
-    clip_exposure: the smallest exposure with f = peak; infinity for a curve that only approaches it.
-    notes: one line each on what was repaired in measured samples; empty for most.
-    learnable: whether it is an nn.Module whose parameters are trained with the scene; photos can be decoded by it only
-        after that, so `decodable` is the opposite.
-
     encode, encode_extended and decode take a torch tensor (float32 or float64, any shape, any device; differentiable
     once) and return one like it, or a NumPy array or number and return a NumPy array. NaN stays NaN.
+
+    Attributes:
+        name: what response_by_name takes, or the curve's source.
+        black: f(0), in [0, 1).
+        peak: the largest value that the curve takes or approaches, at most 1.
+        clip_exposure: the smallest exposure with f = peak; infinity for a curve that only approaches it.
+        notes: one line each on what was repaired in measured samples.
+        learnable: whether it is an nn.Module that is trained with the scene, and can decode photos only after that.
     """
 
     name: str
@@ -103,14 +103,11 @@ class Response(ABC):
 
     def encode(self, exposure):
         """f(x), in [black, peak]. Exposures below 0 count as 0; the gradient is 0 there and beyond the clip point."""
-        return self._through(_Encode, exposure, None)
+        return self._through(_Encode, exposure, 0.0)
 
     def encode_extended(self, exposure):
-        """f(x) up to the clip point; beyond it f(clip) + s log(x / clip), s = EXTENSION_SLOPE, which leaves a gradient.
-
-        Continuous; the derivative jumps at the clip point and is at most s / clip beyond it. A loss can compare
-        the surplus over 1 with a clipped target through a hinge. Equals encode for a curve that never clips.
-        """
+        """f(x) up to the clip point; beyond it f(clip) + EXTENSION_SLOPE log(x / clip), which leaves a gradient and a
+        surplus over 1 that a hinge can weigh. Equals encode for a curve that never clips."""
         return self._through(_Encode, exposure, EXTENSION_SLOPE)
 
     def decode(self, value):
@@ -159,19 +156,16 @@ class _Encode(_Pointwise):
         differentiate = ctx.needs_input_grad[0]
         clip = response.clip_exposure
         if differentiate and (formula := response.formula()) is not None:
-            value, slope = encode_with_slope(exposure, formula, extension_slope or 0.0)
+            value, slope = encode_with_slope(exposure, formula, extension_slope)
             ctx.save_for_backward(slope)
             return value
         inside = exposure.clamp(0.0, clip if response.clips else None)
         value, slope = response._evaluate(inside, differentiate)
-        if response.clips and extension_slope is not None:
+        if response.clips and extension_slope:
             value = value + extension_slope * (exposure.clamp_min(clip) / clip).log()
         if differentiate:
-            slope = torch.where(exposure < 0, 0.0, slope)
-            if response.clips:
-                beyond = 0.0 if extension_slope is None else extension_slope / exposure
-                slope = torch.where(exposure > clip, beyond, slope)
-            ctx.save_for_backward(slope)
+            slope = torch.where(exposure > clip, extension_slope / exposure, slope)
+            ctx.save_for_backward(torch.where(exposure < 0, 0.0, slope))
         return value
 
 

@@ -1,8 +1,6 @@
 """Responses that are read: EMoR and DoRF files, a curve of one's own, and the camera encodings of colour-science."""
 
-import difflib
 import io
-import json
 import os
 import re
 import subprocess
@@ -11,34 +9,34 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError, SehdrError
+from ..errors import InputError, SehdrError, nearest
+from ..files import read_json, read_text
 from .curve import Response
 from .table import TabulatedResponse
 
-# The largest file read here (all of DoRF as text has 5 MB).
+# The largest text file read here (all of DoRF has 5 MB).
 MAX_BYTES = 64 * 2**20
-# Of a child process: threads would reserve more memory than its limit.
-_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 def response_from_file(path: Path, selector: str | None = None) -> Response:
     """The curve in a file. `selector` is what follows the last colon of `FILE:SELECTOR`.
 
-    201_CRF_data.mat and dorfCurves.txt (DoRF; exposures and values normalised to [0, 1]): an index from 0, or a
+    201_CRF_data.mat and dorfCurves.txt (DoRF; exposures and values normalized to [0, 1]): an index from 0, or a
     curve's name where the file holds names. emor.txt (f = f0 + sum c_i h_i) and invemor.txt (the same for the inverse):
     coefficients c_1,c_2,... separated by commas, none for the mean curve. CSV or text: two columns, exposure and value,
     an optional line of headings, `#` comments. JSON: {"exposures": [...], "values": [...]} or Response.to_dict's.
 
     Raises InputError for a file that is missing, too large, of another content, or whose curve cannot be used.
     """
-    text = None if path.suffix.lower() == ".mat" else _read_text(path)
-    if text is not None and text.lstrip()[:2] in ("E ", "E=", "B ", "B=") and "(1)" in text:
+    suffix = path.suffix.lower()
+    text = "" if suffix in (".mat", ".json") else read_text(path, MAX_BYTES)
+    if text.lstrip()[:2] in ("E ", "E=", "B ", "B=") and "(1)" in text:
         return _emor(path, text, selector)
-    if text is None or _is_dorf(text):
+    if suffix == ".mat" or _is_dorf(text):
         return _select(path, responses_in_file(path), selector)
     if selector is not None:
         raise InputError(path, f"holds one curve, and {selector!r} asks for one of several", "leave out the selector")
-    return _json_curve(path, text) if path.suffix.lower() == ".json" else _text_curve(path, text)
+    return _json_curve(path) if suffix == ".json" else _text_curve(path, text)
 
 
 def responses_in_file(path: Path | str) -> list[Response]:
@@ -46,7 +44,7 @@ def responses_in_file(path: Path | str) -> list[Response]:
     path = Path(path)
     if path.suffix.lower() == ".mat":
         return _dorf_mat(path)
-    text = _read_text(path)
+    text = read_text(path, MAX_BYTES)
     if not _is_dorf(text):
         raise InputError(path, "is not a DoRF file", "give 201_CRF_data.mat or dorfCurves.txt")
     return _dorf_text(path, text)
@@ -55,20 +53,19 @@ def responses_in_file(path: Path | str) -> list[Response]:
 def colour_response(encoding: str) -> Response:
     """A camera or display encoding of colour-science by name (`S-Log3`; case, blanks and hyphens do not matter).
 
-    The exposure axis is scene reflectance as that encoding defines it (0.18 is middle grey); values are limited to
+    The exposure axis is scene reflectance as that encoding defines it (0.18 is middle gray); values are limited to
     [0, 1]. Sampled once at 32 points an octave, 24 octaves below white. Raises SehdrError for an unknown name or an
     encoding that is not a camera's (undefined values, or white beyond 2^20).
     """
     import colour
     from colour.utilities import suppress_warnings
 
-    wanted = _key(encoding)
-    matches = [name for name in colour.CCTF_ENCODINGS if _key(name) == wanted]
-    if not matches:
-        near = difflib.get_close_matches(encoding, colour.CCTF_ENCODINGS, n=5, cutoff=0.3)
-        hint = f"did you mean {', '.join(near)}?" if near else "colour.CCTF_ENCODINGS lists them"
+    known = {_key(name): name for name in reversed(list(colour.CCTF_ENCODINGS))}
+    name = known.get(_key(encoding))
+    if name is None:
+        near = nearest(_key(encoding), known)
+        hint = f"did you mean {known[near]}?" if near else "colour.CCTF_ENCODINGS lists them"
         raise SehdrError(f"response 'colour:{encoding:.60}': colour-science has no such encoding; {hint}")
-    name = matches[0]
 
     def encode(exposure):
         with np.errstate(all="ignore"), suppress_warnings(colour_warnings=True):
@@ -94,21 +91,6 @@ def _key(name: str) -> str:
     return "".join(letter for letter in name.lower() if letter.isalnum())
 
 
-def _read_text(path: Path) -> str:
-    _check_size(path)
-    return path.read_text(encoding="utf-8", errors="replace")
-
-
-def _check_size(path: Path) -> None:
-    try:
-        with open(path, "rb") as file:
-            size = file.seek(0, os.SEEK_END)
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", "give the path of a response file") from error
-    if size > MAX_BYTES:
-        raise InputError(path, f"{size} bytes are too many for a response", f"give a file under {MAX_BYTES} bytes")
-
-
 def _numbers(path: Path, text: str) -> np.ndarray:
     try:
         return np.array(text.split(), dtype=np.float64)
@@ -119,15 +101,15 @@ def _numbers(path: Path, text: str) -> np.ndarray:
 def _select(path: Path, curves: list[Response], selector: str | None) -> Response:
     if selector is None:
         raise InputError(path, f"holds {len(curves)} curves", f"say which, as {path.name}:INDEX or {path.name}:NAME")
-    named = [curve for curve in curves if curve.name.lower() == selector.strip().lower()]
-    if named:
-        return named[0]
-    if selector.strip().isdecimal() and int(selector) < len(curves):
-        return curves[int(selector)]
+    wanted = selector.strip().lower()
+    for index, curve in enumerate(curves):
+        if wanted in (curve.name.lower(), str(index)):
+            return curve
     raise InputError(path, f"has no curve {selector!r}", f"give an index from 0 to {len(curves) - 1}, or a name")
 
 
-# SciPy believes the lengths in a .mat file: a damaged one ends the process that reads it, or fills its memory.
+# SciPy believes the lengths in a .mat file: a damaged one ends the process that reads it, or fills its memory. With
+# several threads the child would reserve more memory than its limit.
 _READ_MAT = """
 import sys
 import numpy, scipy.io
@@ -141,10 +123,10 @@ B, I = (stored[name] for name in "BI")
 assert B.dtype.kind + I.dtype.kind in ("ff", "fu", "fi", "uf", "if", "uu", "ii"), "no real numbers"
 numpy.savez(sys.stdout.buffer, B=B.astype(float), I=I.astype(float))
 """
+_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 def _dorf_mat(path: Path) -> list[Response]:
-    _check_size(path)
     command = [sys.executable, "-c", _READ_MAT, str(path)]
     try:
         done = subprocess.run(command, capture_output=True, timeout=120, check=True, env={**os.environ, **_ONE_THREAD})
@@ -157,8 +139,8 @@ def _dorf_mat(path: Path) -> list[Response]:
     if values.ndim != 2 or values.shape != exposures.shape:
         raise InputError(path, f"B is {values.shape} and I is {exposures.shape}", "give both as [curves, samples]")
     return [
-        TabulatedResponse(f"dorf:{index}", exposures[index], values[index], source=f"{path}:{index}")
-        for index in range(len(values))
+        TabulatedResponse(f"dorf:{index}", *curve, source=f"{path}:{index}")
+        for index, curve in enumerate(zip(exposures, values, strict=True))
     ]
 
 
@@ -171,49 +153,42 @@ def _dorf_text(path: Path, text: str) -> list[Response]:
     """Six lines a curve: name, kind, "I =", exposures, "B =", values."""
     lines = [line for line in text.splitlines() if line.strip()]
     curves = []
-    for start in range(0, len(lines), 6):
-        block = lines[start : start + 6]
-        if len(block) < 6 or block[2].strip() != "I =" or block[4].strip() != "B =":
-            raise InputError(
-                path, f"curve {start // 6} lacks its 'I =' or 'B =' line", "give dorfCurves.txt as published"
-            )
-        exposures, values = _numbers(path, block[3]), _numbers(path, block[5])
-        curves.append(TabulatedResponse(block[0].strip(), exposures, values, source=f"{path}:{start // 6}"))
+    for index in range(-(-len(lines) // 6)):
+        name, _, i, exposures, b, values = (*lines[6 * index : 6 * index + 6], *[""] * 5)[:6]
+        if (i.strip(), b.strip()) != ("I =", "B ="):
+            raise InputError(path, f"curve {index} lacks its 'I =' or 'B =' line", "give dorfCurves.txt as published")
+        columns = _numbers(path, exposures), _numbers(path, values)
+        curves.append(TabulatedResponse(name.strip(), *columns, source=f"{path}:{index}"))
     return curves
 
 
 def _emor(path: Path, text: str, selector: str | None) -> Response:
     """Sections "E =", "f0 =", "h(1)=", ... of equal length; in the inverse file "B =", "g0 =", "hinv(1)=", ..."""
-    remedy = "give emor.txt or invemor.txt as published"
-    sections = re.split(r"^[^=\n]*=", text, flags=re.MULTILINE)[1:]
-    rows = [_numbers(path, body) for body in sections]
+    rows = [_numbers(path, body) for body in re.split(r"^[^=\n]*=", text, flags=re.MULTILINE)[1:]]
     if len(rows) < 3 or len({len(row) for row in rows}) != 1:
-        raise InputError(path, "is not EMoR's layout of sections of one length", remedy)
-    coefficients = _numbers(path, (selector or "").replace(",", " "))
-    if len(coefficients) > len(rows) - 2 or not np.isfinite(coefficients).all():
-        raise InputError(path, f"{selector!r} is not up to {len(rows) - 2} finite numbers", "separate them by commas")
-    curve = rows[1] + sum((c * row for c, row in zip(coefficients, rows[2:], strict=False)), np.zeros_like(rows[1]))
+        raise InputError(
+            path, "is not EMoR's layout of sections of one length", "give emor.txt or invemor.txt as published"
+        )
+    axis, mean, *bends = rows
+    weights = _numbers(path, (selector or "").replace(",", " "))
+    if len(weights) > len(bends) or not np.isfinite(weights).all():
+        raise InputError(path, f"{selector!r} is not up to {len(bends)} finite numbers", "separate them by commas")
+    curve = (mean + weights @ np.array(bends[: len(weights)]).reshape(-1, len(mean))).clip(0.0, 1.0)
     inverse = text.lstrip().startswith("B")
     name = ("invemor" if inverse else "emor") + (f":{selector}" if selector else "")
-    curve = curve.clip(0.0, 1.0)
-    if inverse:
-        return TabulatedResponse(name, np.maximum.accumulate(curve), rows[0], source=str(path))
-    return TabulatedResponse(name, rows[0], curve, source=str(path))
+    columns = (np.maximum.accumulate(curve), axis) if inverse else (axis, curve)
+    return TabulatedResponse(name, *columns, source=str(path))
 
 
-def _json_curve(path: Path, text: str) -> Response:
+def _json_curve(path: Path) -> Response:
     remedy = 'give {"exposures": [...], "values": [...]}'
+    stored = read_json(path)
     try:
-        stored = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(path, f"is not JSON ({error})", remedy) from error
-    if isinstance(stored, dict) and "kind" in stored:
-        try:
+        if "kind" in stored:
             return Response.from_dict(stored)
-        except SehdrError as error:
-            raise InputError(path, str(error), remedy) from error
-    try:
         exposures, values = (np.array(stored[key], np.float64) for key in ("exposures", "values"))
+    except SehdrError as error:
+        raise InputError(path, str(error), remedy) from error
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(path, f"has no two lists of numbers ({error!r})", remedy) from error
     return TabulatedResponse(str(stored.get("name", path.stem)), exposures, values, source=str(path))
@@ -222,16 +197,14 @@ def _json_curve(path: Path, text: str) -> Response:
 def _text_curve(path: Path, text: str) -> Response:
     rows = []
     for number, line in enumerate(text.splitlines(), 1):
-        cells = line.split("#", 1)[0].replace(",", " ").replace(";", " ").split()
-        if not cells:
-            continue
-        try:
-            rows.append([float(cell) for cell in cells])
-        except ValueError:
-            if rows or len(cells) != 2:
-                raise InputError(path, f"line {number} is {line.strip()[:40]!r}", "give two numbers") from None
+        cells = re.split(r"[\s,;]+", line.partition("#")[0].strip(" \t,;"))
+        if cells == [""]:
             continue
         if len(cells) != 2:
             raise InputError(path, f"line {number} has {len(cells)} columns", "give two: exposure and value")
-    columns = np.array(rows).reshape(-1, 2)
-    return TabulatedResponse(path.stem, columns[:, 0], columns[:, 1], source=str(path))
+        try:
+            rows.append([float(cell) for cell in cells])
+        except ValueError:
+            if rows:  # Else these are headings.
+                raise InputError(path, f"line {number} is {line.strip()[:40]!r}", "give two numbers") from None
+    return TabulatedResponse(path.stem, *np.array(rows).reshape(-1, 2).T, source=str(path))

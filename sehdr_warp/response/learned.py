@@ -25,14 +25,14 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
     """f_c(x) = sigmoid(MLP_c(log x)) for the channels c: exposure x = E dt to an encoded value, learned with the scene.
 
     Source: HDR-GS (Cai et al., NeurIPS 2024): log exposure in, one hidden layer of 128 with ReLU, a sigmoid at the end,
-    weights as torch.nn.Linear starts them, turned so that the function rises at first but for a few bends, which is not
-    HDR-GS's. Nothing keeps it rising, and nothing in photos of one exposure tells its scale.
+    weights as torch.nn.Linear starts them, here turned so that the function rises at first but for a few bends. Nothing
+    keeps it rising, and nothing in photos of one exposure tells its scale.
+
+    A Response whose tensors end in a dimension of three channels. encode and encode_extended are the same and
+    differentiable in exposure and weights; decode searches a table of the weights as they are, on values made to
+    increase, and is not differentiable.
 
     width: hidden units, at least 1; seed: of the start weights.
-
-    It is a Response whose tensors end in a dimension of three channels; all state is in state_dict(). encode and
-    encode_extended are the same and differentiable in exposure and weights; decode searches a table of the weights as
-    they are, on values made to increase, and is not differentiable.
     """
 
     name = "learned"
@@ -69,14 +69,13 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
         return self._with_arrays(self.encode, exposure)
 
     def encode_extended(self, exposure):
-        """As encode: the sigmoid approaches 1 and leaves a gradient everywhere, so there is nothing to extend."""
+        """As encode: the sigmoid leaves a gradient everywhere."""
         return self.encode(exposure)
 
     def encode_log(self, log_exposure: torch.Tensor) -> torch.Tensor:
         """Encoded values in (0, 1) of natural logarithms of exposures [..., 3].
 
-        Many of them are interpolated in a table of the perceptrons, as the fusion's are: a function of one number need
-        not be evaluated for every Gaussian. The table is of what the sigmoid takes, which is linear but for kinks.
+        Many are interpolated in a table of what the sigmoid takes, which is linear but for kinks.
         """
         points = log_exposure.reshape(-1, 3)
         if len(points) < EXACT_BELOW or points.dtype != torch.float32 or torch.are_deterministic_algorithms_enabled():
@@ -126,7 +125,7 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
         return float(self.decode(torch.full((1, 3), 1 - HALF_CODE)).max())
 
     def to_dict(self) -> dict:
-        """What from_dict makes a mapper of this shape from; the weights are in state_dict()."""
+        """The mapper's shape; the weights are in state_dict()."""
         return {"kind": "mlp", "width": self.width}
 
     @classmethod

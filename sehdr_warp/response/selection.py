@@ -1,26 +1,31 @@
-"""A response from photos: by color mixtures at edges, the histogram and a prior; or by the paper's score."""
+"""A response from photos: by color mixtures at edges, the histogram and a prior; or by the paper's score.
+
+Every candidate is a table of log exposure over the 8-bit codes, and the photos are edges and shares of codes; what
+speaks for a candidate is computed for all of them at once.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ..errors import SehdrError
-from .analytic import analytic_names, analytic_response
+from .analytic import DESCRIPTIONS, analytic_response
 from .curve import Response
 from .family import CODES, family_logs
 from .table import TabulatedResponse
 
 CODE = 1.0 / 255
-# Edges: pixel pairs this far from the middle one; each end must be flat to 3 codes and 20 codes apart from the other.
+# Edges: pixels this far on both sides of the middle one; each side must be flat to 3 codes and 20 from the other.
 EDGE_REACH, FLAT_CODES, EDGE_CODES = 2, 3, 20
-# The two ends' encoded colours must not be one grey scaled: angle between them, in radians.
+# The two sides' encoded colors must not be one gray scaled: angle between them, in radians.
 EDGE_ANGLE = 0.05
 MAX_EDGES, MIN_EDGES = 12_000, 50
 # The middle lies between these shares of the way from one side to the other, in encoded values.
 LEAST_SHARE, MOST_SHARE = 0.15, 0.85
-# Variance of a stored value in codes^2: rounding, and a little for what two evenly coloured sides still hide.
+# Variance of a stored value in codes^2: rounding, and a little for what two evenly colored sides still hide.
 CODE_VARIANCE = 1 / 12 + 0.05
 # Student's t: an edge that no mixture explains (a third surface, a highlight) costs a logarithm, not a square.
 EDGE_FREEDOM = 2.0
@@ -35,25 +40,21 @@ HIGHLIGHT_RATE, HIGHLIGHT_SPREAD, HIGHLIGHT_FLOOR = 0.4, 0.8, 0.002
 SPAN, SPAN_SPREAD = 0.3, 0.4
 # The density of log exposure, in bins of eight codes from 5.5 to 253.5. From one bin to the next ln density changes by
 # DENSITY_SLOPE times their distance in stops, and by DENSITY_JUMP at any distance; the tails are Student's t. A bin
-# with less than about DENSITY_SHARE of the values counts less.
+# with less than about DENSITY_SHARE of the values counts less, and BINS_PER_FACT neighbors count as one.
 DENSITY_EDGES = np.arange(6, 255, 8)
 DENSITY_SLOPE, DENSITY_JUMP, DENSITY_FREEDOM, DENSITY_SHARE = 0.9, 0.1, 5.0, 1e-3
-# Neighbouring bins share what is unusual about a scene: this many count as one.
 BINS_PER_FACT = 4.0
 # Minus log prior, up to a constant. Of photos that say nothing about where they come from ...
 PRIOR = {"camera": 0.5, "srgb": 0.5, "rec709": 1.0, "gamma-2.2": 1.0, "hdr-nerf": 1.0, "filmic": 2.0, "aces": 2.0}
 # ... and of a camera's own JPEG, which is sharpened and cleaned of noise: its edges mislead (docs/response.md).
 CAMERA_PRIOR = {"camera": 0.0, "rec709": 1.0}
-UNLIKELY = 12.0
 # Nobody stores 8-bit linear photos, and photos scaled down in encoded values have edges that are linear in them.
-LINEAR_PRIOR = 1000.0
+UNLIKELY, LINEAR_PRIOR = 12.0, 1000.0
 # How likely it is beforehand that no formula made the photos, and the probability from which a formula is taken for the
 # truth (docs/response.md: set on half of the scenes and curves).
 NO_FORMULA, DECISIVE = 0.5, 0.25
-# Members of the family that are judged at once.
-BATCH = 16
-# Photos larger than this are read in bands.
-MOST_PIXELS, BAND_ROWS = 400_000, 32
+# Candidates whose edges are judged at once; photos larger than MOST_PIXELS are read in bands.
+BATCH, MOST_PIXELS, BAND_ROWS = 16, 400_000, 32
 
 
 @dataclass(frozen=True)
@@ -124,33 +125,32 @@ def select_response(
     if method not in ("posterior", "paper"):
         raise SehdrError(f"select_response: method = {method!r} is neither posterior nor paper")
     beside = candidates is None and method == "posterior" and not from_camera
-    if candidates is None:
-        candidates = [analytic_response(name) for name in analytic_names()]
+    candidates = [analytic_response(name) for name in DESCRIPTIONS] if candidates is None else candidates
     if not candidates:
         raise SehdrError("select_response: there are no candidates; give at least one response")
     photos = [_bands(each) for each in (image if isinstance(image, list | tuple) else [image])]
     fullest = max(photos, key=lambda bands: sum(clear.sum() for _, clear in bands))
     if method == "paper" and sum(clear.sum() for _, clear in fullest) < 100:
         raise SehdrError("select_response: under 100 pixels are neither black nor clipped; name a response instead")
-    edges = np.concatenate([_edge_colours(*band) for bands in photos for band in bands])
+    bands = [band for each in photos for band in each]
+    edges = np.concatenate([_edge_colors(*band) for band in bands])
     if len(edges) > MAX_EDGES:
         edges = edges[np.random.default_rng(seed).choice(len(edges), MAX_EDGES, replace=False)]
-    bands = [values for each in photos for values, _ in each]
+    codes = [np.rint(255 * values.clip(0, 1)).astype(int).ravel() for values, _ in bands]
+    shares = np.bincount(np.concatenate(codes), minlength=256) / sum(map(len, codes))
+
+    count = len(candidates)
     logs, rises = map(np.stack, zip(*map(_at_codes, candidates), strict=True))
+    ranges, roughnesses = np.array([_range_and_roughness(fullest, each) for each in logs]).T
+    paper = _relative(ranges) - _relative(roughnesses)
     if beside:
         logs, rises = (np.concatenate(pair) for pair in zip((logs, rises), family_logs(), strict=True))
-    count, facts = len(candidates), edge_facts(len(edges))
-    surprise = _edge_surprise(_edge_points(edges), logs, rises)
-    bright, shares = _highlights(bands, logs), _code_shares(bands)
-    spans, densities = _span_surprise(shares, logs), _density_surprise(shares, logs)
+    parts = [_edges(edges, logs, rises), *(part(shares, logs) for part in (_highlights, _span, _density))]
+    evidence = np.nan_to_num(parts[0]) * edge_facts(len(edges)) + np.sum(parts[1:], axis=0)
     priors = np.array([_prior(each, from_camera) for each in candidates])
-    evidence = np.nan_to_num(surprise) * facts + bright + spans + densities
     posteriors = evidence[:count] + priors
-    ranges, roughnesses = np.array([_range_and_roughness(fullest, each) for each in candidates]).T
-    paper = _relative(ranges) - _relative(roughnesses)
-    columns = (ranges, roughnesses, paper, surprise, bright, spans, densities, priors, posteriors)
-    rows = zip(candidates, *(column[:count] for column in columns), strict=True)
-    scores = [ResponseScore(each, *map(float, row)) for each, *row in rows]
+    columns = ranges, roughnesses, paper, *(part[:count] for part in parts), priors, posteriors
+    scores = [ResponseScore(*row) for row in zip(candidates, *(column.tolist() for column in columns), strict=True)]
     order = np.argsort(-paper if method == "paper" else posteriors, kind="stable")
     best = candidates[order[0]]
     if beside:
@@ -194,42 +194,34 @@ def _bands(image) -> list[tuple[np.ndarray, np.ndarray]]:
 
 def _prior(response: Response, from_camera: bool) -> float:
     """Minus the log prior of a candidate; one that is not of the bank was given on purpose, and is as likely as any."""
-    if response.name not in analytic_names():
+    if response.name not in DESCRIPTIONS:
         return 0.0
     if response.name == "linear":
         return LINEAR_PRIOR
     return (CAMERA_PRIOR if from_camera else PRIOR).get(response.name, UNLIKELY)
 
 
-def _highlights(images, logs: np.ndarray) -> np.ndarray:
-    """[K] minus the log likelihood of the shares of values at the brightest code and at the nine codes below it.
+# Minus log likelihoods [K] from the shares of values at the codes [256] and the codes' natural log exposures [K, 256].
+
+
+def _highlights(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
+    """Of the shares of values at the brightest code and at the nine codes below it.
 
     If log radiance falls off as exp(-rate stops), the nine codes span S stops and white holds all beyond them, then
     near / (at + near) = 1 - exp(-rate S): a clipping camera piles values up at 255, a curve that never clips spreads
     the same light over the codes below. The rate is log-normal.
     """
-    count = sum(image.size for image in images)
-    bright = sum(int((image >= 1 - 9.5 * CODE).sum()) for image in images) / count
-    at_white = sum(int((image >= 1 - CODE / 2).sum()) for image in images) / count
     stops = (logs[:, 254:].mean(1) - logs[:, 245:247].mean(1)) / np.log(2)
-    white, near = at_white + HIGHLIGHT_FLOOR / 2, bright - at_white + HIGHLIGHT_FLOOR / 2
+    white, near = shares[255] + HIGHLIGHT_FLOOR / 2, shares[246:255].sum() + HIGHLIGHT_FLOOR / 2
     rate = np.log1p(near / white) / np.maximum(stops, 1e-6)
-    spread = HIGHLIGHT_SPREAD**2 + HIGHLIGHT_FLOOR / (bright + 1e-9)
+    spread = HIGHLIGHT_SPREAD**2 + HIGHLIGHT_FLOOR / (shares[246:].sum() + 1e-9)
     return 0.5 * np.log(rate / HIGHLIGHT_RATE) ** 2 / spread
 
 
-def _code_shares(images) -> np.ndarray:
-    """[256] share of the values at each 8-bit code."""
-    counts = [np.bincount(np.rint(255 * image.clip(0, 1)).astype(np.int64).ravel(), minlength=256) for image in images]
-    return np.sum(counts, axis=0) / np.sum(counts)
-
-
-def _span_surprise(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
-    """[K] minus the log likelihood of the spread of ln exposure, from the codes' natural log exposures [K, 256].
-
-    Scenes span alike many stops, and a wrong curve stretches or squeezes them: above all one that never clips for one
-    that does. The standard deviation is log-normal; its weight is the share of values between black and white.
-    """
+def _span(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
+    """Of the spread of ln exposure. Scenes span alike many stops, and a wrong curve stretches or squeezes them: above
+    all one that never clips for one that does. The standard deviation is log-normal; its weight is the share of values
+    between black and white."""
     inside, logs = shares[1:255].sum(), logs[:, 1:255]
     if inside <= 0:
         return np.zeros(len(logs))
@@ -239,12 +231,9 @@ def _span_surprise(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
     return 0.5 * inside * (off / SPAN_SPREAD) ** 2
 
 
-def _density_surprise(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
-    """[K] minus the log likelihood of the density of log exposure, from the codes' natural log exposures [K, 256].
-
-    A scene's light is spread smoothly over its stops; a wrong curve, which squeezes some codes together and pulls
-    others apart, heaps it up or thins it out.
-    """
+def _density(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
+    """Of the density of log exposure. A scene's light is spread smoothly over its stops; a wrong curve, which squeezes
+    some codes together and pulls others apart, heaps it up or thins it out."""
     edges = 0.5 * (logs[:, DENSITY_EDGES - 1] + logs[:, DENSITY_EDGES]) / np.log(2)
     widths = np.maximum(np.diff(edges), 1e-6)
     counts = np.add.reduceat(shares, DENSITY_EDGES)[:-1]
@@ -262,101 +251,84 @@ def _relative(values: np.ndarray) -> np.ndarray:
     return values / median if median > 0 else np.zeros_like(values)
 
 
-def _range_and_roughness(bands, response):
+def _range_and_roughness(bands, logs: np.ndarray) -> tuple[float, float]:
+    """A photo's dynamic range and roughness in stops, under one candidate's log exposures [256]."""
     seen, bends = [], []
-    for image, clear in bands:
-        stops = np.log2(response.decode(np.maximum(image, response.black + CODE)))
+    for values, clear in bands:
+        stops = np.interp(values, CODES, logs) / np.log(2)
         seen.append(stops[clear].ravel())
-        for axis in (0, 1):
-            rows, known = np.moveaxis(stops, axis, 0), np.moveaxis(clear, axis, 0)
-            bends.append(np.abs(rows[2:] - 2 * rows[1:-1] + rows[:-2])[known[2:] & known[1:-1] & known[:-2]].ravel())
+        for rows, known in ((stops, clear), (stops.swapaxes(0, 1), clear.T)):
+            bends.append(np.abs(np.diff(rows, 2, axis=0))[known[2:] & known[1:-1] & known[:-2]].ravel())
     seen, bends = np.concatenate(seen), np.concatenate(bends)
     low, high = np.percentile(seen, (0.1, 99.9)) if len(seen) else (0.0, 0.0)
     return high - low, bends.mean() if len(bends) else 0.0
 
 
-def _edge_colours(image, clear):
-    """[E, 3, 3] encoded colours (one side, middle, other side) of clean, coloured edges along rows and columns."""
-    found = []
-    for axis in (0, 1):
-        rows, known = np.moveaxis(image, axis, 0), np.moveaxis(clear, axis, 0)
-        reach, length = EDGE_REACH, len(rows)
-        if length < 2 * reach + 3:
+def _edge_colors(image: np.ndarray, clear: np.ndarray) -> np.ndarray:
+    """[E, 3, 3] encoded colors (one side, middle, other side) of clean, colored edges along rows and columns."""
+    found = [np.zeros((0, 3, 3))]
+    for rows, known in ((image, clear), (image.swapaxes(0, 1), clear.T)):
+        length = 2 * EDGE_REACH + 3
+        if len(rows) < length:
             continue
-
-        def at(offset, values=rows, margin=reach + 1, length=length):
-            return values[margin + offset : length - margin + offset]
-
-        first, middle, last = at(-reach), at(0), at(reach)
-        flat = (np.abs(at(-reach - 1) - first).max(-1) <= FLAT_CODES * CODE) & (
-            np.abs(at(reach + 1) - last).max(-1) <= FLAT_CODES * CODE
-        )
+        at = np.moveaxis(sliding_window_view(rows, length, axis=0), -1, 0)
+        seen = sliding_window_view(known, length, axis=0)[..., 1:-1:EDGE_REACH].all(-1)
+        first, middle, last = at[1:-1:EDGE_REACH]
+        flat = np.maximum(np.abs(at[0] - first), np.abs(at[-1] - last)).max(-1) <= FLAT_CODES * CODE
         apart = np.abs(last - first).max(-1) >= EDGE_CODES * CODE
         # Between the sides in every channel, and well off both: another surface at the edge is not.
         between = ((middle - first) * (last - middle) >= -(CODE**2)).all(-1)
         share = np.linalg.norm(middle - first, axis=-1) / np.maximum(np.linalg.norm(last - first, axis=-1), CODE)
         cosine = (first * last).sum(-1) / (np.linalg.norm(first, axis=-1) * np.linalg.norm(last, axis=-1) + 1e-12)
-        coloured = cosine < np.cos(EDGE_ANGLE)
-        seen = at(-reach, known) & at(0, known) & at(reach, known)
-        chosen = flat & apart & between & coloured & seen & (share > LEAST_SHARE) & (share < MOST_SHARE)
+        mixed = (share > LEAST_SHARE) & (share < MOST_SHARE) & (cosine < np.cos(EDGE_ANGLE))
+        chosen = seen & flat & apart & between & mixed
         found.append(np.stack([first[chosen], middle[chosen], last[chosen]], axis=1))
-    return np.concatenate(found) if found else np.zeros((0, 3, 3))
+    return np.concatenate(found)
 
 
-def _edge_points(edges):
-    """[E, 13] encoded: the three colours of each edge; of the channel that changes most, where the middle may lie (2),
-    and the two sides."""
+def _edges(edges: np.ndarray, logs: np.ndarray, rises: np.ndarray) -> np.ndarray:
+    """[K] mean over edges of minus the log likelihood, nats, in float32; between codes along straight lines. NaN for
+    too few edges."""
+    if len(edges) < MIN_EDGES:
+        return np.full(len(logs), np.nan)
+    # The three colors; of the channel that changes most, where the middle may lie (2), and the two sides.
     channel = np.abs(edges[:, 2] - edges[:, 0]).argmax(1)[:, None]
     first, last = (np.take_along_axis(edges[:, side], channel, 1) for side in (0, 2))
     limits = [first + share * (last - first) for share in (LEAST_SHARE, MOST_SHARE)]
-    return np.concatenate([edges.reshape(-1, 9), *limits, first, last], axis=1)
+    points = np.concatenate([edges.reshape(-1, 9), *limits, first, last], axis=1)
+    place = torch.from_numpy(np.clip(points * 255, 1, 255)).float()
+    below = place.floor().clamp_max(254).long()
+    part = place - below
 
+    def read(table, count):
+        return table[:, below[:, :count]].lerp(table[:, below[:, :count] + 1], part[:, :count])
 
-def _edge_surprise(points, logs, rises) -> np.ndarray:
-    """[K] mean over edges of minus the log likelihood, nats, in float32; between codes along straight lines. NaN for
-    too few edges."""
-    if len(points) < MIN_EDGES:
-        return np.full(len(logs), np.nan)
     exposures = torch.from_numpy(np.exp(logs)).float()
     slopes = 1 / (exposures * torch.from_numpy(rises).float())
-    place = torch.from_numpy(np.clip(points * 255, 1, 255)).float()
-    below = place.floor().clamp_max(254)
-    part, below = place - below, below.long()
-    found = []
-    for start in range(0, len(logs), BATCH):
-        read = [
-            table[:, at].lerp(table[:, at + 1], weight)
-            for table, at, weight in (
-                (exposures[start : start + BATCH], below, part),
-                (slopes[start : start + BATCH], below[:, :9], part[:, :9]),
-            )
-        ]
-        found.append(_mixture_surprise(*read))
-    return torch.cat(found).double().numpy()
+    batches = zip(exposures.split(BATCH), slopes.split(BATCH), strict=True)
+    return torch.cat([_mixture_surprise(read(x, 13), read(slope, 9)) for x, slope in batches]).double().numpy()
 
 
-def _mixture_surprise(exposures, slopes):
-    """[...] from exposures [..., E, 13] of _edge_points and the curve's slopes [..., E, 9] at the nine colours.
+def _mixture_surprise(exposures: torch.Tensor, slopes: torch.Tensor) -> torch.Tensor:
+    """[K] from exposures [K, E, 13] at the points of _edges and the curve's slopes [K, E, 9] at the nine colors.
 
-    The middle colour lies on the line of its two sides. Its distance from the line has the variance that rounding of
-    all three colours gives it under this candidate, measured at the middle colour in code values, where a photo's own
+    The middle color lies on the line of its two sides. Its distance from the line has the variance that rounding of
+    all three colors gives it under this candidate, measured at the middle color in code values, where a photo's own
     noise is alike for every candidate. Along the line every share in linear light is as likely, within the limits that
-    the choice of edges left. The densities' normalisation belongs to both: without, the curve that crowds colours
+    the choice of edges left. The densities' normalization belongs to both: without, the curve that crowds colors
     together would win.
     """
     first, middle, last = exposures[..., :9].unflatten(-1, (3, 3)).unbind(-2)
     slope_first, slope, slope_last = slopes.unflatten(-1, (3, 3)).unbind(-2)
     low, high, begin, end = exposures[..., 9:].unbind(-1)
     offset, line = slope * (middle - first) / CODE, slope * (last - first) / CODE
-    length = line.square().sum(-1).clamp_min(1e-30)
-    share = ((offset * line).sum(-1) / length)[..., None]
+    share = ((offset * line).sum(-1) / line.square().sum(-1).clamp_min(1e-30))[..., None]
     variance = CODE_VARIANCE * (1 + ((1 - share) * slope / slope_first) ** 2 + (share * slope / slope_last) ** 2)
     weighted = (line.square() / variance).sum(-1).clamp_min(1e-30)
     share = ((offset * line / variance).sum(-1) / weighted)[..., None]
     distance = ((offset - share * line).square() / variance).sum(-1)
-    spread = (
-        0.5 * (variance.log().sum(-1) + weighted.log()) + ((high - low) / (end - begin)).abs().clamp_min(1e-3).log()
-    )
+    width = ((high - low) / (end - begin)).abs().clamp_min(1e-3)
+    spread = 0.5 * (variance.log().sum(-1) + weighted.log()) + width.log()
     tail = (EDGE_FREEDOM + 2) / 2
     costs = [tail * (distance / (EDGE_FREEDOM * misfit)).log1p().mean(-1) + np.log(misfit) for misfit in EDGE_MISFITS]
     return torch.stack(costs).amin(0) + spread.mean(-1)

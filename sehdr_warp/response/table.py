@@ -24,14 +24,13 @@ LEAST_STEP = 1e-9
 class TabulatedResponse(Response, kind="table"):
     """A response through samples (exposure, value), increasing, exact inverse included.
 
-    exposures: [K] >= 0, increasing, in the file's own unit; values: [K] in [0, 1]. At least 3 samples.
-    Sampled curves are given up to scale: `white` of a DoRF curve is 1 or less, and radiance is then relative to it.
+    exposures: [K] >= 0, in the file's own unit; values: [K] in [0, 1]. At least 3 samples. Radiance is relative to that
+    unit.
 
     What is repaired, with one of `notes` each: samples out of order are sorted, equal exposures averaged, a decrease is
     replaced by the nearest monotone curve (least squares). What is always done: a curve that starts above exposure 0
-    is continued to (0, 0) by a line; a flat part within the curve is tilted about its centre by 2^-14, so that its
-    value decodes to the middle of the part (at black: rises from it); a flat part at the top is the clipped range.
-    Beyond the last sample the curve is flat.
+    is continued to (0, 0) by a line; a flat part within the curve is tilted about its center, so that its value decodes
+    to the middle of the part (at black: rises from it); a flat part at the top is the clipped range.
 
     Raises InputError(source, ...) for fewer than 3 samples, NaN or infinity, a negative exposure, a value outside
     [0, 1], or a curve that does not rise.
@@ -95,13 +94,8 @@ class TabulatedResponse(Response, kind="table"):
         return torch.lerp(nodes[cell], nodes[cell + 1], part).to(value.dtype)
 
     def to_dict(self):
-        return {
-            "kind": "table",
-            "name": self.name,
-            "exposures": self._knots.tolist(),
-            "values": self._levels.tolist(),
-            "notes": list(self.notes),
-        }
+        columns = {"exposures": self._knots.tolist(), "values": self._levels.tolist()}
+        return {"kind": "table", "name": self.name, **columns, "notes": list(self.notes)}
 
     @classmethod
     def _from_dict(cls, values):
@@ -127,11 +121,8 @@ def _monotone(exposures: np.ndarray, values: np.ndarray, source: str):
         exposures, values = np.concatenate([[0.0], exposures]), np.concatenate([[0.0], values])
     values = _without_traces(values)
     if values[-1] - values[0] < 2 * HALF_CODE:
-        raise InputError(
-            source,
-            f"the curve rises by only {values[-1] - values[0]:.3g}",
-            "give a curve from dark to bright",
-        )
+        rise = f"the curve rises by only {values[-1] - values[0]:.3g}"
+        raise InputError(source, rise, "give a curve from dark to bright")
     clipped = np.searchsorted(values, values[-1])
     return *_tilt_flat_parts(exposures[: clipped + 1], values[: clipped + 1]), notes
 
@@ -139,23 +130,21 @@ def _monotone(exposures: np.ndarray, values: np.ndarray, source: str):
 def _check(exposures: np.ndarray, values: np.ndarray, source: str):
     remedy = "give two columns of numbers, exposure and value in [0, 1]"
     if exposures.ndim != 1 or exposures.shape != values.shape or len(exposures) < 3:
-        raise InputError(
-            source, f"{exposures.shape} exposures and {values.shape} values are not 3 samples or more", remedy
-        )
+        shapes = f"{exposures.shape} exposures and {values.shape} values"
+        raise InputError(source, f"{shapes} are not 3 samples or more", remedy)
     for what, column in (("exposure", exposures), ("value", values)):
         for bad in np.flatnonzero(~np.isfinite(column)):
             raise InputError(source, f"{what} {bad + 1} is {column[bad]}", remedy)
     if exposures.min() < 0:
         raise InputError(source, f"exposure {exposures.min():.6g} is negative", remedy)
-    steps = np.diff(np.unique(np.concatenate([[0.0], exposures])))
-    if exposures.max() > 1e30 or (len(steps) and steps.min() < 1e-30):
-        worst = exposures.max() if exposures.max() > 1e30 else steps.min()
-        raise InputError(
-            source, f"exposures of {worst:.3g} apart cannot be computed with", "divide them by the largest"
-        )
-    if values.min() < 0 or values.max() > 1:
-        worst = values.max() if values.max() > 1 else values.min()
-        raise InputError(source, f"value {worst:.6g} is outside [0, 1]", "divide codes by the largest, 255 or 65535")
+    for step in (exposures.max(), np.diff(np.unique(np.r_[0.0, exposures])).min(initial=1.0)):
+        if not 1e-30 <= step <= 1e30:
+            problem = f"exposures of {step:.3g} apart cannot be computed with"
+            raise InputError(source, problem, "divide them by the largest")
+    for worst in (values.max(), values.min()):
+        if not 0 <= worst <= 1:
+            problem = f"value {worst:.6g} is outside [0, 1]"
+            raise InputError(source, problem, "divide codes by the largest, 255 or 65535")
 
 
 def _without_traces(values: np.ndarray) -> np.ndarray:

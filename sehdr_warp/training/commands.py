@@ -17,6 +17,8 @@ from ..errors import InputError, SehdrError, UsageError
 from .config_fields import flag_of, flags_type, gone_flags, named_fields
 
 log = logging.getLogger(__name__)
+# What load_scene takes besides the path and the response.
+_READ_BY = ("exposure_index", "max_size", "holdout")
 
 
 @dataclass(frozen=True)
@@ -117,27 +119,33 @@ def run_train(asked: Train) -> None:
     from .prediction import check_predictor
     from .run_folder import RunFolder
 
-    out, resumed = asked.output.out, False
-    if out is None and not asked.training.plan_only:
+    output, plan_only, resumed = asked.output, asked.training.plan_only, False
+    how = {"resume": output.resume, "overwrite": output.overwrite}
+    if output.out is None and not plan_only:
         raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
     # What can be refused is refused before the photos are read, which may take minutes.
-    if out is not None and not asked.training.plan_only:
-        resumed = RunFolder(out).check(resume=asked.output.resume, overwrite=asked.output.overwrite)
+    if not plan_only:
+        resumed = RunFolder(output.out).check(**how)
     data = _data(asked, resumed)
     config, device = _config(asked, resumed), pick_device(asked.machine.device)
     if config.loss.predictor:
         check_predictor(config.loss.predictor)
     options = config.response
     scene = _load(data, response=options.name, method=options.method, candidates=options.candidates)
-    if asked.training.plan_only:
+    if plan_only:
         from .plan import make_plan
 
         plan = make_plan(scene, config, device)
-        print(json.dumps(plan.to_dict()) if asked.output.json else plan.table())
+        print(json.dumps(plan.to_dict()) if output.json else plan.table())
         return
-    run = _train(asked, scene, config, device, data)
+    from ..console import follow
+    from .train import Training
+
+    training = Training(scene, output.out, config, device=device, tensorboard=output.tensorboard, data=data, **how)
+    follow(training, training.total)
+    run = training.run
     summary = run.summary() | {"run": str(run.path), "metrics": run.metrics()}
-    print(json.dumps(summary) if asked.output.json else _ending(run.path, summary))
+    print(json.dumps(summary) if output.json else _ending(run.path, summary))
 
 
 def run_presets(asked: Presets) -> None:
@@ -198,13 +206,7 @@ def _data(asked: Train, resumed: bool) -> dict:
     path = asked.data
     if path is not None and not is_embedded(path):
         path = str(Path(path).absolute())
-    options = asked.scene
-    given = {
-        "path": path,
-        "exposure_index": options.exposure_index,
-        "max_size": options.max_size,
-        "holdout": options.holdout,
-    }
+    given = {"path": path} | {name: getattr(asked.scene, name) for name in _READ_BY}
     if resumed:
         known = RunFolder(asked.output.out).read_info()["data"]
         given = {name: known.get(name) if value is None else value for name, value in given.items()}
@@ -248,29 +250,10 @@ def _load(data: Mapping, **response):
     """The scene, developed with a response, as load_scene takes it; its notes go to the log."""
     from ..scene import load_scene
 
-    names = ("exposure_index", "max_size", "holdout")
-    scene = load_scene(data["path"], **{name: data.get(name) for name in names}, **response)
+    scene = load_scene(data["path"], **{name: data.get(name) for name in _READ_BY}, **response)
     for note in scene.notes:
         log.info("%s", note)
     return scene
-
-
-def _train(asked: Train, scene, config, device, data: dict):
-    from ..console import follow
-    from .train import Training
-
-    training = Training(
-        scene,
-        asked.output.out,
-        config,
-        device=device,
-        resume=asked.output.resume,
-        overwrite=asked.output.overwrite,
-        tensorboard=asked.output.tensorboard,
-        data=data,
-    )
-    follow(training, training.total)
-    return training.run
 
 
 def _cost(config) -> str:
@@ -291,9 +274,6 @@ def _ending(path: Path, summary: dict) -> str:
     scores = [(line["psnr_ldr"], line["iteration"]) for line in summary["metrics"] if "psnr_ldr" in line]
     heldout = f", held-out PSNR {scores[-1][0]:.2f} dB" if scores else ""
     made = f"{summary['iteration']} iterations, {summary['gaussians']} Gaussians{heldout}"
-    lines = [f"{path}: {made}, {summary['train_seconds']:.1f} s on {summary['device']}"]
-    lines += [
-        f"exposure brackets:  sehdr-warp render {path} --out {path}/views --evs=-4,-2,0,2,4",
-        f"pictures, splats:   sehdr-warp report {path} --out {path}/report;  sehdr-warp export {path} --out scene.ply",
-    ]
-    return "\n".join(lines)
+    return f"""{path}: {made}, {summary["train_seconds"]:.1f} s on {summary["device"]}
+exposure brackets:  sehdr-warp render {path} --out {path}/views --evs=-4,-2,0,2,4
+pictures, splats:   sehdr-warp report {path} --out {path}/report;  sehdr-warp export {path} --out scene.ply"""

@@ -12,6 +12,7 @@ from typing import Annotated, Literal, get_args, get_origin
 from pydantic import ValidationError
 
 from ..errors import InputError, did_you_mean
+from ..files import read_json, read_text
 from .config import Config, ConfigError
 from .config_fields import GONE, config_fields
 
@@ -27,7 +28,7 @@ def preset_names() -> list[str]:
 
 def preset_purpose(name: str) -> str:
     """What a preset is for: the first line of its file."""
-    return _text(_locate(name)).partition("\n")[0].strip("# .")
+    return read_text(_locate(name), _LARGEST_FILE).partition("\n")[0].strip("# .")
 
 
 def load_config(
@@ -114,38 +115,28 @@ def config_from_dict(values: dict, source: Path | str = "config") -> Config:
 
 def read_config_json(path: Path) -> Config:
     """The config saved with a run; raises InputError."""
-    try:
-        values = json.loads(_text(path))
-    except (ValueError, RecursionError) as error:
-        raise InputError(path, f"not valid JSON ({error})", "the run is damaged: train again") from None
-    return _build(path, values)
+    return _build(path, read_json(path))
 
 
 def _read(preset: str | Path) -> tuple[Path, dict]:
     """The file's path and its values on top of those of its base, bases first."""
-    path = _locate(preset)
-    chain, seen = [], set()
-    while True:
-        if path in seen:
+    path, chain = _locate(preset), {}
+    while path is not None:
+        if path in chain:
             raise InputError(path, "its bases lead back to itself", "remove the key `base` from one of the files")
-        seen.add(path)
         try:
-            values = tomllib.loads(_text(path))
+            values = chain[path] = tomllib.loads(read_text(path, _LARGEST_FILE))
         except (ValueError, RecursionError) as error:
             raise InputError(path, f"not valid TOML ({error})", _REMEDY) from None
-        chain.append(values)
         base = values.pop("base", None)
-        if base is None:
-            break
-        if not isinstance(base, str):
-            raise InputError(
-                path, f"base = {base!r} is not a name", f"use one of {', '.join(preset_names())}, or a file"
-            )
-        path = _locate(base, beside=path.parent)
+        if not isinstance(base, str | None):
+            remedy = f"use one of {', '.join(preset_names())}, or a file"
+            raise InputError(path, f"base = {base!r} is not a name", remedy)
+        path = None if base is None else _locate(base, beside=path.parent)
     merged: dict = {}
-    for values in reversed(chain):
+    for values in reversed(chain.values()):
         _merge(merged, values)
-    return _locate(preset), merged
+    return next(iter(chain)), merged
 
 
 def _locate(preset: str | Path, beside: Path | None = None) -> Path:
@@ -157,23 +148,9 @@ def _locate(preset: str | Path, beside: Path | None = None) -> Path:
     except (OSError, ValueError):  # A name that no file can have.
         found = False
     if not found:
-        raise InputError(
-            str(preset)[:200],
-            f"no such preset or file{did_you_mean(str(preset), preset_names())}",
-            f"use one of {', '.join(preset_names())}, or a TOML file",
-        )
+        problem = f"no such preset or file{did_you_mean(str(preset), preset_names())}"
+        raise InputError(str(preset)[:200], problem, f"use one of {', '.join(preset_names())}, or a TOML file")
     return path
-
-
-def _text(path: Path) -> str:
-    try:
-        if path.stat().st_size > _LARGEST_FILE:
-            raise InputError(path, f"larger than {_LARGEST_FILE} bytes", "this is not a config file")
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", "check the path") from None
-    except UnicodeDecodeError:
-        raise InputError(path, "not UTF-8 text", "this is not a config file") from None
 
 
 def _override(source: Path | str, values: dict, overrides: dict, flags: Mapping[str, str] | None) -> Config:

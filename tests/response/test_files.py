@@ -13,18 +13,11 @@ from sehdr_warp.response.table import FLAT_TILT, TabulatedResponse
 
 
 def dorf_text(curves: dict[str, np.ndarray]) -> str:
-    blocks = []
+    text = ""
     for name, values in curves.items():
-        exposures = np.linspace(0, 1, len(values))
-        blocks += [
-            name,
-            f"{name} graph",
-            "I =",
-            " ".join(f"{x:.6e}" for x in exposures),
-            "B =",
-            " ".join(map(str, values)),
-        ]
-    return "\n".join(blocks) + "\n"
+        exposures, levels = (" ".join(map(str, column)) for column in (np.linspace(0, 1, len(values)), values))
+        text += f"{name}\n{name} graph\nI =\n{exposures}\nB =\n{levels}\n"
+    return text
 
 
 def test_dorf_matlab_file(shared):
@@ -46,18 +39,19 @@ def test_dorf_matlab_file(shared):
 
 
 def test_emor(shared):
-    path = shared / "crf" / "emor.txt"
-    text = path.read_text()
-    numbers = [line for line in text.splitlines() if line and "=" not in line]
-    rows = np.array(" ".join(numbers).split(), float).reshape(-1, 1024)
+    path, inverse = (shared / "crf" / name for name in ("emor.txt", "invemor.txt"))
+
+    def stored(file):
+        numbers = [line for line in file.read_text().splitlines() if "=" not in line]
+        return np.array(" ".join(numbers).split(), float).reshape(-1, 1024)
+
+    rows = stored(path)
     assert len(rows) == 27
     mean, bent = response_by_name(path), response_by_name(f"{path}:0.3,-0.1")
     np.testing.assert_allclose(mean.encode(rows[0]), rows[1], atol=FLAT_TILT + 1e-12)
     np.testing.assert_allclose(bent.encode(rows[0]), rows[1] + 0.3 * rows[2] - 0.1 * rows[3], atol=FLAT_TILT + 1e-12)
-    inverse = response_by_name(shared / "crf" / "invemor.txt")
-    stored = (shared / "crf" / "invemor.txt").read_text().splitlines()
-    values, exposures = np.array(" ".join(x for x in stored if x and "=" not in x).split(), float).reshape(-1, 1024)[:2]
-    np.testing.assert_allclose(inverse.encode(exposures), values, atol=5e-4)
+    values, exposures, *_ = stored(inverse)
+    np.testing.assert_allclose(response_by_name(inverse).encode(exposures), values, atol=5e-4)
     for wrong in ("1e", "nan", ",".join("0" * 26)):
         with pytest.raises(InputError, match="emor.txt"):
             response_by_name(f"{path}:{wrong}")
@@ -110,25 +104,25 @@ BAD_TABLES = {
 }
 
 
-@pytest.mark.parametrize("case", BAD_TABLES)
-def test_bad_tables_are_refused_in_one_line(tmp_path, case):
-    path = tmp_path / "bad.csv"
-    path.write_text(BAD_TABLES[case])
+BAD_JSON = (
+    "{",
+    "[1, 2]",
+    '{"exposures": [0, 1]}',
+    '{"exposures": "a", "values": [1]}',
+    '{"kind": "table"}',
+    "[" * 100000,
+)
+BAD_FILES = [("csv", text) for text in BAD_TABLES.values()] + [("json", text) for text in BAD_JSON]
+BAD_IDS = [*BAD_TABLES, *(f"json {number}" for number in range(len(BAD_JSON)))]
+
+
+@pytest.mark.parametrize("suffix, text", BAD_FILES, ids=BAD_IDS)
+def test_bad_files_are_refused_in_one_line(tmp_path, suffix, text):
+    path = tmp_path / f"bad.{suffix}"
+    path.write_text(text)
     with pytest.raises(InputError) as error:
         response_by_name(path)
     assert str(path) in str(error.value) and "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["{", "[1, 2]", '{"exposures": [0, 1]}', '{"exposures": "abc", "values": [1]}', '{"kind": "table"}', "[" * 100000],
-)
-def test_bad_json_is_refused(tmp_path, text):
-    path = tmp_path / "bad.json"
-    path.write_text(text)
-    with pytest.raises(Exception) as error:
-        response_by_name(path)
-    assert "SehdrError" in [each.__name__ for each in type(error.value).__mro__]
 
 
 def test_damaged_matlab_files_end_no_more_than_their_reader(tmp_path):
@@ -136,16 +130,15 @@ def test_damaged_matlab_files_end_no_more_than_their_reader(tmp_path):
 
     path = tmp_path / "bad.mat"
     savemat(path, {"B": np.array([["a", "b"]]), "I": np.eye(2)})
-    for content in (b"MATLAB 5.0 MAT-file" + b" " * 105 + b"\x00\x01IM\x0e\x00\x00\x00", b"\xff" * 300, None):
-        if content is not None:
-            path.write_bytes(content)
+    cut = b"MATLAB 5.0 MAT-file" + b" " * 105 + b"\x00\x01IM\x0e\x00\x00\x00"
+    for content in (path.read_bytes(), cut, b"\xff" * 300):
+        path.write_bytes(content)
         with pytest.raises(InputError, match="bad.mat: is not a DoRF file") as error:
             response_by_name(f"{path}:0")
         assert "\n" not in str(error.value)
-        savemat(path, {"B": np.array([["a", "b"]]), "I": np.eye(2)})
 
 
-def test_noise_is_made_monotone_and_noted():
+def test_noise_and_disorder_are_repaired_and_noted():
     exposures = np.linspace(0, 1, 500)
     noisy = (exposures**0.5 + np.random.default_rng(0).normal(0, 0.01, 500)).clip(0, 1)
     curve = TabulatedResponse("noisy", exposures, noisy)
@@ -154,6 +147,8 @@ def test_noise_is_made_monotone_and_noted():
     assert (np.diff(encoded[exposures < curve.clip_exposure]) > 0).all()
     assert abs(encoded - exposures**0.5).max() < 0.04
     assert TabulatedResponse("clean", exposures, exposures).notes == ()
+    shuffled = TabulatedResponse("shuffled", [1.0, 0.0, 0.5, 0.5], [1.0, 0.0, 0.6, 0.8])
+    assert "sorted" in shuffled.notes[0] and shuffled.encode(0.5) == pytest.approx(0.7, abs=1e-4)
 
 
 def test_flat_parts():
@@ -167,20 +162,14 @@ def test_flat_parts():
     assert curve.notes == ()
 
 
-def test_order_and_repeats_are_repaired():
-    curve = TabulatedResponse("shuffled", [1.0, 0.0, 0.5, 0.5], [1.0, 0.0, 0.6, 0.8])
-    assert "sorted" in curve.notes[0] and curve.encode(0.5) == pytest.approx(0.7, abs=1e-4)
+ROW = st.tuples(st.floats(0, 1e6, width=32), st.floats(0, 1))
 
 
 @settings(deadline=None, max_examples=60)
 @example([(0.0, 0.0), (5941.0, 0.0), (159959.0, 1.0)])
 @example([(0.0, 0.0), (1.0, 0.9999999999999999), (2.0, 1.0)])
 @example([(0.0, 0.0), (1.0, 1e-16), (2.0, 0.5), (3.0, 0.5 + 1e-15), (4.0, 1.0)])
-@given(
-    st.lists(
-        st.tuples(st.floats(0, 1e6, width=32), st.floats(0, 1)), min_size=3, max_size=300, unique_by=lambda row: row[0]
-    )
-)
+@given(st.lists(ROW, min_size=3, max_size=300, unique_by=lambda row: row[0]))
 def test_any_table_becomes_an_invertible_curve_or_an_input_error(rows):
     exposures, values = np.array(rows).T
     try:

@@ -97,7 +97,7 @@ def test_seeds_differ_and_descriptions_keep_the_shape():
         Response.from_dict({"kind": "mlp"})
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_every_channel_starts_rising_in_the_dark_in_the_middle_and_in_the_light(seed):
     log_exposure = torch.tensor([-12.0, -7.0, -0.01, 0.01, 3.0, 8.0])[:, None].expand(-1, 3)
     with torch.no_grad():
