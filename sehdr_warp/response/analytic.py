@@ -21,12 +21,12 @@ class PowerLaw:
 
     def evaluate(self, exposure, with_slope):
         exponent, offset, toe_slope, toe_end = self.numbers
-        line, line_slope = toe_slope * exposure, torch.full_like(exposure, toe_slope) if with_slope else None
+        line = toe_slope * exposure
         if toe_end >= 1.0:
-            return line, line_slope
+            return line, torch.full_like(exposure, toe_slope) if with_slope else None
         power, toe = exposure.pow(1.0 / exponent) * (1.0 + offset), exposure < toe_end
         value = torch.where(toe, line, power - offset).clamp_max(1.0)
-        return value, torch.where(toe, line_slope, power / (exponent * exposure)) if with_slope else None
+        return value, torch.where(toe, toe_slope, power / (exponent * exposure)) if with_slope else None
 
     def invert(self, value):
         exponent, offset, toe_slope, toe_end = self.numbers
