@@ -59,20 +59,19 @@ def evaluate(
 
     Args:
         run: a Run.
-        scene: the views, at the exposure that was trained on. Without test views the training views are taken, and
-            "split" says so.
+        scene: at the exposure that was trained on. Without test views the training views are taken; "split" says so.
         lpips_weights: a folder, see load_lpips.
         peak_luminance: cd/m^2 at which PU21 shows the truth's maximum.
         flip: also HDR-FLIP under each protocol's scale, where flip-evaluator is installed; slow.
 
     Returns:
-        Plain values, ready for strict JSON (null in place of NaN and infinity). "protocol": {name: psnr_mu, ssim_mu,
-        lpips_mu, views, hdr_flip if asked for}, with "scale" for "aligned"; "pu21": {name: psnr, ssim}; "ldr": psnr,
-        ssim, lpips of the simulated photo, unquantised; "regions": {region: fraction, psnr_ldr, psnr_mu}, pooled over
-        views; "confidence": see ranking.py; "views": the same for each view; "split", "lpips_backbone" and the run's
-        facts. Means are over views. What cannot be computed is null with "reason" (or "lpips_reason") beside it.
-        Outside a view's mask the prediction counts as right and nothing is averaged, but by LPIPS and HDR-FLIP, which
-        are of whole images; views with an empty mask are left out.
+        Plain values, ready for strict JSON. "protocol": {name: psnr_mu, ssim_mu, lpips_mu, views, hdr_flip if asked
+        for}, with "scale" for "aligned"; "pu21": {name: psnr, ssim}; "ldr": psnr, ssim, lpips of the simulated photo,
+        unquantised; "regions": {region: fraction, psnr_ldr, psnr_mu}, pooled over views; "confidence": see ranking.py;
+        "views": the same for each view; "split", "lpips_backbone" and the run's facts. Means are over views. What
+        cannot be computed is null with "reason" (or "lpips_reason") beside it. Outside a view's mask the prediction
+        counts as right and nothing is averaged, but by LPIPS and HDR-FLIP, which are of whole images; views with an
+        empty mask are left out.
 
     Raises:
         SehdrError: for a scene without views, images that disagree with their camera or a render that is not finite.
@@ -127,8 +126,8 @@ class Evaluation:
         hdr, pu21 = {}, {}
         for name in PROTOCOLS:
             if reason := missing or (scale_reason if name == "aligned" else None):
-                hdr[name] = dict.fromkeys(("psnr_mu", "ssim_mu", "lpips_mu")) | {"views": 0, "reason": reason}
-                hdr[name] |= {"hdr_flip": None} if self.with_flip else {}
+                names = ("psnr_mu", "ssim_mu", "lpips_mu", *["hdr_flip"] * self.with_flip)
+                hdr[name] = dict.fromkeys(names) | {"views": 0, "reason": reason}
                 pu21[name] = {"psnr": None, "ssim": None, "reason": reason}
                 continue
             hdr[name] = self._explained(_mean([row["protocol"][name] for row in truths])) | {"views": len(truths)}

@@ -17,8 +17,8 @@ VARIABLE = "SEHDR_LPIPS"
 BACKBONE = "squeeze v0.1"
 # Below this many pixels along an edge the last pooling finds nothing.
 SMALLEST_EDGE = 17
-# Features after which the network is tapped.
-TAPS = (1, 4, 7, 9, 10, 11, 12)
+# Features after which the network is tapped, and their channels.
+TAPS, WIDTHS = (1, 4, 7, 9, 10, 11, 12), (64, 128, 256, 384, 384, 512, 512)
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 
@@ -39,11 +39,12 @@ class _Fire(nn.Module):
 
 def _squeezenet_features() -> nn.Sequential:
     """SqueezeNet 1.1 up to its last fire module, layers numbered as in torchvision."""
-    fires = ((64, 16, 64), (128, 16, 64)), ((128, 32, 128), (256, 32, 128))
-    last = ((256, 48, 192), (384, 48, 192), (384, 64, 256), (512, 64, 256))
-    layers = [nn.Conv2d(3, 64, 3, stride=2), nn.ReLU()]
-    for stage in (*fires, last):
-        layers += [nn.MaxPool2d(3, 2, ceil_mode=True), *(_Fire(*shape) for shape in stage)]
+    channels, layers = 64, [nn.Conv2d(3, 64, 3, stride=2), nn.ReLU()]
+    for widths in ((64, 64), (128, 128), (192, 192, 256, 256)):  # Of the fires between two poolings.
+        layers.append(nn.MaxPool2d(3, 2, ceil_mode=True))
+        for width in widths:
+            layers.append(_Fire(channels, width // 4, width))
+            channels = 2 * width
     return nn.Sequential(*layers)
 
 
@@ -87,33 +88,24 @@ def load_lpips(folder: Path | str | None = None, device: torch.device | str = "c
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "the folder of LPIPS weights does not exist", "name the folder that holds squeeze.pth")
-    backbones = [*sorted(folder.glob("squeezenet1_1_features.pth")), *sorted(folder.glob("squeezenet1_1-*.pth"))]
+    backbones = [*folder.glob("squeezenet1_1_features.pth"), *sorted(folder.glob("squeezenet1_1-*.pth"))]
     heads = folder / "squeeze.pth"
     if not backbones or not heads.is_file():
         missing = "squeeze.pth" if backbones else "a SqueezeNet 1.1 backbone (squeezenet1_1_features.pth)"
         others = [name for name in ("alex", "vgg") if (folder / f"{name}.pth").is_file()]
         beside = f"; the heads for {' and '.join(others)} have no backbone here" if others else ""
         return None, f"{folder} lacks {missing}{beside}"
-    features = _squeezenet_features()
-    state = {
-        name.removeprefix("features."): value
-        for name, value in _tensors(backbones[0]).items()
-        if not name.startswith("classifier.")
-    }
+    features, state = _squeezenet_features(), _tensors(backbones[0])
+    kept = [name for name in state if not name.startswith("classifier.")]
     try:
-        features.load_state_dict(state)
+        features.load_state_dict({name.removeprefix("features."): state[name] for name in kept})
     except RuntimeError as error:
         raise InputError(backbones[0], "is not SqueezeNet 1.1", "take torchvision's squeezenet1_1 weights") from error
-    return Lpips(features, _heads(heads), device), None
-
-
-def _heads(path: Path) -> list[torch.Tensor]:
-    state = _tensors(path)
-    widths = (64, 128, 256, 384, 384, 512, 512)
-    names = [f"lin{number}.model.1.weight" for number in range(len(widths))]
-    if any(name not in state or state[name].shape != (1, width, 1, 1) for name, width in zip(names, widths)):
-        raise InputError(path, "does not hold the seven linear heads of LPIPS-squeeze", "take v0.1's squeeze.pth")
-    return [state[name][0].float() for name in names]
+    state = _tensors(heads)
+    linear = [state.get(f"lin{number}.model.1.weight") for number in range(len(WIDTHS))]
+    if any(head is None or head.shape != (1, width, 1, 1) for head, width in zip(linear, WIDTHS)):
+        raise InputError(heads, "does not hold the seven linear heads of LPIPS-squeeze", "take v0.1's squeeze.pth")
+    return Lpips(features, [head[0].float() for head in linear], device), None
 
 
 def _tensors(path: Path) -> dict[str, torch.Tensor]:

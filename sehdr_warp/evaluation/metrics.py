@@ -26,10 +26,8 @@ PU21_PEAK = 256.0
 
 
 def mu_law(radiance: torch.Tensor, mu: float = 5000.0) -> torch.Tensor:
-    """log(1 + mu E) / log(1 + mu) (SeHDR, section 4.1; Kalantari and Ramamoorthi 2017).
-
-    radiance: normalised to [0, 1], any shape; values outside are limited to it first, as HDR-NeRF and HDR-GS do.
-    """
+    """log(1 + mu E) / log(1 + mu) (SeHDR, section 4.1; Kalantari and Ramamoorthi 2017) of radiance of any shape, first
+    limited to [0, 1], as HDR-NeRF and HDR-GS do."""
     return torch.log1p(mu * radiance.clamp(0.0, 1.0)) / math.log1p(mu)
 
 
@@ -72,10 +70,9 @@ def decibels(mean_squared_error: float, peak: float = 1.0) -> float:
 def ssim(
     prediction: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor | None = None, *, peak: float = 1.0
 ) -> float:
-    """Structural similarity (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5, averaged over pixels and channels.
+    """Structural similarity (splatting.ssim), averaged over pixels and channels; a mask weights the average only.
 
-    Beyond the border both images count as zero and border pixels are averaged too, as in the code of 3DGS and HDR-GS;
-    HDR-NeRF's script uses a uniform 7 x 7 window without the border instead. A mask weights the average only.
+    Border pixels count, as in the code of 3DGS and HDR-GS; HDR-NeRF's script uses a uniform 7 x 7 window without them.
     """
     values = ssim_map((prediction / peak).float(), (truth / peak).float()).double().mean(2)
     if mask is None:
@@ -120,10 +117,9 @@ def pu21_metrics(
 
 
 def region_masks(photo: torch.Tensor) -> dict[str, torch.Tensor]:
-    """{region: [H, W] bool} for REGIONS, which part the pixels among them, by the photo's own code values.
+    """{region: [H, W] bool} for REGIONS, which part the pixels of a photo [H, W, 3], encoded in [0, 1].
 
-    photo: [H, W, 3] encoded values in [0, 1]. Clipped: some channel reaches code 250 of 255, so that the photo only
-    bounds the radiance from below. Dark: no channel exceeds code 16. Well-exposed: the rest.
+    Clipped: some channel reaches code 250 of 255. Dark: no channel exceeds code 16. Well-exposed: the rest.
     """
     codes = photo * 255
     clipped = (codes >= CLIPPED_CODE - 0.5).any(2)

@@ -1,16 +1,13 @@
 """How a prediction and its truth are brought to one scale before the mu-law: three protocols, always named.
 
-The scale decides the figure: an error of 1.1, 1.5, 2 or 4 times costs down to 39.0, 26.5, 21.8 and 15.8 dB of mu-law
-PSNR. Figures of different protocols are not comparable.
+Figures of different protocols are not comparable: an error of scale of 1.1, 1.5, 2 or 4 costs down to 39.0, 26.5, 21.8
+and 15.8 dB of mu-law PSNR.
 
-gt-max    HDR-NeRF (xhuangcv/hdr-nerf, eval_hdr.py): prediction and truth are both divided by the maximum of the view's
-          truth and limited to [0, 1].
-self-max  HDR-GS (caiyuanhao1998/HDR-GS, train_synthetic.py and scene/dataset_readers.py), Mono-HDR-GS: each image is
-          divided by its own maximum; the tone-mapped truth is cut down to whole codes of 8 bits (floor(255 M) / 255),
-          the prediction is not; PSNR is the mean of the three channels' PSNR (utils/image_utils.py).
+gt-max    HDR-NeRF (eval_hdr.py): both are divided by the maximum of the view's truth and limited to [0, 1].
+self-max  HDR-GS (train_synthetic.py, dataset_readers.py), Mono-HDR-GS: each image is divided by its own maximum; the
+          tone-mapped truth is cut down to whole codes of 8 bits, the prediction is not; PSNR is the mean over channels.
 aligned   ours: the prediction is first multiplied by one factor for the whole scene, fitted in log radiance on what the
-          training photos do not show clipped; then as gt-max. It tells what is left once the unknowable global scale is
-          taken out.
+          training photos do not show clipped; then as gt-max. It tells what is left beside the unknowable scale.
 """
 
 from collections.abc import Iterable
@@ -20,8 +17,7 @@ import torch
 from .metrics import mu_law, psnr, region_masks
 
 PROTOCOLS = ("gt-max", "self-max", "aligned")
-# Values below this fraction of a view's maximum do not vote on the scale: the mu-law (mu = 5000) shows next to nothing
-# of them, and log radiance near zero is noise.
+# Values below this fraction of a view's maximum do not vote on the scale: their logarithm is noise.
 VOTING_FLOOR = 1e-4
 # Votes taken from one view; evenly spaced pixels, so that large photos cost no memory.
 VOTES_PER_VIEW = 65536
@@ -76,15 +72,12 @@ def tone_mapped_psnr(
 def fit_scale(
     views: Iterable[tuple[torch.Tensor, torch.Tensor, torch.Tensor | None, torch.Tensor | None]],
 ) -> float | None:
-    """The factor that takes predictions to the truth: exp of the median of log(truth / prediction).
+    """The factor that takes predictions to the truth: exp of the median of log(truth / prediction); None without votes.
 
     views: (prediction, truth, mask or None, photo or None) of the training views; prediction and truth [H, W, 3]
-    scene-linear radiance, photo [H, W, 3] encoded. Every channel of every pixel votes whose truth is above 1e-4 of the
-    view's maximum, whose prediction is not black, and which the photo does not show clipped (region_masks): it does not
-    tell such light, and where most of a scene clips the median would be that of a guess. Clipped pixels vote where
-    fewer than LEAST_VOTES others do. A median stands up to empty and wrong regions of up to half the votes.
-
-    Returns None if nothing can vote (an empty prediction, or no view with truth).
+    scene-linear radiance, photo [H, W, 3] encoded. A channel votes whose truth is above 1e-4 of the view's maximum and
+    whose prediction is not black, where the photo does not clip (region_masks): it does not tell such light. Clipped
+    pixels vote where fewer than LEAST_VOTES others do.
     """
     votes, guesses = [], []
     for prediction, truth, mask, photo in views:

@@ -38,18 +38,15 @@ def score_folder(
 ) -> dict:
     """Scores pictures of any origin against a scene's HDR truth.
 
-    Args:
-        folder: EXR files of scene-linear radiance with Rec.709 primaries, named as the views (`r_0.exr`).
-        truth: a scene whose views hold HDR truth. Its test views are scored, or all named ones where it has none.
-        lpips_weights, flip: as of evaluate().
+    folder: EXR files of scene-linear radiance with Rec.709 primaries, named as the views (`r_0.exr`). truth: a scene
+    whose views hold HDR truth; its test views are scored, or all named ones where it has none. lpips_weights, flip: as
+    of evaluate().
 
-    Returns:
-        As evaluate(), without figures of photos; and "missing", test views without a file, and "extra", files of no
-        view. The scale of "aligned" is fitted on the training views that have a file, else on the scored views, which
-        favours the folder: "scale_from" says which.
+    Returns what evaluate() does, without figures of photos; and "missing", test views without a file, "extra", files of
+    no view, and "scale_from": the scale of "aligned" is fitted on the training views that have a file ("train"), else
+    on the scored views ("scored"), which favors the folder.
 
-    Raises:
-        InputError: for a folder without a file of a scored view, or a picture of another size.
+    Raises InputError for a folder without a file of a scored view, SehdrError for a picture of another size.
     """
     folder = Path(folder)
     found = {file.stem: file for file in sorted(folder.glob("*.exr"))} if folder.is_dir() else {}

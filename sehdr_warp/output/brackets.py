@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Self
@@ -26,35 +26,6 @@ MANIFEST_FORMAT = 1
 _SHORTEST, _LONGEST = 1e-6, 1e6
 
 
-@dataclass(frozen=True)
-class BracketOptions:
-    """How brackets are written.
-
-    exposures: ascending, as from bracket_exposures. base_time: seconds at 0 EV.
-    colorspace: of the EXR files. pixel: "half" (float where half would overflow) or "float".
-    multipart: one EXR file with all exposures of a view. ldr: one of LDR_FORMATS adds simulated photos, through
-    response.encode; None leaves them out. provenance: text by key, for the EXR attributes `sehdr:<key>`.
-    """
-
-    exposures: tuple[Exposure, ...]
-    base_time: float
-    colorspace: str = "rec709"
-    pixel: str = "half"
-    multipart: bool = False
-    ldr: str | None = None
-    response: object | None = None
-    captured: datetime | None = None
-    provenance: Mapping[str, str] | None = None
-
-    def __post_init__(self):
-        color_space(self.colorspace)
-        stored_pixel_type((), self.pixel)
-        if self.ldr is not None and self.ldr not in LDR_FORMATS:
-            raise SehdrError(f"LDR brackets {self.ldr!r} are not one of {', '.join(LDR_FORMATS)}")
-        if self.ldr is not None and self.response is None:
-            raise SehdrError("LDR brackets need a camera response; give one, or leave out ldr")
-
-
 def bracket_exposures(
     base_time: float, *, evs: Items | None = None, exposures: Items | None = None
 ) -> tuple[Exposure, ...]:
@@ -69,15 +40,15 @@ def bracket_exposures(
     if (evs is None) == (exposures is None):
         count = "both were given" if evs is not None else "neither was given"
         raise SehdrError(f"brackets need evs or exposures, and {count}; give one of them")
-    field, items = "exposures", exposures
+    name, items = "exposures", exposures
     if evs is not None:
         stops = [ev for ev in evs.split(",") if ev.strip()] if isinstance(evs, str) else evs
-        field, items = "evs", [f"{str(ev).strip()}ev" for ev in stops]
-    made = read_exposures(items, base_time, field)
+        name, items = "evs", [f"{str(ev).strip()}ev" for ev in stops]
+    made = read_exposures(items, base_time, name)
     for exposure in made:
         if not _SHORTEST <= exposure.time <= _LONGEST:
             raise SehdrError(
-                f"{field}: {exposure.time:.6g} s ({exposure.ev:+g} EV) is outside {_SHORTEST:g} to {_LONGEST:g} seconds"
+                f"{name}: {exposure.time:.6g} s ({exposure.ev:+g} EV) is outside {_SHORTEST:g} to {_LONGEST:g} seconds"
             )
     return made
 
@@ -101,7 +72,7 @@ def write_brackets(
 
     views: name -> [H, W, 3] scene-linear Rec.709 radiance E, >= 0, not multiplied by an exposure time.
     base_time: seconds at 0 EV. evs or exposures: as bracket_exposures takes them.
-    cameras: name -> camera, for the EXR attributes, where known. Other parameters: see BracketOptions.
+    cameras: name -> camera, for the EXR attributes, where known. Other parameters: see BracketFolder.
 
     Every pixel is E dt, computed in float64 and rounded once. Files: `out/brackets/<view>/<view>_b<i>_ev<+x.x>.exr`
     with i ascending by exposure, or `out/brackets/<view>.exr`; `out/brackets_ldr/<view>/...` where ldr is given; and
@@ -111,33 +82,54 @@ def write_brackets(
     overwrite) or a pixel is not finite.
     """
     made = bracket_exposures(base_time, evs=evs, exposures=exposures)
-    options = BracketOptions(made, base_time, colorspace, pixel, multipart, ldr, response)
+    options = {"colorspace": colorspace, "pixel": pixel, "multipart": multipart, "ldr": ldr, "response": response}
     pairs = list(views.items() if isinstance(views, Mapping) else views)
-    with BracketFolder(out, options, overwrite=overwrite) as folder:
+    with BracketFolder(Path(out), made, base_time, **options, overwrite=overwrite) as folder:
         for safe, (name, radiance) in zip(safe_names([name for name, _ in pairs]), pairs, strict=True):
             folder.add(safe, radiance, (cameras or {}).get(name))
     return folder.files
 
 
+@dataclass
 class BracketFolder:
     """A set of brackets under construction: add views one at a time; leaving the `with` block makes them appear.
 
+    exposures: ascending, as from bracket_exposures. base_time: seconds at 0 EV. colorspace: of the EXR files. pixel:
+    "half" (float where half would overflow) or "float". multipart: one EXR file with all exposures of a view. ldr: one
+    of LDR_FORMATS adds simulated photos through response.encode. provenance: text by key, for the EXR attributes.
     files: the EXR files, at their final places.
+
+    Raises SehdrError for an unknown color space or LDR format, or for photos without a response.
     """
 
-    def __init__(self, out: Path | str, options: BracketOptions, *, overwrite: bool = False):
-        self.out = Path(out)
-        self.options = options
-        self.files: list[Path] = []
-        self._overwrite = overwrite
+    out: Path
+    exposures: tuple[Exposure, ...]
+    base_time: float
+    colorspace: str = "rec709"
+    pixel: str = "half"
+    multipart: bool = False
+    ldr: str | None = None
+    response: object | None = None
+    captured: datetime | None = None
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    overwrite: bool = False
+    files: list[Path] = field(default_factory=list, init=False)
+
+    def __post_init__(self):
+        color_space(self.colorspace)
+        stored_pixel_type((), self.pixel)
+        if self.ldr is not None and self.ldr not in LDR_FORMATS:
+            raise SehdrError(f"LDR brackets {self.ldr!r} are not one of {', '.join(LDR_FORMATS)}")
+        if self.ldr is not None and self.response is None:
+            raise SehdrError("LDR brackets need a camera response; give one, or leave out ldr")
         self._views: list[dict] = []
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            self._manifest = stack.enter_context(atomic_path(self.out / "brackets.json", self._overwrite))
-            self._folder = stack.enter_context(atomic_folder(self.out / "brackets", self._overwrite))
-            if self.options.ldr:
-                self._ldr_folder = stack.enter_context(atomic_folder(self.out / "brackets_ldr", self._overwrite))
+            self._manifest = stack.enter_context(atomic_path(self.out / "brackets.json", self.overwrite))
+            self._folder = stack.enter_context(atomic_folder(self.out / "brackets", self.overwrite))
+            if self.ldr:
+                self._ldr_folder = stack.enter_context(atomic_folder(self.out / "brackets_ldr", self.overwrite))
             stack.push(self._finish)  # Pushed last, it runs first: the list must be there before anything appears.
             self._stack = stack.pop_all()
         return self
@@ -147,37 +139,36 @@ class BracketFolder:
 
     def add(self, name: str, radiance: np.ndarray, camera: Camera | None = None) -> str:
         """Writes the bracket of one view under a name that is safe for files; returns the pixel type of its files."""
-        options = self.options
         radiance = np.asarray(radiance, np.float64)
         if radiance.shape[2:] != (3,):
             raise ValueError(f"radiance has shape {radiance.shape}, not [H, W, 3]")
         check_finite(self.out / "brackets" / name, radiance, "{count} radiances")
-        linear = from_rec709(radiance, options.colorspace)
-        pixels = [linear * exposure.time for exposure in options.exposures]
+        linear = from_rec709(radiance, self.colorspace)
+        pixels = [linear * exposure.time for exposure in self.exposures]
         # One type for all exposures of a view, so that their ratios keep one precision.
-        pixel = stored_pixel_type(pixels, options.pixel)
+        pixel = stored_pixel_type(pixels, self.pixel)
         parts, entries = [], []
-        for index, (exposure, image) in enumerate(zip(options.exposures, pixels, strict=True)):
+        for index, (exposure, image) in enumerate(zip(self.exposures, pixels, strict=True)):
             label = f"b{index}_{exposure.label}"
-            facts = {"view": name, "ev": repr(exposure.ev), "baseExposureTime": repr(options.base_time)}
+            facts = {"view": name, "ev": repr(exposure.ev), "baseExposureTime": repr(self.base_time)}
             header = exr_header(
-                colorspace=options.colorspace,
+                colorspace=self.colorspace,
                 exposure_time=exposure.time,
                 camera=camera,
-                captured=options.captured,
-                provenance={**(options.provenance or {}), **facts},
+                captured=self.captured,
+                provenance={**self.provenance, **facts},
             )
             parts.append(Part(dict(zip("RGB", np.moveaxis(image, 2, 0), strict=True)), header, label))
-            file = f"{name}.exr" if options.multipart else f"{name}/{name}_{label}.exr"
+            file = f"{name}.exr" if self.multipart else f"{name}/{name}_{label}.exr"
             entry = {"index": index, "exposure_time": exposure.time, "ev": exposure.ev, "file": f"brackets/{file}"}
-            if options.multipart:
+            if self.multipart:
                 entry["part"] = index
             else:
                 write_exr(self._folder / file, parts[-1].channels, pixel=pixel, header=header)
-            if options.ldr:
+            if self.ldr:
                 entry["ldr_file"] = self._write_photo(f"{name}/{name}_{label}", radiance, exposure)
             entries.append(entry)
-        if options.multipart:
+        if self.multipart:
             write_multipart_exr(self._folder / f"{name}.exr", parts, pixel=pixel)
         self.files += [self.out / file for file in dict.fromkeys(entry["file"] for entry in entries)]
         self._views.append({"view": name, "pixel": pixel, "exposures": entries})
@@ -185,26 +176,24 @@ class BracketFolder:
 
     def _write_photo(self, stem: str, radiance: np.ndarray, exposure: Exposure) -> str:
         """Writes what the response makes of an exposure; returns the file's name in the manifest."""
-        options = self.options
-        exif = exposure_exif(exposure.time, bias=exposure.ev, captured=options.captured)
-        codes = quantize(options.response.encode(radiance * exposure.time), 16 if options.ldr == "png16" else 8)
-        file = f"{stem}.{'jpg' if options.ldr == 'jpeg' else 'png'}"
+        exif = exposure_exif(exposure.time, bias=exposure.ev, captured=self.captured)
+        codes = quantize(self.response.encode(radiance * exposure.time), 16 if self.ldr == "png16" else 8)
+        file = f"{stem}.{'jpg' if self.ldr == 'jpeg' else 'png'}"
         write_picture(self._ldr_folder / file, codes, exif=exif)
         return f"brackets_ldr/{file}"
 
     def _finish(self, kind, error, trace) -> None:
-        options = self.options
         if kind is None:
             described = {
                 "format": MANIFEST_FORMAT,
                 "software": "sehdr-warp",
                 "units": "relative scene-linear radiance times exposure_time (seconds)",
-                "color_space": options.colorspace,
-                "base_exposure_time": options.base_time,
-                "multipart": options.multipart,
-                "response": getattr(options.response, "name", None),
-                "ldr": options.ldr,
-                "provenance": dict(options.provenance or {}),
+                "color_space": self.colorspace,
+                "base_exposure_time": self.base_time,
+                "multipart": self.multipart,
+                "response": getattr(self.response, "name", None),
+                "ldr": self.ldr,
+                "provenance": dict(self.provenance),
                 "views": self._views,
             }
             write_json(self._manifest, described)

@@ -76,19 +76,8 @@ def run_render(asked: Render) -> None:
     """Writes the images and prints which."""
     from .render_views import render_views
 
-    written = render_views(
-        open_run(asked.run, asked.device),
-        asked.out,
-        cameras=asked.cameras,
-        count=asked.count,
-        evs=asked.evs,
-        exposures=asked.exposures,
-        multipart=asked.multipart,
-        colorspace=asked.colorspace,
-        pixel=asked.pixel,
-        ldr_brackets=asked.ldr_brackets,
-        overwrite=asked.overwrite,
-    )
+    options = {name: value for name, value in vars(asked).items() if name not in ("run", "device", "json")}
+    written = render_views(open_run(asked.run, asked.device), **options)
     if asked.json:
         print(json.dumps({"files": [str(path) for path in written]}))
     else:

@@ -23,9 +23,6 @@ from ..files import atomic_path
 from .colorspace import chromaticities, color_space
 from .images import EXIF_TIME
 
-HALF_MAX = 65504.0
-"""The largest value of a 16-bit float (IEEE 754 binary16)."""
-
 _TYPES = {"half": np.float16, "float": np.float32}
 # OpenCV axes (+y down, +z forward) to the axes of worldToCamera (+y up, -z forward).
 _FLIP_Y_Z = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -87,9 +84,9 @@ def write_exr(
 def write_multipart_exr(path: Path | str, parts: Sequence[Part], *, pixel: str = "half") -> str:
     """Writes a file of several named parts with ZIP compression; returns the pixel type of the colors.
 
-    pixel: "half" or "float". Numbers are rounded once, to the nearest. Where half cannot hold a value (above 65504 in
-    size), all channels of the file are float instead, and each part's `sehdr:pixelType` says so: nothing is clipped.
-    Depth (`Z`, or a layer's `.Z`) is always float: half's 11 bits are too few for it.
+    pixel: "half" or "float". Where half cannot hold a value (above 65504 in size), all channels of the file are float
+    instead, and each part's `sehdr:pixelType` says so: nothing is clipped. Depth (`Z`, or a layer's `.Z`) is always
+    float: half's 11 bits are too few for it.
 
     Raises InputError where a value is NaN or infinite (with channel and place) or `path` exists; SehdrError where the
     file cannot be written; ValueError for an unknown pixel type, unequal shapes or names.
@@ -100,15 +97,14 @@ def write_multipart_exr(path: Path | str, parts: Sequence[Part], *, pixel: str =
 
 
 def read_exr(path: Path | str, *, max_pixels: int = MAX_PIXELS) -> tuple[np.ndarray, tuple[str, ...], dict[str, Any]]:
-    """The first part of a file: pixels [H, W, C] float32, channel names (R, G, B, A first) and the header.
+    """The first part of a file: pixels [H, W, C] float32 as stored, channel names (R, G, B, A first) and the header.
 
-    Values are as stored: NaN and infinity pass.
     Raises InputError where the file is missing, damaged, truncated, empty or larger than max_pixels.
     """
     channels, header = read_exr_channels(Path(path), max_pixels=max_pixels)
     if not channels:
         raise InputError(path, "has no channels", "export it with color channels")
-    names = tuple(sorted(channels, key=lambda name: ("RGBA".find(name) if name in ("R", "G", "B", "A") else 4, name)))
+    names = tuple(sorted(channels, key=lambda name: ("RGBA".find(name) % 5, name)))
     return np.stack([channels[name] for name in names], axis=2), names, header
 
 
@@ -116,7 +112,8 @@ def stored_pixel_type(arrays: Sequence[np.ndarray], pixel: str = "half") -> str:
     """The type that holds all values unclipped: `pixel`, or "float" where half would overflow."""
     if pixel not in _TYPES:
         raise ValueError(f"pixel type {pixel!r} is not one of {', '.join(_TYPES)}")
-    return "float" if pixel == "float" or any(_largest(array) > HALF_MAX for array in arrays) else "half"
+    fits = all(_largest(array) <= float(np.finfo(np.float16).max) for array in arrays)
+    return "half" if pixel == "half" and fits else "float"
 
 
 def _write(path: Path, parts: Sequence[Part], pixel: str, overwrite: bool = False) -> str:

@@ -11,8 +11,8 @@ _LONGEST = 120
 def safe_names(names: Sequence[str]) -> list[str]:
     """File names for views, all different, also where upper and lower case are one.
 
-    Separators and characters that some system forbids become `_`, leading dots go, and length is limited to 120 bytes.
-    Of names that come more than once, the later ones get a number.
+    What some system forbids becomes `_`, leading dots go, and length is limited to 120 bytes. Of names that come more
+    than once, the later ones get a number.
     """
     cleaned = [_clean(name) for name in names]
     wanted, taken, result = {name.casefold() for name in cleaned}, set(), []

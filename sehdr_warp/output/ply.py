@@ -70,11 +70,8 @@ def without_unseen_degrees(gaussians: GaussianArrays) -> GaussianArrays:
 
 
 def hdr_gaussians(run) -> GaussianArrays:
-    """The scene-linear Gaussians of a run.
-
-    Exact for models whose harmonics are exposures or their logarithms. With fused brackets, or harmonics of encoded
-    values, harmonics are fitted to the logarithm of the radiance (see bake).
-    """
+    """The scene-linear Gaussians of a run: exact where harmonics are exposures or their logarithms; else, with fused
+    brackets or harmonics of encoded values, fitted to the logarithm of the radiance (see bake)."""
     stored, to_radiance = _stored(run)
     if to_radiance is not None:
         return bake(
@@ -90,8 +87,7 @@ def hdr_gaussians(run) -> GaussianArrays:
 def ldr_gaussians(run, exposure_time: float | None = None) -> GaussianArrays:
     """Display colors of a run at an exposure time in seconds: what its response makes of each Gaussian's radiance.
 
-    The encoded values are shown as sRGB, as the photos were. Viewers blend these, not radiance, so half-covered edges
-    of very bright things come out darker than in a rendered photo. Degree and geometry are kept.
+    Viewers blend these, not radiance: half-covered edges of very bright things come out darker than in a photo.
     """
     time = run.base_time if exposure_time is None else float(exposure_time)
     if not (np.isfinite(time) and time > 0):
@@ -100,13 +96,15 @@ def ldr_gaussians(run, exposure_time: float | None = None) -> GaussianArrays:
     if stored.color_model == "display" and time == run.base_time:
         return stored
     radiance = to_radiance or (lambda exposure: exposure / run.base_time)
-    shown = lambda color: run.response.encode(radiance(color) * time)  # noqa: E731
+
+    def shown(colors):
+        return run.response.encode(radiance(colors) * time)
+
     return bake(stored, shown, "display", camera_positions=_seen_from(run))
 
 
 def _stored(run) -> tuple[GaussianArrays, Colors | None]:
-    """The run's Gaussians in the colors of its model (exposures at the base time, or encoded values), and how these
-    become radiance; None where radiance is the exposure over the base time."""
+    """The run's Gaussians in its model's colors, and how these become radiance; None where they are exposures."""
     tensors = {name: value.cpu().numpy() for name, value in run.model.gaussians.tensors().items()}
     harmonics = np.concatenate([tensors["harmonics_dc"], tensors["harmonics_rest"]], axis=1)
     geometry = (tensors[name] for name in ("means", "log_scales", "quaternions", "opacity_logits"))

@@ -13,7 +13,7 @@ from sehdr_warp.scene import Camera, load_cameras
 
 from ..field.exposure import Items
 from ..files import atomic_folder
-from .brackets import BracketFolder, BracketOptions, bracket_exposures
+from .brackets import BracketFolder, bracket_exposures
 from .camera_paths import interpolate, orbit
 from .colorspace import from_rec709
 from .exr import exr_header, write_exr
@@ -47,21 +47,21 @@ def render_views(
 
     Always: `hdr/<view>.exr` (R, G, B scene-linear radiance; A coverage; Z distance along the axis, 0 where empty;
     confidence, if the run has it) and `preview/<view>.png` (tone-mapped, sRGB). With evs or exposures: brackets, see
-    output/brackets.py; ldr_brackets ("jpeg", "png" or "png16") adds simulated photos through the run's response.
+    write_brackets; ldr_brackets ("jpeg", "png" or "png16") adds simulated photos through the run's response.
 
     cameras: "train", "test", "all", "orbit", "interpolate", or a JSON file. count: views of an orbit or interpolation.
     overwrite: replaces the folders hdr, preview and brackets of an earlier render; other files in `out` stay.
 
-    Everything appears when the last view is done; if a view fails, nothing new is left.
-    Raises SehdrError for unusable options or an empty set of cameras, InputError where something would be replaced or
-    a pixel is not finite.
+    Everything appears when the last view is done. Raises SehdrError for unusable options or an empty set of cameras,
+    InputError where something would be replaced or a pixel is not finite.
     """
     out = Path(out)
     wanted = evs is not None or exposures is not None
     if (multipart or ldr_brackets) and not wanted:
         raise SehdrError("brackets were asked for without exposures; give evs (--evs=-2,0,2) or exposures")
     made = bracket_exposures(run.base_time, evs=evs, exposures=exposures) if wanted else ()
-    options = BracketOptions(
+    brackets = BracketFolder(
+        out,
         made,
         run.base_time,
         colorspace,
@@ -71,12 +71,13 @@ def render_views(
         run.response,
         datetime.now().replace(microsecond=0),
         _provenance(run),
+        overwrite,
     )
     views = select_cameras(run, cameras, count=count)
     with (
         atomic_folder(out / "hdr", overwrite) as hdr_folder,
         atomic_folder(out / "preview", overwrite) as preview_folder,
-        BracketFolder(out, options, overwrite=overwrite) if wanted else nullcontext() as brackets,
+        brackets if wanted else nullcontext(),
     ):
         tone_map = fit_run_tone_map(run, [camera for _, camera in views])
         for index, (name, camera) in enumerate(views, start=1):
@@ -87,15 +88,15 @@ def render_views(
                 layers["confidence"] = as_array(confidence)
             elif index == 1:
                 log.info("without a confidence channel: `sehdr-warp report` measures it, from the photos")
-            stored = {_write_hdr(hdr_folder / f"{name}.exr", hdr, layers, camera, options)}
+            stored = {_write_hdr(hdr_folder / f"{name}.exr", hdr, layers, camera, brackets)}
             write_picture(preview_folder / f"{name}.png", quantize(tone_map(hdr)))
-            if brackets is not None:
+            if wanted:
                 stored.add(brackets.add(name, hdr, camera))
             log.info("%s (%d of %d)", name, index, len(views))
             if stored != {pixel}:
                 log.info("%s: holds values above 65504, which half cannot; written as float", name)
     files = [out / place.format(name) for place in ("hdr/{}.exr", "preview/{}.png") for name, _ in views]
-    return files if brackets is None else files + brackets.files + [out / "brackets.json"]
+    return files + ([*brackets.files, out / "brackets.json"] if wanted else [])
 
 
 def select_cameras(run, cameras: str | Path, *, count: int = 60) -> list[tuple[str, Camera]]:
@@ -127,7 +128,7 @@ def fit_run_tone_map(run, cameras: Sequence[Camera]) -> ToneMap:
     return fit_tone_map([as_array(run.render(_small(camera)).hdr) for camera in chosen])
 
 
-def _write_hdr(path: Path, hdr, layers: dict, camera: Camera, options: BracketOptions) -> str:
+def _write_hdr(path: Path, hdr, layers: dict, camera: Camera, options: BracketFolder) -> str:
     linear = from_rec709(hdr, options.colorspace)
     header = exr_header(
         colorspace=options.colorspace,

@@ -92,10 +92,10 @@ def comparison_figure(comparisons: Sequence[Comparison], exposure_time: float, c
 
 
 def stops_figure(comparison: Comparison, exposure_time: float):
-    """A matplotlib Figure: one view at several exposures, as radiance on a plain sRGB display: no tone map.
+    """A matplotlib Figure: one view at several exposures on a plain sRGB display: no tone map.
 
-    The first row holds the photo as it is and re-exposed alone: what it clipped stays white or black. Beside the HDR
-    scene stands its confidence, where there is one, as grey. exposure_time: seconds at 0 EV.
+    Rows are the photo alone, the HDR scene with its confidence (where there is one) and the truth. exposure_time:
+    seconds at 0 EV.
     """
     sources = {"Photo alone": comparison.from_photo, "HDR scene": comparison.hdr, "Truth": comparison.truth}
     sources = {name: radiance for name, radiance in sources.items() if radiance is not None}

@@ -1,10 +1,8 @@
 """Display pictures of scene-linear radiance: a tone map for eyes, and plain exposure stops.
 
 The tone map is Reinhard's extended global operator (Reinhard et al. 2002, Eq. 4) on luminance, with the key and the
-white point found from the scene (Reinhard 2003, "Parameter estimation for photographic tone reproduction"). Scaling
-colours by luminance alone would leave bright saturated colours outside the display's gamut, and mapping each channel
-alone would bleach them; the two are mixed by the display luminance itself, so that colours hold in the shadows and run
-into white in the highlights.
+white point found from the scene (Reinhard 2003). Scaling by luminance alone would leave bright colors outside the
+display's gamut, and mapping each channel alone would bleach them; the two are mixed by the display luminance.
 """
 
 from collections.abc import Iterable
@@ -14,7 +12,7 @@ import numpy as np
 
 # ITU-R BT.709 luminance weights.
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-# Below this part of the brightest per cent, a pixel says nothing about the scene's key: empty background and noise.
+# Below this part of the brightest per cent, a pixel says nothing about the scene's key.
 _FLOOR = 1e-6
 # Reinhard 2003 uses the extremes; percentiles keep a lamp's filament from deciding the picture.
 _LOW, _HIGH, _WHITE = 1.0, 99.0, 99.8

@@ -31,14 +31,6 @@ def test_an_error_of_scale_costs_under_gt_max_what_the_mu_law_says(factor, decib
     assert decibels - 0.1 < value < decibels + 0.5
 
 
-def test_gt_max_divides_both_by_the_truths_maximum():
-    truth = torch.tensor([0.0, 1.0, 4.0]).reshape(1, 1, 3)
-    prediction = torch.tensor([0.5, 2.0, 9.0]).reshape(1, 1, 3)
-    a, b = tone_map("gt-max", prediction, truth)
-    assert a.flatten().tolist() == pytest.approx([math.log(1 + 5000 * v) / math.log(5001) for v in (0.125, 0.5, 1.0)])
-    assert b.flatten().tolist() == pytest.approx([math.log(1 + 5000 * v) / math.log(5001) for v in (0.0, 0.25, 1.0)])
-
-
 def test_self_max_cuts_the_truth_down_to_codes_and_averages_channels():
     truth, prediction = radiance(1), radiance(2) * 5
     a, b = tone_map("self-max", prediction, truth)

@@ -192,13 +192,6 @@ def test_degrees_without_energy_are_left_out_to_the_bound(color_model, scale):
     assert without_unseen_degrees(full.with_colors(harmonics, color_model)).degree == 2
 
 
-def test_what_is_not_finite_is_not_left_out():
-    full = gaussians(degree=2)
-    harmonics = np.zeros_like(full.harmonics)
-    harmonics[3, 8, 0] = np.nan
-    assert without_unseen_degrees(full.with_colors(harmonics, "log")).degree == 2
-
-
 def test_the_log_says_what_is_left_out(tmp_path, logged):
     run = StoredRun()
     export(run, tmp_path / "full.ply")

@@ -100,13 +100,9 @@ def test_options_that_do_nothing_are_refused(tmp_path):
     with pytest.raises(SehdrError, match="'tset' are neither a file nor one of train, test, all, orbit, interpolate"):
         render_views(AnalyticRun(), tmp_path / "out", cameras="tset")
     assert not (tmp_path / "out").exists()
-
-
-def test_cameras_from_a_file(tmp_path):
     entries = [{"name": name, **camera(position=(i, 0, -3)).to_dict()} for i, name in enumerate(("a", "b"))]
     (tmp_path / "cameras.json").write_text(json.dumps({"cameras": entries}))
-    render_views(AnalyticRun(), tmp_path / "out", cameras=tmp_path / "cameras.json")
-    assert tree(tmp_path / "out" / "hdr") == ["a.exr", "b.exr"]
+    assert [name for name, _ in select_cameras(AnalyticRun(), tmp_path / "cameras.json")] == ["a", "b"]
 
 
 def test_names_are_safe_and_different():
