@@ -36,6 +36,7 @@ def training_chart(rows: Mapping[str, Sequence[Sequence[Mapping]]]):
     keys = [key for key in PANELS if any(training_points(c, key) for curves in rows.values() for c in curves)]
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(4.6 * max(len(keys), 1) + 1.6 * (len(rows) > 1), 3.8), layout="constrained")
+        figure.get_layout_engine().set(w_pad=0.12, h_pad=0.12)
         handles = {}
         for place, key in enumerate(keys, 1):
             axes = figure.add_subplot(1, len(keys), place)

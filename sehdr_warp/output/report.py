@@ -178,7 +178,7 @@ def _caption(views: Sequence[View], metrics: Sequence[dict], held_out: bool) -> 
     if last and held_out:
         figures = [f"{PANELS[key]} {decibels:.1f} dB" for key, (_, decibels) in last.items()]
         seconds = max(seconds for seconds, _ in last.values())
-        text += f" All held-out views after {seconds:.0f} s of training: PSNR {', '.join(figures)}."
+        text += f" PSNR of all held-out views after {seconds:.0f} s of training: {'; '.join(figures)}."
     return text
 
 
