@@ -5,6 +5,7 @@ The gradient runs back through the rasterizer, then through the kernel, whose ad
 python examples/own_kernel.py
 """
 
+# pyright: reportInvalidTypeForm=false
 import torch
 import warp as wp
 

@@ -4,7 +4,7 @@ python examples/own_loop.py
 """
 
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 import sehdr_warp as sw
 
@@ -13,7 +13,7 @@ def main(steps: int = 90, max_size: int = 64) -> list[float]:
     """Fits colored Gaussians to the embedded scene's photos; the loss of each step."""
     scene = sw.load_scene("embedded", max_size=max_size)
     means = torch.tensor(scene.points, dtype=torch.float32)
-    distances, _ = cKDTree(scene.points).query(scene.points, k=4)  # of each point to itself and its three nearest
+    distances, _ = KDTree(scene.points).query(scene.points, k=4)  # of each point to itself and its three nearest
     spacing = torch.tensor(distances[:, 1:].mean(axis=1, keepdims=True), dtype=torch.float32)
     parameters = {
         "means": means,

@@ -8,6 +8,7 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ..errors import SehdrError
 from .table import columns
@@ -32,7 +33,7 @@ class ComparedRuns:
     label: str
     scene: str
     figures: dict[str, list[float | None]]
-    curves: list[list[dict]]
+    curves: list[list[dict[str, Any]]]
 
     @property
     def count(self) -> int:
@@ -40,16 +41,16 @@ class ComparedRuns:
 
     def mean(self, column: str) -> float | None:
         """The mean over the runs; None where one lacks it."""
-        values = self.figures[column]
-        return None if None in values else statistics.fmean(values)
+        values = [value for value in self.figures[column] if value is not None]
+        return statistics.fmean(values) if len(values) == self.count else None
 
     def spread(self, column: str) -> float | None:
         """The sample's standard deviation; None for one run."""
-        values = self.figures[column]
-        return None if None in values or len(values) < 2 else statistics.stdev(values)
+        values = [value for value in self.figures[column] if value is not None]
+        return statistics.stdev(values) if len(values) == self.count > 1 else None
 
 
-def compare_runs(runs: Sequence) -> list[ComparedRuns]:
+def compare_runs(runs: Sequence[Any]) -> list[ComparedRuns]:
     """Rows of a comparison, in the order of the runs; runs of one scene and config but for the seed share a row.
 
     Raises SehdrError without runs, for a run that is given twice, or one without evaluations in its metrics.

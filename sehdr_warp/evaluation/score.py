@@ -2,6 +2,7 @@
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -35,7 +36,7 @@ class FolderPictures:
 @torch.no_grad()
 def score_folder(
     folder: Path | str, truth: Scene, *, lpips_weights: Path | str | None = None, flip: bool = False
-) -> dict:
+) -> dict[str, Any]:
     """Scores pictures of any origin against a scene's HDR truth.
 
     folder: EXR files of scene-linear radiance with Rec.709 primaries, named as the views (`r_0.exr`). truth: a scene

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from ..errors import SehdrError
@@ -137,7 +137,7 @@ def neighbour_distances(points: Tensor) -> Tensor:
         index = int((~finite).argmax())
         problem = f"point {index} of {len(points)} is {positions[index].tolist()}"
         raise SehdrError(f"{problem}: a point cloud needs finite coordinates; remove such points")
-    tree = cKDTree(positions, balanced_tree=False, compact_nodes=False)
+    tree = KDTree(positions, balanced_tree=False, compact_nodes=False)
     distances = np.empty((len(positions), 4))
     # In the tree's own order, in which queries that follow each other read the same nodes.
     distances[tree.indices], _ = tree.query(positions[tree.indices], k=4, workers=thread_count())

@@ -1,6 +1,7 @@
 """The pinhole camera that every part of the package shares."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -80,14 +81,14 @@ class Camera:
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.world_to_camera)
 
-    def to_dict(self) -> dict:
+    def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON; from_dict reads them back exactly."""
         names = ("width", "height", "fx", "fy", "cx", "cy")
         return {name: getattr(self, name) for name in names} | {"world_to_camera": self.world_to_camera.tolist()}
 
     @staticmethod
-    def from_dict(values: dict) -> "Camera":
+    def from_dict(values: dict[str, Any]) -> "Camera":
         """The camera that to_dict described; raises KeyError for a missing field, ValueError for a bad value."""
-        sizes = (int(values[name]) for name in ("width", "height"))
-        numbers = (float(values[name]) for name in ("fx", "fy", "cx", "cy"))
-        return Camera(*sizes, *numbers, np.array(values["world_to_camera"], dtype=np.float64))
+        width, height = (int(values[name]) for name in ("width", "height"))
+        fx, fy, cx, cy = (float(values[name]) for name in ("fx", "fy", "cx", "cy"))
+        return Camera(width, height, fx, fy, cx, cy, np.array(values["world_to_camera"], dtype=np.float64))

@@ -42,6 +42,12 @@ class Shot:
     derived: bool = False
     oriented: bool | None = None
 
+    @property
+    def seconds(self) -> float:
+        """The exposure time, once the set's files or EXIF have told it."""
+        assert self.exposure_time is not None
+        return self.exposure_time
+
 
 @dataclass(frozen=True)
 class Capture:

@@ -87,7 +87,7 @@ def _exr_window(path: Path, max_pixels: int) -> tuple[tuple[int, int], tuple[int
     try:
         with silent_stderr(), OpenEXR.File(str(path), header_only=True) as file:
             header = file.header()
-            windows = [[[int(v) for v in corner] for corner in header[key]] for key in ("displayWindow", "dataWindow")]
+            windows = [[(int(x), int(y)) for x, y in header[key]] for key in ("displayWindow", "dataWindow")]
     except _EXR_ERRORS as error:
         raise InputError(path, f"cannot be read as OpenEXR ({error})", DAMAGED) from None
     sizes = [(high[0] - low[0] + 1, high[1] - low[1] + 1) for low, high in windows]
@@ -96,7 +96,7 @@ def _exr_window(path: Path, max_pixels: int) -> tuple[tuple[int, int], tuple[int
         check_size(path, *size, max_pixels)
         if size[0] * size[1] > _MOST_PIXELS_PER_BYTE * stored:
             raise InputError(path, f"states {size[0]} x {size[1]} pixels, but has only {stored} bytes", DAMAGED)
-    return tuple(windows[0][0]), sizes[0]
+    return windows[0][0], sizes[0]
 
 
 def _read_radiance(path: Path) -> np.ndarray:

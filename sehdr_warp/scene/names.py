@@ -76,4 +76,4 @@ def unique_names(shots: Sequence[Shot]) -> list[str]:
                 name, number = f"{base}_{number}", number + 1
             names[i] = name
             taken.add(name.lower())
-    return names
+    return [name for name in names if name is not None]

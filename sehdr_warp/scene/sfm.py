@@ -75,7 +75,7 @@ def triangulate(capture: Capture, cache: Path | str | None = None) -> tuple[np.n
     """
     shots = capture.training
     parts = [
-        (shot.image.name, _digest(shot.image), shot.mask and _digest(shot.mask), shot.exposure_time * shot.derived,
+        (shot.image.name, _digest(shot.image), shot.mask and _digest(shot.mask), shot.seconds * shot.derived,
          shot.lens.model, shot.lens.params, shot.world_to_camera.tolist())
         for shot in shots
     ]  # fmt: skip

@@ -13,6 +13,7 @@ from ..errors import InputError
 from .capture import Shot
 from .exposure import with_exposure_times
 from .images import LDR_SUFFIXES, read_ldr
+from .lens import Lens
 from .names import list_images
 
 if TYPE_CHECKING:
@@ -42,13 +43,14 @@ def read_stack(folder: Path | str, times: Sequence[float] | None = None) -> Stac
     if not files:
         raise InputError(folder, "is no folder of photos", "give a folder of one scene at several exposure times")
     if times is None:
-        shots = [Shot(file.stem, file, None, None) for file in files]
+        no_lens = Lens("PINHOLE", 1, 1, (1.0, 1.0, 0.5, 0.5), folder)
+        shots = [Shot(file.stem, file, no_lens, np.eye(4)) for file in files]
         shots, known, notes = with_exposure_times(shots, folder)
         if not known:
             raise InputError(folder, "its photos state no exposure times", "give --exposures or an exposures.json")
         for note in notes:
             log.info(note)
-        times = [shot.exposure_time for shot in shots]
+        times = [shot.seconds for shot in shots]
     if len(times) != len(files):
         raise InputError(folder, f"has {len(files)} photos, and {len(times)} times are given", "give one for each")
     return Stack(tuple(files), tuple(read_ldr(file).pixels for file in files), tuple(map(float, times)))

@@ -196,12 +196,12 @@ class _ProgramFunction(torch.autograd.Function):
 
 @overload
 def differentiable(
-    body: Callable[Concatenate[Program, P], tuple[wp.array, ...]],
+    body: Callable[Concatenate[Program, P], tuple["wp.array[Any, Any]", ...]],
 ) -> Callable[P, tuple[torch.Tensor, ...]]: ...
 
 
 @overload
-def differentiable(body: Callable[Concatenate[Program, P], wp.array]) -> Callable[P, torch.Tensor]: ...
+def differentiable(body: Callable[Concatenate[Program, P], "wp.array[Any, Any]"]) -> Callable[P, torch.Tensor]: ...
 
 
 def differentiable(body: Callable[..., Any]) -> Callable[..., Any]:

@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 from pydantic import ValidationError
 
@@ -32,7 +32,7 @@ def preset_purpose(name: str) -> str:
 
 
 def load_config(
-    preset: str | Path = "default", overrides: dict | None = None, flags: Mapping[str, str] | None = None
+    preset: str | Path = "default", overrides: dict[str, Any] | None = None, flags: Mapping[str, str] | None = None
 ) -> Config:
     """The config of a preset or of a TOML file.
 

@@ -5,6 +5,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -87,13 +88,13 @@ class Training:
         self,
         scene: Scene,
         out: Path | str,
-        config: Config | str | Path | Mapping | None = None,
+        config: Config | str | Path | Mapping[str, Any] | None = None,
         *,
         device: str | torch.device | None = None,
         resume: bool = False,
         overwrite: bool = False,
         tensorboard: bool = False,
-        data: dict | None = None,
+        data: dict[str, Any] | None = None,
     ):
         self.folder = RunFolder(out)
         self.device = pick_device(device)
@@ -309,7 +310,9 @@ class Training:
             )
 
 
-def train(scene: Scene, out: Path | str, config: Config | str | Path | Mapping | None = None, **options) -> Run:
+def train(
+    scene: Scene, out: Path | str, config: Config | str | Path | Mapping[str, Any] | None = None, **options: Any
+) -> Run:
     """Trains a scene to the end and returns the trained run, whose folder is `out`.
 
     config and options: as of Training. Raises what Training does, and KeyboardInterrupt after an interrupt; a usable
