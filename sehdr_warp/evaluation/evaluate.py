@@ -4,6 +4,7 @@ import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -48,13 +49,13 @@ class RunPictures:
 
 @torch.no_grad()
 def evaluate(
-    run,
+    run: Any,
     scene: Scene,
     *,
     lpips_weights: Path | str | None = None,
     peak_luminance: float = PEAK_LUMINANCE,
     flip: bool = False,
-) -> dict:
+) -> dict[str, Any]:
     """Render the scene's test views with a trained run and compare them with the photos and the HDR truth.
 
     Args:

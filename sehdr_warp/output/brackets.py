@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -65,7 +65,7 @@ def write_brackets(
     pixel: str = "half",
     multipart: bool = False,
     ldr: str | None = None,
-    response=None,
+    response: Any = None,
     overwrite: bool = False,
 ) -> list[Path]:
     """Writes exposure brackets of HDR views; returns the EXR files.

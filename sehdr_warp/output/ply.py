@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ Colors = Callable[[np.ndarray], np.ndarray]
 
 
 def export(
-    run,
+    run: Any,
     path: Path | str,
     *,
     kind: str = "hdr",

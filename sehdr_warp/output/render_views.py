@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,7 @@ _FIT_VIEWS, _FIT_SIZE = 4, 160
 
 
 def render_views(
-    run,
+    run: Any,
     out: Path | str,
     *,
     cameras: str | Path = "test",

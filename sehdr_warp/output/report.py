@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -41,7 +42,9 @@ class Comparison:
     new: np.ndarray | None = None
 
 
-def write_report(run, scene: Scene, out: Path | str, *, view_count: int = 3, overwrite: bool = False) -> list[Path]:
+def write_report(
+    run: Any, scene: Scene, out: Path | str, *, view_count: int = 3, overwrite: bool = False
+) -> list[Path]:
     """Renders some held-out views of a trained run and writes the report's pictures; returns their paths.
 
     `comparison.png`: photo; photo, HDR scene and truth (where there is some) at -4 EV; a new view; one row for each of
