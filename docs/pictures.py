@@ -7,7 +7,7 @@ import io
 import sys
 from pathlib import Path
 
-from PIL import Image
+from PIL import Image, ImageChops
 
 import sehdr_warp as sw
 from sehdr_warp.output.report import compare, comparison_figure
@@ -28,6 +28,8 @@ def main(name: str = "embedded:lamps", folder: str = "runs/hero", view: str = ""
     figure.savefig(drawn, dpi=160, facecolor="white", format="png")
     with Image.open(drawn) as picture:
         picture = picture.convert("RGB")
+        content = ImageChops.difference(picture, Image.new("RGB", picture.size, "white")).getbbox()
+        picture = picture.crop((0, 0, picture.width, content[3] + 8))
         picture.thumbnail((WIDTH, WIDTH))
         picture.save(PICTURE, quality=88, optimize=True)
 

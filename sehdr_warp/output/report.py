@@ -63,7 +63,7 @@ def write_report(
     if not given:
         raise SehdrError("the scene has no views to report on; check its splits")
     views = [given[i] for i in sorted({round(i) for i in np.linspace(0, len(given) - 1, max(view_count, 1))})]
-    comparisons = [_compare(run, view, scene.views) for view in views]
+    comparisons = [compare(run, view, scene.views) for view in views]
     brightest = max(comparisons, key=lambda comparison: float((comparison.photo > 0.99).mean()))
     time = views[0].exposure_time
     figures = [
@@ -151,7 +151,8 @@ def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, ce
         return figure
 
 
-def _compare(run, view: View, views: Sequence[View]) -> Comparison:
+def compare(run, view: View, views: Sequence[View]) -> Comparison:
+    """What comparison_figure shows of a view of the scene whose views are `views`."""
     between, confidence = _between(view, views), run.render_confidence(view.camera)
     return Comparison(
         view.name,
