@@ -29,12 +29,11 @@ from functools import cache
 import warp as wp
 
 from .constants import ALPHA_MAX, TILE_SIZE, TRANSMITTANCE_MIN
-from .geometry import geometry, vector
+from .geometry import vector
 
 # Inlining everything and fusing multiply-adds is worth 1.3-1.6x here. The flags go to Warp's own LLVM.
-COMPILER_FLAGS = (
-    "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -ffp-contract=fast"
-)
+COMPILER_FLAGS = "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 "
+COMPILER_FLAGS += "-ffp-contract=fast"
 
 # exp(x) on [-0.7, 0] by falling powers, least squares in relative error at Chebyshev points: right to 8.1e-8.
 EXP_COEFFICIENTS = (
@@ -50,8 +49,7 @@ def row_functions(dtype, halvings: int):
     halvings: the polynomial is taken at p / 2^halvings and squared as often, so that p may go down to -0.7 2^halvings.
     float64 rows use the library's exponential: they are the reference, not the fast path.
     """
-    row = vector(TILE_SIZE, dtype)
-    real = dtype
+    row, real = vector(TILE_SIZE, dtype), dtype
     lowest = -0.7 * 2.0**halvings
     highest, *others = EXP_COEFFICIENTS
     degree = len(others)
@@ -90,10 +88,8 @@ def row_functions(dtype, halvings: int):
 
 
 def _options(dtype) -> dict:
-    options = {"enable_backward": False, "max_unroll": 64}
-    if dtype is wp.float32:
-        options["cpu_compiler_flags"] = COMPILER_FLAGS
-    return options
+    flags = {"cpu_compiler_flags": COMPILER_FLAGS} if dtype is wp.float32 else {}
+    return {"enable_backward": False, "max_unroll": 64, **flags}
 
 
 @cache
@@ -108,28 +104,16 @@ def forward_kernel(dtype, channels: int, halvings: int):
     image: [H W, C]; left_over: [H W], the transmittance behind everything
     """
     row, spread, step, exponential = row_functions(dtype, halvings)
-    g = geometry(dtype)
-    real, vec4 = g.real, g.vec4
-    size = TILE_SIZE
+    real, vec4, size = dtype, vector(4, dtype), TILE_SIZE
 
     @wp.kernel(module="unique", module_options=_options(dtype))
     def blend_forward(
         first: int,
-        ranges: wp.array(dtype=wp.vec2i),
-        entries: wp.array(dtype=wp.int32),
-        shapes: wp.array(dtype=vec4),
-        ellipses: wp.array(dtype=vec4),
-        features: wp.array2d(dtype=real),
-        columns: int,
-        width: int,
-        height: int,
-        alpha_threshold: real,
-        iota: wp.array(dtype=row),
-        transmittance: wp.array2d(dtype=row),
-        accumulated: wp.array3d(dtype=row),
-        last: wp.array2d(dtype=row),
-        image: wp.array2d(dtype=real),
-        left_over: wp.array(dtype=real),
+        ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), shapes: wp.array(dtype=vec4),
+        ellipses: wp.array(dtype=vec4), features: wp.array2d(dtype=real),
+        columns: int, width: int, height: int, alpha_threshold: real,
+        iota: wp.array(dtype=row), transmittance: wp.array2d(dtype=row), accumulated: wp.array3d(dtype=row),
+        last: wp.array2d(dtype=row), image: wp.array2d(dtype=real), left_over: wp.array(dtype=real),
     ):
         tile = first + wp.tid()
         bounds = ranges[tile]
@@ -199,33 +183,18 @@ def backward_kernel(dtype, channels: int, halvings: int):
     entry_gradients: [M, C + 6], in the order of emission: features, conic a b c, x, y, opacity
     """
     row, spread, step, exponential = row_functions(dtype, halvings)
-    g = geometry(dtype)
-    real, vec4 = g.real, g.vec4
-    size = TILE_SIZE
+    real, vec4, size = dtype, vector(4, dtype), TILE_SIZE
 
     @wp.kernel(module="unique", module_options=_options(dtype))
     def blend_backward(
         first: int,
-        ranges: wp.array(dtype=wp.vec2i),
-        entries: wp.array(dtype=wp.int32),
-        emission: wp.array(dtype=wp.int32),
-        shapes: wp.array(dtype=vec4),
-        ellipses: wp.array(dtype=vec4),
-        features: wp.array2d(dtype=real),
-        columns: int,
-        width: int,
-        height: int,
-        alpha_threshold: real,
-        iota: wp.array(dtype=row),
-        last: wp.array2d(dtype=row),
-        image_gradient: wp.array2d(dtype=real),
-        left_over_gradient: wp.array(dtype=real),
-        transmittance: wp.array2d(dtype=row),
-        behind: wp.array2d(dtype=row),
-        incoming: wp.array3d(dtype=row),
-        weights: wp.array2d(dtype=row),
-        slopes: wp.array2d(dtype=row),
-        entry_gradients: wp.array2d(dtype=real),
+        ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), emission: wp.array(dtype=wp.int32),
+        shapes: wp.array(dtype=vec4), ellipses: wp.array(dtype=vec4), features: wp.array2d(dtype=real),
+        columns: int, width: int, height: int, alpha_threshold: real,
+        iota: wp.array(dtype=row), last: wp.array2d(dtype=row), image_gradient: wp.array2d(dtype=real),
+        left_over_gradient: wp.array(dtype=real), transmittance: wp.array2d(dtype=row),
+        behind: wp.array2d(dtype=row), incoming: wp.array3d(dtype=row), weights: wp.array2d(dtype=row),
+        slopes: wp.array2d(dtype=row), entry_gradients: wp.array2d(dtype=real),
     ):
         tile = first + wp.tid()
         bounds = ranges[tile]

@@ -49,25 +49,14 @@ def forward_kernel(dtype, channels: int):
     blocks_across = TILE_SIZE // 8
 
     @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        launch_bounds=BLOCK_DIM,
-        grid_stride=False,
+        module="unique", enable_backward=False, launch_bounds=BLOCK_DIM, grid_stride=False,
         module_options=module_options(dtype),
     )
     def blend_forward(
-        ranges: wp.array(dtype=wp.vec2i),
-        entries: wp.array(dtype=wp.int32),
-        shapes: wp.array(dtype=vec4),
-        ellipses: wp.array(dtype=vec4),
-        features: wp.array(dtype=vec4),
-        columns: int,
-        width: int,
-        height: int,
-        alpha_threshold: real,
-        image: wp.array(dtype=vec_image),
-        transmittance: wp.array(dtype=real),
-        last: wp.array(dtype=wp.int32),
+        ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), shapes: wp.array(dtype=vec4),
+        ellipses: wp.array(dtype=vec4), features: wp.array(dtype=vec4),
+        columns: int, width: int, height: int, alpha_threshold: real,
+        image: wp.array(dtype=vec_image), transmittance: wp.array(dtype=real), last: wp.array(dtype=wp.int32),
     ):
         thread = wp.tid()
         block = thread >> 5

@@ -15,8 +15,7 @@ from .constants import ALPHA_MAX, TILE_SIZE
 from .geometry import geometry, vector
 
 BLOCKS_PER_TILE = (TILE_SIZE // 8) * (TILE_SIZE // 4)
-ROWS = 4
-"""Rows of pixels of one warp."""
+ROWS = 4  # of pixels of one warp
 
 
 @cache
@@ -27,10 +26,9 @@ def backward_kernel(dtype, channels: int, ordered: bool):
     rows: ROWS and gradient_count: C + 6, as arguments so that their loops stay loops;
     gradients: [N (C + 6)], flat rows (features, conic a b c, x, y, opacity), added to
 
-    ordered: the same sums in the same order every time. One launch over tiles x 32 threads for each `corner`, one of
-    the BLOCKS_PER_TILE rectangles of a tile: within it a row of gradients has one writer. rows_of: [M] the row of each
-    entry, gradients: [M (C + 6)], to be gathered by Gaussian. Unordered, neither is read: the rows are the Gaussians',
-    and atomics add to them in whatever order the GPU finishes.
+    ordered: the same sums in the same order every time, by one launch over tiles x 32 threads for each `corner` of the
+    BLOCKS_PER_TILE, within which a row of gradients has one writer. rows_of: [M] the row of each entry, gradients:
+    [M (C + 6)], to be gathered by Gaussian. Unordered, neither is read: atomics add to the Gaussians' rows.
     """
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4
@@ -41,31 +39,17 @@ def backward_kernel(dtype, channels: int, ordered: bool):
     blocks_across = TILE_SIZE // 8
 
     @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        launch_bounds=BLOCK_DIM,
-        grid_stride=False,
+        module="unique", enable_backward=False, launch_bounds=BLOCK_DIM, grid_stride=False,
         module_options=module_options(dtype),
     )
     def blend_backward(
-        ranges: wp.array(dtype=wp.vec2i),
-        entries: wp.array(dtype=wp.int32),
-        shapes: wp.array(dtype=vec4),
-        ellipses: wp.array(dtype=vec4),
-        features: wp.array(dtype=vec4),
-        columns: int,
-        width: int,
-        height: int,
-        alpha_threshold: real,
-        transmittance: wp.array(dtype=real),
-        last: wp.array(dtype=wp.int32),
-        image_gradient: wp.array(dtype=vec_image),
-        transmittance_gradient: wp.array(dtype=real),
-        rows: int,
-        gradient_count: int,
-        only_corner: int,
-        rows_of: wp.array(dtype=wp.int32),
-        gradients: wp.array(dtype=real),
+        ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), shapes: wp.array(dtype=vec4),
+        ellipses: wp.array(dtype=vec4), features: wp.array(dtype=vec4),
+        columns: int, width: int, height: int, alpha_threshold: real,
+        transmittance: wp.array(dtype=real), last: wp.array(dtype=wp.int32),
+        image_gradient: wp.array(dtype=vec_image), transmittance_gradient: wp.array(dtype=real),
+        rows: int, gradient_count: int, only_corner: int,
+        rows_of: wp.array(dtype=wp.int32), gradients: wp.array(dtype=real),
     ):
         thread = wp.tid()
         block = thread >> 5

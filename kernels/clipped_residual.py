@@ -27,19 +27,10 @@ def clipped_residual_kernel(dtype, code, mu_law: bool):
     @wp.kernel(module="unique", module_options={"enable_backward": False, "fuse_fp": False})
     def clipped_residual(
         first: int,
-        image: wp.array(dtype=real),
-        codes: wp.array2d(dtype=code),
-        index: wp.array(dtype=wp.int64),
+        image: wp.array(dtype=real), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64),
         table: wp.array(dtype=real),
-        scale: real,
-        gain: real,
-        white: int,
-        black: int,
-        below_white: real,
-        above_black: real,
-        seen: wp.array(dtype=real),
-        slopes: wp.array(dtype=real),
-        truth: wp.array(dtype=real),
+        scale: real, gain: real, white: int, black: int, below_white: real, above_black: real,
+        seen: wp.array(dtype=real), slopes: wp.array(dtype=real), truth: wp.array(dtype=real),
     ):
         """truth: what the table holds for the codes of photo index[0]. seen: of the image; where the code is `white`
         the truth, less what is missing to truth - below_white; where it is `black` the truth, plus what is beyond

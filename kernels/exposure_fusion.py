@@ -21,7 +21,7 @@ def fusion_kernels(dtype) -> SimpleNamespace:
     encoded, exposedness, outputs and what is made of them: [3, Q]; inner [3, 2, H], inner_bias, outer [3, H],
     outer_bias [3]: the perceptrons' weights; log_sigma: [3]; results: [M, 3].
     """
-    real = dtype
+    real, options = dtype, {"enable_backward": False}
 
     @wp.func
     def deviation_of(encoded: real, log_sigma: real, most_log: real) -> real:
@@ -29,12 +29,8 @@ def fusion_kernels(dtype) -> SimpleNamespace:
 
     @wp.func
     def largest_logit(
-        outputs: wp.array2d(dtype=real),
-        exposedness: wp.array2d(dtype=real),
-        channel: int,
-        place: int,
-        count: int,
-        brackets: int,
+        outputs: wp.array2d(dtype=real), exposedness: wp.array2d(dtype=real),
+        channel: int, place: int, count: int, brackets: int,
     ) -> real:
         """What softmax subtracts from the logits of one colour's brackets, so that its exponentials stay finite."""
         largest = outputs[channel, place] * exposedness[channel, place]
@@ -42,18 +38,12 @@ def fusion_kernels(dtype) -> SimpleNamespace:
             largest = wp.max(largest, outputs[channel, p * count + place] * exposedness[channel, p * count + place])
         return largest
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.kernel(module="unique", module_options=options)
     def perceptrons(
-        encoded: wp.array2d(dtype=real),
-        log_sigma: wp.array(dtype=real),
-        most_log: real,
-        most: real,
-        inner: wp.array3d(dtype=real),
-        inner_bias: wp.array2d(dtype=real),
-        outer: wp.array2d(dtype=real),
-        outer_bias: wp.array(dtype=real),
-        exposedness: wp.array2d(dtype=real),
-        outputs: wp.array2d(dtype=real),
+        encoded: wp.array2d(dtype=real), log_sigma: wp.array(dtype=real),
+        most_log: real, most: real,
+        inner: wp.array3d(dtype=real), inner_bias: wp.array2d(dtype=real), outer: wp.array2d(dtype=real),
+        outer_bias: wp.array(dtype=real), exposedness: wp.array2d(dtype=real), outputs: wp.array2d(dtype=real),
     ):
         """exposedness: exp(-d^2 / 2) of the deviations from mid grey; outputs: of the perceptron of both."""
         channel, point = wp.tid()
@@ -67,13 +57,10 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         exposedness[channel, point] = near
         outputs[channel, point] = output
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.kernel(module="unique", module_options=options)
     def mix(
-        encoded: wp.array2d(dtype=real),
-        exposedness: wp.array2d(dtype=real),
-        outputs: wp.array2d(dtype=real),
-        brackets: int,
-        scale: real,
+        encoded: wp.array2d(dtype=real), exposedness: wp.array2d(dtype=real), outputs: wp.array2d(dtype=real),
+        brackets: int, scale: real,
         results: wp.array2d(dtype=real),
     ):
         """scale times the mean of the encoded brackets, weighted by the softmax of outputs times exposedness."""
@@ -89,17 +76,12 @@ def fusion_kernels(dtype) -> SimpleNamespace:
             weighted += weight * encoded[channel, q]
         results[place, channel] = scale * weighted / total
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.kernel(module="unique", module_options=options)
     def mix_adjoint(
-        encoded: wp.array2d(dtype=real),
-        exposedness: wp.array2d(dtype=real),
-        outputs: wp.array2d(dtype=real),
-        brackets: int,
-        scale: real,
-        results: wp.array2d(dtype=real),
-        result_gradients: wp.array2d(dtype=real),
-        by_exposedness: wp.array2d(dtype=real),
-        by_output: wp.array2d(dtype=real),
+        encoded: wp.array2d(dtype=real), exposedness: wp.array2d(dtype=real), outputs: wp.array2d(dtype=real),
+        brackets: int, scale: real,
+        results: wp.array2d(dtype=real), result_gradients: wp.array2d(dtype=real),
+        by_exposedness: wp.array2d(dtype=real), by_output: wp.array2d(dtype=real),
     ):
         """by_exposedness: through the logits alone."""
         place, channel = wp.tid()
@@ -117,19 +99,13 @@ def fusion_kernels(dtype) -> SimpleNamespace:
             by_exposedness[channel, q] = by_logit * outputs[channel, q]
             by_output[channel, q] = by_logit * exposedness[channel, q]
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.kernel(module="unique", module_options=options)
     def unit_adjoint(
-        encoded: wp.array2d(dtype=real),
-        exposedness: wp.array2d(dtype=real),
-        by_output: wp.array2d(dtype=real),
-        inner: wp.array3d(dtype=real),
-        inner_bias: wp.array2d(dtype=real),
-        outer: wp.array2d(dtype=real),
+        encoded: wp.array2d(dtype=real), exposedness: wp.array2d(dtype=real), by_output: wp.array2d(dtype=real),
+        inner: wp.array3d(dtype=real), inner_bias: wp.array2d(dtype=real), outer: wp.array2d(dtype=real),
         points: int,
-        by_inner: wp.array3d(dtype=real),
-        by_inner_bias: wp.array2d(dtype=real),
-        by_outer: wp.array2d(dtype=real),
-        by_outer_bias: wp.array(dtype=real),
+        by_inner: wp.array3d(dtype=real), by_inner_bias: wp.array2d(dtype=real),
+        by_outer: wp.array2d(dtype=real), by_outer_bias: wp.array(dtype=real),
     ):
         """Added to: the gradients by the perceptrons' weights, of `points` points a thread."""
         channel, chunk, unit = wp.tid()
@@ -161,18 +137,13 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         if unit == 0:
             wp.atomic_add(by_outer_bias, channel, output_sum)
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.kernel(module="unique", module_options=options)
     def point_adjoint(
-        encoded: wp.array2d(dtype=real),
-        exposedness: wp.array2d(dtype=real),
-        by_exposedness: wp.array2d(dtype=real),
-        by_output: wp.array2d(dtype=real),
+        encoded: wp.array2d(dtype=real), exposedness: wp.array2d(dtype=real),
+        by_exposedness: wp.array2d(dtype=real), by_output: wp.array2d(dtype=real),
         log_sigma: wp.array(dtype=real),
-        most_log: real,
-        most: real,
-        inner: wp.array3d(dtype=real),
-        inner_bias: wp.array2d(dtype=real),
-        outer: wp.array2d(dtype=real),
+        most_log: real, most: real,
+        inner: wp.array3d(dtype=real), inner_bias: wp.array2d(dtype=real), outer: wp.array2d(dtype=real),
         by_log_sigma: wp.array2d(dtype=real),
     ):
         """by_log_sigma: [3, Q], to be summed over Q."""
@@ -193,9 +164,6 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         by_log_sigma[channel, point] = result
 
     return SimpleNamespace(
-        perceptrons=perceptrons,
-        mix=mix,
-        mix_adjoint=mix_adjoint,
-        unit_adjoint=unit_adjoint,
+        perceptrons=perceptrons, mix=mix, mix_adjoint=mix_adjoint, unit_adjoint=unit_adjoint,
         point_adjoint=point_adjoint,
     )

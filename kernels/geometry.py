@@ -72,13 +72,7 @@ def geometry(dtype) -> SimpleNamespace:
         return wp.min(real(-0.5) * (a * dx * dx + c * dy * dy) - b * dx * dy, real(0.0))
 
     return SimpleNamespace(
-        real=real,
-        vec2=vector(2, dtype),
-        vec3=vec3,
-        vec4=vec4,
-        mat33=mat33,
-        mat44=matrix(4, 4, dtype),
-        rotation_from_quaternion=rotation_from_quaternion,
-        ellipse_meets_rectangle=ellipse_meets_rectangle,
+        real=real, vec2=vector(2, dtype), vec3=vec3, vec4=vec4, mat33=mat33, mat44=matrix(4, 4, dtype),
+        rotation_from_quaternion=rotation_from_quaternion, ellipse_meets_rectangle=ellipse_meets_rectangle,
         splat_exponent=splat_exponent,
     )

@@ -41,11 +41,8 @@ def harmonics_kernel(dtype, degree: int):
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def evaluate_harmonics(
         first: int,
-        constant: wp.array2d(dtype=vec3),
-        rest: wp.array2d(dtype=vec3),
-        means: wp.array(dtype=vec3),
-        camera_position: wp.array(dtype=vec3),
-        values: wp.array(dtype=vec3),
+        constant: wp.array2d(dtype=vec3), rest: wp.array2d(dtype=vec3), means: wp.array(dtype=vec3),
+        camera_position: wp.array(dtype=vec3), values: wp.array(dtype=vec3),
     ):
         i = first + wp.tid()
         value = real(0.28209479177387814) * constant[i, 0]
@@ -95,13 +92,9 @@ def harmonics_adjoint_kernel(dtype, degree: int):
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def harmonics_adjoint(
         first: int,
-        rest: wp.array2d(dtype=vec3),
-        means: wp.array(dtype=vec3),
-        camera_position: wp.array(dtype=vec3),
-        value_gradients: wp.array(dtype=vec3),
-        constant_gradients: wp.array2d(dtype=vec3),
-        rest_gradients: wp.array2d(dtype=vec3),
-        mean_gradients: wp.array(dtype=vec3),
+        rest: wp.array2d(dtype=vec3), means: wp.array(dtype=vec3), camera_position: wp.array(dtype=vec3),
+        value_gradients: wp.array(dtype=vec3), constant_gradients: wp.array2d(dtype=vec3),
+        rest_gradients: wp.array2d(dtype=vec3), mean_gradients: wp.array(dtype=vec3),
     ):
         i = first + wp.tid()
         gradient = value_gradients[i]

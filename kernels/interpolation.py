@@ -51,10 +51,8 @@ def weight_slopes(part: float) -> _weights4:
 @wp.kernel(module="unique", module_options={"enable_backward": False})
 def interpolate(
     table: wp.array2d(dtype=wp.float32),
-    low: float,
-    inverse_step: float,
-    positions: wp.array2d(dtype=wp.float32),
-    values: wp.array2d(dtype=wp.float32),
+    low: float, inverse_step: float,
+    positions: wp.array2d(dtype=wp.float32), values: wp.array2d(dtype=wp.float32),
 ):
     """table: [nodes + 2, C], the node at `low` in row 1; positions, values: [N, C]."""
     i, column = wp.tid()
@@ -70,12 +68,9 @@ def interpolate(
 @wp.kernel(module="unique", module_options={"enable_backward": False})
 def interpolate_adjoint(
     table: wp.array2d(dtype=wp.float32),
-    low: float,
-    inverse_step: float,
-    positions: wp.array2d(dtype=wp.float32),
-    value_gradients: wp.array2d(dtype=wp.float32),
-    position_gradients: wp.array2d(dtype=wp.float32),
-    table_gradients: wp.array3d(dtype=wp.float32),
+    low: float, inverse_step: float,
+    positions: wp.array2d(dtype=wp.float32), value_gradients: wp.array2d(dtype=wp.float32),
+    position_gradients: wp.array2d(dtype=wp.float32), table_gradients: wp.array3d(dtype=wp.float32),
 ):
     """table_gradients: [copies, nodes + 2, C], added to; the other gradients: [N, C]."""
     i, column = wp.tid()

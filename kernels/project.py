@@ -39,22 +39,12 @@ def projection_kernel(dtype, antialiased: bool):
     @wp.kernel(module="unique", module_options={"enable_backward": True})
     def project(
         first: int,
-        means: wp.array(dtype=vec3),
-        log_scales: wp.array(dtype=vec3),
-        quaternions: wp.array(dtype=vec4),
-        opacities: wp.array(dtype=real),
-        world_to_camera: wp.array(dtype=mat44),
+        means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quaternions: wp.array(dtype=vec4),
+        opacities: wp.array(dtype=real), world_to_camera: wp.array(dtype=mat44),
         intrinsics: wp.array(dtype=vec4),
-        width: int,
-        height: int,
-        near: real,
-        low_pass: real,
-        alpha_threshold: real,
-        means2d: wp.array(dtype=vec2),
-        conics: wp.array(dtype=vec3),
-        depths: wp.array(dtype=real),
-        opacities2d: wp.array(dtype=real),
-        extents: wp.array(dtype=vec2),
+        width: int, height: int, near: real, low_pass: real, alpha_threshold: real,
+        means2d: wp.array(dtype=vec2), conics: wp.array(dtype=vec3), depths: wp.array(dtype=real),
+        opacities2d: wp.array(dtype=real), extents: wp.array(dtype=vec2),
     ):
         i = first + wp.tid()
         pose = world_to_camera[0]
@@ -115,11 +105,8 @@ def projection_kernel(dtype, antialiased: bool):
             extent_y = wp.sqrt(level * variance_y)
         # Keep only what reaches the centre of a pixel of this image.
         usable = (
-            usable
-            and pixel[0] + extent_x > real(0.0)
-            and pixel[0] - extent_x < w
-            and pixel[1] + extent_y > real(0.0)
-            and pixel[1] - extent_y < h
+            usable and pixel[0] + extent_x > real(0.0) and pixel[0] - extent_x < w
+            and pixel[1] + extent_y > real(0.0) and pixel[1] - extent_y < h
         )
         if usable:
             inverse = real(1.0) / blurred

@@ -19,12 +19,8 @@ def encode_kernel(dtype, tone: int):
     def encode(
         first: int,
         exposures: wp.array(dtype=real),
-        power_law: vec4,
-        tone_numbers: vec5,
-        clip: real,
-        extension_slope: real,
-        values: wp.array(dtype=real),
-        slopes: wp.array(dtype=real),
+        power_law: vec4, tone_numbers: vec5, clip: real, extension_slope: real,
+        values: wp.array(dtype=real), slopes: wp.array(dtype=real),
     ):
         """power_law: exponent, offset, slope and end of the toe; tone_numbers: Filmic's a, b, d, e, g or Knee's start
         and softness; clip: the clip point, infinite for none; extension_slope: of the rise by log exposure beyond."""

@@ -73,11 +73,8 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def blur_columns(
         first: int,
-        a: wp.array2d(dtype=run),
-        b: wp.array2d(dtype=run),
-        weights: wp.array(dtype=real),
-        length: int,
-        channels: int,
+        a: wp.array2d(dtype=run), b: wp.array2d(dtype=run), weights: wp.array(dtype=real),
+        length: int, channels: int,
         moments: wp.array3d(dtype=run),
     ):
         margin = radius * channels
@@ -107,16 +104,11 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def compare(
         first: int,
-        moments: wp.array3d(dtype=run),
-        weights: wp.array(dtype=real),
-        length: int,
-        channels: int,
-        a: wp.array2d(dtype=run),
-        b: wp.array2d(dtype=run),
-        distance_weight: real,
-        dissimilarity_weight: real,
-        similarity: wp.array2d(dtype=run),
-        derivatives: wp.array3d(dtype=run),
+        moments: wp.array3d(dtype=run), weights: wp.array(dtype=real),
+        length: int, channels: int,
+        a: wp.array2d(dtype=run), b: wp.array2d(dtype=run),
+        distance_weight: real, dissimilarity_weight: real,
+        similarity: wp.array2d(dtype=run), derivatives: wp.array3d(dtype=run),
     ):
         y, i = place_of(first + wp.tid(), length, 0)
         ms = run(real(0.0))
@@ -160,10 +152,8 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def blur_derivatives(
         first: int,
-        derivatives: wp.array3d(dtype=run),
-        weights: wp.array(dtype=real),
-        length: int,
-        channels: int,
+        derivatives: wp.array3d(dtype=run), weights: wp.array(dtype=real),
+        length: int, channels: int,
         blurred: wp.array3d(dtype=run),
     ):
         margin = radius * channels
@@ -186,15 +176,11 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def gradient(
         first: int,
-        blurred: wp.array3d(dtype=run),
-        a: wp.array2d(dtype=run),
-        b: wp.array2d(dtype=run),
+        blurred: wp.array3d(dtype=run), a: wp.array2d(dtype=run), b: wp.array2d(dtype=run),
         weights: wp.array(dtype=real),
-        length: int,
-        channels: int,
+        length: int, channels: int,
         scale: wp.array(dtype=real),
-        distance_weight: real,
-        dissimilarity_weight: real,
+        distance_weight: real, dissimilarity_weight: real,
         adjoint_a: wp.array2d(dtype=run),
     ):
         y, i = place_of(first + wp.tid(), length, 0)

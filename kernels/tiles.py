@@ -42,15 +42,10 @@ def tile_kernels(dtype) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def pack_records(
         first: int,
-        means2d: wp.array(dtype=vec2),
-        conics: wp.array(dtype=vec3),
-        opacities: wp.array(dtype=real),
+        means2d: wp.array(dtype=vec2), conics: wp.array(dtype=vec3), opacities: wp.array(dtype=real),
         features: wp.array2d(dtype=real),
-        channels: int,
-        alpha_threshold: real,
-        extents: wp.array(dtype=vec2),
-        shapes: wp.array(dtype=vec4),
-        ellipses: wp.array(dtype=vec4),
+        channels: int, alpha_threshold: real,
+        extents: wp.array(dtype=vec2), shapes: wp.array(dtype=vec4), ellipses: wp.array(dtype=vec4),
     ):
         """shapes: (x, y, opacity, half-height); ellipses: (conic a, b, c, level at which alpha meets the threshold).
 
@@ -74,9 +69,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def key_by_depth(
         first: int,
-        depths: wp.array(dtype=real),
-        extents: wp.array(dtype=vec2),
-        keys: wp.array(dtype=real),
+        depths: wp.array(dtype=real), extents: wp.array(dtype=vec2), keys: wp.array(dtype=real),
         places: wp.array(dtype=int),
     ):
         """What sorts Gaussians nearest first, culled ones last, and their indices."""
@@ -90,12 +83,9 @@ def tile_kernels(dtype) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def count_tiles(
         first: int,
-        order: wp.array(dtype=wp.int32),
-        shapes: wp.array(dtype=vec4),
-        ellipses: wp.array(dtype=vec4),
+        order: wp.array(dtype=wp.int32), shapes: wp.array(dtype=vec4), ellipses: wp.array(dtype=vec4),
         extents: wp.array(dtype=vec2),
-        columns: int,
-        rows: int,
+        columns: int, rows: int,
         counts: wp.array(dtype=wp.int32),
     ):
         place = first + wp.tid()
@@ -116,16 +106,12 @@ def tile_kernels(dtype) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def emit_entries(
         first: int,
-        order: wp.array(dtype=wp.int32),
-        shapes: wp.array(dtype=vec4),
-        ellipses: wp.array(dtype=vec4),
+        order: wp.array(dtype=wp.int32), shapes: wp.array(dtype=vec4), ellipses: wp.array(dtype=vec4),
         extents: wp.array(dtype=vec2),
-        columns: int,
-        rows: int,
+        columns: int, rows: int,
         ends: wp.array(dtype=wp.int32),
         capacity: int,
-        tiles: wp.array(dtype=wp.int32),
-        gaussians: wp.array(dtype=wp.int32),
+        tiles: wp.array(dtype=wp.int32), gaussians: wp.array(dtype=wp.int32),
     ):
         """ends: the running sum of the counts, so that Gaussian `place` fills the entries before ends[place].
 
@@ -158,8 +144,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def gather_entries(
         first: int,
-        order: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
+        order: wp.array(dtype=wp.int32), ends: wp.array(dtype=wp.int32),
         entry_gradients: wp.array2d(dtype=real),
         columns: int,
         rows: wp.array2d(dtype=real),
@@ -178,10 +163,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
             rows[i, column] = total
 
     return SimpleNamespace(
-        pack_records=pack_records,
-        key_by_depth=key_by_depth,
-        count_tiles=count_tiles,
-        emit_entries=emit_entries,
+        pack_records=pack_records, key_by_depth=key_by_depth, count_tiles=count_tiles, emit_entries=emit_entries,
         gather_entries=gather_entries,
     )
 

@@ -18,9 +18,7 @@ _vec3, _vec4 = vector(3, wp.float32), vector(4, wp.float32)
 
 @wp.kernel(module="unique", module_options={"enable_backward": False})
 def judge_step(
-    loss: wp.array(dtype=wp.float32),
-    norms: wp.array(dtype=wp.float32),
-    incomplete: wp.array(dtype=wp.bool),
+    loss: wp.array(dtype=wp.float32), norms: wp.array(dtype=wp.float32), incomplete: wp.array(dtype=wp.bool),
     verdict: wp.array(dtype=wp.float32),
 ):
     """verdict: [3], 1 or 0 each: the loss or a gradient is not finite; the step is to be skipped; it is not to be.
@@ -51,17 +49,10 @@ def bias_correction(decay_log: float, step: float) -> float:
 @wp.kernel(module="unique", module_options={"enable_backward": False})
 def update_by_adam(
     first: int,
-    gradients: wp.array(dtype=wp.float32),
-    step: wp.array(dtype=wp.float32),
-    rate: wp.array(dtype=wp.float32),
+    gradients: wp.array(dtype=wp.float32), step: wp.array(dtype=wp.float32), rate: wp.array(dtype=wp.float32),
     skipped: wp.array(dtype=wp.float32),
-    first_gain: float,
-    second_gain: float,
-    first_decay_log: float,
-    second_decay_log: float,
-    epsilon: float,
-    parameters: wp.array(dtype=wp.float32),
-    first_moments: wp.array(dtype=wp.float32),
+    first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
+    parameters: wp.array(dtype=wp.float32), first_moments: wp.array(dtype=wp.float32),
     second_moments: wp.array(dtype=wp.float32),
 ):
     """One step of every number, in place; none where skipped[0] is not 0.
@@ -83,13 +74,9 @@ def update_by_adam(
 @wp.kernel(module="unique", module_options={"enable_backward": False})
 def add_gradient_statistics(
     first: int,
-    gradients: wp.array(dtype=wp.vec2),
-    radii: wp.array(dtype=wp.float32),
-    usable: wp.array(dtype=wp.float32),
-    half_width: float,
-    half_height: float,
-    gradient_sum: wp.array(dtype=wp.float32),
-    seen: wp.array(dtype=wp.float32),
+    gradients: wp.array(dtype=wp.vec2), radii: wp.array(dtype=wp.float32), usable: wp.array(dtype=wp.float32),
+    half_width: float, half_height: float,
+    gradient_sum: wp.array(dtype=wp.float32), seen: wp.array(dtype=wp.float32),
 ):
     """Adds the lengths of the gradients by the projected centres, in units of half the image's sides, and 1, for each
     Gaussian with a radius; nothing where usable[0] is 0."""
@@ -109,11 +96,9 @@ def add_gradient_statistics(
 @wp.kernel(module="unique", module_options={"enable_backward": False})
 def add_position_noise(
     first: int,
-    log_scales: wp.array(dtype=_vec3),
-    quaternions: wp.array(dtype=_vec4),
+    log_scales: wp.array(dtype=_vec3), quaternions: wp.array(dtype=_vec4),
     opacity_logits: wp.array(dtype=wp.float32),
-    seed: int,
-    strength: float,
+    seed: int, strength: float,
     means: wp.array(dtype=_vec3),
 ):
     """means += strength * sigmoid(100 (0.005 - opacity)) * R S S R^T * normal noise, of seed and index alone."""

@@ -23,12 +23,9 @@ def blend(
     conics: torch.Tensor,
     opacities: torch.Tensor,
     features: torch.Tensor,
-    *,
+    extents: torch.Tensor,
     lists: TileLists,
     records: tuple[torch.Tensor, torch.Tensor],
-    extents: torch.Tensor,
-    width: int,
-    height: int,
     alpha_threshold: float,
     deterministic: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -42,22 +39,21 @@ def blend(
     deterministic: on a GPU gradients are summed in a fixed order, as the CPU always does: slower, and the gradients of
     every (Gaussian, tile) pair take memory.
     """
-    options = lists, records, width, height, alpha_threshold, deterministic
+    options = lists, records, alpha_threshold, deterministic
     return _Blend.apply(means2d, conics, opacities, features, extents, *options)
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means2d, conics, opacities, features, extents, lists, records, width, height, threshold, ordered):
+    def forward(ctx, means2d, conics, opacities, features, extents, lists, records, threshold, ordered):
         features = features.detach()
-        image = features.new_empty(height, width, features.shape[1])
-        transmittance = features.new_empty(height, width)
+        ctx.sizes, ctx.threshold = (lists.height, lists.width, features.shape[1]), threshold
+        image, transmittance = features.new_empty(ctx.sizes), features.new_empty(ctx.sizes[:2])
         backend = blend_on_cuda if features.device.type == "cuda" else blend_on_cpu
         # Not the tensors that torch makes results of: the adjoint keeps one, and with it would keep itself.
         results = image.detach(), transmittance.detach()
         ctx.adjoint = backend(features, lists, records, *results, threshold, ordered)
         ctx.save_for_backward(means2d, conics, opacities, extents)
-        ctx.sizes, ctx.threshold = (height, width, features.shape[1]), threshold
         ctx.set_materialize_grads(False)
         return image, transmittance
 
@@ -79,14 +75,13 @@ class _Blend(torch.autograd.Function):
         by_features, by_conics, by_means2d, by_opacities = gathered.split((channels, 3, 2, 1), dim=1)
         gradients = by_means2d, by_conics, by_opacities[:, 0], by_features
         wanted = (part if needed else None for part, needed in zip(gradients, ctx.needs_input_grad, strict=False))
-        return *wanted, *(None,) * 7
+        return *wanted, *(None,) * 5
 
 
 def blend_on_cpu(
     features, lists: TileLists, records, image, left_over, alpha_threshold: float, deterministic: bool
 ) -> Adjoint:
-    """Fill image [H, W, C] and left_over [H, W], the transmittance, tile by tile: balanced pieces, one piece to a
-    thread at a time."""
+    """Fill image [H, W, C] and left_over [H, W], the transmittance: balanced pieces of tiles, a thread each."""
     scalar = warp_scalar(features.dtype)
     height, width, channels = image.shape
     halvings = exponent_halvings(alpha_threshold)
@@ -147,8 +142,7 @@ def blend_on_cuda(
     tile_count = lists.columns * lists.rows
     frame = lists.columns, width, height, alpha_threshold
 
-    # The backward pass takes the features from here and lets them go once they are padded: again, since what is padded
-    # is larger.
+    # The backward pass takes the features from here and lets them go once they are padded again, which is larger.
     count, kept = len(features), [features]
 
     def by_gaussian(features, records):

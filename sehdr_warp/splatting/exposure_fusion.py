@@ -3,6 +3,7 @@
 import torch
 
 from ..kernels.exposure_fusion import POINTS_PER_THREAD, fusion_kernels
+from .checks import check_tensors
 from .launching import launch, sums_are_ordered, warp_scalar
 
 MAX_LOG_SIGMA, MAX_DEVIATION = 30.0, 30.0
@@ -25,37 +26,23 @@ def fuse_exposures(
     perceptrons, one a channel: inner [3, 2, H], inner_bias [3, 1, H], ReLU, outer [3, H, 1], outer_bias [3, 1, 1].
     Differentiable once, with respect to all tensors. By kernels, or by torch's own operations where the brackets ask
     for a gradient, or on a GPU for a fixed order of sums (torch.use_deterministic_algorithms).
-    All contiguous, of one type, float32 or float64, and on one device; raises ValueError for other shapes.
+    All contiguous, of one type, float32 or float64, and on one device; raises ValueError otherwise.
     """
-    hidden = inner.shape[-1]
-    shapes = {
-        "encoded": (encoded, (*encoded.shape[:2], 3)),
-        "log_sigma": (log_sigma, (3,)),
-        "inner": (inner, (3, 2, hidden)),
-        "inner_bias": (inner_bias, (3, 1, hidden)),
-        "outer": (outer, (3, hidden, 1)),
-        "outer_bias": (outer_bias, (3, 1, 1)),
-    }
-    for name, (tensor, shape) in shapes.items():
-        if tuple(tensor.shape) != shape or tensor.dtype != encoded.dtype or tensor.device != encoded.device:
-            raise ValueError(
-                f"{name} is {tensor.dtype} {list(tensor.shape)} on {tensor.device}, expected {encoded.dtype} "
-                f"{list(shape)} on {encoded.device}"
-            )
+    check_tensors(
+        encoded=(encoded, ("P", "M", 3)),
+        log_sigma=(log_sigma, (3,)),
+        inner=(inner, (3, 2, "H")),
+        inner_bias=(inner_bias, (3, 1, "H")),
+        outer=(outer, (3, "H", 1)),
+        outer_bias=(outer_bias, (3, 1, 1)),
+    )
     learned = log_sigma, inner, inner_bias, outer, outer_bias
     if encoded.requires_grad or sums_are_ordered(encoded.device):
         return scale * (fusion_weights(encoded, *learned) * encoded).sum(dim=0)
     return _Fusion.apply(encoded, *learned, scale)
 
 
-def fusion_weights(
-    encoded: torch.Tensor,
-    log_sigma: torch.Tensor,
-    inner: torch.Tensor,
-    inner_bias: torch.Tensor,
-    outer: torch.Tensor,
-    outer_bias: torch.Tensor,
-) -> torch.Tensor:
+def fusion_weights(encoded, log_sigma, inner, inner_bias, outer, outer_bias) -> torch.Tensor:
     """[P, M, 3] the weights in fuse_exposures(), which sum to 1 over P, by torch's own operations."""
     deviation = (encoded - 0.5) / log_sigma.clamp(-MAX_LOG_SIGMA, MAX_LOG_SIGMA).exp()
     exposedness = (-0.5 * deviation.clamp(-MAX_DEVIATION, MAX_DEVIATION).square()).exp()

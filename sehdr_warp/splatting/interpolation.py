@@ -3,6 +3,7 @@
 import torch
 
 from ..kernels import interpolation
+from .checks import check_tensors
 from .launching import launch, sums_are_ordered
 
 
@@ -15,13 +16,9 @@ def interpolate(table: torch.Tensor, low: float, step: float, positions: torch.T
     order of sums (torch.use_deterministic_algorithms).
     Raises ValueError for a table that is too short or for shapes, types or devices that do not fit.
     """
-    fits = table.ndim == positions.ndim == 2 and table.shape[1] == positions.shape[1] and table.shape[0] >= 4
-    same = table.dtype == positions.dtype in (torch.float32, torch.float64) and table.device == positions.device
-    if not (fits and same):
-        raise ValueError(
-            f"interpolate takes floats [nodes + 2, C] and [N, C] on one device, not {table.dtype} {list(table.shape)} "
-            f"on {table.device} and {positions.dtype} {list(positions.shape)} on {positions.device}"
-        )
+    check_tensors(table=(table, ("nodes + 2", "C")), positions=(positions, ("N", "C")))
+    if len(table) < 4:
+        raise ValueError(f"table has shape {list(table.shape)}, expected [nodes + 2, C] with 2 nodes at least")
     if table.dtype == torch.float64 or sums_are_ordered(table.device):
         return _in_torch(table, low, step, positions)
     return _Interpolation.apply(table, low, step, positions)

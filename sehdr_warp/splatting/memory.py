@@ -17,40 +17,21 @@ class OutOfMemory(SehdrError):
 
 
 def held_by_warp(device: torch.device) -> int:
-    """Bytes that Warp itself has allocated on a CUDA device at most so far (sorting's scratch); 0 on the CPU, where
-    nothing counts them."""
-    if device.type != "cuda":
-        return 0
-    return wp.get_mempool_used_mem_high(wp.device_from_torch(device))
+    """Bytes that Warp itself has allocated on a CUDA device at most so far (sorting's scratch); 0 on the CPU."""
+    return wp.get_mempool_used_mem_high(wp.device_from_torch(device)) if device.type == "cuda" else 0
 
 
 def bytes_asked_for(error: BaseException) -> str | None:
     """How much memory an error says could not be had, as text ("some memory" where it does not say how much); None if
     the error is about something else."""
-    if isinstance(error, OutOfMemory):
-        return None
-    text = str(error)
-    is_allocation = isinstance(error, (MemoryError, torch.OutOfMemoryError)) or re.search(
-        r"can't allocate memory|[Ff]ailed to allocate|out of memory", text
-    )
-    if not is_allocation:
+    text, kinds = str(error), (MemoryError, torch.OutOfMemoryError)
+    says_so = re.search(r"can't allocate memory|[Ff]ailed to allocate|out of memory", text)
+    if isinstance(error, OutOfMemory) or not (isinstance(error, kinds) or says_so):
         return None
     found = re.search(r"allocate (\d[\d.]*) ?(bytes|[KMGT]iB)", text)
     if found is None:
         return "some memory"
     return _readable(int(found[1])) if found[2] == "bytes" else f"{found[1]} {found[2]}"
-
-
-def out_of_memory(
-    error: BaseException, device: torch.device, gaussians: int, width: int, height: int, channels: int | None = None
-) -> OutOfMemory | None:
-    """The error to raise instead, or None if `error` is not about memory."""
-    asked = bytes_asked_for(error)
-    if asked is None:
-        return None
-    sizes = f"{gaussians} Gaussians, an image of {width} x {height}"
-    sizes += "" if channels is None else f", {channels} channels"
-    return OutOfMemory(f"out of memory on {device}: {asked} could not be allocated with {sizes}; {REMEDY}")
 
 
 @contextmanager
@@ -60,10 +41,12 @@ def memory_told(device: torch.device, sizes: Callable[[], tuple[int, ...]]) -> I
     try:
         yield
     except (RuntimeError, MemoryError) as error:
-        told = out_of_memory(error, device, *sizes())
-        if told is None:
+        asked = bytes_asked_for(error)
+        if asked is None:
             raise
-        raise told from error
+        gaussians, width, height, *channels = sizes()
+        told = f"{gaussians} Gaussians, an image of {width} x {height}" + "".join(f", {n} channels" for n in channels)
+        raise OutOfMemory(f"out of memory on {device}: {asked} could not be allocated with {told}; {REMEDY}") from error
 
 
 def _readable(count: int) -> str:

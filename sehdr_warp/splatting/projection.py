@@ -38,27 +38,12 @@ def project(
     scalar = warp_scalar(means.dtype)
     vec2, vec3, vec4 = vector(2, scalar), vector(3, scalar), vector(4, scalar)
     count = means.shape[0]
-    means2d = program.write((count, 2), vec2)
-    conics = program.write((count, 3), vec3)
-    depths = program.write((count,), scalar)
-    opacities2d = program.write((count,), scalar)
-    extents = program.write((count, 2), vec2, differentiable=False)
-    program.launch(
-        projection_kernel(scalar, antialiased),
-        count,
-        [
-            program.read(means, vec3),
-            program.read(log_scales, vec3),
-            program.read(quaternions, vec4),
-            program.read(opacities, scalar),
-            program.read(world_to_camera, matrix(4, 4, scalar)),
-            program.read(intrinsics, vec4),
-            width,
-            height,
-            near,
-            low_pass,
-            alpha_threshold,
-        ],
-        [means2d, conics, depths, opacities2d, extents],
-    )
-    return means2d, conics, depths, opacities2d, extents
+    gaussians = (means, vec3), (log_scales, vec3), (quaternions, vec4), (opacities, scalar)
+    camera = (world_to_camera, matrix(4, 4, scalar)), (intrinsics, vec4)
+    read = [program.read(tensor, kind) for tensor, kind in (*gaussians, *camera)]
+    means2d, conics = program.write((count, 2), vec2), program.write((count, 3), vec3)
+    depths, opacities2d = program.write((count,), scalar), program.write((count,), scalar)
+    results = means2d, conics, depths, opacities2d, program.write((count, 2), vec2, differentiable=False)
+    kernel = projection_kernel(scalar, antialiased)
+    program.launch(kernel, count, [*read, width, height, near, low_pass, alpha_threshold], results)
+    return results

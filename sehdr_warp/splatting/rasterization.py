@@ -12,8 +12,7 @@ from .memory import memory_told
 from .projection import project
 from .tile_lists import LARGEST_CAPACITY, build_tile_lists, pack_records
 
-LARGEST_SIDE = 1 << 20
-"""Of an image, in pixels."""
+LARGEST_SIDE = 1 << 20  # of an image, in pixels
 
 
 @dataclass(frozen=True)
@@ -111,44 +110,24 @@ def rasterize(
     height = whole_number("height", height, 1, LARGEST_SIDE)
     if capacity is not None:
         capacity = whole_number("capacity", capacity, 1, LARGEST_CAPACITY)
-    _check_options(near, low_pass, alpha_threshold)
-    tensors = (means, log_scales, quaternions, opacities, world_to_camera, intrinsics)
-    with memory_told(means.device, lambda: (len(means), width, height, features.shape[1])):
-        means2d, conics, depths, opacities2d, extents = project(
-            *(tensor.contiguous() for tensor in tensors),
-            width=width,
-            height=height,
-            near=near,
-            low_pass=low_pass,
-            alpha_threshold=alpha_threshold,
-            antialiased=antialiased,
-        )
-        features = features.contiguous()
-        means_, conics_, opacities_ = (tensor.detach() for tensor in (means2d, conics, opacities2d))
-        records = pack_records(means_, conics_, opacities_, extents, alpha_threshold, features.detach())
-        emission = means.device.type == "cpu" or deterministic
-        lists = build_tile_lists(records, depths.detach(), extents, width, height, capacity, emission=emission)
-        image, transmittance = blend(
-            means2d,
-            conics,
-            opacities2d,
-            features,
-            lists=lists,
-            records=records,
-            extents=extents,
-            width=width,
-            height=height,
-            alpha_threshold=alpha_threshold,
-            deterministic=deterministic,
-        )
-        radii = extents.amax(dim=1)
-    return Rendering(image, transmittance, means2d, depths, radii, lists.entry_count, lists.overflow, lists.total)
-
-
-def _check_options(near: float, low_pass: float, alpha_threshold: float) -> None:
     if not 0.0 < near < math.inf:
         raise ValueError(f"near {near} is not a positive number")
     if not 0.0 <= low_pass < math.inf:
         raise ValueError(f"low_pass {low_pass} is not a number from 0")
     if not 0.0 < alpha_threshold < 1.0:
         raise ValueError(f"alpha_threshold {alpha_threshold} is not between 0 and 1")
+    tensors = (means, log_scales, quaternions, opacities, world_to_camera, intrinsics)
+    with memory_told(means.device, lambda: (len(means), width, height, features.shape[1])):
+        options = {"near": near, "low_pass": low_pass, "alpha_threshold": alpha_threshold, "antialiased": antialiased}
+        means2d, conics, depths, opacities2d, extents = project(
+            *(tensor.contiguous() for tensor in tensors), width=width, height=height, **options
+        )
+        features = features.contiguous()
+        means_, conics_, opacities_ = (tensor.detach() for tensor in (means2d, conics, opacities2d))
+        records = pack_records(means_, conics_, opacities_, extents, alpha_threshold, features.detach())
+        emission = means.device.type == "cpu" or deterministic
+        lists = build_tile_lists(records, depths.detach(), extents, width, height, capacity, emission=emission)
+        given = means2d, conics, opacities2d, features, extents
+        image, transmittance = blend(*given, lists, records, alpha_threshold, deterministic)
+        radii = extents.amax(dim=1)
+    return Rendering(image, transmittance, means2d, depths, radii, lists.entry_count, lists.overflow, lists.total)

@@ -36,7 +36,7 @@ class TileLists:
     ranges: [tiles, 2] first and one past the last entry of each tile.
     gaussians: [M] the Gaussian of each entry, by tile and then front to back.
     emission: how the entries stood by Gaussian; None where it was not asked for.
-    columns, rows: tiles across and down.
+    width, height: of the image in pixels; columns, rows: tiles across and down.
     overflow: scalar bool, whether a given capacity was too small for all entries; None without a capacity.
     total: scalar int64, how many entries there are, with or without room for them.
     """
@@ -44,10 +44,18 @@ class TileLists:
     ranges: torch.Tensor
     gaussians: torch.Tensor
     emission: Emission | None
-    columns: int
-    rows: int
+    width: int
+    height: int
     overflow: torch.Tensor | None
     total: torch.Tensor
+
+    @property
+    def columns(self) -> int:
+        return -(-self.width // TILE_SIZE)
+
+    @property
+    def rows(self) -> int:
+        return -(-self.height // TILE_SIZE)
 
     @property
     def entry_count(self) -> int:
@@ -81,23 +89,19 @@ def build_tile_lists(
     counts = count_entries(order, shapes, ellipses, extents, columns, rows)
     total = counts.sum(dtype=torch.int64)
     overflow = None if capacity is None else total > capacity
-    room = _exact_room(int(total), order.shape[0], columns, rows) if capacity is None else capacity
+    room = int(total) if capacity is None else capacity
+    if room > LARGEST_CAPACITY:
+        raise SehdrError(
+            f"{len(order)} Gaussians touch {room} tiles of a {columns} x {rows} tile image, more than 2^31 - 1; "
+            "render fewer Gaussians or a smaller image"
+        )
     ends = counts.cumsum(0, dtype=torch.int32)
     touched = order, shapes, ellipses, extents, columns, rows
     tiles, gaussians = emit_entries(*touched, ends, room, capacity is not None)
     tiles, gaussians, places = sort_by_tile(tiles, gaussians, room, tile_count, emission)
     ranges = find_ranges(tiles, tile_count)
     by_gaussian = None if places is None else Emission(order, ends, places)
-    return TileLists(ranges, gaussians, by_gaussian, columns, rows, overflow, total)
-
-
-def _exact_room(total: int, gaussian_count: int, columns: int, rows: int) -> int:
-    if total > LARGEST_CAPACITY:
-        raise SehdrError(
-            f"{gaussian_count} Gaussians touch {total} tiles of a {columns} x {rows} tile image, more than 2^31 - 1; "
-            "render fewer Gaussians or a smaller image"
-        )
-    return total
+    return TileLists(ranges, gaussians, by_gaussian, width, height, overflow, total)
 
 
 def pack_records(

@@ -46,12 +46,11 @@ def adam_step(
     graph; a rate that is a number cannot change there.
     Raises ValueError for a tensor that is not contiguous float32 of the parameter's shape.
     """
+    shape = parameter.shape
     for name, tensor in {"gradient": gradient, "first moment": first_moment, "second moment": second_moment}.items():
-        if tensor.shape != parameter.shape or tensor.dtype != torch.float32 or not tensor.is_contiguous():
-            raise ValueError(
-                f"the {name} is {tensor.dtype} {list(tensor.shape)}, expected contiguous float32 "
-                f"{list(parameter.shape)}"
-            )
+        if tensor.shape != shape or tensor.dtype != torch.float32 or not tensor.is_contiguous():
+            is_ = f"{tensor.dtype} {list(tensor.shape)}"
+            raise ValueError(f"the {name} is {is_}, expected contiguous float32 {list(shape)}")
     if not parameter.numel():
         return
     if parameter.device.type == "cpu":
@@ -62,22 +61,9 @@ def adam_step(
 
 
 def _step_in_torch(parameter, gradient, first_moment, second_moment, step, skipped, rate, betas, epsilon) -> None:
-    torch._fused_adam_(  # pyright: ignore[reportPrivateImportUsage]
-        [parameter],
-        [gradient],
-        [first_moment],
-        [second_moment],
-        [],
-        [step],
-        lr=rate,
-        beta1=betas[0],
-        beta2=betas[1],
-        weight_decay=0.0,
-        eps=epsilon,
-        amsgrad=False,
-        maximize=False,
-        found_inf=skipped,
-    )
+    lists = [parameter], [gradient], [first_moment], [second_moment], [], [step]
+    numbers = {"lr": rate, "beta1": betas[0], "beta2": betas[1], "weight_decay": 0.0, "eps": epsilon}
+    torch._fused_adam_(*lists, **numbers, amsgrad=False, maximize=False, found_inf=skipped)  # pyright: ignore
 
 
 def _step_by_kernel(parameter, gradient, first_moment, second_moment, step, skipped, rate, betas, epsilon) -> None:
@@ -100,9 +86,8 @@ def add_gradient_statistics(
     """Adds to gradient_sum [N] the lengths of gradients [N, 2] by the projected centres, in normalised screen units
     (the screen is 2 wide), and to seen [N] 1, where radii [N] are above 0; nothing where the scalar usable is 0. width,
     height: of the image in pixels. All float32 on one device."""
-    changed = gradient_sum, seen
     given = gradients.contiguous(), radii, usable, width / 2, height / 2
-    launch(kernels.add_gradient_statistics, len(radii), *given, *changed)
+    launch(kernels.add_gradient_statistics, len(radii), *given, gradient_sum, seen)
 
 
 @torch.no_grad()

@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 import torch
 
+from sehdr_warp.splatting.projection import project
+from sehdr_warp.splatting.tile_lists import pack_records
+
 WIDTH, HEIGHT = 70, 50
 
 
@@ -49,6 +52,20 @@ def random_scene(count=150, channels=3, seed=0, width=WIDTH, height=HEIGHT, spre
     pose[:3, 3] = torch.tensor([0.1, -0.05, 0.2])
     intrinsics = torch.tensor([60.0, 62.0, width / 2 + 3.0, height / 2 - 2.0], dtype=torch.float64)
     return SplatInputs([means, log_scales, quaternions, opacities, features, pose, intrinsics], width, height)
+
+
+def projected(scene: SplatInputs, threshold: float = 1 / 255) -> tuple[torch.Tensor, ...]:
+    """means2d, conics, depths, opacities and extents of a scene, with no graph behind them."""
+    options = {"near": 0.01, "low_pass": 0.3, "alpha_threshold": threshold, "antialiased": False}
+    tensors = *scene.tensors[:4], *scene.tensors[5:]
+    with torch.no_grad():
+        return project(*tensors, width=scene.width, height=scene.height, **options)
+
+
+def packed(scene: SplatInputs, threshold: float = 1 / 255):
+    """Records, depths and extents of a scene, as build_tile_lists() takes them."""
+    means2d, conics, depths, opacities, extents = projected(scene, threshold)
+    return pack_records(means2d, conics, opacities, extents, threshold), depths, extents
 
 
 def relative_error(value: torch.Tensor, truth: torch.Tensor) -> float:

@@ -46,7 +46,7 @@ def test_poison_stays_where_it_is(device):
 
 
 def test_what_does_not_fit_is_refused(device):
-    with pytest.raises(ValueError, match="interpolate takes floats"):
+    with pytest.raises(ValueError, match="with 2 nodes at least"):
         interpolate(torch.zeros(3, 3, device=device), 0.0, 1.0, torch.zeros(2, 3, device=device))
-    with pytest.raises(ValueError, match=r"torch.float64 \[2, 3\]"):
+    with pytest.raises(ValueError, match="positions is torch.float64"):
         interpolate(torch.zeros(8, 3, device=device), 0.0, 1.0, torch.zeros(2, 3, dtype=torch.float64, device=device))

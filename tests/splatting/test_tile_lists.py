@@ -5,37 +5,21 @@ from dataclasses import fields
 import pytest
 import torch
 
-from sehdr_warp.splatting.projection import project
-from sehdr_warp.splatting.tile_lists import (
-    build_tile_lists,
-    count_entries,
-    depth_order,
-    emit_entries,
-    find_ranges,
-    pack_records,
-)
+from sehdr_warp.splatting.tile_lists import build_tile_lists, count_entries, depth_order, emit_entries, find_ranges
 
-from .scenes import random_scene
+from .scenes import packed, random_scene
 
 COLUMNS, ROWS, UNWRITTEN = 20, 15, -7
-THRESHOLD = 1 / 255
 
 
-def packed(device, count=20000):
+def dense(device, count=20000):
     """Records, depths and extents of a scene dense enough that many ellipses end just at a tile's border."""
-    scene = random_scene(count=count, width=16 * COLUMNS, height=16 * ROWS).to(torch.float32, device)
-    means, log_scales, quaternions, opacities, _, pose, intrinsics = (tensor.detach() for tensor in scene.tensors)
-    projected = project(
-        means, log_scales, quaternions, opacities, pose, intrinsics,
-        width=16 * COLUMNS, height=16 * ROWS, near=0.01, low_pass=0.3, alpha_threshold=THRESHOLD, antialiased=False,
-    )  # fmt: skip
-    means2d, conics, depths, opacities2d, extents = projected
-    return pack_records(means2d, conics, opacities2d, extents, THRESHOLD), depths, extents
+    return packed(random_scene(count=count, width=16 * COLUMNS, height=16 * ROWS).to(torch.float32, device))
 
 
 def counted(*scene):
     """What emit_entries() reads, and the counts."""
-    records, depths, extents = packed(*scene)
+    records, depths, extents = dense(*scene)
     listed = depth_order(depths, extents), *records, extents, COLUMNS, ROWS
     return listed, count_entries(*listed)
 
@@ -89,7 +73,7 @@ def kept_bytes(holder):
 @pytest.mark.parametrize("spare", [None, 7])
 @pytest.mark.parametrize("emission", [False, True])
 def test_lists_keep_no_more_memory_than_they_use(device, emission, spare):
-    scene = packed(device, 500)
+    scene = dense(device, 500)
     size = 16 * COLUMNS, 16 * ROWS
     exact = build_tile_lists(*scene, *size, emission=emission)
     lists = exact if spare is None else build_tile_lists(*scene, *size, exact.entry_count + spare, emission=emission)
