@@ -44,10 +44,10 @@ EXP_COEFFICIENTS = (
 
 @cache
 def row_functions(dtype, halvings: int):
-    """The type of a row of 16, and on rows: broadcast, comparison with zero, exp.
+    """The type of a row of 16, and on rows: broadcast, comparison with zero, exp. float64, the reference, uses the
+    library's exponential.
 
     halvings: the polynomial is taken at p / 2^halvings and squared as often, so that p may go down to -0.7 2^halvings.
-    float64 rows use the library's exponential: they are the reference, not the fast path.
     """
     row, real = vector(TILE_SIZE, dtype), dtype
     lowest = -0.7 * 2.0**halvings

@@ -49,11 +49,8 @@ def geometry(dtype) -> SimpleNamespace:
     def ellipse_meets_rectangle(
         x: real, y: real, a: real, b: real, c: real, level: real, left: real, top: real, width: real, height: real
     ) -> bool:
-        """Does the ellipse a dx^2 + 2 b dx dy + c dy^2 <= level around (x, y) touch the rectangle?
-
-        The smallest value of the quadratic form over a rectangle lies on the edges nearest to the centre; both are
-        tried. The small allowance keeps rounding from dropping a pixel on the border.
-        """
+        """Does the ellipse a dx^2 + 2 b dx dy + c dy^2 <= level around (x, y) touch the rectangle? The form is smallest
+        on one of the edges nearest to the centre. The small allowance keeps rounding from dropping a border pixel."""
         x0 = left - x
         x1 = x0 + width
         y0 = top - y

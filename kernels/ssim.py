@@ -39,15 +39,12 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
     blur_columns, then compare: the SSIM map and its derivatives by the four windowed moments, combined for `a`.
     blur_derivatives, then gradient: the adjoint of the blurs, applied to those derivatives.
 
-    A launch covers [0, rows * blocks) with blocks = ceil(W C / lanes); `first` is added to the thread's index. With one
-    lane the blurs write the zeros on both sides too, and cover [0, rows * (W C + 2 RADIUS C)).
-
+    A launch covers [0, rows * blocks) with blocks = ceil(W C / lanes). With one lane the blurs write the zeros on both
+    sides too, and cover [0, rows * (W C + 2 RADIUS C)).
     distance: for a weighted sum of |a - b| and 1 - SSIM in place of the SSIM; the weights are read with it alone.
     """
-    real = dtype
-    run = wp.types.vector(length=lanes, dtype=dtype)
-    taps = wp.constant(2 * RADIUS + 1)
-    radius = wp.constant(RADIUS)
+    real, run = dtype, wp.types.vector(length=lanes, dtype=dtype)
+    taps, radius = wp.constant(2 * RADIUS + 1), wp.constant(RADIUS)
     # Pixels on both sides that the blurs write too.
     border = wp.constant(RADIUS if lanes == 1 else 0)
     c1, c2 = wp.constant(real(C1)), wp.constant(real(C2))

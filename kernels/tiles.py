@@ -48,10 +48,8 @@ def tile_kernels(dtype) -> SimpleNamespace:
         extents: wp.array(dtype=vec2), shapes: wp.array(dtype=vec4), ellipses: wp.array(dtype=vec4),
     ):
         """shapes: (x, y, opacity, half-height); ellipses: (conic a, b, c, level at which alpha meets the threshold).
-
         extents: changed to 0 for a Gaussian with a feature that is not finite: the CPU blend multiplies what a pixel
-        does not see by 0, and 0 times NaN would show beside it.
-        """
+        does not see by 0, and 0 times NaN would show beside it."""
         i = first + wp.tid()
         for channel in range(channels):
             if not wp.isfinite(features[i, channel]):
@@ -113,11 +111,8 @@ def tile_kernels(dtype) -> SimpleNamespace:
         capacity: int,
         tiles: wp.array(dtype=wp.int32), gaussians: wp.array(dtype=wp.int32),
     ):
-        """ends: the running sum of the counts, so that Gaussian `place` fills the entries before ends[place].
-
-        Entries from `capacity` on are left out. Whatever the counts say, every entry below both is filled, by its own
-        Gaussian: with columns * rows, no tile at all, where there are fewer tiles than were counted.
-        """
+        """ends: the running sum of the counts: Gaussian `place` fills the entries before ends[place] and `capacity`,
+        with columns * rows, no tile at all, where there are fewer tiles than were counted."""
         place = first + wp.tid()
         i = order[place]
         extent = extents[i]
@@ -171,9 +166,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
 @wp.kernel(module="unique", module_options={"enable_backward": False})
 def mark_ranges(tiles: wp.array(dtype=wp.int32), entry_count: int, tile_count: int, ranges: wp.array(dtype=wp.vec2i)):
     """ranges[t] = (first, one past the last) entry of tile t in the sorted list; untouched tiles keep what they had.
-
-    Unused entries carry the tile number tile_count, and belong to no list.
-    """
+    Unused entries carry the tile number tile_count, and belong to no list."""
     entry = wp.tid()
     tile = tiles[entry]
     if tile == tile_count:

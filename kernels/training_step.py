@@ -22,9 +22,7 @@ def judge_step(
     verdict: wp.array(dtype=wp.float32),
 ):
     """verdict: [3], 1 or 0 each: the loss or a gradient is not finite; the step is to be skipped; it is not to be.
-
-    norms: [K] of the gradients; incomplete: [1], or [0] where nothing can be. One thread.
-    """
+    norms: [K] of the gradients; incomplete: [1], or [0] where nothing can be. One thread."""
     finite = wp.isfinite(loss[0])
     for i in range(norms.shape[0]):
         finite = finite and wp.isfinite(norms[i])
@@ -55,11 +53,8 @@ def update_by_adam(
     parameters: wp.array(dtype=wp.float32), first_moments: wp.array(dtype=wp.float32),
     second_moments: wp.array(dtype=wp.float32),
 ):
-    """One step of every number, in place; none where skipped[0] is not 0.
-
-    step: [1], already counted up; rate: [1]; *_decay_log: log of the decays; *_gain: 1 - decay, not as float32 would
-    round it.
-    """
+    """One step of every number, in place; none where skipped[0] is not 0. step: [1], already counted up; rate: [1];
+    *_decay_log: log of the decays; *_gain: 1 - decay, not as float32 would round it."""
     i = first + wp.tid()
     if skipped[0] == 0.0:
         gradient = gradients[i]

@@ -4,19 +4,11 @@ A *program* is a function that reads torch tensors as Warp arrays, launches kern
 it wrote. `@differentiable` turns it into a torch operation: data is shared, never copied; launches go to torch's
 current stream; the tape is replayed when torch asks for gradients, and not recorded when nobody will.
 
-    @wp.kernel
-    def scale(values: wp.array(dtype=wp.vec3), gain: float, scaled: wp.array(dtype=wp.vec3)):
-        i = wp.tid()
-        scaled[i] = gain * values[i]
-
     @differentiable
     def scaled(program, values, *, gain):
         result = program.write(values.shape, wp.vec3)
         program.launch(scale, len(values), [program.read(values, wp.vec3), gain], [result])
         return result
-
-    loss = scaled(radiance, gain=2.0).sum()     # radiance: [N, 3] torch tensor
-    loss.backward()
 
 Positional arguments are tensors and take part in autograd; keyword arguments are passed on as they are.
 """
@@ -64,8 +56,6 @@ class Program:
         dim: int | Sequence[int],
         inputs: Sequence[Any],
         outputs: Sequence[Any] = (),
-        *,
-        block_dim: int | None = None,
     ) -> None:
         """Launch a kernel; its generated adjoint runs in the backward pass.
 
@@ -79,7 +69,7 @@ class Program:
             return
         inputs = [0, *inputs] if ranged else [*inputs]
         with nullcontext() if self.tape is None else self.tape:
-            wp.launch(kernel, dim, inputs, [*outputs], device=self.device, block_dim=block_dim)
+            wp.launch(kernel, dim, inputs, [*outputs], device=self.device)
 
     def _launch_ranges(self, kernel, count: int, inputs: list, outputs: list) -> None:
         arguments = [*inputs, *outputs]
@@ -91,19 +81,12 @@ class Program:
         def adjoint() -> None:
             tape = wp.Tape()
             gradients = [tape.get_adjoint(argument) for argument in arguments]
-            shared = any(
-                isinstance(argument, wp.array) and argument.grad is not None and argument.shape[0] != count
-                for argument in inputs
-            )
-            launch_ranges(
-                kernel,
-                [(0, count)] if shared or count == 0 else threads.even_ranges(count),
-                inputs,
-                outputs=outputs,
-                adj_inputs=[None, *gradients[: len(inputs)]],
-                adj_outputs=gradients[len(inputs) :],
-                adjoint=True,
-            )
+            arrays = [argument for argument in inputs if isinstance(argument, wp.array) and argument.grad is not None]
+            shared = any(array.shape[0] != count for array in arrays)
+            ranges = [(0, count)] if shared or count == 0 else threads.even_ranges(count)
+            by_inputs, by_outputs = [None, *gradients[: len(inputs)]], gradients[len(inputs) :]
+            options = {"outputs": outputs, "adj_inputs": by_inputs, "adj_outputs": by_outputs, "adjoint": True}
+            launch_ranges(kernel, ranges, inputs, **options)
 
         self.tape.record_func(adjoint, arrays=[])
 

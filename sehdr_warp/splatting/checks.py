@@ -22,25 +22,21 @@ def check_tensors(**arguments: tuple[Any, tuple[int | str, ...]]) -> None:
     for name, (value, shape) in arguments.items():
         expected = f"[{', '.join(map(str, shape))}]"
         if not isinstance(value, torch.Tensor):
-            kind = type(value)
-            raise TypeError(
-                f"{name} is a {kind.__module__.split('.')[0]}.{kind.__name__}, expected a torch tensor {expected}"
-            )
+            kind = f"{type(value).__module__.split('.')[0]}.{type(value).__name__}"
+            raise TypeError(f"{name} is a {kind}, expected a torch tensor {expected}")
         if value.ndim == len(shape):
             for size, letter in zip(value.shape, shape, strict=True):
                 if isinstance(letter, str):
                     sizes.setdefault(letter, size)
         if tuple(value.shape) != tuple(sizes.get(n, -1) if isinstance(n, str) else n for n in shape):
             known = ", ".join(f"{n} = {sizes[n]}" for n in shape if isinstance(n, str) and n in sizes)
-            raise ValueError(
-                f"{name} has shape {list(value.shape)}, expected {expected}" + (f" with {known}" if known else "")
-            )
+            expected += f" with {known}" if known else ""
+            raise ValueError(f"{name} has shape {list(value.shape)}, expected {expected}")
         if value.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"{name} is {value.dtype}, expected torch.float32 or torch.float64")
         if value.dtype != first.dtype or value.device != first.device:
-            raise ValueError(
-                f"{name} is {value.dtype} on {value.device}, but {first_name} is {first.dtype} on {first.device}"
-            )
+            other = f"{first_name} is {first.dtype} on {first.device}"
+            raise ValueError(f"{name} is {value.dtype} on {value.device}, but {other}")
 
 
 def whole_number(name: str, value: Any, least: int, most: int) -> int:
@@ -65,10 +61,8 @@ def check_opacities(opacities: torch.Tensor) -> None:
 
 @torch.no_grad()
 def warn_of_scales(log_scales: torch.Tensor) -> None:
-    """Warns of log_scales on the CPU that are probably sizes: two or more Gaussians, and all numbers between 0 and 1.
-
-    Logarithms may be so, of sizes from 1 to 2.7; then the warning is wrong, and an error would be worse.
-    """
+    """Warns of log_scales on the CPU that are probably sizes: two or more Gaussians, all numbers between 0 and 1. No
+    error, since logarithms of sizes from 1 to 2.7 are so, too."""
     if log_scales.device.type == "cpu" and len(log_scales) > 1:
         low, high = (float(value) for value in log_scales.aminmax())
         if low > 0 and high < 1:

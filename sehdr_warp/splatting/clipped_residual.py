@@ -53,9 +53,8 @@ def clipped_residual(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """What a photo can tell of an image, and what it tells, both [H, W, 3] in the domain of the scale.
 
-    Where the code is the largest, which says `at least this`, the first equals the second as soon as it is above it
-    or within half a code of it; where the code is 0, `at most this`, as soon as it is below. Differentiable once with
-    respect to the image.
+    Where the code is the largest, which says `at least this`, the first equals the second as soon as it is within half
+    a code of it or above; where the code is 0, `at most this`, below. Differentiable once with respect to the image.
 
     image: [H, W, 3] float32 or float64. codes: code_tensor()'s of the photo, [H, W, 3], or of a stack of photos
     [V, H, W, 3] that has it at index [1], int64. All on one device. Raises ValueError otherwise.
@@ -63,10 +62,8 @@ def clipped_residual(
     shape = image.shape if index is None else (codes.shape[0], *image.shape)
     levels = WHITE.get(codes.dtype, 0) + 1
     if codes.shape != shape or levels != len(scale.table) or scale.table.dtype != image.dtype:
-        raise ValueError(
-            f"codes are {codes.dtype} {list(codes.shape)} with a table of {len(scale.table)} {scale.table.dtype}, "
-            f"expected uint8 or int16 {list(shape)} with one {image.dtype} for each code"
-        )
+        given = f"codes are {codes.dtype} {list(codes.shape)} with a table of {len(scale.table)} {scale.table.dtype}"
+        raise ValueError(f"{given}, expected uint8 or int16 {list(shape)} with one {image.dtype} for each code")
     return _ClippedResidual.apply(image, codes, scale, index)
 
 

@@ -80,12 +80,11 @@ class _Fusion(torch.autograd.Function):
         sizes = [weight.numel() for weight in weights]
         zeros = encoded.new_zeros(sum(sizes)).split(sizes)
         by_weights = [part.view(weight.shape) for part, weight in zip(zeros, weights, strict=True)]
-        inner, inner_bias, outer, _ = _flat(weights)
-        learned = inner, inner_bias, outer
+        learned = _flat(weights)[:3]
         kernels = fusion_kernels(warp_scalar(encoded.dtype))
         mixed = encoded, exposedness, outputs, brackets, scale, results, gradients.contiguous()
         launch(kernels.mix_adjoint, results.shape, *mixed, by_exposedness, by_output)
-        units = 3, -(-encoded.shape[1] // POINTS_PER_THREAD), outer.shape[1]
+        units = 3, -(-encoded.shape[1] // POINTS_PER_THREAD), weights[0].shape[2]
         given = encoded, exposedness, by_output, *learned, POINTS_PER_THREAD
         launch(kernels.unit_adjoint, units, *given, *_flat(by_weights))
         points = encoded, exposedness, by_exposedness, by_output, log_sigma, MAX_LOG_SIGMA, MAX_DEVIATION

@@ -40,8 +40,7 @@ def launch(
     arguments: the kernel's, tensors (of one device) in the place of arrays. A vector or matrix type takes up the last
         one or two dimensions, and a tensor with more dimensions than the kernel's array is handed over flat.
     A kernel whose first parameter is `first` adds it to its thread's index and writes nothing that another index
-    writes: it is given the start of a range, and the ranges run side by side on the CPU.
-    ranges: [first, last) pieces for that; by default even ones of at least `smallest` items.
+    writes: on the CPU it runs side by side over [first, last) ranges, by default even ones of `smallest` items or more.
     """
     if dim == 0 or (not isinstance(dim, int) and 0 in dim):
         return
@@ -54,15 +53,9 @@ def launch(
     if ranged and device.type == "cpu" and isinstance(dim, int):
         launch_ranges(kernel, threads.even_ranges(dim, smallest) if ranges is None else ranges, inputs)
         return
-    wp.launch(
-        kernel,
-        dim=dim if isinstance(dim, int) else tuple(dim),
-        inputs=[0, *inputs] if ranged else inputs,
-        stream=_stream(device),
-        device=wp.device_from_torch(device),
-        block_dim=block_dim,
-        record_tape=False,
-    )
+    dim = dim if isinstance(dim, int) else tuple(dim)
+    where = {"stream": _stream(device), "device": wp.device_from_torch(device)}
+    wp.launch(kernel, dim, [0, *inputs] if ranged else inputs, **where, block_dim=block_dim, record_tape=False)
 
 
 def launch_ranges(kernel: Any, ranges: list[tuple[int, int]], inputs: list, **options: Any) -> None:

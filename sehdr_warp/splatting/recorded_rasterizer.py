@@ -34,13 +34,11 @@ class RecordedRasterizer:
         rendering = splat(means, log_scales, quaternions, opacities, features, pose, intrinsics, width, height)
         loss(rendering.image).backward()
 
-    What a call returns is overwritten by the next call, and its backward pass must have run before that: RuntimeError
-    otherwise. It is the recording's own memory, which that pass reads: do not write to it. Other shapes, options or
-    tensors that ask for gradients make a new recording in the place of the old. Rendering.means2d is no part of the
-    graph; densification by its gradient needs rasterize().
+    What a call returns is the recording's own memory: do not write to it. The next call overwrites it, and the backward
+    pass must have run before that: RuntimeError otherwise. Other shapes, options or tensors that ask for gradients make
+    a new recording. Rendering.means2d is no part of the graph; densification by its gradient needs rasterize().
 
-    device: a CUDA device; raises ValueError for another. Besides what rasterize() needs, a recording keeps copies of
-    the arguments and of the gradients.
+    device: a CUDA device; raises ValueError for another.
     """
 
     def __init__(self, device: torch.device | str) -> None:
@@ -107,19 +105,14 @@ class RecordedRasterizer:
                 self._upstream = [torch.zeros_like(launched.image), torch.zeros_like(launched.transmittance)]
                 backward(launched)
             del launched
-        for recorder in (self._forward, self._backward):
-            recorder.invalidate()
+        self._forward.invalidate()
+        self._backward.invalidate()
         # Not run(): a recording is made, not played, and the backward pass is recorded on the forward's own graph.
         rendering = self._forward.record(key, lambda: forward(capacity))
         made = iter(self._backward.record(key, lambda: backward(rendering)) if leaves else ())
         self._gradients = [next(made) if want else None for want in wanted]
-        self._rendering = replace(
-            rendering,
-            image=rendering.image.detach(),
-            transmittance=rendering.transmittance.detach(),
-            means2d=rendering.means2d.detach(),
-            depths=rendering.depths.detach(),
-        )
+        made = {name: getattr(rendering, name).detach() for name in ("image", "transmittance", "means2d", "depths")}
+        self._rendering = replace(rendering, **made)
         self._key = key
 
 
@@ -140,13 +133,9 @@ class _Replay(torch.autograd.Function):
     def backward(ctx, *upstream):
         owner = ctx.owner
         if ctx.call != owner._calls:
-            raise RuntimeError(
-                "a RecordedRasterizer was called again before the backward pass of this call; use one for each call "
-                "that is differentiated later"
-            )
+            raise RuntimeError("a RecordedRasterizer was called again before the backward pass of this call; use two")
         for target, gradient in zip(owner._upstream, upstream, strict=True):
             target.zero_() if gradient is None else target.copy_(gradient)
         owner._backward.replay()
-        # Copies: torch may keep what it is given, or a view of it, as a parameter's gradient, which the next replay
-        # would overwrite.
+        # Copies: torch may keep what it is given as a parameter's gradient, which the next replay would overwrite.
         return None, *(None if gradient is None else gradient.clone() for gradient in owner._gradients)

@@ -36,8 +36,7 @@ def _no_collection():
 
 
 def _one_thread():
-    """Backward passes run on this thread: torch's own lets go of a graph some time later, in mid-recording too, and
-    makes a recording take half as long again."""
+    """Backward passes run on this thread: torch's own lets go of a graph some time later, in mid-recording too."""
     return torch.autograd.set_multithreading_enabled(False)
 
 
@@ -86,11 +85,9 @@ class GraphRecorder:
 
     @contextmanager
     def launching(self) -> Iterator[None]:
-        """Launches within this block go to the stream of the recordings, after and before what is launched around it.
-
-        For work that is recorded later: torch keeps the stream on which a parameter's gradient was first summed for as
-        long as any graph of it lives, and a recording that meets another stream than its own is spoilt.
-        """
+        """Launches within this block go to the stream of the recordings, as must those of work that is recorded later:
+        torch keeps the stream on which a parameter's gradient was first summed for as long as any graph of it lives,
+        and a recording that meets another stream than its own is spoilt."""
         current = torch.cuda.current_stream(self.device)
         self.stream.wait_stream(current)
         try:
@@ -108,18 +105,14 @@ class GraphRecorder:
 
     def run(self, key: Hashable, function: Callable[[], T]) -> T:
         """Replay the recording made under `key`, after recording `function` if there is none; returns its result.
-
-        Raises RuntimeError if the function cannot be recorded.
-        """
+        Raises RuntimeError if the function cannot be recorded."""
         if self._graph is None or key != self._key:
             self.record(key, function)
         return self.replay()
 
     def record(self, key: Hashable, function: Callable[[], T]) -> T:
         """Record `function` without playing it, in the place of any other recording; returns what will be its result.
-
-        Raises RuntimeError if the function cannot be recorded.
-        """
+        Raises RuntimeError if the function cannot be recorded."""
         self.invalidate()
         self._graph, self._modules, self._result = self._record(function)
         self._key = key

@@ -20,9 +20,8 @@ def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     a, b: [H, W, C] float32 or float64 on one device, any size from 1 x 1 x 1. Beyond the border both images count as
     zero and every pixel is averaged, as in 3DGS's loss.
 
-    Returns a scalar of the same type, at most 1, differentiable once with respect to both images. The result and the
-    gradient do not depend on the number of threads.
-
+    Returns a scalar of the same type, at most 1, differentiable once with respect to both images, the same whatever the
+    number of threads.
     Raises TypeError for what is no tensor, ValueError if shapes, types or devices differ or are others.
     """
     return _Similarity.apply(a, b, True)
@@ -36,10 +35,8 @@ def ssim_map(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 def image_distance(
     a: torch.Tensor, b: torch.Tensor, distance_weight: float, dissimilarity_weight: float
 ) -> torch.Tensor:
-    """distance_weight mean |a - b| + dissimilarity_weight (1 - ssim(a, b)), in one launch more than ssim() takes.
-
-    a, b: as for ssim(), with its errors. Returns a scalar, differentiable once with respect to a.
-    """
+    """distance_weight mean |a - b| + dissimilarity_weight (1 - ssim(a, b)), in one launch more than ssim() takes: a
+    scalar, differentiable once with respect to a. a, b: as for ssim(), with its errors."""
     return _Distance.apply(a, b, distance_weight, dissimilarity_weight)
 
 
@@ -100,10 +97,8 @@ def _compare(
     """The similarity [H, W, C] and its derivatives [3, H, W C] by the windowed moments. weights: of |a - b| and of the
     dissimilarity, whose sum [H, W, C] then stands in the similarity's place."""
     runs = _Runs(a, weights)
-    similarity = torch.empty_like(a)
-    derivatives = a.new_empty(3, runs.rows, runs.length)
-    buffer = runs.padded(4)
-    moments = runs.view(buffer)
+    similarity, derivatives = torch.empty_like(a), a.new_empty(3, runs.rows, runs.length)
+    moments = runs.view(runs.padded(4))
     images = runs.view(a), runs.view(b)
     runs.launch(runs.kernels.blur_columns, images, [moments], borders=True)
     compared = *images, *runs.weights_of_both, runs.view(similarity), runs.view(derivatives)
@@ -111,18 +106,11 @@ def _compare(
     return similarity, derivatives
 
 
-def _gradient(
-    a: torch.Tensor,
-    b: torch.Tensor,
-    derivatives: torch.Tensor,
-    scale: torch.Tensor,
-    weights: tuple[float, float] | None = None,
-) -> torch.Tensor:
+def _gradient(a, b, derivatives, scale: torch.Tensor, weights: tuple[float, float] | None = None) -> torch.Tensor:
     """scale times the gradient by `a`, [H, W, C], of the sum of what _compare() gives."""
     runs = _Runs(a, weights)
     result = torch.empty_like(a)
-    buffer = runs.padded(3)
-    blurred = runs.view(buffer)
+    blurred = runs.view(runs.padded(3))
     runs.launch(runs.kernels.blur_derivatives, [runs.view(derivatives)], [blurred], borders=True)
     scaled = scale, *runs.weights_of_both, runs.view(result)
     runs.launch(runs.kernels.gradient, [blurred, runs.view(a), runs.view(b)], scaled)

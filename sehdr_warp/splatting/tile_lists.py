@@ -77,8 +77,8 @@ def build_tile_lists(
     """Order the projected Gaussians by depth and list, for each tile, those whose ellipse touches it.
 
     records: pack_records()'s; depths, extents: project()'s. Nothing here is differentiable.
-    capacity: room for this many entries. The host then never waits for the device to learn how many there are; entries
-    beyond it are left out, and TileLists.overflow says so.
+    capacity: room for this many entries; those beyond it are left out, which TileLists.overflow tells. The host then
+    never waits for the device to learn how many there are.
     emission: also tell where entries came from, which adjoints need that sum by Gaussian in a fixed order.
     Raises SehdrError if the lists would need more than 2^31 - 1 entries.
     """
@@ -146,13 +146,10 @@ def count_entries(order, shapes, ellipses, extents, columns: int, rows: int):
 
 
 def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends, room: int, padded: bool):
-    """One entry for each tile that each Gaussian touches, front to back: tiles and Gaussians, each [2 room].
-
-    Only the first halves are filled; the sort needs the rest. padded: there may be fewer entries than room, and
-    the unused ones belong to tile columns * rows.
-    """
-    tiles = torch.empty(2 * room, dtype=torch.int32, device=order.device)
-    gaussians = torch.empty(2 * room, dtype=torch.int32, device=order.device)
+    """One entry for each tile that each Gaussian touches, front to back: tiles and Gaussians, each [2 room], of which
+    the first halves are filled; the sort needs the rest. padded: there may be fewer entries than room, and the unused
+    ones belong to tile columns * rows."""
+    tiles, gaussians = (torch.empty(2 * room, dtype=torch.int32, device=order.device) for _ in range(2))
     if padded:
         tiles[:room] = columns * rows
         gaussians[:room] = 0
@@ -164,11 +161,8 @@ def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends
 
 
 def sort_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: bool):
-    """Stable sort of the entries by tile: tiles [M], Gaussians [M], and where each entry stood before [M] or None.
-
-    tiles, gaussians: as by emit_entries(). The sorted tiles are in the same memory; the rest, which is kept, is copied
-    out of it.
-    """
+    """Stable sort of emit_entries()'s by tile: tiles [M], in the same memory, and copied out of it, which is kept,
+    Gaussians [M] and where each entry stood before [M] or None."""
     bits = tile_count.bit_length()
     if emission:
         places = torch.empty(2 * entry_count, dtype=torch.int32, device=tiles.device)

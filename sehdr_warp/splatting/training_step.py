@@ -13,16 +13,13 @@ def judge_step(
     loss: torch.Tensor, norms: torch.Tensor, incomplete: torch.Tensor | None = None
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Three scalars, 1 or 0: whether the loss or a norm is not finite; whether a step is therefore, or as `incomplete`
-    is true, to be skipped; whether it is to be made.
-
-    loss: float32 scalar; norms: [K] float32; incomplete: bool scalar. All on one device.
+    is true, to be skipped; whether it is to be made. loss: float32 scalar; norms: [K] float32; incomplete: bool scalar.
     """
     verdict = norms.new_empty(3)
     if incomplete is None:
         incomplete = torch.empty(0, dtype=torch.bool, device=norms.device)
     launch(kernels.judge_step, 1, loss.detach(), norms, incomplete, verdict)
-    nonfinite, skipped, made = verdict.unbind()
-    return nonfinite, skipped, made
+    return verdict[0], verdict[1], verdict[2]
 
 
 @torch.no_grad()
@@ -63,7 +60,7 @@ def adam_step(
 def _step_in_torch(parameter, gradient, first_moment, second_moment, step, skipped, rate, betas, epsilon) -> None:
     lists = [parameter], [gradient], [first_moment], [second_moment], [], [step]
     numbers = {"lr": rate, "beta1": betas[0], "beta2": betas[1], "weight_decay": 0.0, "eps": epsilon}
-    torch._fused_adam_(*lists, **numbers, amsgrad=False, maximize=False, found_inf=skipped)  # pyright: ignore
+    torch._fused_adam_(*lists, **numbers, amsgrad=False, maximize=False, found_inf=skipped)  # pyright: ignore[reportPrivateImportUsage]
 
 
 def _step_by_kernel(parameter, gradient, first_moment, second_moment, step, skipped, rate, betas, epsilon) -> None:

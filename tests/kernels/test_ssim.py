@@ -1,10 +1,8 @@
-"""The SSIM kernels against a float64 convolution, finite differences and an independent scipy version."""
+"""The SSIM kernels against a float64 convolution."""
 
 from importlib import import_module
 
-import numpy as np
 import pytest
-import scipy.ndimage
 import torch
 import torch.nn.functional as F
 
@@ -84,20 +82,6 @@ def test_the_distance_is_the_weighted_sum(shape, dtype, tolerance, device, lanes
     assert relative_error(x.grad / 2, a.grad) < 10 * tolerance
 
 
-def test_gradient_equals_finite_differences(device, lanes):
-    a, b = images((9, 13, 3), device)
-    x = a.clone().requires_grad_()
-    ssim(x, b).backward()
-    step, numeric = 1e-5, torch.zeros_like(a)
-    for index in np.ndindex(*a.shape):
-        shifted = a.clone()
-        shifted[index] += step
-        above = ssim(shifted, b)
-        shifted[index] -= 2 * step
-        numeric[index] = (above - ssim(shifted, b)) / (2 * step)
-    assert relative_error(x.grad, numeric) < 1e-8
-
-
 def test_map_gradient_takes_a_weight_per_pixel(device):
     a, b = images((17, 12, 3), device)
     weights = torch.linspace(-1, 2, a.numel(), dtype=a.dtype, device=device).reshape(a.shape)
@@ -107,19 +91,6 @@ def test_map_gradient_takes_a_weight_per_pixel(device):
     assert relative_error(gradient, expected) < 1e-11
 
 
-def test_value_equals_scipys_filters():
-    a, b = images((30, 41, 3), dtype=torch.float32)
-
-    def blur(image):
-        return scipy.ndimage.gaussian_filter(image, (1.5, 1.5, 0), mode="constant", radius=(5, 5, 0))
-
-    x, y = a.double().numpy(), b.double().numpy()
-    mx, my = blur(x), blur(y)
-    vx, vy, vxy = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
-    quotient = (2 * mx * my + 1e-4) * (2 * vxy + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
-    np.testing.assert_allclose(ssim_map(a, b).numpy(), quotient, atol=2e-5)
-
-
 @pytest.mark.parametrize("level", [0.0, 0.5, 1.0, 100.0, 1e4])
 def test_constant_images(level, device):
     a = torch.full((20, 30, 3), level, device=device, requires_grad=True)
@@ -127,12 +98,9 @@ def test_constant_images(level, device):
     same.backward()
     assert same.item() == pytest.approx(1.0, abs=1e-6)
     assert torch.isfinite(a.grad).all() and a.grad.abs().max() < 1e-6
-    other = torch.full((20, 30, 3), level + 0.25, device=device, requires_grad=True)
-    expected = conv_ssim(other.detach().double(), a.detach().double()).mean().item()
-    value = ssim(other, a.detach())
-    value.backward()
-    assert value.item() == pytest.approx(expected, abs=1e-4)
-    assert torch.isfinite(other.grad).all()
+    other = torch.full((20, 30, 3), level + 0.25, device=device)
+    expected = conv_ssim(other.double(), a.detach().double()).mean().item()
+    assert ssim(other, a.detach()).item() == pytest.approx(expected, abs=1e-4)
 
 
 def test_bright_images_keep_their_digits(device):

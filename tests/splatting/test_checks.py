@@ -20,23 +20,12 @@ def arguments(**changes):
 @pytest.mark.parametrize(
     ("name", "change", "kind", "message"),
     [
-        (
-            "means",
-            lambda t: t.detach().numpy(),
-            TypeError,
-            r"means is a numpy.ndarray, expected a torch tensor \[N",
-        ),
+        ("means", lambda t: t.detach().numpy(), TypeError, r"means is a numpy.ndarray, expected a torch tensor \[N"),
         ("means", lambda t: t[0, 0], ValueError, r"means has shape \[\], expected \[N, 3\]"),
         ("log_scales", lambda t: t[:-1], ValueError, r"log_scales has shape \[4, 3\], expected \[N, 3\] with N = 5"),
-        (
-            "quaternions",
-            lambda t: t[:, :3],
-            ValueError,
-            r"quaternions has shape \[5, 3\], expected \[N, 4\]",
-        ),
+        ("quaternions", lambda t: t[:, :3], ValueError, r"quaternions has shape \[5, 3\], expected \[N, 4\]"),
         ("opacities", lambda t: t.float(), ValueError, "opacities is torch.float32 on cpu, but means is torch.float64"),
         ("opacities", lambda t: t.detach() + 5, ValueError, "opacities are from 5.* expected 0 to 1; give logits"),
-        ("opacities", lambda t: t.detach() - 2, ValueError, "opacities are from -.* expected 0 to 1"),
         ("features", lambda t: t[:, :0], ValueError, r"features has shape \[5, 0\], expected \[N, C\] with C >= 1"),
         ("features", lambda t: t.to("meta"), ValueError, "features is torch.float64 on meta, but means is .* on cpu"),
         ("means", lambda t: t.half(), ValueError, "means is torch.float16, expected torch.float32 or torch.float64"),
@@ -61,11 +50,7 @@ def test_sizes_in_the_place_of_their_logarithms_are_warned_of():
         rasterize(**arguments(log_scales=lambda t: torch.full_like(t, 0.01)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        rasterize(**arguments())
-
-
-def test_sizes_may_be_numpys_whole_numbers():
-    assert rasterize(**arguments(width=np.int64)).image.shape == (50, 70, 3)
+        assert rasterize(**arguments(width=np.int64)).image.shape == (50, 70, 3)  # numpy's whole numbers are, too
 
 
 @pytest.mark.parametrize(
@@ -97,12 +82,7 @@ def test_misfits_of_harmonics_are_named(degree, change, kind, message):
         (torch.zeros(0, 5, 3), torch.zeros(0, 5, 3), ValueError, "with a pixel at least"),
         (torch.zeros(4, 4, 3), torch.zeros(4, 5, 3), ValueError, r"b has shape \[4, 5, 3\], .* H = 4, W = 4, C = 3"),
         (torch.zeros(4, 4, 3), torch.zeros(4, 4, 3).double(), ValueError, "b is torch.float64 on cpu, but a is"),
-        (
-            torch.zeros(4, 4, 3).int(),
-            torch.zeros(4, 4, 3).int(),
-            ValueError,
-            "a is torch.int32, expected torch",
-        ),
+        (torch.zeros(4, 4, 3).int(), torch.zeros(4, 4, 3).int(), ValueError, "a is torch.int32, expected torch"),
         (np.zeros((4, 4, 3)), torch.zeros(4, 4, 3), TypeError, "a is a numpy.ndarray"),
     ],
 )

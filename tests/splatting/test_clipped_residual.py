@@ -1,4 +1,4 @@
-"""Comparison with a photo's codes: the kernel against torch's own operations and finite differences."""
+"""Comparison with a photo's codes: the kernel against torch's own operations."""
 
 import math
 
@@ -78,14 +78,6 @@ def test_one_of_a_stack_is_taken_where_it_is(device, bits):
         assert torch.equal(alone, stacked)
 
 
-def test_gradients_match_finite_differences(device):
-    light, codes, worth = images(8)
-    scale = CodeScale(mu_law(worth).to(device), MU, WHITE, HALF_CODES)
-    part = code_tensor(np.ascontiguousarray(codes[2:4, :9]), device)
-    leaf = light[2:4, :9].contiguous().to(device).requires_grad_()
-    assert torch.autograd.gradcheck(lambda image: clipped_residual(image, part, scale)[0], leaf)
-
-
 def test_poison_stays_where_it_is(device):
     light = torch.tensor([[[math.nan, math.inf, 1.0]]], device=device)
     codes = torch.full((1, 1, 3), 128, dtype=torch.uint8, device=device)
@@ -97,11 +89,8 @@ def test_poison_stays_where_it_is(device):
 
 def test_what_does_not_fit_is_refused(device):
     image, scale = torch.zeros(4, 3, 3, device=device), CodeScale(torch.zeros(256, device=device))
-    for codes in (
-        torch.zeros(2, 3, 3, dtype=torch.uint8),
-        torch.zeros(4, 3, 3, dtype=torch.int16),
-        torch.zeros(4, 3, 3),
-    ):
+    for shape, dtype in (((2, 3, 3), torch.uint8), ((4, 3, 3), torch.int16), ((4, 3, 3), torch.float32)):
+        codes = torch.zeros(shape, dtype=dtype)
         with pytest.raises(ValueError, match=r"expected uint8 or int16 \[4, 3, 3\]"):
             clipped_residual(image, codes.to(device), scale)
 
