@@ -4,10 +4,8 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sehdr_warp.splatting import rasterize, spherical_harmonics, ssim_map
+from sehdr_warp.splatting import rasterize
 from sehdr_warp.splatting.reference import rasterize_reference
-
-from .scenes import relative_error
 
 SETTINGS = settings(
     max_examples=40,
@@ -73,27 +71,3 @@ def test_one_gaussian_of_any_numbers_leaves_the_others_alone(data):
         assert all(bool(leaf.grad[others].isfinite().all()) for leaf in leaves)
     elif float(good[4][2].abs().max()) < 1e30:
         assert bool(rendering.image.isfinite().all())
-
-
-@SETTINGS
-@given(rows(anything, 3), st.integers(0, 3))
-def test_harmonics_keep_each_row_to_itself(means, degree):
-    coefficients = torch.randn(COUNT, 16, 3, generator=torch.Generator().manual_seed(1))
-    together = spherical_harmonics(degree, coefficients, means, torch.zeros(3))
-    for i in range(COUNT):
-        alone = spherical_harmonics(degree, coefficients[i : i + 1], means[i : i + 1], torch.zeros(3))
-        assert torch.equal(together[i].nan_to_num(7.0), alone[0].nan_to_num(7.0))
-        if 1e-15 < float(means[i].norm()) < 1e15:
-            assert bool(alone.isfinite().all())
-
-
-@SETTINGS
-@given(anything, st.integers(1, 9), st.integers(1, 9))
-def test_similarity_is_at_most_one_and_local(value, height, width):
-    image = torch.rand(height + 20, width + 20, 1, generator=torch.Generator().manual_seed(0))
-    assert relative_error(ssim_map(image, image), torch.ones_like(image)) < 1e-6
-    spoiled = image.clone()
-    spoiled[0, 0, 0] = value
-    similarity = ssim_map(spoiled, image)
-    assert torch.equal(similarity[6:, 6:], ssim_map(image, image)[6:, 6:])
-    assert not bool((similarity > 1 + 1e-5).any())
