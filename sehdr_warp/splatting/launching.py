@@ -54,8 +54,8 @@ def launch(
         launch_ranges(kernel, threads.even_ranges(dim, smallest) if ranges is None else ranges, inputs)
         return
     dim = dim if isinstance(dim, int) else tuple(dim)
-    where = {"stream": _stream(device), "device": wp.device_from_torch(device)}
-    wp.launch(kernel, dim, [0, *inputs] if ranged else inputs, **where, block_dim=block_dim, record_tape=False)
+    inputs, where = [0, *inputs] if ranged else inputs, wp.device_from_torch(device)
+    wp.launch(kernel, dim, inputs, stream=_stream(device), device=where, block_dim=block_dim, record_tape=False)
 
 
 def launch_ranges(kernel: Any, ranges: list[tuple[int, int]], inputs: list, **options: Any) -> None:
