@@ -24,6 +24,14 @@ def pytest_generate_tests(metafunc):
         metafunc.parametrize("device", available_devices())
 
 
+@pytest.fixture(autouse=True)
+def plain_logs():
+    """Undoes what a command line that a test ran in this process set up, so that caplog sees the package's logs."""
+    logger = logging.getLogger("sehdr_warp")
+    logger.propagate, logger.handlers = True, []
+    logger.setLevel(logging.NOTSET)
+
+
 @pytest.fixture(autouse=True, scope="session")
 def own_cache(tmp_path_factory):
     """Structure from motion keeps its results for the session, not in the user's cache."""

@@ -15,7 +15,6 @@ from sehdr_warp.training.config import (
     LossConfig,
     ModelConfig,
     ResponseConfig,
-    stated,
 )
 from sehdr_warp.training.config_fields import GONE, config_fields
 from sehdr_warp.training.config_files import (
@@ -191,7 +190,7 @@ def test_contradictions_are_refused():
 def test_iteration_numbers_scale():
     config = load_config("default", {"schedule.iterations": 3000})
     assert config.scaled(15_000) == 1500 and config.scaled(1) == 1
-    assert config.scaled(stated(70, 3000)) == 70
+    assert config.scaled(700) == 70
 
 
 def test_a_config_is_refused_before_it_is_made():
