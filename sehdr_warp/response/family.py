@@ -18,13 +18,16 @@ MEMBERS = 512
 # Least d ln x / dz: a curve with less is not one that a camera has (a linear one has 1 at white).
 LEAST_RISE = 0.15
 CODES = np.arange(256) / 255
+# Curves are read between codes too, at this many steps a code: an even number has the middle between two codes.
+FINE = 8
+GRID = np.arange(255 * FINE + 1) / (255 * FINE)
 
 
 @cache
 def family_logs() -> tuple[np.ndarray, np.ndarray]:
-    """[512, 256] natural log of the exposure at each 8-bit code, and d ln x / dz there, of curves drawn from the
-    family's prior by a fixed seed. Code 0 counts as 1. Unit: code 128 stands for what it is under `camera`."""
-    z = np.maximum(CODES, 1 / 255)
+    """[512, 2041] natural log of the exposure at each place of GRID, and d ln x / dz there, of curves drawn from the
+    family's prior by a fixed seed. Below code 1 all count as it. Unit: code 128 means what it does under `camera`."""
+    z = np.maximum(GRID, 1 / 255)
     terms = np.stack([np.log(z), np.log(z + TOE), -np.log(1 + SHOULDER - z)])
     rises = np.stack([1 / z, 1 / (z + TOE), 1 / (1 + SHOULDER - z)])
     draws = MEAN + np.random.default_rng(0).normal(size=(2 * MEMBERS, 3)) @ SPREAD.T
@@ -32,4 +35,4 @@ def family_logs() -> tuple[np.ndarray, np.ndarray]:
     draws = draws[increasing][:MEMBERS]
     logs = draws @ terms
     middle = np.log(float(analytic_response("camera").decode(CODES[128])))
-    return logs - logs[:, 128:129] + middle, draws @ rises
+    return logs - logs[:, 128 * FINE, None] + middle, draws @ rises

@@ -14,12 +14,14 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ..errors import SehdrError
 from .analytic import DESCRIPTIONS, analytic_response
 from .curve import Response
-from .family import CODES, family_logs
+from .family import CODES, FINE, GRID, family_logs
 from .table import TabulatedResponse
 
 CODE = 1.0 / 255
 # Edges: pixels this far on both sides of the middle one; each side must be flat to 3 codes and 20 from the other.
 EDGE_REACH, FLAT_CODES, EDGE_CODES = 2, 3, 20
+# Of a code, in such comparisons: whole codes must not be told apart by how a float rounds.
+SLACK = 0.25
 # The two sides' encoded colors must not be one gray scaled: angle between them, in radians.
 EDGE_ANGLE = 0.05
 MAX_EDGES, MIN_EDGES = 12_000, 50
@@ -140,12 +142,13 @@ def select_response(
     shares = np.bincount(np.concatenate(codes), minlength=256) / sum(map(len, codes))
 
     count = len(candidates)
-    logs, rises = map(np.stack, zip(*map(_at_codes, candidates), strict=True))
-    ranges, roughnesses = np.array([_range_and_roughness(fullest, each) for each in logs]).T
+    fine, rises = map(np.stack, zip(*map(_on_grid, candidates), strict=True))
+    ranges, roughnesses = np.array([_range_and_roughness(fullest, each) for each in fine[:, ::FINE]]).T
     paper = _relative(ranges) - _relative(roughnesses)
     if beside:
-        logs, rises = (np.concatenate(pair) for pair in zip((logs, rises), family_logs(), strict=True))
-    parts = [_edges(edges, logs, rises), *(part(shares, logs) for part in (_highlights, _span, _density))]
+        fine, rises = (np.concatenate(pair) for pair in zip((fine, rises), family_logs(), strict=True))
+    logs = fine[:, ::FINE]
+    parts = _edges(edges, fine, rises), _highlights(shares, fine), _span(shares, logs), _density(shares, logs)
     evidence = np.nan_to_num(parts[0]) * edge_facts(len(edges)) + np.sum(parts[1:], axis=0)
     priors = np.array([_prior(each, from_camera) for each in candidates])
     posteriors = evidence[:count] + priors
@@ -168,9 +171,9 @@ def edge_facts(count: int) -> float:
     return min(count / EDGES_PER_FACT, MOST_FACTS)
 
 
-def _at_codes(response: Response) -> tuple[np.ndarray, np.ndarray]:
-    """[256] natural log of the exposure at each 8-bit code, and d ln x / dz there; code 0 counts as 1."""
-    exposures = np.asarray(response.decode(np.maximum(CODES, response.black + CODE)))
+def _on_grid(response: Response) -> tuple[np.ndarray, np.ndarray]:
+    """[2041] natural log of the exposure at each place of GRID, and d ln x / dz there; below code 1 all count as it."""
+    exposures = np.asarray(response.decode(np.maximum(GRID, response.black + CODE)))
     return np.log(exposures), 1 / (exposures * np.maximum(np.asarray(response.slope(exposures)), 1e-9))
 
 
@@ -204,14 +207,14 @@ def _prior(response: Response, from_camera: bool) -> float:
 # Minus log likelihoods [K] from the shares of values at the codes [256] and the codes' natural log exposures [K, 256].
 
 
-def _highlights(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
-    """Of the shares of values at the brightest code and at the nine codes below it.
+def _highlights(shares: np.ndarray, fine: np.ndarray) -> np.ndarray:
+    """Of the shares of values at the brightest code and at the nine codes below it; fine: on GRID.
 
     If log radiance falls off as exp(-rate stops), the nine codes span S stops and white holds all beyond them, then
     near / (at + near) = 1 - exp(-rate S): a clipping camera piles values up at 255, a curve that never clips spreads
     the same light over the codes below. The rate is log-normal.
     """
-    stops = (logs[:, 254:].mean(1) - logs[:, 245:247].mean(1)) / np.log(2)
+    stops = (fine[:, 509 * FINE // 2] - fine[:, 491 * FINE // 2]) / np.log(2)
     white, near = shares[255] + HIGHLIGHT_FLOOR / 2, shares[246:255].sum() + HIGHLIGHT_FLOOR / 2
     rate = np.log1p(near / white) / np.maximum(stops, 1e-6)
     spread = HIGHLIGHT_SPREAD**2 + HIGHLIGHT_FLOOR / (shares[246:].sum() + 1e-9)
@@ -274,10 +277,10 @@ def _edge_colors(image: np.ndarray, clear: np.ndarray) -> np.ndarray:
         at = np.moveaxis(sliding_window_view(rows, length, axis=0), -1, 0)
         seen = sliding_window_view(known, length, axis=0)[..., 1:-1:EDGE_REACH].all(-1)
         first, middle, last = at[1:-1:EDGE_REACH]
-        flat = np.maximum(np.abs(at[0] - first), np.abs(at[-1] - last)).max(-1) <= FLAT_CODES * CODE
-        apart = np.abs(last - first).max(-1) >= EDGE_CODES * CODE
+        flat = np.maximum(np.abs(at[0] - first), np.abs(at[-1] - last)).max(-1) <= (FLAT_CODES + SLACK) * CODE
+        apart = np.abs(last - first).max(-1) >= (EDGE_CODES - SLACK) * CODE
         # Between the sides in every channel, and well off both: another surface at the edge is not.
-        between = ((middle - first) * (last - middle) >= -(CODE**2)).all(-1)
+        between = ((middle - first) * (last - middle) >= -(1 + SLACK) * CODE**2).all(-1)
         share = np.linalg.norm(middle - first, axis=-1) / np.maximum(np.linalg.norm(last - first, axis=-1), CODE)
         cosine = (first * last).sum(-1) / (np.linalg.norm(first, axis=-1) * np.linalg.norm(last, axis=-1) + 1e-12)
         mixed = (share > LEAST_SHARE) & (share < MOST_SHARE) & (cosine < np.cos(EDGE_ANGLE))
@@ -287,8 +290,7 @@ def _edge_colors(image: np.ndarray, clear: np.ndarray) -> np.ndarray:
 
 
 def _edges(edges: np.ndarray, logs: np.ndarray, rises: np.ndarray) -> np.ndarray:
-    """[K] mean over edges of minus the log likelihood, nats, in float32; between codes along straight lines. NaN for
-    too few edges."""
+    """[K] mean over edges of minus the log likelihood, nats, in float32; NaN for too few. logs and rises: on GRID."""
     if len(edges) < MIN_EDGES:
         return np.full(len(logs), np.nan)
     # The three colors; of the channel that changes most, where the middle may lie (2), and the two sides.
@@ -296,8 +298,8 @@ def _edges(edges: np.ndarray, logs: np.ndarray, rises: np.ndarray) -> np.ndarray
     first, last = (np.take_along_axis(edges[:, side], channel, 1) for side in (0, 2))
     limits = [first + share * (last - first) for share in (LEAST_SHARE, MOST_SHARE)]
     points = np.concatenate([edges.reshape(-1, 9), *limits, first, last], axis=1)
-    place = torch.from_numpy(np.clip(points * 255, 1, 255)).float()
-    below = place.floor().clamp_max(254).long()
+    place = torch.from_numpy(np.clip(points * 255, 1, 255) * FINE).float()
+    below = place.floor().clamp_max(255 * FINE - 1).long()
     part = place - below
 
     def read(table, count):
