@@ -5,7 +5,6 @@ Nothing here waits for a GPU: values are looked at on the CPU alone.
 
 import math
 import operator
-import warnings
 from typing import Any
 
 import torch
@@ -57,16 +56,3 @@ def check_opacities(opacities: torch.Tensor) -> None:
         low, high = (float(value) for value in opacities.aminmax())
         if -math.inf < low < -1e-6 or math.inf > high > 1 + 1e-6:
             raise ValueError(f"opacities are from {low:g} to {high:g}, expected 0 to 1; give logits through a sigmoid")
-
-
-@torch.no_grad()
-def warn_of_scales(log_scales: torch.Tensor) -> None:
-    """Warns of log_scales on the CPU that are probably sizes: two or more Gaussians, all numbers between 0 and 1. No
-    error, since logarithms of sizes from 1 to 2.7 are so, too."""
-    if log_scales.device.type == "cpu" and len(log_scales) > 1:
-        low, high = (float(value) for value in log_scales.aminmax())
-        if low > 0 and high < 1:
-            warnings.warn(
-                f"log_scales are from {low:g} to {high:g}, as sizes would be; expected their logarithms, scales.log()",
-                stacklevel=3,
-            )

@@ -7,7 +7,7 @@ import torch
 
 from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR
 from .blending import blend
-from .checks import check_opacities, check_tensors, warn_of_scales, whole_number
+from .checks import check_opacities, check_tensors, whole_number
 from .memory import memory_told
 from .projection import project
 from .tile_lists import LARGEST_CAPACITY, build_tile_lists, pack_records
@@ -105,7 +105,6 @@ def rasterize(
     if not features.shape[1]:
         raise ValueError(f"features has shape {list(features.shape)}, expected [N, C] with C >= 1")
     check_opacities(opacities)
-    warn_of_scales(log_scales)
     width = whole_number("width", width, 1, LARGEST_SIDE)
     height = whole_number("height", height, 1, LARGEST_SIDE)
     if capacity is not None:

@@ -1,6 +1,5 @@
 """What does not fit the public operations is answered in one line that names it."""
 
-import warnings
 
 import numpy as np
 import pytest
@@ -45,12 +44,8 @@ def test_misfits_of_a_render_are_named(name, change, kind, message):
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_sizes_in_the_place_of_their_logarithms_are_warned_of():
-    with pytest.warns(UserWarning, match=r"log_scales are from 0.01 to 0.01, as sizes would be; .* scales.log\(\)"):
-        rasterize(**arguments(log_scales=lambda t: torch.full_like(t, 0.01)))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert rasterize(**arguments(width=np.int64)).image.shape == (50, 70, 3)  # numpy's whole numbers are, too
+def test_whole_numbers_of_numpy_are_sizes():
+    assert rasterize(**arguments(width=np.int64)).image.shape == (50, 70, 3)
 
 
 @pytest.mark.parametrize(
