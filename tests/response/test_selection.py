@@ -7,7 +7,7 @@ import torch
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.response import Response, response_by_name
 from sehdr_warp.response import selection as response_selection
-from sehdr_warp.response.family import family_logs
+from sehdr_warp.response.family import FINE, GRID, family_logs
 from sehdr_warp.response.selection import edge_facts, select_response
 from sehdr_warp.response.table import TabulatedResponse
 
@@ -166,7 +166,7 @@ def test_posterior_never_takes_photos_for_linear():
 
 def family_curve(draw: int) -> Response:
     """A member of the family that posterior photos are judged by."""
-    logs, _ = family_logs()
+    logs = family_logs()[0][:, ::FINE]
     return TabulatedResponse(f"member {draw}", np.concatenate([[0.0], np.exp(logs[draw, 1:])]), CODES)
 
 
@@ -176,7 +176,8 @@ def stops_off(response, truth) -> float:
 
 def test_family_is_increasing_and_holds_what_cameras_do():
     logs, rises = family_logs()
-    assert logs.shape == rises.shape == (512, 256) and (np.diff(logs[:, 1:]) > 0).all()
+    assert logs.shape == rises.shape == (512, len(GRID)) and (np.diff(logs[:, FINE:]) > 0).all()
+    logs, rises = logs[:, ::FINE], rises[:, ::FINE]
     assert rises[:, 128] == pytest.approx((logs[:, 129] - logs[:, 127]) * 127.5, rel=1e-3)
     # Nearer than this to one of 512 curves: the camera's, sRGB, and light that is stored as it is.
     for name, most in (("camera", 0.12), ("srgb", 0.15), ("linear", 0.2)):

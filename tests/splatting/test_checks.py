@@ -1,6 +1,5 @@
 """What does not fit the public operations is answered in one line that names it."""
 
-
 import numpy as np
 import pytest
 import torch
