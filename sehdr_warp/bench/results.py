@@ -12,11 +12,12 @@ from pathlib import Path
 
 import torch
 
+from .. import __version__
 from ..errors import SehdrError
 from ..files import write_json
 
 SCHEMA = 2
-_PACKAGES = ("sehdr-warp", "torch", "warp-lang", "gsplat")
+_PACKAGES = ("torch", "warp-lang", "gsplat")
 
 
 def new_result(benchmark: str, device: torch.device, settings: dict) -> dict:
@@ -43,7 +44,7 @@ def _describe_machine(device: torch.device) -> dict:
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        "versions": {name: _version(name) for name in _PACKAGES},
+        "versions": {"sehdr-warp": __version__} | {name: _version(name) for name in _PACKAGES},
         "gpu": None,
     }
     if device.type == "cuda":
