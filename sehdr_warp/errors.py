@@ -27,7 +27,7 @@ class InputError(SehdrError):
     """
 
     def __init__(self, path: Path | str, problem: str, remedy: str):
-        self.path = str(path)
+        self.path, self.problem = str(path), problem
         # A problem may quote a file, which may hold anything; names of files may come from files as well.
         place, problem = (
             text if len(text) <= LONGEST_PART else text[:LONGEST_PART] + " ..." for text in (str(path), problem)

@@ -11,8 +11,7 @@ from sehdr_warp import __version__, cli
 from sehdr_warp.response import response_by_name, response_names
 from sehdr_warp.scene.hdr_files import read_hdr
 from sehdr_warp.scene.images import read_ldr
-from sehdr_warp.training.config_fields import config_fields, flag_of
-from sehdr_warp.training.config_files import load_config, preset_names
+from sehdr_warp.training.config_files import config_fields, flag_of, load_config, preset_names
 
 from .refusals import call
 

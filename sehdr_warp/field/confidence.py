@@ -15,16 +15,13 @@ from ..response import Response
 from ..scene import View
 from .radiance_field import CameraTensors, RadianceField
 
-CLIPPED_STOPS = 1.0
-"""Uncertainty of a pixel that is clipped in all channels."""
+CLIPPED_STOPS = 1.0  # Uncertainty of a pixel that is clipped in all channels
 PARTLY_CLIPPED_STOPS = 0.25
 """Of a clipped channel beside one that is not: the others say where the light is, this one its hue."""
-MOST_STOPS = 4.0
-"""A misfit counts no more than this: 1/16 of the confidence already says that nothing is known."""
+MOST_STOPS = 4.0  # A misfit counts no more than this: 1/16 of the confidence already says that nothing is known
 LEAST_SEEN = 0.01
 """Pixels of blending weight, over all photos, at which a Gaussian has half of the confidence that they give it."""
-MOST_VIEWS = 200
-"""Training views that are looked at, evenly chosen: more change the means little."""
+MOST_VIEWS = 200  # Training views that are looked at, evenly chosen: more change the means little
 
 _HALF_CODE = 0.5 / 255
 

@@ -49,12 +49,12 @@ def read_exposures(items: Items, base_time: float | None, field: str = "exposure
 
     Raises SehdrError with the item for one in no known form, not positive or not finite, or given twice.
     """
-    if base_time is not None:
-        base_time = _positive(base_time, "base exposure time")
-    items = [item for item in items.split(",") if item.strip()] if isinstance(items, str) else list(items)
-    if not items:
+    if base_time is not None and not 0 < base_time < math.inf:
+        problem = f"base exposure time = {base_time} is not a positive number of seconds"
+        raise SehdrError(f"{problem}; give the photos' exposure time")
+    made = sorted(_exposures(items, base_time, field), key=lambda exposure: exposure.time)
+    if not made:
         raise SehdrError(f"{field}: the list is empty; give {_FORMS}")
-    made = sorted((_exposure(item, base_time, field) for item in items), key=lambda exposure: exposure.time)
     for first, second in pairwise(made):
         if second.time <= first.time * (1 + 1e-9):
             raise SehdrError(f"{field}: {first.time:.6g} s is given twice; leave one out")
@@ -68,14 +68,18 @@ def exposure_times(base_time: float, items: Items = PAPER_BRACKETS) -> tuple[flo
 
 def seconds(items: Items, field: str = "exposures") -> tuple[float, ...]:
     """Times of their own, in the order given; SehdrError for an item that is none."""
-    items = [item for item in items.split(",") if item.strip()] if isinstance(items, str) else items
-    return tuple(_exposure(item, None, field).time for item in items)
+    return tuple(exposure.time for exposure in _exposures(items, None, field))
 
 
 def is_seconds(item: str | float) -> bool:
     """Whether an item is a time of its own, not relative to the photos' exposure."""
     text = str(item).strip().lower()
     return not (text == "base" or text.endswith(("ev", "x")))
+
+
+def _exposures(items: Items, base_time: float | None, field: str) -> list[Exposure]:
+    items = [item for item in items.split(",") if item.strip()] if isinstance(items, str) else items
+    return [_exposure(item, base_time, field) for item in items]
 
 
 def _exposure(item: str | float, base_time: float | None, field: str) -> Exposure:
@@ -100,19 +104,12 @@ def _exposure(item: str | float, base_time: float | None, field: str) -> Exposur
     return made
 
 
-def _positive(time: float, field: str) -> float:
-    time = float(time)
-    if not (math.isfinite(time) and time > 0):
-        raise SehdrError(f"{field} = {time} is not a positive number of seconds; give the photos' exposure time")
-    return time
-
-
 def bracket_log_radiance(log_base: "torch.Tensor", times: Sequence[float], base_time: float) -> "torch.Tensor":
     """[n, ...]: log c^{l_j} = log c^{l_1} + log dt_j - log dt_1 (SeHDR, section 3.2), from log_base [...].
 
-    times: n exposure times dt_j, and base_time dt_1, in seconds; SehdrError for one that is not positive.
+    times: n exposure times dt_j, and base_time dt_1, in seconds.
     """
-    shifts = [math.log(_positive(time, "times")) - math.log(_positive(base_time, "base_time")) for time in times]
+    shifts = [math.log(time) - math.log(base_time) for time in times]
     offsets = _on_device(tuple(shifts), log_base.dtype, log_base.device)
     return log_base + offsets.reshape(-1, *[1] * log_base.dim())
 

@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
-from torch import nn
-from torch.utils.checkpoint import checkpoint
+from torch import Tensor, nn
 
 from ..errors import SehdrError
 from ..response.curve import Response
@@ -24,8 +23,6 @@ from .exposure import bracket_log_radiance, exposure_times
 # of an 8-bit code) to this many octaves above white, where only the response's extension is left: a line in the log.
 DARKEST_VALUE, OCTAVES_ABOVE_WHITE = 1e-5, 6.0
 NODES = 1024
-# Gaussians evaluated together by the exact form: bounds its memory to some 100 MB at width 128 and 5 brackets.
-EXACT_CHUNK = 16384
 
 
 class NeuralExposureFusion(nn.Module):
@@ -68,19 +65,18 @@ class NeuralExposureFusion(nn.Module):
         self._kept_nodes = {}
         self._high = math.log(response.white) + OCTAVES_ABOVE_WHITE * math.log(2) - min(brackets)
 
-    def forward(self, log_base: torch.Tensor) -> torch.Tensor:
+    def forward(self, log_base: Tensor) -> Tensor:
         """[N, 3] scene-linear radiance c^h from [N, 3] log c^{l_1}, the log of the radiance at the input exposure."""
         step = (self._high - self._low) / (NODES - 1)
         table = fuse_exposures(self._encoded_at_nodes(log_base, step), *self._learned(), scale=self.radiance_scale)
         return interpolate(table, self._low, step, log_base)
 
-    def exact(self, log_base: torch.Tensor) -> torch.Tensor:
+    def exact(self, log_base: Tensor) -> Tensor:
         """As forward, by the equations themselves for every Gaussian: what the table stands for."""
-        if not torch.is_grad_enabled() or len(log_base) <= EXACT_CHUNK:
-            return torch.cat([self._fuse(part) for part in log_base.split(EXACT_CHUNK)])
-        return torch.cat([checkpoint(self._fuse, part, use_reentrant=False) for part in log_base.split(EXACT_CHUNK)])
+        weights, encoded = self.fusion_weights(log_base)
+        return self.radiance_scale * (weights * encoded).sum(dim=0)
 
-    def fusion_weights(self, log_base: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def fusion_weights(self, log_base: Tensor) -> tuple[Tensor, Tensor]:
         """The weights w and the encoded brackets f(c^{l_p}) behind the sum, each [n, N, 3], for [N, 3] log c^{l_1}."""
         encoded = self._encode(log_base)
         return fusion_weights(encoded, *self._learned()), encoded
@@ -92,10 +88,6 @@ class NeuralExposureFusion(nn.Module):
     def _learned(self):
         """What fuse_exposures() takes behind the brackets."""
         return self.log_sigma, *(part for layer in zip(self.weights, self.biases, strict=True) for part in layer)
-
-    def _fuse(self, log_base):
-        weights, encoded = self.fusion_weights(log_base)
-        return self.radiance_scale * (weights * encoded).sum(dim=0)
 
     def _encoded_at_nodes(self, like, step):
         """[n, nodes + 2, 3] the encoded brackets at the table's nodes; kept, unless the curve is itself learned."""
@@ -115,10 +107,10 @@ def _channel_layers(sizes: list[int], seed: int) -> tuple[nn.ParameterList, nn.P
     """Weights [3, in, out] and biases [3, 1, out], uniform within 1 / sqrt(in) as torch.nn.Linear starts."""
     generator = torch.Generator().manual_seed(seed)
 
-    def uniform(*shape, bound):
-        return nn.Parameter((2.0 * torch.rand(*shape, generator=generator) - 1.0) * bound)
+    def layers(middle):
+        shapes = ((3, middle or a, b, a**-0.5) for a, b in pairwise(sizes))
+        return nn.ParameterList(
+            (2.0 * torch.rand(*shape, generator=generator) - 1.0) * bound for *shape, bound in shapes
+        )
 
-    pairs = list(pairwise(sizes))
-    weights = nn.ParameterList([uniform(3, a, b, bound=a**-0.5) for a, b in pairs])
-    biases = nn.ParameterList([uniform(3, 1, b, bound=a**-0.5) for a, b in pairs])
-    return weights, biases
+    return layers(None), layers(1)

@@ -10,8 +10,7 @@ from torch import Tensor, nn
 from ..errors import SehdrError
 from ..splatting.threads import thread_count
 
-HARMONIC_0 = 0.28209479177387814
-"""The value of the spherical harmonic of degree 0, 1 / (2 sqrt(pi))."""
+HARMONIC_0 = 0.28209479177387814  # The value of the spherical harmonic of degree 0, 1 / (2 sqrt(pi))
 
 PARAMETER_NAMES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics_dc", "harmonics_rest")
 

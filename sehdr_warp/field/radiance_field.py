@@ -92,15 +92,11 @@ class RadianceField(nn.Module):
         deterministic: bool = False,
     ):
         super().__init__()
-        self.gaussians = gaussians
-        self.fusion = fusion
-        self.response = response
-        self.base_time = base_time
+        self.gaussians, self.fusion = gaussians, fusion
+        self.response, self.base_time = response, base_time
         self.rasterizer = rasterizer
-        self.color_model = color_model(radiance)
-        self.tone_map = tone_map
-        self.antialiased = antialiased
-        self.deterministic = deterministic
+        self.color_model, self.tone_map = color_model(radiance), tone_map
+        self.antialiased, self.deterministic = antialiased, deterministic
         self.register_buffer("confidence", None, persistent=False)
 
     def photograph(
@@ -149,9 +145,7 @@ class RadianceField(nn.Module):
         colors, depth = rendering.image[..., :3], rendering.image[..., 3]
         if encoded:
             colors = self.response.decode(colors.clamp(0, 1))
-        alpha = rendering.alpha
-        depth = torch.where(alpha > 1e-3, depth / alpha.clamp_min(1e-3), torch.zeros_like(depth))
-        return RenderedView(colors / self.base_time, alpha, depth)
+        return RenderedView(colors / self.base_time, rendering.alpha, _mean_of_seen(depth, rendering.alpha))
 
     @torch.no_grad()
     def render_ldr(self, camera: Camera, exposure_time: float | None = None, *, degree: int | None = None) -> Tensor:
@@ -169,9 +163,7 @@ class RadianceField(nn.Module):
         # As wide as a training's features, though one channel is meant: no further kernel is compiled.
         features = self.confidence[:, None].expand(-1, 3).contiguous()
         rendering = self._rasterize(CameraTensors.of(camera, features.device), features)
-        alpha = rendering.alpha
-        mean = (rendering.image[..., 0] / alpha.clamp_min(1e-3)).clamp(0, 1)
-        return torch.where(alpha > 1e-3, mean, torch.zeros_like(mean))
+        return _mean_of_seen(rendering.image[..., 0], rendering.alpha).clamp(0, 1)
 
     def weighted_sums(self, camera: CameraTensors, images: Tensor) -> Tensor:
         """[N, C]: for each Gaussian the sum over a view's pixels of its blending weight times images [H, W, C].
@@ -203,16 +195,14 @@ class RadianceField(nn.Module):
     def _rasterize(self, camera: CameraTensors, features: Tensor, capacity: int | None = None) -> Rendering:
         gaussians = self.gaussians
         return self.rasterizer(
-            gaussians.means,
-            gaussians.log_scales,
-            gaussians.quaternions,
-            gaussians.opacities(),
-            features,
-            camera.world_to_camera,
-            camera.intrinsics,
-            camera.width,
-            camera.height,
+            *(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacities(), features),
+            *(camera.world_to_camera, camera.intrinsics, camera.width, camera.height),
             antialiased=self.antialiased,
             capacity=capacity,
             deterministic=self.deterministic,
         )
+
+
+def _mean_of_seen(blended: Tensor, alpha: Tensor) -> Tensor:
+    """The mean of what was blended where alpha is above 0.001, else 0; [H, W] each."""
+    return torch.where(alpha > 1e-3, blended / alpha.clamp_min(1e-3), torch.zeros_like(blended))

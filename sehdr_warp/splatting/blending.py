@@ -5,6 +5,7 @@ from collections.abc import Callable
 from itertools import pairwise
 
 import torch
+from torch import Tensor
 
 from ..kernels import blend_cpu, blend_cuda, blend_cuda_adjoint
 from ..kernels.constants import TILE_SIZE
@@ -13,22 +14,22 @@ from . import threads
 from .launching import launch, warp_scalar
 from .tile_lists import Emission, TileLists, pack_records
 
-Adjoint = Callable[[tuple[torch.Tensor, torch.Tensor], torch.Tensor, torch.Tensor], torch.Tensor]
+Adjoint = Callable[[tuple[Tensor, Tensor], Tensor, Tensor], Tensor]
 """The backward pass: from the records made again, and the gradients by image and transmittance, to those by Gaussian,
 [N, C + 6]: features, conic a b c, x, y, opacity."""
 
 
 def blend(
-    means2d: torch.Tensor,
-    conics: torch.Tensor,
-    opacities: torch.Tensor,
-    features: torch.Tensor,
-    extents: torch.Tensor,
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    extents: Tensor,
     lists: TileLists,
-    records: tuple[torch.Tensor, torch.Tensor],
+    records: tuple[Tensor, Tensor],
     alpha_threshold: float,
     deterministic: bool = False,
-) -> tuple[torch.Tensor, torch.Tensor]:
+) -> tuple[Tensor, Tensor]:
     """Blend features [N, C] over the tile lists: image [H, W, C] and the transmittance left [H, W].
 
     Differentiable once with respect to means2d [N, 2], conics [N, 3], opacities [N] and features. Which entries count
@@ -101,7 +102,7 @@ def blend_on_cpu(
         ranges=pieces,
     )
 
-    def backward(records, image_gradient: torch.Tensor, left_over_gradient: torch.Tensor) -> torch.Tensor:
+    def backward(records, image_gradient: Tensor, left_over_gradient: Tensor) -> Tensor:
         scratch = rows(TILE_SIZE), rows(channels, TILE_SIZE), rows(TILE_SIZE), rows(TILE_SIZE)
         entry_gradients = features.new_empty(lists.entry_count, channels + 6)
         launch(
@@ -159,7 +160,7 @@ def blend_on_cuda(
         *(*by_gaussian(features, records), image, transmittance, last),
     )
 
-    def backward(records, image_gradient: torch.Tensor, transmittance_gradient: torch.Tensor) -> torch.Tensor:
+    def backward(records, image_gradient: Tensor, transmittance_gradient: Tensor) -> Tensor:
         kernel = blend_cuda_adjoint.backward_kernel(scalar, channels, deterministic)
         corners, sizes = blend_cuda_adjoint.BLOCKS_PER_TILE, (blend_cuda_adjoint.ROWS, channels + 6)
         given = *by_gaussian(kept.pop(), records), transmittance, last, image_gradient, transmittance_gradient, *sizes
@@ -180,7 +181,7 @@ def _emission(lists: TileLists) -> Emission:
     return lists.emission
 
 
-def gather_by_gaussian(emission: Emission, by_entry: torch.Tensor) -> torch.Tensor:
+def gather_by_gaussian(emission: Emission, by_entry: Tensor) -> Tensor:
     """[N, columns]: for each Gaussian the sum of its rows of by_entry [M, columns], front tile to last.
 
     by_entry: rows in the order in which entries were before the sort by tile.

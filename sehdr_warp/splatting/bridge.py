@@ -20,6 +20,7 @@ from typing import Any, Concatenate, ParamSpec, overload
 
 import torch
 import warp as wp
+from torch import Tensor
 
 from . import threads
 from .launching import launch_ranges, parameters, torch_stream
@@ -34,10 +35,10 @@ class Program:
         self.device = wp.device_from_torch(device)
         self.torch_device = device
         self.tape = wp.Tape() if recording else None
-        self.inputs: list[tuple[torch.Tensor, wp.array]] = []
-        self.outputs: dict[int, tuple[torch.Tensor, wp.array, bool]] = {}
+        self.inputs: list[tuple[Tensor, wp.array]] = []
+        self.outputs: dict[int, tuple[Tensor, wp.array, bool]] = {}
 
-    def read(self, tensor: torch.Tensor, dtype: Any = None) -> wp.array:
+    def read(self, tensor: Tensor, dtype: Any = None) -> wp.array:
         """The tensor's memory as a Warp array; a vector or matrix dtype takes up the last one or two dimensions."""
         array = _array(tensor, dtype)
         self.inputs.append((tensor, array))
@@ -50,13 +51,7 @@ class Program:
         self.outputs[id(array)] = (tensor, array, differentiable)
         return array
 
-    def launch(
-        self,
-        kernel: Any,
-        dim: int | Sequence[int],
-        inputs: Sequence[Any],
-        outputs: Sequence[Any] = (),
-    ) -> None:
+    def launch(self, kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], outputs: Sequence[Any] = ()) -> None:
         """Launch a kernel; its generated adjoint runs in the backward pass.
 
         A kernel whose first parameter is an integer `first` adds it to its thread's index and writes only what belongs
@@ -95,7 +90,7 @@ def _scalar(dtype) -> torch.dtype:
     return dtype if isinstance(dtype, torch.dtype) else wp.dtype_to_torch(getattr(dtype, "_wp_scalar_type_", dtype))
 
 
-def _array(tensor: torch.Tensor, dtype=None) -> wp.array:
+def _array(tensor: Tensor, dtype=None) -> wp.array:
     dtype = None if isinstance(dtype, torch.dtype) else dtype
     tensor = tensor.detach()
     if tensor.is_contiguous():
@@ -104,7 +99,7 @@ def _array(tensor: torch.Tensor, dtype=None) -> wp.array:
     return wp.from_torch(tensor, dtype=dtype, requires_grad=False)
 
 
-def _zeros_like(tensors: list[torch.Tensor]) -> list[torch.Tensor]:
+def _zeros_like(tensors: list[Tensor]) -> list[Tensor]:
     """Contiguous zeros of the tensors' shapes; where all are of one type in one memory, filled by a single launch."""
     if len(tensors) < 2 or len({tensor.dtype for tensor in tensors}) > 1:
         return [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in tensors]
@@ -157,7 +152,7 @@ class _ProgramFunction(torch.autograd.Function):
                     gradient = torch.empty_like(tensor).copy_(gradient)
                 array.grad = _array(gradient, array.dtype)
                 array.retain_grad = True  # the gradient is torch's: adjoint kernels must not clear it
-            results: list[torch.Tensor | None] = [None] * len(plain)
+            results: list[Tensor | None] = [None] * len(plain)
             by_memory = {}
             wanted = [position for position, needed in enumerate(ctx.needs_input_grad[2:]) if needed]
             # On a GPU leaves, whose gradients stay, have them in one memory; others' are soon let go, each by itself.
@@ -180,11 +175,11 @@ class _ProgramFunction(torch.autograd.Function):
 @overload
 def differentiable(
     body: Callable[Concatenate[Program, P], tuple["wp.array[Any, Any]", ...]],
-) -> Callable[P, tuple[torch.Tensor, ...]]: ...
+) -> Callable[P, tuple[Tensor, ...]]: ...
 
 
 @overload
-def differentiable(body: Callable[Concatenate[Program, P], "wp.array[Any, Any]"]) -> Callable[P, torch.Tensor]: ...
+def differentiable(body: Callable[Concatenate[Program, P], "wp.array[Any, Any]"]) -> Callable[P, Tensor]: ...
 
 
 def differentiable(body: Callable[..., Any]) -> Callable[..., Any]:
@@ -195,7 +190,7 @@ def differentiable(body: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     @wraps(body)
-    def operation(*tensors: torch.Tensor, **options: Any) -> Any:
+    def operation(*tensors: Tensor, **options: Any) -> Any:
         return _ProgramFunction.apply(body, options, *tensors)
 
     return operation

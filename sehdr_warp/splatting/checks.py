@@ -8,6 +8,7 @@ import operator
 from typing import Any
 
 import torch
+from torch import Tensor
 
 
 def check_tensors(**arguments: tuple[Any, tuple[int | str, ...]]) -> None:
@@ -20,7 +21,7 @@ def check_tensors(**arguments: tuple[Any, tuple[int | str, ...]]) -> None:
     first_name, (first, _) = next(iter(arguments.items()))
     for name, (value, shape) in arguments.items():
         expected = f"[{', '.join(map(str, shape))}]"
-        if not isinstance(value, torch.Tensor):
+        if not isinstance(value, Tensor):
             kind = f"{type(value).__module__.split('.')[0]}.{type(value).__name__}"
             raise TypeError(f"{name} is a {kind}, expected a torch tensor {expected}")
         if value.ndim == len(shape):
@@ -50,7 +51,7 @@ def whole_number(name: str, value: Any, least: int, most: int) -> int:
 
 
 @torch.no_grad()
-def check_opacities(opacities: torch.Tensor) -> None:
+def check_opacities(opacities: Tensor) -> None:
     """Raises ValueError for opacities on the CPU that are finite and outside of [0, 1]."""
     if opacities.device.type == "cpu" and opacities.numel():
         low, high = (float(value) for value in opacities.aminmax())

@@ -10,22 +10,22 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import warp as wp
+from torch import Tensor
 
 from ..kernels.clipped_residual import clipped_residual_kernel
 from .launching import launch, warp_scalar
 
 _CODES = {torch.uint8: wp.uint8, torch.int16: wp.uint16}
-WHITE = {torch.uint8: 255, torch.int16: 65535}
-"""The largest code, by the type of the tensor that holds it."""
+WHITE = {torch.uint8: 255, torch.int16: 65535}  # The largest code, by the type of the tensor that holds it
 
 
-def code_tensor(codes: np.ndarray, device: torch.device | str) -> torch.Tensor:
+def code_tensor(codes: np.ndarray, device: torch.device | str) -> Tensor:
     """uint8 or uint16 codes on a device: uint8, or int16 of the same bits. On the CPU in the array's own memory."""
     codes = np.require(codes, requirements=("C", "W"))
     return torch.from_numpy(codes.view(np.int16) if codes.dtype == np.uint16 else codes).to(device)
 
 
-def code_values(codes: torch.Tensor) -> torch.Tensor:
+def code_values(codes: Tensor) -> Tensor:
     """Encoded values in [0, 1], float32, of code_tensor()'s codes."""
     found = codes.int() & 0xFFFF if codes.dtype == torch.int16 else codes
     # By a tensor: torch's division by a number on a GPU is a product with its reciprocal, which rounds differently.
@@ -42,15 +42,15 @@ class CodeScale:
         white and black; None: these are codes like any other.
     """
 
-    table: torch.Tensor
+    table: Tensor
     mu: float = 0.0
     white: float = 1.0
     half_codes: tuple[float, float] | None = None
 
 
 def clipped_residual(
-    image: torch.Tensor, codes: torch.Tensor, scale: CodeScale, index: torch.Tensor | None = None
-) -> tuple[torch.Tensor, torch.Tensor]:
+    image: Tensor, codes: Tensor, scale: CodeScale, index: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """What a photo can tell of an image, and what it tells, both [H, W, 3] in the domain of the scale.
 
     Where the code is the largest, which says `at least this`, the first equals the second as soon as it is within half

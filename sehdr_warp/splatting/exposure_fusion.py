@@ -1,6 +1,7 @@
 """Neural exposure fusion of given brackets as a torch operation (kernels/exposure_fusion.py)."""
 
 import torch
+from torch import Tensor
 
 from ..kernels.exposure_fusion import POINTS_PER_THREAD, fusion_kernels
 from .checks import check_tensors
@@ -11,15 +12,15 @@ MAX_LOG_SIGMA, MAX_DEVIATION = 30.0, 30.0
 
 
 def fuse_exposures(
-    encoded: torch.Tensor,
-    log_sigma: torch.Tensor,
-    inner: torch.Tensor,
-    inner_bias: torch.Tensor,
-    outer: torch.Tensor,
-    outer_bias: torch.Tensor,
+    encoded: Tensor,
+    log_sigma: Tensor,
+    inner: Tensor,
+    inner_bias: Tensor,
+    outer: Tensor,
+    outer_bias: Tensor,
     *,
     scale: float,
-) -> torch.Tensor:
+) -> Tensor:
     """[M, 3]: scale times the encoded brackets [P, M, 3], weighted by the softmax over P of MLP(gamma, encoded) gamma.
 
     gamma = exp(-d^2 / 2), d = (encoded - 0.5) / exp(log_sigma), with log_sigma [3] and d held within their limits. The
@@ -42,7 +43,7 @@ def fuse_exposures(
     return _Fusion.apply(encoded, *learned, scale)
 
 
-def fusion_weights(encoded, log_sigma, inner, inner_bias, outer, outer_bias) -> torch.Tensor:
+def fusion_weights(encoded, log_sigma, inner, inner_bias, outer, outer_bias) -> Tensor:
     """[P, M, 3] the weights in fuse_exposures(), which sum to 1 over P, by torch's own operations."""
     deviation = (encoded - 0.5) / log_sigma.clamp(-MAX_LOG_SIGMA, MAX_LOG_SIGMA).exp()
     exposedness = (-0.5 * deviation.clamp(-MAX_DEVIATION, MAX_DEVIATION).square()).exp()

@@ -3,6 +3,7 @@
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from ..kernels.harmonics import harmonics_adjoint_kernel, harmonics_kernel
 from .checks import check_tensors, whole_number
@@ -12,11 +13,8 @@ MAX_DEGREE = 3
 
 
 def spherical_harmonics(
-    degree: int,
-    coefficients: torch.Tensor | tuple[torch.Tensor, torch.Tensor],
-    means: torch.Tensor,
-    camera_position: torch.Tensor,
-) -> torch.Tensor:
+    degree: int, coefficients: Tensor | tuple[Tensor, Tensor], means: Tensor, camera_position: Tensor
+) -> Tensor:
     """Evaluate spherical harmonics for the direction from the camera to each Gaussian (3DGS's basis and signs).
 
     degree: 0 to 3, not above what the coefficients hold.
@@ -37,7 +35,7 @@ def spherical_harmonics(
         given |= {"coefficients": (coefficients, ("N", "K", 3))}
     check_tensors(**given, camera_position=(camera_position, (3,)))
     degree = whole_number("degree", degree, 0, MAX_DEGREE)
-    whole = isinstance(coefficients, torch.Tensor)
+    whole = isinstance(coefficients, Tensor)
     constant, rest = (coefficients[:, :1], coefficients[:, 1:]) if whole else coefficients
     if constant.shape[1] + rest.shape[1] < (degree + 1) ** 2:
         raise ValueError(f"degree {degree} needs {(degree + 1) ** 2} coefficients, not {1 + rest.shape[1]}")

@@ -1,13 +1,14 @@
 """Interpolation in a table of functions as a torch operation (kernels/interpolation.py)."""
 
 import torch
+from torch import Tensor
 
 from ..kernels import interpolation
 from .checks import check_tensors
 from .launching import launch, sums_are_ordered
 
 
-def interpolate(table: torch.Tensor, low: float, step: float, positions: torch.Tensor) -> torch.Tensor:
+def interpolate(table: Tensor, low: float, step: float, positions: Tensor) -> Tensor:
     """[N, C] values at positions [N, C] of C functions given at equal steps (Catmull and Rom 1974).
 
     table: [nodes + 2, C], column c holding function c at low - step, low, low + step ...; nodes from 2. Below `low` a
@@ -24,7 +25,7 @@ def interpolate(table: torch.Tensor, low: float, step: float, positions: torch.T
     return _Interpolation.apply(table, low, step, positions)
 
 
-def _in_torch(table: torch.Tensor, low: float, step: float, positions: torch.Tensor) -> torch.Tensor:
+def _in_torch(table: Tensor, low: float, step: float, positions: Tensor) -> Tensor:
     nodes = table.shape[0] - 2
     position = ((positions - low) / step).clamp_min(0.0)
     cell = position.detach().nan_to_num(0.0).clamp_max(nodes - 2).long()

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 import warp as wp
+from torch import Tensor
 
 from ..quiet import silent_stderr
 from . import threads
@@ -45,9 +46,9 @@ def launch(
     if dim == 0 or (not isinstance(dim, int) and 0 in dim):
         return
     ranged, types = parameters(kernel)
-    device = next(argument.device for argument in arguments if isinstance(argument, torch.Tensor))
+    device = next(argument.device for argument in arguments if isinstance(argument, Tensor))
     inputs = [
-        _descriptor(argument, kind) if isinstance(argument, torch.Tensor) else argument
+        _descriptor(argument, kind) if isinstance(argument, Tensor) else argument
         for argument, kind in zip(arguments, types, strict=True)
     ]
     if ranged and device.type == "cpu" and isinstance(dim, int):
@@ -78,7 +79,7 @@ def parameters(kernel: Any) -> tuple[bool, list]:
     return ranged, [argument.type for argument in arguments[ranged:]]
 
 
-def _descriptor(tensor: torch.Tensor, kind: wp.array) -> Any:
+def _descriptor(tensor: Tensor, kind: wp.array) -> Any:
     """The tensor's memory for one launch: a third of what a wp.array costs the host. It keeps the tensor alive."""
     surplus = tensor.ndim - kind.ndim - len(getattr(kind.dtype, "_shape_", ()))
     if surplus > 0:

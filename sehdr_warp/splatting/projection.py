@@ -1,7 +1,7 @@
 """Stage one of a render: 3D Gaussians to 2D Gaussians."""
 
-import torch
 import warp as wp
+from torch import Tensor
 
 from ..kernels.geometry import matrix, vector
 from ..kernels.project import projection_kernel
@@ -12,12 +12,12 @@ from .launching import warp_scalar
 @differentiable
 def project(
     program: Program,
-    means: torch.Tensor,
-    log_scales: torch.Tensor,
-    quaternions: torch.Tensor,
-    opacities: torch.Tensor,
-    world_to_camera: torch.Tensor,
-    intrinsics: torch.Tensor,
+    means: Tensor,
+    log_scales: Tensor,
+    quaternions: Tensor,
+    opacities: Tensor,
+    world_to_camera: Tensor,
+    intrinsics: Tensor,
     *,
     width: int,
     height: int,

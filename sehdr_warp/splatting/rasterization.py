@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-import torch
+from torch import Tensor
 
 from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR
 from .blending import blend
@@ -30,34 +30,34 @@ class Rendering:
     pair_count: scalar int64 tensor, how many there are; None from rasterizers that do not count them.
     """
 
-    image: torch.Tensor
-    transmittance: torch.Tensor
-    means2d: torch.Tensor
-    depths: torch.Tensor
-    radii: torch.Tensor
+    image: Tensor
+    transmittance: Tensor
+    means2d: Tensor
+    depths: Tensor
+    radii: Tensor
     entry_count: int
-    overflow: torch.Tensor | None = None
-    pair_count: torch.Tensor | None = None
+    overflow: Tensor | None = None
+    pair_count: Tensor | None = None
 
     @property
-    def alpha(self) -> torch.Tensor:
+    def alpha(self) -> Tensor:
         """[H, W] in [0, 1], how much of each pixel the Gaussians cover; made anew whenever it is asked for."""
         return 1.0 - self.transmittance
 
     @property
-    def visible(self) -> torch.Tensor:
+    def visible(self) -> Tensor:
         """[N] bool: not culled."""
         return self.radii > 0
 
 
 def rasterize(
-    means: torch.Tensor,
-    log_scales: torch.Tensor,
-    quaternions: torch.Tensor,
-    opacities: torch.Tensor,
-    features: torch.Tensor,
-    world_to_camera: torch.Tensor,
-    intrinsics: torch.Tensor,
+    means: Tensor,
+    log_scales: Tensor,
+    quaternions: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    world_to_camera: Tensor,
+    intrinsics: Tensor,
     width: int,
     height: int,
     *,

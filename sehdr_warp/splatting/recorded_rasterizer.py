@@ -8,12 +8,12 @@ from dataclasses import replace
 from typing import TypedDict, Unpack
 
 import torch
+from torch import Tensor
 
 from .rasterization import Rendering, rasterize
 from .recording import GraphRecorder
 
-ROOM = 1.25
-"""A recording has room for this many times the (Gaussian, tile) pairs of the call before it."""
+ROOM = 1.25  # A recording has room for this many times the (Gaussian, tile) pairs of the call before it
 LEAST_ROOM = 1 << 12
 
 
@@ -45,21 +45,21 @@ class RecordedRasterizer:
         self._forward = GraphRecorder(device)
         self._backward = GraphRecorder(device, self._forward.stream)
         self._key = None
-        self._arguments: list[torch.Tensor] = []
+        self._arguments: list[Tensor] = []
         self._rendering: Rendering | None = None
-        self._upstream: list[torch.Tensor] = []
-        self._gradients: list[torch.Tensor | None] = []
+        self._upstream: list[Tensor] = []
+        self._gradients: list[Tensor | None] = []
         self._calls = 0
 
     def __call__(
         self,
-        means: torch.Tensor,
-        log_scales: torch.Tensor,
-        quaternions: torch.Tensor,
-        opacities: torch.Tensor,
-        features: torch.Tensor,
-        world_to_camera: torch.Tensor,
-        intrinsics: torch.Tensor,
+        means: Tensor,
+        log_scales: Tensor,
+        quaternions: Tensor,
+        opacities: Tensor,
+        features: Tensor,
+        world_to_camera: Tensor,
+        intrinsics: Tensor,
         width: int,
         height: int,
         **options: Unpack[Options],

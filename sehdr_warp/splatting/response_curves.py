@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from ..kernels.geometry import vector
 from ..kernels.response_curves import FILMIC, KNEE, NO_TONE, REINHARD, encode_kernel
@@ -23,9 +24,7 @@ class FormulaCurve:
 
 
 @torch.no_grad()
-def encode_with_slope(
-    exposure: torch.Tensor, curve: FormulaCurve, extension_slope: float
-) -> tuple[torch.Tensor, torch.Tensor]:
+def encode_with_slope(exposure: Tensor, curve: FormulaCurve, extension_slope: float) -> tuple[Tensor, Tensor]:
     """The encoded values of exposures [...], float32 or float64, with extension_slope log(x / clip) added beyond the
     clip point, and their derivatives by exposure: 0 below 0, NaN for NaN."""
     exposure = exposure.contiguous()

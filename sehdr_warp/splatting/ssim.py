@@ -3,6 +3,7 @@
 from functools import cache
 
 import torch
+from torch import Tensor
 
 from ..kernels.ssim import RADIUS, ssim_kernels, window
 from .checks import check_tensors
@@ -14,7 +15,7 @@ CPU_LANES = 16
 STEPS_PER_THREAD = 4096
 
 
-def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+def ssim(a: Tensor, b: Tensor) -> Tensor:
     """Mean structural similarity (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5, data range 1.
 
     a, b: [H, W, C] float32 or float64 on one device, any size from 1 x 1 x 1. Beyond the border both images count as
@@ -27,14 +28,12 @@ def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return _Similarity.apply(a, b, True)
 
 
-def ssim_map(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+def ssim_map(a: Tensor, b: Tensor) -> Tensor:
     """The [H, W, C] values whose mean is ssim(a, b); same arguments, same errors, differentiable as well."""
     return _Similarity.apply(a, b, False)
 
 
-def image_distance(
-    a: torch.Tensor, b: torch.Tensor, distance_weight: float, dissimilarity_weight: float
-) -> torch.Tensor:
+def image_distance(a: Tensor, b: Tensor, distance_weight: float, dissimilarity_weight: float) -> Tensor:
     """distance_weight mean |a - b| + dissimilarity_weight (1 - ssim(a, b)), in one launch more than ssim() takes: a
     scalar, differentiable once with respect to a. a, b: as for ssim(), with its errors."""
     return _Distance.apply(a, b, distance_weight, dissimilarity_weight)
@@ -85,15 +84,13 @@ class _Similarity(torch.autograd.Function):
         return for_a, for_b, None
 
 
-def _check(a: torch.Tensor, b: torch.Tensor) -> None:
+def _check(a: Tensor, b: Tensor) -> None:
     check_tensors(a=(a, ("H", "W", "C")), b=(b, ("H", "W", "C")))
     if not a.numel():
         raise ValueError(f"a has shape {list(a.shape)}, expected [H, W, C] with a pixel at least")
 
 
-def _compare(
-    a: torch.Tensor, b: torch.Tensor, weights: tuple[float, float] | None = None
-) -> tuple[torch.Tensor, torch.Tensor]:
+def _compare(a: Tensor, b: Tensor, weights: tuple[float, float] | None = None) -> tuple[Tensor, Tensor]:
     """The similarity [H, W, C] and its derivatives [3, H, W C] by the windowed moments. weights: of |a - b| and of the
     dissimilarity, whose sum [H, W, C] then stands in the similarity's place."""
     runs = _Runs(a, weights)
@@ -106,7 +103,7 @@ def _compare(
     return similarity, derivatives
 
 
-def _gradient(a, b, derivatives, scale: torch.Tensor, weights: tuple[float, float] | None = None) -> torch.Tensor:
+def _gradient(a, b, derivatives, scale: Tensor, weights: tuple[float, float] | None = None) -> Tensor:
     """scale times the gradient by `a`, [H, W, C], of the sum of what _compare() gives."""
     runs = _Runs(a, weights)
     result = torch.empty_like(a)
@@ -120,7 +117,7 @@ def _gradient(a, b, derivatives, scale: torch.Tensor, weights: tuple[float, floa
 class _Runs:
     """One image size's launches: rows of W C numbers, taken `lanes` at a time."""
 
-    def __init__(self, image: torch.Tensor, weights: tuple[float, float] | None = None):
+    def __init__(self, image: Tensor, weights: tuple[float, float] | None = None):
         self.rows, width, self.channels = image.shape
         self.length = width * self.channels
         self.like = image
@@ -129,7 +126,7 @@ class _Runs:
         self.weights_of_both = weights or (0.0, 0.0)
         self.weights = _weights(image.dtype, image.device)
 
-    def padded(self, count: int) -> torch.Tensor:
+    def padded(self, count: int) -> Tensor:
         """[count, rows, ...] uninitialised rows with the zeros that the horizontal blur finds beyond the border; with
         one lane the kernels that fill the rows write those too."""
         margin = RADIUS * self.channels
@@ -139,7 +136,7 @@ class _Runs:
             buffer[..., -margin:] = 0
         return buffer
 
-    def view(self, tensor: torch.Tensor) -> torch.Tensor:
+    def view(self, tensor: Tensor) -> Tensor:
         """A contiguous image [H, W, C] or stack of rows [..., H, n] as overlapping runs."""
         rows = tensor.shape[:1] if tensor.shape == self.like.shape else tensor.shape[:-1]
         length = tensor.numel() // rows.numel()
@@ -156,10 +153,10 @@ class _Runs:
 
 
 @cache
-def _weights(dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+def _weights(dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.tensor(window(), dtype=dtype, device=device)
 
 
 @cache
-def _one(dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+def _one(dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.ones((), dtype=dtype, device=device)

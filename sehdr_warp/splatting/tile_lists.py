@@ -5,14 +5,14 @@ from dataclasses import dataclass
 
 import torch
 import warp as wp
+from torch import Tensor
 
 from ..errors import SehdrError
 from ..kernels.constants import TILE_SIZE
 from ..kernels.tiles import mark_ranges, tile_kernels
 from .launching import launch, torch_stream, warp_scalar
 
-LARGEST_CAPACITY = 2**31 - 1
-"""Entries are counted in int32."""
+LARGEST_CAPACITY = 2**31 - 1  # Entries are counted in int32
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Emission:
     places: [M] each entry's place then.
     """
 
-    order: torch.Tensor
-    ends: torch.Tensor
-    places: torch.Tensor
+    order: Tensor
+    ends: Tensor
+    places: Tensor
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,13 @@ class TileLists:
     total: scalar int64, how many entries there are, with or without room for them.
     """
 
-    ranges: torch.Tensor
-    gaussians: torch.Tensor
+    ranges: Tensor
+    gaussians: Tensor
     emission: Emission | None
     width: int
     height: int
-    overflow: torch.Tensor | None
-    total: torch.Tensor
+    overflow: Tensor | None
+    total: Tensor
 
     @property
     def columns(self) -> int:
@@ -65,9 +65,9 @@ class TileLists:
 
 @torch.no_grad()
 def build_tile_lists(
-    records: tuple[torch.Tensor, torch.Tensor],
-    depths: torch.Tensor,
-    extents: torch.Tensor,
+    records: tuple[Tensor, Tensor],
+    depths: Tensor,
+    extents: Tensor,
     width: int,
     height: int,
     capacity: int | None = None,
@@ -105,13 +105,13 @@ def build_tile_lists(
 
 
 def pack_records(
-    means2d: torch.Tensor,
-    conics: torch.Tensor,
-    opacities: torch.Tensor,
-    extents: torch.Tensor,
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    extents: Tensor,
     alpha_threshold: float,
-    features: torch.Tensor | None = None,
-) -> tuple[torch.Tensor, torch.Tensor]:
+    features: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
     """What is drawn of each projected Gaussian, in rows of four: shapes and ellipses.
 
     shapes: [N, 4] x, y, opacity, half-height; ellipses: [N, 4] conic a, b, c and the level where alpha meets the
@@ -126,7 +126,7 @@ def pack_records(
     return shapes, ellipses
 
 
-def depth_order(depths: torch.Tensor, extents: torch.Tensor) -> torch.Tensor:
+def depth_order(depths: Tensor, extents: Tensor) -> Tensor:
     """[N] int32: Gaussians nearest first, culled ones last; equal depths keep the order of their indices."""
     count = depths.shape[0]
     # The sort needs room for twice as many; what is returned does not hold on to it.

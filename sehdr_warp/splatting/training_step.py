@@ -3,15 +3,14 @@
 import math
 
 import torch
+from torch import Tensor
 
 from ..kernels import training_step as kernels
 from .launching import launch
 
 
 @torch.no_grad()
-def judge_step(
-    loss: torch.Tensor, norms: torch.Tensor, incomplete: torch.Tensor | None = None
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def judge_step(loss: Tensor, norms: Tensor, incomplete: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
     """Three scalars, 1 or 0: whether the loss or a norm is not finite; whether a step is therefore, or as `incomplete`
     is true, to be skipped; whether it is to be made. loss: float32 scalar; norms: [K] float32; incomplete: bool scalar.
     """
@@ -19,19 +18,19 @@ def judge_step(
     if incomplete is None:
         incomplete = torch.empty(0, dtype=torch.bool, device=norms.device)
     launch(kernels.judge_step, 1, loss.detach(), norms, incomplete, verdict)
-    return verdict[0], verdict[1], verdict[2]
+    return verdict.unbind()
 
 
 @torch.no_grad()
 def adam_step(
-    parameter: torch.Tensor,
-    gradient: torch.Tensor,
-    first_moment: torch.Tensor,
-    second_moment: torch.Tensor,
-    step: torch.Tensor,
-    skipped: torch.Tensor,
+    parameter: Tensor,
+    gradient: Tensor,
+    first_moment: Tensor,
+    second_moment: Tensor,
+    step: Tensor,
+    skipped: Tensor,
     *,
-    rate: torch.Tensor | float,
+    rate: Tensor | float,
     betas: tuple[float, float],
     epsilon: float,
 ) -> None:
@@ -51,16 +50,12 @@ def adam_step(
     if not parameter.numel():
         return
     if parameter.device.type == "cpu":
-        _step_in_torch(parameter, gradient, first_moment, second_moment, step, skipped, float(rate), betas, epsilon)
+        lists = [parameter], [gradient], [first_moment], [second_moment], [], [step]
+        numbers = {"lr": float(rate), "beta1": betas[0], "beta2": betas[1], "weight_decay": 0.0, "eps": epsilon}
+        torch._fused_adam_(*lists, **numbers, amsgrad=False, maximize=False, found_inf=skipped)  # pyright: ignore[reportPrivateImportUsage]
         return
-    rate = rate if isinstance(rate, torch.Tensor) else torch.full_like(skipped, rate)
+    rate = rate if isinstance(rate, Tensor) else torch.full_like(skipped, rate)
     _step_by_kernel(parameter, gradient, first_moment, second_moment, step, skipped, rate, betas, epsilon)
-
-
-def _step_in_torch(parameter, gradient, first_moment, second_moment, step, skipped, rate, betas, epsilon) -> None:
-    lists = [parameter], [gradient], [first_moment], [second_moment], [], [step]
-    numbers = {"lr": rate, "beta1": betas[0], "beta2": betas[1], "weight_decay": 0.0, "eps": epsilon}
-    torch._fused_adam_(*lists, **numbers, amsgrad=False, maximize=False, found_inf=skipped)  # pyright: ignore[reportPrivateImportUsage]
 
 
 def _step_by_kernel(parameter, gradient, first_moment, second_moment, step, skipped, rate, betas, epsilon) -> None:
@@ -72,13 +67,7 @@ def _step_by_kernel(parameter, gradient, first_moment, second_moment, step, skip
 
 @torch.no_grad()
 def add_gradient_statistics(
-    gradients: torch.Tensor,
-    radii: torch.Tensor,
-    usable: torch.Tensor,
-    width: int,
-    height: int,
-    gradient_sum: torch.Tensor,
-    seen: torch.Tensor,
+    gradients: Tensor, radii: Tensor, usable: Tensor, width: int, height: int, gradient_sum: Tensor, seen: Tensor
 ) -> None:
     """Adds to gradient_sum [N] the lengths of gradients [N, 2] by the projected centres, in normalised screen units
     (the screen is 2 wide), and to seen [N] 1, where radii [N] are above 0; nothing where the scalar usable is 0. width,
@@ -89,13 +78,7 @@ def add_gradient_statistics(
 
 @torch.no_grad()
 def add_position_noise(
-    means: torch.Tensor,
-    log_scales: torch.Tensor,
-    quaternions: torch.Tensor,
-    opacity_logits: torch.Tensor,
-    *,
-    strength: float,
-    seed: int,
+    means: Tensor, log_scales: Tensor, quaternions: Tensor, opacity_logits: Tensor, *, strength: float, seed: int
 ) -> None:
     """Adds to means, in place, the noise of 3DGS-MCMC's equation 8: normal, shaped by each Gaussian's covariance, and
     faded out where opacities are above some hundredths.

@@ -14,7 +14,19 @@ import tyro
 from tyro.conf import Positional
 
 from ..errors import InputError, SehdrError, UsageError
-from .config_fields import flag_of, flags_type, gone_flags, named_fields
+from .config_files import (
+    config_as_toml,
+    config_to_dict,
+    flag_of,
+    flags_type,
+    gone_flags,
+    load_config,
+    named_fields,
+    override_config,
+    preset_names,
+    preset_purpose,
+    value_of,
+)
 
 log = logging.getLogger(__name__)
 # What load_scene takes besides the path and the response.
@@ -150,7 +162,6 @@ def run_train(asked: Train) -> None:
 
 def run_presets(asked: Presets) -> None:
     """Prints every preset with its purpose and cost."""
-    from .config_files import load_config, preset_names, preset_purpose
 
     rows = {name: {"purpose": preset_purpose(name), "cost": _cost(load_config(name))} for name in preset_names()}
     if asked.json:
@@ -162,7 +173,6 @@ def run_presets(asked: Presets) -> None:
 
 def run_config(asked: ShowConfig) -> None:
     """Prints a config."""
-    from .config_files import config_as_toml, config_to_dict, load_config
     from .run_folder import RunFolder
 
     folder = RunFolder(asked.which)
@@ -219,7 +229,6 @@ def _data(asked: Train, resumed: bool) -> dict:
 
 def _config(asked: Train, resumed: bool):
     """The preset's config, or the resumed run's, with what the command line names in it."""
-    from .config_files import load_config, override_config, value_of
     from .run_folder import RunFolder
 
     options = asked.training

@@ -5,20 +5,21 @@ The defaults are the `default` preset. Iteration numbers other than `schedule.it
 """
 
 from collections.abc import Iterator
+from operator import attrgetter
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ..errors import SehdrError
 
-REFERENCE_ITERATIONS = 30_000
-"""The length of training for which iteration numbers are stated: 3DGS's."""
+REFERENCE_ITERATIONS = 30_000  # The length of training for which iteration numbers are stated: 3DGS's
 
 Part = Annotated[float, Field(ge=0.0, le=1.0)]
 Weight = Annotated[float, Field(ge=0.0, le=100.0)]
 Rate = Annotated[float, Field(gt=0.0, le=1.0)]
 Iteration = Annotated[int, Field(ge=1)]
 Name = Annotated[str, Field(min_length=1)]
+Many = Field(strict=False)  # Lists, as TOML and JSON have them, are tuples here
 
 
 class ConfigError(SehdrError):
@@ -58,7 +59,7 @@ class ResponseConfig(_Table):
     method: Literal["posterior", "paper"] = "posterior"
     """how auto chooses; posterior: by edges, by the spread of light and by what cameras do; paper: dynamic range and
     smoothness on one random training photo (SeHDR)"""
-    candidates: tuple[Name, ...] = ()
+    candidates: Annotated[tuple[Name, ...], Many] = ()
     """what auto chooses from: names, and files of one curve or many; empty: the built-in ones and those between"""
 
 
@@ -67,7 +68,7 @@ class FusionConfig(_Table):
 
     enabled: bool = False
     """fuse exposure brackets into the HDR colour; off, the base colour is the HDR colour"""
-    exposures: tuple[Name, ...] = ("1/8x", "1/4x", "1x", "8x", "16x")
+    exposures: Annotated[tuple[Name, ...], Many] = ("1/8x", "1/4x", "1x", "8x", "16x")
     """exposures of the brackets: multiples of the photos' own (1/8x), stops from it (-3ev) or seconds (1/125)"""
     radiance_scale: Literal["unit", "base"] = "unit"
     """the radiance of a fused value of 1; unit: 1, as printed in the paper; base: 1 / dt_1, an exposure of 1"""
@@ -168,7 +169,7 @@ class ScheduleConfig(_Table):
     """training steps; one photo each"""
     harmonics_every: Iteration = 1000
     """iterations between degrees of the harmonics; degree 0 first"""
-    evaluate_at: tuple[Iteration, ...] = (500, 1000, 2000, 4000, 7000, 10_000, 14_000, 20_000, 30_000)
+    evaluate_at: Annotated[tuple[Iteration, ...], Many] = (500, 1000, 2000, 4000, 7000, 10_000, 14_000, 20_000, 30_000)
     """iterations that test the held-out views; the last always does"""
     checkpoint_every: Iteration = 5000
     """iterations between checkpoints; one is always written at the end"""
@@ -183,7 +184,7 @@ class PlanConfig(_Table):
 
     enabled: bool = True
     """read the scene before the training and leave out what it does not need"""
-    keep: tuple[Name, ...] = ()
+    keep: Annotated[tuple[Name, ...], Many] = ()
     """fields that the plan leaves as they are, such as those given on the command line"""
 
 
@@ -224,21 +225,16 @@ def _contradictions(config: Config) -> Iterator[str]:
     learned, display = config.response.name == "learned", model.radiance == "display"
     if fusion.enabled and len(fusion.exposures) < 2:
         yield f"fusion.exposures = {list(fusion.exposures)} is too few; a fusion needs two or more"
-    no_radiance = 'needs radiance: model.radiance = "display" has none'
-    if display and fusion.enabled:
-        yield f"fusion.enabled = True {no_radiance}"
-    if display and loss.linear_weight > 0:
-        yield f"loss.linear_weight = {loss.linear_weight} {no_radiance}"
-    if display and loss.hdr_weight > 0:
-        yield f"loss.hdr_weight = {loss.hdr_weight} {no_radiance}"
-    no_curve = 'needs a known response: response.name = "learned" has none'
-    if learned and display:
-        yield f"model.radiance = 'display' {no_curve}"
-    if learned and fusion.enabled:
-        yield f"fusion.enabled = True {no_curve}"
+    if display:
+        for path in ("fusion.enabled", "loss.linear_weight", "loss.hdr_weight"):
+            if value := attrgetter(path)(config):
+                yield f'{path} = {value} needs radiance: model.radiance = "display" has none'
+    if learned and (display or fusion.enabled):
+        field = "model.radiance = 'display'" if display else "fusion.enabled = True"
+        yield f'{field} needs a known response: response.name = "learned" has none'
     if loss.linear_weight > 0 and not (fusion.enabled or loss.hdr_truth):
-        needs = "has nothing to compare: needs fusion.enabled or loss.hdr_truth"
-        yield f"loss.linear_weight = {loss.linear_weight} {needs}"
+        given = f"loss.linear_weight = {loss.linear_weight}"
+        yield f"{given} has nothing to compare: needs fusion.enabled or loss.hdr_truth"
     if loss.ldr_weight == loss.hdr_weight == loss.linear_weight == 0:
         yield "loss.ldr_weight = 0.0 leaves nothing to compare: give loss.hdr_weight or loss.ldr_weight"
     if loss.predictor and not loss.uses_hdr:

@@ -1,23 +1,29 @@
-"""Configs as files: TOML presets and overrides in, JSON beside the run out."""
+"""Configs as files and as flags, field by field, and what became of the fields of earlier versions."""
 
 import json
 import reprlib
 import textwrap
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib import resources
+from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, TypedDict, get_args, get_origin
 
-from pydantic import ValidationError
+import tyro
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+from tyro.constructors import PrimitiveConstructorSpec
 
 from ..errors import InputError, did_you_mean
-from ..files import read_json, read_text
+from ..files import read_text
 from .config import Config, ConfigError
-from .config_fields import GONE, config_fields
 
 _LARGEST_FILE = 1 << 20
 _REMEDY = "`sehdr-warp config` lists every field with its meaning"
+_GONE = tomllib.loads((resources.files("sehdr_warp.training") / "gone.toml").read_text(encoding="utf-8"))
+GONE: dict[str, str] = {path: advice for advice, paths in _GONE.items() for path in paths}
+"""Fields of earlier versions, each with what to do now."""
 
 
 def preset_names() -> list[str]:
@@ -45,16 +51,25 @@ def load_config(
         InputError: naming file, field and value for a missing file, bad TOML, an unknown field, a wrong type or a value
             out of range.
     """
-    source, values = _read(preset)
-    _build(source, values)
-    return _override("overrides", values, overrides or {}, flags)
+    config = config_from_dict(*_read(preset))
+    return override_config(config, overrides or {}, "overrides", flags)
 
 
 def override_config(
     config: Config, overrides: dict, source: Path | str = "the config", flags: Mapping[str, str] | None = None
 ) -> Config:
-    """A config with some fields replaced, given as for load_config; `source` names it in errors. Raises InputError."""
-    return _override(source, config_to_dict(config), overrides, flags)
+    """A config with some fields replaced, given as for load_config. Raises InputError that blames the override, by its
+    flag where it has one, else as of `source`."""
+    values = config_to_dict(config)
+    for path, value in overrides.items():
+        *parents, leaf = path.split(".")
+        table = values
+        for parent in parents:
+            table = table.setdefault(parent, {})
+            if not isinstance(table, dict):
+                raise InputError(path, f"{parent} is a field, not a table", _REMEDY)
+        table[leaf] = value
+    return config_from_dict(values, source, flags)
 
 
 def config_as_toml(config: Config, differing: bool = False) -> str:
@@ -64,7 +79,7 @@ def config_as_toml(config: Config, differing: bool = False) -> str:
     table = ""
     for path, item in config_fields():
         part, _, name = path.rpartition(".")
-        value = getattr(getattr(config, part) if part else config, name)
+        value = attrgetter(path)(config)
         if differing and value == item.default:
             continue
         if part != table:
@@ -92,14 +107,11 @@ def value_of(path: str, text: str):
 
 def _one_value(kind, text: str):
     kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
-    return text if kind is str or get_origin(kind) is Literal else toml_value(text)
-
-
-def toml_value(text: str):
-    """A value written as in TOML; what is no TOML is taken as a plain word."""
+    if kind is str or get_origin(kind) is Literal:
+        return text
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except tomllib.TOMLDecodeError:  # The config will say what it takes in place of a word.
         return text
 
 
@@ -108,18 +120,41 @@ def config_to_dict(config: Config) -> dict:
     return config.model_dump()
 
 
-def config_from_dict(values: dict, source: Path | str = "config") -> Config:
-    """The config that config_to_dict described; `source` names it in errors. Raises InputError."""
-    return _build(source, values)
+def config_from_dict(values: dict, source: Path | str = "config", flags: Mapping[str, str] | None = None) -> Config:
+    """The config that config_to_dict described. Raises InputError that blames a field by its flag, else as of `source`,
+    and says of one of an earlier version what to do."""
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        path, problem = field_and_problem(error)
+    except ConfigError as error:
+        path, problem = "", str(error)
+    flag = (flags or {}).get(path)
+    if flag is None and flags and not path:  # Fields that contradict each other: the first that was named.
+        flag = next((flag for path, flag in flags.items() if path in problem), None)
+    if path in GONE:
+        raise InputError(source, f"{problem} of an earlier version is gone", GONE[path])
+    raise InputError(flag or source, problem, _REMEDY)
 
 
-def read_config_json(path: Path) -> Config:
-    """The config saved with a run; raises InputError."""
-    return _build(path, read_json(path))
+def field_and_problem(found: ValidationError) -> tuple[str, str]:
+    """The first field that is wrong, and `field = value: what is allowed`; of an unknown one, what is near."""
+    error = found.errors()[0]
+    path, value = ".".join(str(part) for part in error["loc"] if isinstance(part, str)), error["input"]
+    unknown = error["type"] == "extra_forbidden"
+    if unknown and isinstance(value, dict) and value:
+        name, value = next(iter(value.items()))
+        path += f".{name}"
+    value = f"{path or 'the config'} = {reprlib.repr(value)}"
+    if path in GONE:
+        return path, value
+    if unknown:
+        return path, f"unknown field {value}{did_you_mean(path, (name for name, _ in config_fields()))}"
+    return path, f"{value}: {error['msg'][0].lower()}{error['msg'][1:]}"
 
 
-def _read(preset: str | Path) -> tuple[Path, dict]:
-    """The file's path and its values on top of those of its base, bases first."""
+def _read(preset: str | Path) -> tuple[dict, Path]:
+    """The values of a file on top of those of its bases, and its path."""
     path, chain = _locate(preset), {}
     while path is not None:
         if path in chain:
@@ -136,7 +171,7 @@ def _read(preset: str | Path) -> tuple[Path, dict]:
     merged: dict = {}
     for values in reversed(chain.values()):
         _merge(merged, values)
-    return next(iter(chain)), merged
+    return merged, next(iter(chain))
 
 
 def _locate(preset: str | Path, beside: Path | None = None) -> Path:
@@ -153,19 +188,6 @@ def _locate(preset: str | Path, beside: Path | None = None) -> Path:
     return path
 
 
-def _override(source: Path | str, values: dict, overrides: dict, flags: Mapping[str, str] | None) -> Config:
-    """Values with others in their place. Raises InputError that blames the override, by its flag where it has one."""
-    for path, value in overrides.items():
-        *parents, leaf = path.split(".")
-        table = values
-        for parent in parents:
-            table = table.setdefault(parent, {})
-            if not isinstance(table, dict):
-                raise InputError(path, f"{parent} is a field, not a table", _REMEDY)
-        table[leaf] = value
-    return _build(source, values, flags)
-
-
 def _merge(into: dict, values: dict) -> None:
     for key, value in values.items():
         if isinstance(value, dict) and isinstance(into.get(key), dict):
@@ -174,42 +196,74 @@ def _merge(into: dict, values: dict) -> None:
             into[key] = value
 
 
-def _build(source: Path | str, values: dict, flags: Mapping[str, str] | None = None) -> Config:
-    try:
-        return Config.model_validate(_with_tuples(values))
-    except ValidationError as error:
-        path, problem = _problem(error.errors()[0])
-    except ConfigError as error:
-        path, problem = "", str(error)
-    flag = (flags or {}).get(path)
-    if flag is None and flags and not path:  # Fields that contradict each other: the first that was named.
-        flag = next((flag for path, flag in flags.items() if path in problem), None)
-    if path in GONE:
-        raise InputError(source, f"{problem} of an earlier version is gone", GONE[path])
-    raise InputError(flag or source, problem, _REMEDY)
+def config_fields(kind: type[BaseModel] = Config, prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """Dotted name and declaration of every field, those of the config itself first."""
+    nested = []
+    for name, item in kind.model_fields.items():
+        if isinstance(item.annotation, type) and issubclass(item.annotation, BaseModel):
+            nested.append((item.annotation, f"{prefix}{name}."))
+        else:
+            yield prefix + name, item
+    for inner, path in nested:
+        yield from config_fields(inner, path)
 
 
-def _with_tuples(values, depth: int = 0):
-    """TOML's and JSON's lists as the tuples that a config holds; what is nested deeper than a config is left."""
-    if isinstance(values, dict):
-        return {key: value if depth > 2 else _with_tuples(value, depth + 1) for key, value in values.items()}
-    return tuple(map(_with_tuples, values)) if isinstance(values, list) else values
+def flag_of(path: str) -> str:
+    """The flag of a field: `--loss.ssim-weight` for loss.ssim_weight."""
+    return "--" + path.replace("_", "-")
 
 
-def _problem(error: dict) -> tuple[str, str]:
-    """The field of one of pydantic's errors, and `field = value: what is allowed`; of an unknown one, what is near."""
-    path, value = ".".join(str(part) for part in error["loc"] if isinstance(part, str)), error["input"]
-    if error["type"] == "extra_forbidden" and isinstance(value, dict) and value:
-        name, value = next(iter(value.items()))
-        path += f".{name}"
-    value = f"{path or 'the config'} = {_shown(value)}"
-    if path in GONE:
-        return path, value
-    if error["type"] == "extra_forbidden":
-        return path, f"unknown field {value}{did_you_mean(path, (name for name, _ in config_fields()))}"
-    return path, f"{value}: {error['msg'][0].lower()}{error['msg'][1:]}"
+def gone_flags() -> dict[str, str]:
+    """The flags of fields that are gone, with what to do now."""
+    return {flag_of(path): advice for path, advice in GONE.items()}
+
+
+def flags_type() -> type:
+    """A TypedDict of every field, for tyro: nothing but what was named is in it, as text."""
+    tables: dict[str, dict[str, Any]] = {}
+    for path, item in config_fields():
+        if path == "seed":  # A flag of its own, in every help.
+            continue
+        spec = PrimitiveConstructorSpec(
+            nargs=1,
+            metavar=_metavar(item.annotation),
+            instance_from_str=lambda words: words[0],
+            is_instance=lambda value: isinstance(value, str),
+            str_from_instance=lambda value: [value],
+        )
+        told = tyro.conf.arg(
+            help=" ".join((item.description or "").split()), help_behavior_hint=f"(default: {_shown(item.default)})"
+        )
+        tables.setdefault(path.rpartition(".")[0], {})[path] = Annotated[str, spec, told]
+    parts = {
+        part: Annotated[TypedDict(part, fields, total=False), tyro.conf.arg(name=part)]  # type: ignore[misc]
+        for part, fields in tables.items()
+        if part
+    }
+    return TypedDict("Fields", {**tables.get("", {}), **parts}, total=False)  # type: ignore[misc]
+
+
+def named_fields(values: dict) -> dict[str, str]:
+    """The flat names and texts of what flags_type() read."""
+    found: dict[str, str] = {}
+    for name, value in values.items():
+        found |= named_fields(value) if isinstance(value, dict) else {name: value}
+    return found
 
 
 def _shown(value) -> str:
-    """A value for an error's one line: short, whatever a file holds."""
-    return reprlib.repr(value)
+    """A field's value as its flag takes it."""
+    if isinstance(value, tuple):
+        return ",".join(map(str, value)) or "none"
+    return str(value).lower() if isinstance(value, bool) else "none" if value == "" else f"{value}"
+
+
+def _metavar(kind) -> str:
+    origin = get_origin(kind)
+    if origin is Literal:
+        return "|".join(get_args(kind))
+    if origin is Annotated:
+        return _metavar(get_args(kind)[0])
+    if origin is tuple:
+        return f"{_metavar(get_args(kind)[0])},..."
+    return {bool: "true|false", int: "INT", float: "NUM"}.get(kind, "TEXT")

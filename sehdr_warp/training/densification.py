@@ -15,18 +15,15 @@ from ..splatting import Rendering
 from ..splatting.training_step import add_gradient_statistics, add_position_noise
 from .config import Config, DensificationConfig
 
-SPLIT_SHRINK = 1.6
-"""The two halves of a split are this much smaller (3DGS: 0.8 times the number of halves)."""
+SPLIT_SHRINK = 1.6  # The two halves of a split are this much smaller (3DGS: 0.8 times the number of halves)
 SHORTEST_INTERVAL = 20
 """Iterations between changes are never fewer, however short the training: gradients need photos to be means of."""
 SHORTEST_RESET = 300
 """Where resets would come closer together they are left out: opacities would not recover in between."""
 MOST_COPIES = 51
 """A Gaussian is shared by at most this many at once, as in the authors' code: the binomial sums stay exact."""
-MOST_GROWTH = 1.0
-"""A change adds at most as many as there are: each then shares with one other in the mean."""
-SEED_STEP = 1_000_003
-"""Seeds of trainings are this far apart in the seeds of their noise, one for each iteration."""
+MOST_GROWTH = 1.0  # A change adds at most as many as there are: each then shares with one other in the mean
+SEED_STEP = 1_000_003  # Seeds of trainings are this far apart in the seeds of their noise, one for each iteration
 
 
 class Densification:

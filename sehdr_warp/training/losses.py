@@ -13,15 +13,12 @@ from ..splatting.clipped_residual import CodeScale, clipped_residual, code_value
 from ..splatting.ssim import image_distance, ssim
 from .config import LossConfig
 
-CODE = 1 / 255
-"""One step of an 8-bit photo."""
-MU = 5000.0
-"""Of the mu-law in which HDR images are compared."""
+CODE = 1 / 255  # One step of an 8-bit photo
+MU = 5000.0  # Of the mu-law in which HDR images are compared
 KNEE = 8.0
 """The code of 255 whose exposure is white / mu in the mu-law of photos: light below counts as light, above as its
 logarithm."""
-ANCHOR = 0.5
-"""What anchor_loss wants the unit exposure encoded as: the middle of the encoded range."""
+ANCHOR = 0.5  # What anchor_loss wants the unit exposure encoded as: the middle of the encoded range
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,7 @@ from ..field.radiance_field import RadianceField
 from ..splatting.training_step import adam_step, judge_step
 from .config import Config
 
-EPSILON = 1e-15
-"""3DGS: gradients of a single Gaussian are tiny, and must not drown in Adam's usual 1e-8."""
+EPSILON = 1e-15  # 3DGS: gradients of a single Gaussian are tiny, and must not drown in Adam's usual 1e-8
 
 
 class Adam(torch.optim.Adam):
@@ -40,18 +39,9 @@ class Adam(torch.optim.Adam):
             for parameter in group["params"]:
                 if parameter.grad is None:
                     continue
-                state = self.state[parameter]
-                adam_step(
-                    parameter.detach(),
-                    parameter.grad.contiguous(),
-                    state["exp_avg"],
-                    state["exp_avg_sq"],
-                    state["step"],
-                    skipped,
-                    rate=group["lr"],
-                    betas=group["betas"],
-                    epsilon=group["eps"],
-                )
+                given = parameter.detach(), parameter.grad.contiguous()
+                state = (self.state[parameter][key] for key in ("exp_avg", "exp_avg_sq", "step"))
+                adam_step(*given, *state, skipped, rate=group["lr"], betas=group["betas"], epsilon=group["eps"])
 
 
 def make_optimizer(field: RadianceField, config: Config, extent: float) -> Adam:

@@ -6,32 +6,61 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import asdict, dataclass
 from operator import attrgetter
 
+import numpy as np
 import torch
 
 from ..errors import InputError
 from ..field.exposure import exposure_times, is_seconds
-from ..scene import Scene
+from ..scene import Scene, View
+from ..scene.exposure import made_by_camera
 from ..splatting.threads import thread_count
 from .config import Config
 from .config_files import override_config
 from .densification import gaussian_budget
-from .initialization import base_time
+from .initialization import base_time, focus_distance, pixels_of, points_on_rays
 from .machine import pick_device
-from .plan_scene import SceneFacts, check_scene, measure_scene
+from .targets import largest_truth
 
-PASSES = 900
-"""Steps on each photo. A second look at the same photos teaches less and less, and in the end their noise."""
+PASSES = 900  # Steps on each photo. A second look at the same photos teaches less and less, and in the end their noise
 FEWEST_ITERATIONS = 3000
-CPU_SECONDS = 240.0
-"""What a training on a CPU may take, as far as CPU_FEWEST allows."""
+CPU_SECONDS = 240.0  # What a training on a CPU may take, as far as CPU_FEWEST allows
 CPU_FEWEST = 1000
 CPU_PIXEL, CPU_GAUSSIAN = 1.5e-6, 2.3e-6
 """Seconds of one core for each pixel and each Gaussian of a step, measured on two cores of an AMD EPYC."""
 REACH = 2.0**16
 """Brackets farther from the photos' exposure than this are black or white in all pixels of 8 bits and some headroom."""
 
+PROBES = 2000  # Places at which overlap and visibility are measured
+FEWEST_POINTS = 100  # With fewer sparse points places along the cameras' rays serve as probes
+FEWEST_PHOTOS = 3
+LEAST_OVERLAP = 0.02
+LEAST_CONTRAST = 1 / 255
+MOST_VIEWS = 64  # Photos that codes are read from, evenly spread; geometry is of all
+
 Choice = tuple[dict[str, object], str, str]
 """What a rule decides: fields of the config and their values, the choice in words, and the figures it rests on."""
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """Figures of a scene's training views; parts are of 1.
+
+    pixels: of all photos together. from_camera: whether a camera made the files. truths: photos with HDR truth.
+    points: sparse points. seen: mean number of photos whose field of view holds a probe.
+    overlap: part of the probes, or of places along the cameras' rays if that is more, that two photos show.
+    clipped, black: part of the pixels with a channel at white, with all at 0. contrast: deviation of all codes.
+    """
+
+    photos: int
+    pixels: int
+    from_camera: bool
+    truths: int
+    points: int
+    seen: float
+    overlap: float
+    clipped: float
+    black: float
+    contrast: float
 
 
 @dataclass(frozen=True)
@@ -114,6 +143,56 @@ def apply_plan(scene: Scene, config: Config, device: torch.device) -> tuple[Conf
     return config, None
 
 
+def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
+    """The facts of a scene with at least one training view; takes a second or so, draws its probes from a seed."""
+    views = scene.train_views
+    rng = np.random.default_rng(seed)
+    probes = drawn = points_on_rays(views, PROBES, focus_distance(views), rng)
+    if len(scene.points) >= FEWEST_POINTS:
+        count = min(PROBES, len(scene.points))
+        probes = np.asarray(scene.points)[rng.choice(len(scene.points), count, replace=False)]
+    shown, drawn = (np.array([pixels_of(points, view)[2] for view in views]).sum(0) for points in (probes, drawn))
+    figures = np.mean([_light(view) for view in views[:: -(-len(views) // MOST_VIEWS)]], axis=0)
+    clipped, black, mean, square = (float(figure) for figure in figures)
+    return SceneFacts(
+        photos=len(views),
+        pixels=sum(view.camera.width * view.camera.height for view in views),
+        from_camera=made_by_camera([view.source for view in views]),
+        truths=sum(view.hdr is not None for view in views),
+        points=len(scene.points),
+        seen=float(shown[shown > 0].mean()) if shown.any() else 0.0,
+        overlap=max(float((count >= 2).mean()) for count in (shown, drawn)),
+        clipped=clipped,
+        black=black,
+        contrast=float(np.sqrt(max(square - mean**2, 0.0))),
+    )
+
+
+def _light(view: View) -> tuple[float, float, float, float]:
+    """Parts of the pixels that are clipped and black, and the means of the encoded values and of their squares."""
+    image = view.image
+    clipped, black = (image >= 254.5 / 255).any(2).mean(), (image <= 0.5 / 255).all(2).mean()
+    return clipped, black, image.mean(dtype=np.float64), np.square(image, dtype=np.float64).mean()
+
+
+def check_scene(scene: Scene, facts: SceneFacts) -> None:
+    """Raises InputError for a scene that no training can make sense of."""
+    if facts.photos < FEWEST_PHOTOS:
+        problem = f"{facts.photos} training photos: depth and light cannot be told apart from so few"
+        remedy = f"take {FEWEST_PHOTOS} or more photos from different places, better 20"
+    elif facts.contrast < LEAST_CONTRAST:
+        spread = f"standard deviation {255 * facts.contrast:.2f} of 255"
+        problem = f"all photos show a single colour ({spread}): nothing to match"
+        remedy = "check that the files are the photos, and their exposure"
+    elif facts.overlap < LEAST_OVERLAP:
+        places = f"{facts.overlap:.1%} of the places that one shows"
+        problem = f"the photos share no view: {places} are in the field of view of another"
+        remedy = "check the poses and the axes' convention, or take photos that overlap by a half"
+    else:
+        return
+    raise InputError(scene.name, problem, remedy)
+
+
 def check_fields(scene: Scene, facts: SceneFacts, config: Config, given: Collection[str]) -> None:
     """Raises InputError, with both values, for fields that the user gave and the scene contradicts. given: names."""
 
@@ -130,11 +209,8 @@ def check_fields(scene: Scene, facts: SceneFacts, config: Config, given: Collect
             if not 1 / REACH <= time / base <= REACH:
                 problem = f"{time:.3g} s is {time / base:.3g} times the photos' {base:.3g} s"
                 refuse("fusion.exposures", problem, f"stay within 1/{REACH:.0f} and {REACH:.0f} times")
-    if {"loss.hdr_truth", "loss.linear_weight", "loss.hdr_weight"} & set(given) and not facts.truths:
-        problem = f"0 of {facts.photos} training photos have HDR truth"
-        for path in ("loss.hdr_truth", "loss.hdr_weight"):
-            if attrgetter(path)(config) and not config.loss.predictor:
-                refuse(path, problem, "take a scene with HDR truth, leave the field out, or use --predict-hdr")
+    if {"loss.hdr_truth", "loss.linear_weight", "loss.hdr_weight"} & set(given) and not config.loss.predictor:
+        largest_truth(scene, config.loss)
     if "densification.max_gaussians" in given and config.densification.max_gaussians < facts.points:
         problem = f"the scene starts from {facts.points} points"
         refuse("densification.max_gaussians", problem, f"use {facts.points} or more, or leave the field out")

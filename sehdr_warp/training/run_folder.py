@@ -16,28 +16,40 @@ mistaken for one. Nothing is pickled.
 import hashlib
 import json
 import math
-import reprlib
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+from pydantic import BaseModel, Field, ValidationError
 from torch import Tensor
 
 from ..errors import InputError, SehdrError
 from ..field.confidence import Evidence
 from ..field.radiance_field import RadianceField
-from ..files import atomic_folder, atomic_path, write_json, writing
+from ..files import atomic_folder, atomic_path, read_json, write_json, writing
 from ..response import Response
 from ..scene import Camera, Scene
 from ..scene.images import MAX_PIXELS
 from .config import Config
-from .config_files import config_to_dict, read_config_json
+from .config_files import config_from_dict, config_to_dict, field_and_problem
 
-FORMAT = 2
-"""Version of what a run holds; a reader refuses others."""
+FORMAT = 2  # Version of what a run holds; a reader refuses others
 TENSORS, VALUES = "state.safetensors", "checkpoint.json"
 _REMEDY = "the run is damaged: train again"
 _OLDER = "remove this folder to use an older checkpoint, or train again"
+
+
+class _RunValues(BaseModel):
+    scene: str
+    data: dict
+    base_time: Annotated[float, Field(gt=0, le=1e300)]
+    response: dict
+
+
+class _CheckpointValues(BaseModel):
+    iteration: Annotated[int, Field(ge=0)]
+    seconds: Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
@@ -92,15 +104,12 @@ class RunFolder:
 
     def require(self) -> None:
         """Raises InputError if this is not the folder of a training."""
-        problem = None
-        if not self.path.is_dir():
-            problem = "no such folder"
-        elif not any(self.path.iterdir()):
+        if self.config.is_file():
+            return
+        problem = f"is not a run (no {self.config.name})" if self.path.is_dir() else "no such folder"
+        if self.path.is_dir() and not any(self.path.iterdir()):
             problem = "is an empty folder"
-        elif not self.config.is_file():
-            problem = f"is not a run (no {self.config.name})"
-        if problem:
-            raise InputError(self.path, problem, "give the folder that `sehdr-warp train --out` wrote")
+        raise InputError(self.path, problem, "give the folder that `sehdr-warp train --out` wrote")
 
     def begin(self, scene: Scene, config: Config, field: RadianceField, data: dict, plan: dict | None) -> None:
         """Makes the folder, or removes the run in it, and writes what does not change during the training; config.json
@@ -132,21 +141,11 @@ class RunFolder:
     def read_config(self) -> Config:
         """The config of the training."""
         self.read_info()
-        return read_config_json(self.config)
+        return config_from_dict(_read_json(self.config), self.config)
 
     def read_info(self) -> dict:
         """What run.json holds; InputError also for a run of another version's format."""
-        info = _read_json(self.info)
-        _refuse_format(self.path, info)
-        for name, kind in (("scene", str), ("data", dict), ("base_time", int | float), ("response", dict)):
-            if name not in info:
-                raise InputError(self.info, f"lacks the field {name}", _REMEDY)
-            if not isinstance(info[name], kind):
-                raise InputError(self.info, f"{name} = {reprlib.repr(info[name])} is of the wrong type", _REMEDY)
-        time = info["base_time"]
-        if not 0 < time < math.inf or time > 1e300:
-            problem = f"base_time = {reprlib.repr(time)} is not a positive number of seconds"
-            raise InputError(self.info, problem, _REMEDY)
+        info = _read_values(self.info, _RunValues)
         try:
             Response.from_dict(info["response"])
         except SehdrError as error:
@@ -287,12 +286,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
     from safetensors import SafetensorError
     from safetensors.torch import load
 
-    values = _read_json(path / VALUES, _OLDER)
-    _refuse_format(path / VALUES, values)
-    for name, kind in (("iteration", int), ("seconds", int | float)):
-        if not isinstance(values.get(name), kind) or not 0 <= values[name] < math.inf:
-            problem = f"{name} = {reprlib.repr(values.get(name))} is not a number from 0"
-            raise InputError(path / VALUES, problem, _OLDER)
+    values = _read_values(path / VALUES, _CheckpointValues, _OLDER)
     try:
         data = (path / TENSORS).read_bytes()
         if hashlib.sha256(data).hexdigest() != values.get("sha256"):
@@ -316,13 +310,8 @@ def first_not_finite(tensors: dict[str, Tensor]) -> str | None:
 def describe_scene(scene: Scene) -> dict:
     """What scene.json holds."""
     views = [
-        {
-            "name": view.name,
-            "split": view.split,
-            "exposure_time": view.exposure_time,
-            "camera": view.camera.to_dict(),
-            "has_hdr": view.hdr is not None,
-        }
+        {name: getattr(view, name) for name in ("name", "split", "exposure_time")}
+        | {"camera": view.camera.to_dict(), "has_hdr": view.hdr is not None}
         for view in scene.views
     ]
     return {
@@ -351,22 +340,23 @@ def _is_sound(path: Path) -> bool:
         return False
 
 
-def _refuse_format(path: Path, values: dict) -> None:
-    """Raises InputError for values of another format than this version's."""
-    found = values.get("format")
-    if found == 1:
-        raise InputError(path, "was made by version 0.1, whose runs this version does not read", "train again")
-    if found != FORMAT:
-        raise InputError(path, f"format = {reprlib.repr(found)} is not {FORMAT}", _REMEDY)
+def _read_values(path: Path, kind: type[BaseModel], remedy: str = _REMEDY) -> dict:
+    """The values in a file of this version's format, checked to be of a kind."""
+    values = _read_json(path, remedy)
+    if values.get("format") == 1:
+        problem = "was made by version 0.1, whose runs this version does not read"
+        raise InputError(path.parent, problem, "train again")
+    if values.get("format") != FORMAT:
+        raise InputError(path, f"format = {values.get('format')!r:.60} is not {FORMAT}", remedy)
+    try:
+        kind.model_validate(values)
+    except ValidationError as error:
+        raise InputError(path, field_and_problem(error)[1], remedy) from None
+    return values
 
 
 def _read_json(path: Path, remedy: str = _REMEDY) -> dict:
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", remedy) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(path, f"not valid JSON ({error})", remedy) from None
-    if not isinstance(values, dict):
-        raise InputError(path, "is not a JSON object", remedy)
-    return values
+        return read_json(path)
+    except InputError as error:
+        raise InputError(path, error.problem, remedy) from None

@@ -4,18 +4,21 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from ..errors import InputError, SehdrError
+from ..evaluation.metrics import psnr
+from ..evaluation.protocols import tone_map
+from ..field.radiance_field import RadianceField
 from ..response import Response
-from ..scene import Scene
+from ..scene import Scene, View
 from ..splatting.memory import memory_told
 from .config import Config
-from .config_files import config_to_dict, load_config, override_config
-from .heldout import evaluate_views
+from .config_files import config_fields, load_config, override_config
 from .initialization import choose_response, make_field
 from .machine import interruptible, machine_figures, pick_device, torch_settings
 from .plan import apply_plan
@@ -26,8 +29,8 @@ from .trainer import Trainer
 
 log = logging.getLogger(__name__)
 
-FALL = 0.2
-"""Decibels by which the last held-out figure may be below the best before it is told."""
+BEST = 100.0  # Identical images count this many dB, so that a mean over views stays a number
+FALL = 0.2  # Decibels by which the last held-out figure may be below the best before it is told
 
 
 class Step:
@@ -37,10 +40,10 @@ class Step:
     loss, psnr (dB, of the step's photo) and gaussians are read when they are asked for, until the next step.
     """
 
-    def __init__(self, training: "Training", seconds_left: float | None):
+    def __init__(self, training: "Training"):
         self._training = training
-        self.iteration, self.total = training.iteration, training.total
-        self.seconds, self.seconds_left = training.seconds, seconds_left
+        self.iteration, self.total, self.seconds = training.iteration, training.total, training.seconds
+        self.seconds_left: float | None = None
 
     @property
     def loss(self) -> float:
@@ -99,14 +102,14 @@ class Training:
         self.folder = RunFolder(out)
         self.device = pick_device(device)
         make_writer = _summary_writer() if tensorboard else None
-        config = None if config is None else as_config(config)
+        config = as_config(config)
         self.seconds = 0.0
         with memory_told(self.device, lambda: _sizes(scene)):
             if self.folder.check(resume=resume, overwrite=overwrite):
                 self.scene = scene
                 self.trainer = self._continue(config)
             else:
-                self.trainer = self._begin(scene, config or load_config(), data or {})
+                self.trainer = self._begin(scene, config or Config(), data or {})
         self.config = self.trainer.config
         self.total = self.config.schedule.iterations
         self._first = self.iteration
@@ -176,18 +179,19 @@ class Training:
                 self._evaluate()
             if save and iteration < self.total:
                 self._checkpoint()
+        step = Step(self)
         if self._writer is not None and iteration % max(1, self.total // 200) == 0:
-            step = Step(self, None)
             self._log("train", {name: getattr(step, name) for name in ("loss", "psnr", "gaussians")})
         done = iteration - self._first - 1
         if done == 0:  # It compiled kernels, which says nothing of the pace.
-            return Step(self, None)
+            return step
         self._pace += (self.seconds - before - self._pace) / min(done, 100)
         # With all the Gaussians that it may have, a step takes about twice as long as at the start.
         strategy = self.trainer.densification
         growing = self.trainer.field.gaussians.count < strategy.most
         ahead = max(0.0, 1 - iteration / strategy.stop) if growing else 0.0
-        return Step(self, self._pace * (1 + ahead) * (self.total - iteration))
+        step.seconds_left = self._pace * (1 + ahead) * (self.total - iteration)
+        return step
 
     def _wait(self) -> None:
         """Lets the device finish, as part of the training's time."""
@@ -324,15 +328,33 @@ def train(
     return training.run
 
 
-def as_config(config: Config | str | Path | Mapping) -> Config:
-    """A config, or the one of a preset's name or file, or the default preset's with some fields replaced."""
-    if isinstance(config, Config):
+def as_config(config: object) -> Config | None:
+    """A config or None, or the config of a preset's name or file, or the default preset's with some fields replaced."""
+    if config is None or isinstance(config, Config):
         return config
     if isinstance(config, str | Path):
         return load_config(config)
     if isinstance(config, Mapping):
-        return load_config("default", dict(config))
+        return override_config(Config(), dict(config), "overrides")
     raise InputError("config", f"is {type(config).__name__}", "give a preset's name, a dict of fields or a Config")
+
+
+@torch.no_grad()
+def evaluate_views(field: RadianceField, views: tuple[View, ...], degree: int) -> dict[str, float]:
+    """Means over views, in dB, of psnr_ldr (simulated photo against photo, where the mask counts) and, over the views
+    with HDR truth, of psnr_mu (mu-law, protocol "gt-max"). Empty without views."""
+    device = field.gaussians.means.device
+    scores: dict[str, list[float]] = {}
+    for view in views:
+        mask = None if view.mask is None else torch.tensor(view.mask, device=device)
+        photo = torch.tensor(view.image, device=device)
+        predicted = field.render_ldr(view.camera, view.exposure_time, degree=degree)
+        scores.setdefault("psnr_ldr", []).append(min(psnr(predicted, photo, mask), BEST))
+        if view.hdr is not None:
+            hdr = field.render(view.camera, degree=degree).hdr
+            images = tone_map("gt-max", hdr, torch.tensor(view.hdr, device=device), mask)
+            scores.setdefault("psnr_mu", []).append(min(psnr(*images, mask), BEST))
+    return {name: sum(values) / len(values) for name, values in scores.items()}
 
 
 def with_predictions(scene: Scene, config: Config, response: Response) -> Scene:
@@ -349,15 +371,8 @@ def _sizes(scene: Scene, trainer: Trainer | None = None) -> tuple[int, int, int]
 
 
 def _first_difference(saved: Config, given: Config) -> str:
-    old, new = config_to_dict(saved), config_to_dict(given)
-    for part, values in old.items():
-        one = {part: (values, new[part])}
-        if isinstance(values, dict):
-            one = {f"{part}.{name}": (value, new[part][name]) for name, value in values.items()}
-        for path, (before, after) in one.items():
-            if before != after:
-                return f"{path} = {before!r}, but {after!r} was asked for"
-    return "the config differs"
+    both = ((path, attrgetter(path)(saved), attrgetter(path)(given)) for path, _ in config_fields())
+    return next(f"{path} = {old!r}, but {new!r} was asked for" for path, old, new in both if old != new)
 
 
 def _summary_writer() -> type:

@@ -28,10 +28,8 @@ from .optimizer import (
 )
 from .targets import TrainingView, ViewStack, largest_truth, training_views
 
-CHECK_EVERY = 20
-"""Iterations between looks at the count of skipped steps, each of which waits for the device."""
-MOST_SKIPPED = 20
-"""Steps with a loss or gradient that is not finite are skipped; more than so many end the training."""
+CHECK_EVERY = 20  # Iterations between looks at the count of skipped steps, each of which waits for the device
+MOST_SKIPPED = 20  # Steps with a loss or gradient that is not finite are skipped; more than so many end the training
 
 
 class Trainer:

@@ -53,10 +53,5 @@ def test_what_is_relative_needs_photos():
 
 @pytest.mark.parametrize("time", [0.0, -1.0, math.nan, math.inf])
 def test_bad_times(time):
-    for call in (
-        lambda: exposure_times(time),
-        lambda: bracket_log_radiance(torch.zeros(3), [1.0, time], 1.0),
-        lambda: bracket_log_radiance(torch.zeros(3), [1.0], time),
-    ):
-        with pytest.raises(SehdrError, match=str(time)):
-            call()
+    with pytest.raises(SehdrError, match=str(time)):
+        exposure_times(time)

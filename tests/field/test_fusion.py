@@ -157,18 +157,6 @@ def test_highlights_keep_a_gradient():
         assert (log_base.grad > 0.01).all()
 
 
-def test_chunks_do_not_change_the_result(monkeypatch):
-    from sehdr_warp.field import fusion as module
-
-    whole = make_fusion()
-    log_base = log_radiance(whole, 101).requires_grad_()
-    expected = torch.autograd.grad(whole.exact(log_base).sum(), [log_base, *whole.parameters()])
-    monkeypatch.setattr(module, "EXACT_CHUNK", 17)
-    given = torch.autograd.grad(whole.exact(log_base).sum(), [log_base, *whole.parameters()])
-    for a, b in zip(given, expected, strict=True):
-        torch.testing.assert_close(a, b)
-
-
 def test_radiance_scale():
     response = response_by_name("reinhard-gamma")
     log_base = torch.zeros(2, 3, dtype=torch.float64)

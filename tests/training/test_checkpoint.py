@@ -66,7 +66,7 @@ def test_what_a_killed_writer_left_is_no_checkpoint(folder):
     assert not left.exists()
 
 
-@pytest.mark.parametrize("text,words", [("{", "JSON"), ("[]", "JSON object"), ('{"format": 99}', "format = 99")])
+@pytest.mark.parametrize("text,words", [("{", "JSON"), ("[]", "JSON list"), ('{"format": 99}', "format = 99")])
 def test_bad_values_are_named(folder, text, words):
     path = folder.write_checkpoint(*state(1), kept=1)
     (path / "checkpoint.json").write_text(text)

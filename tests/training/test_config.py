@@ -8,23 +8,16 @@ from pydantic import ValidationError
 
 import sehdr_warp
 from sehdr_warp.errors import InputError
-from sehdr_warp.training.config import (
-    Config,
-    ConfigError,
-    FusionConfig,
-    LossConfig,
-    ModelConfig,
-    ResponseConfig,
-)
-from sehdr_warp.training.config_fields import GONE, config_fields
+from sehdr_warp.training.config import Config, ConfigError, FusionConfig, LossConfig, ModelConfig, ResponseConfig
 from sehdr_warp.training.config_files import (
+    GONE,
     config_as_toml,
+    config_fields,
     config_from_dict,
     config_to_dict,
     load_config,
     override_config,
     preset_names,
-    read_config_json,
     value_of,
 )
 
@@ -141,9 +134,8 @@ def test_an_override_is_blamed_by_its_flag_and_never_the_file():
 def test_a_run_of_an_earlier_version_is_told_so(tmp_path):
     values = config_to_dict(Config())
     values["schedule"]["stated_for"] = 30_000
-    (tmp_path / "config.json").write_text(json.dumps(values))
     with pytest.raises(InputError, match=r"config.json: schedule.stated_for = 30000 of an earlier version is gone"):
-        read_config_json(tmp_path / "config.json")
+        config_from_dict(values, tmp_path / "config.json")
 
 
 @pytest.mark.parametrize(

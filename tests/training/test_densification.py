@@ -9,13 +9,7 @@ import torch
 from sehdr_warp.field.gaussians import PARAMETER_NAMES, Gaussians
 from sehdr_warp.splatting import rasterize
 from sehdr_warp.training.config_files import load_config
-from sehdr_warp.training.densification import (
-    GradientDensification,
-    _draw,
-    _relocation_sums,
-    make_densification,
-    rotate,
-)
+from sehdr_warp.training.densification import GradientDensification, _draw, _relocation_sums, make_densification, rotate
 
 EXTENT = 2.0
 

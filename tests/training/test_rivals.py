@@ -114,10 +114,7 @@ def test_weights_mix_photos_and_truth(scene):
 
 def test_photos_of_no_weight_teach_nothing(scene):
     views = tuple(dataclasses.replace(view, codes=view.codes[::-1].copy()) for view in scene.views)
-    trainers = [
-        trainer_of(scene, quick("truth")),
-        trainer_of(dataclasses.replace(scene, views=views), quick("truth")),
-    ]
+    trainers = [trainer_of(scene, quick("truth")), trainer_of(dataclasses.replace(scene, views=views), quick("truth"))]
     for trainer in trainers:
         for _ in range(5):
             trainer.step()

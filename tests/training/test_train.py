@@ -84,14 +84,7 @@ def test_a_scene_without_points_starts_from_drawn_ones(tmp_path):
     assert run.metrics()[-1]["psnr_ldr"] > 20
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"densification.budget": 0.1},
-        {"densification.max_gaussians": 50},
-    ],
-)
+@pytest.mark.parametrize("options", [{}, {"densification.budget": 0.1}, {"densification.max_gaussians": 50}])
 def test_more_start_points_than_the_budget_stay_as_many_and_are_told(scene, tmp_path, caplog, options):
     """60 points; 0.1 times the square root of six photos of 32 x 32 pixels is 7."""
     caplog.set_level("INFO")
