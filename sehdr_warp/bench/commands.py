@@ -1,4 +1,4 @@
-"""The command line of `sehdr-warp bench`: what may be asked for, and the call. torch is imported when it runs."""
+"""The command line of `sehdr-warp bench`. torch is imported when it runs."""
 
 import os
 from dataclasses import dataclass
@@ -31,7 +31,9 @@ class Timed(Output):
     """Timed runs of each variant; slow ones have fewer on the CPU."""
 
     def timing(self) -> dict:
-        return {"device": _device(self.device), "repetitions": positive("--repetitions", self.repetitions)}
+        from ..training.train import pick_device
+
+        return {"device": pick_device(self.device), "repetitions": positive("--repetitions", self.repetitions)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,13 +46,13 @@ class Kernels(Timed):
     """Gaussians@WIDTHxHEIGHT such as 20k@200x200, separated by commas."""
 
     def measure(self):
-        from .kernels import COLUMNS, bench_kernels
+        from .kernels import bench_kernels
         from .splats import parse_size
 
         timing = self.timing()
         default = {"cuda": "50k@400x400,200k@800x800,1M@1600x1200", "cpu": "5k@200x200,20k@200x200"}
         sizes = [parse_size(item) for item in (self.sizes or default[timing["device"].type]).split(",")]
-        return bench_kernels(sizes, numbers("--channels", self.channels, int, least=1), **timing), COLUMNS
+        return bench_kernels(sizes, numbers("--channels", self.channels, int, least=1), **timing)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,11 +66,11 @@ class Step(Timed):
 
     def measure(self):
         from .splats import parse_size
-        from .step import COLUMNS, bench_step
+        from .step import bench_step
 
         timing = self.timing()
         size = parse_size(self.size or {"cuda": "100k@400x400", "cpu": "20k@200x200"}[timing["device"].type])
-        return bench_step(size, presets=_words(self.preset), **timing), COLUMNS
+        return bench_step(size, presets=_words(self.preset), **timing)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,30 +81,9 @@ class Scale(Timed):
     """Every second point, without the largest."""
 
     def measure(self):
-        from .scale import COLUMNS, bench_scale
+        from .scale import bench_scale
 
-        return bench_scale(small=self.small, **self.timing()), COLUMNS
-
-
-@dataclass(frozen=True, kw_only=True)
-class Training(Output):
-    """Train plain 3DGS on our kernels and with gsplat on equal terms, and compare."""
-
-    data: tyro.conf.Positional[str]
-    """Photos, as for train."""
-    iterations: int = 30_000
-    """Training steps of both."""
-    max_size: int | None = None
-    """Longest side of the photos, in pixels; larger ones are reduced."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
-
-    def measure(self):
-        from ..scene import load_scene
-        from .training import COLUMNS, bench_training
-
-        device, iterations = _device(self.device), positive("--iterations", self.iterations)
-        return bench_training(load_scene(self.data, max_size=self.max_size), device, iterations=iterations), COLUMNS
+        return bench_scale(small=self.small, **self.timing())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +120,7 @@ class Quality(Output):
         import torch
 
         from .jobs import plan_jobs
-        from .quality import COLUMNS, run_jobs
+        from .quality import run_jobs
         from .results import new_result
 
         device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")
@@ -163,7 +144,7 @@ class Quality(Output):
         for job, row in zip(jobs, rows, strict=True):
             error = row.get("error")
             result["checks"].append({"what": job.label, "passed": error is None, "error": error})
-        return result, COLUMNS
+        return result
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,10 +161,10 @@ class Responses(Output):
     """Longest side of the scenes' photos, in pixels."""
 
     def measure(self):
-        from .response import COLUMNS, bench_response
+        from .response import bench_response
 
         exposures = positive("--exposures", self.exposures)
-        return bench_response(self.data, _words(self.curves), exposures=exposures, max_size=self.max_size), COLUMNS
+        return bench_response(self.data, _words(self.curves), exposures=exposures, max_size=self.max_size)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,7 +183,6 @@ class Bench:
         Annotated[Kernels, tyro.conf.subcommand("kernels")]
         | Annotated[Step, tyro.conf.subcommand("step")]
         | Annotated[Scale, tyro.conf.subcommand("scale")]
-        | Annotated[Training, tyro.conf.subcommand("training")]
         | Annotated[Quality, tyro.conf.subcommand("quality")]
         | Annotated[Responses, tyro.conf.subcommand("response")]
         | Annotated[Report, tyro.conf.subcommand("report")]
@@ -224,13 +204,7 @@ def run_bench(command: Bench) -> None:
 
     if asked.json is not None:
         check_absent(asked.json, asked.overwrite)
-    finish(*asked.measure(), asked.json, asked.overwrite)
-
-
-def _device(name: str | None):
-    from ..training.train import pick_device
-
-    return pick_device(name)
+    finish(asked.measure(), asked.json, asked.overwrite)
 
 
 def _words(text: str) -> tuple[str, ...]:

@@ -16,8 +16,7 @@ from ..training.config import REFERENCE_ITERATIONS, Config
 from ..training.config_files import config_to_dict, load_config, override_config, preset_names
 
 LOG = logging.getLogger(__name__)
-FORMAT = 3
-"""Version of a job and of its result; others are run again."""
+FORMAT = 3  # Of a job and of its result; others are run again.
 RESULT, FAILURE = "result.json", "failure.json"
 TESTS, FIRST_TEST = 16, 100
 """A training tests its held-out views this often, at iterations spaced evenly on a log scale from 1/100 of all."""
@@ -55,7 +54,6 @@ class Job:
         return f"{where} {config['method']} {config['response']} seed {config['seed']}"
 
     def folder(self, out: Path) -> Path:
-        """Readable, with the key at its end."""
         return out / "jobs" / f"{re.sub(r'[^A-Za-z0-9.]+', '-', self.label)[:100].strip('-')}-{self.key}"
 
     def result(self, out: Path) -> dict | None:
@@ -81,29 +79,25 @@ def plan_jobs(
     """Every combination. Methods that learn the response have one job for known and blind together; those that take
     nothing from photos have none that is blind.
 
-    Args:
-        scenes: folders with HDR truth, or names that load_scene knows. methods: presets, or TOML files.
-        curves: responses that expose the truth. exposures: places in the ladder.
-        iterations: None is the preset's own, or its plan's. device: kind, "cpu" or "cuda". lpips: whether it is judged.
+    scenes: folders with HDR truth, or names that load_scene knows. methods: presets, or TOML files. curves: responses
+    that expose the truth. exposures: places in the ladder. iterations: None is the preset's own, or its plan's. device:
+    kind, "cpu" or "cuda". lpips: whether it is judged.
 
-    Raises:
-        InputError, SehdrError: for a preset, field, curve or folder that cannot be used, before anything runs.
+    Raises SehdrError for a preset, field, curve or folder that cannot be used, before anything runs.
     """
-    for asked, known, what in (
-        (exposures, range(EXPOSURES), "exposure {} is not one of 0 to 4"),
-        (responses, (KNOWN, BLIND), "response {!r} is not one of known, blind"),
-    ):
-        for item in asked:
-            if item not in known:
-                raise SehdrError(what.format(item))
-    for curve in curves:
-        for note in response_by_name(curve).notes:
-            LOG.info("%s", note)
+    for item in set(exposures) - set(range(EXPOSURES)):
+        raise SehdrError(f"exposure {item} is not one of 0 to {EXPOSURES - 1}")
+    for item in set(responses) - {KNOWN, BLIND}:
+        raise SehdrError(f"response {item!r} is not one of {KNOWN}, {BLIND}")
+    for note in (note for curve in curves for note in response_by_name(curve).notes):
+        LOG.info("%s", note)
     found = {place: {"name": _scene_name(place), "sha256": _digest(place)} for place in dict.fromkeys(scenes)}
-    if len({scene["name"] for scene in found.values()}) < len(found):
-        raise SehdrError("two scenes have one name; rename a folder so that tables can tell them apart")
-    if len({Path(method).stem for method in methods}) < len(methods):
-        raise SehdrError("two methods have one name; rename a TOML file so that tables can tell them apart")
+    for what, names, file in (
+        ("scenes", [scene["name"] for scene in found.values()], "folder"),
+        ("methods", [Path(method).stem for method in methods], "TOML file"),
+    ):
+        if len(set(names)) < len(names):
+            raise SehdrError(f"two {what} have one name; rename a {file} so that tables can tell them apart")
     jobs = []
     for method, seed, place, curve, exposure, response in product(
         methods, *(dict.fromkeys(items) for items in (seeds, scenes, curves, exposures, responses))

@@ -1,7 +1,6 @@
 """`bench kernels`: the whole differentiable splat (project, order, bin, blend; colors given), timed and checked."""
 
 import logging
-import math
 from collections.abc import Callable, Sequence
 from itertools import product
 
@@ -30,15 +29,10 @@ IMAGE_BOUND, GRADIENT_BOUND = 1e-4, 1e-3
 make most of it; a wrong formula or a lost Gaussian is far beyond."""
 REFERENCE_GAUSSIANS = 4000
 """Scenes of at most so many Gaussians are checked themselves, larger ones on a smaller one of the same density."""
-COLUMNS = {
-    "Gaussians=gaussians": ",d", "width": "d", "height": "d", "C=channels": "d", "pass": "",
-    "rasterizer=implementation": "", "median ms=median_ms": ".3f", "p90 ms=p90_ms": ".3f", "n=repetitions": "d",
-    "peak MiB=peak_memory_bytes": "MiB", "ours / this=ours_over_this": ".3f",
-}  # fmt: skip
 
 
 def bench_kernels(sizes: Sequence[Size], channels: Sequence[int], device: torch.device, *, repetitions: int) -> dict:
-    """Every combination of size and channels, forward, and forward and backward; a result."""
+    """A result: every combination of size and channels, forward, and forward and backward."""
     result = new_result("kernels", device, {"device": str(device), "repetitions": repetitions})
     peer = note_missing(result, device)
     for size, count in product(sizes, channels):
@@ -56,7 +50,6 @@ def render(scene: SplatScene) -> torch.Tensor:
 
 
 def render_reference(scene: SplatScene) -> torch.Tensor:
-    """The plain torch rasterizer, in the scene's own precision and on its device."""
     return rasterize_reference(*scene.arguments).image
 
 
@@ -106,10 +99,9 @@ def _compared(name: str, against: str, ours: list[torch.Tensor], truth: list[tor
 
 
 def _difference(value: torch.Tensor, other: torch.Tensor) -> float:
-    """|value - other| / |other| over the whole tensor, in float64; infinite where a number is not finite."""
+    """|value - other| / |other| over the whole tensor, in float64."""
     value, other = value.detach().double().cpu(), other.detach().double().cpu()
-    difference = float((value - other).norm() / other.norm().clamp_min(1e-300))
-    return difference if math.isfinite(difference) else math.inf
+    return float((value - other).norm() / other.norm().clamp_min(1e-300))
 
 
 def _recorded(scene: SplatScene, cotangent: torch.Tensor | None) -> Callable[[], list[torch.Tensor]]:

@@ -27,14 +27,8 @@ from .timing import Variant, forget_peaks, time_variants
 
 LOG = logging.getLogger(__name__)
 WARM_UP_ITERATIONS = 30
-"""Of a training that is thrown away before the first of its kind in a process: kernels are compiled and loaded, on a
-GPU steps are recorded. All schedules scale with the length, so every part of a training is in it."""
-LONGEST_DAYS = 30
-COLUMNS = {
-    "scene": "", "curve": "", "exposure": "d", "method": "", "response": "", "seed": "d", "gt-max dB=gt_max": ".2f",
-    "aligned dB=aligned": ".2f", "SSIM=ssim": ".4f", "LDR dB=ldr": ".2f", "clipped=clipped": ".2f",
-    "well-exposed=well_exposed": ".2f", "seconds": ".1f", "MiB=peak_memory_bytes": "MiB", "Gaussians=gaussians": ",d",
-}  # fmt: skip
+"""Of a training that is thrown away before the first of its kind in a process: kernels are compiled, steps recorded.
+All schedules scale with the length, so every part of a training is in it."""
 _warm: set[str] = set()
 
 
@@ -50,10 +44,8 @@ def run_jobs(
     """Runs the jobs that have no result in out/jobs, and returns a row for each job of the list: its result, or its
     label and error.
 
-    Args:
-        device: kind, "cpu" or "cuda". at_once: trainings at one time; more than one, or any on SLURM, by submitit.
-        slurm: parameters of SLURM jobs such as {"partition": "gpu"}, None for this machine.
-        lpips: folder of weights.
+    device: kind, "cpu" or "cuda". at_once: trainings at one time; more than one, or any on SLURM, by submitit. slurm:
+    parameters of SLURM jobs such as {"partition": "gpu"}, None for this machine. lpips: folder of weights.
     """
     open_jobs = [job for job in jobs if job.result(out) is None]
     LOG.info("%d jobs, %d of them to do", len(jobs), len(open_jobs))
@@ -80,7 +72,7 @@ def row_of(result: dict) -> dict:
     return {
         "scene": config["scene"]["name"],
         **{name: config[name] for name in names},
-        "iterations": figures["iterations"],
+        **{name: figures[name] for name in ("iterations", "gaussians", "peak_memory_bytes", "renders_per_second")},
         "gt_max": hdr["gt-max"]["psnr_mu"],
         "self_max": hdr["self-max"]["psnr_mu"],
         "aligned": hdr["aligned"]["psnr_mu"],
@@ -94,9 +86,6 @@ def row_of(result: dict) -> dict:
         "confidence": figures["confidence"]["spearman_log2"],
         "chosen": figures["response"],
         "seconds": figures["train_seconds"],
-        "peak_memory_bytes": figures["peak_memory_bytes"],
-        "gaussians": figures["gaussians"],
-        "renders_per_second": figures["renders_per_second"],
         "shared_by": result["shared_by"],
         "tests": [[line["seconds"], line["psnr_mu"]] for line in result["curve"] if line.get("psnr_mu") is not None],
     }
@@ -107,16 +96,14 @@ def _submit(jobs, out: Path, device: str, at_once: int, slurm: dict | None, lpip
     try:
         import submitit
     except ImportError:
-        raise SehdrError(
-            "submitit starts several jobs at once and is not installed; pip install 'sehdr-warp[slurm]', or take "
-            "--jobs 1"
-        ) from None
+        problem = "submitit starts several jobs at once and is not installed"
+        raise SehdrError(f"{problem}; pip install 'sehdr-warp[slurm]', or take --jobs 1") from None
     gpus = torch.cuda.device_count() if device == "cuda" and slurm is None else 0
     shared = -(-at_once // gpus) if gpus else at_once if slurm is None else 1
     workers = []
     for index in range(at_once):
         executor = submitit.AutoExecutor(folder=out / "logs", cluster="local" if slurm is None else "slurm")
-        executor.update_parameters(timeout_min=LONGEST_DAYS * 24 * 60, name="sehdr-warp")
+        executor.update_parameters(timeout_min=30 * 24 * 60, name="sehdr-warp")
         if gpus:
             executor.update_parameters(gpus_per_node=1, visible_gpus=[index % gpus])
         elif slurm is not None:
@@ -167,11 +154,11 @@ def _write_failure(folder: Path, error: str) -> None:
 def run_job(job: Job, folder: Path, device: str, lpips: str | None) -> dict:
     """Trains, evaluates and returns the result as it is to be written. Scenes, photos and kernels stay for the next.
 
-    Raises:
-        SehdrError: where the scene has no truth, the training diverges, or a file cannot be used.
+    Raises SehdrError where the scene has no truth, the training diverges, or a file cannot be used.
     """
     config, out = job.config, folder / "run"
-    scene, training = exposed(job), config_from_dict(job.config["training"], job.label)
+    scene = exposed(job.place, config["scene"]["max_size"], config["curve"], config["exposure"])
+    training = config_from_dict(config["training"], job.label)
     # A method that learns from photos alone sees no truth in the training views.
     views = tuple(replace(view, hdr=None) if view.split == "train" else view for view in scene.views)
     shown = scene if config["sees_truth"] else replace(scene, views=views)
@@ -182,11 +169,8 @@ def run_job(job: Job, folder: Path, device: str, lpips: str | None) -> dict:
     peak = torch.cuda.max_memory_allocated(device) if device.startswith("cuda") else None
     figures = evaluate(run, scene, lpips_weights=lpips if config["lpips"] else None)
     figures.pop("views")
-    figures |= {
-        "response": run.response.name,
-        "peak_memory_bytes": peak,
-        "renders_per_second": _render_rate(run, scene),
-    }
+    figures |= {"response": run.response.name, "peak_memory_bytes": peak}
+    figures["renders_per_second"] = _render_rate(run, scene)
     curve = run.metrics()
     shutil.rmtree(out, ignore_errors=True)
     return {"format": FORMAT, "key": job.key, "config": config, "figures": figures, "curve": curve}
@@ -211,24 +195,17 @@ def _render_rate(run, scene: Scene) -> float:
     return 1e3 / time_variants({"render": variant}, run.device, budget=1.0)["render"]["mean_ms"]
 
 
-def exposed(job: Job) -> Scene:
-    """The scene as the job's camera took it, with its truth."""
-    config = job.config
-    return _exposed(job.place, config["scene"]["max_size"], config["curve"], config["exposure"])
-
-
 @lru_cache(maxsize=8)
-def _exposed(place: str, max_size: int | None, curve: str, exposure: int) -> Scene:
+def exposed(place: str, max_size: int | None, curve: str, exposure: int) -> Scene:
+    """A scene with its truth, as a job's camera took it: by a curve, at a place in the ladder of exposures."""
     truth, response = _true_scene(place, max_size), response_by_name(curve)
     return expose(truth, response, exposure_ladder(truth, response, EXPOSURES, FACTOR)[exposure])
 
 
 @lru_cache(maxsize=4)
 def _true_scene(place: str, max_size: int | None) -> Scene:
-    """A scene with HDR truth in every view; raises InputError for one without."""
     scene = load_scene(place, max_size=max_size, response="srgb")
-    for view in scene.views:
-        if view.hdr is None:
-            problem = f"view {view.name} has no HDR truth"
-            raise InputError(place, problem, "only scenes with truth in every view can be benchmarked")
+    for view in (view for view in scene.views if view.hdr is None):
+        problem = f"view {view.name} has no HDR truth"
+        raise InputError(place, problem, "only scenes with truth in every view can be benchmarked")
     return scene

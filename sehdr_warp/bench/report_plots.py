@@ -1,64 +1,62 @@
 """The plots of `bench report`: matplotlib figures that need no display, saved small."""
 
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
 
 import numpy as np
 
-COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#1f2328")
-"""Hues that the color-blind tell apart (Okabe and Ito)."""
+from ..output.charts import COLORS, RULE
+from .results import groups
+
 SMALLEST = 2.0**-28
 """An exact result has no place on a logarithmic axis: it is drawn here."""
 
 
 def plot_kernels(result: dict, path: Path) -> None:
     """Median times over channels: a panel for each size, a line for each implementation, forward and backward."""
-    rows = [row for row in result["rows"] if row["pass"] != "forward"]
-    sizes = _unique((row["gaussians"], row["width"], row["height"]) for row in rows)
-    figure, (panels,) = _panels(1, len(sizes))
-    for axes, size in zip(panels, sizes, strict=True):
-        here = [row for row in rows if (row["gaussians"], row["width"], row["height"]) == size]
-        for name, color in zip(_unique(row["implementation"] for row in here), cycle(COLORS)):
-            points = sorted((row["channels"], row["median_ms"]) for row in here if row["implementation"] == name)
-            axes.plot(*zip(*points, strict=True), "o-", color=color, markersize=3, label=name)
-        title = f"{size[0]:,} Gaussians, {size[1]} x {size[2]}"
-        axes.set(title=title, xlabel="channels", ylabel="forward + backward, ms", yscale="log")
-    _save(figure, path, legend_of=panels)
+    rows, panels = [row for row in result["rows"] if row["pass"] != "forward"], []
+    for (count, width, height), here in groups(rows, "gaussians", "width", "height").items():
+        lines = {
+            name: sorted((row["channels"], row["median_ms"]) for row in mine)
+            for (name,), mine in groups(here, "implementation").items()
+        }
+        labels = {"xlabel": "channels", "ylabel": "forward + backward, ms", "yscale": "log"}
+        panels.append((lines, labels | {"title": f"{count:,} Gaussians, {width} x {height}"}))
+    _draw(path, [panels])
 
 
 def plot_scale(result: dict, path: Path) -> None:
     """Median times and, below, peak memory over what is varied; both axes in decades."""
-    rows = result["rows"]
-    names = _unique(row["sweep"] for row in rows)
-    lines = _unique((row["implementation"], row["what"]) for row in rows)
-    figure, panels = _panels(2, len(names))
-    for panel_row, field, unit in zip(panels, ("median_ms", "peak_memory_bytes"), ("median, ms", "peak, bytes")):
-        for axes, name in zip(panel_row, names, strict=True):
-            for line, color in zip(lines, cycle(COLORS)):
-                here = [row for row in rows if (row["sweep"], row["implementation"], row["what"]) == (name, *line)]
-                if points := [(row["varied"], row[field]) for row in here if row.get(field)]:
-                    axes.plot(*zip(*points, strict=True), "o-", color=color, markersize=3, label=": ".join(line))
-            axes.set(xlabel=name, ylabel=unit, xscale="log", yscale="log")
-    _save(figure, path, legend_of=panels[0])
+    names, sweeps = groups(result["rows"], "implementation", "what"), groups(result["rows"], "sweep")
+    panels = []
+    for field, unit in (("median_ms", "median, ms"), ("peak_memory_bytes", "peak, bytes")):
+        panels.append([])
+        for (sweep,), rows in sweeps.items():
+            found = groups(rows, "implementation", "what")
+            lines = {
+                ": ".join(name): [(row["varied"], row[field]) for row in found.get(name, ()) if row.get(field)]
+                for name in names
+            }
+            panels[-1].append((lines, {"xlabel": sweep, "ylabel": unit, "xscale": "log", "yscale": "log"}))
+    _draw(path, panels)
 
 
 def plot_quality(result: dict, path: Path) -> None:
     """Mean held-out PSNR over training seconds, a panel for each curve and response, a line for each method."""
-    rows = [row for row in result["rows"] if row["tests"]]
-    tables = _unique((row["curve"], row["response"]) for row in rows if row["response"] != "learned")
-    figure, (panels,) = _panels(1, len(tables))
-    for axes, (curve, response) in zip(panels, tables, strict=True):
-        members = [row for row in rows if row["curve"] == curve and row["response"] in (response, "learned")]
-        for name, color in zip(_unique(row["method"] for row in rows), cycle(COLORS)):
-            if here := [row["tests"] for row in members if row["method"] == name]:
-                axes.plot(*error_over_time(here), color=color, label=name)
-        axes.set(title=f"{curve}, {response}", xlabel="training seconds", ylabel="held-out HDR PSNR, dB", xscale="log")
-    _save(figure, path, legend_of=panels)
+    rows, panels = [row for row in result["rows"] if row["tests"]], []
+    for curve, response in groups([row for row in rows if row["response"] != "learned"], "curve", "response"):
+        lines = {}
+        for (method,), mine in groups(rows, "method").items():
+            here = [row for row in mine if row["curve"] == curve and row["response"] in (response, "learned")]
+            lines[method] = error_over_time([row["tests"] for row in here]) if here else []
+        labels = {"xlabel": "training seconds", "ylabel": "held-out HDR PSNR, dB", "xscale": "log"}
+        panels.append((lines, labels | {"title": f"{curve}, {response}"}))
+    _draw(path, [panels], form="-")
 
 
-def error_over_time(trainings: Sequence[Sequence], count: int = 60) -> tuple[np.ndarray, np.ndarray]:
+def error_over_time(trainings: Sequence[Sequence], count: int = 60) -> list[tuple[float, float]]:
     """(seconds, mean dB) of trainings, each a list of [seconds, dB], at times even on a log scale.
 
     Between two tests a PSNR is interpolated over the logarithm of time; the mean starts when all have one; a training
@@ -68,47 +66,45 @@ def error_over_time(trainings: Sequence[Sequence], count: int = 60) -> tuple[np.
     first, last = max(curve[0, 0] for curve in curves), max(curve[0, -1] for curve in curves)
     seconds = np.geomspace(max(first, 1e-3), max(last, first, 1e-3), count)
     values = [np.interp(np.log(seconds), np.log(np.maximum(time, 1e-3)), psnr) for time, psnr in curves]
-    return seconds, np.mean(values, axis=0)
+    return list(zip(seconds, np.mean(values, axis=0), strict=True))
 
 
 def plot_stability(result: dict, path: Path) -> None:
     """Errors as solid lines over each sweep, their bounds as dotted ones of the same color."""
-    figure, panels = _panels(2, 2)
-    for axes, sweep in zip(panels.flat, result["sweeps"], strict=False):
-        for (name, readings), color in zip(sweep["readings"].items(), cycle(COLORS)):
-            errors, bounds = zip(*readings, strict=True)
-            drawn = [max(error or 0.0, SMALLEST) for error in errors]
-            axes.plot(sweep["values"], drawn, "o-", color=color, markersize=3, label=name)
-            axes.plot(sweep["values"], bounds, ":", color=color, linewidth=1)
+    panels = []
+    for sweep in result["sweeps"]:
+        lines, bounds = {}, {}
+        for name, readings in sweep["readings"].items():
+            lines[name] = [(x, max(error or 0.0, SMALLEST)) for x, (error, _) in zip(sweep["values"], readings)]
+            bounds[name] = [(x, bound) for x, (_, bound) in zip(sweep["values"], readings)]
         scale = "log" if sweep["values"][-1] > 1000 else "linear"
-        axes.set(xlabel=sweep["label"], ylabel="relative error", xscale=scale, yscale="log")
-        axes.legend(frameon=False, fontsize=7)
-    _save(figure, path)
+        labels = {"xlabel": sweep["label"], "ylabel": "relative error", "xscale": scale, "yscale": "log"}
+        panels.append((lines, labels, bounds))
+    _draw(path, [panels[:2], panels[2:]])
 
 
-def _unique(items: Iterable) -> list:
-    return list(dict.fromkeys(items))
-
-
-def _panels(rows: int, columns: int):
-    """A figure, and its axes [rows][columns]."""
+def _draw(path: Path, panels: Sequence[Sequence[tuple]], form: str = "o-") -> None:
+    """A PNG of 32 colors, which is all that lines need. panels: rows of ({label: points}, what Axes.set() takes) and,
+    with a legend of its own, {label: points of a dotted line}; without, one legend below names all lines of a row."""
     from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(max(4.2 * columns, 6.4), 3.2 * rows + 0.5), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False)
-    for axes in panels.flat:
-        axes.grid(color="#e1e4e8", linewidth=0.6)
-        axes.spines[["top", "right"]].set_visible(False)
-    return figure, panels
-
-
-def _save(figure, path: Path, legend_of: Sequence = ()) -> None:
-    """As a PNG of 32 colors, which is all that lines need. legend_of: axes whose lines one legend below names."""
     from PIL import Image
 
+    width = max((len(row) for row in panels), default=1)
+    figure = Figure(figsize=(max(4.2 * width, 6.4), 3.2 * len(panels) + 0.5), layout="constrained")
     named = {}
-    for axes in legend_of:
-        named |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    for place, (lines, labels, *bounds) in enumerate(panel for row in panels for panel in row):
+        axes = figure.add_subplot(len(panels), width, place + 1)
+        for (name, points), color in zip(lines.items(), cycle(COLORS)):
+            if points:
+                (named[name],) = axes.plot(*zip(*points, strict=True), form, color=color, markersize=3, label=name)
+            if bounds:
+                axes.plot(*zip(*bounds[0][name], strict=True), ":", color=color, linewidth=1)
+        axes.set(**labels)
+        axes.grid(color=RULE, linewidth=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+        if bounds:
+            axes.legend(frameon=False, fontsize=7)
+            named = {}
     if named:
         figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     buffer = io.BytesIO()

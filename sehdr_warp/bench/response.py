@@ -23,10 +23,6 @@ FIXED = ("srgb", "camera")
 """Curves that are also taken always, without a look at the photos."""
 GOOD = 0.35
 """Stops: a chosen curve within them counts as good."""
-COLUMNS = {
-    "curve": "", "method": "", "n=trials": "d", "mean stops=mean": ".2f", "worst": ".2f", "under 0.35=good": "d",
-    "aligned dB=aligned": ".1f", "of the true curve=aligned_known": ".1f",
-}  # fmt: skip
 
 
 def response_error(response: Response, truth: Response) -> float:
@@ -37,13 +33,10 @@ def response_error(response: Response, truth: Response) -> float:
 def bench_response(
     data: Sequence[str], curves: Sequence[str], *, exposures: int = 5, max_size: int | None = None
 ) -> dict:
-    """Scenes with HDR truth, exposed by each curve at a ladder of exposures, four times apart; a result.
+    """A result: scenes with HDR truth, exposed by each curve at a ladder of exposures, four times apart.
 
     `rows` sum up over scenes and exposures, by curve and method, and over everything; `trials` are single. Decibels
     are mu-law PSNR of the photos decoded by the chosen curve and by the true one, aligned; no 3D is involved.
-
-    Raises:
-        SehdrError: for a scene without truth and for data that cannot be read.
     """
     settings = {"data": list(data), "curves": list(curves), "exposures": exposures, "max_size": max_size}
     result = new_result("response", torch.device("cpu"), settings)

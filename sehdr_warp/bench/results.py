@@ -1,14 +1,18 @@
 """A benchmark's result: rows and checks with the machine and the command that made them; as JSON, and as a table."""
 
 import importlib.metadata
+import math
 import os
 import platform
 import shlex
 import subprocess
 import sys
-from collections.abc import Sequence
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -17,10 +21,13 @@ from ..errors import SehdrError
 from ..files import write_json
 
 SCHEMA = 2
-_PACKAGES = ("torch", "warp-lang", "gsplat")
+PAGES: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_name("pages.toml").read_text(encoding="utf-8"))
+"""What a report says of each benchmark: title, text, caption; and the columns of its tables, as markdown_table's."""
+for _page in PAGES.values():
+    _page |= {key: dict(_page[key]) for key in ("columns", "means") if key in _page}
 
 
-def new_result(benchmark: str, device: torch.device, settings: dict) -> dict:
+def new_result(benchmark: str, device: torch.device, settings: dict) -> dict[str, Any]:
     """A result to be filled: lists `rows` (of plain values), `checks` and `notes`."""
     return {
         "schema": SCHEMA,
@@ -35,16 +42,20 @@ def new_result(benchmark: str, device: torch.device, settings: dict) -> dict:
     }
 
 
-def _describe_machine(device: torch.device) -> dict:
+def _describe_machine(device: torch.device) -> dict[str, Any]:
     """Processor, GPU, driver and versions; what cannot be found out is None."""
-    affinity = getattr(os, "sched_getaffinity", None)
+    versions: dict[str, str | None] = {"sehdr-warp": __version__}
+    for package in ("torch", "warp-lang", "gsplat"):
+        versions[package] = None
+        with suppress(importlib.metadata.PackageNotFoundError):
+            versions[package] = importlib.metadata.version(package)
     machine = {
         "cpu": _cpu_model(),
-        "cores": len(affinity(0)) if affinity else os.cpu_count(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        "versions": {"sehdr-warp": __version__} | {name: _version(name) for name in _PACKAGES},
+        "versions": versions,
         "gpu": None,
     }
     if device.type == "cuda":
@@ -54,28 +65,19 @@ def _describe_machine(device: torch.device) -> dict:
     return machine
 
 
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
 def _cpu_model() -> str | None:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return (models or [platform.processor()])[0] or None
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or None
 
 
 def _driver_version() -> str | None:
     command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-    try:
+    with suppress(OSError, subprocess.SubprocessError, IndexError):
         return subprocess.run(command, capture_output=True, text=True, timeout=20, check=True).stdout.split()[0]
-    except (OSError, subprocess.SubprocessError, IndexError):
-        return None
+    return None
 
 
 def machine_line(result: dict) -> str:
@@ -89,17 +91,18 @@ def machine_line(result: dict) -> str:
 
 
 def check(what: str, against: str, difference: float, bound: float) -> dict:
-    """One comparison of a result; a difference that is not a number does not pass."""
+    """One comparison of a result; a difference that is not a number counts as infinite."""
+    difference = difference if math.isfinite(difference) else math.inf
     values = {"what": what, "against": against, "difference": difference, "bound": bound}
     return values | {"passed": difference <= bound}
 
 
-def finish(result: dict, columns: dict[str, str], json: Path | None, overwrite: bool) -> None:
-    """Writes and prints a result; columns as markdown_table() takes them. Raises SehdrError for checks that failed,
-    after everything is out."""
+def finish(result: dict, json: Path | None = None, overwrite: bool = False) -> None:
+    """Writes and prints a result. Raises SehdrError for checks that failed, after everything is out."""
     if json is not None:
         write_json(json, result, overwrite)
-    print(machine_line(result), markdown_table(result["rows"], columns), *result["notes"], sep="\n\n")
+    table = markdown_table(result["rows"], PAGES[result["benchmark"]]["columns"])
+    print(machine_line(result), table, *result["notes"], sep="\n\n")
     failed = [check for check in result["checks"] if not check["passed"]]
     if not failed:
         return
@@ -114,23 +117,34 @@ def finish(result: dict, columns: dict[str, str], json: Path | None, overwrite: 
     )
 
 
-def markdown_table(rows: Sequence[dict], columns: dict[str, str]) -> str:
+def groups(rows: Iterable[Mapping], *fields: str) -> dict[tuple, list[Mapping]]:
+    """Rows by the values of these fields, in the order of their first."""
+    found: dict[tuple, list[Mapping]] = {}
+    for row in rows:
+        found.setdefault(tuple(row[field] for field in fields), []).append(row)
+    return found
+
+
+def parted(columns: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
+    """(title, field, format) of each column of markdown_table()."""
+    for key, form in columns.items():
+        title, _, field = key.partition("=")
+        yield title, field or title, form
+
+
+def markdown_table(rows: Sequence[Mapping], columns: Mapping[str, str]) -> str:
     """Aligned Markdown. columns: `field` or `title=field` to a format: as of format(), or MiB, or "" for text; a column
     without any value is left out, and so is a value that a row lacks."""
-    parted = [(*key.partition("="), form) for key, form in columns.items()]
-    shown = [(title, field or title, form) for title, _, field, form in parted]
-    shown = [column for column in shown if any(row.get(column[1]) is not None for row in rows)]
+    shown = [column for column in parted(columns) if any(row.get(column[1]) is not None for row in rows)]
     if not shown:
         return "There are no results."
-    lines = [
-        [title for title, _, _ in shown],
-        *([_cell(row.get(field), form) for _, field, form in shown] for row in rows),
-    ]
-    widths = [max(2, *map(len, column)) for column in zip(*lines, strict=True)]
-    text = [form == "" for _, _, form in shown]
-    lines.insert(1, ["-" * w if t else "-" * (w - 1) + ":" for w, t in zip(widths, text, strict=True)])
-    padded = ([v.ljust(w) if t else v.rjust(w) for v, w, t in zip(line, widths, text, strict=True)] for line in lines)
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in padded)
+    table = []
+    for title, field, form in shown:
+        cells = [title, *(_cell(row.get(field), form) for row in rows)]
+        width = max(2, *map(len, cells))
+        cells.insert(1, "-" * width if form == "" else "-" * (width - 1) + ":")
+        table.append([cell.ljust(width) if form == "" else cell.rjust(width) for cell in cells])
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in zip(*table, strict=True))
 
 
 def _cell(value, form: str) -> str:

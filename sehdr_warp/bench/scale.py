@@ -10,7 +10,7 @@ from ..splatting.memory import held_by_warp
 from ..training.config_files import load_config
 from .gsplat_peer import BOUND, GSPLAT, gsplat_renderer, note_missing, rasterize_with_gsplat
 from .kernels import OURS, against_float64, against_gsplat, render, splat_variant
-from .results import check, new_result
+from .results import check, groups, new_result
 from .splats import Size, make_photo_scene, make_splat_scene
 from .step import make_trainer, time_step
 from .timing import forget_peaks, peak_memory, time_variants
@@ -25,11 +25,6 @@ STEEPEST = 1.2
 """A slope above it, at the large end of a sweep, is steeper than linear; 2 is quadratic."""
 LARGE_END = 3
 """The large end is a sweep's last so many points."""
-COLUMNS = {
-    "sweep": "", "Gaussians=gaussians": ",d", "width": "d", "height": "d", "C=channels": "d", "photos": "d",
-    "rasterizer=implementation": "", "what": "", "median ms=median_ms": ".3f", "n=repetitions": "d",
-    "peak MiB=peak_memory_bytes": "MiB",
-}  # fmt: skip
 
 
 def sweeps(device_type: str, small: bool = False) -> dict[str, list[tuple[int, Size, int, int]]]:
@@ -75,18 +70,14 @@ def bench_scale(device: torch.device, *, repetitions: int, small: bool = False) 
 def fit_slopes(rows: Sequence[dict]) -> list[dict]:
     """Slopes of log(time) and log(memory) on log(what is varied), over a whole sweep and over its large end, by least
     squares; times are the least of their repetitions, which other work disturbs least."""
-    series: dict[tuple, list[tuple[int, float]]] = {}
-    for row in rows:
+    fields, slopes = ("sweep", "implementation", "what"), []
+    for key, here in groups(rows, *fields).items():
         for quantity, field in (("time", "min_ms"), ("memory", "peak_memory_bytes")):
-            if row.get(field):
-                key = row["sweep"], row["implementation"], row["what"], quantity
-                series.setdefault(key, []).append((row["varied"], row[field]))
-    fields = ("sweep", "implementation", "what", "quantity")
-    return [
-        dict(zip(fields, key, strict=True)) | {"slope": _slope(points), "slope_large": _slope(points[-LARGE_END:])}
-        for key, points in series.items()
-        if len(points) > 1
-    ]
+            points = [(row["varied"], row[field]) for row in here if row.get(field)]
+            if len(points) > 1:
+                row = dict(zip(fields, key, strict=True)) | {"quantity": quantity, "slope": _slope(points)}
+                slopes.append(row | {"slope_large": _slope(points[-LARGE_END:])})
+    return slopes
 
 
 def _slope(points: Sequence[tuple[float, float]]) -> float:
@@ -94,7 +85,7 @@ def _slope(points: Sequence[tuple[float, float]]) -> float:
 
 
 def verdict(slopes: Sequence[dict]) -> str:
-    """One sentence on the steepest slope of ours at the large end of a sweep."""
+    """One sentence on the steepest slopes of ours at the large end of a sweep."""
     ours = [row for row in slopes if row["implementation"] == OURS]
     if not ours:
         return "No slopes: a sweep needs two points."

@@ -37,12 +37,11 @@ class Size:
 
 def parse_size(text: str) -> Size:
     """`20k@200x200`, where k and M multiply. Raises SehdrError."""
-    match = re.fullmatch(r"(\d+)([kM]?)@(\d+)x(\d+)", text.strip())
-    if match:
-        count = int(match[1]) * {"": 1, "k": 1000, "M": 1_000_000}[match[2]]
-        if count and int(match[3]) and int(match[4]):
-            return Size(count, int(match[3]), int(match[4]))
-    raise SehdrError(f"size {text}: not a size; write Gaussians@WIDTHxHEIGHT such as 20k@200x200")
+    number = r"0*([1-9]\d*)"
+    match = re.fullmatch(rf"{number}([kM]?)@{number}x{number}", text.strip())
+    if not match:
+        raise SehdrError(f"size {text}: not a size; write Gaussians@WIDTHxHEIGHT such as 20k@200x200")
+    return Size(int(match[1]) * {"": 1, "k": 1000, "M": 1_000_000}[match[2]], int(match[3]), int(match[4]))
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,6 @@ class SplatScene:
 
     @property
     def arguments(self) -> tuple:
-        """What rasterize() takes positionally."""
         return (*self.leaves, self.world_to_camera, self.intrinsics, self.size.width, self.size.height)
 
     @property
@@ -74,7 +72,6 @@ class SplatScene:
         return SplatScene(leaves, *camera, self.size)
 
     def clear(self) -> None:
-        """Forget the gradients."""
         for leaf in self.leaves:
             leaf.grad = None
 
@@ -110,11 +107,8 @@ def make_splat_scene(size: Size, channels: int, device: torch.device | str = "cp
 
 
 def make_photo_scene(size: Size, views: int = 18, device: str | torch.device = "cpu") -> Scene:
-    """8-bit sRGB photos, all for training, of colored balls on a floor, from a circle around them.
-
-    size.gaussians points lie on the surfaces, as those of a trained scene do; the photos show them as Gaussians, some
-    pixels clipped and some black. device: where they are rendered.
-    """
+    """8-bit sRGB photos, all for training, of colored balls on a floor, from a circle around them: some pixels clipped,
+    some black. size.gaussians points lie on the surfaces. device: where the photos are rendered."""
     rng = np.random.default_rng(0)
     points, log_exposure = _surfaces(size.gaussians, rng)
     response = response_by_name("srgb")

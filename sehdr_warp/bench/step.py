@@ -1,7 +1,6 @@
 """`bench step`: a whole training step (photograph, losses, gradients, optimizer, densification) of a preset."""
 
 import logging
-import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -31,17 +30,11 @@ FIRST_LOSS_BOUND, LATER_LOSS_BOUND = 1e-4, 1e-2
 the gradients and the optimizer in it; Adam's division makes much of what float32 rounds."""
 INTERVALS = {"cuda": 3, "cpu": 1}
 """Densification intervals over which the mean step is taken."""
-COLUMNS = {
-    "preset": "", "step=implementation": "", "Gaussians=gaussians": ",d", "width": "d", "height": "d",
-    "median ms=median_ms": ".3f", "mean ms=mean_ms": ".3f", "with densification=amortized_ms": ".3f",
-    "host ms=host_ms": ".3f", "n=repetitions": "d", "peak MiB=peak_memory_bytes": "MiB",
-    "ours / this=ours_over_this": ".3f",
-}  # fmt: skip
 
 
 def bench_step(size: Size, device: torch.device, *, presets: Sequence[str], repetitions: int, views: int = 18) -> dict:
-    """Steps of each preset in the thick of its training (all degrees of the harmonics, densification going on) on
-    synthetic photos, recorded and launched on a GPU, beside the plain torch rasterizer on the CPU; a result."""
+    """A result: steps of each preset in the thick of its training (all degrees of the harmonics, densification going
+    on) on synthetic photos, recorded and launched on a GPU, beside the plain torch rasterizer on the CPU."""
     settings = {"device": str(device), "presets": list(presets), "repetitions": repetitions, "views": views}
     result = new_result("step", device, settings)
     scene = make_photo_scene(size, views, device)
@@ -58,8 +51,7 @@ def bench_step(size: Size, device: torch.device, *, presets: Sequence[str], repe
 
 
 def thick_of_training(config: Config) -> int:
-    """The first iteration, a multiple of the densification's interval, from which on harmonics and densification are
-    at their full cost."""
+    """The first iteration from which on harmonics and densification, whose interval it is a multiple of, cost most."""
     every = config.scaled(config.densification.every)
     ready = max(config.model.harmonics_degree * config.schedule.harmonics_every, config.densification.start)
     return -(-(config.scaled(ready) + 1) // every) * every
@@ -139,7 +131,6 @@ def _rows(scene: Scene, config: Config, device: torch.device, repetitions: int, 
 
 
 def _plain_torch(*arguments, capacity=None, deterministic=False, **options):
-    """rasterize() in plain torch, for a field."""
     return rasterize_reference(*arguments, **options)
 
 
@@ -165,10 +156,8 @@ def _checks(scene: Scene, config: Config, device: torch.device, fits: bool, pres
     for step in range(1, CHECKED_STEPS + 1):
         ours.step()
         other.step()
-        difference = abs(ours.loss - other.loss) / max(abs(other.loss), 1e-12)
-        difference = difference if math.isfinite(difference) else math.inf
-        if step in (1, CHECKED_STEPS):
-            bound = FIRST_LOSS_BOUND if step == 1 else LATER_LOSS_BOUND
+        if bound := {1: FIRST_LOSS_BOUND, CHECKED_STEPS: LATER_LOSS_BOUND}.get(step):
+            difference = abs(ours.loss - other.loss) / max(abs(other.loss), 1e-12)
             against = PLAIN_TORCH if fits else "the CPU's kernels"
             made.append(check(f"{preset}: loss of step {step}", against, difference, bound))
     return made

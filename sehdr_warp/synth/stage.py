@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .textures import Color, books, checker, fabric, painting, wood
+from . import textures
+from .textures import Color
 
 Material = dict
 Surface = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -16,24 +17,37 @@ class Stage:
     """Collects a scene for mitsuba.load_dict (`items`).
 
     mi: the imported mitsuba module with its variant set. rng: all randomness comes from it. folder: for meshes.
-    A paint is a function of `textures` followed by its arguments, a picture [H, W, 3], or one color.
+    A paint is the name of a function in `textures` followed by its arguments, a name in `paints`, a picture [H, W, 3],
+    or one color.
     """
 
     def __init__(self, mi, rng: np.random.Generator, folder: Path):
         self.mi, self.rng, self.folder = mi, rng, folder
         self.items: dict = {"type": "scene"}
+        self.paints: dict[str, np.ndarray] = {}
 
     # Materials. Nothing is perfectly smooth but glass: a mirror's reflection of a small lamp is found by chance alone.
 
-    def paint(self, paint, *args, repeat=(1.0, 1.0), gain: float = 1.0, lift: float = 0.0, **options) -> dict:
-        if callable(paint):
-            paint = paint(self.rng, *args, **options) * gain + lift
-        if not isinstance(paint, np.ndarray):
-            return {"type": "rgb", "value": list(paint)}
+    def image(
+        self, paint: str, *args, power: float = 1.0, gain: float = 1.0, lift: float = 0.0, **options
+    ) -> np.ndarray:
+        """A texture's picture [H, W, 3], or gain * picture ** power + lift."""
+        made = self.paints[paint] if paint in self.paints else getattr(textures, paint)(self.rng, *args, **options)
+        return made**power * gain + lift
+
+    def paint(self, paint, *args, repeat=(1.0, 1.0), **options) -> dict:
+        if isinstance(paint, dict):
+            return paint
+        picture = self.image(paint, *args, **options) if isinstance(paint, str) else paint
+        if not isinstance(picture, np.ndarray):
+            return {"type": "rgb", "value": list(picture)}
         # Rows of an array go down while v goes up.
-        bitmap = self.mi.Bitmap(np.ascontiguousarray(paint[::-1], np.float32))
+        bitmap = self.mi.Bitmap(np.ascontiguousarray(picture[::-1], np.float32))
         transform = self.mi.ScalarTransform3f().scale([float(repeat[0]), float(repeat[1])])
         return {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "repeat", "to_uv": transform}
+
+    def uniform(self, low: float, high: float) -> float:
+        return self.rng.uniform(low, high)
 
     def matt(self, *paint, **options) -> Material:
         return two_sided(type="diffuse", reflectance=self.paint(*paint, **options))
@@ -101,16 +115,16 @@ class Stage:
         """A glowing rod."""
         self.rod(start, end, radius, **self._glow(radiance, weight))
 
-    def sky(self, radiance: np.ndarray, weight: float = 1.0) -> None:
-        """radiance: [H, 2 H, 3], equirectangular, zenith on top."""
-        bitmap = self.mi.Bitmap(np.ascontiguousarray(radiance, np.float32))
+    def sky(self, weight: float, *paint) -> None:
+        """paint: radiance [H, 2 H, 3], equirectangular, zenith on top."""
+        bitmap = self.mi.Bitmap(np.ascontiguousarray(self.image(*paint), np.float32))
         upright = self.mi.ScalarTransform4f().rotate([1, 0, 0], 90)
         self.add(type="envmap", bitmap=bitmap, to_world=upright, sampling_weight=weight)
 
     def sun(self, direction, irradiance: Color, weight: float = 1.0) -> None:
         """Parallel light that travels along `direction`; irradiance on a surface that faces it."""
-        light = {"direction": list(direction), "irradiance": self.paint(irradiance)}
-        self.add(type="directional", **light, sampling_weight=weight)
+        direction = list(direction / np.linalg.norm(direction))
+        self.add(type="directional", direction=direction, irradiance=self.paint(irradiance), sampling_weight=weight)
 
     def _glow(self, radiance, weight: float) -> dict:
         emitter = {"type": "area", "radiance": self.paint(radiance), "sampling_weight": weight}
@@ -118,7 +132,7 @@ class Stage:
 
     # Buildings.
 
-    def room(self, half_width: float, front: float, back: float, height: float, walls: list[Material]) -> None:
+    def room(self, half_width: float, front: float, back: float, height: float, *walls: Material) -> None:
         """Panels facing inwards: floor, ceiling, left, right, front, back; a back left out is open at +y."""
         middle, half, up = (front + back) / 2, (back - front) / 2, height / 2
         sides = (
@@ -132,8 +146,9 @@ class Stage:
         for side, wall in zip(sides, walls):
             self.panel(*side, wall)
 
-    def wall_with_hole(self, y: float, half_width: float, height: float, hole, texture: np.ndarray, repeat) -> None:
+    def wall_with_hole(self, y: float, half_width: float, height: float, hole, paint: str, repeat) -> None:
         """A wall in the plane y with a hole (x0, x1, z0, z1); one texture over all."""
+        texture = self.image(paint)
         (x0, x1, z0, z1), left, right = hole, -half_width, half_width
         scale = [repeat[0] / (right - left), repeat[1] / height]
         for a, b, c, d in ((left, x0, 0, height), (x1, right, 0, height), (x0, x1, 0, z0), (x0, x1, z1, height)):
@@ -152,16 +167,36 @@ class Stage:
             self.box([place, y, z], [0.025, 0.06, half_z], material)
         self.box([x, y - 0.10, z0 - 0.03], [half_x + 0.10, 0.12, 0.02], material)
 
+    # Gardens.
+
+    def lawn(self, center, material: Material) -> None:
+        """12 m of gentle hills."""
+
+        def surface(u, v):
+            x, y = (2 * u - 1) * 6, (2 * v - 1) * 6
+            return np.stack([x, y, hills(x, y)], -1)
+
+        self.surface(surface, 120, 120, center, material)
+
+    def pebbles(self, count: int, ranges: dict[str, list[float]], ground: float | str, *paint, **options) -> None:
+        """Balls at random. ranges: of x, y and radius, drawn in this order; ground: its height, or "lawn"."""
+        low, high = zip(*ranges.values())
+        for _ in range(count):
+            drawn = dict(zip(ranges, self.rng.uniform(low, high).tolist()))
+            x, y, radius = (drawn[name] for name in ("x", "y", "radius"))
+            height = hills(x, y - 1.5) - 0.4 * radius if ground == "lawn" else ground
+            self.ball([x, y, height + radius], radius, self.matt(*paint, **options))
+
     # Furniture.
 
     def rug(self, x: float, y: float, half_x: float, half_y: float, dark: Color, light: Color, repeat) -> None:
-        cloth = self.matt(fabric, dark, light, repeat=repeat)
+        cloth = self.matt("fabric", dark, light, repeat=repeat)
         self.panel([x, y, 0.006], [half_x, 0, 0], [0, half_y, 0], cloth)
 
     def table(self, center, half, height: float = 0.72) -> float:
         """A wooden table around (x, y); returns the height of its top."""
         x, y = center
-        board = wood(self.rng, 4, (0.08, 0.04, 0.02), (0.34, 0.20, 0.11))
+        board = self.image("wood", 4, (0.08, 0.04, 0.02), (0.34, 0.20, 0.11))
         self.box([x, y, height - 0.025], [half[0], half[1], 0.025], self.varnished(board))
         for side in (-0.9, 0.9):
             for end in (-0.85, 0.85):
@@ -172,7 +207,7 @@ class Stage:
     def shelf(self, center, half_width: float, depth: float, levels: int) -> None:
         """A bookcase standing at (x, y), open towards -y, full of books; its depths are dark."""
         rng, (x, y), gap = self.rng, center, 0.42
-        boards = self.varnished(wood, 2, (0.05, 0.03, 0.02), (0.20, 0.12, 0.07), rough=0.3)
+        boards = self.varnished("wood", 2, (0.05, 0.03, 0.02), (0.20, 0.12, 0.07), rough=0.3)
         half = levels * gap / 2
         for level in range(levels + 1):
             self.box([x, y, 0.02 + level * gap], [half_width, depth, 0.018], boards)
@@ -186,7 +221,7 @@ class Stage:
                 if rng.random() < 0.12:
                     place += 0.06
                     continue
-                back = self.varnished(books, rough=0.3)
+                back = self.varnished("books", rough=0.3)
                 middle = [place + thick, y - 0.03 + 0.03 * rng.random(), 0.04 + level * gap + high]
                 self.box(middle, [thick, depth * 0.65, high], back)
                 place += 2 * thick + 0.003
@@ -197,20 +232,24 @@ class Stage:
         half_v, center = np.array([0, 0, half_height]), np.asarray(center, float)
         facing = np.cross(half_u, half_v)
         facing /= np.linalg.norm(facing)
-        self.panel(center + 0.02 * facing, half_u, half_v, self.varnished(painting, cells, rough=0.15))
+        self.panel(center + 0.02 * facing, half_u, half_v, self.varnished("painting", cells, rough=0.15))
         for sign in (-1, 1):
             for along, aside in ((half_u, half_v), (half_v, half_u)):
                 ends = [center + sign * aside * 1.04 + s * along * 1.04 for s in (-1, 1)]
                 self.rod(*ends, 0.025, self.metal(frame, 0.3))
 
+    def lathe(self, profile, columns: int, rows: int, center, bsdf: Material) -> None:
+        """A body of revolution; see the function of this name."""
+        self.surface(lathe(profile), columns, rows, center, bsdf)
+
     def vase(self, center, material: Material, height: float = 0.42) -> None:
         line = np.array([[0.01, 0], [0.08, 0.0], [0.13, 0.12], [0.10, 0.26], [0.05, 0.36], [0.075, 0.42]])
-        self.surface(lathe(line * (height / 0.42)), 64, 96, center, material)
+        self.lathe(line * (height / 0.42), 64, 96, center, material)
 
     def plant(self, center, leaves: int = 11, size: float = 0.3) -> None:
         """Broad leaves from one place."""
         for k in range(leaves):
-            green = self.varnished(fabric, (0.03, 0.16, 0.03), (0.16, 0.40, 0.08), 64, rough=0.3)
+            green = self.varnished("fabric", (0.03, 0.16, 0.03), (0.16, 0.40, 0.08), 64, rough=0.3)
             length, lean = size * self.rng.uniform(0.8, 1.3), self.rng.uniform(0.3, 0.85)
             self.surface(leaf(length, 0.16 * length, lean, k * 2.399), 20, 7, center, green)
 
@@ -220,16 +259,16 @@ class Stage:
     def crate(self, center, half: float) -> None:
         """A box open towards -y, dark inside, with a ball in it."""
         x, y, z = center
-        boards = self.matt(wood, 5, (0.20, 0.12, 0.06), (0.50, 0.34, 0.18))
+        boards = self.matt("wood", 5, (0.20, 0.12, 0.06), (0.50, 0.34, 0.18))
         for side in (-1, 1):
             self.box([x + side * half, y, z + half], [0.015, half, half], boards)
             self.box([x, y, z + half + side * (half - 0.015)], [half, half, 0.015], boards)
         self.box([x, y + half, z + half], [half, 0.015, half], boards)
-        self.ball([x + 0.05, y + 0.1, z + 0.03 + 0.4 * half], 0.4 * half, self.varnished(checker, 10))
+        self.ball([x + 0.05, y + 0.1, z + 0.03 + 0.4 * half], 0.4 * half, self.varnished("checker", 10))
 
     def armchair(self, center, turn: float) -> None:
         """Upholstered boxes; `turn` 0 faces -y."""
-        cloth = self.matt(fabric, (0.05, 0.10, 0.22), (0.26, 0.36, 0.46), repeat=(2, 2))
+        cloth = self.matt("fabric", (0.05, 0.10, 0.22), (0.26, 0.36, 0.46), repeat=(2, 2))
         cos, sin = np.cos(np.radians(turn)), np.sin(np.radians(turn))
         for x, y, z, *half in (
             (0, 0, 0.24, 0.36, 0.36, 0.20),
@@ -259,6 +298,10 @@ def lathe(profile) -> Surface:
         return np.stack([radius * np.cos(u * 2 * np.pi), radius * np.sin(u * 2 * np.pi), height], -1)
 
     return surface
+
+
+def hills(x, y):
+    return 0.10 * np.sin(1.3 * x + 0.4) * np.cos(1.1 * y) + 0.05 * np.sin(3.1 * x + 2.2 * y) - 0.05
 
 
 def torus_knot(u: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -164,6 +164,11 @@ def sky(rng, zenith: Color, horizon: Color, clouds: float, ground: Color, size: 
     return image.astype(np.float32)
 
 
+def even_sky(rng, color: Color, top: float, bottom: float):
+    """[16, 32, 3] radiance of a whole sphere: one color, from `top` times it at the zenith to `bottom` times below."""
+    return np.full((16, 32, 3), color, np.float32) * np.linspace(top, bottom, 16, dtype=np.float32)[:, None, None]
+
+
 def mix(first: Color, second: Color, share) -> np.ndarray:
     """[..., 3] float32 between two colors by a share of any shape, clipped to [0, 1]."""
     share = np.asarray(np.clip(share, 0, 1), np.float32)[..., None]

@@ -1,4 +1,4 @@
-"""`sehdr-warp bench kernels`, `step`, `scale` and `training`, at sizes that take seconds."""
+"""`sehdr-warp bench kernels`, `step` and `scale`, at sizes that take seconds."""
 
 import json
 import sys
@@ -13,12 +13,10 @@ from sehdr_warp.bench import gsplat_peer, kernels, scale, step
 from sehdr_warp.bench.results import finish
 from sehdr_warp.bench.splats import Size, make_splat_scene, parse_size
 from sehdr_warp.bench.timing import Variant, peak_memory, time_variants
-from sehdr_warp.bench.training import bench_training
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.splatting import rasterize
 
 from ..refusals import call, refused
-from ..training.toy import toy_scene
 
 KERNELS = ["bench", "kernels", "--device", "cpu", "--sizes", "200@40x33", "--repetitions", "3"]
 CPU = torch.device("cpu")
@@ -138,7 +136,7 @@ def test_a_step_with_another_loss_fails(monkeypatch):
     monkeypatch.setattr(step, "rasterize_reference", other)
     result = step.bench_step(Size(300, 40, 32), CPU, presets=["default"], views=4, **BRIEF)
     with pytest.raises(SehdrError, match="loss of step 1"):
-        finish(result, step.COLUMNS, None, False)
+        finish(result)
 
 
 def fake_gsplat(monkeypatch):
@@ -222,20 +220,3 @@ def test_sweeps_ascend():
             for points in scale.sweeps(device, small).values():
                 varied = [point[0] for point in points]
                 assert varied == sorted(set(varied)) and varied
-
-
-def test_training_puts_gsplat_beside_ours(monkeypatch):
-    row, calls = {"psnr_ldr": 20.0, "train_seconds": 1.0, "gaussians": 7, "peak_memory_bytes": 5}, []
-
-    def fake(scene, config, device, steps=None):
-        calls.append(steps)
-        return row
-
-    monkeypatch.setattr("sehdr_warp.bench.training.train_with_gsplat", fake)
-    ours = bench_training(toy_scene(), CPU, iterations=20)
-    assert ours["notes"] == ["gsplat not compared: it needs CUDA"] and calls == []
-    assert ours["rows"][0]["iterations"] == 20 and 5 < ours["rows"][0]["psnr_ldr"] < 60
-    monkeypatch.setattr("sehdr_warp.bench.training.note_missing", lambda result, device: True)
-    both = bench_training(toy_scene(), CPU, iterations=5)
-    assert [row["implementation"] for row in both["rows"]] == ["sehdr-warp", "gsplat"]
-    assert calls == [40, None], "it is warmed up before it is timed"

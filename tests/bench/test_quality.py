@@ -163,7 +163,7 @@ def test_only_methods_with_truth_see_that_of_training_views(tmp_path, monkeypatc
 
 
 def test_exposures_are_four_times_apart_and_photos_follow():
-    dark, bright = (exposed(jobs(exposures=(place,), max_size=32)[0]) for place in (1, 2))
+    dark, bright = (exposed("embedded", 32, "hdr-nerf", place) for place in (1, 2))
     assert bright.views[0].exposure_time == pytest.approx(4 * dark.views[0].exposure_time)
     assert bright.views[0].image.mean() > 1.3 * dark.views[0].image.mean()
 

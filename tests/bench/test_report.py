@@ -55,7 +55,7 @@ def test_quality_is_paired_with_the_upper_bound(tmp_path):
 
 
 def test_error_over_time_is_a_mean_on_a_log_scale():
-    seconds, mean = error_over_time([[[1.0, 20.0], [100.0, 40.0]], [[1.0, 10.0], [10.0, 30.0]]], count=3)
+    seconds, mean = zip(*error_over_time([[[1.0, 20.0], [100.0, 40.0]], [[1.0, 10.0], [10.0, 30.0]]], count=3))
     assert seconds == pytest.approx([1, 10, 100]) and mean == pytest.approx([15, 30, 35])
 
 
