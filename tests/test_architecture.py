@@ -27,7 +27,8 @@ ALLOWED = {
     "evaluation": ANY | {"scene", "splatting.ssim", "output.names", "output.charts"},
     "training": ANY | {"scene", "response", "field", "splatting", "evaluation.metrics", "evaluation.protocols"},
     "synth": ANY | {"scene", "response", "output.exr", "output.images", "field.exposure"},
-    "check": ANY | {"bench.results", "kernels.constants", "scene", "response", "field", "splatting", "training"},
+    "check": ANY
+    | {"bench.results", "bench.splats", "kernels.constants", "scene", "response", "field", "splatting", "training"},
     "bench": ANY
     | {
         "synth.expose",

@@ -1,15 +1,16 @@
 """The catalogue's training: where it diverges, what the guards do, and what resets and clipped batches do to it."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import torch
 
-from ..field.gaussians import Gaussians
+from ..bench.splats import EXPOSURE_TIME, Size, make_photo_scene
 from ..field.radiance_field import RadianceField
 from ..response import response_by_name
-from ..scene import Camera, Scene, View, codes_of, look_at
+from ..scene import Scene
 from ..training.config import Config
 from ..training.config_files import load_config
 from ..training.initialization import make_field
@@ -18,33 +19,17 @@ from ..training.targets import training_views
 from ..training.trainer import Trainer
 from .case import Case, Reading, count, not_finite
 
-STEPS = 40
-SIZE, VIEWS, EXPOSURE_TIME = 32, 6, 0.25
+STEPS, SIZE = 40, 32
 RATES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics_dc", "harmonics_rest")
 
 
-def toy_field(device="cpu", base_time: float = EXPOSURE_TIME) -> RadianceField:
-    """A cloud of 60 blobs whose exposures span four stops."""
-    generator = torch.Generator().manual_seed(3)
-    points = torch.rand(60, 3, generator=generator) * 2 - 1
-    logs = torch.rand(60, 3, generator=generator) * 3.3 - 3.0
-    gaussians = Gaussians.from_points(points, logs, 0, opacity=0.9, scale=0.6)
-    return RadianceField(gaussians, response_by_name("srgb"), base_time=base_time).to(device)
-
-
 @cache
-def toy_scene(clipped: float = 0.0) -> Scene:
-    """8-bit photos of toy_field() from a circle around it. clipped: this share of each photo's rows is white."""
-    field, views = toy_field(), []
-    for index in range(VIEWS):
-        angle = 2 * np.pi * index / VIEWS
-        pose = look_at([4 * np.cos(angle), 4 * np.sin(angle), 0.8])
-        camera = Camera(SIZE, SIZE, 1.2 * SIZE, 1.2 * SIZE, SIZE / 2, SIZE / 2, pose)
-        codes = codes_of(field.render_ldr(camera).numpy(), 8)
-        codes[: round(clipped * SIZE)] = 255
-        views.append(View(f"v_{index}", codes, camera, EXPOSURE_TIME, "train"))
-    points = field.gaussians.means.detach().numpy().astype(np.float64)
-    return Scene("toy", "transforms", tuple(views), points, np.full((len(points), 3), 0.5, np.float32))
+def _photos(clipped: float = 0.0) -> Scene:
+    """Photos and points without their colors. clipped: this share of each photo's rows is white."""
+    scene = make_photo_scene(Size(300, SIZE, SIZE), 6)
+    for view in scene.views:
+        view.codes[: round(clipped * SIZE)] = 255
+    return replace(scene, point_colors=np.full_like(scene.point_colors, 0.5))
 
 
 def _trainer(device, clipped: float = 0.0, **rates: float) -> Trainer:
@@ -52,7 +37,7 @@ def _trainer(device, clipped: float = 0.0, **rates: float) -> Trainer:
     still = {"densification.stop": 0, "densification.noise": 0.0, "schedule.harmonics_every": 30_000}
     fixed = {"schedule.iterations": STEPS, "seed": 1} | still
     config = load_config("default", fixed | {f"optimizer.{name}": rate for name, rate in rates.items()})
-    scene = toy_scene(clipped)
+    scene = _photos(clipped)
     return Trainer(scene, config, make_field(scene, config, response_by_name("srgb"), device))
 
 
@@ -84,7 +69,7 @@ def _learning_rates(device):
 def _gradient_norms(device):
     """Finite, and none drowns the photo's by 1e4."""
     field = _trainer(device).field
-    view = training_views(toy_scene().train_views, field.base_time, device, truth=False)[0]
+    view = training_views(_photos().train_views, field.base_time, device, truth=False)[0]
     norms, broken = {}, 0
     for name, ssim, opacity in (("L1", 0.0, 0.0), ("L1 and SSIM", 0.2, 0.0), ("opacity", 0.0, 0.01)):
         config = load_config("default", {"loss.ssim_weight": ssim, "loss.opacity_weight": opacity}).loss
@@ -104,13 +89,16 @@ def _scale_ambiguity(device):
     With a fixed response that direction is exactly flat; a free response would add its own. The base time takes it out:
     colors are exposures at that time.
     """
-    readings, camera = [], toy_scene().train_views[0].camera
-    factors = (1.0, 2.0**-20, 1e-3, 1e3, 2.0**20)
-    times = [EXPOSURE_TIME * factor for factor in factors]
-    first, *others = (toy_field(device, time).render_ldr(camera, time).double() for time in times)
-    for factor, photo in zip(factors[1:], others, strict=True):
-        readings.append(Reading(f"photo at base time x {factor:.3g}", float((first - photo).abs().max()), 2.0**-22))
-    return readings
+    camera, field = _photos().train_views[0].camera, _trainer(device).field
+
+    def photo(factor):
+        time = EXPOSURE_TIME * factor
+        return RadianceField(field.gaussians, field.response, base_time=time).render_ldr(camera, time).double()
+
+    return [
+        Reading(f"photo at base time x {factor:.3g}", float((photo(1.0) - photo(factor)).abs().max()), 2.0**-22)
+        for factor in (2.0**-20, 1e-3, 1e3, 2.0**20)
+    ]
 
 
 def _opacity_reset(device):

@@ -26,13 +26,15 @@ class _Figures:
         from ..files import check_absent, write_json
         from .table import format_table
 
-        to_file = self.json is not None and str(self.json) != "-"
-        if to_file:
+        if str(self.json) == "-":
+            print(json.dumps(figures()))
+            return
+        if self.json is not None:
             check_absent(self.json, self.overwrite)
         result = figures()
-        if to_file:
+        if self.json is not None:
             write_json(self.json, result, self.overwrite)
-        print(format_table(result) if self.json is None or to_file else json.dumps(result))
+        print(format_table(result))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +78,6 @@ class Score(_Figures):
 
 
 def run_evaluate(asked: Evaluate) -> None:
-    """Prints the figures as a table or as JSON, and writes what was asked for."""
     from .evaluate import evaluate
 
     def figures():
@@ -87,7 +88,6 @@ def run_evaluate(asked: Evaluate) -> None:
 
 
 def run_score(asked: Score) -> None:
-    """Prints the figures as a table or as JSON, and writes what was asked for."""
     from ..scene import load_scene
     from .score import score_folder
 
@@ -98,7 +98,6 @@ def run_score(asked: Score) -> None:
 
 
 def run_compare(asked: Compare) -> None:
-    """Prints the table and writes what was asked for."""
     from ..files import atomic_path, check_absent
     from ..output.charts import training_chart
     from .compare import compare_runs, comparison_csv, comparison_latex, comparison_table

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import SehdrError
-from .table import columns
+from .table import columns, number
 
 COLUMNS = {
     "iterations": ("iterations", 0),
@@ -41,13 +41,13 @@ class ComparedRuns:
 
     def mean(self, column: str) -> float | None:
         """The mean over the runs; None where one lacks it."""
-        values = [value for value in self.figures[column] if value is not None]
-        return statistics.fmean(values) if len(values) == self.count else None
+        values = self.figures[column]
+        return None if None in values else statistics.fmean(values)
 
     def spread(self, column: str) -> float | None:
-        """The sample's standard deviation; None for one run."""
-        values = [value for value in self.figures[column] if value is not None]
-        return statistics.stdev(values) if len(values) == self.count > 1 else None
+        """The sample's standard deviation; None for one run, or where one lacks the figure."""
+        values = self.figures[column]
+        return None if None in values or self.count == 1 else statistics.stdev(values)
 
 
 def compare_runs(runs: Sequence[Any]) -> list[ComparedRuns]:
@@ -103,14 +103,11 @@ def comparison_latex(rows: Sequence[ComparedRuns]) -> str:
 def _cells(rows: Sequence[ComparedRuns], between: str) -> list[list[str]]:
     """A heading, then each row's text; `between` stands between a mean and its spread."""
 
-    def cell(row, column, digits):
-        mean, spread = row.mean(column), row.spread(column)
-        if mean is None:
-            return "-"
-        return f"{mean:.{digits}f}" + (f"{between}{spread:.{digits}f}" if spread else "")
-
     cells = [["run", "scene", "seeds", *(heading for heading, _ in COLUMNS.values())]]
     for row in rows:
-        figures = (cell(row, column, digits) for column, (_, digits) in COLUMNS.items())
-        cells.append([row.label, row.scene, str(row.count), *figures])
+        cells.append([row.label, row.scene, str(row.count)])
+        for column, (_, digits) in COLUMNS.items():
+            spread = row.spread(column)
+            more = f"{between}{spread:.{digits}f}" if spread else ""
+            cells[-1].append(number(row.mean(column), digits) + more)
     return cells

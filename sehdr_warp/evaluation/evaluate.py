@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from ..errors import SehdrError
 from ..scene import Scene, View
 from . import metrics
-from .flip import load_flip
-from .lpips import BACKBONE, SMALLEST_EDGE, load_lpips
+from .perceptual import BACKBONE, SMALLEST_EDGE, load_flip, load_lpips
 from .protocols import PROTOCOLS, fit_scale, normalise, tone_map, tone_mapped_psnr
 from .ranking import DARKEST_CODE, ErrorRanking
 
@@ -30,15 +30,15 @@ class RunPictures:
         names = {"train_seconds": "train_seconds", "gaussians": "gaussian_count", "iterations": "iterations"}
         self.facts = {key: getattr(run, name) for key, name in names.items()}
 
-    def hdr(self, view: View) -> torch.Tensor:
+    def hdr(self, view: View) -> Tensor:
         """[H, W, 3] scene-linear radiance."""
         return self.run.render(view.camera).hdr
 
-    def ldr(self, view: View) -> torch.Tensor | None:
+    def ldr(self, view: View) -> Tensor | None:
         """[H, W, 3] simulated photo in [0, 1]; None where there is none."""
         return self.run.render_ldr(view.camera, view.exposure_time)
 
-    def doubt(self, view: View) -> tuple[torch.Tensor, float] | None:
+    def doubt(self, view: View) -> tuple[Tensor, float] | None:
         """Confidence [H, W] in [0, 1], and the radiance that a photo shows as black; None where it is not known."""
         confidence = self.run.render_confidence(view.camera)
         if confidence is None:
@@ -78,8 +78,7 @@ def evaluate(
         SehdrError: for a scene without views, images that disagree with their camera or a render that is not finite.
         InputError: for LPIPS weights that cannot be read.
     """
-    options = {"lpips_weights": lpips_weights, "peak_luminance": peak_luminance, "flip": flip}
-    return Evaluation(RunPictures(run), scene, run.device, **options).result()
+    return Evaluation(RunPictures(run), scene, run.device, lpips_weights, flip, peak_luminance).result()
 
 
 class Evaluation:
@@ -94,12 +93,12 @@ class Evaluation:
         pictures,
         scene: Scene,
         device,
+        lpips_weights: Path | str | None,
+        flip: bool,
+        peak_luminance: float = PEAK_LUMINANCE,
         *,
         views: Sequence[View] | None = None,
         scale_views: Sequence[View] | None = None,
-        lpips_weights=None,
-        peak_luminance: float = PEAK_LUMINANCE,
-        flip: bool = False,
     ):
         self.pictures, self.scene, self.device = pictures, scene, torch.device(device)
         self.split = "test" if scene.test_views else "train"
@@ -117,33 +116,33 @@ class Evaluation:
 
     def result(self) -> dict:
         """The figures, as evaluate() describes them."""
-        scale, scale_reason = self._scale()
+        truths = [view.hdr is not None for view in self.views]
+        missing = None if any(truths) else f"the {self.split} views hold no HDR truth"
+        scale, scale_reason = (None, missing) if missing else self._scale()
         rows = []
         for number, view in enumerate(self.views, 1):
             rows.append(self._view(view, scale))
             log.info(_line(number, len(self.views), rows[-1]))
-        truths = [row for row, view in zip(rows, self.views) if view.hdr is not None]
-        missing = None if truths else f"the {self.split} views hold no HDR truth"
         hdr, pu21 = {}, {}
         for name in PROTOCOLS:
-            if reason := missing or (scale_reason if name == "aligned" else None):
-                names = ("psnr_mu", "ssim_mu", "lpips_mu", *["hdr_flip"] * self.with_flip)
-                hdr[name] = dict.fromkeys(names) | {"views": 0, "reason": reason}
-                pu21[name] = {"psnr": None, "ssim": None, "reason": reason}
-                continue
-            hdr[name] = self._explained(_mean([row["protocol"][name] for row in truths])) | {"views": len(truths)}
-            hdr[name] |= {"flip_reason": self.flip_reason} if self.flip_reason else {}
-            pu21[name] = _mean([row["pu21"][name] for row in truths])
+            reason = scale_reason if name == "aligned" else missing
+            why = {"reason": reason} if reason else {}
+            counted = [] if reason else [row for row, known in zip(rows, truths) if known]
+            figures = _mean(
+                [row["protocol"][name] for row in counted], "psnr_mu", "ssim_mu", "lpips_mu", *self._flipped
+            )
+            hdr[name] = figures | {"views": len(counted)} | (why or self._reasons(figures))
+            pu21[name] = _mean([row["pu21"][name] for row in counted], "psnr", "ssim") | why
         hdr["aligned"]["scale"] = scale
-        ldr = _mean([row["ldr"] for row in rows])
-        if ldr["psnr"] is None:
-            ldr["reason"] = "the folder holds radiance, no simulated photos"
+        ldr = _mean([row["ldr"] for row in rows], "psnr", "ssim", "lpips")
+        unseen = ldr["psnr"] is None
+        ldr |= {"reason": "the folder holds radiance, no simulated photos"} if unseen else self._reasons(ldr)
         result = {
             "scene": self.scene.name,
             "split": self.split,
             "protocol": hdr,
             "pu21": pu21 | {"peak_luminance": self.peak_luminance},
-            "ldr": ldr if "reason" in ldr else self._explained(ldr),
+            "ldr": ldr,
             "regions": {region: errors.result(missing) for region, errors in self.regions.items()},
             "confidence": self.ranking.result() | ({"reason": missing} if missing else {}),
             "views": rows,
@@ -151,10 +150,12 @@ class Evaluation:
         }
         return _plain(result | self.pictures.facts)
 
+    @property
+    def _flipped(self) -> list[str]:
+        return ["hdr_flip"] if self.with_flip else []
+
     def _scale(self) -> tuple[float | None, str | None]:
         """The one factor of the scene for `aligned`, or why there is none."""
-        if not any(view.hdr is not None for view in self.views):
-            return None, None
         views = self.scale_views
         if not views:
             return None, "no training view holds HDR truth to fit the scale on"
@@ -162,7 +163,7 @@ class Evaluation:
         scale = fit_scale((*self._render(view), self._tensor(view.mask), self._tensor(view.image)) for view in views)
         return scale, None if scale else "the pictures hold no light to fit the scale on"
 
-    def _render(self, view: View) -> tuple[torch.Tensor, torch.Tensor | None]:
+    def _render(self, view: View) -> tuple[Tensor, Tensor | None]:
         """Prediction and truth, [H, W, 3] float32 on the device each; no truth gives None."""
         size = (view.camera.height, view.camera.width, 3)
         prediction = self.pictures.hdr(view).detach()
@@ -176,7 +177,7 @@ class Evaluation:
             raise SehdrError(f"view {view.name!r}: the render holds values that are not finite; the training diverged")
         return prediction.float(), self._tensor(view.hdr)
 
-    def _tensor(self, array) -> torch.Tensor | None:
+    def _tensor(self, array) -> Tensor | None:
         return None if array is None else torch.tensor(array, dtype=torch.float32, device=self.device)
 
     def _view(self, view: View, scale: float | None) -> dict:
@@ -184,8 +185,7 @@ class Evaluation:
         hdr, truth = self._render(view)
         photo, mask = self._tensor(view.image), self._tensor(view.mask)
         row = {"name": view.name, "ldr": dict.fromkeys(("psnr", "ssim", "lpips")), "protocol": {}, "pu21": {}}
-        regions = metrics.region_masks(photo)
-        pooled = []
+        regions, pooled = metrics.region_masks(photo), []
         if (encoded := self.pictures.ldr(view)) is not None:
             pair = _inside((encoded.detach().float(), photo), mask)
             row["ldr"] = {"psnr": metrics.psnr(*pair, mask), "ssim": metrics.ssim(*pair, mask)}
@@ -196,31 +196,29 @@ class Evaluation:
         for name in PROTOCOLS if truth is not None else ():
             if name == "aligned" and scale is None:
                 continue
-            pair = _inside(tone_map(name, hdr, truth, mask, scale=scale), mask)
+            linear = normalise(name, hdr, truth, mask, scale=scale)
+            pair, linear = _inside(tone_map(name, *linear), mask), _inside(linear, mask)
             row["protocol"][name] = {
                 "psnr_mu": tone_mapped_psnr(name, *pair, mask),
                 "ssim_mu": metrics.ssim(*pair, mask),
                 "lpips_mu": self._lpips(*pair),
             }
-            linear = _inside(normalise(name, hdr, truth, mask, scale=scale), mask)
+            row["protocol"][name] |= {key: self.flip and self.flip(*linear) for key in self._flipped}
             row["pu21"][name] = metrics.pu21_metrics(*linear, mask, peak_luminance=self.peak_luminance)
-            if self.with_flip:
-                row["protocol"][name]["hdr_flip"] = self.flip(*linear) if self.flip else None
             pooled.append((name, *pair))
         for region, inside in regions.items():
             self.regions[region].add(inside if mask is None else inside * mask, mask, pooled)
         return row
 
     def _lpips(self, prediction, truth) -> float | None:
-        if self.lpips is None or min(truth.shape[:2]) < SMALLEST_EDGE:
-            return None
-        return self.lpips(prediction, truth)
+        return self.lpips(prediction, truth) if self.lpips and min(truth.shape[:2]) >= SMALLEST_EDGE else None
 
-    def _explained(self, figures: dict) -> dict:
-        """The figures, and beside a missing LPIPS why it is missing."""
-        if None not in (figures.get("lpips", 0), figures.get("lpips_mu", 0)):
-            return figures
-        return figures | {"lpips_reason": self.lpips_reason or f"a view is smaller than {SMALLEST_EDGE} pixels"}
+    def _reasons(self, figures: dict) -> dict:
+        """Why LPIPS or HDR-FLIP are missing, where they are."""
+        reasons = {"flip_reason": self.flip_reason} if self.flip_reason and "hdr_flip" in figures else {}
+        if None in (figures.get("lpips", 0), figures.get("lpips_mu", 0)):
+            reasons["lpips_reason"] = self.lpips_reason or f"a view is smaller than {SMALLEST_EDGE} pixels"
+        return reasons
 
 
 class _RegionErrors:
@@ -250,18 +248,16 @@ class _RegionErrors:
         return metrics.decibels(error / weight if weight else math.nan)
 
 
-def _inside(pair: tuple[torch.Tensor, torch.Tensor], mask: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+def _inside(pair: tuple[Tensor, Tensor], mask: Tensor | None) -> tuple[Tensor, Tensor]:
     """Prediction and truth, the prediction as the truth outside the mask: windows across its border see no error."""
     prediction, truth = pair
     return (prediction if mask is None else torch.lerp(truth, prediction, mask[..., None].to(truth))), truth
 
 
-def _mean(rows: list[dict]) -> dict:
-    """The mean of each figure over views; None where some view lacks it."""
-    return {
-        key: None if any(row[key] is None for row in rows) else math.fsum(row[key] for row in rows) / len(rows)
-        for key in rows[0]
-    }
+def _mean(rows: list[dict], *names: str) -> dict[str, float | None]:
+    """The mean of each figure over views; None without views, or where one lacks it."""
+    lacking = {name for name in names if not rows or any(row[name] is None for row in rows)}
+    return {name: None if name in lacking else math.fsum(row[name] for row in rows) / len(rows) for name in names}
 
 
 def _plain(value):

@@ -7,6 +7,7 @@ for identical images under PSNR, NaN where a mask leaves nothing.
 import math
 
 import torch
+from torch import Tensor
 
 from ..splatting.ssim import ssim_map
 
@@ -25,19 +26,14 @@ PU21_RANGE = (0.005, 10000.0)
 PU21_PEAK = 256.0
 
 
-def mu_law(radiance: torch.Tensor, mu: float = 5000.0) -> torch.Tensor:
+def mu_law(radiance: Tensor, mu: float = 5000.0) -> Tensor:
     """log(1 + mu E) / log(1 + mu) (SeHDR, section 4.1; Kalantari and Ramamoorthi 2017) of radiance of any shape, first
     limited to [0, 1], as HDR-NeRF and HDR-GS do."""
     return torch.log1p(mu * radiance.clamp(0.0, 1.0)) / math.log1p(mu)
 
 
 def psnr(
-    prediction: torch.Tensor,
-    truth: torch.Tensor,
-    mask: torch.Tensor | None = None,
-    *,
-    peak: float = 1.0,
-    channels_apart: bool = False,
+    prediction: Tensor, truth: Tensor, mask: Tensor | None = None, *, peak: float = 1.0, channels_apart: bool = False
 ) -> float:
     """Peak signal-to-noise ratio in dB: 10 log10(peak^2 / MSE).
 
@@ -50,9 +46,7 @@ def psnr(
     return math.fsum(decibels(float(mean) / weight, peak) for mean in means) / len(means)
 
 
-def squared_error(
-    prediction: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor | None = None
-) -> tuple[torch.Tensor, float]:
+def squared_error(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> tuple[Tensor, float]:
     """The sum of weighted squared errors for each channel [C] (float64), and the sum of the weights."""
     squared = (prediction.double() - truth.double()) ** 2
     if mask is None:
@@ -67,9 +61,7 @@ def decibels(mean_squared_error: float, peak: float = 1.0) -> float:
     return math.inf if mean_squared_error == 0 else 10 * math.log10(peak**2 / mean_squared_error)
 
 
-def ssim(
-    prediction: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor | None = None, *, peak: float = 1.0
-) -> float:
+def ssim(prediction: Tensor, truth: Tensor, mask: Tensor | None = None, *, peak: float = 1.0) -> float:
     """Structural similarity (splatting.ssim), averaged over pixels and channels; a mask weights the average only.
 
     Border pixels count, as in the code of 3DGS and HDR-GS; HDR-NeRF's script uses a uniform 7 x 7 window without them.
@@ -81,7 +73,7 @@ def ssim(
     return float((values * mask.double()).sum()) / weight if weight else math.nan
 
 
-def pu21_encode(luminance: torch.Tensor) -> torch.Tensor:
+def pu21_encode(luminance: Tensor) -> Tensor:
     """PU21 values of absolute luminance or colour in cd/m^2: 0 at 0.005, 256 at 100, 595 at 10000.
 
     Values outside [0.005, 10000] cd/m^2 are limited to it. Source: Mantiuk and Azimi, PU21, PCS 2021 (banding_glare).
@@ -92,35 +84,29 @@ def pu21_encode(luminance: torch.Tensor) -> torch.Tensor:
 
 
 def pu21_metrics(
-    prediction: torch.Tensor,
-    truth: torch.Tensor,
-    mask: torch.Tensor | None = None,
-    *,
-    peak_luminance: float = 1000.0,
+    prediction: Tensor, truth: Tensor, mask: Tensor | None = None, *, peak_luminance: float = 1000.0
 ) -> dict[str, float]:
-    """PSNR of PU21-encoded colour and SSIM of PU21-encoded luminance.
+    """PSNR of PU21-encoded colour and SSIM of PU21-encoded luminance, both with peak 256: {"psnr": dB, "ssim": ...}.
 
     prediction, truth: [H, W, 3] relative radiance in one unit, Rec.709 primaries. PU21 needs absolute values: the
     truth's maximum is shown at peak_luminance cd/m^2, and the prediction by the same factor.
-    Returns {"psnr": dB, "ssim": ...}, both with peak 256.
     """
-    counted = truth if mask is None else truth[mask > 0]
-    white = float(counted.max()) if counted.numel() else 0.0
-    factor = peak_luminance / white if white > 0 else 1.0
+    factor = peak_luminance / maximum(truth, mask)
     shown = [image.double() * factor for image in (prediction, truth)]
-    weights = shown[0].new_tensor(LUMINANCE)
-    gray = [pu21_encode((image @ weights)[..., None]) for image in shown]
-    return {
-        "psnr": psnr(*map(pu21_encode, shown), mask, peak=PU21_PEAK),
-        "ssim": ssim(*gray, mask, peak=PU21_PEAK),
-    }
+    gray = [pu21_encode((image @ shown[0].new_tensor(LUMINANCE))[..., None]) for image in shown]
+    decibels = psnr(*map(pu21_encode, shown), mask, peak=PU21_PEAK)
+    return {"psnr": decibels, "ssim": ssim(*gray, mask, peak=PU21_PEAK)}
 
 
-def region_masks(photo: torch.Tensor) -> dict[str, torch.Tensor]:
-    """{region: [H, W] bool} for REGIONS, which part the pixels of a photo [H, W, 3], encoded in [0, 1].
+def maximum(image: Tensor, mask: Tensor | None) -> float:
+    """The largest value where the mask counts; 1 for an image without light, which then stays black."""
+    counted = image if mask is None else image[mask > 0]
+    largest = float(counted.max()) if counted.numel() else 0.0
+    return largest if largest > 0 else 1.0
 
-    Clipped: some channel reaches code 250 of 255. Dark: no channel exceeds code 16. Well-exposed: the rest.
-    """
+
+def region_masks(photo: Tensor) -> dict[str, Tensor]:
+    """{region: [H, W] bool} for REGIONS, which part the pixels of a photo [H, W, 3], encoded in [0, 1]."""
     codes = photo * 255
     clipped = (codes >= CLIPPED_CODE - 0.5).any(2)
     dark = (codes <= DARK_CODE + 0.5).all(2)

@@ -13,8 +13,9 @@ aligned   ours: the prediction is first multiplied by one factor for the whole s
 from collections.abc import Iterable
 
 import torch
+from torch import Tensor
 
-from .metrics import mu_law, psnr, region_masks
+from .metrics import maximum, mu_law, psnr, region_masks
 
 PROTOCOLS = ("gt-max", "self-max", "aligned")
 # Values below this fraction of a view's maximum do not vote on the scale: their logarithm is noise.
@@ -26,52 +27,33 @@ LEAST_VOTES = 100
 
 
 def normalise(
-    protocol: str,
-    prediction: torch.Tensor,
-    truth: torch.Tensor,
-    mask: torch.Tensor | None = None,
-    *,
-    scale: float | None = None,
-) -> tuple[torch.Tensor, torch.Tensor]:
+    protocol: str, prediction: Tensor, truth: Tensor, mask: Tensor | None = None, *, scale: float | None = None
+) -> tuple[Tensor, Tensor]:
     """Relative radiance of prediction and truth, [H, W, 3] float64 each, the truth's maximum at 1; not yet limited.
 
     mask: [H, W]; maxima are taken where it is above 0. scale: the factor of fit_scale, for `aligned` alone.
-    Raises ValueError for an unknown protocol.
     """
-    if protocol not in PROTOCOLS:
-        raise ValueError(f"protocol {protocol!r} is not one of {', '.join(PROTOCOLS)}")
     prediction, truth = prediction.double(), truth.double()
-    unit = _maximum(truth, mask)
-    own = {"gt-max": unit, "self-max": _maximum(prediction, mask), "aligned": unit / (scale or 1.0)}[protocol]
+    unit = maximum(truth, mask)
+    own = {"gt-max": unit, "self-max": maximum(prediction, mask), "aligned": unit / (scale or 1.0)}[protocol]
     return prediction / own, truth / unit
 
 
-def tone_map(
-    protocol: str,
-    prediction: torch.Tensor,
-    truth: torch.Tensor,
-    mask: torch.Tensor | None = None,
-    *,
-    scale: float | None = None,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """The mu-law images that the protocol compares, [H, W, 3] float64 in [0, 1]; arguments as in normalise."""
-    prediction, truth = (mu_law(image) for image in normalise(protocol, prediction, truth, mask, scale=scale))
+def tone_map(protocol: str, prediction: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """The mu-law images that the protocol compares, [H, W, 3] float64 in [0, 1], of what normalise() gave."""
+    prediction, truth = mu_law(prediction), mu_law(truth)
     if protocol == "self-max":
         # A little more than exact, so that a whole code does not fall below itself by rounding.
         truth = torch.floor(truth * 255 + 1e-9) / 255
     return prediction, truth
 
 
-def tone_mapped_psnr(
-    protocol: str, prediction: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor | None = None
-) -> float:
+def tone_mapped_psnr(protocol: str, prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
     """PSNR in dB of two images made by tone_map, averaged over channels as the protocol's own code does."""
     return psnr(prediction, truth, mask, channels_apart=protocol == "self-max")
 
 
-def fit_scale(
-    views: Iterable[tuple[torch.Tensor, torch.Tensor, torch.Tensor | None, torch.Tensor | None]],
-) -> float | None:
+def fit_scale(views: Iterable[tuple[Tensor, Tensor, Tensor | None, Tensor | None]]) -> float | None:
     """The factor that takes predictions to the truth: exp of the median of log(truth / prediction); None without votes.
 
     views: (prediction, truth, mask or None, photo or None) of the training views; prediction and truth [H, W, 3]
@@ -82,7 +64,7 @@ def fit_scale(
     votes, guesses = [], []
     for prediction, truth, mask, photo in views:
         prediction, truth = prediction.double(), truth.double()
-        valid = truth > VOTING_FLOOR * _maximum(truth, mask)
+        valid = truth > VOTING_FLOOR * maximum(truth, mask)
         # No floor for the prediction: its scale is what is sought, and one wild highlight would set its maximum.
         valid &= prediction > 0
         if mask is not None:
@@ -96,20 +78,13 @@ def fit_scale(
     return median_factor(votes)
 
 
-def log_ratios(prediction: torch.Tensor, truth: torch.Tensor, chosen: torch.Tensor) -> torch.Tensor:
+def log_ratios(prediction: Tensor, truth: Tensor, chosen: Tensor) -> Tensor:
     """[K] log(truth / prediction) of the chosen values, evenly spaced where they are too many."""
     ratios = (truth[chosen] / prediction[chosen]).log()
     return ratios[:: max(1, -(-len(ratios) // VOTES_PER_VIEW))].cpu()
 
 
-def median_factor(votes: list[torch.Tensor]) -> float | None:
+def median_factor(votes: list[Tensor]) -> float | None:
     """exp of the median of what log_ratios gave for several views; None without votes."""
     joined = torch.cat(votes) if votes else torch.zeros(0)
     return float(joined.median().exp()) if len(joined) else None
-
-
-def _maximum(image: torch.Tensor, mask: torch.Tensor | None) -> float:
-    """The largest value where the mask counts; 1 for an image without light, which then stays black."""
-    counted = image if mask is None else image[mask > 0]
-    largest = float(counted.max()) if counted.numel() else 0.0
-    return largest if largest > 0 else 1.0

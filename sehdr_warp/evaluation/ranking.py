@@ -18,15 +18,7 @@ class ErrorRanking:
     def __init__(self):
         self._views: list[tuple[Tensor, Tensor, Tensor, Tensor, float, float]] = []
 
-    def add(
-        self,
-        confidence: Tensor,
-        prediction: Tensor,
-        truth: Tensor,
-        well_exposed: Tensor,
-        darkest: float,
-        mask: Tensor | None = None,
-    ) -> None:
+    def add(self, confidence, prediction, truth, well_exposed, darkest: float, mask: Tensor | None = None) -> None:
         """confidence: [H, W] in [0, 1]. prediction, truth: [H, W, 3] radiance. well_exposed: [H, W] bool, of the photo.
         darkest: radiance that the photo shows as black, in the render's unit. mask: [H, W]; only pixels above 0.5
         count."""
@@ -49,9 +41,7 @@ class ErrorRanking:
         confidence = torch.cat([view[0] for view in self._views]) if self._views else torch.zeros(0)
         if not len(confidence):
             return figures | {"reason": "the run's confidence was not measured"}
-        votes = []
-        for _, prediction, truth, well_exposed, *_ in self._views:
-            votes.append(log_ratios(prediction, truth, (prediction > 0) & (truth > 0) & well_exposed[:, None]))
+        votes = [log_ratios(a, b, (a > 0) & (b > 0) & voting[:, None]) for _, a, b, voting, *_ in self._views]
         scale = median_factor(votes) or 1.0
         stops, steps = [], []
         for _, prediction, truth, _, darkest, unit in self._views:

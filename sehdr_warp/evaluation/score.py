@@ -23,7 +23,6 @@ class FolderPictures:
         self.facts = {"folder": str(folder)}
 
     def hdr(self, view):
-        """Raises InputError for a file that cannot be read."""
         return torch.from_numpy(read_hdr(self.files[view.name]).copy())
 
     def ldr(self, view):
@@ -67,7 +66,7 @@ def score_folder(
         if which:
             log.warning("%d %s: %s", len(which), what, ", ".join(which[:5]) + (", ..." if len(which) > 5 else ""))
     training = [view for view in truth.train_views if view.name in files and view.hdr is not None]
-    options = {"views": views, "scale_views": training or views, "lpips_weights": lpips_weights, "flip": flip}
-    evaluation = Evaluation(FolderPictures(folder, files), truth, "cpu", **options)
+    chosen = {"views": views, "scale_views": training or views}
+    evaluation = Evaluation(FolderPictures(folder, files), truth, "cpu", lpips_weights, flip, **chosen)
     more = {"missing": missing, "extra": extra, "scale_from": "train" if training else "scored"}
     return evaluation.result() | more

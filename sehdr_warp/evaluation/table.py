@@ -26,7 +26,7 @@ def format_table(result: dict) -> str:
     regions = [["region of the photo", "share", "LDR", *names]]
     for region, figures in result["regions"].items():
         values = [figures["psnr_ldr"], *(figures["psnr_mu"][name] for name in names)]
-        regions.append([region, f"{figures['fraction']:.1%}", *(_number(value, 2) for value in values)])
+        regions.append([region, f"{figures['fraction']:.1%}", *(number(value, 2) for value in values)])
     lines = [f"{result['scene']}: {len(result['views'])} {result['split']} views, {origin}", "", *columns(rows)]
     lines += ["", *columns(regions)]
     ranking = result["confidence"]
@@ -38,10 +38,10 @@ def format_table(result: dict) -> str:
 
 def _row(label: str, figures: dict, suffix: str = "") -> list[str]:
     digits = {f"psnr{suffix}": 2, f"ssim{suffix}": 4, f"lpips{suffix}": 4}
-    return [label, *(_number(figures[key], count) for key, count in digits.items() if key in figures)]
+    return [label, *(number(figures[key], count) for key, count in digits.items() if key in figures)]
 
 
-def _number(value: float | None, digits: int) -> str:
+def number(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 

@@ -12,7 +12,7 @@ import torch
 
 from ..errors import InputError, SehdrError
 from ..evaluation.metrics import psnr
-from ..evaluation.protocols import tone_map
+from ..evaluation.protocols import normalise, tone_map
 from ..field.radiance_field import RadianceField
 from ..response import Response
 from ..scene import Scene, View
@@ -352,8 +352,8 @@ def evaluate_views(field: RadianceField, views: tuple[View, ...], degree: int) -
         scores.setdefault("psnr_ldr", []).append(min(psnr(predicted, photo, mask), BEST))
         if view.hdr is not None:
             hdr = field.render(view.camera, degree=degree).hdr
-            images = tone_map("gt-max", hdr, torch.tensor(view.hdr, device=device), mask)
-            scores.setdefault("psnr_mu", []).append(min(psnr(*images, mask), BEST))
+            images = normalise("gt-max", hdr, torch.tensor(view.hdr, device=device), mask)
+            scores.setdefault("psnr_mu", []).append(min(psnr(*tone_map("gt-max", *images), mask), BEST))
     return {name: sum(values) / len(values) for name, values in scores.items()}
 
 

@@ -1,15 +1,16 @@
-"""LPIPS v0.1 (Zhang et al. 2018) on SqueezeNet 1.1 features, with weights from the user's folder.
+"""What an eye sees, where the user has what it takes: LPIPS by weights from a folder, HDR-FLIP by a package.
 
-The package ships no weights. The folder, given by the caller or by the environment variable SEHDR_LPIPS, holds
-`squeeze.pth` (the v0.1 linear heads of the lpips package) and SqueezeNet 1.1 as `squeezenet1_1_features.pth` (features
-only) or under torchvision's own name `squeezenet1_1-*.pth`.
+LPIPS v0.1 (Zhang et al. 2018) is on SqueezeNet 1.1 features. The folder, given by the caller or by the environment
+variable SEHDR_LPIPS, holds `squeeze.pth` (the v0.1 linear heads of the lpips package) and SqueezeNet 1.1 as
+`squeezenet1_1_features.pth` (features only) or under torchvision's own name `squeezenet1_1-*.pth`.
 """
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from ..errors import InputError
 
@@ -19,8 +20,7 @@ BACKBONE = "squeeze v0.1"
 SMALLEST_EDGE = 17
 # Features after which the network is tapped, and their channels.
 TAPS, WIDTHS = (1, 4, 7, 9, 10, 11, 12), (64, 128, 256, 384, 384, 512, 512)
-SHIFT = (-0.030, -0.088, -0.188)
-SCALE = (0.458, 0.448, 0.450)
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 
 
 class _Fire(nn.Module):
@@ -51,17 +51,16 @@ def _squeezenet_features() -> nn.Sequential:
 class Lpips:
     """The distance itself: call it with two [H, W, 3] images in [0, 1]; 0 for equal images, larger for less alike."""
 
-    def __init__(self, features: nn.Sequential, heads: list[torch.Tensor], device: torch.device | str = "cpu"):
+    def __init__(self, features: nn.Sequential, heads: list[Tensor], device: torch.device | str = "cpu"):
         self.features = features.to(device).eval().requires_grad_(False)
         self.heads = [head.to(device) for head in heads]
-        self.device = torch.device(device)
 
     @torch.no_grad()
-    def __call__(self, prediction: torch.Tensor, truth: torch.Tensor) -> float:
+    def __call__(self, prediction: Tensor, truth: Tensor) -> float:
         """Raises ValueError for images of different sizes or with an edge below 17 pixels."""
         if prediction.shape != truth.shape or min(prediction.shape[:2]) < SMALLEST_EDGE:
             raise ValueError(f"LPIPS takes two images of one size from {SMALLEST_EDGE} pixels on")
-        pair = torch.stack([prediction, truth]).to(self.device, torch.float32).permute(0, 3, 1, 2)
+        pair = torch.stack([prediction, truth]).to(self.heads[0]).permute(0, 3, 1, 2)
         shift, scale = pair.new_tensor(SHIFT)[:, None, None], pair.new_tensor(SCALE)[:, None, None]
         x = (2 * pair - 1 - shift) / scale
         distance = 0.0
@@ -75,9 +74,7 @@ class Lpips:
 
 
 def load_lpips(folder: Path | str | None = None, device: torch.device | str = "cpu") -> tuple[Lpips | None, str | None]:
-    """(metric, None), or (None, the reason) where no usable set of weights is there.
-
-    folder: where the weights lie; None takes the environment variable SEHDR_LPIPS.
+    """(metric, None), or (None, the reason) where no usable set of weights is there. folder: by default SEHDR_LPIPS.
 
     Raises InputError for a folder that does not exist or a file that is not what its name says. Files are read as
     plain tensors (torch.load with weights_only), so that they cannot run code.
@@ -96,9 +93,9 @@ def load_lpips(folder: Path | str | None = None, device: torch.device | str = "c
         beside = f"; the heads for {' and '.join(others)} have no backbone here" if others else ""
         return None, f"{folder} lacks {missing}{beside}"
     features, state = _squeezenet_features(), _tensors(backbones[0])
-    kept = [name for name in state if not name.startswith("classifier.")]
+    kept = {name.removeprefix("features."): state[name] for name in state if not name.startswith("classifier.")}
     try:
-        features.load_state_dict({name.removeprefix("features."): state[name] for name in kept})
+        features.load_state_dict(kept)
     except RuntimeError as error:
         raise InputError(backbones[0], "is not SqueezeNet 1.1", "take torchvision's squeezenet1_1 weights") from error
     state = _tensors(heads)
@@ -108,11 +105,29 @@ def load_lpips(folder: Path | str | None = None, device: torch.device | str = "c
     return Lpips(features, [head[0].float() for head in linear], device), None
 
 
-def _tensors(path: Path) -> dict[str, torch.Tensor]:
+def _tensors(path: Path) -> dict[str, Tensor]:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch reports damaged archives, pickles and missing files in many ways
         raise InputError(path, f"cannot be read as weights ({type(error).__name__})", "download it again") from error
-    if not isinstance(state, dict) or not all(isinstance(value, torch.Tensor) for value in state.values()):
+    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         raise InputError(path, "is not a table of tensors", "take the file of the lpips package or of torchvision")
     return state
+
+
+def load_flip() -> tuple[Callable[[Tensor, Tensor], float] | None, str | None]:
+    """(HDR-FLIP (Andersson et al. 2021), None), or (None, the reason) where flip-evaluator is not installed.
+
+    It takes prediction and truth, [H, W, 3] linear radiance with Rec.709 primaries in one unit, and returns the mean in
+    [0, 1], 0 for equal images, at 67 pixels a degree, over all exposures that the truth asks for.
+    """
+    try:
+        import flip_evaluator
+    except ImportError:
+        return None, "HDR-FLIP needs the package flip-evaluator: pip install sehdr-warp[flip]"
+
+    def distance(prediction: Tensor, truth: Tensor) -> float:
+        images = (image.clamp_min(0).float().cpu().contiguous().numpy() for image in (truth, prediction))
+        return float(flip_evaluator.evaluate(*images, "HDR", applyMagma=False)[1])
+
+    return distance, None
