@@ -15,7 +15,7 @@ from sehdr_warp.scene import Camera
 from ..field.exposure import Exposure, Items, read_exposures
 from ..files import atomic_folder, atomic_path, write_json
 from .colorspace import color_space, from_rec709
-from .exr import Part, check_finite, exr_header, stored_pixel_type, write_exr, write_multipart_exr
+from .exr import Part, check_finite, exr_header, rgb_channels, stored_pixel_type, write_exr, write_multipart_exr
 from .images import exposure_exif, quantize, write_picture
 from .names import safe_names
 
@@ -37,14 +37,14 @@ def bracket_exposures(
     Raises SehdrError, naming the value, where both or none are given, an item cannot be read or comes twice, or a time
     is outside 1e-6 to 1e6 seconds.
     """
-    if (evs is None) == (exposures is None):
+    if evs is not None and exposures is None:
+        stops = [ev for ev in evs.split(",") if ev.strip()] if isinstance(evs, str) else evs
+        name, made = "evs", read_exposures([f"{str(ev).strip()}ev" for ev in stops], base_time, "evs")
+    elif exposures is not None and evs is None:
+        name, made = "exposures", read_exposures(exposures, base_time, "exposures")
+    else:
         count = "both were given" if evs is not None else "neither was given"
         raise SehdrError(f"brackets need evs or exposures, and {count}; give one of them")
-    name, items = "exposures", exposures
-    if evs is not None:
-        stops = [ev for ev in evs.split(",") if ev.strip()] if isinstance(evs, str) else evs
-        name, items = "evs", [f"{str(ev).strip()}ev" for ev in stops]
-    made = read_exposures(items, base_time, name)
     for exposure in made:
         if not _SHORTEST <= exposure.time <= _LONGEST:
             raise SehdrError(
@@ -98,8 +98,6 @@ class BracketFolder:
     "half" (float where half would overflow) or "float". multipart: one EXR file with all exposures of a view. ldr: one
     of LDR_FORMATS adds simulated photos through response.encode. provenance: text by key, for the EXR attributes.
     files: the EXR files, at their final places.
-
-    Raises SehdrError for an unknown color space or LDR format, or for photos without a response.
     """
 
     out: Path
@@ -149,16 +147,8 @@ class BracketFolder:
         pixel = stored_pixel_type(pixels, self.pixel)
         parts, entries = [], []
         for index, (exposure, image) in enumerate(zip(self.exposures, pixels, strict=True)):
-            label = f"b{index}_{exposure.label}"
-            facts = {"view": name, "ev": repr(exposure.ev), "baseExposureTime": repr(self.base_time)}
-            header = exr_header(
-                colorspace=self.colorspace,
-                exposure_time=exposure.time,
-                camera=camera,
-                captured=self.captured,
-                provenance={**self.provenance, **facts},
-            )
-            parts.append(Part(dict(zip("RGB", np.moveaxis(image, 2, 0), strict=True)), header, label))
+            label, header = f"b{index}_{exposure.label}", self.header(name, exposure.time, camera, ev=repr(exposure.ev))
+            parts.append(Part(rgb_channels(image), header, label))
             file = f"{name}.exr" if self.multipart else f"{name}/{name}_{label}.exr"
             entry = {"index": index, "exposure_time": exposure.time, "ev": exposure.ev, "file": f"brackets/{file}"}
             if self.multipart:
@@ -174,8 +164,18 @@ class BracketFolder:
         self._views.append({"view": name, "pixel": pixel, "exposures": entries})
         return pixel
 
+    def header(self, view: str, exposure_time: float, camera: Camera | None, **facts: str) -> dict[str, Any]:
+        """The EXR attributes of a picture of the set."""
+        facts |= {"view": view, "baseExposureTime": repr(self.base_time)}
+        return exr_header(
+            colorspace=self.colorspace,
+            exposure_time=exposure_time,
+            camera=camera,
+            captured=self.captured,
+            provenance={**self.provenance, **facts},
+        )
+
     def _write_photo(self, stem: str, radiance: np.ndarray, exposure: Exposure) -> str:
-        """Writes what the response makes of an exposure; returns the file's name in the manifest."""
         exif = exposure_exif(exposure.time, bias=exposure.ev, captured=self.captured)
         codes = quantize(self.response.encode(radiance * exposure.time), 16 if self.ldr == "png16" else 8)
         file = f"{stem}.{'jpg' if self.ldr == 'jpeg' else 'png'}"

@@ -73,7 +73,6 @@ class Export:
 
 
 def run_render(asked: Render) -> None:
-    """Writes the images and prints which."""
     from .render_views import render_views
 
     options = {name: value for name, value in vars(asked).items() if name not in ("run", "device", "json")}
@@ -85,7 +84,6 @@ def run_render(asked: Render) -> None:
 
 
 def run_report(asked: Report) -> None:
-    """Writes the pictures and prints their files."""
     from .report import write_report
 
     run = open_run(asked.run, asked.device)
@@ -94,7 +92,6 @@ def run_report(asked: Report) -> None:
 
 
 def run_export(asked: Export) -> None:
-    """Writes the file and prints its name."""
     from .ply import export
 
     print(export(open_run(asked.run, "cpu"), asked.out, kind=asked.kind, overwrite=asked.overwrite))

@@ -69,6 +69,11 @@ def exr_header(
     return header | {f"sehdr:{key}": str(value) for key, value in (provenance or {}).items()}
 
 
+def rgb_channels(image: np.ndarray) -> dict[str, np.ndarray]:
+    """R, G and B of [H, W, 3]."""
+    return dict(zip("RGB", np.moveaxis(image, 2, 0), strict=True))
+
+
 def write_exr(
     path: Path | str,
     channels: Mapping[str, np.ndarray],

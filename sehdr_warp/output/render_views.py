@@ -17,7 +17,7 @@ from ..files import atomic_folder
 from .brackets import BracketFolder, bracket_exposures
 from .camera_paths import interpolate, orbit
 from .colorspace import from_rec709
-from .exr import exr_header, write_exr
+from .exr import rgb_channels, write_exr
 from .images import as_array, quantize, write_picture
 from .names import safe_names
 from .tonemap import ToneMap, fit_tone_map
@@ -61,19 +61,8 @@ def render_views(
     if (multipart or ldr_brackets) and not wanted:
         raise SehdrError("brackets were asked for without exposures; give evs (--evs=-2,0,2) or exposures")
     made = bracket_exposures(run.base_time, evs=evs, exposures=exposures) if wanted else ()
-    brackets = BracketFolder(
-        out,
-        made,
-        run.base_time,
-        colorspace,
-        pixel,
-        multipart,
-        ldr_brackets,
-        run.response,
-        datetime.now().replace(microsecond=0),
-        _provenance(run),
-        overwrite,
-    )
+    form, now = (colorspace, pixel, multipart, ldr_brackets, run.response), datetime.now().replace(microsecond=0)
+    brackets = BracketFolder(out, made, run.base_time, *form, now, _provenance(run), overwrite)
     views = select_cameras(run, cameras, count=count)
     with (
         atomic_folder(out / "hdr", overwrite) as hdr_folder,
@@ -89,7 +78,9 @@ def render_views(
                 layers["confidence"] = as_array(confidence)
             elif index == 1:
                 log.info("without a confidence channel: `sehdr-warp report` measures it, from the photos")
-            stored = {_write_hdr(hdr_folder / f"{name}.exr", hdr, layers, camera, brackets)}
+            channels = rgb_channels(from_rec709(hdr, colorspace)) | layers
+            header = brackets.header(name, 1.0, camera)
+            stored = {write_exr(hdr_folder / f"{name}.exr", channels, pixel=pixel, header=header)}
             write_picture(preview_folder / f"{name}.png", quantize(tone_map(hdr)))
             if wanted:
                 stored.add(brackets.add(name, hdr, camera))
@@ -101,16 +92,15 @@ def render_views(
 
 
 def select_cameras(run, cameras: str | Path, *, count: int = 60) -> list[tuple[str, Camera]]:
-    """Named cameras: "train", "test", "all", "orbit", "interpolate" (see render_views) or a JSON file.
+    """Cameras as render_views takes them, by names that are safe for files and all different.
 
-    Names are safe for files and all different.
     Raises SehdrError where the set is empty or the name is neither known nor a file.
     """
-    text = str(cameras)
+    text, known = str(cameras), ", ".join(SPLITS + PATHS)
     if text in SPLITS:
         named = [(entry.name, entry.camera) for entry in run.cameras if text in (entry.split, "all")]
         if not named:
-            raise SehdrError(f"the run has no {text} views; choose other cameras ({', '.join(SPLITS + PATHS)}, a file)")
+            raise SehdrError(f"the run has no {text} views; choose other cameras ({known}, a file)")
     elif text in PATHS:
         seen = [entry.camera for entry in run.cameras if entry.split == "train"]
         path = interpolate(seen, count) if text == "interpolate" else orbit(seen, count, _focus_distance(run, seen))
@@ -119,7 +109,7 @@ def select_cameras(run, cameras: str | Path, *, count: int = 60) -> list[tuple[s
     elif Path(cameras).is_file():
         named = load_cameras(Path(cameras))
     else:
-        raise SehdrError(f"cameras {text!r} are neither a file nor one of {', '.join(SPLITS + PATHS)}")
+        raise SehdrError(f"cameras {text!r} are neither a file nor one of {known}")
     return list(zip(safe_names([name for name, _ in named]), [camera for _, camera in named], strict=True))
 
 
@@ -127,19 +117,6 @@ def fit_run_tone_map(run, cameras: Sequence[Camera]) -> ToneMap:
     """One tone map for a set of views, from small renders of up to four of them, evenly chosen."""
     chosen = [cameras[i] for i in sorted({round(i) for i in np.linspace(0, len(cameras) - 1, _FIT_VIEWS)})]
     return fit_tone_map([as_array(run.render(_small(camera)).hdr) for camera in chosen])
-
-
-def _write_hdr(path: Path, hdr, layers: dict, camera: Camera, options: BracketFolder) -> str:
-    linear = from_rec709(hdr, options.colorspace)
-    header = exr_header(
-        colorspace=options.colorspace,
-        exposure_time=1.0,
-        camera=camera,
-        captured=options.captured,
-        provenance={**options.provenance, "view": path.stem, "baseExposureTime": repr(options.base_time)},
-    )
-    channels = dict(zip("RGB", np.moveaxis(linear, 2, 0), strict=True)) | layers
-    return write_exr(path, channels, pixel=options.pixel, header=header)
 
 
 def _provenance(run) -> dict[str, str]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.scene import Camera, Scene, View
+from sehdr_warp.scene import Scene, View
 
 from ..files import atomic_path, check_absent
 from .camera_paths import interpolate
@@ -126,52 +126,35 @@ def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, ce
     from matplotlib.figure import Figure
 
     shapes = [next(picture.shape for picture in row if picture is not None) for row in rows]
-    heights = [cell * shape[0] / shape[1] for shape in shapes]
-    gap, left, top, bottom = 0.06, 0.3, 0.36, 0.46
-    width, height = left + len(titles) * (cell + gap) + 0.06, top + sum(heights) + gap * (len(rows) - 1) + bottom
+    heights, width = [cell * shape[0] / shape[1] for shape in shapes], 0.4 + len(titles) * cell
+    untitled = dict(enumerate(titles))
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(width, height))
-        for column, title in enumerate(titles):
-            where = ((left + column * (cell + gap) + cell / 2) / width, (height - top + 0.1) / height)
-            figure.text(*where, title, ha="center", va="bottom", fontsize=9.5, fontweight="bold")
-        y = height - top
-        for pictures, name, tall in zip(rows, names, heights, strict=True):
-            y -= tall
-            for column, picture in enumerate(pictures):
-                if picture is not None:
-                    x = left + column * (cell + gap)
-                    axes = figure.add_axes((x / width, y / height, cell / width, tall / height))
-                    axes.imshow(np.clip(picture, 0, 1), aspect="auto", interpolation="lanczos")
-                    axes.set_axis_off()
-            where = ((left - 0.1) / width, (y + tall / 2) / height)
-            figure.text(*where, name, rotation=90, ha="right", va="center", color=QUIET, fontsize=8.5)
-            y -= gap
-        caption = textwrap.fill(caption, max(30, int((width - left) * 17)))
-        figure.text(left / width, 0.16 / height, caption, color=QUIET, fontsize=8, va="bottom")
+        figure = Figure(figsize=(width, 0.9 + sum(heights)), layout="constrained")
+        figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03, wspace=0, hspace=0)
+        grid = figure.add_gridspec(len(rows), len(titles), height_ratios=heights)
+        for row, (pictures, name) in enumerate(zip(rows, names, strict=True)):
+            places = [column for column, picture in enumerate(pictures) if picture is not None]
+            for column in places:
+                axes = figure.add_subplot(grid[row, column])
+                axes.imshow(np.clip(pictures[column], 0, 1), aspect="auto", interpolation="lanczos")
+                axes.set(xticks=[], yticks=[], frame_on=False)
+                axes.set_title(untitled.pop(column, ""), fontsize=9.5, fontweight="bold")
+                axes.set_ylabel(name if column == places[0] else "", fontsize=8.5)
+        figure.supxlabel(textwrap.fill(caption, round(16 * width)), x=0.02, ha="left", fontsize=8.5, color=QUIET)
         return figure
 
 
 def compare(run, view: View, views: Sequence[View]) -> Comparison:
     """What comparison_figure shows of a view of the scene whose views are `views`."""
-    between, confidence = _between(view, views), run.render_confidence(view.camera)
-    return Comparison(
-        view.name,
-        view.image,
-        np.asarray(run.response.decode(view.image)) / view.exposure_time,
-        as_array(run.render(view.camera).hdr),
-        view.hdr,
-        None if confidence is None else as_array(confidence),
-        None if between is None else as_array(run.render(between).hdr),
-    )
-
-
-def _between(view: View, views: Sequence[View]) -> Camera | None:
-    """A camera halfway to the nearest other view."""
+    confidence, new = run.render_confidence(view.camera), None
+    hdr = as_array(run.render(view.camera).hdr)
     others = [other.camera for other in views if other.name != view.name]
-    if not others:
-        return None
-    nearest = min(others, key=lambda camera: float(np.linalg.norm(camera.position - view.camera.position)))
-    return interpolate([view.camera, nearest], 3)[1]
+    if others:
+        nearest = min(others, key=lambda camera: float(np.linalg.norm(camera.position - view.camera.position)))
+        new = as_array(run.render(interpolate([view.camera, nearest], 3)[1]).hdr)
+    from_photo = np.asarray(run.response.decode(view.image)) / view.exposure_time
+    confidence = None if confidence is None else as_array(confidence)
+    return Comparison(view.name, view.image, from_photo, hdr, view.hdr, confidence, new)
 
 
 def _caption(views: Sequence[View], metrics: Sequence[dict], held_out: bool) -> str:
