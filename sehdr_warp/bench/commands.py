@@ -119,8 +119,7 @@ class Quality(Output):
     def measure(self):
         import torch
 
-        from .jobs import plan_jobs
-        from .quality import run_jobs
+        from .quality import plan_jobs, run_jobs
         from .results import new_result
 
         device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")

@@ -9,7 +9,7 @@ from statistics import fmean, median
 from ..errors import InputError
 from ..files import atomic_path
 from . import report_plots as plots
-from .jobs import LEARNED, UPPER_BOUND
+from .quality import LEARNED, UPPER_BOUND
 from .results import PAGES, groups, machine_line, markdown_table, parted
 
 

@@ -16,8 +16,6 @@ import numpy as np
 from sehdr_warp import __version__
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.scene import Camera
-from sehdr_warp.scene.hdr_files import read_exr_channels
-from sehdr_warp.scene.images import MAX_PIXELS
 
 from ..files import atomic_path
 from .colorspace import chromaticities, color_space
@@ -99,18 +97,6 @@ def write_multipart_exr(path: Path | str, parts: Sequence[Part], *, pixel: str =
     if not parts or any(not part.name for part in parts) or len({part.name for part in parts}) < len(parts):
         raise ValueError("parts need one name each, all different")
     return _write(Path(path), parts, pixel)
-
-
-def read_exr(path: Path | str, *, max_pixels: int = MAX_PIXELS) -> tuple[np.ndarray, tuple[str, ...], dict[str, Any]]:
-    """The first part of a file: pixels [H, W, C] float32 as stored, channel names (R, G, B, A first) and the header.
-
-    Raises InputError where the file is missing, damaged, truncated, empty or larger than max_pixels.
-    """
-    channels, header = read_exr_channels(Path(path), max_pixels=max_pixels)
-    if not channels:
-        raise InputError(path, "has no channels", "export it with color channels")
-    names = tuple(sorted(channels, key=lambda name: ("RGBA".find(name) % 5, name)))
-    return np.stack([channels[name] for name in names], axis=2), names, header
 
 
 def stored_pixel_type(arrays: Sequence[np.ndarray], pixel: str = "half") -> str:

@@ -1,16 +1,22 @@
-"""A trained scene as PLY: scene-linear for HDR tools, or baked to display colors for the viewers of 3DGS."""
+"""A trained scene as PLY: scene-linear for HDR tools, or baked to display colors for the viewers of 3DGS.
+
+The files have the attributes of 3D Gaussian Splatting (Kerbl et al. 2023, the reference release), little-endian
+float32: x y z, nx ny nz (zero), f_dc_0..2, f_rest_0..3(K-1)-1 (all coefficients of red, then of green, then of blue),
+opacity (logit), scale_0..2 (logarithm), rot_0..3 (w x y z).
+"""
 
 import logging
+import math
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sehdr_warp.errors import SehdrError
+from sehdr_warp.errors import InputError, SehdrError
 
-from ..files import check_absent
-from .gaussians import GaussianArrays, bake, write_gaussians
+from ..files import atomic_path, check_absent
 
 log = logging.getLogger(__name__)
 KINDS = ("hdr", "ldr")
@@ -20,17 +26,43 @@ _HARMONIC_0 = 0.5 / np.sqrt(np.pi)
 _UNSEEN = 1e-4
 # Radiance below this is written as this: its logarithm must be finite.
 _DARKEST = 1e-12
+# For a fit: more than three directions for each of the 16 coefficients of degree 3, and the sphere's whole weight
+# against 1 for all the cameras together; more cameras than these only cost time.
+_SPHERE_DIRECTIONS, _SPHERE_WEIGHT, _MAX_CAMERAS = 64, 0.05, 48
+_CHUNK = 4096
 
 Colors = Callable[[np.ndarray], np.ndarray]
 
 
+@dataclass(frozen=True)
+class GaussianArrays:
+    """N Gaussians as NumPy arrays, float32.
+
+    means [N, 3] world; log_scales [N, 3], natural logarithm of the standard deviations; quaternions [N, 4] (w x y z);
+    opacity_logits [N]; harmonics [N, K, 3] with K = (degree + 1)^2, degree 0 to 3.
+    color_model: what the sum of harmonics over a viewing direction means, per channel. "display": sRGB-encoded color
+    max(sum + 0.5, 0), as every 3DGS viewer takes it; "log": scene-linear radiance exp(sum); "linear": scene-linear
+    radiance max(sum, 0). base_time: seconds at which the scene was photographed.
+    """
+
+    means: np.ndarray
+    log_scales: np.ndarray
+    quaternions: np.ndarray
+    opacity_logits: np.ndarray
+    harmonics: np.ndarray
+    color_model: str
+    base_time: float
+
+    @property
+    def degree(self) -> int:
+        return math.isqrt(self.harmonics.shape[1]) - 1
+
+    def with_colors(self, harmonics: np.ndarray, color_model: str) -> "GaussianArrays":
+        return replace(self, harmonics=np.ascontiguousarray(harmonics, np.float32), color_model=color_model)
+
+
 def export(
-    run: Any,
-    path: Path | str,
-    *,
-    kind: str = "hdr",
-    exposure_time: float | None = None,
-    overwrite: bool = False,
+    run: Any, path: Path | str, *, kind: str = "hdr", exposure_time: float | None = None, overwrite: bool = False
 ) -> Path:
     """Writes the Gaussians of a trained run as PLY; returns the path.
 
@@ -53,31 +85,12 @@ def export(
     return Path(path)
 
 
-def without_unseen_degrees(gaussians: GaussianArrays) -> GaussianArrays:
-    """The Gaussians without the highest degrees that change no color by more than a ten-thousandth ("display": of
-    white) in any direction.
-
-    A degree l with coefficients c changes a color by at most |c| sqrt((2 l + 1) / (4 pi)) (addition theorem).
-    """
-    harmonics, degree = gaussians.harmonics.astype(np.float64), gaussians.degree
-    scale = np.abs(_HARMONIC_0 * harmonics[:, 0]) if gaussians.color_model == "linear" else 1.0
-    while degree > 0:
-        band = harmonics[:, degree**2 : (degree + 1) ** 2]
-        largest = np.sqrt((band**2).sum(1) * (2 * degree + 1) / (4 * np.pi))
-        if not (largest <= _UNSEEN * scale).all():  # NaN counts as seen, and is refused by name when it is written.
-            break
-        degree -= 1
-    return gaussians.with_colors(gaussians.harmonics[:, : (degree + 1) ** 2], gaussians.color_model)
-
-
 def hdr_gaussians(run) -> GaussianArrays:
     """The scene-linear Gaussians of a run: exact where harmonics are exposures or their logarithms; else, with fused
     brackets or harmonics of encoded values, fitted to the logarithm of the radiance (see bake)."""
     stored, to_radiance = _stored(run)
     if to_radiance is not None:
-        return bake(
-            stored, lambda c: np.log(np.maximum(to_radiance(c), _DARKEST)), "log", camera_positions=_seen_from(run)
-        )
+        return bake(stored, lambda c: np.log(np.maximum(to_radiance(c), _DARKEST)), "log", _seen_from(run))
     harmonics = stored.harmonics.astype(np.float64)
     if stored.color_model == "linear":
         return stored.with_colors(harmonics / run.base_time, "linear")
@@ -97,11 +110,7 @@ def ldr_gaussians(run, exposure_time: float | None = None) -> GaussianArrays:
     if stored.color_model == "display" and time == run.base_time:
         return stored
     radiance = to_radiance or (lambda exposure: exposure / run.base_time)
-
-    def shown(colors):
-        return run.response.encode(radiance(colors) * time)
-
-    return bake(stored, shown, "display", camera_positions=_seen_from(run))
+    return bake(stored, lambda colors: run.response.encode(radiance(colors) * time), "display", _seen_from(run))
 
 
 def _stored(run) -> tuple[GaussianArrays, Colors | None]:
@@ -127,3 +136,126 @@ def _fuse(run, exposure: np.ndarray) -> np.ndarray:
 
 def _seen_from(run) -> np.ndarray:
     return np.array([entry.camera.position for entry in run.cameras if entry.split == "train"])
+
+
+def harmonic_basis(directions: np.ndarray, degree: int) -> np.ndarray:
+    """[..., (degree + 1)^2] float64 real spherical harmonics of unit directions [..., 3], orthonormal over the sphere.
+
+    With the Condon-Shortley phase and in the order of 3D Gaussian Splatting: l = 0, 1, ..., and m = -l ... l.
+    """
+    from scipy.special import sph_harm_y
+
+    x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
+    polar, azimuth = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x)
+    basis = []
+    for order in range(degree + 1):
+        for m in range(-order, order + 1):
+            value = sph_harm_y(order, abs(m), polar, azimuth)
+            basis.append(value.real if m == 0 else np.sqrt(2) * (value.real if m > 0 else value.imag))
+    return np.stack(basis, axis=-1)
+
+
+def sphere_directions(count: int = _SPHERE_DIRECTIONS) -> np.ndarray:
+    """[count, 3] unit vectors, evenly over the sphere (a Fibonacci lattice)."""
+    index = np.arange(count) + 0.5
+    z = 1 - 2 * index / count
+    azimuth, ring = np.pi * (1 + np.sqrt(5)) * index, np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
+
+
+def evaluate_colors(gaussians: GaussianArrays, directions: np.ndarray) -> np.ndarray:
+    """[N, D, 3] colors in the model's own meaning for directions [D, 3] or [N, D, 3]."""
+    value = harmonic_basis(directions, gaussians.degree) @ gaussians.harmonics.astype(np.float64)
+    if gaussians.color_model == "log":
+        return np.exp(np.clip(value, -80, 80))
+    return np.maximum(value + (0.5 if gaussians.color_model == "display" else 0.0), 0)
+
+
+def bake(
+    gaussians: GaussianArrays, change: Colors, color_model: str, camera_positions: np.ndarray | None = None
+) -> GaussianArrays:
+    """The same Gaussians with harmonics fitted to changed colors.
+
+    A camera response and the fusion of brackets act on the radiance of a direction, not on harmonics. So radiance is
+    evaluated over many directions, changed there, and harmonics of the same degree are fitted to it by least squares.
+    Directions in which a Gaussian was photographed count most, since elsewhere its harmonics were never held to
+    anything; an even cover of the sphere keeps the fit bounded there.
+
+    change: [N, D, 3] colors of the present model -> [N, D, 3] values that the new harmonics (with "display" after
+    its offset of 0.5) shall give. camera_positions: [C, 3] from where the scene was photographed; without any, all
+    directions weigh alike.
+    """
+    sphere, cameras = sphere_directions(), np.empty((0, 3))
+    weights = np.full(len(sphere), 1.0 / len(sphere))
+    if camera_positions is not None and len(camera_positions):
+        count = min(len(camera_positions), _MAX_CAMERAS)
+        chosen = np.linspace(0, len(camera_positions) - 1, count).round().astype(int)
+        cameras = np.asarray(camera_positions, np.float64)[chosen]
+        weights = np.concatenate([weights * _SPHERE_WEIGHT, np.full(count, 1.0 / count)])
+    offset = 0.5 if color_model == "display" else 0.0
+    fitted = np.empty_like(gaussians.harmonics)
+    for start in range(0, len(gaussians.means), _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        part = replace(gaussians, means=gaussians.means[rows], harmonics=gaussians.harmonics[rows])
+        seen = part.means[:, None].astype(np.float64) - cameras
+        seen /= np.maximum(np.linalg.norm(seen, axis=2, keepdims=True), 1e-12)
+        directions = np.concatenate([np.broadcast_to(sphere, (len(seen), *sphere.shape)), seen], axis=1)
+        wanted = change(evaluate_colors(part, directions)) - offset
+        basis = harmonic_basis(directions, gaussians.degree)
+        weighted = (basis * weights[:, None]).swapaxes(1, 2)
+        fitted[rows] = np.linalg.solve(weighted @ basis, weighted @ wanted)
+    return gaussians.with_colors(fitted, color_model)
+
+
+def without_unseen_degrees(gaussians: GaussianArrays) -> GaussianArrays:
+    """The Gaussians without the highest degrees that change no color by more than a ten-thousandth ("display": of
+    white) in any direction.
+
+    A degree l with coefficients c changes a color by at most |c| sqrt((2 l + 1) / (4 pi)) (addition theorem).
+    """
+    harmonics, degree = gaussians.harmonics.astype(np.float64), gaussians.degree
+    scale = np.abs(_HARMONIC_0 * harmonics[:, 0]) if gaussians.color_model == "linear" else 1.0
+    while degree > 0:
+        band = harmonics[:, degree**2 : (degree + 1) ** 2]
+        largest = np.sqrt((band**2).sum(1) * (2 * degree + 1) / (4 * np.pi))
+        if not (largest <= _UNSEEN * scale).all():  # NaN counts as seen, and is refused by name when it is written.
+            break
+        degree -= 1
+    return gaussians.with_colors(gaussians.harmonics[:, : (degree + 1) ** 2], gaussians.color_model)
+
+
+def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: bool = False) -> None:
+    """Writes a PLY file; the color model and the base exposure time are `comment sehdr:...` lines of its header.
+
+    Raises InputError where a value is NaN or infinite (with field and index) or the file exists (unless overwrite),
+    SehdrError where it cannot be written.
+    """
+    from plyfile import PlyData, PlyElement
+
+    count = len(gaussians.means)
+    rest = gaussians.harmonics[:, 1:].swapaxes(1, 2).reshape(count, -1)
+    parts = {
+        "x y z": gaussians.means,
+        "nx ny nz": np.zeros((count, 3)),
+        "f_dc_0 f_dc_1 f_dc_2": gaussians.harmonics[:, 0],
+        " ".join(f"f_rest_{i}" for i in range(rest.shape[1])): rest,
+        "opacity": gaussians.opacity_logits[:, None],
+        "scale_0 scale_1 scale_2": gaussians.log_scales,
+        "rot_0 rot_1 rot_2 rot_3": gaussians.quaternions,
+    }
+    columns = [pair for names, values in parts.items() for pair in zip(names.split(), values.T, strict=True)]
+    table = np.empty(count, [(name, "<f4") for name, _ in columns])
+    for name, values in columns:
+        bad = ~np.isfinite(values)
+        if bad.any():
+            index = int(np.argmax(bad))
+            raise InputError(
+                path,
+                f"{name} of {int(bad.sum())} Gaussians is not finite, the first {values[index]} at {index}",
+                "such scenes are not written; train again from an earlier checkpoint or with another seed",
+            )
+        table[name] = values
+    time = f"sehdr:base_exposure_time {gaussians.base_time!r}"
+    comments = [f"sehdr:color_model {gaussians.color_model}", time]
+    with atomic_path(path, overwrite) as temporary, temporary.open("wb") as file:
+        PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=comments).write(file)

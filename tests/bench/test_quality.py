@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from sehdr_warp.bench import quality
-from sehdr_warp.bench.jobs import FAILURE, FORMAT, RESULT, Job, plan_jobs
-from sehdr_warp.bench.quality import exposed, run_job, run_jobs
+from sehdr_warp.bench.quality import FAILURE, FORMAT, RESULT, Job, exposed, plan_jobs, run_job, run_jobs
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.files import write_json
 

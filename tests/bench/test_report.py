@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from sehdr_warp.bench.jobs import plan_jobs
-from sehdr_warp.bench.quality import row_of
+from sehdr_warp.bench.quality import plan_jobs, row_of
 from sehdr_warp.bench.report import write_reports
 from sehdr_warp.bench.report_plots import error_over_time
 from sehdr_warp.bench.results import markdown_table

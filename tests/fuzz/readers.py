@@ -17,12 +17,12 @@ from scipy.io import savemat
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.field.gaussians import Gaussians
-from sehdr_warp.output.exr import Part, read_exr, write_exr, write_multipart_exr
+from sehdr_warp.output.exr import Part, write_exr, write_multipart_exr
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_cameras, load_scene
 from sehdr_warp.scene.colmap_model import read_ply_points
 from sehdr_warp.scene.exposure import exif_exposure
-from sehdr_warp.scene.hdr_files import hdr_size, read_hdr
+from sehdr_warp.scene.hdr_files import hdr_size, read_exr_channels, read_hdr
 from sehdr_warp.scene.images import image_sizes, read_ldr, read_mask
 from sehdr_warp.scene.read_colmap import read_colmap
 from sehdr_warp.scene.read_llff import read_llff
@@ -211,7 +211,7 @@ READERS = {
     "scene": Reader(_transforms, ("transforms.json", "images/*"), _load, text=True),
     "llff": Reader(_llff, ("poses_bounds.npy",), read_llff),
     "ply-points": Reader(_points, ("*.ply",), each(read_ply_points), text=True),
-    "exr": Reader(_exr, ("*.exr",), each(hdr_size, read_hdr, read_exr)),
+    "exr": Reader(_exr, ("*.exr",), each(hdr_size, read_hdr, read_exr_channels)),
     "radiance": Reader(_radiance, ("*.hdr",), each(read_hdr)),
     "photos": Reader(_photos, ("*",), each(image_sizes, read_mask, exif_exposure, _read_photo)),
     "config": Reader(_config, ("*.toml",), each(load_config), text=True),

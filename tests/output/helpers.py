@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from plyfile import PlyData
 
-from sehdr_warp.output.gaussians import GaussianArrays
+from sehdr_warp.output.ply import GaussianArrays
 from sehdr_warp.scene import Camera, look_at
+from sehdr_warp.scene.hdr_files import read_exr_channels
 
 
 def radiance(height=24, width=32, seed=0):
@@ -106,3 +107,10 @@ def read_gaussians(path) -> GaussianArrays:
         comments["color_model"],
         float(comments["base_exposure_time"]),
     )
+
+
+def read_exr(path):
+    """The first part of a file: pixels [H, W, C] float32 as stored, channel names (R, G, B, A first) and the header."""
+    channels, header = read_exr_channels(path)
+    names = tuple(sorted(channels, key=lambda name: ("RGBA".find(name) % 5, name)))
+    return np.stack([channels[name] for name in names], axis=2), names, header

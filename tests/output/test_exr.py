@@ -9,14 +9,10 @@ import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.colorspace import SPACES, chromaticities, color_space, from_rec709, matrix_from_rec709
-from sehdr_warp.output.exr import Part, exr_header, read_exr, stored_pixel_type, write_exr, write_multipart_exr
+from sehdr_warp.output.exr import Part, exr_header, rgb_channels, stored_pixel_type, write_exr, write_multipart_exr
 
 from ..full_disk import full_disk
-from .helpers import camera, radiance
-
-
-def rgb(image):
-    return dict(zip("RGB", np.moveaxis(image, 2, 0), strict=True))
+from .helpers import camera, radiance, read_exr
 
 
 def read_openimageio(path, subimage=0):
@@ -30,7 +26,7 @@ def read_openimageio(path, subimage=0):
 def test_both_readers_give_back_the_rounded_pixels(tmp_path, pixel, dtype):
     image = radiance()
     alpha, depth = np.full(image.shape[:2], 0.3), image[..., 0] * 1.0001
-    channels = rgb(image) | {"A": alpha, "Z": depth, "confidence": alpha / 2}
+    channels = rgb_channels(image) | {"A": alpha, "Z": depth, "confidence": alpha / 2}
     assert write_exr(tmp_path / "a.exr", channels, pixel=pixel) == pixel
 
     pixels, names, header = read_exr(tmp_path / "a.exr")
@@ -54,7 +50,7 @@ def test_metadata_reaches_both_readers(tmp_path):
         captured=datetime(2025, 1, 2, 3, 4, 5),
         provenance={"scene": "room", "iteration": "7"},
     )
-    write_exr(tmp_path / "a.exr", rgb(radiance()), header=header)
+    write_exr(tmp_path / "a.exr", rgb_channels(radiance()), header=header)
     _, _, found = read_exr(tmp_path / "a.exr")
     assert found["expTime"] == np.float32(0.1) and float(found["sehdr:exposureTime"]) == 0.1
     assert found["capDate"] == "2025:01:02 03:04:05"
@@ -89,28 +85,28 @@ def test_values_that_are_not_finite_are_refused_with_their_place(tmp_path, value
     image = radiance()
     image[5, 7, 1] = value
     with pytest.raises(InputError, match=rf"a.exr: channel G: 1 values are not finite, the first {value} at x=7, y=5"):
-        write_exr(tmp_path / "a.exr", rgb(image))
+        write_exr(tmp_path / "a.exr", rgb_channels(image))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_half_overflow_becomes_float_and_says_so(tmp_path):
     image = radiance()
     image[2, 3, 0] = 70000.0
-    assert write_exr(tmp_path / "a.exr", rgb(image)) == "float"
+    assert write_exr(tmp_path / "a.exr", rgb_channels(image)) == "float"
     pixels, _, header = read_exr(tmp_path / "a.exr")
     np.testing.assert_array_equal(pixels, image)
     assert header["sehdr:pixelType"] == "float, since half would overflow 65504"
     # The largest half itself is held by half.
     image[2, 3, 0] = 65504.0
-    assert write_exr(tmp_path / "b.exr", rgb(image)) == "half"
+    assert write_exr(tmp_path / "b.exr", rgb_channels(image)) == "half"
     assert stored_pixel_type([np.array([-65505.0])]) == "float"
     with pytest.raises(InputError, match="past 32-bit floats"):
-        write_exr(tmp_path / "c.exr", rgb(image.astype(np.float64) * 1e38))
+        write_exr(tmp_path / "c.exr", rgb_channels(image.astype(np.float64) * 1e38))
 
 
 def test_full_disk_is_one_line_and_leaves_nothing(tmp_path):
     with pytest.raises(SehdrError, match="a.exr: cannot be written") as caught, full_disk():
-        write_exr(tmp_path / "a.exr", rgb(radiance(200, 200)))
+        write_exr(tmp_path / "a.exr", rgb_channels(radiance(200, 200)))
     assert "\n" not in str(caught.value) and ".tmp" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
 

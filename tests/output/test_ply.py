@@ -7,16 +7,19 @@ from plyfile import PlyData
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.field.color_models import color_model
-from sehdr_warp.output import gaussians as gaussians_module
-from sehdr_warp.output.gaussians import (
+from sehdr_warp.output import ply
+from sehdr_warp.output.ply import (
     GaussianArrays,
     bake,
     evaluate_colors,
+    export,
     harmonic_basis,
+    hdr_gaussians,
+    ldr_gaussians,
     sphere_directions,
+    without_unseen_degrees,
     write_gaussians,
 )
-from sehdr_warp.output.ply import export, hdr_gaussians, ldr_gaussians, without_unseen_degrees
 from sehdr_warp.splatting import spherical_harmonics
 
 from .helpers import Entry, GammaResponse, camera, read_gaussians
@@ -83,7 +86,7 @@ def test_basis_is_that_of_the_renderer():
 
 
 def test_bake_gives_back_what_harmonics_can_hold(monkeypatch):
-    monkeypatch.setattr(gaussians_module, "_CHUNK", 16)
+    monkeypatch.setattr(ply, "_CHUNK", 16)
     start = gaussians(color_model="linear")
     start.harmonics[:, 0] += 20  # Positive in all directions: nothing is cut off.
     baked = bake(start, lambda radiance: 2 * radiance + 0.5, "display", camera_positions=np.ones((3, 3)))

@@ -7,11 +7,10 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.camera_paths import common_focus, interpolate, orbit
-from sehdr_warp.output.exr import read_exr
 from sehdr_warp.output.names import safe_names
 from sehdr_warp.output.render_views import render_views, select_cameras
 
-from .helpers import AnalyticRun, Entry, camera
+from .helpers import AnalyticRun, Entry, camera, read_exr
 
 
 def tree(folder):
