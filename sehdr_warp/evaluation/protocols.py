@@ -66,7 +66,7 @@ def fit_scale(views: Iterable[tuple[Tensor, Tensor, Tensor | None, Tensor | None
         prediction, truth = prediction.double(), truth.double()
         valid = truth > VOTING_FLOOR * maximum(truth, mask)
         # No floor for the prediction: its scale is what is sought, and one wild highlight would set its maximum.
-        valid &= prediction > 0
+        valid &= (prediction > 0) & prediction.isfinite()
         if mask is not None:
             valid &= (mask > 0.5)[..., None]
         clipped = torch.zeros_like(valid) if photo is None else region_masks(photo)["clipped"][..., None]
