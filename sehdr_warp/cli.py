@@ -13,8 +13,6 @@ from . import __version__
 from .errors import SehdrError, UsageError, did_you_mean
 
 PROGRAM = "sehdr-warp"
-
-
 COMMANDS = {
     "train and use a scene": {
         "train": ("training.commands", "Train", "run_train"),
@@ -151,7 +149,3 @@ def _tell(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
-
-
-if __name__ == "__main__":
-    main()

@@ -4,7 +4,7 @@ import functools
 import operator
 import os
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -27,12 +27,18 @@ class Completion:
 
 
 def run_completion(asked: Completion) -> None:
-    """Prints the script."""
     from .cli import PROGRAM, command_options
 
     own = Path(os.environ.get("SHELL", "bash")).name
     shell = asked.shell or (own if own in ("bash", "zsh", "fish", "tcsh") else "bash")
-    choices = [Annotated[options, tyro.conf.subcommand(name)] for name, options in command_options().items()]
+    # What every command takes; cli.py reads these flags before a command does.
+    short = {"quiet": ["-q"], "verbose": None, "debug": None}
+    common = [(name, Annotated[bool, tyro.conf.arg(aliases=of)], field(default=False)) for name, of in short.items()]
+    choices = []
+    for name, options in command_options().items():
+        known = make_dataclass(options.__name__, common, bases=(options,), frozen=True, kw_only=True)
+        known.__doc__ = options.__doc__
+        choices.append(Annotated[known, tyro.conf.subcommand(name)])
     commands = functools.reduce(operator.or_, choices)
     with suppress(SystemExit):
         tyro.cli(commands, prog=PROGRAM, args=["--tyro-write-completion", shell, "-"], config=MARKERS)

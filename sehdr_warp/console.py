@@ -4,7 +4,8 @@ import logging
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from functools import partial
 
 LINE_EVERY = 10.0
 """Seconds between lines about a training where there is no terminal."""
@@ -36,8 +37,8 @@ def show_logs(level: str = "info") -> None:
 def follow(steps: Iterable, total: int) -> None:
     """Runs a training to its end and tells of it: a bar on a terminal, else a line every LINE_EVERY seconds.
 
-    steps: as of a Training: each has iteration, seconds_left, loss, psnr and gaussians; the last three are read only
-        where they are shown.
+    steps: as of a Training, with iteration, seconds_left, loss, psnr and gaussians; the last three are read only where
+    they are shown.
     """
     if not logging.getLogger("sehdr_warp").isEnabledFor(logging.INFO):
         for _ in steps:
@@ -45,7 +46,7 @@ def follow(steps: Iterable, total: int) -> None:
         return
     terminal = sys.stderr.isatty()
     every, due, start = (BAR_EVERY if terminal else LINE_EVERY), 0.0, None
-    with _bar(total) if terminal else _lines(total) as show:
+    with _bar(total) if terminal else nullcontext(partial(_show_line, total)) as show:
         for step in steps:
             now = time.monotonic()
             # The first step waits for the compiling of kernels, which says nothing of the pace.
@@ -57,15 +58,10 @@ def follow(steps: Iterable, total: int) -> None:
             due = time.monotonic() + max(every, min(20 * (time.monotonic() - now), LINE_EVERY))
 
 
-@contextmanager
-def _lines(total: int) -> Iterator[Callable]:
+def _show_line(total, iteration, pace, left, loss, psnr, gaussians) -> None:
+    figures = f"loss {loss:.4f}, PSNR {psnr:.2f} dB, {gaussians} Gaussians"
     log = logging.getLogger("sehdr_warp.training")
-
-    def show(iteration, pace, left, loss, psnr, gaussians):
-        figures = f"loss {loss:.4f}, PSNR {psnr:.2f} dB, {gaussians} Gaussians"
-        log.info("iteration %d/%d, %s, %s left", iteration, total, figures, format_seconds(left))
-
-    yield show
+    log.info("iteration %d/%d, %s, %s left", iteration, total, figures, format_seconds(left))
 
 
 @contextmanager

@@ -21,7 +21,6 @@ from typing import Any
 
 from sehdr_warp.errors import InputError, SehdrError
 
-_REPLACE = "choose another place, or ask for it to be replaced (--overwrite)"
 _REFUSALS = "ENOSPC EDQUOT EFBIG EROFS EACCES EPERM EIO ENAMETOOLONG ENOTDIR EISDIR EMFILE"
 _WRITE_ERRORS = {getattr(errno, name) for name in _REFUSALS.split() if hasattr(errno, name)}
 
@@ -68,10 +67,10 @@ def atomic_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
         for folder, _, names in os.walk(temporary):
             for place in (*names, "."):
                 _sync(Path(folder, place))
-        check_absent_folder(path, overwrite)
+        check_absent(path, overwrite, folder=True)
         _swap_in(temporary, path)
 
-    with _written_beside(path, lambda: check_absent_folder(path, overwrite), put) as temporary:
+    with _written_beside(path, lambda: check_absent(path, overwrite, folder=True), put) as temporary:
         try:
             temporary.mkdir()
             yield temporary
@@ -156,39 +155,32 @@ def contained(folder: Path, name: str, source: Path) -> Path:
     if not isinstance(name, str) or not name or "\0" in name:
         raise InputError(source, f"file name {name!r} is not usable", "correct the entry")
     problem = None
-    if PurePosixPath(name).is_absolute() or PureWindowsPath(name).drive or PureWindowsPath(name).root:
-        problem = "is absolute"
-    elif ".." in PurePosixPath(name.replace("\\", "/")).parts:
-        problem = "contains '..'"
-    else:
-        try:
-            if not (folder / name).resolve().is_relative_to(folder.resolve()):
-                problem = "leads outside the data folder"
-        except (OSError, ValueError, RuntimeError) as error:
-            problem = f"cannot be resolved ({error})"
+    try:
+        if PurePosixPath(name).is_absolute() or PureWindowsPath(name).anchor:
+            problem = "is absolute"
+        elif ".." in PureWindowsPath(name).parts:
+            problem = "contains '..'"
+        elif not (folder / name).resolve().is_relative_to(folder.resolve()):
+            problem = "leads outside the data folder"
+    except (OSError, ValueError, RuntimeError) as error:
+        problem = f"cannot be resolved ({error})"
     if problem:
         short = repr(name if len(name) <= 80 else name[:77] + "...")
         raise InputError(source, f"file name {short} {problem}", f"use a path relative to {folder} without '..'")
     return folder / name
 
 
-def check_absent(path: Path | str, overwrite: bool = False) -> None:
-    """Raises InputError where a file at `path` would have to be replaced without leave, or a folder is in the way."""
+def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = False) -> None:
+    """Raises InputError where a file (or a folder that is not empty) at `path` would have to be replaced without leave,
+    or the other of both is in the way."""
     path = Path(path)
-    if path.is_dir():
-        raise InputError(path, "is a folder, not a file", "choose another name")
-    if not overwrite and (path.exists() or path.is_symlink()):
-        raise InputError(path, "exists already", _REPLACE)
-
-
-def check_absent_folder(path: Path | str, overwrite: bool = False) -> None:
-    """Raises InputError where a folder at `path` would have to be replaced without leave, or a file is in the way."""
-    path = Path(path)
-    if path.is_dir():
-        if not overwrite and any(path.iterdir()):
-            raise InputError(path, "exists already", _REPLACE)
-    elif path.exists() or path.is_symlink():
-        raise InputError(path, "is a file, not a folder", "choose another name")
+    if not (path.exists() or path.is_symlink()):
+        return
+    if path.is_dir() != folder:
+        here, wanted = ("a file", "a folder") if folder else ("a folder", "a file")
+        raise InputError(path, f"is {here}, not {wanted}", "choose another name")
+    if not overwrite and not (folder and not any(path.iterdir())):
+        raise InputError(path, "exists already", "choose another place, or ask for it to be replaced (--overwrite)")
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """The command line: what scripts may rely on."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -226,7 +227,7 @@ def test_config_prints_what_train_takes(run, tmp_path, capsys):
 def test_shells_can_complete(shell, capsys):
     assert call("completion", shell) == 0
     text = capsys.readouterr().out
-    assert "sehdr-warp" in text and "render" in text and "ssim-weight" in text
+    assert all(word in text for word in ("sehdr-warp", "render", "ssim-weight", "quiet", "verbose", "debug"))
 
 
 def test_debug_shows_where_an_error_comes_from(tmp_path, capsys):
@@ -250,6 +251,14 @@ def test_interrupt_is_130(monkeypatch, capsys):
     monkeypatch.setattr("sehdr_warp.evaluation.commands.run_evaluate", interrupted)
     assert call("eval", "x") == 130
     assert capsys.readouterr().err == "sehdr-warp: interrupted\n"
+
+
+def test_an_interrupt_while_modules_load_is_130(tmp_path):
+    (tmp_path / "difflib.py").write_text("raise KeyboardInterrupt")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    command = [sys.executable, "-m", "sehdr_warp", "presets"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    assert (ended.returncode, ended.stderr) == (130, "sehdr-warp: interrupted\n")
 
 
 def test_render_writes_hdr_previews_and_brackets(run, tmp_path, capsys):

@@ -19,7 +19,7 @@ from filelock import FileLock, Timeout
 
 from ..errors import InputError, SehdrError
 from ..evaluation.evaluate import evaluate
-from ..files import write_json
+from ..files import read_json, write_json
 from ..response import response_by_name
 from ..scene import Scene, embedded_folder, is_embedded, load_scene
 from ..synth.expose import expose, exposure_ladder
@@ -75,9 +75,9 @@ class Job:
 
     def result(self, out: Path) -> dict | None:
         """The complete result; None where there is none, or one that was cut short or is another config's."""
-        found = read_json(self.folder(out) / RESULT)
-        whole = isinstance(found, dict) and "figures" in found
-        return found if whole and (found.get("format"), found.get("key")) == (FORMAT, self.key) else None
+        found = _read(self.folder(out) / RESULT)
+        whole = "figures" in found and (found.get("format"), found.get("key")) == (FORMAT, self.key)
+        return found if whole else None
 
 
 def plan_jobs(
@@ -163,12 +163,11 @@ def _training(method: str, iterations: int | None, seed: int) -> Config:
     return override_config(config, times | {"plan.keep": sorted({*config.plan.keep, *stated, "response.name"})}, method)
 
 
-def read_json(path: Path):
-    """What a JSON file holds; None where it is missing or damaged."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return None
+def _read(path: Path) -> dict:
+    """What a JSON file holds; nothing where it is missing or damaged."""
+    with contextlib.suppress(InputError):
+        return read_json(path)
+    return {}
 
 
 def _digest(place: str) -> str:
@@ -210,7 +209,7 @@ def run_jobs(
         _submit(open_jobs, out, device, at_once, slurm, lpips)
     rows = []
     for job in jobs:
-        result, failure = job.result(out), read_json(job.folder(out) / FAILURE) or {}
+        result, failure = job.result(out), _read(job.folder(out) / FAILURE)
         error = failure.get("error", "no worker was left to run it")
         rows.append(row_of(result) if result else {"label": job.label, "error": error})
     return rows

@@ -1,13 +1,12 @@
 """`bench report`: the pages and plots of docs/reports, made of the results stored there. Nothing is typed by hand."""
 
 import csv
-import json
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from statistics import fmean, median
 
 from ..errors import InputError
-from ..files import atomic_path
+from ..files import atomic_path, read_json
 from . import report_plots as plots
 from .quality import LEARNED, UPPER_BOUND
 from .results import PAGES, groups, machine_line, markdown_table, parted
@@ -43,12 +42,9 @@ def write_reports(folder: Path) -> list[Path]:
 
 
 def _read(path: Path) -> dict:
-    try:
-        result = json.loads(path.read_text(encoding="utf-8"))
-        for key in ("command", "machine", "date", "rows", "notes"):
-            result[key]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(path, f"is no result ({error!r:.80})", "write it with --json of a benchmark") from None
+    result = read_json(path)
+    if missing := {"command", "machine", "date", "rows", "notes"} - result.keys():
+        raise InputError(path, f"is no result (lacks {min(missing)})", "write it with --json of a benchmark")
     return result
 
 
