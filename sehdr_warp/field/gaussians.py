@@ -24,6 +24,13 @@ class Gaussians(nn.Module):
         K = (degree + 1)^2. What their sum means is the color model's choice.
     """
 
+    means: Tensor
+    log_scales: Tensor
+    quaternions: Tensor
+    opacity_logits: Tensor
+    harmonics_dc: Tensor
+    harmonics_rest: Tensor
+
     def __init__(self, means, log_scales, quaternions, opacity_logits, harmonics_dc, harmonics_rest):
         super().__init__()
         given = (means, log_scales, quaternions, opacity_logits, harmonics_dc, harmonics_rest)

@@ -78,6 +78,8 @@ class RadianceField(nn.Module):
     confidence: [N] in [0, 1], how far the photos vouch for each Gaussian; None where it was not measured.
     """
 
+    confidence: Tensor | None
+
     def __init__(
         self,
         gaussians: Gaussians,
@@ -129,7 +131,7 @@ class RadianceField(nn.Module):
         images = dict(zip(sets, parts, strict=True))
         encoded, exposure, light = images.get("encoded"), images.get("fused"), None
         if self.tone_map == "pixel":
-            light = exposure * ratio
+            light = images["fused"] * ratio
             encoded = self.response.encode_extended(light) if encode else None
         return Photograph(encoded, exposure, images.get("base", exposure), rendering, light)
 
@@ -151,8 +153,9 @@ class RadianceField(nn.Module):
     def render_ldr(self, camera: Camera, exposure_time: float | None = None, *, degree: int | None = None) -> Tensor:
         """[H, W, 3] in [0, 1]: the simulated photo of exposure_time seconds, by default the base time."""
         tensors = CameraTensors.of(camera, self.gaussians.means.device)
-        photo = self.photograph(tensors, exposure_time or self.base_time, degree=degree)
-        return photo.encoded.clamp(0, 1)
+        photo = self.photograph(tensors, exposure_time or self.base_time, degree=degree).encoded
+        assert photo is not None
+        return photo.clamp(0, 1)
 
     @torch.no_grad()
     def render_confidence(self, camera: Camera) -> Tensor | None:
@@ -186,7 +189,7 @@ class RadianceField(nn.Module):
             return base, base
         return base, self.fusion(base.log() if logarithm is None else logarithm) * self.base_time
 
-    def _reexpose(self, encoded: Tensor, ratio: float) -> Tensor:
+    def _reexpose(self, encoded: Tensor, ratio: float | Tensor) -> Tensor:
         """Encoded values at the base time as they would be at `ratio` times it."""
         if ratio == 1.0:
             return encoded

@@ -83,9 +83,11 @@ def blend_on_cpu(
     features, lists: TileLists, records, image, left_over, alpha_threshold: float, deterministic: bool
 ) -> Adjoint:
     """Fill image [H, W, C] and left_over [H, W], the transmittance: balanced pieces of tiles, a thread each."""
-    scalar = warp_scalar(features.dtype)
+    scalar, emission = warp_scalar(features.dtype), lists.emission
+    assert emission is not None, "sums in a fixed order need the entries as they were emitted"
     height, width, channels = image.shape
-    halvings = exponent_halvings(alpha_threshold)
+    # How often the polynomial exponential halves its argument to reach down to log(alpha_threshold).
+    halvings = max(1, math.ceil(math.log2(-math.log(alpha_threshold) / 0.7)))
     tile_count, pieces = lists.columns * lists.rows, balanced_pieces(lists)
 
     def rows(*shape):
@@ -108,18 +110,13 @@ def blend_on_cpu(
         launch(
             blend_cpu.backward_kernel(scalar, channels, halvings),
             tile_count,
-            *(lists.ranges, lists.gaussians, _emission(lists).places, *records, *frame, last),
+            *(lists.ranges, lists.gaussians, emission.places, *records, *frame, last),
             *(image_gradient.view(-1, channels), left_over_gradient, transmittance, *scratch, entry_gradients),
             ranges=pieces,
         )
-        return gather_by_gaussian(_emission(lists), entry_gradients)
+        return gather_by_gaussian(emission, entry_gradients)
 
     return backward
-
-
-def exponent_halvings(alpha_threshold: float) -> int:
-    """How often the polynomial exponential halves its argument to reach down to log(alpha_threshold)."""
-    return max(1, math.ceil(math.log2(-math.log(alpha_threshold) / 0.7)))
 
 
 def balanced_pieces(lists: TileLists) -> list[tuple[int, int]]:
@@ -168,17 +165,13 @@ def blend_on_cuda(
             gathered = transmittance.new_zeros(count, channels + 6)
             launch_blocks(kernel, corners, *given, 0, lists.gaussians, gathered)
             return gathered
-        by_entry = transmittance.new_zeros(lists.entry_count, channels + 6)
+        emission, by_entry = lists.emission, transmittance.new_zeros(lists.entry_count, channels + 6)
+        assert emission is not None, "sums in a fixed order need the entries as they were emitted"
         for corner in range(corners):
-            launch_blocks(kernel, 1, *given, corner, _emission(lists).places, by_entry)
-        return gather_by_gaussian(_emission(lists), by_entry)
+            launch_blocks(kernel, 1, *given, corner, emission.places, by_entry)
+        return gather_by_gaussian(emission, by_entry)
 
     return backward
-
-
-def _emission(lists: TileLists) -> Emission:
-    assert lists.emission is not None, "sums in a fixed order need the entries as they were emitted"
-    return lists.emission
 
 
 def gather_by_gaussian(emission: Emission, by_entry: Tensor) -> Tensor:

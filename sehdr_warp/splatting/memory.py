@@ -31,7 +31,11 @@ def bytes_asked_for(error: BaseException) -> str | None:
     found = re.search(r"allocate (\d[\d.]*) ?(bytes|[KMGT]iB)", text)
     if found is None:
         return "some memory"
-    return _readable(int(found[1])) if found[2] == "bytes" else f"{found[1]} {found[2]}"
+    count, unit = float(found[1]), found[2]
+    for larger, size in (("GiB", 1 << 30), ("MiB", 1 << 20)):
+        if unit == "bytes" and count >= size:
+            return f"{count / size:.2f} {larger}"
+    return f"{found[1]} {unit}"
 
 
 @contextmanager
@@ -47,10 +51,3 @@ def memory_told(device: torch.device, sizes: Callable[[], tuple[int, ...]]) -> I
         gaussians, width, height, *channels = sizes()
         told = f"{gaussians} Gaussians, an image of {width} x {height}" + "".join(f", {n} channels" for n in channels)
         raise OutOfMemory(f"out of memory on {device}: {asked} could not be allocated with {told}; {REMEDY}") from error
-
-
-def _readable(count: int) -> str:
-    for unit, size in (("GiB", 1 << 30), ("MiB", 1 << 20)):
-        if count >= size:
-            return f"{count / size:.2f} {unit}"
-    return f"{count} bytes"

@@ -46,7 +46,7 @@ class RecordedRasterizer:
         self._backward = GraphRecorder(device, self._forward.stream)
         self._key = None
         self._arguments: list[Tensor] = []
-        self._rendering: Rendering | None = None
+        self._rendering: Rendering
         self._upstream: list[Tensor] = []
         self._gradients: list[Tensor | None] = []
         self._calls = 0
@@ -72,16 +72,11 @@ class RecordedRasterizer:
         if key != self._key:
             self._record(key, tensors, wanted, size, options)
         image, transmittance = _Replay.apply(self, *tensors)
-        if self._rendered.overflow:
+        if self._rendering.overflow:
             # These arguments need more room than those that were recorded.
             self._record(key, tensors, wanted, size, options)
             image, transmittance = _Replay.apply(self, *tensors)
-        return replace(self._rendered, image=image, transmittance=transmittance)
-
-    @property
-    def _rendered(self) -> Rendering:
-        assert self._rendering is not None, "nothing is recorded"
-        return self._rendering
+        return replace(self._rendering, image=image, transmittance=transmittance)
 
     def _record(self, key, tensors, wanted, size, options) -> None:
         self._key = None
@@ -93,9 +88,8 @@ class RecordedRasterizer:
                 return rasterize(*self._arguments, *size, capacity=capacity, **options)  # pyright: ignore[reportArgumentType]
 
         def backward(rendering):
-            return torch.autograd.grad(
-                [rendering.image, rendering.transmittance], leaves, self._upstream, allow_unused=True
-            )
+            images = [rendering.image, rendering.transmittance]
+            return torch.autograd.grad(images, leaves, self._upstream, allow_unused=True)
 
         # Launched once: nothing may be compiled or loaded during a recording, and it tells how much room is needed.
         with self._forward.launching():
@@ -121,12 +115,11 @@ class _Replay(torch.autograd.Function):
     def forward(ctx, owner: RecordedRasterizer, *tensors):
         owner._calls += 1
         ctx.owner, ctx.call = owner, owner._calls
-        torch._foreach_copy_(  # pyright: ignore[reportPrivateImportUsage]
-            [argument.detach() for argument in owner._arguments], [t.detach() for t in tensors]
-        )
+        given = [t.detach() for t in tensors]
+        torch._foreach_copy_([t.detach() for t in owner._arguments], given)  # pyright: ignore[reportPrivateImportUsage]
         owner._forward.replay()
         ctx.set_materialize_grads(False)
-        return owner._rendered.image.detach(), owner._rendered.transmittance.detach()
+        return owner._rendering.image.detach(), owner._rendering.transmittance.detach()
 
     @staticmethod
     @torch.autograd.function.once_differentiable

@@ -26,13 +26,12 @@ its own, and while it is made torch can give nothing back."""
 def _no_collection():
     """No garbage collection within this block. A recording that only the collector frees (trainings live in reference
     cycles) takes its memory along, and in the middle of another recording that spoils both."""
-    enabled = gc.isenabled()
+    restore = gc.enable if gc.isenabled() else gc.disable
     gc.disable()
     try:
         yield
     finally:
-        if enabled:
-            gc.enable()
+        restore()
 
 
 def _one_thread():

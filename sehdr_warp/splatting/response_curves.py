@@ -31,7 +31,6 @@ def encode_with_slope(exposure: Tensor, curve: FormulaCurve, extension_slope: fl
     values, slopes = torch.empty_like(exposure), torch.empty_like(exposure)
     scalar = warp_scalar(exposure.dtype)
     numbers = (*curve.tone_numbers, *[0.0] * (5 - len(curve.tone_numbers)))
-    kernel = encode_kernel(scalar, TONES[curve.tone])
     constants = vector(4, scalar)(*curve.power_law), vector(5, scalar)(*numbers), curve.clip, extension_slope
-    launch(kernel, exposure.numel(), exposure, *constants, values, slopes)
+    launch(encode_kernel(scalar, TONES[curve.tone]), exposure.numel(), exposure, *constants, values, slopes)
     return values, slopes

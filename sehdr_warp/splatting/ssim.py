@@ -9,10 +9,8 @@ from ..kernels.ssim import RADIUS, ssim_kernels, window
 from .checks import check_tensors
 from .launching import launch, warp_scalar
 
-# Numbers that one step of the CPU kernels takes: one AVX-512 register of float32.
-CPU_LANES = 16
-# Smallest share of such steps that is worth handing to another thread: about 0.1 ms of work.
-STEPS_PER_THREAD = 4096
+CPU_LANES = 16  # Numbers that one step of the CPU kernels takes: one AVX-512 register of float32
+STEPS_PER_THREAD = 4096  # Smallest share of such steps that is worth handing to another thread: about 0.1 ms of work
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
@@ -48,7 +46,7 @@ class _Distance(torch.autograd.Function):
         terms, derivatives = _compare(a, b, weights)
         if ctx.needs_input_grad[0]:
             # Made at once: it takes a fifth of the memory of what it is made of.
-            ctx.save_for_backward(_gradient(a, b, derivatives, _one(a.dtype, a.device), weights))
+            ctx.save_for_backward(_gradient(a, b, derivatives, _constant((1.0,), a.dtype, a.device)[0], weights))
         return terms.sum() if a.device.type == "cuda" else terms.flatten(1).sum(1).sum()
 
     @staticmethod
@@ -124,7 +122,7 @@ class _Runs:
         self.lanes = CPU_LANES if image.device.type == "cpu" and self.length >= CPU_LANES else 1
         self.kernels = ssim_kernels(warp_scalar(image.dtype), self.lanes, weights is not None)
         self.weights_of_both = weights or (0.0, 0.0)
-        self.weights = _weights(image.dtype, image.device)
+        self.weights = _constant(tuple(window()), image.dtype, image.device)
 
     def padded(self, count: int) -> Tensor:
         """[count, rows, ...] uninitialised rows with the zeros that the horizontal blur finds beyond the border; with
@@ -153,10 +151,5 @@ class _Runs:
 
 
 @cache
-def _weights(dtype: torch.dtype, device: torch.device) -> Tensor:
-    return torch.tensor(window(), dtype=dtype, device=device)
-
-
-@cache
-def _one(dtype: torch.dtype, device: torch.device) -> Tensor:
-    return torch.ones((), dtype=dtype, device=device)
+def _constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    return torch.tensor(values, dtype=dtype, device=device)

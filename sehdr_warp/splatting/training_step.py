@@ -1,6 +1,7 @@
 """What a training does at every step beside rendering, on either device without waiting for it."""
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ def judge_step(loss: Tensor, norms: Tensor, incomplete: Tensor | None = None) ->
     if incomplete is None:
         incomplete = torch.empty(0, dtype=torch.bool, device=norms.device)
     launch(kernels.judge_step, 1, loss.detach(), norms, incomplete, verdict)
-    return verdict.unbind()
+    return verdict[0], verdict[1], verdict[2]
 
 
 @torch.no_grad()
@@ -51,7 +52,7 @@ def adam_step(
         return
     if parameter.device.type == "cpu":
         lists = [parameter], [gradient], [first_moment], [second_moment], [], [step]
-        numbers = {"lr": float(rate), "beta1": betas[0], "beta2": betas[1], "weight_decay": 0.0, "eps": epsilon}
+        numbers: Any = {"lr": float(rate), "beta1": betas[0], "beta2": betas[1], "weight_decay": 0.0, "eps": epsilon}
         torch._fused_adam_(*lists, **numbers, amsgrad=False, maximize=False, found_inf=skipped)  # pyright: ignore[reportPrivateImportUsage]
         return
     rate = rate if isinstance(rate, Tensor) else torch.full_like(skipped, rate)

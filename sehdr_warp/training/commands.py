@@ -14,23 +14,10 @@ import tyro
 from tyro.conf import Positional
 
 from ..errors import InputError, SehdrError, UsageError
-from .config_files import (
-    config_as_toml,
-    config_to_dict,
-    flag_of,
-    flags_type,
-    gone_flags,
-    load_config,
-    named_fields,
-    override_config,
-    preset_names,
-    preset_purpose,
-    value_of,
-)
+from . import config_files as configs
 
 log = logging.getLogger(__name__)
-# What load_scene takes besides the path and the response.
-_READ_BY = ("exposure_index", "max_size", "holdout")
+_READ_BY = ("exposure_index", "max_size", "holdout")  # What load_scene takes besides the path and the response
 
 
 @dataclass(frozen=True)
@@ -91,7 +78,7 @@ class MachineOptions:
 class Train:
     """Train a scene from photos of one exposure. What the scene does not need is left out; what you name stays."""
 
-    gone: ClassVar[Mapping[str, str]] = gone_flags() | {
+    gone: ClassVar[Mapping[str, str]] = {configs.flag_of(path): advice for path, advice in configs.GONE.items()} | {
         "--plan": "it is the default; --plan.enabled false trains without",
         "--set": "every field is a flag, as --loss.clipping false for --set loss.clipping=false",
     }
@@ -102,7 +89,7 @@ class Train:
     training: TrainingOptions = TrainingOptions()
     output: OutputOptions = OutputOptions()
     machine: MachineOptions = MachineOptions()
-    fields: Annotated[flags_type(), tyro.conf.arg(name="")] = field(default_factory=dict)
+    fields: Annotated[configs.flags_type(), tyro.conf.arg(name="")] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -163,7 +150,8 @@ def run_train(asked: Train) -> None:
 def run_presets(asked: Presets) -> None:
     """Prints every preset with its purpose and cost."""
 
-    rows = {name: {"purpose": preset_purpose(name), "cost": _cost(load_config(name))} for name in preset_names()}
+    names, purpose = configs.preset_names(), configs.preset_purpose
+    rows = {name: {"purpose": purpose(name), "cost": _cost(configs.load_config(name))} for name in names}
     if asked.json:
         print(json.dumps(rows))
         return
@@ -176,8 +164,8 @@ def run_config(asked: ShowConfig) -> None:
     from .run_folder import RunFolder
 
     folder = RunFolder(asked.which)
-    config = folder.read_config() if folder.config.is_file() else load_config(asked.which)
-    print(json.dumps(config_to_dict(config)) if asked.json else config_as_toml(config, asked.diff))
+    config = folder.read_config() if folder.config.is_file() else configs.load_config(asked.which)
+    print(json.dumps(configs.config_to_dict(config)) if asked.json else configs.config_as_toml(config, asked.diff))
 
 
 def open_run(path: Path, device: str | None):
@@ -231,28 +219,25 @@ def _config(asked: Train, resumed: bool):
     """The preset's config, or the resumed run's, with what the command line names in it."""
     from .run_folder import RunFolder
 
-    options = asked.training
+    options, predictor = asked.training, asked.training.predict_hdr
+    if predictor is not None and Path(predictor).exists():  # The config outlives this folder.
+        predictor = str(Path(predictor).absolute())
     shortcuts = {
         "response.name": ("--response", asked.scene.response),
-        "loss.predictor": ("--predict-hdr", _predictor(options.predict_hdr)),
+        "loss.predictor": ("--predict-hdr", predictor),
         "schedule.iterations": ("--iterations", options.iterations),
         "seed": ("--seed", options.seed),
     }
-    fields = named_fields(asked.fields)
+    fields = configs.named_fields(asked.fields)
     named = {path: value for path, (_, value) in shortcuts.items() if value is not None}
-    named |= {path: value_of(path, text) for path, text in fields.items()}
-    flags = {path: flag_of(path) if path in fields else shortcuts[path][0] for path in named}
+    named |= {path: configs.value_of(path, text) for path, text in fields.items()}
+    flags = {path: configs.flag_of(path) if path in fields else shortcuts[path][0] for path in named}
     if resumed and options.preset is None:
-        return override_config(RunFolder(asked.output.out).read_config(), named, flags=flags)
+        return configs.override_config(RunFolder(asked.output.out).read_config(), named, flags=flags)
     preset = options.preset or ("default" if options.predict_hdr is None else "predicted")
-    config = load_config(preset, named, flags)
+    config = configs.load_config(preset, named, flags)
     kept = {*config.plan.keep, *(path for path in named if not path.startswith("plan."))}
-    return override_config(config, {"plan.keep": sorted(kept)})
-
-
-def _predictor(text: str | None) -> str | None:
-    """A predictor for the config, which outlives this folder: paths in full, names as they are."""
-    return str(Path(text).absolute()) if text is not None and Path(text).exists() else text
+    return configs.override_config(config, {"plan.keep": sorted(kept)})
 
 
 def _load(data: Mapping, **response):

@@ -40,16 +40,14 @@ def preset_purpose(name: str) -> str:
 def load_config(
     preset: str | Path = "default", overrides: dict[str, Any] | None = None, flags: Mapping[str, str] | None = None
 ) -> Config:
-    """The config of a preset or of a TOML file.
+    """The config of a preset, a name of preset_names(), or of a TOML file.
 
     Args:
-        preset: a name of preset_names(), or the path of a TOML file.
         overrides: dotted field names and values that replace the file's, e.g. {"schedule.iterations": 500}.
         flags: what overrides are called in errors, where they are flags of a command line.
 
     Raises:
-        InputError: naming file, field and value for a missing file, bad TOML, an unknown field, a wrong type or a value
-            out of range.
+        InputError: naming file, field and value for a missing file, bad TOML, or a field that is unknown or wrong.
     """
     config = config_from_dict(*_read(preset))
     return override_config(config, overrides or {}, "overrides", flags)
@@ -95,10 +93,8 @@ def config_as_toml(config: Config, differing: bool = False) -> str:
 
 
 def value_of(path: str, text: str):
-    """A field's value as it was written behind its flag; the config then checks it.
-
-    Text stands as it is, lists are separated by commas, and everything else is written as in TOML.
-    """
+    """A field's value as written behind its flag, for the config to check: text as it is, lists separated by commas,
+    and everything else as in TOML."""
     kind = dict(config_fields())[path].annotation
     if get_origin(kind) is tuple:
         return [_one_value(get_args(kind)[0], item) for item in map(str.strip, text.split(",")) if item]
@@ -213,24 +209,15 @@ def flag_of(path: str) -> str:
     return "--" + path.replace("_", "-")
 
 
-def gone_flags() -> dict[str, str]:
-    """The flags of fields that are gone, with what to do now."""
-    return {flag_of(path): advice for path, advice in GONE.items()}
-
-
 def flags_type() -> type:
     """A TypedDict of every field, for tyro: nothing but what was named is in it, as text."""
     tables: dict[str, dict[str, Any]] = {}
     for path, item in config_fields():
         if path == "seed":  # A flag of its own, in every help.
             continue
-        spec = PrimitiveConstructorSpec(
-            nargs=1,
-            metavar=_metavar(item.annotation),
-            instance_from_str=lambda words: words[0],
-            is_instance=lambda value: isinstance(value, str),
-            str_from_instance=lambda value: [value],
-        )
+        # Arguments, how help calls them, and text as it is in both directions.
+        text = lambda words: words[0], lambda value: isinstance(value, str), lambda value: [value]
+        spec = PrimitiveConstructorSpec(1, _metavar(item.annotation), *text)
         told = tyro.conf.arg(
             help=" ".join((item.description or "").split()), help_behavior_hint=f"(default: {_shown(item.default)})"
         )
@@ -254,8 +241,8 @@ def named_fields(values: dict) -> dict[str, str]:
 def _shown(value) -> str:
     """A field's value as its flag takes it."""
     if isinstance(value, tuple):
-        return ",".join(map(str, value)) or "none"
-    return str(value).lower() if isinstance(value, bool) else "none" if value == "" else f"{value}"
+        value = ",".join(map(str, value))
+    return str(value).lower() if isinstance(value, bool) else f"{value}" or "none"
 
 
 def _metavar(kind) -> str:

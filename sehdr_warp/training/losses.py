@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -47,19 +46,23 @@ def one_of(stack: Tensor, index: Tensor | None) -> Tensor:
 
 
 def code_scale(
-    white: int, response: Response | None, device, *, clipping: bool = True, dtype: torch.dtype = torch.float32
+    largest: int, response: Response | None, device, *, clipping: bool = True, dtype: torch.dtype = torch.float32
 ) -> CodeScale:
     """How photos are compared: in the mu-law of the exposures that the response decodes, or without one as encoded.
 
-    white: the largest code, 255 or 65535. clipping: it says `at least white less half a code`, and 0 says `at most half
+    largest: code, 255 or 65535. clipping: it says `at least white less half a code`, and 0 says `at most half
     a code`; the half, of 8 bits for 16 too, keeps a response that never quite reaches white from being pulled up.
     """
-    values = torch.arange(white + 1, dtype=torch.float64) / white
+    values = torch.arange(largest + 1, dtype=torch.float64) / largest
     if response is None:
         return CodeScale(values.to(device, dtype), half_codes=(CODE / 2, CODE / 2) if clipping else None)
-    mu = mu_of_knee(response)
+    mu, halves = mu_of_knee(response), None
+    if clipping:
+        exposures = (float(response.decode(value)) for value in (1.0, 1.0 - CODE / 2, CODE / 2, 0.0))
+        white, below, above, black = (math.log1p(mu * x / response.white) / math.log1p(mu) for x in exposures)
+        halves = white - below, above - black
     table = mu_law(response.decode(values), response.white, mu).to(device, dtype)
-    return CodeScale(table, mu, response.white, _half_codes(response, mu) if clipping else None)
+    return CodeScale(table, mu, response.white, halves)
 
 
 def image_loss(prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str, weight: float) -> Tensor:
@@ -88,20 +91,9 @@ def compares_light(config: LossConfig, field: RadianceField) -> bool:
     return config.ldr_weight > 0 and decodable
 
 
-@lru_cache(maxsize=16)
 def mu_of_knee(response: Response) -> float:
     """The mu whose knee, white / mu, is the exposure of code KNEE of 255, for any curve."""
     return response.white / max(float(response.decode(KNEE / 255)), 1e-12)
-
-
-@lru_cache(maxsize=16)
-def _half_codes(response: Response, mu: float) -> tuple[float, float]:
-    """How far half a code below white and half a code above black are from them, in the mu-law of exposures."""
-    exposures = (1.0, 1.0 - CODE / 2, CODE / 2, 0.0)
-    white, below, above, black = (
-        math.log1p(mu * float(response.decode(value)) / response.white) / math.log1p(mu) for value in exposures
-    )
-    return white - below, above - black
 
 
 def mu_law(exposure: Tensor, white: float, mu: float = MU) -> Tensor:
@@ -118,12 +110,12 @@ def anchor_loss(mapper: ToneMapper) -> Tensor:
 def linear_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor | None:
     """SeHDR's L_linear: base exposure against the true one where hdr_truth is on and there is any, else against the
     fused one; None where there is nothing to compare."""
-    if config.hdr_truth and target.exposure_truth is not None:
-        return image_loss(photo.base, target.exposure_truth, target.mask, config.form, config.ssim_weight)
-    if photo.base is photo.exposure:
+    truth = target.exposure_truth if config.hdr_truth else None
+    if truth is None and photo.base is photo.exposure:
         return None
     # The base follows: without the detached side both would settle on what is easiest to agree on.
-    return image_loss(photo.base, photo.exposure.detach(), target.mask, config.form, config.ssim_weight)
+    truth = photo.exposure.detach() if truth is None else truth
+    return image_loss(photo.base, truth, target.mask, config.form, config.ssim_weight)
 
 
 def hdr_loss(photo: Photograph, target: Target, config: LossConfig, largest: float) -> Tensor:

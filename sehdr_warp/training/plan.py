@@ -232,11 +232,10 @@ def _brackets(facts: SceneFacts, config: Config, device: torch.device) -> Choice
     )
     if not config.fusion.enabled:
         return {}, "plain scaling", reason
-    fields: dict[str, object] = {"fusion.enabled": False}
-    if not _truth(facts, config):
-        fields["loss.linear_weight"] = 0.0
+    unfused: dict[str, object] = {"fusion.enabled": False}
+    unfused |= {} if _truth(facts, config) else {"loss.linear_weight": 0.0}
     reason = f"{len(config.fusion.exposures)} brackets of one base hold no light of their own; {reason}"
-    return fields, "plain scaling", reason
+    return unfused, "plain scaling", reason
 
 
 def _truth(facts: SceneFacts, config: Config) -> bool:
@@ -250,8 +249,7 @@ def _linear_loss(facts: SceneFacts, config: Config, device: torch.device) -> Cho
         return {}, "none", f"loss.linear_weight = 0; {shown}"
     if _truth(facts, config):
         return {}, "against truth", shown
-    fields: dict[str, object] = {"loss.linear_weight": 0.0}
-    return fields, "none", f"{shown}: against its own brackets a base learns nothing"
+    return {"loss.linear_weight": 0.0}, "none", f"{shown}: against its own brackets a base learns nothing"
 
 
 def _densification(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
@@ -282,7 +280,9 @@ def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Choi
         if wanted > most:
             wanted = most
             # Of the seconds and not of the steps: a step is as slow as its photo is large.
-            reason = f"about {_minutes(wanted * step)} on a CPU with {thread_count()} threads; --iterations for more"
+            took = wanted * step
+            took = f"{max(1, round(took / 60))} min" if took < 5400 else f"{took / 3600:.1f} h"
+            reason = f"about {took} on a CPU with {thread_count()} threads; --iterations for more"
             if wanted == CPU_FEWEST and wanted * step > 2 * CPU_SECONDS:
                 reason += ", --max-size for smaller photos and less time"
     return {"schedule.iterations": wanted}, f"{wanted}", reason
@@ -290,9 +290,8 @@ def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Choi
 
 def _confidence(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     unsure = facts.clipped + facts.black
-    choice = "worth a look" if unsure >= 0.001 or facts.seen < 4 else "high throughout"
     reason = f"{unsure:.1%} of the pixels state a bound alone, and a place is seen by {facts.seen:.1f} photos"
-    return {}, choice, reason
+    return {}, "worth a look" if unsure >= 0.001 or facts.seen < 4 else "high throughout", reason
 
 
 RULES: dict[str, Callable[[SceneFacts, Config, torch.device], Choice]] = {
@@ -312,7 +311,3 @@ def cpu_step_seconds(facts: SceneFacts, config: Config) -> float:
     count = max(facts.points or config.model.initial_count, gaussian_budget(config.densification, facts.pixels))
     work = CPU_PIXEL * facts.pixels / facts.photos + CPU_GAUSSIAN * min(count, config.densification.max_gaussians) / 1.5
     return work / thread_count()
-
-
-def _minutes(seconds: float) -> str:
-    return f"{max(1, round(seconds / 60))} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

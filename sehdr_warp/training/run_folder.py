@@ -72,10 +72,8 @@ class Checkpoint:
 
 
 class RunFolder:
-    """The files of one training at a path; nothing is read or made before it is asked for.
-
-    What cannot be read is an InputError with the file, and the field where there is one.
-    """
+    """The files of one training at a path, read and made when asked for. What cannot be read is an InputError with the
+    file, and the field where there is one; what cannot be written an SehdrError."""
 
     def __init__(self, path: Path | str):
         self.path = Path(path)
@@ -88,10 +86,8 @@ class RunFolder:
         self.tensorboard = self.path / "tensorboard"
 
     def check(self, *, resume: bool, overwrite: bool) -> bool:
-        """Whether there is a run to continue. Changes nothing.
-
-        Raises InputError if something is there and neither was asked for, or if what is there is no run.
-        """
+        """Whether there is a run to continue. Raises InputError if something is there and neither was asked for, or if
+        what is there is no run."""
         if self.path.exists() and not self.path.is_dir():
             raise InputError(self.path, "is a file", "choose another folder for the run")
         if not self.path.exists() or not any(self.path.iterdir()):
@@ -124,14 +120,8 @@ class RunFolder:
         for file in (self.summary, self.metrics, self.confidence, self.plan, self.scene, self.info, self.config):
             file.unlink(missing_ok=True)
         shutil.rmtree(self.checkpoints, ignore_errors=True)
-        info = {
-            "format": FORMAT,
-            "version": __version__,
-            "scene": scene.name,
-            "data": data,
-            "base_time": field.base_time,
-            "response": field.response.to_dict(),
-        }
+        info = {"format": FORMAT, "version": __version__, "scene": scene.name, "data": data}
+        info |= {"base_time": field.base_time, "response": field.response.to_dict()}
         if plan is not None:
             write_json(self.plan, plan, overwrite=True)
         write_json(self.scene, describe_scene(scene), overwrite=True)
@@ -183,7 +173,7 @@ class RunFolder:
         write_json(self.summary, values, overwrite=True)
 
     def append_metrics(self, line: dict) -> None:
-        """Adds a line to metrics.jsonl; raises SehdrError if the disk refuses."""
+        """Adds a line to metrics.jsonl."""
         with writing(self.metrics), open(self.metrics, "a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
 
@@ -211,13 +201,14 @@ class RunFolder:
         """Writes iteration_N from a state with the value "iteration", then deletes all but the newest `kept`.
 
         Later checkpoints go too: a training that is at N was resumed from an earlier one because they are damaged.
-        Where that of N exists and is sound it is left alone. Raises SehdrError if the disk refuses; checkpoints that
-        exist are untouched then.
+        Where that of N exists and is sound it is left alone; so are all where the disk refuses.
         """
         from safetensors.torch import save
 
         final = self.checkpoints / f"iteration_{values['iteration']:08d}"
-        if not _is_sound(final):
+        try:
+            read_checkpoint(final)
+        except InputError:
             for leftover in self.checkpoints.glob(".iteration_*"):
                 shutil.rmtree(leftover, ignore_errors=True)
             data = save({name: value.detach().cpu().contiguous() for name, value in tensors.items()})
@@ -234,21 +225,21 @@ class RunFolder:
     def newest_checkpoint(self) -> Checkpoint | None:
         """The newest complete checkpoint, None if there is none; damaged ones, and ones with numbers that are not
         finite, are passed over, unless all are: then the newest one's InputError is raised."""
-        problem = None
+        problems = []
         for path in self._newest_first():
             try:
                 return read_checkpoint(path)
             except InputError as error:
-                problem = problem or error
-        if problem is not None:
-            raise problem
+                problems.append(error)
+        if problems:
+            raise problems[0]
         return None
 
     def _newest_first(self) -> list[Path]:
         return sorted(self.checkpoints.glob("iteration_*"), reverse=True)
 
     def write_confidence(self, evidence: Evidence, checkpoint_hash: str) -> None:
-        """Writes the evidence, in place of an earlier one. Raises SehdrError if the disk refuses."""
+        """Writes the evidence, in place of an earlier one."""
         from safetensors.torch import save
 
         tensors = {**vars(evidence), "confidence": evidence.confidence()}
@@ -314,14 +305,8 @@ def describe_scene(scene: Scene) -> dict:
         | {"camera": view.camera.to_dict(), "has_hdr": view.hdr is not None}
         for view in scene.views
     ]
-    return {
-        "format": FORMAT,
-        "name": scene.name,
-        "layout": scene.format,
-        "exposure_times_known": scene.exposure_times_known,
-        "notes": list(scene.notes),
-        "views": views,
-    }
+    known = {"exposure_times_known": scene.exposure_times_known, "notes": list(scene.notes)}
+    return {"format": FORMAT, "name": scene.name, "layout": scene.format, **known, "views": views}
 
 
 def _camera_entry(view: dict) -> CameraEntry:
@@ -331,13 +316,6 @@ def _camera_entry(view: dict) -> CameraEntry:
     if not (math.isfinite(time) and time > 0):
         raise ValueError(f"exposure_time = {time} is not a positive number of seconds")
     return CameraEntry(str(view["name"]), str(view["split"]), camera, time)
-
-
-def _is_sound(path: Path) -> bool:
-    try:
-        return bool(read_checkpoint(path))
-    except InputError:
-        return False
 
 
 def _read_values(path: Path, kind: type[BaseModel], remedy: str = _REMEDY) -> dict:

@@ -112,9 +112,7 @@ class Training:
                 self.trainer = self._begin(scene, config or Config(), data or {})
         self.config = self.trainer.config
         self.total = self.config.schedule.iterations
-        self._first = self.iteration
-        self._pace = 0.0
-        self._stopped = False
+        self._first, self._pace, self._stopped = self.iteration, 0.0, False
         self._run: Run | None = None
         self._writer = make_writer and make_writer(str(self.folder.tensorboard))
         self._evaluate_at = {self.config.scaled(n) for n in self.config.schedule.evaluate_at} | {self.total}
@@ -227,14 +225,9 @@ class Training:
         if not self.scene.test_views:
             return
         scores = evaluate_views(self.trainer.field, self.scene.test_views, self.trainer.degree)
-        line = {
-            "iteration": self.iteration,
-            "seconds": round(self.seconds, 3),
-            "split": "test",
-            **{name: round(value, 4) for name, value in scores.items()},
-            "gaussians": self.trainer.field.gaussians.count,
-        }
-        self.folder.append_metrics(line)
+        line = {"iteration": self.iteration, "seconds": round(self.seconds, 3), "split": "test"}
+        line |= {name: round(value, 4) for name, value in scores.items()}
+        self.folder.append_metrics(line | {"gaussians": self.trainer.field.gaussians.count})
         self._log("test", scores)
         figures = ", ".join(f"{name} {value:.2f} dB" for name, value in scores.items())
         log.info("iteration %d: held-out %s after %.1f s", self.iteration, figures, self.seconds)
@@ -253,9 +246,9 @@ class Training:
         if self.iteration > self._first and not math.isfinite(loss := self.trainer.loss):
             told = "iteration %d: the loss is %s; no checkpoint is written, the last one stays"
             log.warning(told, self.iteration, loss)
-            return
-        kept = self.config.schedule.checkpoints_kept
-        self.folder.write_checkpoint(tensors, values | {"seconds": self.seconds}, kept=kept)
+        else:
+            kept = self.config.schedule.checkpoints_kept
+            self.folder.write_checkpoint(tensors, values | {"seconds": self.seconds}, kept=kept)
 
     def _log(self, split: str, figures: dict[str, float]) -> None:
         if self._writer is not None:
@@ -294,7 +287,7 @@ class Training:
         trainer = Trainer(scene, saved, field_from_checkpoint(checkpoint, saved, info).to(self.device))
         try:
             trainer.load_state(checkpoint.tensors, checkpoint.values)
-        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError, IndexError) as error:
+        except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
             problem = f"its state cannot be taken up ({error!r:.120})"
             raise InputError(checkpoint.path, problem, "remove it, or train again") from None
         folder.rewind_metrics(trainer.iteration)

@@ -13,19 +13,12 @@ from ..response.learned import EXACT_BELOW
 from ..scene import Scene
 from ..splatting import GraphRecorder
 from ..splatting.memory import bytes_asked_for
+from . import optimizer as adam
 from .config import Config
 from .densification import make_densification
 from .graph_capacity import GraphCapacity
 from .initialization import scene_extent
 from .losses import compares_light, data_loss, needed_colours, regularised
-from .optimizer import (
-    guarded_step,
-    load_optimizer_tensors,
-    make_optimizer,
-    means_rate,
-    optimizer_tensors,
-    set_means_rate,
-)
 from .targets import TrainingView, ViewStack, largest_truth, training_views
 
 CHECK_EVERY = 20  # Iterations between looks at the count of skipped steps, each of which waits for the device
@@ -41,11 +34,10 @@ class Trainer:
 
     def __init__(self, scene: Scene, config: Config, field: RadianceField):
         self.config, self.field = config, field
-        self.iteration = 0
-        """Steps done."""
+        self.iteration = 0  # Steps done
         self.device = field.gaussians.means.device
         self.extent = scene_extent(scene)
-        self.optimizer = make_optimizer(field, config, self.extent)
+        self.optimizer = adam.make_optimizer(field, config, self.extent)
         pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
         self.densification = make_densification(config, self.extent, pixels)
         self._views = scene.train_views
@@ -102,18 +94,17 @@ class Trainer:
         watched = self.densification.needs_gradients(self.iteration)
         if watched:
             self.densification.prepare(gaussians.count, self.device)
-        rate = means_rate(self.config, self.extent, self.iteration)
-        set_means_rate(self.optimizer, rate)
+        rate = adam.means_rate(self.config, self.extent, self.iteration)
+        adam.set_means_rate(self.optimizer, rate)
         # The last: a learned response encodes few exposures otherwise, by kernels of its own.
         kind = (self.degree, watched, gaussians.count < EXACT_BELOW)
-        self._last_index = index
+        self._last_index, count = index, gaussians.count
         if self._can_record(views, kind):
             self._loss = self._replay(views, index, watched, kind)
         else:
             with self._launching():
                 self._loss = self._optimise(views[index], watched)
         self.densification.perturb(self.iteration, gaussians, rate)
-        count = gaussians.count
         changed = self.densification.change(self.iteration, gaussians, self.optimizer, self._generator)
         if changed and self._recorder is not None:
             # Other Gaussians need about so many times the room.
@@ -125,15 +116,10 @@ class Trainer:
     def _optimise(self, view: TrainingView, watched: bool, capacity: int | None = None) -> Tensor:
         """Photograph, compare, differentiate, step; the loss. With a capacity all of it works on fixed memory and
         nothing waits for the device."""
-        target, camera = view.target, view.camera
-        photo = self.field.photograph(
-            camera,
-            view.exposure_time,
-            degree=self.degree,
-            also=needed_colours(self.config.loss, target.exposure_truth is not None),
-            capacity=capacity,
-            encode=self._encoded,
-        )
+        target, camera, time = view.target, view.camera, view.exposure_time
+        also = needed_colours(self.config.loss, target.exposure_truth is not None)
+        options = {"degree": self.degree, "also": also, "capacity": capacity, "encode": self._encoded}
+        photo = self.field.photograph(camera, time, **options)
         # What the backward pass does not read, or only its first part does, must not stay until the end of the step.
         kept = {"means2d", "radii"} if watched else set()
         unread = {"image", "transmittance", "depths", "means2d", "radii"} - kept
@@ -144,7 +130,7 @@ class Trainer:
         del photo, target, view
         loss = regularised(loss, self.field, self.config.loss)
         loss.backward()
-        nonfinite, made = guarded_step(self.optimizer, loss, rendering.overflow)
+        nonfinite, made = adam.guarded_step(self.optimizer, loss, rendering.overflow)
         if watched:
             self.densification.observe(rendering, camera.width, camera.height, made)
         self.optimizer.zero_grad(set_to_none=True)
@@ -200,7 +186,7 @@ class Trainer:
             "gaussians": self.field.gaussians.tensors(),
             "fusion": {} if self.field.fusion is None else self.field.fusion.state_dict(),
             "response": self.field.response.state_dict() if self.field.response.learnable else {},
-            "optimizer": optimizer_tensors(self.optimizer),
+            "optimizer": adam.optimizer_tensors(self.optimizer),
             "densification": self.densification.state(),
             "generators": {"order": self._order_generator.get_state(), "device": self._generator.get_state()},
         }
@@ -210,7 +196,7 @@ class Trainer:
 
     def load_state(self, tensors: dict[str, Tensor], values: dict) -> None:
         """Takes up what state() gave; the field's Gaussians must already be those of the state."""
-        load_optimizer_tensors(self.optimizer, _part(tensors, "optimizer"))
+        adam.load_optimizer_tensors(self.optimizer, _part(tensors, "optimizer"))
         statistics = {name: value.to(self.device) for name, value in _part(tensors, "densification").items()}
         self.densification.load_state(statistics)
         generators = _part(tensors, "generators")
@@ -225,15 +211,10 @@ class Trainer:
 
     def _training_views(self) -> ViewStack | list[TrainingView]:
         if self._stack is None:
-            loss, response = self.config.loss, self.field.response
-            views = training_views(
-                self._views,
-                self.field.base_time,
-                self.device,
-                truth=loss.uses_hdr,
-                clipping=loss.clipping,
-                light=response if compares_light(loss, self.field) else None,
-            )
+            loss = self.config.loss
+            light = self.field.response if compares_light(loss, self.field) else None
+            given = self._views, self.field.base_time, self.device
+            views = training_views(*given, truth=loss.uses_hdr, clipping=loss.clipping, light=light)
             # Only recorded steps need what they read in one place.
             self._stack = (None if self._recorder is None else ViewStack.of(views)) or views
         return self._stack
