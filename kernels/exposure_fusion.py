@@ -10,8 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-POINTS_PER_THREAD = 64
-"""Of one hidden unit's gradients, summed before the atomics."""
+POINTS_PER_THREAD = 64  # Of one hidden unit's gradients, summed before the atomics
 
 
 @cache

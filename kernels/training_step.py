@@ -9,8 +9,7 @@ import warp as wp
 from .constants import LOG_SCALE_MAX
 from .geometry import geometry, vector
 
-SHARPNESS, CENTRE = 100.0, 0.995
-"""3DGS-MCMC, equation 8: noise is for Gaussians of opacity below 1 - 0.995."""
+SHARPNESS, CENTRE = 100.0, 0.995  # 3DGS-MCMC, equation 8: noise is for Gaussians of opacity below 1 - 0.995
 
 _g = geometry(wp.float32)
 _vec3, _vec4 = vector(3, wp.float32), vector(4, wp.float32)

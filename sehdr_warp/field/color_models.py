@@ -10,12 +10,9 @@ from torch.nn.functional import hardtanh
 
 from ..response import Response
 
-EXPOSURE_FLOOR = 1e-6
-"""Least exposure of a Gaussian of the linear model: keeps logarithms finite, 100 times below 8-bit black in sRGB."""
-LOG_EXPOSURE_LIMIT = 40.0
-"""Log exposures are held within this: exp stays finite in float32, even squared and summed over a pixel."""
-CODE_RANGE = (1 / 255, 250 / 255)
-"""Start colors are held within these encoded values: beyond them a photo tells a bound, not a color."""
+EXPOSURE_FLOOR = 1e-6  # Of the linear model: keeps logarithms finite, 100 times below 8-bit black in sRGB
+LOG_EXPOSURE_LIMIT = 40.0  # Either way: exp stays finite in float32, even squared and summed over a pixel
+CODE_RANGE = (1 / 255, 250 / 255)  # Of start colors, encoded: beyond it a photo tells a bound, not a color
 
 
 class ColorModel:

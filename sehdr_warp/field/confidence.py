@@ -16,11 +16,9 @@ from ..scene import View
 from .radiance_field import CameraTensors, RadianceField
 
 CLIPPED_STOPS = 1.0  # Uncertainty of a pixel that is clipped in all channels
-PARTLY_CLIPPED_STOPS = 0.25
-"""Of a clipped channel beside one that is not: the others say where the light is, this one its hue."""
+PARTLY_CLIPPED_STOPS = 0.25  # Of a clipped channel beside others, which say where the light is, and it the hue
 MOST_STOPS = 4.0  # A misfit counts no more than this: 1/16 of the confidence already says that nothing is known
-LEAST_SEEN = 0.01
-"""Pixels of blending weight, over all photos, at which a Gaussian has half of the confidence that they give it."""
+LEAST_SEEN = 0.01  # Pixels of blending weight, over all photos, at which half of the confidence that they give counts
 MOST_VIEWS = 200  # Training views that are looked at, evenly chosen: more change the means little
 
 _HALF_CODE = 0.5 / 255
@@ -63,8 +61,7 @@ def pixel_uncertainty(photo: Tensor, exposure: Tensor, response: Response) -> tu
     misfit = torch.where(black, (lit / dark).log2(), misfit).clamp_max(MOST_STOPS)
     low, high = (response.decode((photo + offset).clamp(0, 1)) for offset in (-_HALF_CODE, _HALF_CODE))
     rounding = ((high.clamp_min(1e-12) / low.clamp_min(1e-12)).log2() / 4).clamp(0, 1)
-    every = clipped.all(2, keepdim=True)
-    unknown = torch.where(every, CLIPPED_STOPS, PARTLY_CLIPPED_STOPS).expand_as(photo)
+    unknown = torch.where(clipped.all(2, keepdim=True), CLIPPED_STOPS, PARTLY_CLIPPED_STOPS).expand_as(photo)
     stops = misfit + torch.where(clipped, unknown, rounding)
     return stops.mean(2), clipped.to(photo).mean(2)
 

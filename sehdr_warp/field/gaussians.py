@@ -122,10 +122,9 @@ class Gaussians(nn.Module):
             return
         for group in optimizer.param_groups:
             group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
-        moments = _moments(optimizer, old)
-        state = optimizer.state.pop(old, None)
-        if state is not None:
-            optimizer.state[new] = state | {key: change_state(moment) for key, moment in moments.items()}
+        if moments := _moments(optimizer, old):
+            changed = {key: change_state(moment) for key, moment in moments.items()}
+            optimizer.state[new] = optimizer.state.pop(old) | changed
 
 
 def _moments(optimizer, parameter: nn.Parameter) -> dict[str, Tensor]:

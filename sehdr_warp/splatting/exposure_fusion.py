@@ -7,8 +7,7 @@ from ..kernels.exposure_fusion import POINTS_PER_THREAD, fusion_kernels
 from .checks import check_tensors
 from .launching import launch, sums_are_ordered, warp_scalar
 
-MAX_LOG_SIGMA, MAX_DEVIATION = 30.0, 30.0
-"""Limits inside which exp(-d^2 / 2) and its gradient are finite in float32, for any sigma."""
+MAX_LOG_SIGMA, MAX_DEVIATION = 30.0, 30.0  # Inside these exp(-d^2 / 2) and its gradient are finite in float32
 
 
 def fuse_exposures(

@@ -85,8 +85,8 @@ def build_tile_lists(
     columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
     tile_count = columns * rows
     order = depth_order(depths, extents)
-    shapes, ellipses = records
-    counts = count_entries(order, shapes, ellipses, extents, columns, rows)
+    touched = order, *records, extents, columns, rows
+    counts = count_entries(*touched)
     total = counts.sum(dtype=torch.int64)
     overflow = None if capacity is None else total > capacity
     room = int(total) if capacity is None else capacity
@@ -96,7 +96,6 @@ def build_tile_lists(
             "render fewer Gaussians or a smaller image"
         )
     ends = counts.cumsum(0, dtype=torch.int32)
-    touched = order, shapes, ellipses, extents, columns, rows
     tiles, gaussians = emit_entries(*touched, ends, room, capacity is not None)
     tiles, gaussians, places = sort_by_tile(tiles, gaussians, room, tile_count, emission)
     ranges = find_ranges(tiles, tile_count)
@@ -164,14 +163,14 @@ def sort_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: 
     """Stable sort of emit_entries()'s by tile: tiles [M], in the same memory, and copied out of it, which is kept,
     Gaussians [M] and where each entry stood before [M] or None."""
     bits = tile_count.bit_length()
-    if emission:
-        places = torch.empty(2 * entry_count, dtype=torch.int32, device=tiles.device)
-        torch.arange(entry_count, dtype=torch.int32, device=tiles.device, out=places[:entry_count])
-        _sort_pairs(tiles, places, entry_count, bits)
-        places = places[:entry_count].clone()
-        return tiles[:entry_count], gaussians[:entry_count][places] if entry_count else gaussians, places
-    _sort_pairs(tiles, gaussians, entry_count, bits)
-    return tiles[:entry_count], gaussians[:entry_count].clone(), None
+    if not emission:
+        _sort_pairs(tiles, gaussians, entry_count, bits)
+        return tiles[:entry_count], gaussians[:entry_count].clone(), None
+    places = torch.empty(2 * entry_count, dtype=torch.int32, device=tiles.device)
+    torch.arange(entry_count, dtype=torch.int32, device=tiles.device, out=places[:entry_count])
+    _sort_pairs(tiles, places, entry_count, bits)
+    places = places[:entry_count].clone()
+    return tiles[:entry_count], gaussians[:entry_count][places] if entry_count else gaussians, places
 
 
 def find_ranges(tiles, tile_count: int):

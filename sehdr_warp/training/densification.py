@@ -217,9 +217,8 @@ def make_densification(config: Config, extent: float, pixels: int) -> Densificat
 
 def gaussian_budget(options: DensificationConfig, pixels: int) -> int:
     """The most Gaussians that relocation makes for training photos of so many pixels in all."""
-    return (
-        min(options.max_gaussians, int(options.budget * math.sqrt(pixels))) if options.budget else options.max_gaussians
-    )
+    most = int(options.budget * math.sqrt(pixels)) if options.budget else options.max_gaussians
+    return min(options.max_gaussians, most)
 
 
 def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:

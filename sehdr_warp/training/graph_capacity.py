@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 ROOM = 1.25  # Room in multiples of the most pairs seen: photos of a scene differ by up to 1.32 in theirs
-KEPT = 0.97
-"""What a change of the Gaussians keeps of the room at least: after a reset of opacities pairs are few for a while."""
+KEPT = 0.97  # Of the room, at least, when Gaussians change: after a reset of opacities pairs are few for a while
 LEAST_ROOM = 1 << 14
 
 

@@ -31,8 +31,7 @@ def pick_device(device: str | torch.device | None) -> torch.device:
 def machine_figures(device: torch.device) -> dict:
     """The device's name, and the largest memory so far, bytes: of this process, and on a GPU of torch's tensors."""
     cuda = device.type == "cuda"
-    name = torch.cuda.get_device_name(device) if cuda else f"cpu ({thread_count()} threads)"
-    figures: dict = {"device": name}
+    figures: dict = {"device": torch.cuda.get_device_name(device) if cuda else f"cpu ({thread_count()} threads)"}
     if sys.platform != "win32":
         import resource
 

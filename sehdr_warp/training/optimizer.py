@@ -23,7 +23,8 @@ class Adam(torch.optim.Adam):
     """1 - found_inf, where that is at hand."""
 
     def step(self) -> None:
-        parameters = [p for group in self.param_groups for p in group["params"] if p.grad is not None]
+        grouped = [(group, p) for group in self.param_groups for p in group["params"] if p.grad is not None]
+        parameters = [parameter for _, parameter in grouped]
         skipped = getattr(self, "found_inf", None)
         if skipped is None:
             skipped = parameters[0].new_zeros(())
@@ -35,13 +36,10 @@ class Adam(torch.optim.Adam):
         # With lists on both sides: to add one tensor to many, torch reads it on the host, which no recording allows.
         made = 1 - skipped if self.made is None else self.made
         torch._foreach_add_([self.state[p]["step"] for p in parameters], [made] * len(parameters))
-        for group in self.param_groups:
-            for parameter in group["params"]:
-                if parameter.grad is None:
-                    continue
-                given = parameter.detach(), parameter.grad.contiguous()
-                state = (self.state[parameter][key] for key in ("exp_avg", "exp_avg_sq", "step"))
-                adam_step(*given, *state, skipped, rate=group["lr"], betas=group["betas"], epsilon=group["eps"])
+        for group, parameter in grouped:
+            given = parameter.detach(), parameter.grad.contiguous()
+            state = (self.state[parameter][key] for key in ("exp_avg", "exp_avg_sq", "step"))
+            adam_step(*given, *state, skipped, rate=group["lr"], betas=group["betas"], epsilon=group["eps"])
 
 
 def make_optimizer(field: RadianceField, config: Config, extent: float) -> Adam:

@@ -25,10 +25,8 @@ PASSES = 900  # Steps on each photo. A second look at the same photos teaches le
 FEWEST_ITERATIONS = 3000
 CPU_SECONDS = 240.0  # What a training on a CPU may take, as far as CPU_FEWEST allows
 CPU_FEWEST = 1000
-CPU_PIXEL, CPU_GAUSSIAN = 1.5e-6, 2.3e-6
-"""Seconds of one core for each pixel and each Gaussian of a step, measured on two cores of an AMD EPYC."""
-REACH = 2.0**16
-"""Brackets farther from the photos' exposure than this are black or white in all pixels of 8 bits and some headroom."""
+CPU_PIXEL, CPU_GAUSSIAN = 1.5e-6, 2.3e-6  # Seconds of one core for each in a step, measured on two of an AMD EPYC
+REACH = 2.0**16  # Brackets farther from the photos' exposure are black or white in all pixels of 8 bits
 
 PROBES = 2000  # Places at which overlap and visibility are measured
 FEWEST_POINTS = 100  # With fewer sparse points places along the cameras' rays serve as probes

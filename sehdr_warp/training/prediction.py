@@ -20,8 +20,7 @@ BUILT_IN = "kovaleski-oliveira"
 NETWORK_SUFFIXES = (".pt", ".onnx")
 SATURATED = 254 / 255  # A channel at least this bright is taken to be clipped (Rempel et al. 2007, for photos)
 BRIGHTEST = 4.0  # The largest enhancement
-SPATIAL_SIGMA, RANGE_SIGMA = 150 / 1920, 25 / 255
-"""Of the cross-bilateral filter: in widths of the image, and in encoded values."""
+SPATIAL_SIGMA, RANGE_SIGMA = 150 / 1920, 25 / 255  # Of the filter: in widths of the image, and in encoded values
 REC709 = np.array([0.2126, 0.7152, 0.0722])
 
 

@@ -54,18 +54,11 @@ class ViewStack:
             masks = [whole if mask is None else mask for mask in masks]
         # A multiple of 16 bytes each: kernels may read four numbers at once.
         rows = [torch.cat([c.world_to_camera.flatten(), c.intrinsics, c.position]) for c in cameras]
-        return ViewStack(
-            cameras[0].width,
-            cameras[0].height,
-            functional.pad(torch.stack(rows), (0, 1)),
-            times[0] if len(set(times)) == 1 else torch.tensor(times, device=rows[0].device),
-            Target(
-                torch.stack([t.codes for t in targets]),
-                targets[0].scale,
-                None if masks[0] is None else torch.stack(masks),
-                None if truths[0] is None else torch.stack(truths),
-            ),
-        )
+        stacked = functional.pad(torch.stack(rows), (0, 1))
+        time = times[0] if len(set(times)) == 1 else torch.tensor(times, device=stacked.device)
+        mask, truth = (None if parts[0] is None else torch.stack(parts) for parts in (masks, truths))
+        target = Target(torch.stack([t.codes for t in targets]), targets[0].scale, mask, truth)
+        return ViewStack(cameras[0].width, cameras[0].height, stacked, time, target)
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -112,13 +105,7 @@ def largest_truth(scene: Scene, loss: LossConfig) -> float:
 
 
 def training_views(
-    views: Sequence[View],
-    base_time: float,
-    device: torch.device | str,
-    *,
-    truth: bool,
-    clipping: bool = True,
-    light: Response | None = None,
+    views: Sequence[View], base_time: float, device, *, truth: bool, clipping=True, light: Response | None = None
 ) -> list[TrainingView]:
     """The views on a device. truth: also upload HDR truth; light: the response by which exposures are compared."""
     deep = any(view.codes.dtype == np.uint16 for view in views)
@@ -127,12 +114,11 @@ def training_views(
     for view in views:
         # 257 takes white to white and each value to itself.
         codes = view.codes.astype(np.uint16) * np.uint16(257) if deep and view.codes.dtype == np.uint8 else view.codes
-        mask = None if view.mask is None else _upload(view.mask[..., None], device)
-        exposure_truth = _upload(view.hdr, device) * base_time if truth and view.hdr is not None else None
-        target = Target(code_tensor(codes, device), scale, mask, exposure_truth)
+        given = (None if view.mask is None else view.mask[..., None]), (view.hdr if truth else None)
+        mask, radiance = (
+            None if array is None else torch.tensor(np.ascontiguousarray(array), dtype=torch.float32, device=device)
+            for array in given
+        )
+        target = Target(code_tensor(codes, device), scale, mask, None if radiance is None else radiance * base_time)
         made.append(TrainingView(CameraTensors.of(view.camera, device), view.exposure_time, target))
     return made
-
-
-def _upload(array: np.ndarray, device: torch.device | str) -> Tensor:
-    return torch.tensor(np.ascontiguousarray(array), dtype=torch.float32, device=device)

@@ -163,18 +163,11 @@ def test_radiance_scale():
     scale = response.white / BASE_TIME
     unit, white = make_fusion("reinhard-gamma"), make_fusion("reinhard-gamma", radiance_scale=scale)
     torch.testing.assert_close(white(log_base), unit(log_base) * response.white / BASE_TIME)
+    assert unit(log_base[:0]).shape == (0, 3)
     # The paper's value is at most 1, so at a short exposure a bright pixel is out of reach; scaled, it is not.
     bright = torch.full((1, 3), math.log(1e9), dtype=torch.float64)
     assert response.encode(unit(bright) * 0.125).max() < 0.4
     assert response.encode(white(bright) * BASE_TIME).min() > 1 - 1 / 255
-
-
-def test_state_round_trip():
-    fusion, other = make_fusion(seed=0), make_fusion(seed=1)
-    other.load_state_dict(fusion.state_dict())
-    log_base = log_radiance(fusion, 20)
-    assert torch.equal(fusion(log_base), other(log_base))
-    assert make_fusion()(log_base[:0]).shape == (0, 3)
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, math.nan])

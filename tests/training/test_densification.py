@@ -179,17 +179,8 @@ def test_relocation_moves_the_dead_and_keeps_the_image():
         features = gaussians.harmonics_dc[:, 0].detach()
         pose, intrinsics = torch.eye(4), torch.tensor([40.0, 40.0, 16.0, 16.0])
         with torch.no_grad():
-            return rasterize(
-                gaussians.means,
-                gaussians.log_scales,
-                gaussians.quaternions,
-                gaussians.opacities(),
-                features,
-                pose,
-                intrinsics,
-                32,
-                32,
-            ).image
+            shapes = gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacities()
+            return rasterize(*shapes, features, pose, intrinsics, 32, 32).image
 
     before, tensors = image(), dict(gaussians.named_parameters())
     # In place: what a recorded step holds of them stays good.

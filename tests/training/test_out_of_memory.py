@@ -32,12 +32,3 @@ def test_the_line_names_gaussians_photo_and_remedy(tmp_path, monkeypatch, place,
         f"out of memory on cpu: {asked} could not be allocated with 60 Gaussians, an image of 32 x 32; "
         "use fewer Gaussians (densification.max_gaussians) or a smaller image (--max-size)"
     )
-
-
-def test_other_failures_of_a_step_pass(tmp_path, monkeypatch):
-    def fails(trainer):
-        raise RuntimeError("a defect")
-
-    monkeypatch.setattr(Trainer, "step", fails)
-    with pytest.raises(RuntimeError, match="a defect"):
-        train(toy_scene(), tmp_path / "run", load_config("fast"), device="cpu")

@@ -12,7 +12,7 @@ from sehdr_warp.field.color_models import color_model
 from sehdr_warp.field.radiance_field import Photograph
 from sehdr_warp.response import ToneMapper, response_by_name
 from sehdr_warp.splatting.ssim import ssim
-from sehdr_warp.training.config import Config, ConfigError, LossConfig, ModelConfig, ResponseConfig
+from sehdr_warp.training.config import Config, LossConfig, ResponseConfig
 from sehdr_warp.training.config_files import load_config, override_config, preset_names
 from sehdr_warp.training.initialization import choose_response, make_field
 from sehdr_warp.training.losses import Target, anchor_loss, code_scale, data_loss, hdr_loss
@@ -22,10 +22,10 @@ from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
 
 from .recorded import train_on_gpu
-from .test_train import quick
+from .test_train import PAPER, quick
 
 RIVALS = {
-    "paper-truth": {"response.name": "srgb", "optimizer.harmonics_dc": 0.05, "optimizer.fusion": 0.01},
+    "paper-truth": PAPER,
     "hdr-gs": {"optimizer.harmonics_dc": 0.02, "optimizer.response": 0.005},
     "hdr-gs-truth": {"optimizer.harmonics_dc": 0.02, "optimizer.response": 0.005},
     "gauss-hdr": {"optimizer.harmonics_dc": 0.02, "optimizer.response": 0.005},
@@ -156,18 +156,6 @@ def test_the_largest_truth_is_that_of_training_views_where_they_count(scene):
     assert largest_truth(scene, LossConfig()) == 1.0
 
 
-def test_contradictions_are_refused():
-    with pytest.raises(ConfigError, match="nothing to compare"):
-        Config(loss=LossConfig(ldr_weight=0.0))
-    with pytest.raises(ConfigError, match=r"loss\.hdr_weight = 1\.0 needs radiance"):
-        Config(model=ModelConfig(radiance="display"), loss=LossConfig(hdr_weight=1.0))
-    with pytest.raises(ConfigError, match=r"loss\.predictor = 'x' is for nothing"):
-        Config(loss=LossConfig(predictor="x"))
-    for fields in ({"model.radiance": "display"}, {"fusion.enabled": True}):
-        with pytest.raises(InputError, match=f"{next(iter(fields))} = .* needs a known response"):
-            load_config("default", {"response.name": "learned", **fields})
-
-
 def test_a_learned_tone_mapper_starts_as_hdr_gs_does(scene):
     config = Config(response=ResponseConfig(name="learned"), seed=5)
     mapper = choose_response(scene, config)
@@ -188,8 +176,6 @@ def test_the_anchor_holds_the_unit_exposure_of_a_learned_tone_mapper():
     gradients = [parameter.grad for parameter in mapper.parameters() if parameter.grad is not None]
     assert all(torch.isfinite(gradient).all() for gradient in gradients)
     assert mapper.biases[-1].grad.abs().min() > 0
-    with pytest.raises(InputError, match=r'anchor_weight = 0\.5 is for nothing: needs response\.name = "learned"'):
-        load_config("default", {"loss.anchor_weight": 0.5})
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
