@@ -96,12 +96,16 @@ def optimizer_tensors(optimizer: torch.optim.Adam) -> dict[str, Tensor]:
 def load_optimizer_tensors(optimizer: torch.optim.Adam, tensors: dict[str, Tensor]) -> None:
     """Takes up what optimizer_tensors gave."""
     for prefix, parameter in _named(optimizer):
-        state = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
-        if state:
+        if state := under(tensors, prefix):
             optimizer.state[parameter] = {
                 key: value.to(parameter.device, copy=True).reshape(() if key == "step" else parameter.shape)
                 for key, value in state.items()
             }
+
+
+def under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Those whose names begin so, by the rest of their names."""
+    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
 
 
 def _named(optimizer: torch.optim.Adam) -> Iterator[tuple[str, Tensor]]:

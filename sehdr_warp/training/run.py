@@ -15,6 +15,7 @@ from ..response import Response
 from ..scene import Camera, Scene
 from .config import Config
 from .initialization import assemble_field
+from .optimizer import under
 from .run_folder import CameraEntry, Checkpoint, RunFolder
 
 log = logging.getLogger(__name__)
@@ -114,8 +115,7 @@ def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) ->
         learned = field.response if field.response.learnable else None
         for name, part in (("fusion.", field.fusion), ("response.", learned)):
             if part is not None:
-                states = {k.removeprefix(name): v for k, v in checkpoint.tensors.items() if k.startswith(name)}
-                part.load_state_dict(states)
+                part.load_state_dict(under(checkpoint.tensors, name))
     except (KeyError, ValueError, RuntimeError) as error:
         problem = f"its tensors do not fit the config ({error})"
         raise InputError(checkpoint.path, problem, "the run is damaged: train again") from None

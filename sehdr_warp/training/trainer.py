@@ -196,10 +196,10 @@ class Trainer:
 
     def load_state(self, tensors: dict[str, Tensor], values: dict) -> None:
         """Takes up what state() gave; the field's Gaussians must already be those of the state."""
-        adam.load_optimizer_tensors(self.optimizer, _part(tensors, "optimizer"))
-        statistics = {name: value.to(self.device) for name, value in _part(tensors, "densification").items()}
+        adam.load_optimizer_tensors(self.optimizer, adam.under(tensors, "optimizer."))
+        statistics = {name: value.to(self.device) for name, value in adam.under(tensors, "densification.").items()}
         self.densification.load_state(statistics)
-        generators = _part(tensors, "generators")
+        generators = adam.under(tensors, "generators.")
         self._order_generator.set_state(generators["order"].cpu())
         if self._generator.get_state().numel() == generators["device"].numel():
             self._generator.set_state(generators["device"].cpu())
@@ -224,7 +224,3 @@ class Trainer:
         if not self._order:
             self._order = torch.randperm(count, generator=self._order_generator).tolist()
         return self._order.pop()
-
-
-def _part(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
-    return {key.removeprefix(f"{name}."): value for key, value in tensors.items() if key.startswith(f"{name}.")}
