@@ -95,7 +95,7 @@ def subcommands(options: type) -> dict[str, type]:
     return found
 
 
-def flags(options: type) -> Iterator[str]:
+def flags(options: typing.Any) -> Iterator[str]:
     """The flags of options, without those of their subcommands."""
     for name, hint in _hints(options).items():
         kind = _plain(hint)

@@ -140,7 +140,7 @@ def _summary(module: str, options: str) -> str:
     from pathlib import Path
 
     source = Path(__file__).parent.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8")
-    defined = next(node for node in ast.parse(source).body if getattr(node, "name", None) == options)
+    defined = next(node for node in ast.parse(source).body if isinstance(node, ast.ClassDef) and node.name == options)
     return " ".join((ast.get_docstring(defined) or "").split()).partition(". ")[0].removesuffix(".")
 
 

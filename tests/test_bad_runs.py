@@ -189,6 +189,8 @@ def test_camera_files(trained, tmp_path, capfd, case):
     [
         (("--evs=",), "evs: the list is empty"),
         (("--evs=nan",), "nan"),
+        (("--evs=1,x",), "evs:"),
+        (("--evs=0", "--exposures", "1"), "both were"),
         (("--evs=0,0",), "twice"),
         (("--evs=900",), "900"),
         (("--exposures", "0"), "0"),
@@ -227,24 +229,6 @@ def test_nothing_is_replaced(trained, tmp_path, capfd):
     assert (tmp_path / "scene.ply").read_text() == (tmp_path / "report" / "stops.png").read_text() == "mine"
     assert "is a file" in refused(capfd, "render", trained, "--out", tmp_path / "scene.ply", "--device", "cpu")
     assert "is a folder" in refused(capfd, "export", trained, "--out", out)
-
-
-LPIPS = {
-    "gone": None,
-    "pickle": {"squeeze.pth": b"cos\nsystem\n(S'id'\ntR.", "squeezenet1_1_features.pth": b"cos\nsystem\n(S'id'\ntR."},
-    "empty": {"squeeze.pth": b"", "squeezenet1_1_features.pth": b""},
-}
-
-
-@pytest.mark.parametrize("case", LPIPS)
-def test_lpips_weights(trained, tmp_path, capfd, case):
-    folder = tmp_path / "weights"
-    if LPIPS[case] is not None:
-        folder.mkdir()
-        for name, content in LPIPS[case].items():
-            (folder / name).write_bytes(content)
-    line = refused(capfd, "eval", trained, "--device", "cpu", "--lpips", folder)
-    assert "weights" in line
 
 
 # --------------------------------------------------------------------------------------------- full disks and signals

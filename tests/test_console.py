@@ -33,15 +33,6 @@ def steps(count):
             logging.getLogger("sehdr_warp.training").info("held-out [psnr] 20 dB")
 
 
-@pytest.fixture(autouse=True)
-def plain_logger():
-    yield
-    logger = logging.getLogger("sehdr_warp")
-    logger.handlers.clear()
-    logger.propagate = True
-    logger.setLevel(logging.NOTSET)
-
-
 def told(monkeypatch, stream, columns="80", level="info"):
     monkeypatch.setenv("COLUMNS", columns)
     monkeypatch.setattr("sys.stderr", stream)

@@ -41,13 +41,13 @@ class ComparedRuns:
 
     def mean(self, column: str) -> float | None:
         """The mean over the runs; None where one lacks it."""
-        values = self.figures[column]
-        return None if None in values else statistics.fmean(values)
+        values = [value for value in self.figures[column] if value is not None]
+        return statistics.fmean(values) if len(values) == self.count else None
 
     def spread(self, column: str) -> float | None:
         """The sample's standard deviation; None for one run, or where one lacks the figure."""
-        values = self.figures[column]
-        return None if None in values or self.count == 1 else statistics.stdev(values)
+        values = [value for value in self.figures[column] if value is not None]
+        return statistics.stdev(values) if len(values) == self.count > 1 else None
 
 
 def compare_runs(runs: Sequence[Any]) -> list[ComparedRuns]:

@@ -163,8 +163,8 @@ class Evaluation:
         scale = fit_scale((*self._render(view), self._tensor(view.mask), self._tensor(view.image)) for view in views)
         return scale, None if scale else "the pictures hold no light to fit the scale on"
 
-    def _render(self, view: View) -> tuple[Tensor, Tensor | None]:
-        """Prediction and truth, [H, W, 3] float32 on the device each; no truth gives None."""
+    def _render(self, view: View) -> tuple[Tensor, Any]:
+        """Prediction and truth (or None), [H, W, 3] float32 on the device each."""
         size = (view.camera.height, view.camera.width, 3)
         prediction = self.pictures.hdr(view).detach()
         for what, image in (("photo", view.codes), ("HDR truth", view.hdr), ("picture", prediction)):
@@ -177,24 +177,30 @@ class Evaluation:
             raise SehdrError(f"view {view.name!r}: the render holds values that are not finite; the training diverged")
         return prediction.float(), self._tensor(view.hdr)
 
-    def _tensor(self, array) -> Tensor | None:
+    def _tensor(self, array) -> Any:
+        """None stays None."""
         return None if array is None else torch.tensor(array, dtype=torch.float32, device=self.device)
 
     def _view(self, view: View, scale: float | None) -> dict:
         """The figures of one view; its part in the regions and the ranking is added to theirs."""
         hdr, truth = self._render(view)
         photo, mask = self._tensor(view.image), self._tensor(view.mask)
-        row = {"name": view.name, "ldr": dict.fromkeys(("psnr", "ssim", "lpips")), "protocol": {}, "pu21": {}}
+        row: dict[str, Any] = {
+            "name": view.name,
+            "ldr": dict.fromkeys(("psnr", "ssim", "lpips")),
+            "protocol": {},
+            "pu21": {},
+        }
         regions, pooled = metrics.region_masks(photo), []
         if (encoded := self.pictures.ldr(view)) is not None:
             pair = _inside((encoded.detach().float(), photo), mask)
-            row["ldr"] = {"psnr": metrics.psnr(*pair, mask), "ssim": metrics.ssim(*pair, mask)}
-            row["ldr"]["lpips"] = self._lpips(*pair)
+            figures = metrics.psnr(*pair, mask), metrics.ssim(*pair, mask), self._lpips(*pair)
+            row["ldr"] = dict(zip(row["ldr"], figures, strict=True))
             pooled.append(("ldr", *pair))
         if truth is not None and (doubt := self.pictures.doubt(view)):
             self.ranking.add(doubt[0], hdr, truth, regions["well-exposed"], doubt[1], mask)
-        for name in PROTOCOLS if truth is not None else ():
-            if name == "aligned" and scale is None:
+        for name in PROTOCOLS:
+            if truth is None or (name == "aligned" and scale is None):
                 continue
             linear = normalise(name, hdr, truth, mask, scale=scale)
             pair, linear = _inside(tone_map(name, *linear), mask), _inside(linear, mask)
@@ -260,7 +266,7 @@ def _mean(rows: list[dict], *names: str) -> dict[str, float | None]:
     return {name: None if name in lacking else math.fsum(row[name] for row in rows) / len(rows) for name in names}
 
 
-def _plain(value):
+def _plain(value) -> Any:
     """The same tree without NaN and infinity, which JSON does not know; an infinite PSNR gets a reason beside it."""
     if isinstance(value, dict):
         figures = [item for key, item in value.items() if key.startswith("psnr")]

@@ -92,10 +92,10 @@ def pu21_metrics(
     truth's maximum is shown at peak_luminance cd/m^2, and the prediction by the same factor.
     """
     factor = peak_luminance / maximum(truth, mask)
-    shown = [image.double() * factor for image in (prediction, truth)]
-    gray = [pu21_encode((image @ shown[0].new_tensor(LUMINANCE))[..., None]) for image in shown]
-    decibels = psnr(*map(pu21_encode, shown), mask, peak=PU21_PEAK)
-    return {"psnr": decibels, "ssim": ssim(*gray, mask, peak=PU21_PEAK)}
+    ours, theirs = prediction.double() * factor, truth.double() * factor
+    decibels = psnr(pu21_encode(ours), pu21_encode(theirs), mask, peak=PU21_PEAK)
+    gray, gray_truth = (pu21_encode((image @ image.new_tensor(LUMINANCE))[..., None]) for image in (ours, theirs))
+    return {"psnr": decibels, "ssim": ssim(gray, gray_truth, mask, peak=PU21_PEAK)}
 
 
 def maximum(image: Tensor, mask: Tensor | None) -> float:

@@ -99,8 +99,8 @@ def load_lpips(folder: Path | str | None = None, device: torch.device | str = "c
     except RuntimeError as error:
         raise InputError(backbones[0], "is not SqueezeNet 1.1", "take torchvision's squeezenet1_1 weights") from error
     state = _tensors(heads)
-    linear = [state.get(f"lin{number}.model.1.weight") for number in range(len(WIDTHS))]
-    if any(head is None or head.shape != (1, width, 1, 1) for head, width in zip(linear, WIDTHS)):
+    linear = [state.get(f"lin{number}.model.1.weight", torch.zeros(0)) for number in range(len(WIDTHS))]
+    if any(head.shape != (1, width, 1, 1) for head, width in zip(linear, WIDTHS)):
         raise InputError(heads, "does not hold the seven linear heads of LPIPS-squeeze", "take v0.1's squeeze.pth")
     return Lpips(features, [head[0].float() for head in linear], device), None
 
@@ -127,7 +127,7 @@ def load_flip() -> tuple[Callable[[Tensor, Tensor], float] | None, str | None]:
         return None, "HDR-FLIP needs the package flip-evaluator: pip install sehdr-warp[flip]"
 
     def distance(prediction: Tensor, truth: Tensor) -> float:
-        images = (image.clamp_min(0).float().cpu().contiguous().numpy() for image in (truth, prediction))
-        return float(flip_evaluator.evaluate(*images, "HDR", applyMagma=False)[1])
+        right, test = (image.clamp_min(0).float().cpu().contiguous().numpy() for image in (truth, prediction))
+        return float(flip_evaluator.evaluate(right, test, "HDR", applyMagma=False)[1])
 
     return distance, None

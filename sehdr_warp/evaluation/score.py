@@ -66,7 +66,7 @@ def score_folder(
         if which:
             log.warning("%d %s: %s", len(which), what, ", ".join(which[:5]) + (", ..." if len(which) > 5 else ""))
     training = [view for view in truth.train_views if view.name in files and view.hdr is not None]
-    chosen = {"views": views, "scale_views": training or views}
-    evaluation = Evaluation(FolderPictures(folder, files), truth, "cpu", lpips_weights, flip, **chosen)
+    pictures, voting = FolderPictures(folder, files), training or views
+    evaluation = Evaluation(pictures, truth, "cpu", lpips_weights, flip, views=views, scale_views=voting)
     more = {"missing": missing, "extra": extra, "scale_from": "train" if training else "scored"}
     return evaluation.result() | more

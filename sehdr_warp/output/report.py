@@ -124,13 +124,14 @@ def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, ce
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     shapes = [next(picture.shape for picture in row if picture is not None) for row in rows]
     heights, width = [cell * shape[0] / shape[1] for shape in shapes], 0.4 + len(titles) * cell
     untitled = dict(enumerate(titles))
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(width, 0.9 + sum(heights)), layout="constrained")
-        figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03, wspace=0, hspace=0)
+        layout = ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.03, wspace=0, hspace=0)
+        figure = Figure(figsize=(width, 0.9 + sum(heights)), layout=layout)
         grid = figure.add_gridspec(len(rows), len(titles), height_ratios=heights)
         for row, (pictures, name) in enumerate(zip(rows, names, strict=True)):
             places = [column for column, picture in enumerate(pictures) if picture is not None]

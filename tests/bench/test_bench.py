@@ -212,11 +212,3 @@ def test_a_quadratic_stage_is_found_and_a_linear_one_is_not():
         "Steeper than linear at the large end: 2.00 (time of the quadratic over gaussians)."
     )
     assert "two points" in scale.verdict(scale.fit_slopes(rows("one", (1,))))
-
-
-def test_sweeps_ascend():
-    for device in ("cuda", "cpu"):
-        for small in (False, True):
-            for points in scale.sweeps(device, small).values():
-                varied = [point[0] for point in points]
-                assert varied == sorted(set(varied)) and varied

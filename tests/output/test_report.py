@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.errors import SehdrError
 from sehdr_warp.output.charts import training_chart
 from sehdr_warp.output.report import Comparison, comparison_figure, stops_figure, write_report
 from sehdr_warp.scene import Scene, View, codes_of
@@ -51,16 +51,6 @@ def test_without_test_views_and_metrics(tmp_path):
     empty = Scene("none", "photos", (), np.zeros((0, 3)), np.zeros((0, 3), np.float32))
     with pytest.raises(SehdrError, match="no views"):
         write_report(run, empty, tmp_path / "empty")
-
-
-def test_nothing_is_replaced_unless_asked(tmp_path):
-    run, scene = make(tmp_path)
-    write_report(run, scene, tmp_path)
-    run.rendered = 0
-    with pytest.raises(InputError, match="comparison.png: exists already"):
-        write_report(run, scene, tmp_path)
-    assert run.rendered == 0
-    write_report(run, scene, tmp_path, overwrite=True)
 
 
 def test_the_chart_has_a_line_for_every_run_and_a_name_for_every_row():
