@@ -82,11 +82,6 @@ class Response(ABC):
         """The curve as one launch evaluates it with its slope; None where there is no such kernel."""
         return None
 
-    @property
-    def decodable(self) -> bool:
-        """Whether photos can be decoded by it before a training."""
-        return not self.learnable
-
     def start_exposures(self, encoded: np.ndarray) -> np.ndarray:
         """Exposures above 0 for Gaussians to start from, of encoded values in (0, 1); same shape, float64."""
         return np.maximum(self.decode(np.asarray(encoded, np.float64)), START_FLOOR)

@@ -45,9 +45,9 @@ def responses_in_file(path: Path | str) -> list[Response]:
     if path.suffix.lower() == ".mat":
         return _dorf_mat(path)
     text = read_text(path, MAX_BYTES)
-    if not _is_dorf(text):
-        raise InputError(path, "is not a DoRF file", "give 201_CRF_data.mat or dorfCurves.txt")
-    return _dorf_text(path, text)
+    if _is_dorf(text):
+        return _dorf_text(path, text)
+    raise InputError(path, "is not a DoRF file", "give 201_CRF_data.mat or dorfCurves.txt")
 
 
 def colour_response(encoding: str) -> Response:
@@ -138,10 +138,8 @@ def _dorf_mat(path: Path) -> list[Response]:
         values, exposures = stored["B"], stored["I"]
     if values.ndim != 2 or values.shape != exposures.shape:
         raise InputError(path, f"B is {values.shape} and I is {exposures.shape}", "give both as [curves, samples]")
-    return [
-        TabulatedResponse(f"dorf:{index}", *curve, source=f"{path}:{index}")
-        for index, curve in enumerate(zip(exposures, values, strict=True))
-    ]
+    numbered = enumerate(zip(exposures, values, strict=True))
+    return [TabulatedResponse(f"dorf:{index}", *curve, source=f"{path}:{index}") for index, curve in numbered]
 
 
 def _is_dorf(text: str) -> bool:
@@ -166,9 +164,8 @@ def _emor(path: Path, text: str, selector: str | None) -> Response:
     """Sections "E =", "f0 =", "h(1)=", ... of equal length; in the inverse file "B =", "g0 =", "hinv(1)=", ..."""
     rows = [_numbers(path, body) for body in re.split(r"^[^=\n]*=", text, flags=re.MULTILINE)[1:]]
     if len(rows) < 3 or len({len(row) for row in rows}) != 1:
-        raise InputError(
-            path, "is not EMoR's layout of sections of one length", "give emor.txt or invemor.txt as published"
-        )
+        problem = "is not EMoR's layout of sections of one length"
+        raise InputError(path, problem, "give emor.txt or invemor.txt as published")
     axis, mean, *bends = rows
     weights = _numbers(path, (selector or "").replace(",", " "))
     if len(weights) > len(bends) or not np.isfinite(weights).all():

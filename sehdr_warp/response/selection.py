@@ -63,15 +63,11 @@ BATCH, MOST_PIXELS, BAND_ROWS = 16, 400_000, 32
 class ResponseScore:
     """What the photos say about one candidate; nats are minus log likelihoods, so that smaller is better.
 
-    Attributes:
-        dynamic_range: stops between the 0.1th and the 99.9th percentile of the decoded, unclipped values.
-        roughness: mean absolute second difference of log2 of the decoded values, stops.
-        paper_score: range minus roughness, each over its median among the candidates; larger is better.
-        edges: nats an edge, that its middle is a mixture of its sides in linear light; NaN for under 50 usable edges.
-        highlights: nats, of the pixels at the brightest code beside those just below it.
-        span: nats, of how far the decoded values spread.
-        density: nats, of how smoothly they are spread over log exposure.
-        prior: nats. posterior: the sum of the five, edges times edge_facts(their number).
+    dynamic_range: stops between the 0.1th and 99.9th percentile of decoded, unclipped values; roughness: mean absolute
+    second difference of their log2; paper_score: range minus roughness, each over its median among the candidates,
+    larger is better. In nats: edges, an edge, that its middle is a mixture of its sides in linear light (NaN for
+    under 50 usable ones); highlights, of the pixels at the brightest code beside those just below it; span and density,
+    of how far and how smoothly light is spread; prior. posterior: the sum, edges times edge_facts(their number).
     """
 
     response: Response
@@ -107,22 +103,20 @@ def select_response(
     """The candidate under which photos look most like linear light, up to the exposure's scale.
 
     Args:
-        image: [H, W, 3] codes as photographed, uint8 or uint16, or encoded values in [0, 1] (array or tensor); or a
-            list of such photos of one camera. Resampling in encoded values mixes colors, which edges then tell of.
+        image: [H, W, 3] codes as photographed, uint8 or uint16, or encoded values in [0, 1]; or a list of such photos
+            of one camera. Resampling in encoded values mixes colors, which edges then tell of.
         candidates: by default the responses with a formula.
-        method: "posterior" judges edges (after Lin et al. 2004: at an edge between two even regions a pixel mixes both
-            in linear light), clipped pixels, the spread and smoothness of light, and a prior; it needs none of them.
-            Without `candidates`, and for photos that are not a camera's own, a smooth family of cameras' curves stands
-            beside the formulae. One of these with a quarter of the posterior is taken; else the response is the
-            posterior's mean of log exposure at each code, a table that is none of the candidates.
+        method: "posterior" judges edges (Lin et al. 2004), clipped pixels, the spread and smoothness of light, and
+            a prior; it needs none of them. Without `candidates`, and for photos that are not a camera's own, a smooth
+            family of cameras' curves stands beside the formulae: a formula with a quarter of the posterior is taken;
+            else the posterior's mean of log exposure at each code, a table that is none of the candidates.
             "paper" is SeHDR, section 3.3: the curve that does best on one photo "by dynamic range and smoothness"; the
             paper gives no formula, ours is ResponseScore.paper_score.
         from_camera: the photos are a camera's own JPEGs, with the prior of cameras.
         seed: of the sample of edges where there are more than 12 000.
 
-    Raises:
-        SehdrError: for another method, no candidates, an image of another shape or not finite, or, with "paper", under
-            100 pixels that are neither black nor clipped.
+    Raises SehdrError for another method, no candidates, an image of another shape or not finite, or, by "paper", under
+    100 pixels that are neither black nor clipped.
     """
     if method not in ("posterior", "paper"):
         raise SehdrError(f"select_response: method = {method!r} is neither posterior nor paper")
@@ -180,7 +174,7 @@ def _on_grid(response: Response) -> tuple[np.ndarray, np.ndarray]:
 def _bands(image) -> list[tuple[np.ndarray, np.ndarray]]:
     """A photo, or evenly spaced bands of a large one, as encoded values [h, W, 3] float64, each with where it is
     neither black nor clipped [h, W]."""
-    image = np.asarray(image.detach().cpu() if isinstance(image, torch.Tensor) else image)
+    image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3:
         raise SehdrError(f"select_response: an image of shape {list(image.shape)} is not [H, W, 3]")
     rows, columns = image.shape[:2]

@@ -22,15 +22,13 @@ LEAST_STEP = 1e-9
 
 
 class TabulatedResponse(Response, kind="table"):
-    """A response through samples (exposure, value), increasing, exact inverse included.
+    """A response through 3 or more samples (exposure, value), increasing, exact inverse included.
 
-    exposures: [K] >= 0, in the file's own unit; values: [K] in [0, 1]. At least 3 samples. Radiance is relative to that
-    unit.
-
-    What is repaired, with one of `notes` each: samples out of order are sorted, equal exposures averaged, a decrease is
-    replaced by the nearest monotone curve (least squares). What is always done: a curve that starts above exposure 0
-    is continued to (0, 0) by a line; a flat part within the curve is tilted about its center, so that its value decodes
-    to the middle of the part (at black: rises from it); a flat part at the top is the clipped range.
+    exposures: [K] >= 0, in the file's own unit, to which radiance is relative; values: [K] in [0, 1].
+    Repaired, with one of `notes` each: samples out of order are sorted, equal exposures averaged, a decrease replaced
+    by the nearest monotone curve (least squares). Always done: a curve that starts above exposure 0 is continued to
+    (0, 0) by a line; a flat part within it is tilted about its center, so that its value decodes to the middle of
+    the part (at black: rises from it); a flat part at the top is the clipped range.
 
     Raises InputError(source, ...) for fewer than 3 samples, NaN or infinity, a negative exposure, a value outside
     [0, 1], or a curve that does not rise.
@@ -119,12 +117,10 @@ def _monotone(exposures: np.ndarray, values: np.ndarray, source: str):
         values = np.maximum.accumulate(isotonic_regression(values).x)
     if exposures[0] > 0:
         exposures, values = np.concatenate([[0.0], exposures]), np.concatenate([[0.0], values])
-    values = _without_traces(values)
     if values[-1] - values[0] < 2 * HALF_CODE:
         rise = f"the curve rises by only {values[-1] - values[0]:.3g}"
         raise InputError(source, rise, "give a curve from dark to bright")
-    clipped = np.searchsorted(values, values[-1])
-    return *_tilt_flat_parts(exposures[: clipped + 1], values[: clipped + 1]), notes
+    return *_tilt_flat_parts(exposures, values), notes
 
 
 def _check(exposures: np.ndarray, values: np.ndarray, source: str):
@@ -139,30 +135,26 @@ def _check(exposures: np.ndarray, values: np.ndarray, source: str):
         raise InputError(source, f"exposure {exposures.min():.6g} is negative", remedy)
     for step in (exposures.max(), np.diff(np.unique(np.r_[0.0, exposures])).min(initial=1.0)):
         if not 1e-30 <= step <= 1e30:
-            problem = f"exposures of {step:.3g} apart cannot be computed with"
-            raise InputError(source, problem, "divide them by the largest")
+            raise InputError(source, f"exposures of {step:.3g} apart cannot be computed with",
+                             "divide them by the largest")  # fmt: skip
     for worst in (values.max(), values.min()):
         if not 0 <= worst <= 1:
-            problem = f"value {worst:.6g} is outside [0, 1]"
-            raise InputError(source, problem, "divide codes by the largest, 255 or 65535")
-
-
-def _without_traces(values: np.ndarray) -> np.ndarray:
-    """Increasing values whose steps are 0 or at least LEAST_STEP: smaller ones are what rounding left of a flat part,
-    and an inverse through them would be decided by the last digit."""
-    steps = np.diff(values) >= LEAST_STEP
-    first = np.concatenate([[0], np.flatnonzero(steps) + 1])
-    last = np.concatenate([first[1:], [len(values)]]) - 1
-    # The end of each group, so that the peak stays what it is.
-    return np.repeat(values[last], last - first + 1)
+            raise InputError(source, f"value {worst:.6g} is outside [0, 1]",
+                             "divide codes by the largest, 255 or 65535")  # fmt: skip
 
 
 def _tilt_flat_parts(exposures: np.ndarray, values: np.ndarray):
-    """Strictly increasing values: a run of equal ones becomes a line of FLAT_TILT, less where neighbours are near."""
-    edges = np.flatnonzero(np.diff(values) != 0) + 1
-    starts, ends = np.concatenate([[0], edges]), np.concatenate([edges, [len(values)]]) - 1
+    """Samples up to the clip point with strictly increasing values, of increasing ones.
+
+    Steps under LEAST_STEP are what rounding left of a flat part, and an inverse through them would be decided by the
+    last digit. A flat part becomes a line of FLAT_TILT, less where neighbours are near.
+    """
+    edges = np.flatnonzero(np.diff(values) >= LEAST_STEP) + 1
+    starts, ends = np.r_[0, edges], np.r_[edges, len(values)] - 1
+    # The end of each part, so that the peak stays what it is.
+    values = np.repeat(values[ends], ends - starts + 1)
     tilted = values.copy()
-    for start, end in zip(starts, ends, strict=True):
+    for start, end in zip(starts[:-1], ends[:-1], strict=True):
         if start == end:
             continue
         part = (exposures[start : end + 1] - exposures[start]) / (exposures[end] - exposures[start])
@@ -171,4 +163,4 @@ def _tilt_flat_parts(exposures: np.ndarray, values: np.ndarray):
             height = min(height, 0.5 * (values[start] - values[start - 1]))
             part = part - 0.5
         tilted[start : end + 1] += height * part
-    return exposures, tilted
+    return exposures[: starts[-1] + 1], tilted[: starts[-1] + 1]

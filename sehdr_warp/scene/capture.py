@@ -1,6 +1,6 @@
 """What a reader finds in a data folder, before any pixel is decoded."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -49,11 +49,16 @@ class Shot:
         return self.exposure_time
 
 
+Cloud = tuple[np.ndarray, np.ndarray]
+"""[P, 3] float64 places and [P, 3] float32 encoded colors in [0, 1]."""
+NO_POINTS: Cloud = np.zeros((0, 3)), np.zeros((0, 3), np.float32)
+
+
 @dataclass(frozen=True)
 class Capture:
     """A data folder as read.
 
-    format, points, point_colors, notes: as Scene's. name, folder: what was asked for, and where it lies.
+    format, notes: as Scene's. cloud: its points and their colors. name, folder: what was asked for, and where it lies.
     alpha: what transparency means: "background" (nothing there: composite over black light) or "mask" (not observed).
     holdout: (every so many views, from this one) is held out in the protocol that the layout is published with; None
         for a layout without one.
@@ -64,8 +69,7 @@ class Capture:
     shots: tuple[Shot, ...]
     alpha: str = "mask"
     holdout: tuple[int, int] | None = None
-    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    point_colors: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    cloud: Cloud = NO_POINTS
     notes: tuple[str, ...] = ()
     name: str = ""
     folder: Path = Path()
@@ -80,14 +84,13 @@ def pose_from_quaternion(quaternion, translation, source: Path, name: str) -> np
     """[4, 4] world_to_camera from COLMAP's (w, x, y, z) and t; InputError where not finite or zero."""
     from scipy.spatial.transform import Rotation
 
-    quaternion, pose = np.asarray(quaternion, np.float64), np.eye(4)
-    pose[:3, 3] = translation
-    if not (np.isfinite(quaternion).all() and np.isfinite(pose).all()):
-        raise InputError(source, f"pose of {name!r:.90} is not finite", "remove the image or export the model again")
     length = np.linalg.norm(quaternion)
+    if not (np.isfinite(length) and np.isfinite(translation).all()):
+        raise InputError(source, f"pose of {name!r:.90} is not finite", "remove the image or export the model again")
     if not 1e-8 < length < 1e8:
         raise InputError(source, f"quaternion of {name!r:.90} has length {length:g}", "export the model again")
-    pose[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix(), translation
     return pose
 
 

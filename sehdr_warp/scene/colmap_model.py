@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import read_bytes, read_text
-from .capture import pose_from_quaternion
+from .capture import NO_POINTS, Cloud, pose_from_quaternion
 from .lens import CAMERA_MODELS, Lens
 
 MAX_NAME_BYTES = 4096
@@ -25,18 +25,16 @@ class ModelImage:
     """name: as stored, not yet trusted as a path; world_to_camera: [4, 4]."""
 
     name: str
-    camera_id: int
+    lens: Lens
     world_to_camera: np.ndarray
 
 
 @dataclass(frozen=True)
 class SparseModel:
-    """cameras: by id; images: in the file's order; points: [P, 3] float64; colors: [P, 3] float32 in [0, 1]."""
+    """images: in the file's order; cloud: the points seen in them."""
 
-    cameras: dict[int, Lens]
     images: tuple[ModelImage, ...]
-    points: np.ndarray
-    colors: np.ndarray
+    cloud: Cloud
 
 
 def find_model(folder: Path) -> Path | None:
@@ -67,20 +65,20 @@ def read_model(folder: Path) -> SparseModel:
             raise InputError(image_path, f"image {name!r:.90} is listed twice", _REMEDY)
         if number not in cameras:
             raise InputError(image_path, f"image {name!r:.90} has camera {number}, which is not listed", _REMEDY)
-        images[name] = ModelImage(name, number, pose_from_quaternion(pose[:4], pose[4:], image_path, name))
-    return SparseModel(cameras, tuple(images.values()), *read_points(folder))
+        images[name] = ModelImage(name, cameras[number], pose_from_quaternion(pose[:4], pose[4:], image_path, name))
+    return SparseModel(tuple(images.values()), read_points(folder))
 
 
-def read_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """[P, 3] float64 places and [P, 3] float32 colors in [0, 1] of points3D.bin, .txt or .ply; else none."""
+def read_points(folder: Path) -> Cloud:
+    """The points of points3D.bin, .txt or .ply; else none."""
     readers = {".bin": _points_binary, ".txt": _points_text, ".ply": read_ply_points}
     for name in ("points3D.bin", "points3D.txt", "points3D.ply", "points3d.ply"):
         if (path := folder / name).is_file():
             return readers[path.suffix](path)
-    return np.zeros((0, 3)), np.zeros((0, 3), np.float32)
+    return NO_POINTS
 
 
-def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def read_ply_points(path: Path) -> Cloud:
     """Places and colors of a PLY file's vertices; grey where it has no colors. InputError where it is damaged."""
     from plyfile import PlyData
 
@@ -98,7 +96,7 @@ def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return _checked_points(points, np.clip(colors, 0, 1), path)
 
 
-def _checked_points(points: np.ndarray, colors: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _checked_points(points: np.ndarray, colors: np.ndarray, path: Path) -> Cloud:
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
         raise InputError(path, f"point {int(np.argmax(bad))} is at {points[np.argmax(bad)].tolist()}", _REMEDY)
@@ -162,7 +160,7 @@ def _images_binary(path: Path) -> Iterator[tuple]:
         yield pose, camera_id, name
 
 
-def _points_binary(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _points_binary(path: Path) -> Cloud:
     file = _Bytes(path)
     table = np.empty((file.count(43 + 8), 6))
     for row in table:
@@ -205,7 +203,6 @@ def _point(line: str) -> tuple:
     return float(x), float(y), float(z), *color
 
 
-def _points_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    rows = list(_records(path, "a point with x, y, z and colors in 0..255", _point))
-    table = np.array(rows, np.float64).reshape(-1, 6)
+def _points_text(path: Path) -> Cloud:
+    table = np.array([*_records(path, "a point with x, y, z and colors in 0..255", _point)], np.float64).reshape(-1, 6)
     return _checked_points(table[:, :3], table[:, 3:] / 255, path)

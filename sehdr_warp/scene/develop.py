@@ -12,9 +12,8 @@ from .camera import Camera
 from .capture import Capture, Shot, reinhard_gamma
 from .hdr_files import hdr_size, read_hdr
 from .images import EncodedImage, image_sizes, read_ldr, read_mask
-from .lens import Lens, Undistortion
+from .lens import Lens, Undistortion, area_average, limited_size
 from .names import unique_names
-from .resample import area_average, limited_size
 from .types import Scene, View, codes_of
 
 if TYPE_CHECKING:
@@ -33,8 +32,8 @@ def develop(capture: Capture, response: "Response", max_size: int | None = None)
     developer, names = _Developer(max_size, response, capture.alpha), unique_names(capture.shots)
     views = [developer.view(shot, names[i]) for i, shot in told("reading views", capture.shots)]
     check_content(((view.codes, view.mask) for view in views if view.split == "train"), capture.folder)
-    return Scene(capture.name, capture.format, tuple(views), capture.points, capture.point_colors,
-                 capture.times_known, capture.notes, response=response)  # fmt: skip
+    stated = *capture.cloud, capture.times_known, capture.notes
+    return Scene(capture.name, capture.format, tuple(views), *stated, response=response)
 
 
 def check_content(photos: Iterable[tuple[np.ndarray, np.ndarray | None]], folder: Path) -> None:
@@ -69,11 +68,7 @@ def as_photographed(shot: Shot, *, oriented: bool = False) -> EncodedImage:
     """A shot's codes before anything is undistorted or averaged; of a set of truth alone, HDR-NeRF's photo of it."""
     if not shot.derived:
         return read_ldr(shot.image, oriented=oriented)
-    return EncodedImage(_photo_of_truth(read_hdr(shot.image), shot.exposure_time), None)
-
-
-def _photo_of_truth(hdr: np.ndarray, exposure_time: float) -> np.ndarray:
-    return codes_of(reinhard_gamma(hdr * exposure_time), 8)
+    return EncodedImage(codes_of(reinhard_gamma(read_hdr(shot.image) * shot.seconds), 8), None)
 
 
 class _Developer:
@@ -87,39 +82,41 @@ class _Developer:
     def view(self, shot: Shot, name: str) -> View:
         """The shot's view; raises InputError where a file is damaged or its size disagrees with the camera's."""
         lens, oriented = (shot.lens, False) if shot.derived else fitted_lens(shot)
-        bent = not (lens.is_pinhole or shot.derived)
-        working = _working_lens(lens, self.max_size) if bent else lens
-        undistortion = self._undistortion(working) if bent else None
-        full = undistortion.camera(shot.world_to_camera) if bent else lens.pinhole(shot.world_to_camera)
+        working, undistortion, full = lens, None, lens.pinhole(shot.world_to_camera)
+        if not (lens.is_pinhole or shot.derived):
+            # Distortion is smooth: undone at twice the final size, or a little more, it moves nothing by more than a
+            # fraction of a final pixel, and spares time.
+            factor = 1 if self.max_size is None else max(lens.width, lens.height) // (2 * self.max_size)
+            if factor > 1:
+                working = lens.resized(round(lens.width / factor), round(lens.height / factor))
+            # Sets mostly share one lens; its map is as large as an image, so only the last one is kept.
+            if self._last is None or self._last[0] != working:
+                self._last = working, Undistortion(working)
+            undistortion = self._last[1]
+            full = undistortion.camera(shot.world_to_camera)
         camera = full.resized(*limited_size(full.width, full.height, self.max_size))
 
         def warped(image: np.ndarray) -> np.ndarray:
             """[H, W] or [H, W, C] at the photo's size -> float32 at the camera's, undistorted."""
-            return _shrunk(undistortion.apply(_shrunk(image, working)) if bent else image, camera)
+            return _shrunk(undistortion.apply(_shrunk(image, working)) if undistortion else image, camera)
 
-        hdr = None if shot.hdr is None else warped(_read_truth(shot.hdr, lens, camera, bent))
-        if shot.derived:  # HDR-NeRF's photo of the truth, at the final size.
-            codes = _photo_of_truth(hdr, shot.exposure_time)
-            return View(name, codes, camera, shot.exposure_time, shot.split, None, hdr, Path(shot.image))
+        hdr = None if shot.hdr is None else warped(_read_truth(shot.hdr, lens, camera, undistortion is not None))
+        stated = camera, shot.seconds, shot.split or "train"
+        if shot.derived and hdr is not None:  # HDR-NeRF's photo of the truth, at the final size.
+            return View(name, codes_of(reinhard_gamma(hdr * shot.seconds), 8), *stated, None, hdr, shot.image)
         encoded = as_photographed(shot, oriented=oriented)
         codes, alpha = encoded.pixels, encoded.alpha
-        masks = [] if not bent or undistortion.outside is None else [_shrunk(~undistortion.outside, camera)]
+        masks = [_shrunk(~undistortion.outside, camera)] if undistortion and undistortion.outside is not None else []
         if shot.mask is not None:
             masks.append(warped(_fitted_mask(shot.mask, lens, oriented)))
         if alpha is not None and self.alpha == "mask":
             masks.append(warped(alpha))
             alpha = None
-        if bent or alpha is not None or (camera.width, camera.height) != (lens.width, lens.height):
+        if undistortion or alpha is not None or (camera.width, camera.height) != (lens.width, lens.height):
             codes = self._averaged(codes, alpha, warped)
         mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32) if masks else None
         mask = None if mask is None or mask.min() >= 1 - 1e-6 else mask
-        return View(name, codes, camera, shot.exposure_time, shot.split, mask, hdr, Path(shot.image))
-
-    def _undistortion(self, lens: Lens) -> Undistortion:
-        # Sets mostly share one lens; its map is as large as an image, so only the last one is kept.
-        if self._last is None or self._last[0] != lens:
-            self._last = lens, Undistortion(lens)
-        return self._last[1]
+        return View(name, codes, *stated, mask, hdr, shot.image)
 
     def _averaged(self, codes: np.ndarray, alpha: np.ndarray | None, warped: Callable) -> np.ndarray:
         levels = int(np.iinfo(codes.dtype).max)
@@ -133,16 +130,6 @@ class _Developer:
         # A mean over clipped samples is a lower bound. With half of the area clipped it says little, and white ("at
         # least this bright") is the honest value; with less the mean stays, a slight underestimate.
         return codes_of(np.where(warped(clipped) >= 0.5, np.float32(1.0), self.response.encode(warped(light))), 16)
-
-
-def _working_lens(lens: Lens, max_size: int | None) -> Lens:
-    """The lens at the size at which its distortion is undone: twice the final size at least, to spare time above.
-
-    Averaging first and bending then at twice the final resolution moves nothing by more than a fraction of a final
-    pixel, since distortion is smooth.
-    """
-    factor = 1 if max_size is None else max(lens.width, lens.height) // (2 * max_size)
-    return lens if factor < 2 else lens.resized(round(lens.width / factor), round(lens.height / factor))
 
 
 def _shrunk(image: np.ndarray, to: Lens | Camera) -> np.ndarray:

@@ -22,7 +22,8 @@ def choose_exposure(shots: tuple[Shot, ...], index: int | None, source: Path) ->
     index: the exposure's number in the file names; None takes the middle one (of an even count the longer).
     Raises InputError where no view has the number.
     """
-    keys, asked = sorted({shot.exposure_key for shot in shots} - {None}), f"exposure index {index} asked for"
+    keys = sorted({shot.exposure_key for shot in shots if shot.exposure_key is not None})
+    asked = f"exposure index {index} asked for"
     if not keys:
         if index not in (None, 0):
             raise InputError(source, f"{asked}, but each view has one exposure", "leave the exposure index out")
@@ -53,21 +54,21 @@ def with_exposure_times(shots: list[Shot], source: Path) -> tuple[list[Shot], bo
         stated = [listed.get(s.image.name) if time is None else time for time, s in zip(stated, shots, strict=True)]
     if set(stated) == {None}:
         stated, notes = _exif_times(shots)
+    times = [float(time) for time in stated if time is not None]
     for shot, time in zip(shots, stated, strict=True):
+        if time is None and times:
+            problem = f"exposure time is absent in {len(shots) - len(times)} of {len(shots)} images"
+            raise InputError(shot.image, problem, "state all in exposures.json, or strip them all")
         if time is not None and not (math.isfinite(time) and time > 0):
             raise InputError(shot.image, f"exposure time {time} s is not positive and finite", _REMEDY)
-    known, absent = set(stated) != {None}, [shot for shot, time in zip(shots, stated, strict=True) if time is None]
-    if not known:
+    if not times:
         notes.append("no exposure times were found: each view counts as 1 s")
-        stated = [1.0] * len(shots)
-    elif absent:
-        problem = f"exposure time is absent in {len(absent)} of {len(shots)} images"
-        raise InputError(absent[0].image, problem, "state all in exposures.json, or strip them all")
-    shortest, longest = min(stated), max(stated)
+        return [replace(shot, exposure_time=1.0) for shot in shots], False, notes
+    shortest, longest = min(times), max(times)
     if longest > shortest * 1.01:
         stops = math.log2(longest / shortest)
         notes.append(f"exposures differ: {shortest:g} to {longest:g} s ({stops:.1f} stops); each view keeps its own")
-    return [replace(shot, exposure_time=float(time)) for shot, time in zip(shots, stated, strict=True)], known, notes
+    return [replace(shot, exposure_time=time) for shot, time in zip(shots, times, strict=True)], True, notes
 
 
 def parse_seconds(value, source: Path, field: str) -> float:
@@ -83,19 +84,19 @@ def parse_seconds(value, source: Path, field: str) -> float:
 
 def _listed_times(shots: list[Shot], source: Path) -> dict[str, float]:
     """exposures.json: {"file name": seconds} or a list of {"file": ..., "exposure_time": seconds}."""
-    for folder in dict.fromkeys((shots[0].image.parent, source)):
-        path = folder / "exposures.json"
-        if path.is_file():
-            try:
-                values = json.loads(read_bytes(path, 1 << 24))
-                if isinstance(values, list):
-                    values = {entry["file"]: entry["exposure_time"] for entry in values}
-                entries = values.items()
-            except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as error:
-                raise InputError(path, f"is not a table of exposure times ({error!r:.80})",
-                                 'write {"file name": seconds, ...}') from None  # fmt: skip
-            return {Path(str(name)).name: parse_seconds(value, path, str(name)) for name, value in entries}
-    return {}
+    places = (folder / "exposures.json" for folder in (shots[0].image.parent, source))
+    path = next((place for place in places if place.is_file()), None)
+    if path is None:
+        return {}
+    try:
+        values = json.loads(read_bytes(path, 1 << 24))
+        if isinstance(values, list):
+            values = {entry["file"]: entry["exposure_time"] for entry in values}
+        entries = values.items()
+    except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as error:
+        problem = f"is not a table of exposure times ({error!r:.80})"
+        raise InputError(path, problem, 'write {"file name": seconds, ...}') from None
+    return {Path(str(name)).name: parse_seconds(value, path, str(name)) for name, value in entries}
 
 
 def _exif_times(shots: list[Shot]) -> tuple[list[float | None], list[str]]:

@@ -103,11 +103,12 @@ def _read_radiance(path: Path) -> np.ndarray:
     """[H, W, 3] float32 linear RGB, scaled by the header's EXPOSURE lines (radiance = pixel / exposure)."""
     data = read_bytes(path)
     width, height, position, exposure = _radiance_header(data[:_MAX_HEADER_BYTES], path)
-    codes, rgbe = np.frombuffer(data, np.uint8), np.empty((height, width, 4), np.uint8)
+    rgbe = np.empty((height, width, 4), np.uint8)
     for row in range(height):
-        position = _read_row(codes, position, rgbe[row])
-        if position < 0:
-            raise InputError(path, f"pixel data is damaged or ends early in row {row}", _REMEDY)
+        try:
+            rgbe[row], position = _read_row(data, position, width)
+        except (IndexError, ValueError):
+            raise InputError(path, f"pixel data is damaged or ends early in row {row}", _REMEDY) from None
     scale = np.ldexp(1.0, rgbe[..., 3].astype(np.int32) - 136)
     pixels = (rgbe[..., :3] + 0.5) * scale[..., None] / exposure
     pixels[rgbe[..., 3] == 0] = 0.0
@@ -134,33 +135,21 @@ def _radiance_header(data: bytes, path: Path) -> tuple[int, int, int, float]:
     return int(size[2]), int(size[1]), size.end(), exposure
 
 
-def _read_row(codes: np.ndarray, position: int, row: np.ndarray) -> int:
-    """Fill one row [W, 4], flat or run-length coded, from codes[position:]; returns where the next begins, or -1."""
-    width = len(row)
-    first = codes[position : position + 4]
-    if len(first) < 4:
-        return -1
-    if first[0] != 2 or first[1] != 2 or first[2] & 0x80 or not 8 <= width < 32768:
-        flat = codes[position : position + 4 * width]
-        if len(flat) < 4 * width:
-            return -1
-        row[:] = flat.reshape(width, 4)
-        return position + 4 * width
-    if int(first[2]) << 8 | int(first[3]) != width:
-        return -1
-    position += 4
-    for channel in range(4):
-        filled = 0
-        while filled < width:
-            if position + 2 > len(codes):
-                return -1
-            count, repeated = int(codes[position]), codes[position] > 128
-            count -= 128 * repeated
-            stored = 1 if repeated else count
-            values = codes[position + 1 : position + 1 + stored]
-            if count == 0 or filled + count > width or len(values) < stored:
-                return -1
-            row[filled : filled + count, channel] = values
-            filled += count
-            position += 1 + len(values)
-    return position
+def _read_row(data: bytes, position: int, width: int) -> tuple[np.ndarray, int]:
+    """A row [W, 4], flat or run-length coded, and where the next begins; IndexError or ValueError where damaged."""
+    first = data[position : position + 4]
+    if first[:2] != b"\2\2" or first[2] & 0x80 or not 8 <= width < 32768:
+        end = position + 4 * width
+        return np.frombuffer(data[position:end], np.uint8).reshape(width, 4), end
+    if int.from_bytes(first[2:], "big") != width:
+        raise ValueError
+    position, planes = position + 4, bytearray()
+    while len(planes) < 4 * width:
+        count = data[position]
+        if count > 128:
+            planes += data[position + 1 : position + 2] * (count - 128)
+            position += 2
+        else:
+            planes += data[position + 1 : position + 1 + count]
+            position += 1 + count
+    return np.frombuffer(planes, np.uint8).reshape(4, width).T, position

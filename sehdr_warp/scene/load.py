@@ -14,9 +14,15 @@ from .colmap_model import find_model
 from .develop import as_photographed, check_content, develop, fitted_lens
 from .embedded import embedded_folder, is_embedded
 from .exposure import choose_exposure, made_by_camera, with_exposure_times
-from .read_colmap import image_folder, is_hdr_gs, read_colmap, read_hdr_gs
-from .read_llff import read_hdr_nerf_real, read_llff
-from .read_photos import read_photos
+from .read_folders import (
+    image_folder,
+    is_hdr_gs,
+    read_colmap,
+    read_hdr_gs,
+    read_hdr_nerf_real,
+    read_llff,
+    read_photos,
+)
 from .read_transforms import has_transforms, is_hdr_nerf, read_hdr_nerf, read_transforms
 from .sfm import triangulate
 from .types import Scene
@@ -58,12 +64,17 @@ def load_scene(
     Raises InputError where a file is missing, damaged or hostile, sizes disagree, an exposure is impossible, fewer
     than two training views remain, or the photos show nothing but black or white.
     """
+    from ..response import response_by_name
+
     if max_size is not None and max_size < 1:
         raise InputError(path, f"longest side of {max_size} pixels asked for", "give at least 1 pixel")
     capture = read_capture(path, exposure_index=exposure_index, holdout=holdout, cache=cache)
-    chosen_by = (method, tuple(map(str, candidates))) if isinstance(response, str) and response == "auto" else None
-    curve = choose_response(capture, method, candidates) if chosen_by else _named(response)
-    scene = replace(develop(capture, curve, max_size), chosen_by=chosen_by)
+    chosen_by = None
+    if isinstance(response, str) and response == "auto":
+        response, chosen_by = choose_response(capture, method, candidates), (method, tuple(map(str, candidates)))
+    elif isinstance(response, str | Path):
+        response = response_by_name("srgb" if response == "learned" else response)
+    scene = replace(develop(capture, response, max_size), chosen_by=chosen_by)
     if len(scene.points):
         return scene
     points, colors = triangulate(capture, cache)
@@ -73,11 +84,7 @@ def load_scene(
 
 
 def read_capture(
-    path: Path | str,
-    *,
-    exposure_index: int | None = None,
-    holdout: int | None = None,
-    cache: Path | str | None = None,
+    path: Path | str, *, exposure_index: int | None = None, holdout: int | None = None, cache: Path | str | None = None
 ) -> Capture:
     """Cameras, files, exposure times and splits of a data folder; of photos their sizes alone. Arguments and errors are
     load_scene's."""
@@ -137,15 +144,6 @@ def best_response(
 
     known = [response for name in candidates for response in responses_named(name)] or None
     return select_response(codes, known, method=method, from_camera=made_by_camera(files)).response
-
-
-def _named(response: "str | Path | Response") -> "Response":
-    """The curve to develop by; a learned one is not known yet."""
-    from ..response import response_by_name
-
-    if not isinstance(response, str | Path):
-        return response
-    return response_by_name("srgb" if response == "learned" else response)
 
 
 def _folder(path: Path | str) -> Path:

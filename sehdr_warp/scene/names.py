@@ -1,5 +1,6 @@
 """The order of file names, files beside each other, and names of views."""
 
+import itertools
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -64,16 +65,11 @@ def unique_names(shots: Sequence[Shot]) -> list[str]:
     """
     plain = [re.sub(r"[^\w.+-]", "_", shot.view) or "view" for shot in shots]
     counts = Counter(name.lower() for name in plain)
-    names: list[str | None] = [name if counts[name.lower()] == 1 else None for name in plain]
-    taken = {name.lower() for name in names if name}
-    for wants_plain in (True, False):
-        for i, shot in enumerate(shots):
-            if names[i] is not None or (wants_plain and shot.split != "test"):
-                continue
-            base = plain[i] if wants_plain else f"{shot.image.parent.name}_{plain[i]}"
-            name, number = base, 2
-            while name.lower() in taken:
-                name, number = f"{base}_{number}", number + 1
-            names[i] = name
-            taken.add(name.lower())
-    return [name for name in names if name is not None]
+    shared = [counts[name.lower()] > 1 for name in plain]
+    names, taken = {}, set()
+    for i in sorted(range(len(shots)), key=lambda i: (shared[i], shots[i].split != "test")):
+        base = f"{shots[i].image.parent.name}_{plain[i]}" if shared[i] and shots[i].split != "test" else plain[i]
+        numbered = (f"{base}_{number}" if number > 1 else base for number in itertools.count(1))
+        names[i] = next(name for name in numbered if name.lower() not in taken)
+        taken.add(names[i].lower())
+    return [names[i] for i in range(len(shots))]

@@ -1,20 +1,23 @@
-"""transforms.json and its kin: nerfstudio, instant-ngp, Blender, and HDR-NeRF's synthetic sets."""
+"""transforms.json and its kin (nerfstudio, instant-ngp, Blender, HDR-NeRF's synthetic sets), and files of cameras."""
 
 import math
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import InputError
 from ..files import contained, read_json
-from .capture import DERIVED_PHOTOS, Capture, Shot, pose_from_camera_to_world
+from .camera import Camera
+from .capture import DERIVED_PHOTOS, NO_POINTS, Capture, Cloud, Shot, pose_from_camera_to_world
 from .colmap_model import find_model, read_ply_points, read_points
 from .exposure import parse_seconds
 from .hdr_files import hdr_size
-from .images import HDR_SUFFIXES, LDR_SUFFIXES, image_sizes
+from .images import HDR_SUFFIXES, LDR_SUFFIXES, MAX_PIXELS, image_sizes
 from .lens import Lens
-from .names import photo_beside, sibling
+from .names import natural_key, photo_beside, sibling
 
 _REMEDY = "correct the file or export it again"
 _INCOMPLETE = "copy the whole set"
@@ -35,7 +38,7 @@ def read_transforms(folder: Path) -> Capture:
     else:
         other = "test" if (folder / "transforms_test.json").is_file() else "val"
         files = [(folder / "transforms_train.json", "train"), (folder / f"transforms_{other}.json", "test")]
-    shots, points, colors = [], np.zeros((0, 3)), np.zeros((0, 3), np.float32)
+    shots, cloud = [], NO_POINTS
     for path, split in files:
         if split == "test" and not path.is_file():
             continue
@@ -43,12 +46,12 @@ def read_transforms(folder: Path) -> Capture:
         frames = frames_of(values, path)
         named = _named_splits(values, frames)
         shots += [_frame_shot(folder, path, values, frame, name, split or named.get(name)) for name, frame in frames]
-        if not len(points):
-            points, colors = _points(folder, path, values)
+        if not len(cloud[0]):
+            cloud = _points(folder, path, values)
     kept, notes = [shot for shot in shots if shot.split], ()
     if 0 < len(kept) < len(shots):
         notes = (f"{len(shots) - len(kept)} frames belong to neither the train nor the test split and were left out",)
-    return Capture("transforms", tuple(kept or shots), "background", points=points, point_colors=colors, notes=notes)
+    return Capture("transforms", tuple(kept or shots), "background", cloud=cloud, notes=notes)
 
 
 def read_hdr_nerf(folder: Path) -> Capture:
@@ -88,8 +91,7 @@ def read_hdr_nerf(folder: Path) -> Capture:
                 absent = folder / f"{_plain(name)}_{min(exposures)}.png"
                 raise InputError(absent, "image file not found", _INCOMPLETE)
             shots += present
-    points, colors = _sparse_points(folder)
-    return Capture("hdr-nerf", tuple(shots), "background", points=points, point_colors=colors)
+    return Capture("hdr-nerf", tuple(shots), "background", cloud=_sparse_points(folder))
 
 
 def frames_of(values: dict, path: Path) -> list[tuple[str, dict]]:
@@ -151,20 +153,19 @@ def frame_pose(frame: dict, path: Path, name: str) -> np.ndarray:
 
 def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Lens:
     """The lens of a frame, whose values win over the file's; the size is the image's where neither states it."""
+    stated = values | frame
 
-    def number(key: str) -> float | None:
-        value = frame.get(key, values.get(key))
+    def number(key: str, absent=None):
+        value = stated.get(key)
         if value is None:
-            return None
+            return absent
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
             raise InputError(path, f"{key} = {value!r:.40} is not a finite number", _REMEDY)
         return float(value)
 
     def focal(key: str, angle_key: str, length: float) -> float | None:
-        if (stated := number(key)) is not None:
-            return stated
-        angle = number(angle_key) or 0.0
-        return 0.5 * length / math.tan(0.5 * angle) if 0 < angle < math.pi else None
+        angle = number(angle_key, 0.0)
+        return number(key, 0.5 * length / math.tan(0.5 * angle) if 0 < angle < math.pi else None)
 
     width, height = number("w"), number("h")
     if width is None or height is None:
@@ -174,25 +175,23 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
     fx, fy = focal("fl_x", "camera_angle_x", width), focal("fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
         raise InputError(path, "states no focal length", "add camera_angle_x (radians, below pi) or fl_x (pixels)")
-    cx, cy = number("cx"), number("cy")
-    pinhole = (fy if fx is None else fx, fx if fy is None else fy, width / 2 if cx is None else cx,
-               height / 2 if cy is None else cy)  # fmt: skip
-    k1, k2, k3, k4, p1, p2 = (number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    model = frame.get("camera_model", values.get("camera_model", "OPENCV"))
-    if model == "OPENCV_FISHEYE" or frame.get("is_fisheye", values.get("is_fisheye")) is True:
+    pinhole = fy if fx is None else fx, fx if fy is None else fy, number("cx", width / 2), number("cy", height / 2)
+    k1, k2, k3, k4, p1, p2 = (number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    model, bent = stated.get("camera_model", "OPENCV"), (k1, k2, p1, p2)
+    if model == "OPENCV_FISHEYE" or stated.get("is_fisheye") is True:
         model, bent = "OPENCV_FISHEYE", (k1, k2, k3, k4)
     elif model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL"):
         raise InputError(path, f"camera_model {model!r:.40} is not supported", "use OPENCV, OPENCV_FISHEYE or PINHOLE")
     elif k4:
         raise InputError(path, f"k4 = {k4} of a perspective camera is not supported", "undistort the images first")
     elif k3:
-        model, bent = "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+        model, bent = "FULL_OPENCV", (*bent, k3, 0.0, 0.0, 0.0)
     else:
-        model, bent = "OPENCV", (k1, k2, p1, p2)
+        model = "OPENCV"
     return Lens(model, int(width), int(height), (*pinhole, *bent), path)
 
 
-def _points(folder: Path, path: Path, values: dict) -> tuple[np.ndarray, np.ndarray]:
+def _points(folder: Path, path: Path, values: dict) -> Cloud:
     """ply_file_path (in the frames' coordinates), or nerfstudio's COLMAP model moved by applied_transform."""
     name = values.get("ply_file_path")
     if isinstance(name, str) and (ply := contained(folder, name, path)).is_file():
@@ -206,10 +205,10 @@ def _points(folder: Path, path: Path, values: dict) -> tuple[np.ndarray, np.ndar
     return points, colors
 
 
-def _sparse_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+def _sparse_points(folder: Path) -> Cloud:
     places = (find_model(folder), folder / "sparse" / "0", folder / "sparse", folder)
     clouds = (read_points(place) for place in places if place is not None)
-    return next((cloud for cloud in clouds if len(cloud[0])), (np.zeros((0, 3)), np.zeros((0, 3), np.float32)))
+    return next((cloud for cloud in clouds if len(cloud[0])), NO_POINTS)
 
 
 def _plain(name: str) -> str:
@@ -226,3 +225,66 @@ def _exposures_of(values: dict, path: Path) -> dict[str, dict[int, tuple[str, fl
             name = _plain(key) if match[3] else f"{_plain(key)}.png"
             found.setdefault(match[1], {})[int(match[2])] = (name, parse_seconds(value, path, key))
     return found
+
+
+def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
+    """Named cameras from a JSON file, in its order, without distortion.
+
+    Accepted: {"cameras": [{"name": ..., **Camera.to_dict()}, ...]} (each entry may also keep its values under
+    "camera"), nerfstudio's camera_path.json, and transforms.json.
+    Raises InputError where the file is damaged, a pose or size cannot be, or two cameras share a name.
+    """
+    path = Path(path)
+    values = read_json(path)
+    if isinstance(values.get("cameras"), list):
+        cameras = [_own(entry, i, path) for i, entry in enumerate(values["cameras"])]
+    elif isinstance(values.get("camera_path"), list):
+        cameras = [_nerfstudio(entry, i, values, path) for i, entry in enumerate(values["camera_path"])]
+    elif "frames" in values:
+        cameras = [
+            (Path(name).stem, frame_lens(values, frame, None, path).pinhole(frame_pose(frame, path, name)))
+            for name, frame in frames_of(values, path)
+        ]
+    else:
+        raise InputError(path, "has none of cameras, camera_path and frames", "export cameras as the manual describes")
+    if not cameras:
+        raise InputError(path, "lists no cameras", "add at least one")
+    names = [name.lower() for name, _ in cameras]
+    if len(set(names)) < len(names):
+        twice = min((name for name in names if names.count(name) > 1), key=natural_key)
+        raise InputError(path, f"camera name {twice!r} is used twice", "give every camera its own name")
+    for i, (name, camera) in enumerate(cameras):
+        if not name or any(letter in name for letter in "/\\\0") or name in (".", "..") or len(name) > 200:
+            raise InputError(path, f"camera name {name!r:.60} cannot name a file", "use letters, digits, '_' and '-'")
+        if camera.width * camera.height > MAX_PIXELS:
+            problem = f"camera {i} is {camera.width} x {camera.height}"
+            raise InputError(path, problem, f"use sizes of 1 to {MAX_PIXELS} pixels")
+    return cameras
+
+
+@contextmanager
+def _usable(index: int, path: Path) -> Iterator[None]:
+    try:
+        yield
+    except KeyError as error:
+        raise InputError(path, f"camera {index} has no {error.args[0]}", "add the field") from None
+    except (ValueError, TypeError, AttributeError, OverflowError, ZeroDivisionError) as error:
+        raise InputError(path, f"camera {index} cannot be used ({str(error)[:120]})", "correct the camera") from None
+
+
+def _own(entry, index: int, path: Path) -> tuple[str, Camera]:
+    with _usable(index, path):
+        return str(entry.get("name", f"{index:04d}")), Camera.from_dict(entry.get("camera", entry))
+
+
+def _nerfstudio(entry, index: int, values: dict, path: Path) -> tuple[str, Camera]:
+    """An entry of camera_path.json: camera_to_world (OpenGL axes, 16 numbers by rows) and fov (vertical, degrees)."""
+    with _usable(index, path):
+        width, height, fov = int(values["render_width"]), int(values["render_height"]), float(entry["fov"])
+        matrix = np.array(entry["camera_to_world"], dtype=np.float64).reshape(4, 4)
+        if not 1e-6 <= fov < 180:
+            raise InputError(path, f"camera {index} has fov {fov}", "use degrees between 0 and 180")
+        matrix[:3, 1:3] *= -1
+        focal = 0.5 * height / math.tan(math.radians(fov) / 2)
+        pose = pose_from_camera_to_world(matrix, path, f"camera {index}")
+        return f"{index:04d}", Camera(width, height, focal, focal, width / 2, height / 2, pose)

@@ -13,13 +13,15 @@ import math
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from ..errors import InputError, SehdrError
-from .capture import Capture, Shot
+from ..files import atomic_folder
+from .capture import Capture, Cloud, Shot
 from .colmap_model import SparseModel, read_model
 from .develop import as_photographed, fitted_lens, told
 from .images import EXIF_ERRORS, open_image, read_ldr, read_mask
@@ -62,13 +64,12 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Spar
     with _cached(cache, f"sfm-{key}", solve) as folder:
         model = read_model(folder)
         sizes = json.loads((folder / "sizes.json").read_text())
-    full = {image.camera_id: sizes[int(Path(image.name).stem)] for image in model.images}
-    cameras = {camera_id: model.cameras[camera_id].resized(*size) for camera_id, size in full.items()}
-    return SparseModel(cameras, model.images, model.points, model.colors)
+    images = (replace(image, lens=image.lens.resized(*sizes[_index(image.name)])) for image in model.images)
+    return SparseModel(tuple(images), model.cloud)
 
 
-def triangulate(capture: Capture, cache: Path | str | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """[P, 3] points and [P, 3] colors of the training photos, whose cameras are known; P is 0 where nothing matches.
+def triangulate(capture: Capture, cache: Path | str | None = None) -> Cloud:
+    """Points of the training photos, whose cameras are known; P is 0 where nothing matches.
 
     Features are found on the photos stretched to full range (a short exposure is nearly black as it is), at no more
     than MAX_SIDE pixels; poses stay as they are. cache: as reconstruct's.
@@ -115,41 +116,26 @@ def _cached(cache: Path | str | None, name: str, solve: Callable[[Path, Path], N
 
     A user's cache that cannot be written is done without; a named one is asked for.
     """
-    folder = user_cache() if cache is None else Path(cache)
-    if (folder / name).is_dir():
-        _log.info("using the cached result %s", folder / name)
-        yield folder / name
-        return
-    made = not folder.exists()
-    try:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError:
-            if cache is not None:
-                raise
-        kept = os.access(folder, os.W_OK)
-        with tempfile.TemporaryDirectory(prefix="sehdr-sfm-", dir=folder if kept else None) as work:
-            result = Path(work) / "result"
-            (Path(work) / "model").mkdir()
-            result.mkdir()
-            solve(Path(work), result)
-            if not kept:
-                yield result
-                return
+    with contextlib.ExitStack() as stack:
+        folder = user_cache() if cache is None else Path(cache)
+        place = folder / name
+        if place.is_dir():
+            _log.info("using the cached result %s", place)
+        else:
+            there = next(each for each in (folder, *folder.absolute().parents) if each.is_dir())
+            if cache is None and not os.access(there, os.W_OK):
+                place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sehdr-sfm-"))) / name
             try:
-                os.replace(result, folder / name)
-            except OSError:  # Another process finished the same work first; its result is as good.
-                if not (folder / name).is_dir():
+                with (
+                    atomic_folder(place) as result,
+                    tempfile.TemporaryDirectory(prefix="sehdr-sfm-", dir=place.parent) as work,
+                ):
+                    (Path(work) / "model").mkdir()
+                    solve(Path(work), result)
+            except SehdrError:
+                if not place.is_dir():  # Else another process finished the same work first; its result is as good.
                     raise
-    except BaseException as error:
-        if made:
-            with contextlib.suppress(OSError):  # Not empty, or never made.
-                folder.rmdir()
-        if isinstance(error, OSError):
-            problem = f"structure from motion cannot write ({error.strerror or error})"
-            raise SehdrError(f"{folder}: {problem}; free some space or choose another cache (SEHDR_CACHE)") from None
-        raise
-    yield folder / name
+        yield place
 
 
 def _digest(path: Path) -> str:
@@ -166,6 +152,10 @@ def _key(*parts) -> str:
 
 def _name(index: int) -> str:
     return f"{index:05d}.png"
+
+
+def _index(name: str) -> int:
+    return int(name.removesuffix(".png"))
 
 
 def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
@@ -312,31 +302,24 @@ def _known_poses(database: Path, shots: Sequence[Shot]):
         for camera in opened.read_all_cameras():
             model.add_camera_with_trivial_rig(camera)
         for image in opened.read_all_images():
-            pose = shots[int(Path(image.name).stem)].world_to_camera
+            pose = shots[_index(image.name)].world_to_camera
             model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
     return model
 
 
-def _sampled_colors(model, shots: Sequence[Shot], lenses: Sequence[Lens]) -> tuple[np.ndarray, np.ndarray]:
+def _sampled_colors(model, shots: Sequence[Shot], lenses: Sequence[Lens]) -> Cloud:
     """Places and the mean color of the photos' pixels where each point was seen, encoded."""
-    seen: dict[int, list[tuple[int, float, float]]] = {}
-    points = list(model.points3D.values())
-    for number, point in enumerate(points):
-        for element in point.track.elements:
-            image = model.images[element.image_id]
-            x, y = image.points2D[element.point2D_idx].xy
-            seen.setdefault(int(Path(image.name).stem), []).append((number, x, y))
-    total, count = np.zeros((len(points), 3)), np.zeros((len(points), 1))
-    for index, places in seen.items():
-        shot, lens = shots[index], lenses[index]
+    number_of = {key: number for number, key in enumerate(model.points3D)}
+    total, count = np.zeros((len(number_of), 3)), np.zeros((len(number_of), 1))
+    for image in model.images.values():
+        shot, lens = shots[_index(image.name)], lenses[_index(image.name)]
         pixels = as_photographed(shot, oriented=not shot.derived and fitted_lens(shot)[1]).pixels
-        height, width = pixels.shape[:2]
-        for number, x, y in places:
-            row = min(max(int(y * height / lens.height), 0), height - 1)
-            column = min(max(int(x * width / lens.width), 0), width - 1)
-            total[number] += pixels[row, column] / np.iinfo(pixels.dtype).max
-            count[number] += 1
-    places = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
+        size = np.array(pixels.shape[1::-1])
+        for point in image.get_observation_points2D():
+            column, row = np.clip((point.xy * size / (lens.width, lens.height)).astype(int), 0, size - 1)
+            total[number_of[point.point3D_id]] += pixels[row, column] / np.iinfo(pixels.dtype).max
+            count[number_of[point.point3D_id]] += 1
+    places = np.array([point.xyz for point in model.points3D.values()], np.float64).reshape(-1, 3)
     return places, (total / np.maximum(count, 1)).astype(np.float32)
 
 

@@ -14,13 +14,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class View:
-    """One photo with its camera.
+    """One photo with its undistorted pinhole camera.
 
     name: the image's stem in the data (`r_0`); unique within a scene.
     codes: [H, W, 3] uint8 as photographed, or uint16 where the photo has 16 bits or was averaged; at the camera's size.
-    camera: the undistorted pinhole camera.
-    exposure_time: seconds, positive.
-    split: "train" or "test".
+    exposure_time: seconds, positive. split: "train" or "test".
     mask: [H, W] float32 in [0, 1], 1 where the pixel counts; None means all count.
     hdr: [H, W, 3] float32 scene-linear truth (radiance, not multiplied by the exposure time); None without truth.
     source: the file the photo came from.
@@ -58,10 +56,8 @@ class View:
 class Scene:
     """A set of posed views and the sparse points seen in them.
 
-    format: the layout that was read ("colmap", "transforms", "hdr-nerf", "hdr-nerf-real", "hdr-gs", "llff",
-        "photos").
-    points: [P, 3] float64 world coordinates, P may be 0.
-    point_colors: [P, 3] float32 in [0, 1], encoded like the photos.
+    format: the layout that was read (colmap, transforms, hdr-nerf, hdr-nerf-real, hdr-gs, llff, photos).
+    points: [P, 3] float64 world coordinates, P may be 0. point_colors: [P, 3] float32 in [0, 1], encoded like photos.
     exposure_times_known: False where no file stated them (then each view's is 1 second).
     notes: one line each on what the user should know (differing exposures, views left out, ...).
     predictor: what predicted the `hdr` of the training views, each from its photo; None where `hdr` is truth.

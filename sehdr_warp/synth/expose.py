@@ -52,37 +52,25 @@ class RadianceView:
     split: str
 
 
-def expose(
-    scene: Scene,
-    response,
-    exposure_time: float | Sequence[float],
-    *,
-    noise: SensorNoise | None = None,
-    bits: int = 8,
-    seed: int = 0,
-) -> Scene:
-    """The scene as photographed: each photo becomes response.encode(hdr * exposure_time), rounded to `bits` (1 to 16).
+def expose(scene: Scene, response, exposure_time: float, *, noise: SensorNoise | None = None, seed: int = 0) -> Scene:
+    """The scene as photographed: each photo becomes response.encode(hdr * exposure_time), rounded to 8 bits.
 
-    scene: every view has truth (View.hdr), which is kept. exposure_time: seconds; one for all views or one for each.
+    scene: every view has truth (View.hdr), which is kept. exposure_time: seconds.
     noise: applied to the exposure before the response, drawn for each view from (seed, its name).
     Each point takes its new color from the training view whose old photo showed it most nearly in its old color, since
     that view is the likeliest to see it unoccluded; one outside of all training views keeps its own.
 
-    Raises InputError for a view without truth or an impossible time, ValueError for impossible bits.
+    Raises InputError for a view without truth or an impossible time.
     """
-    times = np.broadcast_to(np.asarray(exposure_time, np.float64), len(scene.views))
-    if not (np.isfinite(times).all() and (times > 0).all()):
-        raise InputError(scene.name, f"exposure time {times.min():g} s is not positive and finite", "give seconds")
-    if not 1 <= bits <= 16:
-        raise ValueError(f"{bits} bits are not 1 to 16")
-    levels, views = 2**bits - 1, []
-    for view, time in zip(scene.views, times, strict=True):
-        exposure = _truth(scene, view).astype(np.float64) * time
+    if not (math.isfinite(exposure_time) and exposure_time > 0):
+        raise InputError(scene.name, f"exposure time {exposure_time:g} s is not positive and finite", "give seconds")
+    views = []
+    for view in scene.views:
+        exposure = _truth(scene, view).astype(np.float64) * exposure_time
         if noise is not None:
             rng = np.random.default_rng([seed, zlib.crc32(view.name.encode())])
             exposure = _noisy(exposure, response.clip_exposure if response.clips else response.white, noise, rng)
-        codes = codes_of(np.round(np.clip(response.encode(exposure), 0.0, 1.0) * levels) / levels)
-        views.append(replace(view, codes=codes, exposure_time=float(time)))
+        views.append(replace(view, codes=codes_of(response.encode(exposure), 8), exposure_time=float(exposure_time)))
     made = {"views": tuple(views), "point_colors": _recolored(scene, views), "exposure_times_known": True}
     return replace(scene, **made, response=None, chosen_by=None)
 
@@ -94,8 +82,7 @@ def exposure_ladder(scene: Scene, response, count: int = 5, factor: float = 4.0)
     exp(-(Z - 0.5)^2 / (2 * 0.2^2)) of the encoded values Z over the truth of the training views (Mertens et al. 2007),
     to a sixteenth of a stop. What the photos show decides, not the brightest lamp.
 
-    Raises InputError where a training view has no truth or all of it is black, ValueError for a count or factor that
-    makes no ladder.
+    Raises InputError where a training view has no truth or all of it is black.
     """
     truth = [_truth(scene, view) for view in scene.train_views]
     return ladder_of(scene.name, truth, response.encode, count, factor)
@@ -103,8 +90,6 @@ def exposure_ladder(scene: Scene, response, count: int = 5, factor: float = 4.0)
 
 def ladder_of(name: str, images: Sequence[np.ndarray], encode: Callable, count: int = 5, factor: float = 4.0):
     """exposure_ladder of radiance images through a curve; name: of what they show, for errors."""
-    if count < 1 or not 1.0 < factor < 1e6:
-        raise ValueError(f"{count} exposures {factor} times apart make no ladder")
     radiance = np.concatenate([image.ravel() for image in images])
     radiance = radiance[:: -(-len(radiance) // _MOST_SAMPLES)].astype(np.float64)
     lit = radiance[radiance > 0]
@@ -144,17 +129,15 @@ def _recolored(scene: Scene, views: Sequence[View]) -> np.ndarray:
             continue
         camera = old.camera
         x, y, z = camera.world_to_camera[:3, :3] @ scene.points.T + camera.world_to_camera[:3, 3:]
-        before = z > 1e-9
-        depth = np.where(before, z, 1.0)
-        column = np.floor(np.clip(camera.fx * x / depth + camera.cx, -1, camera.width)).astype(int)
-        row = np.floor(np.clip(camera.fy * y / depth + camera.cy, -1, camera.height)).astype(int)
-        seen = before & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+        depth = np.where(z > 1e-9, z, np.inf)
+        column, row = np.floor(camera.fx * x / depth + camera.cx), np.floor(camera.fy * y / depth + camera.cy)
+        seen = (z > 1e-9) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
         place = np.flatnonzero(seen)
-        difference = np.abs(old.image[row[place], column[place]] - scene.point_colors[place]).sum(axis=1)
+        at = row[place].astype(int), column[place].astype(int)
+        difference = np.abs(old.image[at] - scene.point_colors[place]).sum(axis=1)
         better = difference < nearest[place]
-        place, difference = place[better], difference[better]
-        nearest[place] = difference
-        colors[place] = new.image[row[place], column[place]]
+        nearest[place[better]] = difference[better]
+        colors[place[better]] = new.image[at][better]
     return colors
 
 

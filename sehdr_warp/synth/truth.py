@@ -52,6 +52,8 @@ def pack_truth(folder: Path, out: Path, *, compression="dwab", level: float = 45
     bytes of the whole set.
     Raises InputError where the folder is no finished set of truth.
     """
+    import OpenEXR
+
     names = {split: [f"{kind}_{split}.json" for kind in ("transforms", "exposure")] for split in ("train", "test")}
     splits = [split for split in names if all((folder / name).is_file() for name in names[split])]
     if "train" not in splits or not (folder / "points3d.ply").is_file():
@@ -61,7 +63,9 @@ def pack_truth(folder: Path, out: Path, *, compression="dwab", level: float = 45
     sources = [path for split in splits for path in sorted((folder / f"{split}_hdr").glob("hdr_*.exr"))]
     largest = max(float(read_hdr(source).max()) for source in sources)
     scale = 2.0 ** min(round(np.log2(16 * times[len(times) // 2])), np.floor(np.log2(_LARGEST / max(largest, 1e-30))))
-    header, squares = _exr_options(compression, level), []
+    header, squares = {"compression": getattr(OpenEXR, f"{compression.upper()}_COMPRESSION")}, []
+    if compression == "dwab":
+        header["dwaCompressionLevel"] = float(level)
     with atomic_folder(out, overwrite) as made:
         for source in sources:
             truth, target = read_hdr(source) * np.float32(scale), made / source.relative_to(folder)
@@ -81,13 +85,6 @@ def pack_truth(folder: Path, out: Path, *, compression="dwab", level: float = 45
         making = folder / "synth.json"
         write_json(made / "synth.json", (read_json(making) if making.is_file() else {}) | {"packing": packing})
     return packing
-
-
-def _exr_options(compression: str, level: float) -> dict:
-    import OpenEXR
-
-    options = {"compression": getattr(OpenEXR, f"{compression.upper()}_COMPRESSION")}
-    return options | ({"dwaCompressionLevel": float(level)} if compression == "dwab" else {})
 
 
 def _squared_errors(stored: np.ndarray, truth: np.ndarray) -> tuple[float, float]:

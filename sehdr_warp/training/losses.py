@@ -87,7 +87,7 @@ def ldr_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor:
 
 def compares_light(config: LossConfig, field: RadianceField) -> bool:
     """Whether ldr_loss compares exposures: where pixels have one and the curve is known."""
-    decodable = not field.color_model.encoded and field.tone_map == "pixel" and field.response.decodable
+    decodable = not field.color_model.encoded and field.tone_map == "pixel" and not field.response.learnable
     return config.ldr_weight > 0 and decodable
 
 

@@ -24,8 +24,7 @@ from sehdr_warp.scene.colmap_model import read_ply_points
 from sehdr_warp.scene.exposure import exif_exposure
 from sehdr_warp.scene.hdr_files import hdr_size, read_exr_channels, read_hdr
 from sehdr_warp.scene.images import image_sizes, read_ldr, read_mask
-from sehdr_warp.scene.read_colmap import read_colmap
-from sehdr_warp.scene.read_llff import read_llff
+from sehdr_warp.scene.read_folders import read_colmap, read_llff
 from sehdr_warp.scene.read_transforms import read_hdr_nerf, read_transforms
 from sehdr_warp.synth.expose import RadianceView
 from sehdr_warp.training.config_files import load_config

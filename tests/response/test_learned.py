@@ -48,7 +48,7 @@ def test_shapes_kinds_and_ends():
     assert bool(torch.isfinite(black.grad).all())
     array = mapper.encode(np.full((2, 3), 0.5))
     assert isinstance(array, np.ndarray) and array.dtype == np.float64 and mapper.decode(array).shape == (2, 3)
-    assert mapper.learnable and not mapper.decodable
+    assert mapper.learnable
     np.testing.assert_allclose(np.log(mapper.start_exposures(np.array([[0.1, 0.5, 0.9]]))), [[0.1, 0.5, 0.9]])
     assert not mapper.clips and (mapper.black, mapper.peak) == (0.0, 1.0)
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.response import Response, response_by_name
@@ -60,10 +59,10 @@ def test_thousands_of_edges_are_all_looked_at_and_count_as_few_facts():
         assert score.posterior == pytest.approx(18.75 * score.edges + rest)
 
 
-def test_tensors_arrays_and_codes_are_judged_alike():
+def test_arrays_and_codes_are_judged_alike():
     few, photo = named("linear", "srgb"), photograph("srgb", mosaic())
     by_array = select_response(photo, few)
-    assert by_array.response in few and by_array.scores == select_response(torch.tensor(photo), few).scores
+    assert by_array.response in few
     expected = [score.posterior for score in by_array.scores]
     for codes in (np.rint(photo * 255).astype(np.uint8), np.rint(photo * 65535).astype(np.uint16)):
         assert [score.posterior for score in select_response(codes, few).scores] == pytest.approx(expected)

@@ -13,7 +13,7 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.hdr_files import hdr_size, read_hdr
 from sehdr_warp.scene.images import image_sizes, read_ldr
-from sehdr_warp.scene.resample import area_average, limited_size
+from sehdr_warp.scene.lens import area_average, limited_size
 
 RNG = np.random.default_rng(1)
 

@@ -160,7 +160,7 @@ def test_photos_of_several_cameras_get_their_own_lenses(tmp_path, shared):
         with Image.open(photo) as image:
             image.reduce(4 if i < 3 else 5).save(tmp_path / photo.name, quality=95)
     model = reconstruct(sorted(tmp_path.glob("*.JPG")), tmp_path / "cache")
-    assert sorted((lens.width, lens.height) for lens in model.cameras.values()) == [(567, 426), (708, 532)]
+    assert {(image.lens.width, image.lens.height) for image in model.images} == {(567, 426), (708, 532)}
 
 
 def test_embedded_scene_loads():

@@ -1,0 +1,208 @@
+"""Readers of folders without transforms: COLMAP's sets and HDR-GS's, HDR-NeRF's real ones and LLFF's, bare photos."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from ..files import contained, read_bytes, read_json
+from .capture import NO_POINTS, Capture, Cloud, Shot, pose_from_camera_to_world
+from .colmap_model import SparseModel, find_model, read_model
+from .exposure import parse_seconds
+from .images import HDR_SUFFIXES, LDR_SUFFIXES, image_sizes
+from .lens import Lens
+from .names import list_images, mask_of, natural_key, photo_beside, sibling, view_and_exposure
+from .sfm import reconstruct
+
+# The images of reduced copies of a set lie in images_2 ... images_8; the full ones are taken where they are there.
+_IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
+# HDR-NeRF's synthetic exposures, which HDR-GS's folders do not state (its train_synthetic.py holds them as constants).
+_HDR_GS_SECONDS = (0.125, 0.5, 2.0, 8.0, 32.0)
+_REMEDY = "copy the images that COLMAP used"
+_POSES_REMEDY = "export the poses again with LLFF's imgs2poses"
+
+
+def image_folder(folder: Path) -> Path | None:
+    return next((folder / name for name in _IMAGE_FOLDERS if (folder / name).is_dir()), None)
+
+
+def read_colmap(folder: Path) -> Capture:
+    """One shot for each image of the model, in the natural order of the names."""
+    model, source = _model(folder)
+    images = image_folder(folder)
+    if images is None:
+        raise InputError(folder / "images", "folder not found", "put the photos that COLMAP used there")
+    shots, absent = [], []
+    for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
+        image = contained(images, entry.name, source)
+        if image.suffix.lower() in HDR_SUFFIXES:
+            hdr, image = image, photo_beside(image)
+        elif not image.is_file():
+            absent.append(entry.name)
+            continue
+        else:
+            beside = (sibling(folder / name / image.name, HDR_SUFFIXES) for name in ("hdr", "exr"))
+            hdr = next((file for file in beside if file), None)
+        mask = mask_of(folder, entry.name, source)
+        shots.append(Shot(image.stem, image, entry.lens, entry.world_to_camera, mask=mask, hdr=hdr))
+    if not shots:
+        problem = f"none of the model's {len(absent)} images is here (the first is {absent[0]!r:.90})"
+        raise InputError(images, problem, _REMEDY)
+    notes = ()
+    if absent:
+        notes = (f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ...",)
+    return Capture("colmap", tuple(shots), holdout=(8, 0), cloud=model.cloud, notes=notes)
+
+
+def is_hdr_gs(folder: Path) -> bool:
+    there = (folder / "exr").is_dir() and (folder / "images").is_dir() and find_model(folder) is not None
+    return there and bool(_exposures_by_view(folder / "images"))
+
+
+def read_hdr_gs(folder: Path) -> Capture:
+    """HDR-GS's synthetic layout: `images/<v>_<e>.png`, `exr/<v>.exr`, and a model with one image of each view."""
+    cloud, poses = _poses_by_view(folder)
+    exposures = _exposures_by_view(folder / "images")
+    seconds, notes = _hdr_gs_seconds(folder, 1 + max(key for files in exposures.values() for key in files))
+    shots = [
+        Shot(view, image, *camera, exposure_key=key, exposure_time=seconds[key] if seconds else None,
+             hdr=sibling(folder / "exr" / f"{view}.exr", HDR_SUFFIXES))
+        for view, camera in poses.items()
+        for key, image in sorted(exposures.get(view, {}).items())
+    ]  # fmt: skip
+    if not shots:
+        raise InputError(folder / "images", "none of the model's images is in images/", _REMEDY)
+    return Capture("hdr-gs", tuple(shots), "background", (2, 1), cloud, notes)
+
+
+def _poses_by_view(folder: Path) -> tuple[Cloud, dict[str, tuple]]:
+    """The points and, for each view (names without `_<exposure>`) in natural order, its lens and pose."""
+    model, source = _model(folder)
+    poses = {}
+    for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
+        view = re.sub(r"_\d+$", "", contained(folder, entry.name, source).stem)
+        poses.setdefault(view, (entry.lens, entry.world_to_camera))
+    return model.cloud, poses
+
+
+def _model(folder: Path) -> tuple[SparseModel, Path]:
+    source = find_model(folder) or folder / "sparse"
+    model = read_model(source)
+    if not model.images:
+        raise InputError(source, "the model has no registered views", "run structure from motion again")
+    return model, source
+
+
+def _exposures_by_view(images: Path) -> dict[str, dict[int, Path]]:
+    found: dict[str, dict[int, Path]] = {}
+    for image in images.iterdir():
+        view, key = view_and_exposure(image.stem)
+        if key is not None and image.suffix.lower() in LDR_SUFFIXES:
+            found.setdefault(view, {})[key] = image
+    return found
+
+
+def _hdr_gs_seconds(folder: Path, count: int) -> tuple[list[float] | None, tuple[str, ...]]:
+    """Seconds by exposure number: "exposure_times" in `exposure_times.json`, or HDR-GS's constants."""
+    path = folder / "exposure_times.json"
+    if path.is_file():
+        values = read_json(path).get("exposure_times")
+        if not isinstance(values, list) or len(values) < count:
+            raise InputError(path, f"exposure_times does not list {count} values", "list the seconds of every exposure")
+        return [parse_seconds(value, path, f"exposure {i}") for i, value in enumerate(values)], ()
+    if count == len(_HDR_GS_SECONDS):
+        return list(_HDR_GS_SECONDS), (f"the set states no exposure times; took HDR-NeRF's {list(_HDR_GS_SECONDS)} s",)
+    return None, ()
+
+
+def read_hdr_nerf_real(folder: Path) -> Capture:
+    """HDR-NeRF's real layout: `input_images/<view>_<k>.jpg`, `poses_bounds_exps.npy` [n, 18], seconds last.
+
+    Rows follow the sorted file names. Where `sparse/0` lies beside (HDR-GS's edition of these sets), its cameras,
+    poses and points are taken, since every exposure of a view then has one pose.
+    """
+    path = folder / "poses_bounds_exps.npy"
+    rows = _rows(path, 18)
+    images = _images(folder / "input_images", path, len(rows))
+    cloud, poses = _poses_by_view(folder) if find_model(folder) is not None else (NO_POINTS, None)
+    shots, absent = [], set()
+    for row, image in zip(rows, images, strict=True):
+        view, key = view_and_exposure(image.stem)
+        if poses is not None and view not in poses:
+            absent.add(view)
+            continue
+        lens, pose = _camera(row, path, image.name) if poses is None else poses[view]
+        shots.append(Shot(view, image, lens, pose, exposure_key=key, exposure_time=float(row[17])))
+    notes = (f"{len(absent)} views are not in the sparse model and were left out",) if absent else ()
+    return Capture("hdr-nerf-real", tuple(shots), holdout=(2, 1), cloud=cloud, notes=notes)
+
+
+def read_llff(folder: Path) -> Capture:
+    """`images/` with `poses_bounds.npy` [n, 17], rows in the order of the sorted file names."""
+    path = folder / "poses_bounds.npy"
+    rows = _rows(path, 17)
+    images = _images(folder / "images", path, len(rows))
+    shots = (Shot(image.stem, image, *_camera(row, path, image.name)) for row, image in zip(rows, images, strict=True))
+    return Capture("llff", tuple(shots), holdout=(8, 0))
+
+
+def _rows(path: Path, width: int) -> np.ndarray:
+    """[n, width] float64; mapped, so that no more memory is asked for than the file has bytes."""
+    read_bytes(path, 1 << 28)
+    try:
+        rows = np.load(path, mmap_mode="r", allow_pickle=False)
+        if rows.dtype.kind != "f" or rows.ndim != 2 or rows.shape[1] != width:
+            raise ValueError(f"shape {rows.shape} of {rows.dtype}")
+        return np.array(rows, np.float64)
+    # NumPy parses the header as Python; what that raises for damaged ones is open-ended.
+    except Exception as error:  # noqa: BLE001
+        raise InputError(path, f"is not an [n, {width}] array of numbers ({error!s:.80})", _POSES_REMEDY) from None
+
+
+def _images(folder: Path, path: Path, count: int) -> list[Path]:
+    if not folder.is_dir():
+        raise InputError(folder, "folder not found", "copy the whole set")
+    images = sorted(list_images(folder, LDR_SUFFIXES), key=lambda file: file.name)
+    if len(images) != count:
+        raise InputError(path, f"has {count} rows for {len(images)} images in {folder.name}/", "copy the whole set")
+    return images
+
+
+def _camera(row: np.ndarray, path: Path, name: str) -> tuple[Lens, np.ndarray]:
+    """Columns of the 3 x 5 matrix: down, right, backwards, position, (height, width, focal length)."""
+    matrix = row[:15].reshape(3, 5)
+    if not np.isfinite(matrix).all():
+        raise InputError(path, f"pose of {name!r:.90} is not finite", _POSES_REMEDY)
+    height, width, focal = (float(value) for value in matrix[:, 4])
+    if not (1 <= width <= 1 << 16 and 1 <= height <= 1 << 16):
+        raise InputError(path, f"image size of {name!r:.90} is {width:g} x {height:g}", _POSES_REMEDY)
+    lens = Lens("SIMPLE_PINHOLE", round(width), round(height), (focal, width / 2, height / 2), path)
+    camera_to_world = np.stack([matrix[:, 1], matrix[:, 0], -matrix[:, 2], matrix[:, 3]], axis=1)
+    return lens, pose_from_camera_to_world(camera_to_world, path, name)
+
+
+def read_photos(folder: Path, cache: Path | str | None = None) -> Capture:
+    """One shot for each photo of the folder, or of its `images/`, that structure from motion could place."""
+    places = (place for place in (folder, folder / "images") if place.is_dir())
+    photos = next((found for place in places if (found := list_images(place, LDR_SUFFIXES))), [])
+    if not photos:
+        kinds = sorted({file.suffix.lower() for file in folder.iterdir() if file.suffix.lower() in HDR_SUFFIXES})
+        found = f"only {', '.join(kinds)} files" if kinds else "no photos and no known layout"
+        raise InputError(folder, f"has {found}", "give photos (PNG, JPEG, TIFF), a COLMAP set or a transforms.json")
+    if len(photos) < 2:
+        raise InputError(photos[0], "is the only photo; one view does not show depth", "add photos from other places")
+    for photo in photos:
+        image_sizes(photo)
+    model, shots, lost = reconstruct(photos, cache), [], []
+    placed = {int(Path(image.name).stem): image for image in model.images}
+    for i, photo in enumerate(photos):
+        if (image := placed.get(i)) is None:
+            lost.append(photo.name)
+            continue
+        mask = mask_of(folder, photo.name, folder)
+        shots.append(Shot(photo.stem, photo, image.lens, image.world_to_camera, mask=mask, oriented=True))
+    notes = ()
+    if lost:
+        notes = (f"{len(lost)} of {len(photos)} photos could not be placed and were left out: {', '.join(lost[:5])}",)
+    return Capture("photos", tuple(shots), cloud=model.cloud, notes=notes)
