@@ -2,8 +2,7 @@
 
 from .camera import Camera, look_at
 from .develop import develop
-from .embedded import embedded_folder, embedded_scenes, is_embedded
-from .load import choose_response, load_scene, read_capture
+from .load import choose_response, embedded_folder, embedded_scenes, is_embedded, load_scene, read_capture
 from .read_transforms import load_cameras
 from .types import Scene, View, codes_of, encoded_values
 

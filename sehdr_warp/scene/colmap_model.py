@@ -54,7 +54,7 @@ def read_model(folder: Path) -> SparseModel:
     for number, *lens in _cameras_binary(camera_path) if binary else _records(camera_path, "a camera", _camera):
         if number in cameras:
             raise InputError(camera_path, f"camera {number} is listed twice", _REMEDY)
-        cameras[number] = Lens(*lens, camera_path)
+        cameras[number] = Lens(*lens, source=camera_path)
     images: dict[str, ModelImage] = {}
     # In text a line of observations follows each image; it is empty, or missing at the end, where there are none.
     for pose, number, name in _images_binary(image_path) if binary else _records(image_path, "an image", _image, 2):

@@ -106,7 +106,7 @@ class _Developer:
             return View(name, codes_of(reinhard_gamma(hdr * shot.seconds), 8), *stated, None, hdr, shot.image)
         encoded = as_photographed(shot, oriented=oriented)
         codes, alpha = encoded.pixels, encoded.alpha
-        masks = [_shrunk(~undistortion.outside, camera)] if undistortion and undistortion.outside is not None else []
+        masks = [] if undistortion is None or undistortion.inside is None else [_shrunk(undistortion.inside, camera)]
         if shot.mask is not None:
             masks.append(warped(_fitted_mask(shot.mask, lens, oriented)))
         if alpha is not None and self.alpha == "mask":

@@ -5,6 +5,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from ..errors import InputError
 from ..files import read_bytes
@@ -103,15 +104,13 @@ def _exif_times(shots: list[Shot]) -> tuple[list[float | None], list[str]]:
     settings = [exif_exposure(shot.image) for shot in shots]
     notes, factors = [], [1.0] * len(shots)
     for name, place, power in (("ISO", 1, 1.0), ("f-number", 2, -2.0)):
-        values = [setting[place] for setting in settings]
-        if len(set(values)) == 1:
-            continue
-        if None in values:
+        values = [value for setting in settings if (value := setting[place]) is not None]
+        if 0 < len(values) < len(shots):
             notes.append(f"{name} is not stated for all photos and was not counted")
-            continue
-        factors = [f * (v / values[0]) ** power for f, v in zip(factors, values, strict=True)]
-        span = f"{min(values):g} to {max(values):g}"
-        notes.append(f"{name} differs ({span}); exposure times are relative to {values[0]:g}")
+        elif len(set(values)) > 1:
+            factors = [f * (v / values[0]) ** power for f, v in zip(factors, values, strict=True)]
+            span = f"{min(values):g} to {max(values):g}"
+            notes.append(f"{name} differs ({span}); exposure times are relative to {values[0]:g}")
     return [None if t is None else t * f for (t, _, _), f in zip(settings, factors, strict=True)], notes
 
 
@@ -141,9 +140,10 @@ def made_by_camera(sources: Sequence[Path | None]) -> bool:
     return 2 * made > len(sources)
 
 
-def _number(value) -> float | None:
+def _number(value: Any) -> float | None:
+    value = value[0] if isinstance(value, tuple) and value else value
     try:
-        return float(value[0] if isinstance(value, tuple) and value else value)
+        return float(value)
     except ZeroDivisionError:
         return math.nan
     except (TypeError, ValueError):

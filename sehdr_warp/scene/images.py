@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageFile
 
 from ..errors import InputError
 
@@ -38,7 +38,8 @@ def image_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     Raises InputError where the file is missing, is no image, or holds more than MAX_PIXELS pixels.
     """
     with open_image(path) as image:
-        return image.size, image.size[::-1] if _orientation(image) in (5, 6, 7, 8) else image.size
+        width, height = image.size
+        return image.size, (height, width) if _orientation(image) in (5, 6, 7, 8) else image.size
 
 
 def read_ldr(path: Path, *, oriented: bool = False) -> EncodedImage:
@@ -49,11 +50,11 @@ def read_ldr(path: Path, *, oriented: bool = False) -> EncodedImage:
     """
     with open_image(path) as image:
         try:
-            arrays = _decode(image, path)
+            pixels, alpha = _decode(image, path)
             turn = _orientation(image) if oriented else 1
         except (OSError, SyntaxError, ValueError, EOFError, MemoryError, Image.DecompressionBombError) as error:
             raise InputError(path, f"cannot be decoded ({error})", DAMAGED) from None
-    return EncodedImage(*(None if array is None else _upright(array, turn) for array in arrays))
+    return EncodedImage(_upright(pixels, turn), None if alpha is None else _upright(alpha, turn))
 
 
 def read_mask(path: Path, *, oriented: bool = False) -> np.ndarray:
@@ -62,7 +63,7 @@ def read_mask(path: Path, *, oriented: bool = False) -> np.ndarray:
     return image.alpha if image.alpha is not None else (image.pixels.mean(axis=2) / image.levels).astype(np.float32)
 
 
-def open_image(path: Path) -> Image.Image:
+def open_image(path: Path) -> ImageFile.ImageFile:
     """The image with its header read and its pixels not; InputError as image_sizes raises it."""
     require_file(path)
     # Pillow's own limit is global and lower for its warning; ours is checked below, before any pixel is decoded.
@@ -96,7 +97,7 @@ def check_size(path: Path, width: int, height: int, most: int = MAX_PIXELS) -> N
         raise InputError(path, f"size {width} x {height} is not between 1 and {most} pixels", "scale the image down")
 
 
-def _decode(image: Image.Image, path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+def _decode(image: ImageFile.ImageFile, path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Code values [H, W, 3] and alpha [H, W] in [0, 1] or None."""
     if image.mode in ("RGB", "RGBA") and (low := _low_byte_tiles(image)):
         with Image.open(path) as second:
@@ -124,17 +125,17 @@ def _split(values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     return values[:, :, :3], None if alpha.min() == white else (alpha / np.float32(white)).astype(np.float32)
 
 
-def _low_byte_tiles(image: Image.Image) -> list | None:
+def _low_byte_tiles(image: ImageFile.ImageFile) -> list | None:
     """Pillow keeps the high byte of 16-bit colour; asking for the other byte order makes it keep the low one."""
     other = {"16B": "16L", "16L": "16B", "16N": "16B" if np.little_endian else "16L"}
     tiles = []
     for tile in image.tile:
-        raw = tile.args if isinstance(tile.args, str) else tile.args[0] if tile.args else ""
+        raw, *rest = (tile.args,) if isinstance(tile.args, str) else tile.args or ("",)
         layout, _, depth = str(raw).partition(";")
         if layout not in ("RGB", "RGBA") or depth not in other:
             return None
         mode = f"{layout};{other[depth]}"
-        tiles.append(tile._replace(args=mode if isinstance(tile.args, str) else (mode, *tile.args[1:])))
+        tiles.append(tile._replace(args=mode if isinstance(tile.args, str) else (mode, *rest)))
     return tiles or None
 
 

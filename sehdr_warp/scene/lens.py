@@ -1,6 +1,5 @@
 """Cameras as photographed, with lens distortion, and how photos are resampled: to pinhole cameras, and smaller."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,9 +19,9 @@ PARAMETER_COUNTS = dict(CAMERA_MODELS.values())
 
 _ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE",
               "SIMPLE_DIVISION", "SIMPLE_FISHEYE"}  # fmt: skip
-_PINHOLES = {"SIMPLE_PINHOLE", "PINHOLE"}
-# Models that are pinholes where every parameter after the principal point is zero.
-_NEUTRAL_AT_ZERO = {"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION"}
+# Models that are pinholes where every parameter after the principal point, if there is one, is zero.
+_NEUTRAL_AT_ZERO = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV",
+                    "SIMPLE_DIVISION", "DIVISION"}  # fmt: skip
 _MAX_SIDE = 1 << 16
 
 
@@ -45,12 +44,13 @@ class Lens:
     source: Path
 
     def __post_init__(self):
-        remedy, wanted = "correct the camera or export it again", PARAMETER_COUNTS.get(self.model)
+        remedy, wanted, problem = "correct the camera or export it again", PARAMETER_COUNTS.get(self.model), None
         if wanted is None:
-            remedy = f"use one of {', '.join(PARAMETER_COUNTS)}"
-            raise InputError(self.source, f"camera model {self.model!r:.40} is not supported", remedy)
-        problem = None
-        if len(self.params) != wanted:
+            problem, remedy = (
+                f"camera model {self.model!r:.40} is not supported",
+                f"use one of {', '.join(PARAMETER_COUNTS)}",
+            )
+        elif len(self.params) != wanted:
             problem = f"camera model {self.model} has {len(self.params)} parameters, not {wanted}"
         elif not (1 <= self.width <= _MAX_SIDE and 1 <= self.height <= _MAX_SIDE):
             problem = f"camera size {self.width} x {self.height} is not in 1..{_MAX_SIDE}"
@@ -73,8 +73,6 @@ class Lens:
     @property
     def is_pinhole(self) -> bool:
         """True where the photos need no resampling."""
-        if self.model in _PINHOLES:
-            return True
         first = 3 if self.model in _ONE_FOCAL else 4
         return self.model in _NEUTRAL_AT_ZERO and not any(self.params[first:])
 
@@ -101,13 +99,19 @@ class Undistortion:
     """
 
     def __init__(self, lens: Lens):
+        import pycolmap
+
         described = f"distortion {lens.model} {lens.params}"
         try:
-            distort, (width, height, fx, fy, cx, cy) = _projection(lens)
+            bent = pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))
+            target = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), bent)
+            fx, fy, cx, cy = target.calibration_matrix()[[0, 1, 0, 1], [0, 1, 2, 2]]
+            width, height = int(target.width), int(target.height)
             if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE and np.isfinite([fx, fy, cx, cy]).all()):
                 raise ValueError(f"size {width} x {height}, focal length {fx}")
             columns, rows = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy
-            places = distort(np.stack(np.meshgrid(columns, rows), axis=2).reshape(-1, 2)).reshape(height, width, 2)
+            rays = np.stack([*np.meshgrid(columns, rows), np.ones((height, width))], axis=2)
+            places = np.asarray(bent.img_from_cam(rays.reshape(-1, 3))).reshape(height, width, 2)
         except (ValueError, RuntimeError, OverflowError, MemoryError) as error:
             raise InputError(lens.source, f"{described} cannot be undone ({error})",
                              "undistort the images with COLMAP's image_undistorter first") from None  # fmt: skip
@@ -117,7 +121,7 @@ class Undistortion:
             raise InputError(lens.source, f"{described} leaves no pixel of the image", "correct its parameters")
         # From COLMAP's pixel centers at 0.5 to array indices; coordinates as (row, column).
         self._places = np.where(inside, places.transpose(2, 0, 1)[::-1] - 0.5, 0).astype(np.float32)
-        self.outside = None if inside.all() else ~inside
+        self.inside: np.ndarray | None = None if inside.all() else inside
 
     def camera(self, world_to_camera: np.ndarray) -> Camera:
         return Camera(*self.intrinsics, world_to_camera)
@@ -130,22 +134,9 @@ class Undistortion:
         for channel in np.ndindex(image.shape[2:]):
             plane = image[(..., *channel)]
             done[(..., *channel)] = map_coordinates(plane, self._places, order=1, mode="nearest", output=np.float32)
-        if self.outside is not None:
-            done[self.outside] = 0.0
+        if self.inside is not None:
+            done[~self.inside] = 0.0
         return done
-
-
-def _projection(lens: Lens) -> tuple[Callable[[np.ndarray], np.ndarray], tuple]:
-    """What takes normalized coordinates [N, 2] to the lens's pixels, and the pinhole camera's size and intrinsics."""
-    import pycolmap
-
-    camera = pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))
-    target = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
-
-    def distort(points: np.ndarray) -> np.ndarray:
-        return np.asarray(camera.img_from_cam(np.concatenate([points, np.ones((len(points), 1))], axis=1)))
-
-    return distort, (int(target.width), int(target.height), *target.calibration_matrix()[[0, 1, 0, 1], [0, 1, 2, 2]])
 
 
 def limited_size(width: int, height: int, max_size: int | None) -> tuple[int, int]:

@@ -1,18 +1,19 @@
 """One call for every layout: read what was photographed, choose the response, develop the scene."""
 
 import logging
+import os
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, did_you_mean
 from .capture import Capture, Shot
 from .colmap_model import find_model
 from .develop import as_photographed, check_content, develop, fitted_lens
-from .embedded import embedded_folder, is_embedded
 from .exposure import choose_exposure, made_by_camera, with_exposure_times
 from .read_folders import (
     image_folder,
@@ -23,7 +24,7 @@ from .read_folders import (
     read_llff,
     read_photos,
 )
-from .read_transforms import has_transforms, is_hdr_nerf, read_hdr_nerf, read_transforms
+from .read_transforms import read_hdr_nerf, read_transforms
 from .sfm import triangulate
 from .types import Scene
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from ..response import Response
 
 _log = logging.getLogger("sehdr_warp.scene")
+_MARK = "transforms_train.json"  # What a folder of an embedded scene has.
 _HOLDOUT = 8  # Every eighth view is held out: the habit of LLFF, Mip-NeRF 360 and 3DGS.
 _FEWEST_FOR_TEST = 5  # Below this many views none can be spared for testing.
 _MOST_JUDGED = 24  # Photos that a response is chosen from: they give about as many edges as are looked at.
@@ -165,16 +167,20 @@ def _folder(path: Path | str) -> Path:
 
 def _read(folder: Path, cache: Path | str | None) -> Capture:
     """The first layout that fits, the most telling one first."""
+
+    def has(*names: str) -> bool:
+        return all((folder / name).is_file() for name in names)
+
     model = find_model(folder)
     beside = model is not None and model.is_relative_to(folder / "sparse") and image_folder(folder) is not None
     readers = (
-        (is_hdr_nerf(folder), read_hdr_nerf),
-        ((folder / "poses_bounds_exps.npy").is_file(), read_hdr_nerf_real),
+        (has("transforms_train.json", "exposure_train.json"), read_hdr_nerf),
+        (has("poses_bounds_exps.npy"), read_hdr_nerf_real),
         (is_hdr_gs(folder), read_hdr_gs),
         (beside, read_colmap),
-        (has_transforms(folder), read_transforms),
+        (has("transforms.json") or has("transforms_train.json"), read_transforms),
         (model is not None, read_colmap),
-        ((folder / "poses_bounds.npy").is_file(), read_llff),
+        (has("poses_bounds.npy"), read_llff),
     )
     reader = next((reader for fits, reader in readers if fits), None)
     return reader(folder) if reader else read_photos(folder, cache)
@@ -202,3 +208,32 @@ def _held_out(count: int, step: int | None, published: tuple[int, int] | None) -
         return set(range(min(offset, every - 1), count, every))
     step = step or _HOLDOUT
     return set(range(step // 2, count - 1, step)) or {count // 2}
+
+
+def is_embedded(path: Path | str) -> bool:
+    """Whether this names an embedded scene, known or not, rather than a folder."""
+    return str(path) == "embedded" or str(path).startswith("embedded:")
+
+
+def embedded_scenes() -> tuple[str, ...]:
+    """The names that load_scene("embedded:NAME") finds here: room always, the others in a checkout or $SEHDR_SCENES."""
+    return tuple(sorted({path.parent.name for place in _places() for path in place.glob(f"*/{_MARK}")}))
+
+
+def embedded_folder(path: str) -> Path:
+    """The folder of `embedded` or `embedded:NAME`; InputError where it is not here."""
+    name = str(path).partition(":")[2] or "room"
+    if name in embedded_scenes():
+        return next(place / name for place in _places() if (place / name / _MARK).is_file())
+    known = embedded_scenes()
+    present = ", ".join(f"embedded:{each}" for each in known)
+    raise InputError(path, f"is not here{did_you_mean(name, known)}; present are {present}",
+                     "get the repository's scenes/ and name it in SEHDR_SCENES, or render it with "
+                     "sehdr-warp synth")  # fmt: skip
+
+
+def _places() -> list[Path]:
+    """Where scenes lie: in the package, in $SEHDR_SCENES, and in scenes/ beside a checkout's package."""
+    package = Path(str(resources.files("sehdr_warp")))
+    stated = os.environ.get("SEHDR_SCENES")
+    return [package / "embedded", *([Path(stated)] if stated else []), package.parent / "scenes"]

@@ -2,9 +2,8 @@
 
 import math
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,14 +20,6 @@ from .names import natural_key, photo_beside, sibling
 
 _REMEDY = "correct the file or export it again"
 _INCOMPLETE = "copy the whole set"
-
-
-def has_transforms(folder: Path) -> bool:
-    return (folder / "transforms.json").is_file() or (folder / "transforms_train.json").is_file()
-
-
-def is_hdr_nerf(folder: Path) -> bool:
-    return (folder / "transforms_train.json").is_file() and (folder / "exposure_train.json").is_file()
 
 
 def read_transforms(folder: Path) -> Capture:
@@ -83,7 +74,7 @@ def read_hdr_nerf(folder: Path) -> Capture:
                 raise InputError(truth, "HDR truth not found", _INCOMPLETE)
             present = []
             for key, (file, time) in sorted(exposures.items()):
-                image = hdr if stated else contained(folder, file, times_path)
+                image = hdr if stated and hdr else contained(folder, file, times_path)
                 if image.is_file():
                     lens, view = frame_lens(values, frame, image, path), Path(_plain(name)).name
                     present.append(Shot(view, image, lens, pose, key, time, split, hdr=hdr, derived=bool(stated)))
@@ -155,7 +146,7 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
     """The lens of a frame, whose values win over the file's; the size is the image's where neither states it."""
     stated = values | frame
 
-    def number(key: str, absent=None):
+    def number(key: str, absent: Any = None) -> Any:
         value = stated.get(key)
         if value is None:
             return absent
@@ -163,7 +154,7 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
             raise InputError(path, f"{key} = {value!r:.40} is not a finite number", _REMEDY)
         return float(value)
 
-    def focal(key: str, angle_key: str, length: float) -> float | None:
+    def focal(key: str, angle_key: str, length: float) -> Any:
         angle = number(angle_key, 0.0)
         return number(key, 0.5 * length / math.tan(0.5 * angle) if 0 < angle < math.pi else None)
 
@@ -236,10 +227,18 @@ def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
     """
     path = Path(path)
     values = read_json(path)
-    if isinstance(values.get("cameras"), list):
-        cameras = [_own(entry, i, path) for i, entry in enumerate(values["cameras"])]
-    elif isinstance(values.get("camera_path"), list):
-        cameras = [_nerfstudio(entry, i, values, path) for i, entry in enumerate(values["camera_path"])]
+    listed = next((values[key] for key in ("cameras", "camera_path") if isinstance(values.get(key), list)), None)
+    if listed is not None:
+        own, cameras = isinstance(values.get("cameras"), list), []
+        for i, entry in enumerate(listed):
+            try:
+                name = str(entry.get("name", f"{i:04d}")) if own else f"{i:04d}"
+                camera = Camera.from_dict(entry.get("camera", entry)) if own else _nerfstudio(entry, i, values, path)
+                cameras.append((name, camera))
+            except KeyError as error:
+                raise InputError(path, f"camera {i} has no {error.args[0]}", "add the field") from None
+            except (ValueError, TypeError, AttributeError, OverflowError, ZeroDivisionError) as error:
+                raise InputError(path, f"camera {i} cannot be used ({error!s:.120})", "correct the camera") from None
     elif "frames" in values:
         cameras = [
             (Path(name).stem, frame_lens(values, frame, None, path).pinhole(frame_pose(frame, path, name)))
@@ -262,29 +261,13 @@ def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
     return cameras
 
 
-@contextmanager
-def _usable(index: int, path: Path) -> Iterator[None]:
-    try:
-        yield
-    except KeyError as error:
-        raise InputError(path, f"camera {index} has no {error.args[0]}", "add the field") from None
-    except (ValueError, TypeError, AttributeError, OverflowError, ZeroDivisionError) as error:
-        raise InputError(path, f"camera {index} cannot be used ({str(error)[:120]})", "correct the camera") from None
-
-
-def _own(entry, index: int, path: Path) -> tuple[str, Camera]:
-    with _usable(index, path):
-        return str(entry.get("name", f"{index:04d}")), Camera.from_dict(entry.get("camera", entry))
-
-
-def _nerfstudio(entry, index: int, values: dict, path: Path) -> tuple[str, Camera]:
+def _nerfstudio(entry, index: int, values: dict, path: Path) -> Camera:
     """An entry of camera_path.json: camera_to_world (OpenGL axes, 16 numbers by rows) and fov (vertical, degrees)."""
-    with _usable(index, path):
-        width, height, fov = int(values["render_width"]), int(values["render_height"]), float(entry["fov"])
-        matrix = np.array(entry["camera_to_world"], dtype=np.float64).reshape(4, 4)
-        if not 1e-6 <= fov < 180:
-            raise InputError(path, f"camera {index} has fov {fov}", "use degrees between 0 and 180")
-        matrix[:3, 1:3] *= -1
-        focal = 0.5 * height / math.tan(math.radians(fov) / 2)
-        pose = pose_from_camera_to_world(matrix, path, f"camera {index}")
-        return f"{index:04d}", Camera(width, height, focal, focal, width / 2, height / 2, pose)
+    width, height, fov = int(values["render_width"]), int(values["render_height"]), float(entry["fov"])
+    matrix = np.array(entry["camera_to_world"], dtype=np.float64).reshape(4, 4)
+    if not 1e-6 <= fov < 180:
+        raise InputError(path, f"camera {index} has fov {fov}", "use degrees between 0 and 180")
+    matrix[:3, 1:3] *= -1
+    focal = 0.5 * height / math.tan(math.radians(fov) / 2)
+    pose = pose_from_camera_to_world(matrix, path, f"camera {index}")
+    return Camera(width, height, focal, focal, width / 2, height / 2, pose)

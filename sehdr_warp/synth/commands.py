@@ -116,7 +116,7 @@ def _expose(asked: ExposeTruth) -> None:
         LOG.info("%s", note)
     noise = None
     if asked.noise is not None:
-        figures = numbers("--noise", asked.noise)
+        figures = numbers("--noise", asked.noise) or ()
         if len(figures) != 2:
             raise SehdrError(f"--noise {asked.noise}: give two numbers, full well and read noise in electrons")
         noise = SensorNoise(*figures)
@@ -130,7 +130,7 @@ def _expose(asked: ExposeTruth) -> None:
 
 
 def _pack(asked: PackTruth) -> None:
-    from .truth import pack_truth
+    from .expose import pack_truth
 
     packing = pack_truth(**vars(asked))
     print(

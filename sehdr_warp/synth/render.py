@@ -10,6 +10,7 @@ import time
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,11 +20,9 @@ from ..files import atomic_path, write_json
 from ..output.exr import exr_header
 from ..scene import Camera
 from ..scene.hdr_files import read_hdr
-from .cameras import VIEWS, make_cameras, split_of
-from .expose import RadianceView, truth_path, write_radiance
-from .scenes import Recipe
+from .expose import RadianceView, truth_path, write_radiance, write_truth_tables
+from .scenes import VIEWS, Recipe, make_cameras, split_of
 from .stage import Stage, two_sided
-from .truth import write_truth_tables
 
 LOG = logging.getLogger(__name__)
 # From the fastest: an NVIDIA GPU with OptiX in its driver, LLVM 16 or later, plain C++ on all cores. With each, the
@@ -210,7 +209,7 @@ def _render_view(mi, scene, recipe, camera, view: int, settings, denoiser, path:
         radiance = denoiser(radiance, sensor, (settings.seed * VIEWS + view) % 2**32)
         _check_light(radiance, f"{recipe.name}: view {view}, denoised, has", "take --denoise none, with more --samples")
     seconds = time.perf_counter() - started
-    found = {"seconds": seconds, "noise": noise}
+    found: dict[str, Any] = {"seconds": seconds, "noise": noise}
     if split_of(view) == "train":
         found |= _surface_points(mi, scene, sensor, radiance, view)
     with atomic_path(aside, overwrite=True) as temporary:
@@ -259,7 +258,7 @@ def _finish(mi, recipe: Recipe, folder: Path, settings: Settings, cameras: dict[
         making["denoiser"] = f"Open Image Denoise (pyoidn {version('pyoidn')})"
     empty = np.zeros((0, 3), np.float32)
     cloud = (np.concatenate([empty, *(f[key] for f in figures if key in f)]) for key in ("points", "radiance"))
-    write_truth_tables(folder, views, *cloud, making)
+    write_truth_tables(folder, views, *cloud, making=making)
 
 
 class Denoiser:

@@ -236,7 +236,7 @@ class Stage:
         for sign in (-1, 1):
             for along, aside in ((half_u, half_v), (half_v, half_u)):
                 ends = [center + sign * aside * 1.04 + s * along * 1.04 for s in (-1, 1)]
-                self.rod(*ends, 0.025, self.metal(frame, 0.3))
+                self.rod(*ends, radius=0.025, bsdf=self.metal(frame, 0.3))
 
     def lathe(self, profile, columns: int, rows: int, center, bsdf: Material) -> None:
         """A body of revolution; see the function of this name."""

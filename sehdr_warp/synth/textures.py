@@ -47,7 +47,7 @@ def brick(rng, rows=18, columns=7, dark=(0.30, 0.08, 0.05), light=(0.55, 0.24, 0
     rough = noise(rng, 512, 512, 16, 6)
     image = mix(dark, light, 0.75 * tone + 0.5 * (rough - 0.5) + 0.1)
     joint = (_off(y * rows) > 0.455) | (_off(x) > 0.478)
-    image[joint] = np.float32(mortar) * (0.75 + 0.5 * rough[joint])[:, None]
+    image[joint] = np.array(mortar, np.float32) * (0.75 + 0.5 * rough[joint])[:, None]
     return limited(image)
 
 
@@ -64,7 +64,7 @@ def wallpaper(rng, ground=(0.50, 0.46, 0.36), stripe=(0.17, 0.30, 0.30), dot=(0.
     stripes = np.sin(x * 2 * np.pi * 14) > 0.3
     away = np.hypot((x * 14) % 1 - 0.5, (y * 20 + 0.5 * (np.floor(x * 14) % 2)) % 1 - 0.5)
     image = mix(ground, stripe, stripes * 0.55 + 0.5 * (noise(rng, size, size, 8, 6) - 0.5))
-    image[away < 0.17] = image[away < 0.17] * 0.4 + np.float32(dot) * 0.6
+    image[away < 0.17] = image[away < 0.17] * 0.4 + np.array(dot, np.float32) * 0.6
     return limited(image)
 
 
@@ -72,7 +72,7 @@ def plaster(rng, size: int = 512):
     """Stained, cracked plaster: never an even wall."""
     stain, crack = noise(rng, size, size, 4, 8), noise(rng, size, size, 6, 6)
     shade = 1 - (0.45 * stain + 0.5 * (np.abs(crack - 0.5) < 0.012))
-    return limited(np.float32((0.62, 0.60, 0.56)) * (1.2 * shade)[..., None])
+    return limited(np.array((0.62, 0.60, 0.56), np.float32) * (1.2 * shade)[..., None])
 
 
 def fabric(rng, dark: Color, light: Color, size: int = 512):
@@ -131,7 +131,7 @@ def facade(rng, lit: float, color: Color, columns: int, rows: int, size: int = 2
     v, u = (y * rows) % 1, (x * columns) % 1
     pane = (u > 0.22) & (u < 0.78) & (v > 0.2) & (v < 0.82) & (np.abs(u - 0.5) > 0.03) & (np.abs(v - 0.45) > 0.02)
     curtain = 0.35 + 0.65 * noise(rng, size, size, 8, 4)
-    return np.float32(color) * (pane * each * curtain).astype(np.float32)[..., None]
+    return np.array(color, np.float32) * (pane * each * curtain).astype(np.float32)[..., None]
 
 
 def outside(rng, size: int = 512):
@@ -172,7 +172,7 @@ def even_sky(rng, color: Color, top: float, bottom: float):
 def mix(first: Color, second: Color, share) -> np.ndarray:
     """[..., 3] float32 between two colors by a share of any shape, clipped to [0, 1]."""
     share = np.asarray(np.clip(share, 0, 1), np.float32)[..., None]
-    return np.float32(first) * (1 - share) + np.float32(second) * share
+    return np.array(first, np.float32) * (1 - share) + np.array(second, np.float32) * share
 
 
 def limited(image: np.ndarray) -> np.ndarray:

@@ -6,8 +6,7 @@ import pytest
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.response import Response, response_by_name
 from sehdr_warp.response import selection as response_selection
-from sehdr_warp.response.family import FINE, GRID, family_logs
-from sehdr_warp.response.selection import edge_facts, select_response
+from sehdr_warp.response.selection import FINE, GRID, edge_facts, family_logs, select_response
 from sehdr_warp.response.table import TabulatedResponse
 
 CODES = np.arange(256) / 255

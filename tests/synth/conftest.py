@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from sehdr_warp.synth.cameras import Grid, make_cameras, split_of
-from sehdr_warp.synth.expose import RadianceView, truth_path, write_radiance
-from sehdr_warp.synth.truth import write_truth_tables
+from sehdr_warp.synth.expose import RadianceView, truth_path, write_radiance, write_truth_tables
+from sehdr_warp.synth.scenes import Grid, make_cameras, split_of
 
 VIEWS = 6
 

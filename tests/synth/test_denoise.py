@@ -9,10 +9,9 @@ import pytest
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene.hdr_files import read_hdr
 from sehdr_warp.synth import render
-from sehdr_warp.synth.cameras import make_cameras
 from sehdr_warp.synth.expose import truth_path
 from sehdr_warp.synth.render import Settings, _render_view, denoise, guide_items, load_mitsuba, render_scene
-from sehdr_warp.synth.scenes import RECIPES
+from sehdr_warp.synth.scenes import RECIPES, make_cameras
 from sehdr_warp.synth.stage import Stage
 
 

@@ -8,9 +8,8 @@ import pytest
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_scene
 from sehdr_warp.synth import render, stage, textures
-from sehdr_warp.synth.cameras import VIEWS, Arc, Grid, make_cameras
 from sehdr_warp.synth.render import Settings, load_mitsuba
-from sehdr_warp.synth.scenes import RECIPES
+from sehdr_warp.synth.scenes import RECIPES, VIEWS, Arc, Grid, make_cameras
 
 TEXTURES = ("wood", "brick", "checker", "wallpaper", "plaster", "painting", "globe", "ground", "books")
 

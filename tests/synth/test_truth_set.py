@@ -9,8 +9,8 @@ import pytest
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import embedded_scenes, load_scene
 from sehdr_warp.scene.capture import reinhard_gamma
+from sehdr_warp.synth.expose import pack_truth
 from sehdr_warp.synth.scenes import RECIPES
-from sehdr_warp.synth.truth import pack_truth
 
 from .conftest import write_truth
 
@@ -134,7 +134,7 @@ def test_embedded_scenes_have_truth_and_a_well_exposed_photo(name):
 
 def test_scenes_lie_in_the_package_beside_it_or_where_the_environment_says(tmp_path, monkeypatch):
     assert {*embedded_scenes()} == {"room", *RECIPES}
-    monkeypatch.setattr("sehdr_warp.scene.embedded.resources.files", lambda package: tmp_path / "site" / package)
+    monkeypatch.setattr("sehdr_warp.scene.load.resources.files", lambda package: tmp_path / "site" / package)
     assert embedded_scenes() == ()
     with pytest.raises(InputError, match="embedded:study: is not here; .* get the repository's scenes/ .* or render"):
         load_scene("embedded:study")
