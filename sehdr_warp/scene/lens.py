@@ -116,7 +116,7 @@ class Undistortion:
             raise InputError(lens.source, f"{described} cannot be undone ({error})",
                              "undistort the images with COLMAP's image_undistorter first") from None  # fmt: skip
         self.intrinsics = (width, height, float(fx), float(fy), float(cx), float(cy))
-        inside = (np.isfinite(places) & (places >= 0) & (places <= (lens.width, lens.height))).all(axis=2)
+        inside = np.asarray((np.isfinite(places) & (places >= 0) & (places <= (lens.width, lens.height))).all(axis=2))
         if not inside.any():
             raise InputError(lens.source, f"{described} leaves no pixel of the image", "correct its parameters")
         # From COLMAP's pixel centers at 0.5 to array indices; coordinates as (row, column).

@@ -166,7 +166,8 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
     fx, fy = focal("fl_x", "camera_angle_x", width), focal("fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
         raise InputError(path, "states no focal length", "add camera_angle_x (radians, below pi) or fl_x (pixels)")
-    pinhole = fy if fx is None else fx, fx if fy is None else fy, number("cx", width / 2), number("cy", height / 2)
+    pinhole: tuple[Any, ...] = (fy if fx is None else fx, fx if fy is None else fy, number("cx", width / 2),
+                                number("cy", height / 2))  # fmt: skip
     k1, k2, k3, k4, p1, p2 = (number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model, bent = stated.get("camera_model", "OPENCV"), (k1, k2, p1, p2)
     if model == "OPENCV_FISHEYE" or stated.get("is_fisheye") is True:

@@ -90,8 +90,13 @@ def triangulate(capture: Capture, cache: Path | str | None = None) -> Cloud:
             _extract(database, work / "images", [_name(i)], lens.model, lens.params)
         _match(database, len(shots))
         _log.info("triangulating points from the known poses")
-        model = _known_poses(database, shots)
-        options = pycolmap.IncrementalPipelineOptions()
+        model, options = pycolmap.Reconstruction(), pycolmap.IncrementalPipelineOptions()
+        with pycolmap.Database.open(database) as opened:
+            for camera in opened.read_all_cameras():
+                model.add_camera_with_trivial_rig(camera)
+            for image in opened.read_all_images():
+                pose = shots[_index(image.name)].world_to_camera
+                model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
         _seed(options)
         with _quiet():
             model = pycolmap.triangulate_points(model, database, work / "images", work / "model", options=options)
@@ -291,20 +296,6 @@ def _map(database: Path, work: Path, count: int, source: Path):
         raise InputError(source, f"none of the {count} photos could be placed by structure from motion",
                          "take sharp photos that overlap by two thirds, or bring poses")  # fmt: skip
     return best
-
-
-def _known_poses(database: Path, shots: Sequence[Shot]):
-    """A reconstruction that holds the database's cameras and images at the shots' poses, and no points."""
-    import pycolmap
-
-    model = pycolmap.Reconstruction()
-    with pycolmap.Database.open(database) as opened:
-        for camera in opened.read_all_cameras():
-            model.add_camera_with_trivial_rig(camera)
-        for image in opened.read_all_images():
-            pose = shots[_index(image.name)].world_to_camera
-            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
-    return model
 
 
 def _sampled_colors(model, shots: Sequence[Shot], lenses: Sequence[Lens]) -> Cloud:

@@ -106,7 +106,7 @@ def _render(asked: RenderTruth) -> None:
 
 def _expose(asked: ExposeTruth) -> None:
     from ..field.exposure import read_exposures
-    from ..files import check_absent_folder
+    from ..files import check_absent
     from ..response import response_by_name
     from ..scene import load_scene
     from .expose import SensorNoise, exposure_ladder, write_photo_set
@@ -121,7 +121,7 @@ def _expose(asked: ExposeTruth) -> None:
             raise SehdrError(f"--noise {asked.noise}: give two numbers, full well and read noise in electrons")
         noise = SensorNoise(*figures)
     times = asked.exposures and [exposure.time for exposure in read_exposures(asked.exposures, None, "--exposures")]
-    check_absent_folder(asked.out, asked.overwrite)
+    check_absent(asked.out, asked.overwrite, folder=True)
     scene = load_scene(asked.truth, response="srgb")
     times = times or exposure_ladder(scene, response)
     write_photo_set(scene, asked.out, response, times, noise=noise, seed=asked.seed, overwrite=asked.overwrite)
