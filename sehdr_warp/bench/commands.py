@@ -189,8 +189,7 @@ class Bench:
 
 
 def run_bench(command: Bench) -> None:
-    """Measures, prints the table and writes the result; raises SehdrError if a check failed, after everything is
-    written."""
+    """Raises SehdrError if a check failed, after everything is written."""
     from ..files import check_absent
 
     asked = command.benchmark

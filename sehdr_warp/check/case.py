@@ -98,15 +98,12 @@ def compare(
 ) -> list[Reading]:
     """Readings of function in float32 on the device against truth in float64.
 
-    Args:
-        function: function(*tensors) -> dict of results by name.
-        tensors: float64 values by name. gradients: names by which the derivative is compared too.
-        truth: truth(disturb, *tensors) -> the same, which passes what crosses a stage's border through disturb; by
-            default the function itself, disturbed in its arguments alone.
-        elementwise: the largest relative error of any number, rather than the relative error of the whole in norm.
-        floor: numbers below it are compared absolutely, in units of it.
-        extra: added to every bound, for what the kernel's arithmetic costs beside disturbed interfaces; the case says
-            why. label: what becomes of a quantity's name.
+    function(*tensors) -> dict of results by name. tensors: float64 values by name. gradients: names by which the
+    derivative is compared too. truth(disturb, *tensors) -> the same, which passes what crosses a stage's border through
+    disturb; by default the function itself, disturbed in its arguments alone. elementwise: the largest relative error
+    of any number, rather than the relative error of the whole in norm. floor: numbers below it are compared absolutely,
+    in units of it. extra: added to every bound, for what the kernel's arithmetic costs beside disturbed interfaces; the
+    case says why. label: what becomes of a quantity's name.
     """
 
     def error(value: Tensor, exact: Tensor) -> float:

@@ -64,18 +64,10 @@ def _number(value: float) -> str:
     return f"{value:9.0f}" if math.isfinite(value) and value == int(value) and value < 1e6 else f"{value:9.1e}"
 
 
-def _needle(ratio: float, device) -> list[Reading]:
-    return compare_splat(Splats(24).scaled(1.0, 1 / ratio, 1.3 / ratio), device)
-
-
 def _radiance_range(decades: float, device) -> list[Reading]:
     splats = Splats(40, spread=1.0).lit(-0.5 * decades, 0.5 * decades)
     splats.opacities *= 0.5
     return compare_splat(splats, device)
-
-
-def _overlap(number: float, device) -> list[Reading]:
-    return overlap(int(number), 5.0 / number, 1e-7)(device)  # together they cover a pixel to 1 - e^-5
 
 
 def _exposure(stops: float, device) -> list[Reading]:
@@ -85,11 +77,13 @@ def _exposure(stops: float, device) -> list[Reading]:
 
 
 SWEEPS = (
-    ("length of a needle / its thickness", tuple(10.0**k for k in range(8)), _needle,
+    ("length of a needle / its thickness", tuple(10.0**k for k in range(8)),
+     lambda ratio, device: compare_splat(Splats(24).scaled(1.0, 1 / ratio, 1.3 / ratio), device),
      ("image", "d/d log_scales", "d/d quaternions")),
     ("decades of radiance within the image", tuple(range(0, 29, 4)), _radiance_range,
      ("image", "d/d opacities", "d/d features")),
-    ("Gaussians behind each other", (10, 30, 100, 300, 1000, 3000, 10_000, 30_000), _overlap,
+    ("Gaussians behind each other", (10, 30, 100, 300, 1000, 3000, 10_000, 30_000),
+     lambda number, device: overlap(number, 5.0 / number, 1e-7)(device),  # together they cover a pixel to 1 - e^-5
      ("image", "d/d opacities", "d/d features")),
     ("stops of exposure", tuple(range(-24, 25, 4)), _exposure,
      ("srgb f", "gamma-2.2 f", "hdr-nerf f", "aces f")),

@@ -1,4 +1,4 @@
-"""The command line of `sehdr-warp check`: what may be asked for, and the call. torch is imported when it runs."""
+"""The command line of `sehdr-warp check`. torch is imported when it runs."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,8 +25,7 @@ class Check:
 
 
 def run_check(command: Check) -> None:
-    """Measures, prints the table and writes what was asked for; raises SehdrError if a bound failed, after everything
-    was written."""
+    """Raises SehdrError if a bound failed, after everything was written."""
     from ..bench.results import new_result
     from ..files import check_absent, write_json
     from ..training.train import pick_device

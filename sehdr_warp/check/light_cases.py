@@ -46,11 +46,10 @@ def _exposures(device):
 def _odd_responses(device):
     """Curves that a file may hold: flat, steep, not monotone by noise, and clipped at both ends."""
     x = np.linspace(0, 1, 300)
-    noise = np.random.default_rng(0).normal(0, 0.02, 300)
     curves = {
         "flat": np.where(x < 0.3, x, np.where(x < 0.7, 0.3, x - 0.4 + 0.3)) / 0.9,
         "steep": 0.5 + 0.5 * np.tanh((x - 0.5) * 1000),
-        "noisy": x**0.5 + noise,
+        "noisy": x**0.5 + np.random.default_rng(0).normal(0, 0.02, 300),
         "clipped": (x - 0.2) * 2,
     }
     at = torch.linspace(0.0013, 1.3, 211, dtype=torch.float64)

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import product
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,20 +23,14 @@ class Splats:
     """Arguments of rasterize() in float64, to be changed by a case; tensors by the names of rasterize()."""
 
     def __init__(self, count: int = 40, width: int = 40, height: int = 30, spread: float = 2.0):
-        generator = torch.Generator().manual_seed(0)
-
-        def uniform(*shape):
-            return torch.rand(*shape, generator=generator, dtype=torch.float64)
-
-        def normal(*shape):
-            return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
+        given: dict[str, Any] = {"generator": torch.Generator().manual_seed(0), "dtype": torch.float64}
         self.width, self.height = width, height
-        self.means = (uniform(count, 3) - 0.5) * torch.tensor([spread, spread, 2.0]) + torch.tensor([0.0, 0.0, 3.0])
-        self.log_scales = torch.log(0.05 + 0.25 * uniform(count, 3))
-        self.quaternions = normal(count, 4)
-        self.opacities = 0.05 + 0.9 * uniform(count)
-        self.features = torch.exp(normal(count, 3))
+        self.means = (torch.rand(count, 3, **given) - 0.5) * torch.tensor([spread, spread, 2.0])
+        self.means[:, 2] += 3
+        self.log_scales = torch.log(0.05 + 0.25 * torch.rand(count, 3, **given))
+        self.quaternions = torch.randn(count, 4, **given)
+        self.opacities = 0.05 + 0.9 * torch.rand(count, **given)
+        self.features = torch.exp(torch.randn(count, 3, **given))
         self.world_to_camera = torch.eye(4, dtype=torch.float64)
         focal = 0.9 * max(width, height)
         self.intrinsics = torch.tensor([focal, focal, width / 2 + 0.3, height / 2 - 0.2], dtype=torch.float64)
@@ -288,8 +283,8 @@ def _poisoned_others(device):
         spoiled[4, 4, 0] = value
         similarity = ssim_map(spoiled, image)
         pixels += not_finite(similarity[10:], similarity[:, 10:], similarity[..., 1:])  # the window reaches five pixels
-    wrong = {"other rows of harmonics not finite": rows, "similarity not finite beyond the window": pixels}
-    return [count(quantity, number) for quantity, number in wrong.items()]
+    what = "other rows of harmonics not finite", "similarity not finite beyond the window"
+    return [count(what[0], rows), count(what[1], pixels)]
 
 
 SPLAT_CASES = (

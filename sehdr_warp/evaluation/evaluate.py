@@ -2,7 +2,6 @@
 
 import logging
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -84,21 +83,21 @@ def evaluate(
 class Evaluation:
     """One comparison of pictures, which predict like RunPictures, with a scene's views.
 
-    views: by default the test views, else the training views. scale_views: those that tell the scale of "aligned", by
-    default the training views.
+    views: a sequence of views, by default the test views, else the training views. scale_views: those that tell the
+    scale of "aligned", by default the training views. The rest is as of evaluate().
     """
 
     def __init__(
         self,
         pictures,
-        scene: Scene,
+        scene,
         device,
-        lpips_weights: Path | str | None,
-        flip: bool,
-        peak_luminance: float = PEAK_LUMINANCE,
+        lpips_weights,
+        flip,
+        peak_luminance=PEAK_LUMINANCE,
         *,
-        views: Sequence[View] | None = None,
-        scale_views: Sequence[View] | None = None,
+        views=None,
+        scale_views=None,
     ):
         self.pictures, self.scene, self.device = pictures, scene, torch.device(device)
         self.split = "test" if scene.test_views else "train"
@@ -109,7 +108,7 @@ class Evaluation:
         voting = scene.train_views if scale_views is None else scale_views
         self.scale_views = [view for view in voting if view.hdr is not None]
         self.lpips, self.lpips_reason = load_lpips(lpips_weights, self.device)
-        self.peak_luminance, self.with_flip = peak_luminance, flip
+        self.peak_luminance, self._flipped = peak_luminance, ["hdr_flip"] if flip else []
         self.flip, self.flip_reason = load_flip() if flip else (None, None)
         self.regions = {region: _RegionErrors() for region in metrics.REGIONS}
         self.ranking = ErrorRanking()
@@ -149,10 +148,6 @@ class Evaluation:
             "lpips_backbone": BACKBONE if self.lpips else None,
         }
         return _plain(result | self.pictures.facts)
-
-    @property
-    def _flipped(self) -> list[str]:
-        return ["hdr_flip"] if self.with_flip else []
 
     def _scale(self) -> tuple[float | None, str | None]:
         """The one factor of the scene for `aligned`, or why there is none."""

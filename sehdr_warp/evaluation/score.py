@@ -26,10 +26,9 @@ class FolderPictures:
         return torch.from_numpy(read_hdr(self.files[view.name]).copy())
 
     def ldr(self, view):
-        """A folder of radiance has no simulated photos."""
+        """A folder of radiance has no simulated photos, nor does it say how sure it is."""
 
-    def doubt(self, view):
-        """Nor does it say how sure it is."""
+    doubt = ldr
 
 
 @torch.no_grad()

@@ -32,11 +32,12 @@ def training_chart(rows: Mapping[str, Sequence[Sequence[Mapping]]]):
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     keys = [key for key in PANELS if any(training_points(c, key) for curves in rows.values() for c in curves)]
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(4.6 * max(len(keys), 1) + 1.6 * (len(rows) > 1), 3.8), layout="constrained")
-        figure.get_layout_engine().set(w_pad=0.12, h_pad=0.12)
+        layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.12)
+        figure = Figure(figsize=(4.6 * max(len(keys), 1) + 1.6 * (len(rows) > 1), 3.8), layout=layout)
         handles = {}
         for place, key in enumerate(keys, 1):
             axes = figure.add_subplot(1, len(keys), place)

@@ -103,7 +103,7 @@ def stored_pixel_type(arrays: Sequence[np.ndarray], pixel: str = "half") -> str:
     """The type that holds all values unclipped: `pixel`, or "float" where half would overflow."""
     if pixel not in _TYPES:
         raise ValueError(f"pixel type {pixel!r} is not one of {', '.join(_TYPES)}")
-    fits = all(_largest(array) <= float(np.finfo(np.float16).max) for array in arrays)
+    fits = all(np.abs(array).max() <= np.finfo(np.float16).max for array in arrays)
     return "half" if pixel == "half" and fits else "float"
 
 
@@ -143,10 +143,8 @@ def _check(path: Path, part: Part) -> None:
     for name, array in part.channels.items():
         where = f"part {part.name}, channel {name}" if part.name else f"channel {name}"
         check_finite(path, np.asarray(array), f"{where}: {{count}} values")
-        if _largest(array) > float(np.finfo(np.float32).max):
-            raise InputError(
-                path, f"{where} reaches {_largest(array):.3g}, past 32-bit floats", "scale the radiance down"
-            )
+        if (largest := np.abs(array).max()) > np.finfo(np.float32).max:
+            raise InputError(path, f"{where} reaches {largest:.3g}, past 32-bit floats", "scale the radiance down")
 
 
 def check_finite(path: Path, image: np.ndarray, what: str) -> None:
@@ -161,10 +159,6 @@ def check_finite(path: Path, image: np.ndarray, what: str) -> None:
             f" at x={place[1]}, y={place[0]}",
             "such pictures are not written; train again from an earlier checkpoint or with another seed",
         )
-
-
-def _largest(array: np.ndarray) -> float:
-    return float(np.max(np.abs(array)))
 
 
 def _is_depth(name: str) -> bool:
