@@ -118,13 +118,13 @@ def run_train(asked: Train) -> None:
     from .prediction import check_predictor
     from .run_folder import RunFolder
 
-    output, plan_only, resumed = asked.output, asked.training.plan_only, False
+    output, plan_only, resumed = asked.output, asked.training.plan_only, None
     how = {"resume": output.resume, "overwrite": output.overwrite}
     if output.out is None and not plan_only:
         raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
     # What can be refused is refused before the photos are read, which may take minutes.
-    if not plan_only:
-        resumed = RunFolder(output.out).check(**how)
+    if not plan_only and (folder := RunFolder(output.out)).check(**how):
+        resumed = folder
     data = _data(asked, resumed)
     config, device = _config(asked, resumed), pick_device(asked.machine.device)
     if config.loss.predictor:
@@ -149,7 +149,6 @@ def run_train(asked: Train) -> None:
 
 def run_presets(asked: Presets) -> None:
     """Prints every preset with its purpose and cost."""
-
     names, purpose = configs.preset_names(), configs.preset_purpose
     rows = {name: {"purpose": purpose(name), "cost": _cost(configs.load_config(name))} for name in names}
     if asked.json:
@@ -196,17 +195,16 @@ def ensured_scene(run, data: str | None):
     return scene
 
 
-def _data(asked: Train, resumed: bool) -> dict:
-    """What load_scene takes: as it is given, or else, resuming, as the run has it."""
+def _data(asked: Train, resumed) -> dict:
+    """What load_scene takes: as it is given, or else as the RunFolder that is resumed has it."""
     from ..scene import is_embedded
-    from .run_folder import RunFolder
 
     path = asked.data
     if path is not None and not is_embedded(path):
         path = str(Path(path).absolute())
     given = {"path": path} | {name: getattr(asked.scene, name) for name in _READ_BY}
-    if resumed:
-        known = RunFolder(asked.output.out).read_info()["data"]
+    if resumed is not None:
+        known = resumed.read_info()["data"]
         given = {name: known.get(name) if value is None else value for name, value in given.items()}
     if given["path"] is None and asked.output.resume:
         raise InputError(asked.output.out, "holds nothing to resume", "give SCENE to begin, or the folder of a run")
@@ -215,10 +213,8 @@ def _data(asked: Train, resumed: bool) -> dict:
     return given
 
 
-def _config(asked: Train, resumed: bool):
-    """The preset's config, or the resumed run's, with what the command line names in it."""
-    from .run_folder import RunFolder
-
+def _config(asked: Train, resumed):
+    """The preset's config, or that of the RunFolder that is resumed, with what the command line names in it."""
     options, predictor = asked.training, asked.training.predict_hdr
     if predictor is not None and Path(predictor).exists():  # The config outlives this folder.
         predictor = str(Path(predictor).absolute())
@@ -232,8 +228,8 @@ def _config(asked: Train, resumed: bool):
     named = {path: value for path, (_, value) in shortcuts.items() if value is not None}
     named |= {path: configs.value_of(path, text) for path, text in fields.items()}
     flags = {path: configs.flag_of(path) if path in fields else shortcuts[path][0] for path in named}
-    if resumed and options.preset is None:
-        return configs.override_config(RunFolder(asked.output.out).read_config(), named, flags=flags)
+    if resumed is not None and options.preset is None:
+        return configs.override_config(resumed.read_config(), named, flags=flags)
     preset = options.preset or ("default" if options.predict_hdr is None else "predicted")
     config = configs.load_config(preset, named, flags)
     kept = {*config.plan.keep, *(path for path in named if not path.startswith("plan."))}
