@@ -166,17 +166,9 @@ class Responses(Output):
         return bench_response(self.data, _words(self.curves), exposures=exposures, max_size=self.max_size)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Report:
-    """Write the tables and plots of docs/reports from the results in it."""
-
-    folder: tyro.conf.Positional[Path] = Path("docs/reports")
-    """Folder with results/*.json and tried.csv."""
-
-
 @dataclass(frozen=True)
 class Bench:
-    """Measure speed, memory and quality, and write the reports."""
+    """Measure speed, memory and quality."""
 
     benchmark: (
         Annotated[Kernels, tyro.conf.subcommand("kernels")]
@@ -184,22 +176,15 @@ class Bench:
         | Annotated[Scale, tyro.conf.subcommand("scale")]
         | Annotated[Quality, tyro.conf.subcommand("quality")]
         | Annotated[Responses, tyro.conf.subcommand("response")]
-        | Annotated[Report, tyro.conf.subcommand("report")]
     )
 
 
 def run_bench(command: Bench) -> None:
     """Raises SehdrError if a check failed, after everything is written."""
     from ..files import check_absent
-
-    asked = command.benchmark
-    if isinstance(asked, Report):
-        from .report import write_reports
-
-        print(*write_reports(asked.folder), sep="\n")
-        return
     from .results import finish
 
+    asked = command.benchmark
     if asked.json is not None:
         check_absent(asked.json, asked.overwrite)
     finish(asked.measure(), asked.json, asked.overwrite)

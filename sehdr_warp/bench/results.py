@@ -21,10 +21,8 @@ from ..errors import SehdrError
 from ..files import write_json
 
 SCHEMA = 2
-PAGES: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_name("pages.toml").read_text(encoding="utf-8"))
-"""What a report says of each benchmark: title, text, caption; and the columns of its tables, as markdown_table's."""
-for _page in PAGES.values():
-    _page |= {key: dict(_page[key]) for key in ("columns", "means") if key in _page}
+COLUMNS: dict[str, dict[str, str]] = tomllib.loads(Path(__file__).with_name("columns.toml").read_text(encoding="utf-8"))
+"""The columns of each benchmark's table, as markdown_table's."""
 
 
 def new_result(benchmark: str, device: torch.device, settings: dict) -> dict[str, Any]:
@@ -101,7 +99,7 @@ def finish(result: dict, json: Path | None = None, overwrite: bool = False) -> N
     """Writes and prints a result. Raises SehdrError for checks that failed, after everything is out."""
     if json is not None:
         write_json(json, result, overwrite)
-    table = markdown_table(result["rows"], PAGES[result["benchmark"]]["columns"])
+    table = markdown_table(result["rows"], COLUMNS[result["benchmark"]])
     print(machine_line(result), table, *result["notes"], sep="\n\n")
     failed = [check for check in result["checks"] if not check["passed"]]
     if not failed:

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from sehdr_warp.bench import gsplat_peer, kernels, scale, step
-from sehdr_warp.bench.results import finish
+from sehdr_warp.bench.results import finish, markdown_table
 from sehdr_warp.bench.splats import Size, make_splat_scene, parse_size
 from sehdr_warp.bench.timing import Variant, peak_memory, time_variants
 from sehdr_warp.errors import SehdrError
@@ -212,3 +212,10 @@ def test_a_quadratic_stage_is_found_and_a_linear_one_is_not():
         "Steeper than linear at the large end: 2.00 (time of the quadratic over gaussians)."
     )
     assert "two points" in scale.verdict(scale.fit_slopes(rows("one", (1,))))
+
+
+def test_tables_leave_out_what_nothing_has_and_mark_what_one_lacks():
+    rows = [{"a": 1.234, "b": "x", "c": None}, {"a": None, "b": "yy"}]
+    assert markdown_table(rows, {"A=a": ".1f", "b": "", "c": "d"}) == "\n".join(
+        ["|   A | b  |", "| --: | -- |", "| 1.2 | x  |", "|   - | yy |"]
+    )

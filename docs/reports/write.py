@@ -1,15 +1,25 @@
-"""`bench report`: the pages and plots of docs/reports, made of the results stored there. Nothing is typed by hand."""
+"""Makes the pages and plots of this folder from the results stored in it. Nothing in them is typed by hand.
+
+python docs/reports/write.py
+"""
 
 import csv
+import tomllib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from statistics import fmean, median
+from typing import Any
 
-from ..errors import InputError
-from ..files import atomic_path, read_json
-from . import report_plots as plots
-from .quality import LEARNED, UPPER_BOUND
-from .results import PAGES, groups, machine_line, markdown_table, parted
+import plots
+
+from sehdr_warp.bench.quality import LEARNED, UPPER_BOUND
+from sehdr_warp.bench.results import COLUMNS, groups, machine_line, markdown_table, parted
+from sehdr_warp.errors import InputError
+from sehdr_warp.files import atomic_path, read_json
+
+HERE = Path(__file__).resolve().parent
+PAGES: dict[str, dict[str, Any]] = tomllib.loads((HERE / "pages.toml").read_text(encoding="utf-8"))
+"""Title, text and caption of each page."""
 
 
 def write_reports(folder: Path) -> list[Path]:
@@ -19,7 +29,7 @@ def write_reports(folder: Path) -> list[Path]:
     """
     found = {name: path for name in PAGES if (path := folder / "results" / f"{name}.json").is_file()}
     if not found:
-        raise InputError(folder, "holds no results", "name the folder with results/*.json, such as docs/reports")
+        raise InputError(folder, "holds no results", "store them as results/*.json")
     written, index = [], []
     for name, path in found.items():
         page, result = PAGES[name], _read(path)
@@ -36,7 +46,7 @@ def write_reports(folder: Path) -> list[Path]:
     if (folder / "tried.csv").is_file():
         written.append(_write(folder / "tried.md", _tried_page(folder / "tried.csv")))
         index.append({"report": "[Tried and lost](tried.md)"})
-    text = "What was measured. `sehdr-warp bench report` makes these pages of `results/*.json` and `tried.csv`."
+    text = "What was measured. `python docs/reports/write.py` makes these pages of `results/*.json` and `tried.csv`."
     table = markdown_table(index, {"report": "", "machine": ""})
     return [*written, _write(folder / "README.md", ["# Reports", text, table])]
 
@@ -71,12 +81,12 @@ def _kernel_tables(result: dict) -> Iterable[str]:
 
 
 def _step_tables(result: dict) -> Iterable[str]:
-    yield markdown_table(result["rows"], PAGES["step"]["columns"])
+    yield markdown_table(result["rows"], COLUMNS["step"])
     yield _checks_line(result)
 
 
 def _scale_tables(result: dict) -> Iterable[str]:
-    columns = {key: form for key, form in PAGES["scale"]["columns"].items() if key != "sweep"}
+    columns = {key: form for key, form in COLUMNS["scale"].items() if key != "sweep"}
     for (sweep,), rows in groups(result["rows"], "sweep").items():
         yield f"## Over {sweep}"
         yield markdown_table(rows, columns)
@@ -121,7 +131,7 @@ def _quality_tables(result: dict) -> Iterable[str]:
 
 
 def _response_tables(result: dict) -> Iterable[str]:
-    yield markdown_table(result["rows"], PAGES["response"]["columns"])
+    yield markdown_table(result["rows"], COLUMNS["response"])
 
 
 def _stability_tables(result: dict) -> Iterable[str]:
@@ -168,3 +178,7 @@ def _tried_page(path: Path) -> list[str]:
     )
     tables = [part for (topic,), rows in topics.items() for part in (f"## {topic}", markdown_table(rows, columns))]
     return ["# Tried and lost", text, *tables]
+
+
+if __name__ == "__main__":
+    print(*write_reports(HERE), sep="\n")

@@ -1,4 +1,4 @@
-"""The plots of `bench report`: matplotlib figures that need no display, saved small."""
+"""The plots of the reports: matplotlib figures that need no display, saved small."""
 
 import io
 from collections.abc import Sequence
@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..output.charts import COLORS, RULE
-from .results import groups
+from sehdr_warp.bench.results import groups
+from sehdr_warp.output.charts import COLORS, RULE
 
 SMALLEST = 2.0**-28
 """An exact result has no place on a logarithmic axis: it is drawn here."""
