@@ -106,6 +106,8 @@ def test_help_is_quick_and_needs_no_torch():
         ("train x --out y --plan", "--plan is gone: it is the default"),
         ("train x --out y --set loss.clipping=false", "--set is gone: every field is a flag"),
         ("train x --out y --loss.knee 3", "--loss.knee is gone: it always is"),
+        ("train x --out y --predict-hdr net.pt", "--predict-hdr is gone: it gained nothing"),
+        ("train x --out y --loss.predictor net.pt", "--loss.predictor is gone: it gained nothing"),
         ("train x --out y --response.form mlp", 'write response.name = "learned"'),
         ("render x", "render needs --out PATH"),
         ("render x --out y --pixel byte", "--pixel byte: is none of 'half', 'float'"),

@@ -28,8 +28,8 @@ def hdr_size(path: Path) -> tuple[int, int]:
     return size
 
 
-def read_hdr(path: Path, *, keep_negative: bool = False) -> np.ndarray:
-    """[H, W, 3] float32 scene-linear radiance; negative values are raised to zero unless they are to be kept.
+def read_hdr(path: Path) -> np.ndarray:
+    """[H, W, 3] float32 scene-linear radiance; negative values are raised to zero.
 
     Raises InputError where the file is missing, damaged or too large, or a value is NaN or infinite (with its place).
     """
@@ -48,7 +48,7 @@ def read_hdr(path: Path, *, keep_negative: bool = False) -> np.ndarray:
         row, column, channel = (int(i) for i in np.argwhere(bad)[0])
         place = f"one {'RGB'[channel]} = {pixels[row, column, channel]} at x={column}, y={row}"
         raise InputError(path, f"{int(bad.any(axis=2).sum())} pixels not finite, {place}", _REMEDY)
-    return pixels if keep_negative else np.maximum(pixels, 0.0)
+    return np.maximum(pixels, 0.0)
 
 
 def read_exr_channels(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[dict[str, np.ndarray], dict]:

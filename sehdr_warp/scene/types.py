@@ -60,7 +60,6 @@ class Scene:
     points: [P, 3] float64 world coordinates, P may be 0. point_colors: [P, 3] float32 in [0, 1], encoded like photos.
     exposure_times_known: False where no file stated them (then each view's is 1 second).
     notes: one line each on what the user should know (differing exposures, views left out, ...).
-    predictor: what predicted the `hdr` of the training views, each from its photo; None where `hdr` is truth.
     response: the curve the photos were averaged by; None for a scene made by hand.
     chosen_by: the method and the candidates that chose the response; None where it was named.
     """
@@ -72,7 +71,6 @@ class Scene:
     point_colors: np.ndarray
     exposure_times_known: bool = True
     notes: tuple[str, ...] = ()
-    predictor: str | None = None
     response: "Response | None" = None
     chosen_by: tuple[str, tuple[str, ...]] | None = None
 

@@ -44,8 +44,6 @@ class TrainingOptions:
     """Steps; by default as many as the photos deserve."""
     seed: int | None = None
     """Seed of every random number."""
-    predict_hdr: str | None = None
-    """Single-image predictions in place of HDR truth: kovaleski-oliveira, an EXR folder, a .pt or .onnx file."""
     plan_only: bool = False
     """Print what the scene does not need, and why; train nothing."""
 
@@ -80,6 +78,7 @@ class Train:
 
     gone: ClassVar[Mapping[str, str]] = {configs.flag_of(path): advice for path, advice in configs.GONE.items()} | {
         "--plan": "it is the default; --plan.enabled false trains without",
+        "--predict-hdr": configs.GONE["loss.predictor"],
         "--set": "every field is a flag, as --loss.clipping false for --set loss.clipping=false",
     }
 
@@ -115,7 +114,6 @@ class ShowConfig:
 def run_train(asked: Train) -> None:
     """Trains, or prints the plan, and says what was made and what to do next."""
     from .machine import pick_device
-    from .prediction import check_predictor
     from .run_folder import RunFolder
 
     output, plan_only, resumed = asked.output, asked.training.plan_only, None
@@ -127,8 +125,6 @@ def run_train(asked: Train) -> None:
         resumed = folder
     data = _data(asked, resumed)
     config, device = _config(asked, resumed), pick_device(asked.machine.device)
-    if config.loss.predictor:
-        check_predictor(config.loss.predictor)
     options = config.response
     scene = _load(data, response=options.name, method=options.method, candidates=options.candidates)
     if plan_only:
@@ -215,12 +211,9 @@ def _data(asked: Train, resumed) -> dict:
 
 def _config(asked: Train, resumed):
     """The preset's config, or that of the RunFolder that is resumed, with what the command line names in it."""
-    options, predictor = asked.training, asked.training.predict_hdr
-    if predictor is not None and Path(predictor).exists():  # The config outlives this folder.
-        predictor = str(Path(predictor).absolute())
+    options = asked.training
     shortcuts = {
         "response.name": ("--response", asked.scene.response),
-        "loss.predictor": ("--predict-hdr", predictor),
         "schedule.iterations": ("--iterations", options.iterations),
         "seed": ("--seed", options.seed),
     }
@@ -230,8 +223,7 @@ def _config(asked: Train, resumed):
     flags = {path: configs.flag_of(path) if path in fields else shortcuts[path][0] for path in named}
     if resumed is not None and options.preset is None:
         return configs.override_config(resumed.read_config(), named, flags=flags)
-    preset = options.preset or ("default" if options.predict_hdr is None else "predicted")
-    config = configs.load_config(preset, named, flags)
+    config = configs.load_config(options.preset or "default", named, flags)
     kept = {*config.plan.keep, *(path for path in named if not path.startswith("plan."))}
     return configs.override_config(config, {"plan.keep": sorted(kept)})
 
@@ -254,8 +246,8 @@ def _cost(config) -> str:
         parts.append(f"{len(config.fusion.exposures)} brackets in every step")
     if config.response.name == "learned":
         parts.append("a learned response")
-    if config.loss.predictor or config.loss.uses_hdr:
-        parts.append("predicted HDR" if config.loss.predictor else "needs HDR truth")
+    if config.loss.uses_hdr:
+        parts.append("needs HDR truth")
     return "; ".join(parts)
 
 

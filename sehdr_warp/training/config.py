@@ -85,9 +85,6 @@ class LossConfig(_Table):
     """weight of the photos; 0 leaves them out"""
     hdr_weight: Weight = 0.0
     """weight of the HDR colour against HDR truth in the mu-law, where a view has it (HDR-GS: 0.6)"""
-    predictor: str = ""
-    """what stands in for HDR truth in training: a single-image predictor's name, a folder of predictions or a file of a
-    network; empty: nothing, truth is the data's own"""
     clipping: bool = True
     """a clipped pixel only says `at least`, a black one only `at most`; off: both are plain values"""
     linear_weight: Weight = 0.0
@@ -237,8 +234,6 @@ def _contradictions(config: Config) -> Iterator[str]:
         yield f"{given} has nothing to compare: needs fusion.enabled or loss.hdr_truth"
     if loss.ldr_weight == loss.hdr_weight == loss.linear_weight == 0:
         yield "loss.ldr_weight = 0.0 leaves nothing to compare: give loss.hdr_weight or loss.ldr_weight"
-    if loss.predictor and not loss.uses_hdr:
-        yield f"loss.predictor = {loss.predictor!r} is for nothing: loss.hdr_weight = 0.0"
     if loss.anchor_weight > 0 and not learned:
         yield f'loss.anchor_weight = {loss.anchor_weight} is for nothing: needs response.name = "learned"'
     if config.optimizer.means_final > config.optimizer.means:

@@ -207,7 +207,7 @@ def check_fields(scene: Scene, facts: SceneFacts, config: Config, given: Collect
             if not 1 / REACH <= time / base <= REACH:
                 problem = f"{time:.3g} s is {time / base:.3g} times the photos' {base:.3g} s"
                 refuse("fusion.exposures", problem, f"stay within 1/{REACH:.0f} and {REACH:.0f} times")
-    if {"loss.hdr_truth", "loss.linear_weight", "loss.hdr_weight"} & set(given) and not config.loss.predictor:
+    if {"loss.hdr_truth", "loss.linear_weight", "loss.hdr_weight"} & set(given):
         largest_truth(scene, config.loss)
     if "densification.max_gaussians" in given and config.densification.max_gaussians < facts.points:
         problem = f"the scene starts from {facts.points} points"
@@ -238,7 +238,7 @@ def _brackets(facts: SceneFacts, config: Config, device: torch.device) -> Choice
 
 def _truth(facts: SceneFacts, config: Config) -> bool:
     """Whether the linear loss has truth to compare with."""
-    return config.loss.hdr_truth and bool(facts.truths or config.loss.predictor)
+    return config.loss.hdr_truth and facts.truths > 0
 
 
 def _linear_loss(facts: SceneFacts, config: Config, device: torch.device) -> Choice:

@@ -84,8 +84,7 @@ class Run:
     def measure_confidence(self, scene: Scene) -> Evidence:
         """What the training photos of a scene say of the Gaussians; the model has their confidence from then on. Their
         HDR truth counts only if it was trained on."""
-        loss = self.config.loss
-        truth = loss.uses_hdr and not loss.predictor
+        truth = self.config.loss.uses_hdr
         evidence = gather_evidence(self.model, scene.train_views, degree=self.degree, truth=truth)
         self.model.confidence = evidence.confidence()
         return evidence

@@ -89,7 +89,7 @@ def largest_truth(scene: Scene, loss: LossConfig) -> float:
     if not loss.uses_hdr:
         return 1.0
     field = f"loss.hdr_weight = {loss.hdr_weight}" if loss.hdr_weight > 0 else "loss.hdr_truth = true"
-    remedy = "take a scene with HDR truth, a preset that needs none, or --predict-hdr"
+    remedy = "take a scene with HDR truth, or a preset that needs none"
     given = [view for view in scene.train_views if view.hdr is not None]
     lacking = [view.name for view in scene.train_views if view.hdr is None]
     if not given:

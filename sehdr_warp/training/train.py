@@ -14,7 +14,6 @@ from ..errors import InputError, SehdrError
 from ..evaluation.metrics import psnr
 from ..evaluation.protocols import normalise, tone_map
 from ..field.radiance_field import RadianceField
-from ..response import Response
 from ..scene import Scene, View
 from ..splatting.memory import memory_told
 from .config import Config
@@ -22,7 +21,6 @@ from .config_files import config_fields, load_config, override_config
 from .initialization import choose_response, make_field
 from .machine import interruptible, machine_figures, pick_device, torch_settings
 from .plan import apply_plan
-from .prediction import predicted_scene
 from .run import Run, field_from_checkpoint, load_run
 from .run_folder import RunFolder, first_not_finite
 from .trainer import Trainer
@@ -105,8 +103,8 @@ class Training:
         config = as_config(config)
         self.seconds = 0.0
         with memory_told(self.device, lambda: _sizes(scene)):
+            self.scene = scene
             if self.folder.check(resume=resume, overwrite=overwrite):
-                self.scene = scene
                 self.trainer = self._continue(config)
             else:
                 self.trainer = self._begin(scene, config or Config(), data or {})
@@ -258,10 +256,9 @@ class Training:
     def _begin(self, scene: Scene, config: Config, data: dict) -> Trainer:
         config, plan = apply_plan(scene, config, self.device)
         response = choose_response(scene, config)
-        self.scene = with_predictions(scene, config, response)
-        trainer = Trainer(self.scene, config, make_field(self.scene, config, response, self.device))
+        trainer = Trainer(scene, config, make_field(scene, config, response, self.device))
         # Nothing is made or removed before the scene is known to be good.
-        self.folder.begin(self.scene, config, trainer.field, data, plan and plan.to_dict())
+        self.folder.begin(scene, config, trainer.field, data, plan and plan.to_dict())
         for line in plan.lines() if plan is not None else ():
             log.info("%s", line)
         return trainer
@@ -277,8 +274,6 @@ class Training:
         if config is not None and config != saved:
             remedy = "resume with the run's own config, or train anew"
             raise InputError(folder.config, _first_difference(saved, config), remedy)
-        response = Response.from_dict(info["response"])
-        self.scene = scene = with_predictions(scene, saved, response)
         folder.check_same_scene(scene)
         checkpoint = folder.newest_checkpoint()
         if checkpoint is None:
@@ -348,13 +343,6 @@ def evaluate_views(field: RadianceField, views: tuple[View, ...], degree: int) -
             images = normalise("gt-max", hdr, torch.tensor(view.hdr, device=device), mask)
             scores.setdefault("psnr_mu", []).append(min(psnr(*tone_map("gt-max", *images), mask), BEST))
     return {name: sum(values) / len(values) for name, values in scores.items()}
-
-
-def with_predictions(scene: Scene, config: Config, response: Response) -> Scene:
-    """The scene as the loss may see it: predictions in place of truth where loss.predictor names where from."""
-    if not config.loss.predictor or scene.predictor is not None:
-        return scene
-    return predicted_scene(scene, config.loss.predictor, response)
 
 
 def _sizes(scene: Scene, trainer: Trainer | None = None) -> tuple[int, int, int]:

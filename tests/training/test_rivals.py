@@ -30,7 +30,6 @@ RIVALS = {
     "hdr-gs-truth": {"optimizer.harmonics_dc": 0.02, "optimizer.response": 0.005},
     "gauss-hdr": {"optimizer.harmonics_dc": 0.02, "optimizer.response": 0.005},
     "truth": {},
-    "predicted": {},
 }
 
 
@@ -51,7 +50,7 @@ def without_truth(scene, *names):
 def test_every_rival_learns_and_loads_as_it_was_trained(scene, tmp_path, name):
     config = quick(name, **RIVALS[name], **{"schedule.iterations": 100})
     # What trains without truth trains without any there.
-    given = scene if config.loss.uses_hdr and not config.loss.predictor else without_truth(scene)
+    given = scene if config.loss.uses_hdr else without_truth(scene)
     run = train(given, tmp_path / "run", config, device="cpu")
     first, last = run.metrics()
     figure = "psnr_mu" if config.loss.hdr_weight > 0 else "psnr_ldr"
@@ -72,7 +71,6 @@ def test_presets_are_what_their_methods_say():
     assert with_truth == override_config(gs, {"loss.hdr_weight": 0.6})
     assert load_config("gauss-hdr") == override_config(gs, {"model.tone_map": "pixel", "loss.anchor_weight": 0.5})
     assert (truth.loss.ldr_weight, truth.loss.hdr_weight) == (0.0, 1.0)
-    assert load_config("predicted") == override_config(truth, {"loss.predictor": "kovaleski-oliveira"})
     assert load_config("paper-truth") == override_config(load_config("paper"), {"loss.hdr_truth": True})
     plans = {name for name in preset_names() if load_config(name).plan.enabled}
     assert plans == {"default", "fast", "demo"}
