@@ -227,9 +227,8 @@ def embedded_folder(path: str) -> Path:
         return next(place / name for place in _places() if (place / name / _MARK).is_file())
     known = embedded_scenes()
     present = ", ".join(f"embedded:{each}" for each in known)
-    raise InputError(path, f"is not here{did_you_mean(name, known)}; present are {present}",
-                     "get the repository's scenes/ and name it in SEHDR_SCENES, or render it with "
-                     "sehdr-warp synth")  # fmt: skip
+    problem = f"is not here{did_you_mean(name, known)}; present are {present}"
+    raise InputError(path, problem, "get the repository's scenes/ and name it in SEHDR_SCENES")
 
 
 def _places() -> list[Path]:

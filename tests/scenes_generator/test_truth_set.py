@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from scenes.generator.recipes import RECIPES
+from scenes.generator.truth_set import pack_truth
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import embedded_scenes, load_scene
 from sehdr_warp.scene.capture import reinhard_gamma
-from sehdr_warp.synth.expose import pack_truth
-from sehdr_warp.synth.scenes import RECIPES
 
 from .conftest import write_truth
 
@@ -136,7 +136,7 @@ def test_scenes_lie_in_the_package_beside_it_or_where_the_environment_says(tmp_p
     assert {*embedded_scenes()} == {"room", *RECIPES}
     monkeypatch.setattr("sehdr_warp.scene.load.resources.files", lambda package: tmp_path / "site" / package)
     assert embedded_scenes() == ()
-    with pytest.raises(InputError, match="embedded:study: is not here; .* get the repository's scenes/ .* or render"):
+    with pytest.raises(InputError, match="embedded:study: is not here; .* get the repository's scenes/"):
         load_scene("embedded:study")
     monkeypatch.setenv("SEHDR_SCENES", str(SCENES))
     assert {*embedded_scenes()} == {*RECIPES}

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from sehdr_warp.synth.expose import RadianceView, truth_path, write_radiance, write_truth_tables
-from sehdr_warp.synth.scenes import Grid, make_cameras, split_of
+from scenes.generator.recipes import Grid, make_cameras, split_of
+from scenes.generator.truth_set import write_truth_tables
+from sehdr_warp.synth.expose import RadianceView, truth_path, write_radiance
 
 VIEWS = 6
 

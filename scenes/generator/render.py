@@ -14,17 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from .. import __version__
-from ..errors import InputError, SehdrError
-from ..files import atomic_path, write_json
-from ..output.exr import exr_header
-from ..scene import Camera
-from ..scene.hdr_files import read_hdr
-from .expose import RadianceView, truth_path, write_radiance, write_truth_tables
-from .scenes import VIEWS, Recipe, make_cameras, split_of
-from .stage import Stage, two_sided
+from sehdr_warp import __version__
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.files import atomic_path, write_json
+from sehdr_warp.output.exr import exr_header
+from sehdr_warp.scene import Camera
+from sehdr_warp.scene.hdr_files import read_hdr
+from sehdr_warp.synth.expose import RadianceView, truth_path, write_radiance
 
-LOG = logging.getLogger(__name__)
+from .recipes import VIEWS, Recipe, make_cameras, split_of
+from .stage import Stage, two_sided
+from .truth_set import write_truth_tables
+
+LOG = logging.getLogger("scenes.generator")
 # From the fastest: an NVIDIA GPU with OptiX in its driver, LLVM 16 or later, plain C++ on all cores. With each, the
 # samples of one launch over all pixels that fit memory: the wavefront variants hold every ray at once.
 VARIANTS = {"cuda_ad_rgb": 2**24, "llvm_ad_rgb": 2**21, "scalar_rgb": 2**40}
@@ -55,7 +57,7 @@ def load_mitsuba(variant: str = "auto"):
     Raises SehdrError where Mitsuba is missing, or the variant does not run on this machine.
     """
     if importlib.util.find_spec("mitsuba") is None:
-        raise SehdrError("Mitsuba 3 renders the scenes and is not installed; pip install 'sehdr-warp[synth]'")
+        raise SehdrError("Mitsuba 3 renders the scenes and is not installed; pip install mitsuba")
     if variant == "auto":
         variant = next((name for name in [*VARIANTS][:-1] if _probe(name) is None), "scalar_rgb")
     elif (reason := _probe(variant)) is not None:
@@ -108,8 +110,7 @@ class Settings:
         if self.denoise not in DENOISERS:
             raise SehdrError(f"--denoise {self.denoise:.40}: is not one of {', '.join(DENOISERS)}")
         if self.denoise == "oidn" and importlib.util.find_spec("pyoidn") is None:
-            remedy = "pip install 'sehdr-warp[synth]', or take --denoise none"
-            raise SehdrError(f"Open Image Denoise is not installed; {remedy}")
+            raise SehdrError("Open Image Denoise is not installed; pip install pyoidn, or take --denoise none")
 
 
 def render_scene(mi, recipe: Recipe, out: Path, settings: Settings) -> Path:

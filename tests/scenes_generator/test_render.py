@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
+from scenes.generator import render, stage, textures
+from scenes.generator.recipes import RECIPES, VIEWS, Arc, Grid, make_cameras
+from scenes.generator.render import Settings, load_mitsuba
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_scene
-from sehdr_warp.synth import render, stage, textures
-from sehdr_warp.synth.render import Settings, load_mitsuba
-from sehdr_warp.synth.scenes import RECIPES, VIEWS, Arc, Grid, make_cameras
 
 TEXTURES = ("wood", "brick", "checker", "wallpaper", "plaster", "painting", "globe", "ground", "books")
 
@@ -108,7 +108,7 @@ def test_finished_views_are_not_rendered_again(rendered, mitsuba, monkeypatch, c
     path = folder / "train_hdr" / "hdr_001.exr"
     kept, before = (folder / "train_hdr" / "hdr_000.exr").stat().st_mtime_ns, load_scene(folder).views
     path.unlink()
-    with caplog.at_level("INFO", logger="sehdr_warp"):
+    with caplog.at_level("INFO", logger="scenes.generator"):
         render.render_scene(mitsuba, RECIPES["night"], folder.parent, settings)
     assert "view 34" in caplog.text and "view 0 of" not in caplog.text
     assert (folder / "train_hdr" / "hdr_000.exr").stat().st_mtime_ns == kept

@@ -6,13 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from scenes.generator import render
+from scenes.generator.recipes import RECIPES, make_cameras
+from scenes.generator.render import Settings, _render_view, denoise, guide_items, load_mitsuba, render_scene
+from scenes.generator.stage import Stage
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene.hdr_files import read_hdr
-from sehdr_warp.synth import render
 from sehdr_warp.synth.expose import truth_path
-from sehdr_warp.synth.render import Settings, _render_view, denoise, guide_items, load_mitsuba, render_scene
-from sehdr_warp.synth.scenes import RECIPES, make_cameras
-from sehdr_warp.synth.stage import Stage
 
 
 def reflectance(item):
@@ -73,7 +73,7 @@ def test_an_unknown_or_missing_denoiser_is_refused(monkeypatch):
     with pytest.raises(SehdrError, match="--denoise median: is not one of none, oidn"):
         Settings(denoise="median")
     monkeypatch.setattr(render.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(SehdrError, match=r"pip install 'sehdr-warp\[synth\]', or take --denoise none"):
+    with pytest.raises(SehdrError, match="pip install pyoidn, or take --denoise none"):
         Settings(denoise="oidn")
     Settings(denoise="none")
 

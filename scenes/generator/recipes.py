@@ -1,4 +1,4 @@
-"""The eight scenes by name, as scenes.toml describes them: what stands where, and where the cameras stand."""
+"""The eight scenes by name, as recipes.toml describes them: what stands where, and where the cameras stand."""
 
 import math
 import tomllib
@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import SehdrError
-from ..scene import Camera, look_at
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.scene import Camera, look_at
+
 from .stage import Stage
 
 COLUMNS, ROWS = 7, 5
@@ -67,7 +68,7 @@ def split_of(index: int) -> str:
 
 @dataclass(frozen=True)
 class Recipe:
-    """A scene as scenes.toml has it, which says what its fields mean."""
+    """A scene as recipes.toml has it, which says what its fields mean."""
 
     name: str
     title: str
@@ -94,7 +95,7 @@ def _call(stage: Stage, step: list):
 
 def _read() -> dict[str, Recipe]:
     recipes = {}
-    for name, stated in tomllib.loads(Path(__file__).with_name("scenes.toml").read_text(encoding="utf-8")).items():
+    for name, stated in tomllib.loads(Path(__file__).with_name("recipes.toml").read_text(encoding="utf-8")).items():
         ((kind, places),) = stated.pop("layout").items()
         recipes[name] = Recipe(name, layout={"grid": Grid, "arc": Arc}[kind](**places), **stated)
     return recipes
