@@ -25,7 +25,6 @@ from .read_folders import (
     read_photos,
 )
 from .read_transforms import read_hdr_nerf, read_transforms
-from .sfm import triangulate
 from .types import Scene
 
 if TYPE_CHECKING:
@@ -62,7 +61,7 @@ def load_scene(
         protocol of its layout, or takes the middle of every eight. Sets of fewer than 5 views have no test view.
     cache: a folder where structure from motion keeps its results; None is the user's ($SEHDR_CACHE).
 
-    Returns a Scene in the set's own world coordinates; where the set has poses alone, points are triangulated.
+    Returns a Scene in the set's own world coordinates, with the points that the set has.
     Raises InputError where a file is missing, damaged or hostile, sizes disagree, an exposure is impossible, fewer
     than two training views remain, or the photos show nothing but black or white.
     """
@@ -76,13 +75,7 @@ def load_scene(
         response, chosen_by = choose_response(capture, method, candidates), (method, tuple(map(str, candidates)))
     elif isinstance(response, str | Path):
         response = response_by_name("srgb" if response == "learned" else response)
-    scene = replace(develop(capture, response, max_size), chosen_by=chosen_by)
-    if len(scene.points):
-        return scene
-    points, colors = triangulate(capture, cache)
-    found = f"triangulated {len(points)} from the training views" if len(points) else "none could be triangulated"
-    notes = (*scene.notes, f"the set has no points; {found}")
-    return replace(scene, points=points, point_colors=colors, notes=notes)
+    return replace(develop(capture, response, max_size), chosen_by=chosen_by)
 
 
 def read_capture(

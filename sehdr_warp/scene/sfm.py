@@ -1,4 +1,4 @@
-"""Structure from motion through pycolmap: poses and points of bare photos, and points of views with known poses.
+"""Structure from motion through pycolmap: poses and points of bare photos.
 
 pycolmap only ever sees images that this module wrote under names of its own, and its models come back through the
 package's bounded reader. Results go to a cache folder under a key made of all that they depend on.
@@ -21,12 +21,9 @@ from PIL import Image
 
 from ..errors import InputError, SehdrError
 from ..files import atomic_folder
-from .capture import Capture, Cloud, Shot
 from .colmap_model import SparseModel, read_model
-from .develop import as_photographed, fitted_lens, told
-from .images import EXIF_ERRORS, open_image, read_ldr, read_mask
-from .lens import Lens
-from .types import encoded_values
+from .develop import told
+from .images import EXIF_ERRORS, open_image, read_ldr
 
 _log = logging.getLogger("sehdr_warp.scene")
 
@@ -66,46 +63,6 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Spar
         sizes = json.loads((folder / "sizes.json").read_text())
     images = (replace(image, lens=image.lens.resized(*sizes[_index(image.name)])) for image in model.images)
     return SparseModel(tuple(images), model.cloud)
-
-
-def triangulate(capture: Capture, cache: Path | str | None = None) -> Cloud:
-    """Points of the training photos, whose cameras are known; P is 0 where nothing matches.
-
-    Features are found on the photos stretched to full range (a short exposure is nearly black as it is), at no more
-    than MAX_SIDE pixels; poses stay as they are. cache: as reconstruct's.
-    """
-    shots = capture.training
-    parts = [
-        (shot.image.name, _digest(shot.image), shot.mask and _digest(shot.mask), shot.seconds * shot.derived,
-         shot.lens.model, shot.lens.params, shot.world_to_camera.tolist())
-        for shot in shots
-    ]  # fmt: skip
-
-    def solve(work: Path, result: Path) -> None:
-        import pycolmap
-
-        lenses = _write_shots(shots, work / "images")
-        database = work / "database.db"
-        for i, lens in told("finding features in photos", lenses):
-            _extract(database, work / "images", [_name(i)], lens.model, lens.params)
-        _match(database, len(shots))
-        _log.info("triangulating points from the known poses")
-        model, options = pycolmap.Reconstruction(), pycolmap.IncrementalPipelineOptions()
-        with pycolmap.Database.open(database) as opened:
-            for camera in opened.read_all_cameras():
-                model.add_camera_with_trivial_rig(camera)
-            for image in opened.read_all_images():
-                pose = shots[_index(image.name)].world_to_camera
-                model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
-        _seed(options)
-        with _quiet():
-            model = pycolmap.triangulate_points(model, database, work / "images", work / "model", options=options)
-        places, colors = _sampled_colors(model, shots, lenses)
-        np.savez(result / "points.npz", points=places, colors=colors)
-
-    name = f"points-{_key('points', MAX_SIDE, _SEED, parts)}"
-    with _cached(cache, name, solve) as folder, np.load(folder / "points.npz") as stored:
-        return stored["points"], stored["colors"]
 
 
 def user_cache() -> Path:
@@ -179,25 +136,6 @@ def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tup
         problem = "the photos are all black or all white"
         raise InputError(photos[0].parent, problem, "expose them so that the scene shows")
     return sizes, small
-
-
-def _write_shots(shots: Sequence[Shot], folder: Path) -> list[Lens]:
-    """8-bit copies of at most MAX_SIDE pixels, stretched and masked; returns the lenses at the copies' sizes."""
-    folder.mkdir()
-    lenses = []
-    for i, shot in told("reading photos", shots):
-        lens, oriented = (shot.lens, False) if shot.derived else fitted_lens(shot)
-        image = as_photographed(shot, oriented=oriented)
-        light = _reduced(image.pixels)
-        values = encoded_values(np.asarray(light))
-        values = values / max(float(np.percentile(values, 99.5)), 1 / 255)
-        for mask in (image.alpha, None if shot.mask is None else read_mask(shot.mask, oriented=oriented)):
-            if mask is not None:
-                values *= np.asarray(Image.fromarray(mask).resize(light.size, Image.Resampling.BOX))[:, :, None]
-        picture = Image.fromarray((np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8))
-        picture.save(folder / _name(i), compress_level=1)
-        lenses.append(lens.resized(*light.size))
-    return lenses
 
 
 def _reduced(codes: np.ndarray) -> Image.Image:
@@ -296,22 +234,6 @@ def _map(database: Path, work: Path, count: int, source: Path):
         raise InputError(source, f"none of the {count} photos could be placed by structure from motion",
                          "take sharp photos that overlap by two thirds, or bring poses")  # fmt: skip
     return best
-
-
-def _sampled_colors(model, shots: Sequence[Shot], lenses: Sequence[Lens]) -> Cloud:
-    """Places and the mean color of the photos' pixels where each point was seen, encoded."""
-    number_of = {key: number for number, key in enumerate(model.points3D)}
-    total, count = np.zeros((len(number_of), 3)), np.zeros((len(number_of), 1))
-    for image in model.images.values():
-        shot, lens = shots[_index(image.name)], lenses[_index(image.name)]
-        pixels = as_photographed(shot, oriented=not shot.derived and fitted_lens(shot)[1]).pixels
-        size = np.array(pixels.shape[1::-1])
-        for point in image.get_observation_points2D():
-            column, row = np.clip((point.xy * size / (lens.width, lens.height)).astype(int), 0, size - 1)
-            total[number_of[point.point3D_id]] += pixels[row, column] / np.iinfo(pixels.dtype).max
-            count[number_of[point.point3D_id]] += 1
-    places = np.array([point.xyz for point in model.points3D.values()], np.float64).reshape(-1, 3)
-    return places, (total / np.maximum(count, 1)).astype(np.float32)
 
 
 @contextlib.contextmanager

@@ -44,8 +44,9 @@ class ModelConfig(_Table):
     """pixel: composite radiance, then apply the response to each pixel; gaussian: apply it to each Gaussian (SeHDR)"""
     harmonics_degree: Annotated[int, Field(ge=0, le=3)] = 3
     """highest degree of the spherical harmonics"""
-    initial_count: Annotated[int, Field(ge=100, le=10_000_000)] = 50_000
-    """Gaussians to start from where the scene has no points"""
+    initial_density: Annotated[float, Field(ge=0.0, le=1000.0)] = 20.0
+    """Gaussians to start from, times the square root of the training photos' pixels: the scene's points and, up to so
+    many, points matched between the photos; 0: the scene's points alone"""
     antialiased: bool = False
     """lower opacity where the low-pass filter widens a small Gaussian (Mip-Splatting)"""
 
@@ -132,6 +133,9 @@ class DensificationConfig(_Table):
     growth: Part = 0.05
     """relocation: the count grows by this part at each change, or by more where the training is too short to reach its
     budget so"""
+    births: Part = 0.2
+    """relocation: part of the moved and the new ones that is born where the photos are explained worst, at depths on
+    which they agree"""
     noise: Annotated[float, Field(ge=0.0)] = 5e5
     """relocation: strength of the noise on the positions, in learning rates"""
 

@@ -6,6 +6,7 @@ append / overwrite, which carry Adam's state.
 """
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -24,6 +25,10 @@ MOST_COPIES = 51
 """A Gaussian is shared by at most this many at once, as in the authors' code: the binomial sums stay exact."""
 MOST_GROWTH = 1.0  # A change adds at most as many as there are: each then shares with one other in the mean
 SEED_STEP = 1_000_003  # Seeds of trainings are this far apart in the seeds of their noise, one for each iteration
+
+
+Births = Callable[[int], dict[str, Tensor]]
+"""Rows of at most so many new Gaussians, where the photos are explained worst."""
 
 
 class Densification:
@@ -50,7 +55,7 @@ class Densification:
     def observe(self, rendering: Rendering, width: int, height: int, usable: Tensor) -> None:
         """Takes note of a step's image gradients. usable: scalar tensor, 0 where the step is to be ignored."""
 
-    def change(self, iteration: int, gaussians: Gaussians, optimizer: torch.optim.Optimizer, generator) -> bool:
+    def change(self, iteration: int, gaussians: Gaussians, optimizer, generator, births: Births | None = None) -> bool:
         """Changes the Gaussians where this iteration is one for it; True if any tensor was replaced by another."""
         return False
 
@@ -88,7 +93,7 @@ class GradientDensification(Densification):
         add_gradient_statistics(rendering.means2d.grad, rendering.radii, usable, width, height, *statistics)
 
     @torch.no_grad()
-    def change(self, iteration: int, gaussians: Gaussians, optimizer: torch.optim.Optimizer, generator) -> bool:
+    def change(self, iteration: int, gaussians: Gaussians, optimizer, generator, births: Births | None = None) -> bool:
         changed = self._is_due(iteration) and self.gradient_sum is not None
         if changed:
             self._grow(gaussians, self.gradient_sum / self.seen.clamp_min(1), optimizer, generator)
@@ -141,7 +146,8 @@ class GradientDensification(Densification):
 
 class Relocation(Densification):
     """Dead Gaussians move to where living ones are, in a way that keeps the image; the count grows by a fixed part up
-    to the budget; noise on the positions of the faint ones explores. No opacity resets, no gradient statistics.
+    to the budget; some of the moved and the new are born where the photos are explained worst; noise on the positions
+    of the faint ones explores. No opacity resets, no gradient statistics.
 
     A start with more Gaussians than the budget keeps its count: they move, and none are added.
     """
@@ -152,24 +158,33 @@ class Relocation(Densification):
         self._sums = _relocation_sums()
 
     @torch.no_grad()
-    def change(self, iteration: int, gaussians: Gaussians, optimizer: torch.optim.Optimizer, generator) -> bool:
+    def change(self, iteration: int, gaussians: Gaussians, optimizer, generator, births: Births | None = None) -> bool:
         if not self._is_due(iteration):
             return False
         opacities = gaussians.opacities()
         dead = opacities <= self.options.prune_opacity
         moved, alive = dead.nonzero()[:, 0], (~dead).nonzero()[:, 0]
+        count = gaussians.count
+        added = self.next_count(iteration, count) - count
+        if births is not None and (wanted := int(self.options.births * (len(moved) + added))):
+            rows = births(wanted)
+            here, moved = moved.tensor_split([len(rows["means"])])
+            gaussians.overwrite({name: values[: len(here)] for name, values in rows.items()}, here, optimizer)
+            rows = {name: values[len(here) :] for name, values in rows.items()}
+            if new := len(rows["means"]):
+                gaussians.append(rows, optimizer)
+                added -= new
         if len(moved) and len(alive):
             chosen = alive[_draw(opacities[alive], len(moved), generator)]
             self._share(gaussians, chosen, optimizer)
             # In the authors' code the moved ones keep their Adam state, and only those that share lose it.
             for name, values in gaussians.rows(chosen).items():
                 getattr(gaussians, name)[moved] = values
-        added = self.next_count(iteration, gaussians.count) - gaussians.count
         if added > 0:
             chosen = _draw(gaussians.opacities(), added, generator)
             self._share(gaussians, chosen, optimizer)
             gaussians.append(gaussians.rows(chosen), optimizer)
-        return added > 0
+        return gaussians.count > count
 
     def next_count(self, iteration: int, count: int) -> int:
         """How many Gaussians there are after the change at an iteration: more by `growth`, or by as much as takes the

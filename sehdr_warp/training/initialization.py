@@ -1,4 +1,7 @@
-"""The field a training starts from: the scene's points, or points drawn where several cameras look."""
+"""The field a training starts from: the scene's points and those matched between its photos."""
+
+import logging
+import math
 
 import numpy as np
 import torch
@@ -13,7 +16,13 @@ from ..response import Response, ToneMapper, response_by_name
 from ..scene import Scene, View
 from ..scene.load import best_response, photos_to_judge
 from .config import Config
+from .densification import gaussian_budget
+from .matching import Matcher
 
+_log = logging.getLogger(__name__)
+
+FEWEST_POINTS = 20  # With fewer, points are drawn too, FEWEST_DRAWN or more
+FEWEST_DRAWN = 5000
 DEPTH_RANGE = (0.5, 3.0)
 """Depths of drawn points in units of the distance to where the cameras look. Nearer ones stay as veils before the
 cameras: on the embedded room a start at 0.15 costs 14 dB."""
@@ -56,7 +65,7 @@ def make_field(scene: Scene, config: Config, response: Response, device: torch.d
     """The field at iteration 0. Raises InputError for a scene that cannot be trained."""
     check_views(scene)
     rng = np.random.default_rng(config.seed)
-    points, colors = (scene.points, scene.point_colors) if len(scene.points) else random_points(scene, config, rng)
+    points, colors = start_points(scene, config, response, device, rng)
     most = config.densification.max_gaussians
     if len(points) > most:
         chosen = np.sort(rng.choice(len(points), most, replace=False))
@@ -65,6 +74,40 @@ def make_field(scene: Scene, config: Config, response: Response, device: torch.d
     points, dc = (torch.tensor(values, dtype=torch.float32) for values in (points, dc))
     gaussians = Gaussians.from_points(points, dc, config.model.harmonics_degree)
     return assemble_field(gaussians, config, response, base_time(scene)).to(device)
+
+
+def start_points(scene: Scene, config: Config, response: Response, device, rng) -> tuple[np.ndarray, np.ndarray]:
+    """[N, 3] points to start from and their encoded colors [N, 3]: the scene's and, up to model.initial_density, those
+    matched between its photos; where they are too few, points drawn where several cameras look."""
+    points, colors = scene.points, scene.point_colors
+    wanted = start_count(config, sum(view.camera.width * view.camera.height for view in scene.train_views))
+    if wanted > len(points):
+        matcher = make_matcher(scene, response, device)
+        found = matcher.match(matcher.pixels(wanted - len(points), rng))
+        points = np.concatenate([points, found.points.cpu().numpy()])
+        colors = np.concatenate([colors, found.colors.cpu().numpy()])
+        _log.info("%d points matched between the photos", len(found.points))
+    if len(points) < FEWEST_POINTS:
+        drawn = random_points(scene, max(wanted, FEWEST_DRAWN), rng)
+        points, colors = (np.concatenate(both) for both in zip((points, colors), drawn, strict=True))
+    return points, colors
+
+
+def start_count(config: Config, pixels: int) -> int:
+    """How many points a training on photos of so many pixels in all starts from, if the scene has no more."""
+    options = config.densification
+    most = gaussian_budget(options, pixels) if options.strategy == "relocation" else options.max_gaussians
+    return min(most, round(config.model.initial_density * math.sqrt(pixels)))
+
+
+def make_matcher(scene: Scene, response: Response, device: torch.device | str) -> Matcher:
+    """Of the training views, with depths around those of the scene's points or of where the cameras look."""
+    views = scene.train_views
+    homogeneous = np.c_[scene.points, np.ones(len(scene.points))]
+    depths = [homogeneous[pixels_of(scene.points, view)[2]] @ view.camera.world_to_camera[2] for view in views]
+    depths = np.concatenate(depths)
+    focus = float(np.median(depths)) if len(depths) >= FEWEST_POINTS else focus_distance(views)
+    return Matcher(views, response, focus, device)
 
 
 def assemble_field(gaussians: Gaussians, config: Config, response: Response, base_time: float) -> RadianceField:
@@ -98,12 +141,12 @@ def check_views(scene: Scene) -> None:
         raise InputError(scene.name, "every training photo is white", "use a shorter exposure")
 
 
-def random_points(scene: Scene, config: Config, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Points [N, 3] where at least two training cameras look, and their mean encoded colors [N, 3].
+def random_points(scene: Scene, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Up to `count` points [N, 3] where at least two training cameras look, and their mean encoded colors [N, 3].
 
     Drawn along the cameras' rays, uniform in inverse depth. Raises SehdrError if no two cameras share what they see.
     """
-    views, count = scene.train_views, config.model.initial_count
+    views = scene.train_views
     distance, found, total = focus_distance(views), [], 0
     for _ in range(8):
         points = points_on_rays(views, count, distance, rng)

@@ -17,12 +17,12 @@ from ..splatting.threads import thread_count
 from .config import Config
 from .config_files import override_config
 from .densification import gaussian_budget
-from .initialization import base_time, focus_distance, pixels_of, points_on_rays
+from .initialization import base_time, focus_distance, pixels_of, points_on_rays, start_count
 from .machine import pick_device
 from .targets import largest_truth
 
-PASSES = 900  # Steps on each photo. A second look at the same photos teaches less and less, and in the end their noise
-FEWEST_ITERATIONS = 3000
+PASSES = 300  # Steps on each photo. A second look at the same photos teaches less and less, and in the end their noise
+FEWEST_ITERATIONS = 4000
 CPU_SECONDS = 240.0  # What a training on a CPU may take, as far as CPU_FEWEST allows
 CPU_FEWEST = 1000
 CPU_PIXEL, CPU_GAUSSIAN = 1.5e-6, 2.3e-6  # Seconds of one core for each in a step, measured on two of an AMD EPYC
@@ -257,14 +257,12 @@ def _densification(facts: SceneFacts, config: Config, device: torch.device) -> C
     if options.budget:
         reason = f"{options.budget:g} times the square root of {facts.pixels} pixels, below {options.max_gaussians}"
     if options.strategy == "relocation":
-        start = facts.points or config.model.initial_count
+        start = max(facts.points, start_count(config, facts.pixels))
         choice = f"relocation grows to at most {most}" if start < most else "relocation without growth"
         return {}, choice, f"{reason}; {start} to start with"
     # Relocation has this budget by itself; densification by gradients stops nowhere.
     most = min(options.max_gaussians, max(most, 2 * facts.points))
     fields: dict[str, object] = {"densification.max_gaussians": most}
-    if config.model.initial_count > most // 2 and not facts.points:
-        fields["model.initial_count"] = max(100, most // 2)
     return fields, f"{most} Gaussians", f"{reason}; {facts.points} points to start from"
 
 
@@ -306,6 +304,7 @@ RULES: dict[str, Callable[[SceneFacts, Config, torch.device], Choice]] = {
 def cpu_step_seconds(facts: SceneFacts, config: Config) -> float:
     """About how long a step takes on this machine's CPU, with two thirds of the Gaussians that the training ends with:
     the mean over one that grows for half of its steps."""
-    count = max(facts.points or config.model.initial_count, gaussian_budget(config.densification, facts.pixels))
+    start = max(facts.points, start_count(config, facts.pixels))
+    count = max(start, gaussian_budget(config.densification, facts.pixels))
     work = CPU_PIXEL * facts.pixels / facts.photos + CPU_GAUSSIAN * min(count, config.densification.max_gaussians) / 1.5
     return work / thread_count()

@@ -14,11 +14,13 @@ from ..scene import Scene
 from ..splatting import GraphRecorder
 from ..splatting.memory import bytes_asked_for
 from . import optimizer as adam
+from .births import born_rows
 from .config import Config
-from .densification import make_densification
+from .densification import SEED_STEP, make_densification
 from .graph_capacity import GraphCapacity
-from .initialization import scene_extent
+from .initialization import make_matcher, scene_extent
 from .losses import compares_light, data_loss, needed_colours, regularised
+from .matching import Matcher
 from .targets import TrainingView, ViewStack, largest_truth, training_views
 
 CHECK_EVERY = 20  # Iterations between looks at the count of skipped steps, each of which waits for the device
@@ -40,7 +42,8 @@ class Trainer:
         self.optimizer = adam.make_optimizer(field, config, self.extent)
         pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
         self.densification = make_densification(config, self.extent, pixels)
-        self._views = scene.train_views
+        self._scene, self._views = scene, scene.train_views
+        self._matcher: Matcher | None = None
         # Where light is compared, nothing needs the photo encoded.
         self._encoded = not compares_light(config.loss, field)
         self._largest_truth = largest_truth(scene, config.loss) * field.base_time
@@ -105,13 +108,22 @@ class Trainer:
             with self._launching():
                 self._loss = self._optimise(views[index], watched)
         self.densification.perturb(self.iteration, gaussians, rate)
-        changed = self.densification.change(self.iteration, gaussians, self.optimizer, self._generator)
+        changed = self.densification.change(self.iteration, gaussians, self.optimizer, self._generator, self._births)
         if changed and self._recorder is not None:
             # Other Gaussians need about so many times the room.
             self._recorder.invalidate()
             self._capacity.change(gaussians.count / max(1, count))
         if self.iteration % CHECK_EVERY == 0:
             self.check()
+
+    def _births(self, count: int) -> dict[str, Tensor]:
+        """New Gaussians where the photos are explained worst; of the iteration alone, so that a resumed training has
+        the same."""
+        if self._matcher is None:
+            self._matcher = make_matcher(self._scene, self.field.response, self.device)
+        seed = self.config.seed * SEED_STEP + self.iteration
+        with self._launching():
+            return born_rows(self.field, self._matcher, self._training_views(), count, self.degree, seed)
 
     def _optimise(self, view: TrainingView, watched: bool, capacity: int | None = None) -> Tensor:
         """Photograph, compare, differentiate, step; the loss. With a capacity all of it works on fixed memory and

@@ -149,20 +149,6 @@ def test_photos_are_averaged_as_light(room):
         assert (view.camera.width, view.camera.cx) == (25, 12.5)
 
 
-def test_points_are_triangulated_and_cached(tmp_path, shared, caplog):
-    from scipy.spatial import cKDTree
-
-    write_room(tmp_path, shared, points=False)
-    caplog.set_level("INFO", "sehdr_warp.scene")
-    scene = load(tmp_path, max_size=100, cache=tmp_path / "cache")
-    truth = np.load(shared / "data" / "room" / "points_hdr.npz")["xyz"]
-    assert len(scene.points) > 200 and np.median(cKDTree(truth).query(scene.points)[0]) < 0.1
-    assert any("triangulated" in note for note in scene.notes)
-    again = load(tmp_path, cache=tmp_path / "cache")
-    np.testing.assert_array_equal(again.points, scene.points)
-    assert "cached" in caplog.messages[-1]
-
-
 @pytest.mark.parametrize("value, message", [(0, "0"), (-1, "-1"), ("NaN", "NaN"), (None, "None")])
 def test_impossible_exposures_are_refused(room, tmp_path, value, message):
     folder = tmp_path / "set"

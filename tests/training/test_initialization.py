@@ -38,9 +38,8 @@ def test_cameras_at_one_place_have_an_extent(scene):
 
 
 def test_drawn_points_are_seen_and_repeat(scene):
-    config = load_config("default", {"model.initial_count": 500})
-    points, colors = random_points(scene, config, np.random.default_rng(0))
-    again, _ = random_points(scene, config, np.random.default_rng(0))
+    points, colors = random_points(scene, 500, np.random.default_rng(0))
+    again, _ = random_points(scene, 500, np.random.default_rng(0))
     seen, mean = colors_in_views(points, scene.train_views)
     assert len(points) == len(colors) == 500 and (seen >= 2).all() and np.array_equal(points, again)
     np.testing.assert_allclose(mean, colors)
@@ -65,7 +64,7 @@ def test_cameras_back_to_back_share_nothing():
         away.append(dataclasses.replace(view, camera=dataclasses.replace(view.camera, world_to_camera=pose)))
     two = tuple(view for view in away if view.name in ("v_0", "v_4"))
     with pytest.raises(SehdrError, match="no two training cameras"):
-        random_points(dataclasses.replace(scene, views=two), load_config(), np.random.default_rng(0))
+        random_points(dataclasses.replace(scene, views=two), 500, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("radiance", ["log", "linear", "display"])

@@ -27,7 +27,7 @@ def test_the_line_names_gaussians_photo_and_remedy(tmp_path, monkeypatch, place,
 
     monkeypatch.setattr(Trainer, place, fails)
     with pytest.raises(OutOfMemory) as caught:
-        train(toy_scene(), tmp_path / "run", load_config("fast"), device="cpu")
+        train(toy_scene(), tmp_path / "run", load_config("fast", {"model.initial_density": 0.0}), device="cpu")
     assert str(caught.value) == (
         f"out of memory on cpu: {asked} could not be allocated with 60 Gaussians, an image of 32 x 32; "
         "use fewer Gaussians (densification.max_gaussians) or a smaller image (--max-size)"

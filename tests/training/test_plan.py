@@ -64,7 +64,7 @@ def test_a_plan_decides_everything_once_with_figures(scene):
 @pytest.mark.parametrize(
     "name,change,field,few,many",
     [
-        ("iterations", {"photos": 200}, "schedule.iterations", 5400, 30_000),
+        ("iterations", {"photos": 200}, "schedule.iterations", 4000, 30_000),
         # Relocation's budget: 120 times the square root of 6144, and of 10^6.
         ("densification", {"pixels": 10**6}, "densification.max_gaussians", 9406, 120_000),
     ],
@@ -77,11 +77,11 @@ def test_decisions_follow_their_figures(facts, name, change, field, few, many):
     assert RULES[name](replace(facts, **small | change), config, GPU)[0].get(field) == many
 
 
-@pytest.mark.parametrize("points,choice", [(0, "without growth"), (3000, "at most 9406"), (10_000, "without growth")])
+@pytest.mark.parametrize("points,choice", [(0, "at most 9406"), (3000, "at most 9406"), (10_000, "without growth")])
 def test_a_plan_says_whether_relocation_has_room(facts, points, choice):
-    """120 times the square root of 6144 pixels; without points of its own a scene starts with the preset's 50 000."""
+    """120 times the square root of 6144 pixels; a scene starts with 20 times as many, if it has no more."""
     _, chosen, reason = RULES["densification"](replace(facts, pixels=6144, points=points), config_of(), GPU)
-    assert choice in chosen and f"{points or 50_000} to start with" in reason
+    assert choice in chosen and f"{max(points, 1568)} to start with" in reason
 
 
 def test_a_cpu_gets_the_iterations_that_fit_into_minutes(facts, monkeypatch):

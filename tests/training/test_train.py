@@ -33,7 +33,7 @@ QUICK = {
     "densification.max_gaussians": 400,
     "model.harmonics_degree": 1,
     "optimizer.means": 1e-3,
-    "model.initial_count": 300,
+    "model.initial_density": 2.0,
 }
 
 
@@ -79,7 +79,7 @@ def test_a_scene_without_points_starts_from_drawn_ones(tmp_path):
 def test_more_start_points_than_the_budget_stay_as_many_and_are_told(scene, tmp_path, caplog, options):
     """60 points; 0.1 times the square root of six photos of 32 x 32 pixels is 7."""
     caplog.set_level("INFO")
-    config = quick(**{"schedule.iterations": 50, "densification.growth": 0.5} | options)
+    config = quick(**{"schedule.iterations": 50, "densification.growth": 0.5, "model.initial_density": 0.0} | options)
     run = train(scene, tmp_path / "run", config, device="cpu")
     told = caplog.text
     assert ("60 Gaussians are more than relocation's budget of 7" in told) == ("densification.budget" in options)
@@ -288,7 +288,7 @@ def test_a_training_is_driven_step_by_step_and_left_at_any_time(scene, tmp_path)
     for step in training:
         seen.append((step.iteration, step.seconds, step.seconds_left))
         if step.iteration == 12:
-            assert step.loss > 0 and step.psnr > 5 and step.gaussians == 60 and step.total == 150
+            assert step.loss > 0 and step.psnr > 5 and step.gaussians >= 60 and step.total == 150
             break
     assert [iteration for iteration, *_ in seen] == list(range(1, 13))
     assert seen[0][2] is None and 0 < seen[-1][2] < 138 * (seen[-1][1] - seen[0][1])

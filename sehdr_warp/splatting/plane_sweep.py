@@ -1,0 +1,58 @@
+"""A plane sweep over posed photos as an operation on either device (kernels/plane_sweep.py)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..kernels import plane_sweep
+from .launching import launch
+
+BORDER = int(plane_sweep.RADIUS)
+"""Pixels nearer to the border than this cannot be matched: a patch would leave the photo."""
+NEIGHBORS = plane_sweep.MOST_NEIGHBORS
+"""A photo is compared with so many others at most."""
+
+
+@dataclass(frozen=True)
+class PhotoSet:
+    """Posed photos of any sizes, one after another on a device, each with the neighbors that it is compared with.
+
+    codes: all pixels, uint8. offsets: [V] int64; sizes: [V, 2] int32; intrinsics: [V, 4]; neighbors: [V, K] int32, -1
+    for none; between: [V, K, 4, 4], from a view's axes to a neighbor's.
+    """
+
+    codes: Tensor
+    offsets: Tensor
+    sizes: Tensor
+    intrinsics: Tensor
+    neighbors: Tensor
+    between: Tensor
+
+    @staticmethod
+    def of(photos: Sequence[np.ndarray], cameras: Sequence, neighbors: np.ndarray, device: torch.device | str):
+        """photos: uint8 [H, W, 3]; cameras: scene.Camera, of the photos' sizes; neighbors: [V, K] of -1 and indices."""
+        poses = np.stack([camera.world_to_camera for camera in cameras])
+        back = np.stack([camera.camera_to_world for camera in cameras])
+        offsets = np.cumsum([0, *(photo.size for photo in photos[:-1])])
+        given = {
+            "codes": np.concatenate([photo.ravel() for photo in photos]),
+            "offsets": offsets.astype(np.int64),
+            "sizes": np.array([[camera.width, camera.height] for camera in cameras], np.int32),
+            "intrinsics": np.stack([camera.intrinsics for camera in cameras]).astype(np.float32),
+            "neighbors": np.ascontiguousarray(neighbors, np.int32),
+            "between": (poses[neighbors] @ back[:, None]).astype(np.float32),
+        }
+        return PhotoSet(**{name: torch.from_numpy(values).to(device) for name, values in given.items()})
+
+
+@torch.no_grad()
+def matching_costs(photos: PhotoSet, pixels: Tensor, depths: Tensor) -> Tensor:
+    """[N, D] in [0, 0.25]: how unlike the photos are where pixels [N, 3] (view, column, row; int32) would be at depths
+    [N, D] (float32, along the axis); 0.5 where fewer than two neighbors show the place."""
+    costs = torch.empty_like(depths)
+    given = photos.codes, photos.offsets, photos.sizes, photos.intrinsics, photos.neighbors, photos.between
+    launch(plane_sweep.sweep, depths.numel(), *given, pixels.contiguous(), depths.contiguous(), costs)
+    return costs

@@ -1,0 +1,59 @@
+"""New Gaussians where the photos are explained worst, at the depths that the photos agree on."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..field.gaussians import HARMONIC_0
+from ..field.radiance_field import RadianceField
+from .matching import Matcher
+from .targets import TrainingView
+
+VIEWS = 2  # Photos that are looked at for each change
+MOST = 500  # Gaussians that are born at a change
+OPACITY = 0.5  # Of one that is born: it must be seen to be shaped
+LEAST_ERROR = 0.02  # Mean difference of encoded values from which a pixel is not explained
+
+
+@torch.no_grad()
+def born_rows(
+    field: RadianceField, matcher: Matcher, views: Sequence[TrainingView], count: int, degree: int, seed: int
+) -> dict[str, Tensor]:
+    """Rows of up to `count` Gaussians, as Gaussians.append takes them: of pixels drawn by the square of their error.
+
+    matcher: of the photos in `views`. degree: of the harmonics that renders take. The same seed gives the same rows.
+    """
+    rng = np.random.default_rng(seed)
+    chosen = rng.permutation(len(views))[:VIEWS]
+    pixels = [_unexplained(field, matcher, views[k], int(k), min(count, MOST) // VIEWS, degree, rng) for k in chosen]
+    found = matcher.match(torch.cat(pixels))
+    start = torch.from_numpy(field.color_model.start(found.colors.cpu().numpy(), field.response))
+    rest = field.gaussians.harmonics_rest
+    count = len(found.points)
+    return {
+        "means": found.points,
+        "log_scales": found.footprints.log()[:, None].repeat(1, 3),
+        "quaternions": rest.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        "opacity_logits": rest.new_full((count,), math.log(OPACITY / (1 - OPACITY))),
+        "harmonics_dc": (start / HARMONIC_0).to(rest)[:, None, :],
+        "harmonics_rest": rest.new_zeros(count, *rest.shape[1:]),
+    }
+
+
+def _unexplained(field, matcher: Matcher, view: TrainingView, index: int, count: int, degree: int, rng) -> Tensor:
+    """[up to count, 3] pixels of a photo, as the matcher takes them."""
+    photo = field.photograph(view.camera, view.exposure_time, degree=degree).encoded.clamp(0, 1)
+    error = (photo - view.target.encoded).abs().mean(2, keepdim=True)
+    if view.target.mask is not None:
+        error = error * view.target.mask
+    steps = torch.where(error > LEAST_ERROR, error, 0.0).square().double().flatten().cumsum(0)
+    uniform = torch.from_numpy(rng.random(count)).to(steps)
+    place = torch.searchsorted(steps, uniform * steps[-1]).clamp_max(len(steps) - 1)
+    width, height = view.camera.width, view.camera.height
+    ratio = matcher.sizes[index] / matcher.sizes.new_tensor([width, height])
+    column_and_row = torch.stack([place % width, place // width], 1).add(0.5) * ratio
+    pixels = torch.cat([torch.full_like(place[:, None], index), column_and_row.long()], 1).int()
+    return pixels[matcher.inside(pixels) & (steps[-1] > 0)]

@@ -1,0 +1,185 @@
+"""Points of the surfaces that photos show, found by comparing photos: a plane sweep for pixels chosen one by one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from ..response import Response
+from ..scene import Camera, View, codes_of
+from ..splatting.plane_sweep import BORDER, NEIGHBORS, PhotoSet, matching_costs
+
+LARGEST_SIDE = 800  # Photos are matched at this size at most: depths need no more pixels
+PLANES = 48, 256  # Fewest and most depths that are tried; within these they are a pixel of parallax apart
+WORST_COST = 0.05  # A match whose encoded colors differ by more, in the mean, is none
+MARGIN = 1.3, 0.004  # Depths whose costs are below so many times the least, and so much, are as good
+FEW, WIDEST = 6, 1.2  # Depths that are as good are so few, or within this factor, or nothing is known
+LEAST_COSINE = 0.5  # Of the angle between the axes of two photos that are compared
+FLAT, STEEPEST, WHITE = 0.5, 4.0, 250
+"""Of a pixel's chance to be chosen: gradients count up to STEEPEST times their mean, a code from WHITE on as much, and
+FLAT is added."""
+PROBES = 1500  # Pixels that tell how far away things are
+FEWEST_FOUND = 50  # With fewer of them found, the range is guessed
+RANGE = 0.1, 30.0  # Depths at which they are looked for, and where nothing is found GUESS, in units of the focus
+GUESS = 0.25, 8.0
+SLACK = 0.6, 2.0  # Around the range of those found
+ALIKE = 0.05  # Photos whose exposures differ by less, in stops, are compared as they are
+CHUNK = 1 << 22  # Costs held at one time
+
+
+@dataclass(frozen=True)
+class Matches:
+    """points: [M, 3] world coordinates; colors: [M, 3] in [0, 1], encoded as the photos that show them; footprints: [M]
+    what a pixel of the photo covers there, world units. All float32 on the matcher's device."""
+
+    points: Tensor
+    colors: Tensor
+    footprints: Tensor
+
+
+class Matcher:
+    """Finds depths for pixels of posed photos.
+
+    views: two or more. response: by which photos of differing exposure are made comparable. focus: about how far away
+        things are, world units.
+    """
+
+    def __init__(self, views: Sequence[View], response: Response, focus: float, device: torch.device | str):
+        base = float(np.median([view.exposure_time for view in views]))
+        self._images, cameras = zip(*(_matchable(view, response, base) for view in views), strict=True)
+        self._masks = [view.mask for view in views]
+        self.device = torch.device(device)
+        neighbors = _neighbors(cameras)
+        self._photos = PhotoSet.of(self._images, cameras, neighbors, device)
+        self.sizes = self._photos.sizes
+        """[V, 2] int32: width and height at which the photos are matched."""
+        poses = np.stack([camera.camera_to_world for camera in cameras])
+        self._poses = torch.tensor(poses, dtype=torch.float32, device=device)
+        self._set_depths(np.geomspace(focus * RANGE[1], focus * RANGE[0], PLANES[1]))
+        found = self.match(self.pixels(PROBES, np.random.default_rng(0))).footprints * float(cameras[0].fx)
+        near, far = (part * focus for part in GUESS)
+        if len(found) >= FEWEST_FOUND:
+            near, far = (float(found.quantile(part)) * slack for part, slack in zip((0.01, 0.99), SLACK, strict=True))
+        planes = int(np.clip(_parallax(cameras, neighbors, near, far), *PLANES))
+        self._set_depths(1 / np.linspace(1 / far, 1 / near, planes))
+
+    def _set_depths(self, depths: np.ndarray) -> None:
+        self._depths = torch.tensor(depths, dtype=torch.float32, device=self.device)
+
+    def pixels(self, count: int, rng: np.random.Generator) -> Tensor:
+        """[about count, 3] int32: view, column and row of pixels all over the photos, one for each square of equal
+        size, drawn by their gradients and light: edges can be matched, and lamps are small."""
+        side = max(1.0, (sum(image.shape[0] * image.shape[1] for image in self._images) / count) ** 0.5)
+        chosen = [
+            _one_for_each_square(_chances(image, mask), side, rng, index)
+            for index, (image, mask) in enumerate(zip(self._images, self._masks, strict=True))
+        ]
+        return torch.from_numpy(np.concatenate(chosen).astype(np.int32)).to(self.device)
+
+    def inside(self, pixels: Tensor) -> Tensor:
+        """[N] whether pixels [N, 3] are far enough from the borders of their photos to be matched."""
+        column_and_row, sizes = pixels[:, 1:], self.sizes[pixels[:, 0].long()]
+        return ((column_and_row >= BORDER) & (column_and_row < sizes - BORDER)).all(1)
+
+    @torch.no_grad()
+    def match(self, pixels: Tensor) -> Matches:
+        """The points that pixels [N, 3] show, of those whose depth the photos agree on."""
+        parts = [self._depth(part) for part in pixels.split(max(1, CHUNK // len(self._depths)))]
+        depth = torch.cat(parts) if parts else self._depths[:0]
+        pixels, depth = pixels[depth > 0].long(), depth[depth > 0]
+        view, column, row = pixels.unbind(1)
+        fx, fy, cx, cy = self._photos.intrinsics[view].unbind(1)
+        local = (
+            torch.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, torch.ones_like(depth)], 1) * depth[:, None]
+        )
+        pose = self._poses[view]
+        points = (pose[:, :3, :3] @ local[:, :, None])[:, :, 0] + pose[:, :3, 3]
+        place = self._photos.offsets[view] + 3 * (row * self.sizes[view, 0] + column)
+        colors = self._photos.codes[place[:, None] + torch.arange(3, device=self.device)].float() / 255
+        return Matches(points, colors, depth / fx)
+
+    def _depth(self, pixels: Tensor) -> Tensor:
+        """[N] depths of pixels, between planes; 0 where none is to be trusted."""
+        costs = matching_costs(self._photos, pixels, self._depths.expand(len(pixels), -1))
+        planes, place = costs.shape[1], torch.arange(costs.shape[1], device=costs.device)
+        least = costs.min(1)
+        close = costs < MARGIN[0] * least.values[:, None] + MARGIN[1]
+        first, last = torch.where(close, place, planes).amin(1), torch.where(close, place, -1).amax(1)
+        near, far = (1 / self._depths)[last.clamp_min(0)], (1 / self._depths)[first.clamp_max(planes - 1)]
+        narrow = (last - first < FEW) | (near < WIDEST * far)
+        middle = least.indices.clamp(1, planes - 2)
+        before, at, after = (costs.gather(1, (middle + k)[:, None])[:, 0] for k in (-1, 0, 1))
+        shift = (0.5 * (before - after) / (before - 2 * at + after).clamp_min(1e-6)).clamp(-0.5, 0.5)
+        neighbor = torch.where(shift > 0, middle + 1, middle - 1)
+        between = torch.lerp(1 / self._depths[middle], 1 / self._depths[neighbor], shift.abs())
+        # Anywhere within a thing of one color is as good: its middle is meant.
+        inverse = torch.where(last - first < FEW, between, 0.5 * (near + far))
+        return torch.where((least.values < WORST_COST) & narrow, 1 / inverse, 0.0)
+
+
+def _matchable(view: View, response: Response, base_time: float) -> tuple[np.ndarray, Camera]:
+    """A photo of 8 bits at the size for matching, as if exposed for base_time seconds, and its camera."""
+    codes, camera = view.codes, view.camera
+    if codes.dtype != np.uint8:
+        codes = codes_of(view.image, 8)
+    if abs(np.log2(view.exposure_time / base_time)) > ALIKE and not response.learnable:
+        light = response.decode(np.linspace(0, 1, 256)) * (base_time / view.exposure_time)
+        codes = codes_of(response.encode(light), 8)[codes]
+    scale = min(1.0, LARGEST_SIDE / max(camera.width, camera.height))
+    if scale < 1:
+        size = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+        codes, camera = np.asarray(Image.fromarray(codes).resize(size, Image.Resampling.BOX)), camera.resized(*size)
+    return codes, camera
+
+
+def _chances(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """[H, W] how likely each pixel is to be chosen, up to a factor; 0 where it cannot be matched or does not count."""
+    grey = image.astype(np.float32).mean(2)
+    chance = np.zeros_like(grey)
+    if min(grey.shape) < 2 * BORDER + 2:
+        return chance
+    steep = np.abs(np.gradient(grey)).sum(0)
+    steep = np.minimum(steep / max(float(steep.mean()), 1e-6), STEEPEST) + FLAT
+    steep[image.max(2) >= WHITE] += STEEPEST
+    if mask is not None:
+        size = grey.shape[1], grey.shape[0]
+        steep *= np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.BOX)) > 0.5
+    inside = slice(BORDER, -BORDER), slice(BORDER, -BORDER)
+    chance[inside] = steep[inside]
+    return chance
+
+
+def _one_for_each_square(chance: np.ndarray, side: float, rng: np.random.Generator, view: int) -> np.ndarray:
+    """[N, 3] view, column, row: from each square of a photo one pixel, drawn in proportion to its chance."""
+    row, column = np.indices(chance.shape).reshape(2, -1)
+    square = (row // side) * np.ceil(chance.shape[1] / side) + column // side
+    chance = chance.ravel()
+    with np.errstate(divide="ignore"):
+        # The largest power u^(1 / chance) of a uniform u is drawn so (Efraimidis and Spirakis 2006).
+        key = np.log(rng.random(len(chance))) / chance
+    order = np.lexsort((key, square))
+    last = order[np.append(np.diff(square[order]) != 0, True)]
+    last = last[chance[last] > 0]
+    return np.stack([np.full_like(last, view), column[last], row[last]], 1)
+
+
+def _neighbors(cameras: Sequence[Camera]) -> np.ndarray:
+    """[V, NEIGHBORS] the nearest cameras that look the same way, -1 where there are no more."""
+    positions = np.stack([camera.position for camera in cameras])
+    axes = np.stack([camera.world_to_camera[2, :3] for camera in cameras])
+    distance = np.linalg.norm(positions[:, None] - positions, axis=2)
+    distance[(axes @ axes.T < LEAST_COSINE) | (distance == 0)] = np.inf
+    nearest = np.argsort(distance, axis=1, kind="stable")[:, :NEIGHBORS]
+    return np.where(np.isfinite(np.take_along_axis(distance, nearest, 1)), nearest, -1).astype(np.int32)
+
+
+def _parallax(cameras: Sequence[Camera], neighbors: np.ndarray, near: float, far: float) -> float:
+    """Pixels that the nearest and the farthest depth are apart in a neighbor, in the median; 0 without neighbors."""
+    positions = np.stack([camera.position for camera in cameras])
+    focal = np.array([camera.fx for camera in cameras])
+    apart = np.linalg.norm(positions[:, None] - positions[neighbors], axis=2) * focal[:, None]
+    apart = apart[neighbors >= 0]
+    return float(np.median(apart)) * (1 / near - 1 / far) if len(apart) else 0.0

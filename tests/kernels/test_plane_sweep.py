@@ -1,0 +1,72 @@
+"""Costs of the plane sweep against the same sums in float64 NumPy."""
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.scene import Camera
+from sehdr_warp.scene.camera import look_at
+from sehdr_warp.splatting.plane_sweep import PhotoSet, matching_costs
+
+SIZES = [(23, 17), (20, 20), (31, 12)]
+NEIGHBORS = np.array([[1, 2], [0, 2], [0, -1]])
+
+
+@pytest.fixture(scope="module")
+def photos():
+    rng = np.random.default_rng(0)
+    cameras = [
+        Camera(w, h, 20.0 + k, 21.0, w / 2, h / 2, look_at((0.3 * k, -0.1 * k, 0), (0.05 * k, 0, 3), (0, -1, 0)))
+        for k, (w, h) in enumerate(SIZES)
+    ]
+    return [rng.integers(0, 256, (h, w, 3), dtype=np.uint8) for w, h in SIZES], cameras
+
+
+def reference(images, cameras, pixel, depth) -> float:
+    view, column, row = pixel
+    own, costs = cameras[view], []
+    window = [(x, y) for y in range(-2, 3) for x in range(-2, 3)]
+    values = images[view].astype(float) / 255
+    weights = [np.exp(-np.abs(values[row + y, column + x] - values[row, column]).mean() / 0.1) for x, y in window]
+    for other in NEIGHBORS[view][NEIGHBORS[view] >= 0]:
+        camera, seen, total = cameras[other], images[other].astype(float) / 255, 0.0
+        for (x, y), weight in zip(window, weights, strict=True):
+            ray = [(column + x + 0.5 - own.cx) / own.fx, (row + y + 0.5 - own.cy) / own.fy, 1]
+            world = own.camera_to_world @ np.append(np.multiply(ray, depth), 1)
+            there = (camera.world_to_camera @ world)[:3]
+            u, v = camera.fx * there[0] / there[2] + camera.cx - 0.5, camera.fy * there[1] / there[2] + camera.cy - 0.5
+            if there[2] <= 0 or not (0 <= u < camera.width - 1 and 0 <= v < camera.height - 1):
+                break
+            left, top = int(u), int(v)
+            a, b = u - left, v - top
+            color = (1 - b) * ((1 - a) * seen[top, left] + a * seen[top, left + 1])
+            color += b * ((1 - a) * seen[top + 1, left] + a * seen[top + 1, left + 1])
+            total += weight * min(np.abs(color - values[row + y, column + x]).mean(), 0.25)
+        else:
+            costs.append(total / sum(weights))
+    return float(np.mean(sorted(costs)[: max(2, (len(costs) + 1) // 2)])) if len(costs) > 1 else 0.5
+
+
+def test_costs_are_the_reference(photos, device):
+    images, cameras = photos
+    pixels = [(0, 11, 8), (0, 4, 5), (0, 20, 14), (1, 10, 9), (1, 2, 2), (2, 15, 6)]
+    depths = [0.4, 1.0, 2.0, 5.0, 40.0]
+    expected = [[reference(images, cameras, pixel, depth) for depth in depths] for pixel in pixels]
+    given = torch.tensor(pixels, dtype=torch.int32, device=device), torch.tensor(depths, device=device).repeat(6, 1)
+    costs = matching_costs(PhotoSet.of(images, cameras, NEIGHBORS, device), *given)
+    np.testing.assert_allclose(costs.cpu(), expected, atol=2e-5)
+    # Places that two neighbors see, and places that they do not, are both among them; the last view has one neighbor.
+    assert 0.5 in costs[0] or 0.5 in costs[1]
+    assert (costs[:5] < 0.5).any() and (costs[5] == 0.5).all()
+
+
+@pytest.mark.parametrize("depth", [1e-30, 1e30, float("inf"), float("nan"), 0.0, -1.0])
+def test_impossible_depths_cost_what_is_not_seen(photos, device, depth):
+    images, cameras = photos
+    pixels = torch.tensor([[0, 11, 8]], dtype=torch.int32, device=device)
+    cost = float(
+        matching_costs(
+            PhotoSet.of(images, cameras, NEIGHBORS, device), pixels, torch.full((1, 1), depth, device=device)
+        )
+    )
+    assert 0 <= cost <= 0.25 or cost == 0.5

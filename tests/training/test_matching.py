@@ -1,0 +1,114 @@
+"""Points matched between photos lie on what the photos show, and errors are where Gaussians are born."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.response import response_by_name
+from sehdr_warp.training.births import born_rows
+from sehdr_warp.training.config_files import load_config
+from sehdr_warp.training.initialization import make_field, make_matcher, start_count, start_points
+from sehdr_warp.training.targets import training_views
+from sehdr_warp.training.train import train
+
+from .wall_and_lamp import LAMP, WALL, wall_and_lamp
+
+LINEAR = response_by_name("linear")
+
+
+def matched(scene, device, count=1500):
+    matcher = make_matcher(scene, LINEAR, device)
+    return matcher.match(matcher.pixels(count, np.random.default_rng(0)))
+
+
+@pytest.mark.parametrize("times", [(1.0,), (1.0, 0.5, 0.7)], ids=["one exposure", "exposures that drift"])
+def test_matched_points_lie_on_wall_and_lamp(device, times):
+    found = matched(wall_and_lamp(times), device)
+    depth, white = found.points[:, 2].cpu().numpy(), (found.colors > 0.99).all(1).cpu().numpy()
+    assert len(depth) > 600
+    assert (np.abs(depth[~white] - WALL) < 0.1 * WALL).mean() > 0.9
+    if len(times) == 1:
+        assert white.sum() >= 5 and (np.abs(depth[white] - LAMP) < 0.1 * LAMP).mean() > 0.8
+    np.testing.assert_allclose(found.footprints.cpu(), depth / 70, rtol=1e-4)
+
+
+def test_points_that_mislead_do_no_harm(device):
+    """Behind the cameras, all in one place, or far beyond: depths come from the photos."""
+    scene, rng = wall_and_lamp(), np.random.default_rng(0)
+    clouds = rng.normal(0, 1, (200, 3)) - [0, 0, 5], np.tile([0.0, 0.0, 3.0], (200, 1)), rng.normal(0, 9, (200, 3)) + 40
+    for points in clouds:
+        found = matched(replace(scene, points=points, point_colors=np.full(points.shape, 0.5, np.float32)), device)
+        depth = found.points[:, 2]
+        assert len(depth) > 400 and ((depth - WALL).abs() < 0.1 * WALL).float().mean() > 0.8
+
+
+def test_pixels_repeat_and_avoid_borders_and_masks(device):
+    scene = wall_and_lamp()
+    mask = np.zeros((64, 64), np.float32)
+    mask[:, 32:] = 1
+    matcher = make_matcher(
+        replace(scene, views=tuple(replace(view, mask=mask) for view in scene.views)), LINEAR, device
+    )
+    pixels, again = (matcher.pixels(500, np.random.default_rng(1)) for _ in range(2))
+    assert torch.equal(pixels, again) and matcher.inside(pixels).all() and (pixels[:, 1] >= 32).all()
+    assert 150 < len(pixels) < 500 and set(pixels[:, 0].tolist()) == set(range(9))
+
+
+def test_start_points_are_the_scenes_and_matched_ones():
+    scene, config = wall_and_lamp(), load_config("default", {"model.initial_density": 4.0})
+    assert start_count(config, 9 * 64 * 64) == 768
+    own = np.array([[0.0, 0.0, 3.0]] * 300)
+    given = replace(scene, points=own, point_colors=np.full((300, 3), 0.5, np.float32))
+    points, colors = start_points(given, config, LINEAR, "cpu", np.random.default_rng(0))
+    assert 300 < len(points) == len(colors) <= 800 and np.array_equal(points[:300], own)
+    none = load_config("default", {"model.initial_density": 0.0})
+    assert len(start_points(given, none, LINEAR, "cpu", np.random.default_rng(0))[0]) == 300
+    # Without any, they are drawn where cameras look.
+    assert len(start_points(scene, none, LINEAR, "cpu", np.random.default_rng(0))[0]) == 5000
+
+
+def test_gaussians_are_born_where_the_photos_are_not_explained(device):
+    """A field that shows the wall alone: what is born is the lamp."""
+    scene = wall_and_lamp()
+    config = load_config("default", {"densification.births": 0.5, "schedule.iterations": 300})
+    dark = [replace(v, codes=np.where(v.codes.min(2, keepdims=True) > 250, np.uint8(77), v.codes)) for v in scene.views]
+    wall = replace(scene, views=tuple(dark))
+    field = make_field(wall, config, LINEAR, device)
+    views = training_views(scene.train_views, field.base_time, device, truth=False)
+    matcher = make_matcher(scene, LINEAR, device)
+    with torch.no_grad():
+        # Opaque, so that the wall is explained from the start.
+        field.gaussians.opacity_logits.fill_(4.0)
+    rows = born_rows(field, matcher, views, 200, 0, seed=3)
+    again = born_rows(field, matcher, views, 200, 0, seed=3)
+    assert all(torch.equal(values, again[name]) for name, values in rows.items())
+    white = rows["harmonics_dc"].amax((1, 2)) == rows["harmonics_dc"].max()
+    depth = rows["means"][white, 2]
+    assert white.float().mean() > 0.3 and ((depth - LAMP).abs() < 0.15 * LAMP).float().mean() > 0.6
+    assert {name: tuple(values.shape[1:]) for name, values in rows.items()} == {
+        name: tuple(values.shape[1:]) for name, values in field.gaussians.tensors().items()
+    }
+
+
+def test_a_scene_of_two_photos_or_of_none_that_match_still_starts(tmp_path):
+    scene = wall_and_lamp()
+    two = replace(scene, views=scene.views[:2])
+    config = load_config("default", {"schedule.iterations": 3, "plan.enabled": False, "response.name": "linear"})
+    assert train(two, tmp_path / "two", config, device="cpu").summary()["iteration"] == 3
+    rng = np.random.default_rng(0)
+    noise = tuple(replace(v, codes=rng.integers(0, 256, v.codes.shape, dtype=np.uint8)) for v in scene.views)
+    assert train(replace(scene, views=noise), tmp_path / "noise", config, device="cpu").summary()["iteration"] == 3
+
+
+def test_back_to_back_photos_are_refused(tmp_path):
+    scene = wall_and_lamp()
+    turned = scene.views[1].camera.world_to_camera.copy()
+    turned[[0, 2]] *= -1
+    other = replace(scene.views[1], camera=replace(scene.views[1].camera, world_to_camera=turned))
+    two = replace(scene, views=(scene.views[0], other))
+    config = load_config("default", {"plan.enabled": False, "response.name": "linear"})
+    with pytest.raises(SehdrError, match="no two training cameras"):
+        train(two, tmp_path / "run", config, device="cpu")
