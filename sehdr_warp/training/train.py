@@ -14,6 +14,7 @@ from ..errors import InputError, SehdrError
 from ..evaluation.metrics import psnr
 from ..evaluation.protocols import normalise, tone_map
 from ..field.radiance_field import RadianceField
+from ..field.unexplained import MOST_NAMED, told, unexplained_regions
 from ..scene import Scene, View
 from ..splatting.memory import memory_told
 from .config import Config
@@ -163,6 +164,7 @@ class Training:
             self._run = None
             run = self.run
             self.folder.write_confidence(run.measure_confidence(self.scene), run.checkpoint_hash)
+            self._tell_unexplained(run)
 
     def _step(self) -> Step:
         before = self.seconds
@@ -218,6 +220,19 @@ class Training:
             log.warning(told, best[1], best[0], scores[-1][0])
         if self._writer is not None:
             self._writer.close()
+
+    def _tell_unexplained(self, run: Run) -> None:
+        """Compares the training photos with the scene, and names what is missing in the summary and in a line."""
+        regions = unexplained_regions(run.model, self.scene.train_views, degree=run.degree)
+        self.folder.write_summary(run.summary() | {"unexplained": told(regions)})
+        if regions:
+            worst, photos = regions[0], len({region.photo for region in regions})
+            log.warning(
+                "%d regions in %d photos are not explained by the scene; the worst: %s at column %.0f, row %.0f, "
+                "%d pixels %.1f stops %s than the photo (summary.json names %d)",
+                *(len(regions), photos, worst.photo, worst.column, worst.row, worst.pixels, abs(worst.stops)),
+                *("darker" if worst.stops > 0 else "brighter", min(len(regions), MOST_NAMED)),
+            )
 
     def _evaluate(self) -> None:
         if not self.scene.test_views:

@@ -1,0 +1,65 @@
+"""What photos show and a trained scene does not: regions whose light is off by a stop and more."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import torch
+from scipy import ndimage
+
+from ..response import Response
+from ..scene import View
+from .confidence import MOST_VIEWS
+from .radiance_field import RadianceField
+
+LEAST_STOPS, LEAST_CODE = 1.0, 0.1  # A pixel is off by both: noise is stops in the dark, and little light in the bright
+LEAST_PIXELS = 6
+MOST_NAMED = 20
+
+
+@dataclass(frozen=True)
+class Region:
+    """photo: the view's name. column, row: of the region's middle; pixels: its area; at the size of training. stops: by
+    how much the photo is brighter than the scene, in the mean; where the photo is clipped, at least."""
+
+    photo: str
+    column: float
+    row: float
+    pixels: int
+    stops: float
+
+
+@torch.no_grad()
+def unexplained_regions(field: RadianceField, views: Sequence[View], *, degree: int | None = None) -> list[Region]:
+    """Of up to 200 photos, evenly chosen, the regions of LEAST_PIXELS and more that a field shows otherwise, the worst
+    first: by area times stops. Lines a pixel wide, as edges leave them, are none."""
+    found = []
+    for view in views[:: -(-len(views) // MOST_VIEWS) or 1]:
+        exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time
+        stops, code = _differences(view, exposure, field.response)
+        off = (np.abs(stops) >= LEAST_STOPS) & (code >= LEAST_CODE)
+        labels, _ = ndimage.label(ndimage.binary_opening(off, np.ones((2, 2))), np.ones((3, 3)))
+        for index, place in enumerate(ndimage.find_objects(labels), start=1):
+            row, column = np.nonzero(labels[place] == index)
+            if len(row) >= LEAST_PIXELS:
+                mean = float(stops[place][row, column].mean())
+                x, y = column.mean() + place[1].start + 0.5, row.mean() + place[0].start + 0.5
+                found.append(Region(view.name, round(float(x), 1), round(float(y), 1), len(row), round(mean, 2)))
+    return sorted(found, key=lambda region: -region.pixels * abs(region.stops))
+
+
+def _differences(view: View, exposure: torch.Tensor, response: Response) -> tuple[np.ndarray, np.ndarray]:
+    """[H, W] stops by which the photo is brighter, of the channels' mean, and the largest difference of encoded values;
+    none where the photo is clipped and the scene at white, or the photo does not count."""
+    photo = torch.from_numpy(view.image).to(exposure.device)
+    shown = response.encode_extended(exposure).clamp(0, 1)
+    light = [response.decode(encoded).mean(2).clamp_min(1e-9) for encoded in (photo, shown)]
+    stops, code = (light[0] / light[1]).log2(), (photo - shown).abs().amax(2)
+    counted = 1.0 if view.mask is None else view.mask > 0.5
+    return stops.cpu().numpy() * counted, code.cpu().numpy()
+
+
+def told(regions: Sequence[Region]) -> dict:
+    """Plain values for summary.json: counts, and the worst regions."""
+    photos = len({region.photo for region in regions})
+    return {"regions": len(regions), "photos": photos, "worst": [asdict(region) for region in regions[:MOST_NAMED]]}
