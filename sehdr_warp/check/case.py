@@ -8,6 +8,7 @@ passes if its error stays within it. Nothing of the kernel's own result enters i
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -15,17 +16,13 @@ from torch import Tensor
 UNIT = 2.0**-24
 TINY = torch.finfo(torch.float32).tiny
 """float32's unit of rounding, and its smallest normal number."""
-ROUNDINGS = 8
-"""Roundings allowed between two interfaces: the longest chain of operations there, project(), has about 40 in a row,
-whose errors partly cancel."""
-DRAWS = 4
-"""Random disturbances; the bound is twice the largest effect among them, plus ROUNDINGS units of the result itself."""
+ROUNDINGS = 8  # Between two interfaces: project(), the longest chain, has about 40 in a row, which partly cancel
+DRAWS = 4  # The bound is twice the largest effect of so many disturbances, plus ROUNDINGS units of the result itself
 
 
 @dataclass(frozen=True)
 class Reading:
-    """One measured quantity. error and bound in the same unit, relative to the truth's norm where not said otherwise;
-    an error that is not finite fails."""
+    """One measured quantity. error and bound in one unit, relative to the truth's norm where not said otherwise."""
 
     quantity: str
     error: float
@@ -33,7 +30,7 @@ class Reading:
 
     @property
     def holds(self) -> bool:
-        return self.error <= self.bound
+        return self.error <= self.bound  # as NaN is not
 
 
 @dataclass(frozen=True)
@@ -43,23 +40,22 @@ class Case:
 
     name: str
     what: str
-    measure: Callable[[torch.device], list[Reading]]
+    measure: Callable[[torch.device], Iterable[Reading]]
     quick: bool = True
     note: str = ""
 
 
-class _Disturb(torch.autograd.Function):
+def _disturbed(values: Tensor, generator: torch.Generator) -> Tensor:
     """x (1 + r) forwards and g (1 + r') backwards, r uniform within ROUNDINGS units."""
 
-    @staticmethod
-    def forward(ctx, x, generator):
-        ctx.generator = generator
-        noise = torch.rand(x.shape, generator=generator, dtype=torch.float64)
-        return x * (1 + (2 * noise - 1) * (ROUNDINGS * UNIT))
+    def factor(of: Tensor) -> Tensor:
+        noise = torch.rand(of.shape, generator=generator, dtype=torch.float64)
+        return 1 + (2 * noise - 1) * (ROUNDINGS * UNIT)
 
-    @staticmethod
-    def backward(ctx, gradient):
-        return _Disturb.apply(gradient, ctx.generator), None
+    moved = values + values.detach() * (factor(values) - 1)
+    if moved.requires_grad:
+        moved.register_hook(lambda gradient: gradient * factor(gradient))
+    return moved
 
 
 def as_float32(tensors: Iterable[Tensor]) -> list[Tensor]:
@@ -73,7 +69,7 @@ def _results(function, tensors: list[Tensor], wanted: dict[str, int]) -> dict[st
     leaves = [t.detach().clone().requires_grad_(i in wanted.values()) for i, t in enumerate(tensors)]
     outputs = function(*leaves)
     if wanted:
-        total = 0.0
+        total = torch.zeros(())
         for seed, out in enumerate(outputs.values(), 7):
             weights = torch.rand(out.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
             total = total + (out * (0.5 + weights).to(out)).sum()
@@ -113,10 +109,10 @@ def compare(
 
     def run(draw: int) -> dict[str, Tensor]:
         generator = torch.Generator().manual_seed(draw)
-        disturb = (lambda x: _Disturb.apply(x, generator)) if draw else lambda x: x
-        return _results(lambda *t: truth(disturb, *map(disturb, t)), values, wanted)
+        disturb = partial(_disturbed, generator=generator) if draw else lambda x: x
+        return _results(lambda *t: by_stages(disturb, *map(disturb, t)), values, wanted)
 
-    truth = truth or (lambda _, *t: function(*t))
+    by_stages = truth or (lambda _, *t: function(*t))
     names, values = list(tensors), as_float32(tensors.values())
     wanted = {name: names.index(name) for name in gradients}
     ours = _results(function, [v.to(device, torch.float32) for v in values], wanted)
@@ -133,6 +129,6 @@ def count(quantity: str, wrong: int | Tensor) -> Reading:
     return Reading(quantity, float(wrong), 0.0)
 
 
-def not_finite(*tensors: Tensor) -> int:
-    """How many numbers of the tensors are NaN or infinite."""
-    return sum(int((~torch.isfinite(t.detach())).sum()) for t in tensors)
+def not_finite(*tensors: Tensor | None) -> int:
+    """How many numbers of the tensors that there are are NaN or infinite."""
+    return sum(int((~torch.isfinite(t.detach())).sum()) for t in tensors if t is not None)

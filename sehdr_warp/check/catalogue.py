@@ -11,7 +11,7 @@ from ..errors import SehdrError
 from ..response import response_by_name
 from .case import Case, Reading
 from .light_cases import LIGHT_CASES, encode_readings
-from .splat_cases import POISON_CASES, SPLAT_CASES, Splats, compare_splat, overlap
+from .splat_cases import POISON_CASES, SPLAT_CASES, Splats, compare_splats, overlap
 from .training_cases import TRAINING_CASES
 
 LOG = logging.getLogger(__name__)
@@ -45,7 +45,7 @@ def run_cases(cases: Sequence[tuple[str, Case]], device: torch.device) -> list[d
     try:
         for group, case in cases:
             started = time.perf_counter()
-            readings = case.measure(device)
+            readings = list(case.measure(device))
             row = {"case": case.name, "group": group, "what": case.what, "note": case.note or None}
             row |= {"seconds": round(time.perf_counter() - started, 3), "holds": all(r.holds for r in readings)}
             rows.append(row | {"readings": [vars(reading) | {"holds": reading.holds} for reading in readings]})
@@ -64,10 +64,10 @@ def _number(value: float) -> str:
     return f"{value:9.0f}" if math.isfinite(value) and value == int(value) and value < 1e6 else f"{value:9.1e}"
 
 
-def _radiance_range(decades: float, device) -> list[Reading]:
-    splats = Splats(40, spread=1.0).lit(-0.5 * decades, 0.5 * decades)
+def _radiance_range(decades: float) -> Splats:
+    splats = Splats(40, spread=1.0, radiance=(-0.5 * decades, 0.5 * decades))
     splats.opacities *= 0.5
-    return compare_splat(splats, device)
+    return splats
 
 
 def _exposure(stops: float, device) -> list[Reading]:
@@ -78,12 +78,14 @@ def _exposure(stops: float, device) -> list[Reading]:
 
 SWEEPS = (
     ("length of a needle / its thickness", tuple(10.0**k for k in range(8)),
-     lambda ratio, device: compare_splat(Splats(24).scaled(1.0, 1 / ratio, 1.3 / ratio), device),
+     lambda ratio, device: compare_splats(Splats(24, scales=(1.0, 1 / ratio, 1.3 / ratio)), device),
      ("image", "d/d log_scales", "d/d quaternions")),
-    ("decades of radiance within the image", tuple(range(0, 29, 4)), _radiance_range,
+    ("decades of radiance within the image", tuple(range(0, 29, 4)),
+     lambda decades, device: compare_splats(_radiance_range(decades), device),
      ("image", "d/d opacities", "d/d features")),
     ("Gaussians behind each other", (10, 30, 100, 300, 1000, 3000, 10_000, 30_000),
-     lambda number, device: overlap(number, 5.0 / number, 1e-7)(device),  # together they cover a pixel to 1 - e^-5
+     # Together they cover a pixel to 1 - e^-5.
+     lambda number, device: compare_splats(overlap(number, 5.0 / number, 1e-7), device),
      ("image", "d/d opacities", "d/d features")),
     ("stops of exposure", tuple(range(-24, 25, 4)), _exposure,
      ("srgb f", "gamma-2.2 f", "hdr-nerf f", "aces f")),

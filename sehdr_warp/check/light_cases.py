@@ -1,13 +1,14 @@
 """The catalogue's light: exposures, responses, logarithms, fusion, losses and similarity."""
 
 import math
-from types import SimpleNamespace
+from functools import partial
 
 import numpy as np
 import torch
 
 from ..field.color_models import EXPOSURE_FLOOR
 from ..field.fusion import NeuralExposureFusion
+from ..field.radiance_field import Photograph
 from ..response import Response, response_by_name
 from ..response.table import TabulatedResponse
 from ..splatting import ssim
@@ -39,8 +40,8 @@ def _response_readings(curve: Response, device, exposures, **options) -> list[Re
 def _exposures(device):
     """Radiance 1 photographed for 2^-24 to 2^24 seconds, half-way between whole stops, by every curve."""
     times = 2.0 ** torch.arange(-24.0, 24.0, 0.37, dtype=torch.float64)
-    curves = map(response_by_name, CURVES)
-    return [reading for curve in curves for reading in _response_readings(curve, device, times, gradients=("x",))]
+    for curve in map(response_by_name, CURVES):
+        yield from _response_readings(curve, device, times, gradients=("x",))
 
 
 def _odd_responses(device):
@@ -53,13 +54,11 @@ def _odd_responses(device):
         "clipped": (x - 0.2) * 2,
     }
     at = torch.linspace(0.0013, 1.3, 211, dtype=torch.float64)
-    readings = []
     for name, values in curves.items():
         curve = TabulatedResponse(name, x, np.clip(values, 0, 1))
-        readings += _response_readings(curve, device, at)
+        yield from _response_readings(curve, device, at)
         again = curve.decode(curve.encode(at.clamp_max(curve.clip_exposure).to(device, torch.float32)))
-        readings.append(count(f"{name}: not finite after encode and decode", not_finite(again)))
-    return readings
+        yield count(f"{name}: not finite after encode and decode", not_finite(again))
 
 
 def _extremes(device):
@@ -72,67 +71,61 @@ def _extremes(device):
             (slope,) = torch.autograd.grad(value[:-1].sum(), x)
             wrong += not_finite(value[:-1], slope) + int((value < 0).sum())
         wrong += int(((curve.encode(x) > 1) | curve.encode(x).isnan()).sum())
-    return [count("values or derivatives out of range", wrong)]
+    yield count("values or derivatives out of range", wrong)
 
 
 def _zero_radiance(device):
     """A black photo as a start, and fusion of log 0 = -infinity."""
     logs = torch.tensor([[-math.inf] * 3, [-200.0] * 3, [math.log(EXPOSURE_FLOOR)] * 3], device=device)
-    fusion = _fusion(0.2).to(device)
-    wrong = not_finite(fusion.exact(logs), fusion(logs))
+    fusion = _Fusion(0.2).to(device)
+    yield count("not finite in fusion", not_finite(fusion.exact(logs), fusion(logs)))
     decoded = torch.cat([response_by_name(name).decode(torch.zeros(1, device=device)) for name in CURVES])
-    floored = decoded.clamp_min(EXPOSURE_FLOOR).log()
-    return [count("not finite in fusion", wrong), count("not finite in the start's logarithm", not_finite(floored))]
+    yield count("not finite in the start's logarithm", not_finite(decoded.clamp_min(EXPOSURE_FLOOR).log()))
 
 
-def _fusion(sigma: float) -> NeuralExposureFusion:
-    return _Exact(response_by_name("srgb"), BRACKETS, 1.0, width=16, sigma=sigma)
-
-
-class _Exact(NeuralExposureFusion):
+class _Fusion(NeuralExposureFusion):
     """The fusion by its equations, without the table."""
 
     forward = NeuralExposureFusion.exact
 
+    def __init__(self, sigma: float):
+        super().__init__(response_by_name("srgb"), BRACKETS, 1.0, width=16, sigma=sigma)
 
-def _fusion_case(sigma: float, gain: float):
+
+def _fused(sigma: float, gain: float, device):
     """gain: of the last layer: logits reach a tenth of it."""
+    fusion = _Fusion(sigma)
+    generator = torch.Generator().manual_seed(0)
+    log_base = torch.empty(400, 3, dtype=torch.float64).uniform_(-9, 4, generator=generator)
+    last = fusion.weights[1].detach().double() * gain
+    tensors = {"log_base": log_base, "log_sigma": fusion.log_sigma.detach().double(), "last": last}
 
-    def measure(device):
-        fusion = _fusion(sigma)
-        generator = torch.Generator().manual_seed(0)
-        log_base = torch.empty(400, 3, dtype=torch.float64).uniform_(-9, 4, generator=generator)
-        last = fusion.weights[1].detach().double() * gain
-        tensors = {"log_base": log_base, "log_sigma": fusion.log_sigma.detach().double(), "last": last}
+    def fused(log_base, log_sigma, last):
+        """The equations in whichever precision their arguments come."""
+        parameters = {name: value.to(log_base) for name, value in fusion.named_parameters()}
+        parameters |= {"log_sigma": log_sigma, "weights.1": last}
+        return {"fused": torch.func.functional_call(fusion, parameters, (log_base,))}
 
-        def fused(log_base, log_sigma, last):
-            """The equations in whichever precision their arguments come."""
-            parameters = {name: value.to(log_base) for name, value in fusion.named_parameters()}
-            parameters |= {"log_sigma": log_sigma, "weights.1": last}
-            return {"fused": torch.func.functional_call(fusion, parameters, (log_base,))}
-
-        # Each logit is rounded by itself, at its own size; what differs by that much, the softmax sees as a factor.
-        readings = compare(fused, tensors, device, gradients=("last",), extra=ROUNDINGS * UNIT * gain / 10)
-        given = {name: t.to(device, torch.float32).requires_grad_() for name, t in tensors.items()}
-        fused(*given.values())["fused"].sum().backward()
-        return [*readings, count("derivatives not finite", not_finite(*(t.grad for t in given.values())))]
-
-    return measure
+    # Each logit is rounded by itself, at its own size; what differs by that much, the softmax sees as a factor.
+    yield from compare(fused, tensors, device, gradients=("last",), extra=ROUNDINGS * UNIT * gain / 10)
+    given = {name: t.to(device, torch.float32).requires_grad_() for name, t in tensors.items()}
+    fused(*given.values())["fused"].sum().backward()
+    yield count("derivatives not finite", not_finite(*(t.grad for t in given.values())))
 
 
 def _sigma_limits(device):
     """Widths that float32 cannot hold are held at its limits, derivatives stay finite."""
     wrong = 0
     for log_sigma in (-1e3, -80.0, 80.0, 1e3):
-        fusion = _fusion(1.0).to(device)
+        fusion = _Fusion(1.0).to(device)
         with torch.no_grad():
             fusion.log_sigma.fill_(log_sigma)
         log_base = torch.linspace(-9, 4, 300, device=device).reshape(100, 3).requires_grad_()
         value = fusion(log_base)
         value.sum().backward()
-        wrong += not_finite(value, log_base.grad, *(p.grad for p in fusion.parameters() if p.grad is not None))
+        wrong += not_finite(value, log_base.grad, *(p.grad for p in fusion.parameters()))
         wrong += int((value < -1e-6).sum())
-    return [count("not finite or negative", wrong)]
+    yield count("not finite or negative", wrong)
 
 
 def _photos(device):
@@ -140,28 +133,27 @@ def _photos(device):
     noise = torch.rand(24, 20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     spot = torch.zeros_like(noise)
     spot[11, 7] = 1.0
-    readings, tensors = [], {"prediction": 0.05 + 0.9 * noise}
+    tensors = {"prediction": 0.05 + 0.9 * noise}
     for name, photo in (("clipped", torch.ones_like(noise)), ("black", torch.zeros_like(noise)), ("one pixel", spot)):
         given = {"gradients": ("prediction",), "label": f"{name} {{}}"}
-        readings += compare(lambda x, photo=photo: {"loss": _loss(x, photo)}, tensors, device, **given)
+        yield from compare(lambda x, photo=photo: {"loss": _loss(x, photo)}, tensors, device, **given)
     for name, photo, value in (("above white", 1.0, 3.0), ("below black", 0.0, -1.0)):
         prediction = torch.full((8, 8, 3), value, device=device, requires_grad=True)
         _loss(prediction, torch.full((8, 8, 3), photo, device=device)).backward()
-        readings.append(count(f"{name}: pixels that still pull", (prediction.grad != 0).sum()))
-    return readings
+        yield count(f"{name}: pixels that still pull", (prediction.grad != 0).sum())
 
 
 def _loss(prediction, photo):
     """The training's loss between encoded values of a simulated photo [H, W, 3] and a photo of black and white."""
     codes = (255 * photo).to(prediction.device, torch.uint8)
     target = Target(codes, code_scale(255, None, prediction.device, dtype=prediction.dtype))
-    return ldr_loss(SimpleNamespace(encoded=prediction), target, LossConfig())
+    shown = Photograph(prediction, None, None, None)  # pyright: ignore[reportArgumentType]
+    return ldr_loss(shown, target, LossConfig())
 
 
 def _similarity(device):
     """Of 1 x 1, of odd size, of flat, nearly equal and tiny images."""
     generator = torch.Generator().manual_seed(0)
-    readings = []
     for name, shape, change in (
         ("1 x 1", (1, 1, 3), lambda a: (a, 1 - a)),
         ("odd", (13, 7, 3), lambda a: (a, 1 - a)),
@@ -171,8 +163,7 @@ def _similarity(device):
     ):
         a, b = change(torch.rand(shape, generator=generator, dtype=torch.float64))
         given = {"gradients": ("a",), "extra": VARIANCE_ERROR, "label": f"{name} {{}}"}
-        readings += compare(lambda a, b: {"ssim": ssim(a, b)}, {"a": a, "b": b}, device, **given)
-    return readings
+        yield from compare(lambda a, b: {"ssim": ssim(a, b)}, {"a": a, "b": b}, device, **given)
 
 
 LIGHT_CASES = (
@@ -180,10 +171,10 @@ LIGHT_CASES = (
     Case("responses", "flat, steep, noisy and clipped curves", _odd_responses),
     Case("exposure-limits", "zero, denormal, huge and infinite exposures", _extremes),
     Case("log-zero", "the logarithm of zero radiance", _zero_radiance),
-    Case("sigma-small", "fusion with sigma 1e-3", _fusion_case(1e-3, 1.0)),
-    Case("sigma-large", "fusion with sigma 1e3", _fusion_case(1e3, 1.0)),
+    Case("sigma-small", "fusion with sigma 1e-3", partial(_fused, 1e-3, 1.0)),
+    Case("sigma-large", "fusion with sigma 1e3", partial(_fused, 1e3, 1.0)),
     Case("sigma-limits", "fusion with sigma towards 0 and infinity", _sigma_limits),
-    Case("logits", "softmax logits of +-1e4", _fusion_case(1e3, 1e5),
+    Case("logits", "softmax logits of +-1e4", partial(_fused, 1e3, 1e5),
          note="a logit of 1e4 is known to 1e-3 in float32, and the weights of the brackets to no better"),
     Case("photos", "photos all clipped, all black, and with one bright pixel", _photos),
     Case("similarity", "SSIM of flat, equal, opposite and tiny images", _similarity),

@@ -55,15 +55,13 @@ def _state_not_finite(trainer: Trainer) -> int:
 
 def _learning_rates(device):
     """All learning rates times 1, 10, 100 and 1000: the loss relative to the start's, and what stays finite."""
-    readings = []
     for factor in (1, 10, 100, 1000):
         trainer = _trainer(device, **{name: min(1.0, getattr(Config().optimizer, name) * factor) for name in RATES})
         losses = _losses(trainer, STEPS)
-        readings.append(count(f"rates x {factor}: numbers of the state not finite", _state_not_finite(trainer)))
+        yield count(f"rates x {factor}: numbers of the state not finite", _state_not_finite(trainer))
         # At its own rates a training must descend. Far above, the loss of encoded values must stay bounded.
         last = float(np.mean(losses[-8:])) / losses[0]
-        readings.append(Reading(f"rates x {factor}: last loss / first", last, 0.8 if factor == 1 else 3.0))
-    return readings
+        yield Reading(f"rates x {factor}: last loss / first", last, 0.8 if factor == 1 else 3.0)
 
 
 def _gradient_norms(device):
@@ -79,8 +77,9 @@ def _gradient_norms(device):
         gradients = [p.grad for p in field.gaussians.parameters() if p.grad is not None]
         broken += not_finite(*gradients)
         norms[name] = math.sqrt(sum(float(gradient.square().sum()) for gradient in gradients))
-    readings = [Reading(f"{name}: gradient / L1's", norm / norms["L1"], 1e4) for name, norm in norms.items()]
-    return [*readings, count("gradients not finite", broken)]
+    for name, norm in norms.items():
+        yield Reading(f"{name}: gradient / L1's", norm / norms["L1"], 1e4)
+    yield count("gradients not finite", broken)
 
 
 def _scale_ambiguity(device):
@@ -95,10 +94,9 @@ def _scale_ambiguity(device):
         time = EXPOSURE_TIME * factor
         return RadianceField(field.gaussians, field.response, base_time=time).render_ldr(camera, time).double()
 
-    return [
-        Reading(f"photo at base time x {factor:.3g}", float((photo(1.0) - photo(factor)).abs().max()), 2.0**-22)
-        for factor in (2.0**-20, 1e-3, 1e3, 2.0**20)
-    ]
+    for factor in (2.0**-20, 1e-3, 1e3, 2.0**20):
+        error = float((photo(1.0) - photo(factor)).abs().max())
+        yield Reading(f"photo at base time x {factor:.3g}", error, 2.0**-22)
 
 
 def _opacity_reset(device):
@@ -109,28 +107,22 @@ def _opacity_reset(device):
         trainer.field.gaussians.opacity_logits.clamp_(max=math.log(0.01 / 0.99))
         trainer.field.gaussians.forget("opacity_logits", slice(None), trainer.optimizer)
     losses = _losses(trainer, 60)
-    return [
-        count("steps skipped", trainer.skipped_steps),
-        count("numbers of the state not finite", _state_not_finite(trainer)),
-        Reading("worst loss after the reset / before", max(losses) / before, 100.0),
-        Reading("loss 60 steps later / before", float(np.mean(losses[-6:])) / before, 2.0),
-    ]
+    yield count("steps skipped", trainer.skipped_steps)
+    yield count("numbers of the state not finite", _state_not_finite(trainer))
+    yield Reading("worst loss after the reset / before", max(losses) / before, 100.0)
+    yield Reading("loss 60 steps later / before", float(np.mean(losses[-6:])) / before, 2.0)
 
 
 def _clipped_batches(device):
     """No step is lost, and nothing runs away."""
-    readings = []
     for share in (0.5, 0.97):
         trainer = _trainer(device, clipped=share)
         _losses(trainer, STEPS)
         brightest = float(trainer.field.gaussians.harmonics_dc.detach().abs().max())
-        readings += [
-            count(f"{share:.0%} clipped: steps skipped", trainer.skipped_steps),
-            count(f"{share:.0%} clipped: numbers not finite", _state_not_finite(trainer)),
-            # A clipped pixel says `at least white`: from a start near white, 40 steps of 0.02 are the most there is.
-            Reading(f"{share:.0%} clipped: largest coefficient", brightest, 40.0),
-        ]
-    return readings
+        yield count(f"{share:.0%} clipped: steps skipped", trainer.skipped_steps)
+        yield count(f"{share:.0%} clipped: numbers not finite", _state_not_finite(trainer))
+        # A clipped pixel says `at least white`: from a start near white, 40 steps of 0.02 are the most there is.
+        yield Reading(f"{share:.0%} clipped: largest coefficient", brightest, 40.0)
 
 
 def _guard(device):
@@ -148,11 +140,9 @@ def _guard(device):
     skipped, means = trainer.skipped_steps, gaussians.means.clone()
     trainer.step()
     still = bool((means == gaussians.means).all())
-    return [
-        count("numbers changed by a step that is not finite", changed),
-        count("such steps not counted", abs(1 - skipped)),
-        count("steps lost after it", trainer.skipped_steps - skipped + still),
-    ]
+    yield count("numbers changed by a step that is not finite", changed)
+    yield count("such steps not counted", abs(1 - skipped))
+    yield count("steps lost after it", trainer.skipped_steps - skipped + still)
 
 
 TRAINING_CASES = (

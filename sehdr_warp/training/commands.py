@@ -88,7 +88,7 @@ class Train:
     training: TrainingOptions = TrainingOptions()
     output: OutputOptions = OutputOptions()
     machine: MachineOptions = MachineOptions()
-    fields: Annotated[configs.flags_type(), tyro.conf.arg(name="")] = field(default_factory=dict)
+    fields: Annotated[configs.flags_type(), tyro.conf.arg(name="")] = field(default_factory=dict)  # pyright: ignore[reportInvalidTypeForm]
 
 
 @dataclass(frozen=True)
@@ -116,18 +116,20 @@ def run_train(asked: Train) -> None:
     from .machine import pick_device
     from .run_folder import RunFolder
 
-    output, plan_only, resumed = asked.output, asked.training.plan_only, None
-    how = {"resume": output.resume, "overwrite": output.overwrite}
-    if output.out is None and not plan_only:
+    output, resumed = asked.output, None
+    out, how = output.out, {"resume": output.resume, "overwrite": output.overwrite}
+    if asked.training.plan_only:
+        out = None
+    elif out is None:
         raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
     # What can be refused is refused before the photos are read, which may take minutes.
-    if not plan_only and (folder := RunFolder(output.out)).check(**how):
+    elif (folder := RunFolder(out)).check(**how):
         resumed = folder
     data = _data(asked, resumed)
     config, device = _config(asked, resumed), pick_device(asked.machine.device)
     options = config.response
     scene = _load(data, response=options.name, method=options.method, candidates=options.candidates)
-    if plan_only:
+    if out is None:
         from .plan import make_plan
 
         plan = make_plan(scene, config, device)
@@ -136,7 +138,7 @@ def run_train(asked: Train) -> None:
     from ..console import follow
     from .train import Training
 
-    training = Training(scene, output.out, config, device=device, tensorboard=output.tensorboard, data=data, **how)
+    training = Training(scene, out, config, device=device, tensorboard=output.tensorboard, data=data, **how)
     follow(training, training.total)
     run = training.run
     summary = run.summary() | {"run": str(run.path), "metrics": run.metrics()}
@@ -203,7 +205,9 @@ def _data(asked: Train, resumed) -> dict:
         known = resumed.read_info()["data"]
         given = {name: known.get(name) if value is None else value for name, value in given.items()}
     if given["path"] is None and asked.output.resume:
-        raise InputError(asked.output.out, "holds nothing to resume", "give SCENE to begin, or the folder of a run")
+        raise InputError(
+            str(asked.output.out), "holds nothing to resume", "give SCENE to begin, or the folder of a run"
+        )
     if given["path"] is None:
         raise UsageError("train needs SCENE, a folder of photos or `embedded`; see sehdr-warp train --help")
     return given

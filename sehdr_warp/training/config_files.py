@@ -5,6 +5,7 @@ import reprlib
 import textwrap
 import tomllib
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from importlib import resources
 from operator import attrgetter
 from pathlib import Path
@@ -105,10 +106,9 @@ def _one_value(kind, text: str):
     kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
     if kind is str or get_origin(kind) is Literal:
         return text
-    try:
+    with suppress(tomllib.TOMLDecodeError):  # The config will say what it takes in place of a word.
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:  # The config will say what it takes in place of a word.
-        return text
+    return text
 
 
 def config_to_dict(config: Config) -> dict:

@@ -14,27 +14,20 @@ EPSILON = 1e-15  # 3DGS: gradients of a single Gaussian are tiny, and must not d
 
 
 class Adam(torch.optim.Adam):
-    """torch's Adam with its state, its steps made by splatting.training_step.
+    """torch's Adam with its state, its steps made by splatting.training_step."""
 
-    found_inf: scalar tensor, 1 where the next step is to change nothing; the attribute of torch's gradient scaler.
-    """
-
-    made: Tensor | None = None
-    """1 - found_inf, where that is at hand."""
-
-    def step(self) -> None:
+    def step(self, skipped: Tensor | None = None, made: Tensor | None = None) -> None:
+        """skipped: scalar, 1 where parameters, moments and step count stay as they are. made: 1 - skipped."""
         grouped = [(group, p) for group in self.param_groups for p in group["params"] if p.grad is not None]
         parameters = [parameter for _, parameter in grouped]
-        skipped = getattr(self, "found_inf", None)
-        if skipped is None:
-            skipped = parameters[0].new_zeros(())
+        skipped = parameters[0].new_zeros(()) if skipped is None else skipped
+        made = 1 - skipped if made is None else made
         for parameter in parameters:
             if not self.state[parameter]:
                 moments = (torch.zeros_like(parameter, memory_format=torch.contiguous_format) for _ in range(2))
                 self.state[parameter] = {"step": torch.zeros((), device=parameter.device)}
                 self.state[parameter] |= zip(("exp_avg", "exp_avg_sq"), moments, strict=True)
         # With lists on both sides: to add one tensor to many, torch reads it on the host, which no recording allows.
-        made = 1 - skipped if self.made is None else self.made
         torch._foreach_add_([self.state[p]["step"] for p in parameters], [made] * len(parameters))
         for group, parameter in grouped:
             given = parameter.detach(), parameter.grad.contiguous()
@@ -75,15 +68,13 @@ def set_means_rate(optimizer: torch.optim.Adam, rate: float) -> None:
         group["lr"] = rate
 
 
-def guarded_step(optimizer: torch.optim.Adam, loss: Tensor, incomplete: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def guarded_step(optimizer: Adam, loss: Tensor, incomplete: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """One step of Adam, or none if the loss or a gradient is not finite or the rendering was incomplete; decided on the
     device, without waiting for it. Two scalar float tensors: 1 if something was not finite; 1 if the step was made."""
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
     norms = torch.stack(torch._foreach_norm(gradients))
     nonfinite, skipped, made = judge_step(loss, norms, incomplete)
-    # The hook of torch's gradient scaler: parameters, moments and step count stay as they are where it is 1.
-    optimizer.found_inf, optimizer.made = skipped, made
-    optimizer.step()
+    optimizer.step(skipped, made)
     return nonfinite, made
 
 

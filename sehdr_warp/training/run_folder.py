@@ -17,6 +17,7 @@ import hashlib
 import json
 import math
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -122,11 +123,15 @@ class RunFolder:
         shutil.rmtree(self.checkpoints, ignore_errors=True)
         info = {"format": FORMAT, "version": __version__, "scene": scene.name, "data": data}
         info |= {"base_time": field.base_time, "response": field.response.to_dict()}
-        if plan is not None:
-            write_json(self.plan, plan, overwrite=True)
-        write_json(self.scene, describe_scene(scene), overwrite=True)
-        write_json(self.info, info, overwrite=True)
-        write_json(self.config, config_to_dict(config), overwrite=True)
+        files = {
+            self.plan: plan,
+            self.scene: describe_scene(scene),
+            self.info: info,
+            self.config: config_to_dict(config),
+        }
+        for file, values in files.items():
+            if values is not None:
+                write_json(file, values, overwrite=True)
 
     def read_config(self) -> Config:
         """The config of the training."""
@@ -183,12 +188,10 @@ class RunFolder:
             return []
         lines = []
         for text in self.metrics.read_text(encoding="utf-8", errors="replace").splitlines():
-            try:
+            with suppress(ValueError, RecursionError):
                 line = json.loads(text)
-            except (ValueError, RecursionError):
-                continue
-            if isinstance(line, dict) and isinstance(line.get("iteration", 0), int):
-                lines.append(line)
+                if isinstance(line, dict) and isinstance(line.get("iteration", 0), int):
+                    lines.append(line)
         return lines
 
     def rewind_metrics(self, iteration: int) -> None:

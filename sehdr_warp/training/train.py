@@ -246,10 +246,7 @@ class Training:
         log.info("iteration %d: held-out %s after %.1f s", self.iteration, figures, self.seconds)
 
     def _checkpoint(self) -> None:
-        """Saves the state, unless the training has diverged: the last good checkpoint then stays the newest.
-
-        Raises SehdrError if a parameter or the optimizer's state is not finite: no later step can mend that.
-        """
+        """Saves the state, unless the training has diverged: the last good checkpoint then stays the newest."""
         tensors, values = self.trainer.state()
         if (name := first_not_finite(tensors)) is not None:
             raise SehdrError(

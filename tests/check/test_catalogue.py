@@ -18,7 +18,7 @@ CPU = torch.device("cpu")
     "case", [case for _, case in catalogue.CASES if case.quick and case.name not in SLOW], ids=lambda case: case.name
 )
 def test_bounds_hold(case, device):
-    readings = case.measure(torch.device(device))
+    readings = list(case.measure(torch.device(device)))
     assert readings
     assert [reading for reading in readings if not reading.holds] == []
 
