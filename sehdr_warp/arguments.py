@@ -146,11 +146,9 @@ def _one_line(told: str) -> str:
     return next((match.expand(shorter) for match, shorter in found if match), text)
 
 
-def numbers(flag: str, text: str | None, kind: type = float, least: float = -math.inf) -> tuple | None:
-    """The numbers of a list such as 0.125,0.5,2, None if none was given; raises InputError, with the flag, for anything
-    else and for a number below `least`."""
-    if text is None:
-        return None
+def numbers(flag: str, text: str, kind: type = float, least: float = -math.inf) -> tuple:
+    """The numbers of a list such as 0.125,0.5,2; raises InputError, with the flag, for anything else and for a number
+    below `least`."""
     try:
         found = tuple(kind(item) for item in text.split(","))
         if min(found) < least:

@@ -5,7 +5,7 @@ python docs/reports/write.py
 
 import csv
 import tomllib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any
@@ -64,7 +64,7 @@ def _write(path: Path, parts: Sequence[str]) -> Path:
     return path
 
 
-def _pivot(rows: Sequence[dict], places: dict[str, str], over: str, value: str, form: str) -> str:
+def _pivot(rows: Sequence[Mapping], places: dict[str, str], over: str, value: str, form: str) -> str:
     """A table with a row for each place, and a column for the value of each `over`. places: as columns of a table."""
     fields = [field for _, field, _ in parted(places)]
     found = groups(rows, *fields).items()
@@ -171,7 +171,7 @@ PLOTS: dict[str, Callable[[dict, Path], None]] = {
 def _tried_page(path: Path) -> list[str]:
     with open(path, newline="", encoding="utf-8") as file:
         topics = groups(csv.DictReader(file), "topic")
-    columns = dict.fromkeys(("option", "idea", "gave", "on"), "")
+    columns: dict[str, str] = dict.fromkeys(("option", "idea", "gave", "on"), "")
     text = (
         "Ideas that were built, measured and taken out again, or never turned on. dB are differences in held-out "
         "mu-law PSNR under `gt-max` to the same training without, where nothing else is said; 0.2 dB are within chance."

@@ -3,7 +3,7 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -124,18 +124,12 @@ class Quality(Output):
 
         device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")
         lpips = os.environ.get("SEHDR_LPIPS") or None
-        jobs = plan_jobs(
-            _words(self.scenes),
-            _words(self.methods),
-            curves=_words(self.curves),
-            exposures=numbers("--exposures", self.exposures, int, least=0),
-            responses=_words(self.responses),
-            seeds=numbers("--seeds", self.seeds, int, least=0),
-            iterations=self.iterations and positive("--iterations", self.iterations),
-            max_size=self.max_size,
-            device=device,
-            lpips=lpips is not None,
-        )
+        asked: dict[str, Any] = {
+            name: _words(getattr(self, name)) for name in ("scenes", "methods", "curves", "responses")
+        }
+        asked |= {name: numbers(f"--{name}", getattr(self, name), int, least=0) for name in ("exposures", "seeds")}
+        iterations = self.iterations and positive("--iterations", self.iterations)
+        jobs = plan_jobs(**asked, iterations=iterations, max_size=self.max_size, device=device, lpips=lpips is not None)
         how = {"at_once": positive("--jobs", self.jobs), "slurm": _pairs("--slurm", self.slurm)}
         rows = run_jobs(jobs, self.out, device=device, lpips=lpips and os.path.abspath(lpips), **how)
         result = new_result("quality", torch.device(device), {"jobs": self.jobs})
@@ -195,9 +189,7 @@ def _words(text: str) -> tuple[str, ...]:
 
 
 def _pairs(flag: str, text: str | None) -> dict[str, str] | None:
-    if text is None:
-        return None
-    pairs = [item.partition("=") for item in _words(text)]
-    if not all(name and equals for name, equals, _ in pairs):
+    pairs = {name: value for name, _, value in (item.partition("=") for item in _words(text or ""))}
+    if not all(name and value for name, value in pairs.items()):
         raise InputError(f"{flag} {text}", "not name=value pairs", f"write for example {flag} partition=gpu")
-    return {name: value for name, _, value in pairs}
+    return None if text is None else pairs

@@ -2,6 +2,7 @@
 
 import importlib.util
 from collections.abc import Callable
+from typing import Any
 
 import torch
 
@@ -31,7 +32,7 @@ def rasterize_with_gsplat(
 ) -> Rendering:  # fmt: skip
     """rasterize() by gsplat. capacity and deterministic mean nothing there; there is no transmittance, and
     densification by gradients cannot watch its centers."""
-    from gsplat import rasterization
+    from gsplat import rasterization  # pyright: ignore[reportMissingImports]
 
     fx, fy, cx, cy = intrinsics
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
@@ -43,12 +44,13 @@ def rasterize_with_gsplat(
     # gsplat 1.5 gives two radii, its forerunners one.
     radii = info["radii"][0]
     radii = radii.amax(-1) if radii.ndim == 2 else radii
-    return Rendering(image[0], None, info["means2d"][0], info["depths"][0], radii, 0)
+    unknown: Any = None
+    return Rendering(image[0], unknown, info["means2d"][0], info["depths"][0], radii, 0)
 
 
 def gsplat_renderer(scene: SplatScene) -> Callable[[], torch.Tensor]:
     """A function that renders [H, W, C]; what does not change between calls is prepared."""
-    from gsplat import rasterization
+    from gsplat import rasterization  # pyright: ignore[reportMissingImports]
 
     means, log_scales, quaternions, opacities, features = scene.leaves
     fx, fy, cx, cy = scene.intrinsics.tolist()

@@ -119,9 +119,9 @@ def plan_jobs(
         if len(set(names)) < len(names):
             raise SehdrError(f"two {what} have one name; rename a {file} so that tables can tell them apart")
     jobs = []
-    for method, seed, place, curve, exposure, response in product(
-        methods, *(dict.fromkeys(items) for items in (seeds, scenes, curves, exposures, responses))
-    ):
+    scenes, curves, responses = (list(dict.fromkeys(names)) for names in (scenes, curves, responses))
+    seeds, exposures = (list(dict.fromkeys(items)) for items in (seeds, exposures))
+    for method, seed, place, curve, exposure, response in product(methods, seeds, scenes, curves, exposures, responses):
         config = _training(method, iterations, seed)
         if config.response.name == LEARNED:
             if response != responses[0]:

@@ -41,26 +41,27 @@ def new_result(benchmark: str, device: torch.device, settings: dict) -> dict[str
 
 
 def _describe_machine(device: torch.device) -> dict[str, Any]:
-    """Processor, GPU, driver and versions; what cannot be found out is None."""
-    versions: dict[str, str | None] = {"sehdr-warp": __version__}
-    for package in ("torch", "warp-lang", "gsplat"):
-        versions[package] = None
-        with suppress(importlib.metadata.PackageNotFoundError):
-            versions[package] = importlib.metadata.version(package)
-    machine = {
+    """What cannot be found out is None."""
+    gpu = None
+    if device.type == "cuda":
+        properties = torch.cuda.get_device_properties(device)
+        driver = {"driver": _driver_version(), "cuda": torch.version.cuda}
+        gpu = {"name": properties.name, "memory_bytes": properties.total_memory} | driver
+    return {
         "cpu": _cpu_model(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        "versions": versions,
-        "gpu": None,
+        "versions": {"sehdr-warp": __version__} | {name: _version(name) for name in ("torch", "warp-lang", "gsplat")},
+        "gpu": gpu,
     }
-    if device.type == "cuda":
-        properties = torch.cuda.get_device_properties(device)
-        driver = {"driver": _driver_version(), "cuda": torch.version.cuda}
-        machine["gpu"] = {"name": properties.name, "memory_bytes": properties.total_memory} | driver
-    return machine
+
+
+def _version(package: str) -> str | None:
+    with suppress(importlib.metadata.PackageNotFoundError):
+        return importlib.metadata.version(package)
+    return None
 
 
 def _cpu_model() -> str | None:
@@ -79,7 +80,6 @@ def _driver_version() -> str | None:
 
 
 def machine_line(result: dict) -> str:
-    """Where and with what a result was made, in a line."""
     machine = result["machine"]
     place = f"{machine['cpu']}, {machine['cores']} cores"
     if machine["gpu"]:
@@ -102,17 +102,14 @@ def finish(result: dict, json: Path | None = None, overwrite: bool = False) -> N
     table = markdown_table(result["rows"], COLUMNS[result["benchmark"]])
     print(machine_line(result), table, *result["notes"], sep="\n\n")
     failed = [check for check in result["checks"] if not check["passed"]]
-    if not failed:
-        return
     count = f"{len(failed)} of {len(result['checks'])}"
-    if "error" in failed[0]:
+    if failed and "error" in failed[0]:
         first = f"{failed[0]['error']} ({failed[0]['what']})"
         raise SehdrError(f"{count} jobs failed, the first with: {first}; the same command tries them again")
-    worst = max(failed, key=lambda check: check["difference"] / check["bound"])
-    raise SehdrError(
-        f"{count} checks failed; the worst: {worst['what']} differs from {worst['against']} by "
-        f"{worst['difference']:.1e}, more than {worst['bound']:.0e}: do not use these times"
-    )
+    if failed:
+        worst = max(failed, key=lambda check: check["difference"] / check["bound"])
+        by = f"{worst['against']} by {worst['difference']:.1e}, more than {worst['bound']:.0e}"
+        raise SehdrError(f"{count} checks failed; the worst: {worst['what']} differs from {by}: do not use these times")
 
 
 def groups(rows: Iterable[Mapping], *fields: str) -> dict[tuple, list[Mapping]]:

@@ -1,7 +1,9 @@
 """`bench scale`: how time and memory of splats and training steps grow with Gaussians, pixels, channels and photos."""
 
 import logging
+import tomllib
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -28,22 +30,15 @@ LARGE_END = 3
 
 
 def sweeps(device_type: str, small: bool = False) -> dict[str, list[tuple[int, Size, int, int]]]:
-    """The points of each sweep, ascending: what is varied, then size, channels, and photos of the training step (0 for
-    none). small: every second point, up to a moderate size."""
-    if device_type == "cuda":
-        counts = (10_000, 30_000, 100_000, 300_000, 1_000_000, 2_500_000, 5_000_000)
-        sides = ((200, 200), (400, 400), (800, 800), (1600, 1200), (2560, 1440), (3840, 2160))
-        channels, photos = (3, 4, 6, 9, 12, 16, 24, 32, 48), (2, 8, 32, 128)
-        image, many, few = (1600, 1200), 200_000, Size(200_000, 800, 800)
-    else:
-        counts, sides = (1000, 2500, 5000, 10_000, 20_000, 50_000), ((64, 64), (128, 128), (256, 256), (512, 512))
-        channels, photos = (3, 6, 9, 16, 24, 48), (2, 8, 32)
-        image, many, few = (200, 200), 5000, Size(5000, 200, 200)
+    """The points of each sweep: what is varied, then size, channels, and photos of the training step (0 for none).
+    small: every second point, up to a moderate size."""
+    given = tomllib.loads(Path(__file__).with_name("sweeps.toml").read_text(encoding="utf-8"))[device_type]
+    size = Size(given["count"], *given["small_image"])
     found = {
-        "gaussians": [(count, Size(count, *image), COMPARED_CHANNELS, STEP_VIEWS) for count in counts],
-        "pixels": [(w * h, Size(many, w, h), COMPARED_CHANNELS, STEP_VIEWS) for w, h in sides],
-        "channels": [(count, few, count, 0) for count in channels],
-        "photos": [(count, few, COMPARED_CHANNELS, count) for count in photos],
+        "gaussians": [(n, Size(n, *given["image"]), COMPARED_CHANNELS, STEP_VIEWS) for n in given["gaussians"]],
+        "pixels": [(w * h, Size(given["count"], w, h), COMPARED_CHANNELS, STEP_VIEWS) for w, h in given["pixels"]],
+        "channels": [(count, size, count, 0) for count in given["channels"]],
+        "photos": [(count, size, COMPARED_CHANNELS, count) for count in given["photos"]],
     }
     return {name: points[:-1:2] if small else points for name, points in found.items()}
 
@@ -68,20 +63,18 @@ def bench_scale(device: torch.device, *, repetitions: int, small: bool = False) 
 
 
 def fit_slopes(rows: Sequence[dict]) -> list[dict]:
-    """Slopes of log(time) and log(memory) on log(what is varied), over a whole sweep and over its large end, by least
-    squares; times are the least of their repetitions, which other work disturbs least."""
+    """Slopes of log(time) and log(memory) on log(what is varied), over a whole sweep and over its large end; times are
+    the least of their repetitions, which other work disturbs least."""
     fields, slopes = ("sweep", "implementation", "what"), []
     for key, here in groups(rows, *fields).items():
         for quantity, field in (("time", "min_ms"), ("memory", "peak_memory_bytes")):
             points = [(row["varied"], row[field]) for row in here if row.get(field)]
             if len(points) > 1:
-                row = dict(zip(fields, key, strict=True)) | {"quantity": quantity, "slope": _slope(points)}
-                slopes.append(row | {"slope_large": _slope(points[-LARGE_END:])})
+                x, y = np.log(points).T
+                fits = {"slope": np.polyfit(x, y, 1), "slope_large": np.polyfit(x[-LARGE_END:], y[-LARGE_END:], 1)}
+                row = dict(zip(fields, key, strict=True)) | {"quantity": quantity}
+                slopes.append(row | {name: float(slope) for name, (slope, _) in fits.items()})
     return slopes
-
-
-def _slope(points: Sequence[tuple[float, float]]) -> float:
-    return float(np.polyfit(*np.log(points).T, 1)[0])
 
 
 def verdict(slopes: Sequence[dict]) -> str:
@@ -114,20 +107,19 @@ def _splat_rows(size: Size, channels: int, device, peer: bool, repetitions: int,
 
 
 def _step_rows(size: Size, photos: int, device, peer: bool, repetitions: int, checks: list[dict]) -> list[dict]:
-    """Whole training steps on photos of this size. Without densification, which would watch gradients that gsplat
-    gives in another form; steps of gsplat are launched, since they cannot be recorded."""
+    """Without densification, which would watch gradients that gsplat gives in another form; steps of gsplat are
+    launched, since they cannot be recorded."""
     scene = make_photo_scene(size, photos, device)
     rows, losses = [], {}
-    for who, rasterizer in {OURS: None, GSPLAT: rasterize_with_gsplat}.items():
-        if who == OURS or peer:
-            forget_peaks(device)
-            fixed = {"densification.stop": 0, "densification.max_gaussians": size.gaussians + 1}
-            config = load_config(STEP_PRESET, fixed | {"schedule.recorded": who == OURS})
-            trainer = make_trainer(scene, config, device, rasterizer)
-            trainer.step()
-            losses[who] = trainer.loss
-            rows.append({"implementation": who, "what": "training step"} | time_step(trainer, repetitions))
-            del trainer
+    for who, rasterizer in ({OURS: None} | ({GSPLAT: rasterize_with_gsplat} if peer else {})).items():
+        forget_peaks(device)
+        fixed = {"densification.stop": 0, "densification.max_gaussians": size.gaussians + 1, "model.initial_density": 0}
+        config = load_config(STEP_PRESET, fixed | {"schedule.recorded": who == OURS})
+        trainer = make_trainer(scene, config, device, rasterizer)
+        trainer.step()
+        losses[who] = trainer.loss
+        rows.append({"implementation": who, "what": "training step"} | time_step(trainer, repetitions))
+        del trainer
     forget_peaks(device)
     if peer:
         difference = abs(losses[GSPLAT] - losses[OURS]) / abs(losses[OURS])

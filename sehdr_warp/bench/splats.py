@@ -31,8 +31,8 @@ class Size:
     def reduced(self, most: int) -> "Size":
         """The same density, with at most so many Gaussians (but an image of at least 16 pixels a side)."""
         shrink = math.sqrt(max(1.0, self.gaussians / most))
-        sides = (max(16, round(side / shrink)) for side in (self.width, self.height))
-        return Size(max(1, round(self.gaussians / shrink**2)), *sides)
+        width, height = (max(16, round(side / shrink)) for side in (self.width, self.height))
+        return Size(max(1, round(self.gaussians / shrink**2)), width, height)
 
 
 def parse_size(text: str) -> Size:
@@ -68,8 +68,7 @@ class SplatScene:
     def to(self, device=None, dtype=None) -> "SplatScene":
         """A copy with leaves of its own, which ask for gradients."""
         leaves = tuple(leaf.detach().to(device, dtype, copy=True).requires_grad_() for leaf in self.leaves)
-        camera = (tensor.to(device, dtype) for tensor in (self.world_to_camera, self.intrinsics))
-        return SplatScene(leaves, *camera, self.size)
+        return SplatScene(leaves, self.world_to_camera.to(device, dtype), self.intrinsics.to(device, dtype), self.size)
 
     def clear(self) -> None:
         for leaf in self.leaves:
@@ -83,11 +82,8 @@ class SplatScene:
 
 
 def make_splat_scene(size: Size, channels: int, device: torch.device | str = "cpu") -> SplatScene:
-    """float32 Gaussians at depths of 2 to 8 before a centered pinhole camera at the origin.
-
-    Standard deviations follow the mean distance between centers, so that the depth of layers, some 15 over the alpha
-    threshold in a pixel, does not depend on the size.
-    """
+    """float32 Gaussians at depths of 2 to 8 before a centered pinhole camera at the origin. Deviations follow the mean
+    distance between centers, so that any size has some 15 layers over the alpha threshold in a pixel."""
     generator = torch.Generator().manual_seed(0)
     count, width, height = size.gaussians, size.width, size.height
 
@@ -107,8 +103,8 @@ def make_splat_scene(size: Size, channels: int, device: torch.device | str = "cp
 
 
 def make_photo_scene(size: Size, views: int = 18, device: str | torch.device = "cpu") -> Scene:
-    """8-bit sRGB photos, all for training, of colored balls on a floor, from a circle around them: some pixels clipped,
-    some black. size.gaussians points lie on the surfaces. device: where the photos are rendered."""
+    """8-bit sRGB photos, all for training, of colored balls on a floor, from a circle around them; size.gaussians
+    points lie on the surfaces. device: where the photos are rendered."""
     rng = np.random.default_rng(0)
     points, log_exposure = _surfaces(size.gaussians, rng)
     response = response_by_name("srgb")

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import accumulate
+from typing import Any
 
 import torch
 from torch.profiler import ProfilerActivity, profile
@@ -36,8 +37,8 @@ class Variant:
 def time_variants(
     variants: dict[str, Variant], device: torch.device, *, repetitions: int = 30, budget: float = BUDGET
 ) -> dict[str, dict]:
-    """Times of each variant, see summary(). On a GPU events stand around each run with the device idle before, so that
-    the host's time counts where it is the limit."""
+    """See summary(). On a GPU events stand around each run with the device idle before, so that the host's time counts
+    where it is the limit."""
     samples: dict[str, list[float]] = {name: [] for name in variants}
     wanted = dict.fromkeys(variants, repetitions)
     for name, variant in variants.items():
@@ -83,7 +84,6 @@ def _milliseconds(variant: Variant, device: torch.device) -> float:
 
 
 def wait(device: torch.device) -> None:
-    """Until the device has done what it was given."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
@@ -116,6 +116,7 @@ def peak_memory(variant: Variant, device: torch.device) -> int:
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
         variant.run()
     # In the order of time; events() of the profiler leaves out what is freed within the operation that allocated it.
-    events = recorded.profiler.kineto_results.events()
+    profiler: Any = recorded.profiler
+    events = profiler.kineto_results.events()
     changes = [(event.start_ns(), event.nbytes()) for event in events if event.name() == "[memory]"]
     return max(accumulate(nbytes for _, nbytes in sorted(changes)), default=0)

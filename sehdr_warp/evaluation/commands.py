@@ -26,15 +26,13 @@ class _Figures:
         from ..files import check_absent, write_json
         from .table import format_table
 
-        if str(self.json) == "-":
-            print(json.dumps(figures()))
-            return
-        if self.json is not None:
-            check_absent(self.json, self.overwrite)
+        file = self.json if str(self.json) != "-" else None
+        if file is not None:
+            check_absent(file, self.overwrite)
         result = figures()
-        if self.json is not None:
-            write_json(self.json, result, self.overwrite)
-        print(format_table(result))
+        if file is not None:
+            write_json(file, result, self.overwrite)
+        print(format_table(result) if file == self.json else json.dumps(result))
 
 
 @dataclass(frozen=True, kw_only=True)

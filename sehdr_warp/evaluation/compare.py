@@ -58,8 +58,9 @@ def compare_runs(runs: Sequence[Any]) -> list[ComparedRuns]:
     if not runs:
         raise SehdrError("compare: no runs are given; give their folders")
     groups: dict[str, list] = {}
-    for run in runs:
-        if sum(Path(other.path).resolve() == Path(run.path).resolve() for other in runs) > 1:
+    places = [Path(run.path).resolve() for run in runs]
+    for run, place in zip(runs, places, strict=True):
+        if places.count(place) > 1:
             raise SehdrError(f"compare: {run.path} is given twice; leave one out")
         if not run.metrics():
             raise SehdrError(f"{run.path}: has no evaluations to compare; train it further")
@@ -77,7 +78,7 @@ def _compared(runs: Sequence) -> ComparedRuns:
 
 
 def comparison_table(rows: Sequence[ComparedRuns]) -> str:
-    """For a terminal: one row for each, means with their standard deviation over seeds."""
+    """For a terminal: means with their standard deviation over seeds."""
     return "\n".join(columns(_cells(rows, " ± "), left=2))
 
 
@@ -102,7 +103,6 @@ def comparison_latex(rows: Sequence[ComparedRuns]) -> str:
 
 def _cells(rows: Sequence[ComparedRuns], between: str) -> list[list[str]]:
     """A heading, then each row's text; `between` stands between a mean and its spread."""
-
     cells = [["run", "scene", "seeds", *(heading for heading, _ in COLUMNS.values())]]
     for row in rows:
         cells.append([row.label, row.scene, str(row.count)])

@@ -2,6 +2,7 @@
 
 import logging
 import math
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -47,69 +48,48 @@ class RunPictures:
 
 
 @torch.no_grad()
-def evaluate(
-    run: Any,
-    scene: Scene,
-    *,
-    lpips_weights: Path | str | None = None,
-    peak_luminance: float = PEAK_LUMINANCE,
-    flip: bool = False,
-) -> dict[str, Any]:
+def evaluate(run: Any, scene: Scene, *, lpips_weights: Path | str | None = None, flip: bool = False) -> dict[str, Any]:
     """Render the scene's test views with a trained run and compare them with the photos and the HDR truth.
 
     Args:
         run: a Run.
         scene: at the exposure that was trained on. Without test views the training views are taken; "split" says so.
         lpips_weights: a folder, see load_lpips.
-        peak_luminance: cd/m^2 at which PU21 shows the truth's maximum.
         flip: also HDR-FLIP under each protocol's scale, where flip-evaluator is installed; slow.
 
     Returns:
         Plain values, ready for strict JSON. "protocol": {name: psnr_mu, ssim_mu, lpips_mu, views, hdr_flip if asked
         for}, with "scale" for "aligned"; "pu21": {name: psnr, ssim}; "ldr": psnr, ssim, lpips of the simulated photo,
         unquantised; "regions": {region: fraction, psnr_ldr, psnr_mu}, pooled over views; "confidence": see ranking.py;
-        "views": the same for each view; "split", "lpips_backbone" and the run's facts. Means are over views. What
-        cannot be computed is null with "reason" (or "lpips_reason") beside it. Outside a view's mask the prediction
-        counts as right and nothing is averaged, but by LPIPS and HDR-FLIP, which are of whole images; views with an
-        empty mask are left out.
+        "views": the same for each view; "split", "lpips_backbone" and the run's facts. What cannot be computed is null
+        with "reason" (or "lpips_reason") beside it. Outside a view's mask the prediction counts as right and nothing
+        is averaged, but by LPIPS and HDR-FLIP; views with an empty mask are left out.
 
     Raises:
         SehdrError: for a scene without views, images that disagree with their camera or a render that is not finite.
         InputError: for LPIPS weights that cannot be read.
     """
-    return Evaluation(RunPictures(run), scene, run.device, lpips_weights, flip, peak_luminance).result()
+    return Evaluation(RunPictures(run), scene, run.device, lpips_weights, flip).result()
 
 
 class Evaluation:
     """One comparison of pictures, which predict like RunPictures, with a scene's views.
 
-    views: a sequence of views, by default the test views, else the training views. scale_views: those that tell the
-    scale of "aligned", by default the training views. The rest is as of evaluate().
+    views: by default the test views, else the training views. scale_views: those that tell the scale of "aligned", by
+    default the training views. The rest is as of evaluate().
     """
 
-    def __init__(
-        self,
-        pictures,
-        scene,
-        device,
-        lpips_weights,
-        flip,
-        peak_luminance=PEAK_LUMINANCE,
-        *,
-        views=None,
-        scale_views=None,
-    ):
+    def __init__(self, pictures, scene: Scene, device, lpips_weights, flip: bool, views=(), scale_views=()):
         self.pictures, self.scene, self.device = pictures, scene, torch.device(device)
         self.split = "test" if scene.test_views else "train"
-        given = (scene.test_views or scene.train_views) if views is None else views
+        given = views or scene.test_views or scene.train_views
         self.views = [view for view in given if view.mask is None or view.mask.any()]
         if not self.views:
             raise SehdrError(f"scene {scene.name!r} has no views to evaluate; check its splits and masks")
-        voting = scene.train_views if scale_views is None else scale_views
-        self.scale_views = [view for view in voting if view.hdr is not None]
+        self.scale_views = [view for view in scale_views or scene.train_views if view.hdr is not None]
         self.lpips, self.lpips_reason = load_lpips(lpips_weights, self.device)
-        self.peak_luminance, self._flipped = peak_luminance, ["hdr_flip"] if flip else []
         self.flip, self.flip_reason = load_flip() if flip else (None, None)
+        self.hdr_figures = ["psnr_mu", "ssim_mu", "lpips_mu"] + ["hdr_flip"] * flip
         self.regions = {region: _RegionErrors() for region in metrics.REGIONS}
         self.ranking = ErrorRanking()
 
@@ -127,9 +107,7 @@ class Evaluation:
             reason = scale_reason if name == "aligned" else missing
             why = {"reason": reason} if reason else {}
             counted = [] if reason else [row for row, known in zip(rows, truths) if known]
-            figures = _mean(
-                [row["protocol"][name] for row in counted], "psnr_mu", "ssim_mu", "lpips_mu", *self._flipped
-            )
+            figures = _mean([row["protocol"][name] for row in counted], *self.hdr_figures)
             hdr[name] = figures | {"views": len(counted)} | (why or self._reasons(figures))
             pu21[name] = _mean([row["pu21"][name] for row in counted], "psnr", "ssim") | why
         hdr["aligned"]["scale"] = scale
@@ -140,7 +118,7 @@ class Evaluation:
             "scene": self.scene.name,
             "split": self.split,
             "protocol": hdr,
-            "pu21": pu21 | {"peak_luminance": self.peak_luminance},
+            "pu21": pu21 | {"peak_luminance": PEAK_LUMINANCE},
             "ldr": ldr,
             "regions": {region: errors.result(missing) for region, errors in self.regions.items()},
             "confidence": self.ranking.result() | ({"reason": missing} if missing else {}),
@@ -150,12 +128,13 @@ class Evaluation:
         return _plain(result | self.pictures.facts)
 
     def _scale(self) -> tuple[float | None, str | None]:
-        """The one factor of the scene for `aligned`, or why there is none."""
-        views = self.scale_views
-        if not views:
+        """The factor for `aligned`, or why there is none."""
+        if not self.scale_views:
             return None, "no training view holds HDR truth to fit the scale on"
-        log.info("fitting the scale on %d views", len(views))
-        scale = fit_scale((*self._render(view), self._tensor(view.mask), self._tensor(view.image)) for view in views)
+        log.info("fitting the scale on %d views", len(self.scale_views))
+        scale = fit_scale(
+            (*self._render(view), self._tensor(view.mask), self._tensor(view.image)) for view in self.scale_views
+        )
         return scale, None if scale else "the pictures hold no light to fit the scale on"
 
     def _render(self, view: View) -> tuple[Tensor, Any]:
@@ -164,33 +143,25 @@ class Evaluation:
         prediction = self.pictures.hdr(view).detach()
         for what, image in (("photo", view.codes), ("HDR truth", view.hdr), ("picture", prediction)):
             if image is not None and tuple(image.shape) != size:
-                raise SehdrError(
-                    f"view {view.name!r}: its {what} is {image.shape[1]} x {image.shape[0]}, its camera "
-                    f"{size[1]} x {size[0]}; take both at one size"
-                )
+                sizes = f"its {what} is {image.shape[1]} x {image.shape[0]}, its camera {size[1]} x {size[0]}"
+                raise SehdrError(f"view {view.name!r}: {sizes}; take both at one size")
         if not bool(torch.isfinite(prediction).all()):
             raise SehdrError(f"view {view.name!r}: the render holds values that are not finite; the training diverged")
         return prediction.float(), self._tensor(view.hdr)
 
     def _tensor(self, array) -> Any:
-        """None stays None."""
         return None if array is None else torch.tensor(array, dtype=torch.float32, device=self.device)
 
     def _view(self, view: View, scale: float | None) -> dict:
         """The figures of one view; its part in the regions and the ranking is added to theirs."""
         hdr, truth = self._render(view)
         photo, mask = self._tensor(view.image), self._tensor(view.mask)
-        row: dict[str, Any] = {
-            "name": view.name,
-            "ldr": dict.fromkeys(("psnr", "ssim", "lpips")),
-            "protocol": {},
-            "pu21": {},
-        }
+        ldr, protocol, pu21 = dict.fromkeys(("psnr", "ssim", "lpips")), {}, {}
         regions, pooled = metrics.region_masks(photo), []
         if (encoded := self.pictures.ldr(view)) is not None:
             pair = _inside((encoded.detach().float(), photo), mask)
             figures = metrics.psnr(*pair, mask), metrics.ssim(*pair, mask), self._lpips(*pair)
-            row["ldr"] = dict(zip(row["ldr"], figures, strict=True))
+            ldr = dict(zip(ldr, figures, strict=True))
             pooled.append(("ldr", *pair))
         if truth is not None and (doubt := self.pictures.doubt(view)):
             self.ranking.add(doubt[0], hdr, truth, regions["well-exposed"], doubt[1], mask)
@@ -199,23 +170,19 @@ class Evaluation:
                 continue
             linear = normalise(name, hdr, truth, mask, scale=scale)
             pair, linear = _inside(tone_map(name, *linear), mask), _inside(linear, mask)
-            row["protocol"][name] = {
-                "psnr_mu": tone_mapped_psnr(name, *pair, mask),
-                "ssim_mu": metrics.ssim(*pair, mask),
-                "lpips_mu": self._lpips(*pair),
-            }
-            row["protocol"][name] |= {key: self.flip and self.flip(*linear) for key in self._flipped}
-            row["pu21"][name] = metrics.pu21_metrics(*linear, mask, peak_luminance=self.peak_luminance)
+            figures = tone_mapped_psnr(name, *pair, mask), metrics.ssim(*pair, mask), self._lpips(*pair)
+            protocol[name] = dict(zip(self.hdr_figures, (*figures, self.flip and self.flip(*linear))))
+            pu21[name] = metrics.pu21_metrics(*linear, mask, peak_luminance=PEAK_LUMINANCE)
             pooled.append((name, *pair))
         for region, inside in regions.items():
             self.regions[region].add(inside if mask is None else inside * mask, mask, pooled)
-        return row
+        return {"name": view.name, "ldr": ldr, "protocol": protocol, "pu21": pu21}
 
     def _lpips(self, prediction, truth) -> float | None:
         return self.lpips(prediction, truth) if self.lpips and min(truth.shape[:2]) >= SMALLEST_EDGE else None
 
     def _reasons(self, figures: dict) -> dict:
-        """Why LPIPS or HDR-FLIP are missing, where they are."""
+        """Why LPIPS or HDR-FLIP are missing."""
         reasons = {"flip_reason": self.flip_reason} if self.flip_reason and "hdr_flip" in figures else {}
         if None in (figures.get("lpips", 0), figures.get("lpips_mu", 0)):
             reasons["lpips_reason"] = self.lpips_reason or f"a view is smaller than {SMALLEST_EDGE} pixels"
@@ -227,7 +194,8 @@ class _RegionErrors:
 
     def __init__(self):
         self.inside = self.counted = 0.0
-        self.errors: dict[str, tuple[float, float]] = {}
+        self.errors: dict[str, float] = defaultdict(float)
+        self.weights: dict[str, float] = defaultdict(float)
 
     def add(self, weight, mask, pairs) -> None:
         """weight: [H, W] of the region, 0 outside the mask. pairs: (name, prediction, truth) to be compared in it."""
@@ -235,8 +203,8 @@ class _RegionErrors:
         self.counted += weight.numel() if mask is None else float(mask.sum())
         for name, prediction, truth in pairs:
             error, total = metrics.squared_error(prediction, truth, weight)
-            before = self.errors.get(name, (0.0, 0.0))
-            self.errors[name] = (before[0] + float(error.mean()), before[1] + total)
+            self.errors[name] += float(error.mean())
+            self.weights[name] += total
 
     def result(self, missing: str | None) -> dict:
         reason = missing if self.inside else "no pixel of the photos lies in this region"
@@ -245,8 +213,8 @@ class _RegionErrors:
         return figures | ({"reason": reason} if reason else {})
 
     def _decibels(self, name: str) -> float:
-        error, weight = self.errors.get(name, (0.0, 0.0))
-        return metrics.decibels(error / weight if weight else math.nan)
+        weight = self.weights[name]
+        return metrics.decibels(self.errors[name] / weight if weight else math.nan)
 
 
 def _inside(pair: tuple[Tensor, Tensor], mask: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -19,7 +19,7 @@ REGIONS = ("clipped", "well-exposed", "dark")
 
 # Rec.709 luminance weights, as in the PU21 reference implementation.
 LUMINANCE = (0.212656, 0.715158, 0.072186)
-# PU21 "banding_glare", the variant its authors recommend (Mantiuk and Azimi 2021), and its range in cd/m^2.
+# PU21 "banding_glare", the variant its authors recommend, and its range in cd/m^2.
 PU21 = (0.353487901, 0.3734658629, 8.277049286e-05, 0.9062562627, 0.09150303166, 0.9099517204, 596.3148142)
 PU21_RANGE = (0.005, 10000.0)
 # The peak that the reference implementation uses for PSNR and SSIM of PU21 values; 100 cd/m^2 encode to 256.
@@ -35,10 +35,7 @@ def mu_law(radiance: Tensor, mu: float = 5000.0) -> Tensor:
 def psnr(
     prediction: Tensor, truth: Tensor, mask: Tensor | None = None, *, peak: float = 1.0, channels_apart: bool = False
 ) -> float:
-    """Peak signal-to-noise ratio in dB: 10 log10(peak^2 / MSE).
-
-    channels_apart: the mean of each channel's PSNR in place of the PSNR of the mean error.
-    """
+    """Peak signal-to-noise ratio in dB: 10 log10(peak^2 / MSE), or with channels_apart the mean over channels of it."""
     error, weight = squared_error(prediction, truth, mask)
     if not weight:
         return math.nan
@@ -74,10 +71,8 @@ def ssim(prediction: Tensor, truth: Tensor, mask: Tensor | None = None, *, peak:
 
 
 def pu21_encode(luminance: Tensor) -> Tensor:
-    """PU21 values of absolute luminance or colour in cd/m^2: 0 at 0.005, 256 at 100, 595 at 10000.
-
-    Values outside [0.005, 10000] cd/m^2 are limited to it. Source: Mantiuk and Azimi, PU21, PCS 2021 (banding_glare).
-    """
+    """PU21 values of absolute luminance or colour, limited to [0.005, 10000] cd/m^2: 0 at 0.005, 256 at 100, 595 at
+    10000 (Mantiuk and Azimi, PU21, PCS 2021)."""
     p = PU21
     power = luminance.double().clamp(*PU21_RANGE) ** p[3]
     return p[6] * (((p[0] + p[1] * power) / (1 + p[2] * power)) ** p[4] - p[5])

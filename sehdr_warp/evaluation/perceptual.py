@@ -76,8 +76,7 @@ class Lpips:
 def load_lpips(folder: Path | str | None = None, device: torch.device | str = "cpu") -> tuple[Lpips | None, str | None]:
     """(metric, None), or (None, the reason) where no usable set of weights is there. folder: by default SEHDR_LPIPS.
 
-    Raises InputError for a folder that does not exist or a file that is not what its name says. Files are read as
-    plain tensors (torch.load with weights_only), so that they cannot run code.
+    Raises InputError for a folder that does not exist or a file that is not what its name says.
     """
     folder = folder or os.environ.get(VARIABLE)
     if not folder:
@@ -89,9 +88,7 @@ def load_lpips(folder: Path | str | None = None, device: torch.device | str = "c
     heads = folder / "squeeze.pth"
     if not backbones or not heads.is_file():
         missing = "squeeze.pth" if backbones else "a SqueezeNet 1.1 backbone (squeezenet1_1_features.pth)"
-        others = [name for name in ("alex", "vgg") if (folder / f"{name}.pth").is_file()]
-        beside = f"; the heads for {' and '.join(others)} have no backbone here" if others else ""
-        return None, f"{folder} lacks {missing}{beside}"
+        return None, f"{folder} lacks {missing}"
     features, state = _squeezenet_features(), _tensors(backbones[0])
     kept = {name.removeprefix("features."): state[name] for name in state if not name.startswith("classifier.")}
     try:
@@ -107,7 +104,7 @@ def load_lpips(folder: Path | str | None = None, device: torch.device | str = "c
 
 def _tensors(path: Path) -> dict[str, Tensor]:
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        state = torch.load(path, map_location="cpu", weights_only=True)  # Plain tensors, which cannot run code.
     except Exception as error:  # torch reports damaged archives, pickles and missing files in many ways
         raise InputError(path, f"cannot be read as weights ({type(error).__name__})", "download it again") from error
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
@@ -116,10 +113,10 @@ def _tensors(path: Path) -> dict[str, Tensor]:
 
 
 def load_flip() -> tuple[Callable[[Tensor, Tensor], float] | None, str | None]:
-    """(HDR-FLIP (Andersson et al. 2021), None), or (None, the reason) where flip-evaluator is not installed.
+    """(HDR-FLIP, None), or (None, the reason) where flip-evaluator is not installed.
 
-    It takes prediction and truth, [H, W, 3] linear radiance with Rec.709 primaries in one unit, and returns the mean in
-    [0, 1], 0 for equal images, at 67 pixels a degree, over all exposures that the truth asks for.
+    HDR-FLIP (Andersson et al. 2021): the mean in [0, 1], 0 for equal images, of prediction and truth, [H, W, 3] linear
+    Rec.709 radiance in one unit, at 67 pixels a degree, over all exposures that the truth asks for.
     """
     try:
         import flip_evaluator

@@ -56,10 +56,9 @@ def tone_mapped_psnr(protocol: str, prediction: Tensor, truth: Tensor, mask: Ten
 def fit_scale(views: Iterable[tuple[Tensor, Tensor, Tensor | None, Tensor | None]]) -> float | None:
     """The factor that takes predictions to the truth: exp of the median of log(truth / prediction); None without votes.
 
-    views: (prediction, truth, mask or None, photo or None) of the training views; prediction and truth [H, W, 3]
-    scene-linear radiance, photo [H, W, 3] encoded. A channel votes whose truth is above 1e-4 of the view's maximum and
-    whose prediction is not black, where the photo does not clip (region_masks): it does not tell such light. Clipped
-    pixels vote where fewer than LEAST_VOTES others do.
+    views: (prediction, truth, mask or None, photo or None) of the training views, [H, W, 3] each. A channel votes whose
+    truth is above 1e-4 of the view's maximum and whose prediction is not black, where the photo does not clip: it does
+    not tell such light. Clipped pixels vote where fewer than LEAST_VOTES others do.
     """
     votes, guesses = [], []
     for prediction, truth, mask, photo in views:

@@ -19,9 +19,9 @@ class ErrorRanking:
         self._views: list[tuple[Tensor, Tensor, Tensor, Tensor, float, float]] = []
 
     def add(self, confidence, prediction, truth, well_exposed, darkest: float, mask: Tensor | None = None) -> None:
-        """confidence: [H, W] in [0, 1]. prediction, truth: [H, W, 3] radiance. well_exposed: [H, W] bool, of the photo.
-        darkest: radiance that the photo shows as black, in the render's unit. mask: [H, W]; only pixels above 0.5
-        count."""
+        """confidence, mask (pixels above 0.5 count): [H, W] in [0, 1]. prediction, truth: [H, W, 3] radiance.
+        well_exposed: [H, W] bool, of the photo. darkest: radiance that the photo shows as black, in the render's unit.
+        """
         counted = torch.ones_like(well_exposed) if mask is None else mask > 0.5
         unit = float(truth[counted].max()) if bool(counted.any()) else 0.0
         step = max(1, -(-int(counted.sum()) // MOST_PIXELS))
@@ -51,9 +51,8 @@ class ErrorRanking:
         figures |= {"mean": float(confidence.mean()), "pixels": len(confidence), "scale": scale}
         for name, errors in (("log2", stops), ("mu", steps)):
             figures[f"spearman_{name}"] = spearman(1 - confidence, torch.cat(errors))
-        if figures["spearman_log2"] is None:
-            figures["reason"] = "all pixels have one confidence or one error"
-        return figures
+        constant = {"reason": "all pixels have one confidence or one error"}
+        return figures | (constant if figures["spearman_log2"] is None else {})
 
 
 def spearman(first: Tensor, second: Tensor) -> float | None:

@@ -16,11 +16,10 @@ log = logging.getLogger(__name__)
 
 
 class FolderPictures:
-    """EXR files of views, by the views' names."""
+    """EXR files of views, by the views' names; predicts like RunPictures."""
 
     def __init__(self, folder: Path, files: dict[str, Path]):
-        self.files = files
-        self.facts = {"folder": str(folder)}
+        self.files, self.facts = files, {"folder": str(folder)}
 
     def hdr(self, view):
         return torch.from_numpy(read_hdr(self.files[view.name]).copy())
@@ -49,15 +48,16 @@ def score_folder(
     """
     folder = Path(folder)
     found = {file.stem: file for file in sorted(folder.glob("*.exr"))} if folder.is_dir() else {}
-    names = dict(zip((view.name for view in truth.views), safe_names([view.name for view in truth.views]), strict=True))
+    known = [view.name for view in truth.views]
+    names = dict(zip(known, safe_names(known), strict=True))
     files = {view: found[stem] for view, stem in names.items() if stem in found}
     wanted = [view for view in truth.test_views or truth.train_views if view.hdr is not None]
     if not wanted:
         raise InputError(truth.name, "its views hold no HDR truth", "give a set with truth")
     views = [view for view in wanted if view.name in files]
     if not views:
-        fault = f"holds no {names[wanted[0].name]}.exr or other picture of a view"
-        fault = fault if folder.is_dir() else "is no folder"
+        missing = f"holds no {names[wanted[0].name]}.exr or other picture of a view"
+        fault = missing if folder.is_dir() else "is no folder"
         raise InputError(folder, fault, f"name the EXR files as the {len(wanted)} views of {truth.name}")
     missing = [view.name for view in wanted if view.name not in files]
     extra = sorted(set(found) - set(names.values()))
@@ -65,7 +65,6 @@ def score_folder(
         if which:
             log.warning("%d %s: %s", len(which), what, ", ".join(which[:5]) + (", ..." if len(which) > 5 else ""))
     training = [view for view in truth.train_views if view.name in files and view.hdr is not None]
-    pictures, voting = FolderPictures(folder, files), training or views
-    evaluation = Evaluation(pictures, truth, "cpu", lpips_weights, flip, views=views, scale_views=voting)
+    evaluation = Evaluation(FolderPictures(folder, files), truth, "cpu", lpips_weights, flip, views, training or views)
     more = {"missing": missing, "extra": extra, "scale_from": "train" if training else "scored"}
     return evaluation.result() | more

@@ -1,11 +1,12 @@
 """Exposure brackets of HDR views: scene-linear EXR files whose ratios are exact, and simulated photos of them."""
 
+import logging
 from collections.abc import Iterable, Mapping
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from contextlib import nullcontext
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from .exr import Part, check_finite, exr_header, rgb_channels, stored_pixel_type
 from .images import exposure_exif, quantize, write_picture
 from .names import safe_names
 
+log = logging.getLogger(__name__)
 LDR_FORMATS = ("jpeg", "png", "png16")
 MANIFEST_FORMAT = 1
 
@@ -47,9 +49,8 @@ def bracket_exposures(
         raise SehdrError(f"brackets need evs or exposures, and {count}; give one of them")
     for exposure in made:
         if not _SHORTEST <= exposure.time <= _LONGEST:
-            raise SehdrError(
-                f"{name}: {exposure.time:.6g} s ({exposure.ev:+g} EV) is outside {_SHORTEST:g} to {_LONGEST:g} seconds"
-            )
+            time = f"{exposure.time:.6g} s ({exposure.ev:+g} EV)"
+            raise SehdrError(f"{name}: {time} is outside {_SHORTEST:g} to {_LONGEST:g} seconds")
     return made
 
 
@@ -70,9 +71,8 @@ def write_brackets(
 ) -> list[Path]:
     """Writes exposure brackets of HDR views; returns the EXR files.
 
-    views: name -> [H, W, 3] scene-linear Rec.709 radiance E, >= 0, not multiplied by an exposure time.
-    base_time: seconds at 0 EV. evs or exposures: as bracket_exposures takes them.
-    cameras: name -> camera, for the EXR attributes, where known. Other parameters: see BracketFolder.
+    views: name -> [H, W, 3] scene-linear Rec.709 radiance E, >= 0, not multiplied by an exposure time. evs or
+    exposures: see bracket_exposures. cameras: by name, for the EXR attributes. Other parameters: see Brackets.
 
     Every pixel is E dt, computed in float64 and rounded once. Files: `out/brackets/<view>/<view>_b<i>_ev<+x.x>.exr`
     with i ascending by exposure, or `out/brackets/<view>.exr`; `out/brackets_ldr/<view>/...` where ldr is given; and
@@ -82,36 +82,32 @@ def write_brackets(
     overwrite) or a pixel is not finite.
     """
     made = bracket_exposures(base_time, evs=evs, exposures=exposures)
-    options = {"colorspace": colorspace, "pixel": pixel, "multipart": multipart, "ldr": ldr, "response": response}
-    pairs = list(views.items() if isinstance(views, Mapping) else views)
-    with BracketFolder(Path(out), made, base_time, **options, overwrite=overwrite) as folder:
-        for safe, (name, radiance) in zip(safe_names([name for name, _ in pairs]), pairs, strict=True):
-            folder.add(safe, radiance, (cameras or {}).get(name))
-    return folder.files
+    brackets = Brackets(made, base_time, colorspace, pixel, multipart, ldr, response)
+    radiances = dict(views)
+    names = zip(safe_names(list(radiances)), radiances.items(), strict=True)
+    given = ((safe, radiance, (cameras or {}).get(name)) for safe, (name, radiance) in names)
+    return brackets.write(Path(out), given, overwrite)
 
 
-@dataclass
-class BracketFolder:
-    """A set of brackets under construction: add views one at a time; leaving the `with` block makes them appear.
+@dataclass(frozen=True)
+class Brackets:
+    """What is written of each view.
 
     exposures: ascending, as from bracket_exposures. base_time: seconds at 0 EV. colorspace: of the EXR files. pixel:
     "half" (float where half would overflow) or "float". multipart: one EXR file with all exposures of a view. ldr: one
-    of LDR_FORMATS adds simulated photos through response.encode. provenance: text by key, for the EXR attributes.
-    files: the EXR files, at their final places.
+    of LDR_FORMATS adds simulated photos through response.encode. captured: local time. provenance: text by key, for the
+    EXR attributes.
     """
 
-    out: Path
     exposures: tuple[Exposure, ...]
     base_time: float
     colorspace: str = "rec709"
     pixel: str = "half"
     multipart: bool = False
     ldr: str | None = None
-    response: object | None = None
+    response: Any = None
     captured: datetime | None = None
-    provenance: Mapping[str, str] = field(default_factory=dict)
-    overwrite: bool = False
-    files: list[Path] = field(default_factory=list, init=False)
+    provenance: Mapping[str, str] | None = None
 
     def __post_init__(self):
         color_space(self.colorspace)
@@ -120,70 +116,28 @@ class BracketFolder:
             raise SehdrError(f"LDR brackets {self.ldr!r} are not one of {', '.join(LDR_FORMATS)}")
         if self.ldr is not None and self.response is None:
             raise SehdrError("LDR brackets need a camera response; give one, or leave out ldr")
-        self._views: list[dict] = []
-
-    def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            self._manifest = stack.enter_context(atomic_path(self.out / "brackets.json", self.overwrite))
-            self._folder = stack.enter_context(atomic_folder(self.out / "brackets", self.overwrite))
-            if self.ldr:
-                self._ldr_folder = stack.enter_context(atomic_folder(self.out / "brackets_ldr", self.overwrite))
-            stack.push(self._finish)  # Pushed last, it runs first: the list must be there before anything appears.
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *error) -> bool | None:
-        return self._stack.__exit__(*error)
-
-    def add(self, name: str, radiance: np.ndarray, camera: Camera | None = None) -> str:
-        """Writes the bracket of one view under a name that is safe for files; returns the pixel type of its files."""
-        radiance = np.asarray(radiance, np.float64)
-        if radiance.shape[2:] != (3,):
-            raise ValueError(f"radiance has shape {radiance.shape}, not [H, W, 3]")
-        check_finite(self.out / "brackets" / name, radiance, "{count} radiances")
-        linear = from_rec709(radiance, self.colorspace)
-        pixels = [linear * exposure.time for exposure in self.exposures]
-        # One type for all exposures of a view, so that their ratios keep one precision.
-        pixel = stored_pixel_type(pixels, self.pixel)
-        parts, entries = [], []
-        for index, (exposure, image) in enumerate(zip(self.exposures, pixels, strict=True)):
-            label, header = f"b{index}_{exposure.label}", self.header(name, exposure.time, camera, ev=repr(exposure.ev))
-            parts.append(Part(rgb_channels(image), header, label))
-            file = f"{name}.exr" if self.multipart else f"{name}/{name}_{label}.exr"
-            entry = {"index": index, "exposure_time": exposure.time, "ev": exposure.ev, "file": f"brackets/{file}"}
-            if self.multipart:
-                entry["part"] = index
-            else:
-                write_exr(self._folder / file, parts[-1].channels, pixel=pixel, header=header)
-            if self.ldr:
-                entry["ldr_file"] = self._write_photo(f"{name}/{name}_{label}", radiance, exposure)
-            entries.append(entry)
-        if self.multipart:
-            write_multipart_exr(self._folder / f"{name}.exr", parts, pixel=pixel)
-        self.files += [self.out / file for file in dict.fromkeys(entry["file"] for entry in entries)]
-        self._views.append({"view": name, "pixel": pixel, "exposures": entries})
-        return pixel
 
     def header(self, view: str, exposure_time: float, camera: Camera | None, **facts: str) -> dict[str, Any]:
-        """The EXR attributes of a picture of the set."""
-        facts |= {"view": view, "baseExposureTime": repr(self.base_time)}
+        """The EXR attributes of a picture."""
+        facts = {**(self.provenance or {}), **facts, "view": view, "baseExposureTime": repr(self.base_time)}
         return exr_header(
             colorspace=self.colorspace,
             exposure_time=exposure_time,
             camera=camera,
             captured=self.captured,
-            provenance={**self.provenance, **facts},
+            provenance=facts,
         )
 
-    def _write_photo(self, stem: str, radiance: np.ndarray, exposure: Exposure) -> str:
-        exif = exposure_exif(exposure.time, bias=exposure.ev, captured=self.captured)
-        codes = quantize(self.response.encode(radiance * exposure.time), 16 if self.ldr == "png16" else 8)
-        file = f"{stem}.{'jpg' if self.ldr == 'jpeg' else 'png'}"
-        write_picture(self._ldr_folder / file, codes, exif=exif)
-        return f"brackets_ldr/{file}"
-
-    def _finish(self, kind, error, trace) -> None:
-        if kind is None:
+    def write(
+        self, out: Path, views: Iterable[tuple[str, np.ndarray, Camera | None]], overwrite: bool = False
+    ) -> list[Path]:
+        """As write_brackets() says, one view at a time: a name that is safe for files, radiance, and camera."""
+        with (
+            atomic_path(out / "brackets.json", overwrite) as manifest,
+            atomic_folder(out / "brackets", overwrite) as folder,
+            atomic_folder(out / "brackets_ldr", overwrite) if self.ldr else nullcontext(out) as photos,
+        ):
+            written = [self._write_view(out, folder, photos, *view) for view in views]
             described = {
                 "format": MANIFEST_FORMAT,
                 "software": "sehdr-warp",
@@ -193,7 +147,43 @@ class BracketFolder:
                 "multipart": self.multipart,
                 "response": getattr(self.response, "name", None),
                 "ldr": self.ldr,
-                "provenance": dict(self.provenance),
-                "views": self._views,
+                "provenance": dict(self.provenance or {}),
+                "views": written,
             }
-            write_json(self._manifest, described)
+            write_json(manifest, described)
+        return [out / file for file in dict.fromkeys(each["file"] for view in written for each in view["exposures"])]
+
+    def _write_view(
+        self, out: Path, folder: Path, photos: Path, name: str, radiance: np.ndarray, camera: Camera | None
+    ) -> dict:
+        """Writes the bracket of a view; returns its entry in the manifest."""
+        radiance = np.asarray(radiance, np.float64)
+        if radiance.shape[2:] != (3,):
+            raise ValueError(f"radiance has shape {radiance.shape}, not [H, W, 3]")
+        check_finite(out / "brackets" / name, radiance, "{count} radiances")
+        linear = from_rec709(radiance, self.colorspace)
+        pixels = [linear * exposure.time for exposure in self.exposures]
+        # One type for all exposures of a view, so that their ratios keep one precision.
+        pixel = stored_pixel_type(pixels, self.pixel)
+        if pixel != self.pixel:
+            log.info("%s: its brackets reach above 65504, which half cannot; written as float", name)
+        parts, entries = [], []
+        for index, (exposure, image) in enumerate(zip(self.exposures, pixels, strict=True)):
+            label, header = f"b{index}_{exposure.label}", self.header(name, exposure.time, camera, ev=repr(exposure.ev))
+            parts.append(Part(rgb_channels(image), header, label))
+            file = f"{name}.exr" if self.multipart else f"{name}/{name}_{label}.exr"
+            entry = {"index": index, "exposure_time": exposure.time, "ev": exposure.ev, "file": f"brackets/{file}"}
+            if self.multipart:
+                entry["part"] = index
+            else:
+                write_exr(folder / file, parts[-1].channels, pixel=pixel, header=header)
+            if self.ldr:
+                photo = f"{name}/{name}_{label}.{'jpg' if self.ldr == 'jpeg' else 'png'}"
+                exif = exposure_exif(exposure.time, bias=exposure.ev, captured=self.captured)
+                codes = quantize(self.response.encode(radiance * exposure.time), 16 if self.ldr == "png16" else 8)
+                write_picture(photos / photo, codes, exif=exif)
+                entry["ldr_file"] = f"brackets_ldr/{photo}"
+            entries.append(entry)
+        if self.multipart:
+            write_multipart_exr(folder / f"{name}.exr", parts, pixel=pixel)
+        return {"view": name, "pixel": pixel, "exposures": entries}

@@ -8,7 +8,7 @@ import numpy as np
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera
 
-# An hour of film at 24 views a second has 86 400; more is a slip of the hand.
+# More than an hour of film at 24 views a second is a slip of the hand.
 _LONGEST = 100_000
 # A gap in azimuth smaller than this means that the photos go round the scene.
 _ROUND_GAP = np.radians(120)
@@ -32,14 +32,13 @@ def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[
 
     Where the given cameras go round the focus, a circle of their mean radius and height; else an oval within their
     spread (azimuth and elevation about the focus, at the mean distance), which shows nothing that no photo saw. Size
-    and intrinsics are those of the camera nearest to the middle.
+    and intrinsics are those of the middle camera. focus_distance: of the focus ahead where the optical axes are
+    parallel; world units, positive.
 
-    focus_distance: of the focus ahead where the optical axes are parallel; world units, positive.
     Raises SehdrError without cameras or for a count outside 1 to 100 000.
     """
     _check(cameras, count)
-    positions = _positions(cameras)
-    focus = common_focus(cameras)
+    positions, focus = _positions(cameras), common_focus(cameras)
     middle = cameras[int(np.argmin(np.linalg.norm(positions - positions.mean(axis=0), axis=1)))]
     if focus is None:
         focus = middle.position + focus_distance * middle.world_to_camera[2, :3]
@@ -78,8 +77,8 @@ def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
     from scipy.spatial.transform import Rotation, RotationSpline
 
     _check(cameras, count)
-    positions = _positions(cameras)
-    rotations = Rotation.from_matrix(np.stack([camera.camera_to_world[:3, :3] for camera in cameras]))
+    positions, axes = _positions(cameras), np.stack([camera.camera_to_world[:3, :3] for camera in cameras])
+    rotations = Rotation.from_matrix(axes)
     size = max(float(np.ptp(positions, axis=0).max()), 1e-9)
     moves = np.linalg.norm(np.diff(positions, axis=0), axis=1) / size
     steps = np.append(0.0, moves + (rotations[:-1].inv() * rotations[1:]).magnitude()) if len(cameras) > 1 else [0.0]
@@ -89,7 +88,7 @@ def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
         return [cameras[0]] * count
     at = np.linspace(0, times[-1], count)
     poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = RotationSpline(times, rotations[keep])(at).as_matrix()
+    poses[:, :3, :3] = RotationSpline(times, Rotation.from_matrix(axes[keep]))(at).as_matrix()
     poses[:, :3, 3] = CubicSpline(times, positions[keep])(at)
     return [_moved(cameras[0], pose) for pose in poses]
 

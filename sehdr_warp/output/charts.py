@@ -1,13 +1,14 @@
 """Charts of trainings: held-out error against time."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 # Hues that the colour-blind tell apart (Okabe and Ito).
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31")
 INK, QUIET, RULE = "#1f2328", "#6a737d", "#e1e4e8"
 PANELS = {"psnr_ldr": "Photos", "psnr_mu": "HDR, mu-law (gt-max)"}
 """Figures of a line of metrics.jsonl, and what their panels are called."""
-STYLE = {
+STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["Inter", "Helvetica Neue", "Arial", "DejaVu Sans"],
     "font.size": 9,
@@ -30,12 +31,12 @@ def training_chart(rows: Mapping[str, Sequence[Sequence[Mapping]]]):
     rows: label -> the metrics of one run, or of several that differ by their seed. One color a row, one line a run; of
     a single row the last figure stands in the panel's title.
     """
-    import matplotlib as mpl
+    from matplotlib import rc_context
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     keys = [key for key in PANELS if any(training_points(c, key) for curves in rows.values() for c in curves)]
-    with mpl.rc_context(STYLE):
+    with rc_context(STYLE):
         layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.12)
         figure = Figure(figsize=(4.6 * max(len(keys), 1) + 1.6 * (len(rows) > 1), 3.8), layout=layout)
         handles = {}
@@ -43,9 +44,9 @@ def training_chart(rows: Mapping[str, Sequence[Sequence[Mapping]]]):
             axes = figure.add_subplot(1, len(keys), place)
             title = PANELS[key]
             for number, (label, curves) in enumerate(rows.items()):
-                style = {"color": COLORS[number % len(COLORS)], "linestyle": "-" if number < len(COLORS) else "--"}
+                color, line = COLORS[number % len(COLORS)], "-" if number < len(COLORS) else "--"
                 for points in filter(None, (training_points(curve, key) for curve in curves)):
-                    (handles[label],) = axes.plot(*zip(*points, strict=True), marker=".", linewidth=1.6, **style)
+                    (handles[label],) = axes.plot(*zip(*points), marker=".", linewidth=1.6, color=color, linestyle=line)
                     title = f"{PANELS[key]}: {points[-1][1]:.1f} dB" if len(rows) == len(curves) == 1 else title
             axes.set_title(title, loc="left", fontsize=10, fontweight="bold")
             axes.set_xlabel("training time, seconds")

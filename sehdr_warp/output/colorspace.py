@@ -12,8 +12,8 @@ _REC709 = (0.640, 0.330, 0.300, 0.600, 0.150, 0.060, 0.3127, 0.3290)
 
 
 class ColorSpace(NamedTuple):
-    """A linear, scene-referred RGB space: its name on the command line, its name in colour.RGB_COLOURSPACES, and the
-    Color Interop Forum's, which OpenEXR stores as `colorInteropID`; None if it has none."""
+    """A linear RGB space: its name on the command line, in colour.RGB_COLOURSPACES, and as `colorInteropID` of OpenEXR
+    (Color Interop Forum), if it has one."""
 
     name: str
     dataset: str
@@ -28,8 +28,10 @@ SPACES = (
     ColorSpace("display-p3", "Display P3", "lin_p3d65_scene"),
     ColorSpace("dci-p3", "DCI-P3", None),
 )
-_ALIASES = {"bt709": "rec709", "srgb": "rec709", "ap1": "acescg", "ap0": "aces2065-1", "bt2020": "rec2020"}
-_ALIASES["p3-d65"] = "display-p3"
+_ALIASES = {
+    "bt709": "rec709", "srgb": "rec709", "bt2020": "rec2020",
+    "ap1": "acescg", "ap0": "aces2065-1", "p3-d65": "display-p3",
+}  # fmt: skip
 
 
 def color_space(name: str) -> ColorSpace:
@@ -52,10 +54,8 @@ def chromaticities(name: str) -> tuple[float, ...]:
 
 @cache
 def matrix_from_rec709(name: str) -> np.ndarray:
-    """[3, 3] float64: linear Rec.709 column vectors to the named space, white to white.
-
-    Bradford's adaptation is that of the ACES transforms and of OpenColorIO's built-in ones.
-    """
+    """[3, 3] float64: linear Rec.709 column vectors to the named space, white to white by Bradford's adaptation, as in
+    the ACES transforms and OpenColorIO's built-in ones."""
     import colour
 
     return colour.matrix_RGB_to_RGB(_dataset("rec709"), _dataset(name), "Bradford")

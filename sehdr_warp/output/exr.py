@@ -21,6 +21,7 @@ from ..files import atomic_path
 from .colorspace import chromaticities, color_space
 from .images import EXIF_TIME
 
+NOT_FINITE = "it is not written; train again from an earlier checkpoint or with another seed"
 _TYPES = {"half": np.float16, "float": np.float32}
 # OpenCV axes (+y down, +z forward) to the axes of worldToCamera (+y up, -z forward).
 _FLIP_Y_Z = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -30,8 +31,8 @@ _FLIP_Y_Z = np.diag([1.0, -1.0, -1.0, 1.0])
 class Part:
     """One picture of a file.
 
-    channels: name -> [H, W] finite numbers, all of one shape: R, G, B, A, Z, and any other. header: OpenEXR attributes
-    besides the pixels' own, such as exr_header() makes. name: needed where a file has several parts, and then unique.
+    channels: name -> [H, W] finite numbers, all of one shape: R, G, B, A, Z, and any other. header: attributes such as
+    exr_header() makes. name: unique in the file; may be empty where it has one part.
     """
 
     channels: Mapping[str, np.ndarray]
@@ -47,12 +48,8 @@ def exr_header(
     captured: datetime | None = None,
     provenance: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """OpenEXR attributes for a picture.
-
-    exposure_time: seconds, `expTime`: what radiance was multiplied by. camera: gives `worldToCamera`, `worldToNDC`,
-    `screenWindowCenter`, `screenWindowWidth` and `pixelAspectRatio`. captured: local time, `capDate`. provenance: text
-    by key, `sehdr:<key>`.
-    """
+    """OpenEXR attributes for a picture. exposure_time: seconds, what radiance was multiplied by. captured: local time.
+    provenance: text by key, as `sehdr:<key>`."""
     space = color_space(colorspace)
     header: dict[str, Any] = {"chromaticities": chromaticities(space.name), "sehdr:colorSpace": space.name}
     if space.interop_id:
@@ -72,33 +69,6 @@ def rgb_channels(image: np.ndarray) -> dict[str, np.ndarray]:
     return dict(zip("RGB", np.moveaxis(image, 2, 0), strict=True))
 
 
-def write_exr(
-    path: Path | str,
-    channels: Mapping[str, np.ndarray],
-    *,
-    pixel: str = "half",
-    header: Mapping[str, Any] | None = None,
-    overwrite: bool = False,
-) -> str:
-    """write_multipart_exr for one part without a name; with overwrite a file at `path` is replaced."""
-    return _write(Path(path), [Part(channels, header or {})], pixel, overwrite)
-
-
-def write_multipart_exr(path: Path | str, parts: Sequence[Part], *, pixel: str = "half") -> str:
-    """Writes a file of several named parts with ZIP compression; returns the pixel type of the colors.
-
-    pixel: "half" or "float". Where half cannot hold a value (above 65504 in size), all channels of the file are float
-    instead, and each part's `sehdr:pixelType` says so: nothing is clipped. Depth (`Z`, or a layer's `.Z`) is always
-    float: half's 11 bits are too few for it.
-
-    Raises InputError where a value is NaN or infinite (with channel and place) or `path` exists; SehdrError where the
-    file cannot be written; ValueError for an unknown pixel type, unequal shapes or names.
-    """
-    if not parts or any(not part.name for part in parts) or len({part.name for part in parts}) < len(parts):
-        raise ValueError("parts need one name each, all different")
-    return _write(Path(path), parts, pixel)
-
-
 def stored_pixel_type(arrays: Sequence[np.ndarray], pixel: str = "half") -> str:
     """The type that holds all values unclipped: `pixel`, or "float" where half would overflow."""
     if pixel not in _TYPES:
@@ -107,12 +77,39 @@ def stored_pixel_type(arrays: Sequence[np.ndarray], pixel: str = "half") -> str:
     return "half" if pixel == "half" and fits else "float"
 
 
-def _write(path: Path, parts: Sequence[Part], pixel: str, overwrite: bool = False) -> str:
+def write_exr(
+    path: Path | str,
+    channels: Mapping[str, np.ndarray],
+    *,
+    pixel: str = "half",
+    header: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
+) -> str:
+    """write_multipart_exr() for one part without a name."""
+    return write_multipart_exr(path, [Part(channels, header or {})], pixel=pixel, overwrite=overwrite)
+
+
+def write_multipart_exr(
+    path: Path | str, parts: Sequence[Part], *, pixel: str = "half", overwrite: bool = False
+) -> str:
+    """Writes a file with ZIP compression; returns the pixel type of the colors.
+
+    pixel: "half" or "float". Where half cannot hold a value (above 65504 in size), all channels of the file are float
+    instead, and each part's `sehdr:pixelType` says so: nothing is clipped. Depth (`Z`, or a layer's `.Z`) is always
+    float: half's 11 bits are too few for it.
+
+    Raises InputError where a value is NaN or infinite (with channel and place) or `path` exists (unless overwrite);
+    SehdrError where the file cannot be written; ValueError for an unknown pixel type, unequal shapes or names.
+    """
     import OpenEXR
 
+    path = Path(path)
+    if not parts or len({part.name for part in parts}) < len(parts):
+        raise ValueError("parts need one name each, all different")
     for part in parts:
         _check(path, part)
-    stored = stored_pixel_type([a for part in parts for name, a in part.channels.items() if not _is_depth(name)], pixel)
+    colors = [array for part in parts for name, array in part.channels.items() if not _is_depth(name)]
+    stored = stored_pixel_type(colors, pixel)
     written = []
     for part in parts:
         header = {
@@ -138,7 +135,7 @@ def _write(path: Path, parts: Sequence[Part], pixel: str, overwrite: bool = Fals
 
 def _check(path: Path, part: Part) -> None:
     shapes = {np.shape(array) for array in part.channels.values()}
-    if len(shapes) != 1 or len(shape := next(iter(shapes))) != 2 or 0 in shape:
+    if len(shapes) != 1 or any(len(shape) != 2 or 0 in shape for shape in shapes):
         raise ValueError(f"channels have the shapes {sorted(shapes)}, not one [H, W]")
     for name, array in part.channels.items():
         where = f"part {part.name}, channel {name}" if part.name else f"channel {name}"
@@ -148,17 +145,13 @@ def _check(path: Path, part: Part) -> None:
 
 
 def check_finite(path: Path, image: np.ndarray, what: str) -> None:
-    """Raises InputError for NaN and infinity in [H, W] or [H, W, 3]; what: of the image, with {count} for how many."""
+    """Raises InputError for NaN and infinity in [H, W] or [H, W, 3]; what: they are, with {count} for how many."""
     bad = ~np.isfinite(image)
     if bad.any():
-        place = tuple(int(i) for i in np.argwhere(bad)[0])
-        channel = f"{'RGB'[place[2]]} = " if len(place) == 3 else ""
-        raise InputError(
-            path,
-            f"{what.format(count=int(bad.sum()))} are not finite, the first {channel}{image[place]}"
-            f" at x={place[1]}, y={place[0]}",
-            "such pictures are not written; train again from an earlier checkpoint or with another seed",
-        )
+        y, x, *channel = place = tuple(np.argwhere(bad)[0])
+        first = f"{'RGB'[channel[0]]} = {image[place]}" if channel else image[place]
+        fault = f"{what.format(count=int(bad.sum()))} are not finite, the first {first} at x={x}, y={y}"
+        raise InputError(path, fault, NOT_FINITE)
 
 
 def _is_depth(name: str) -> bool:

@@ -5,6 +5,7 @@ import zlib
 from datetime import datetime
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -26,10 +27,8 @@ def quantize(values: np.ndarray, bits: int = 8) -> np.ndarray:
 
 
 def exposure_exif(exposure_time: float, *, bias: float | None = None, captured: datetime | None = None) -> Image.Exif:
-    """EXIF with ExposureTime as the nearest rational of 32 bits: seconds.
-
-    bias: ExposureBiasValue in stops. captured: DateTimeOriginal.
-    """
+    """ExposureTime in seconds as the nearest rational of 32 bits; bias: ExposureBiasValue in stops. captured:
+    DateTimeOriginal."""
     exif = Image.Exif()
     exif[_SOFTWARE] = "sehdr-warp"
     details = exif.get_ifd(_EXIF_IFD)
@@ -51,12 +50,12 @@ def write_picture(path: Path | str, codes: np.ndarray, *, exif: Image.Exif | Non
     allowed = (np.uint8,) if jpeg else (np.uint8, np.uint16)
     if codes.dtype not in allowed or codes.shape[2:] not in ((), (3,)) or codes.ndim < 2 or 0 in codes.shape:
         raise ValueError(f"code values are {codes.dtype} {codes.shape}, not [H, W] or [H, W, 3] of {allowed}")
-    options = {"quality": 98, "subsampling": 0} if jpeg else {}
+    options: dict[str, Any] = {"quality": 98, "subsampling": 0} if jpeg else {}
     with atomic_path(path) as temporary:
         if codes.dtype == np.uint16:
             temporary.write_bytes(_png16(codes, exif))
         else:
-            Image.fromarray(codes).save(temporary, exif=Image.Exif() if exif is None else exif, **options)
+            Image.fromarray(codes).save(temporary, exif=exif or Image.Exif(), **options)
 
 
 def as_array(value) -> np.ndarray:
@@ -73,11 +72,8 @@ def _png16(codes: np.ndarray, exif: Image.Exif | None) -> bytes:
     filtered[:, 1:] = rows
     filtered[1:, 1:] -= rows[:-1]
     header = struct.pack(">IIBBBBB", width, height, 16, 2 if codes.ndim == 3 else 0, 0, 0, 0)
-    chunks = [(b"IHDR", header)]
-    if exif is not None:
-        chunks.append((b"eXIf", exif.tobytes().removeprefix(b"Exif\0\0")))
-    chunks += [(b"IDAT", zlib.compress(filtered.tobytes(), 6)), (b"IEND", b"")]
-    parts = [
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
-    ]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+    exif_data = {} if exif is None else {b"eXIf": exif.tobytes().removeprefix(b"Exif\0\0")}
+    written = b"\x89PNG\r\n\x1a\n"
+    for kind, data in {b"IHDR": header, **exif_data, b"IDAT": zlib.compress(filtered.tobytes()), b"IEND": b""}.items():
+        written += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return written

@@ -9,11 +9,8 @@ _LONGEST = 120
 
 
 def safe_names(names: Sequence[str]) -> list[str]:
-    """File names for views, all different, also where upper and lower case are one.
-
-    What some system forbids becomes `_`, leading dots go, and length is limited to 120 bytes. Of names that come more
-    than once, the later ones get a number.
-    """
+    """File names for views, all different, also where upper and lower case are one: what some system forbids becomes
+    `_`, leading dots go, 120 bytes are the most, and of equal names the later ones get a number."""
     cleaned = [_clean(name) for name in names]
     wanted, taken, result = {name.casefold() for name in cleaned}, set(), []
     for name in cleaned:

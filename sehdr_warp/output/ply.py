@@ -17,6 +17,7 @@ import numpy as np
 from sehdr_warp.errors import InputError, SehdrError
 
 from ..files import atomic_path, check_absent
+from .exr import NOT_FINITE
 
 log = logging.getLogger(__name__)
 KINDS = ("hdr", "ldr")
@@ -39,10 +40,9 @@ class GaussianArrays:
     """N Gaussians as NumPy arrays, float32.
 
     means [N, 3] world; log_scales [N, 3], natural logarithm of the standard deviations; quaternions [N, 4] (w x y z);
-    opacity_logits [N]; harmonics [N, K, 3] with K = (degree + 1)^2, degree 0 to 3.
-    color_model: what the sum of harmonics over a viewing direction means, per channel. "display": sRGB-encoded color
-    max(sum + 0.5, 0), as every 3DGS viewer takes it; "log": scene-linear radiance exp(sum); "linear": scene-linear
-    radiance max(sum, 0). base_time: seconds at which the scene was photographed.
+    opacity_logits [N]; harmonics [N, (degree + 1)^2, 3], degree 0 to 3. color_model: what their sum over a viewing
+    direction means, per channel: "display": sRGB-encoded color max(sum + 0.5, 0), as every 3DGS viewer takes it; "log":
+    scene-linear radiance exp(sum); "linear": max(sum, 0). base_time: seconds at which the scene was photographed.
     """
 
     means: np.ndarray
@@ -66,8 +66,7 @@ def export(
 ) -> Path:
     """Writes the Gaussians of a trained run as PLY; returns the path.
 
-    kind: "hdr": scene-linear radiance, see hdr_gaussians; "ldr": display colors, see ldr_gaussians.
-    exposure_time: of "ldr", seconds; by default the one the scene was photographed at.
+    kind: "hdr" for scene-linear radiance, "ldr" for display colors at exposure_time: seconds, by default the scene's.
 
     Raises SehdrError for another kind or an exposure time that is not positive, InputError where the file exists
     (unless overwrite) or a value is not finite.
@@ -86,8 +85,8 @@ def export(
 
 
 def hdr_gaussians(run) -> GaussianArrays:
-    """The scene-linear Gaussians of a run: exact where harmonics are exposures or their logarithms; else, with fused
-    brackets or harmonics of encoded values, fitted to the logarithm of the radiance (see bake)."""
+    """Scene-linear: exact where harmonics are exposures or their logarithms; else, with fused brackets or harmonics of
+    encoded values, fitted to the logarithm of the radiance (see bake)."""
     stored, to_radiance = _stored(run)
     if to_radiance is not None:
         return bake(stored, lambda c: np.log(np.maximum(to_radiance(c), _DARKEST)), "log", _seen_from(run))
@@ -99,10 +98,8 @@ def hdr_gaussians(run) -> GaussianArrays:
 
 
 def ldr_gaussians(run, exposure_time: float | None = None) -> GaussianArrays:
-    """Display colors of a run at an exposure time in seconds: what its response makes of each Gaussian's radiance.
-
-    Viewers blend these, not radiance: half-covered edges of very bright things come out darker than in a photo.
-    """
+    """What the run's response makes of each Gaussian's radiance. Viewers blend these colors, not radiance: half-covered
+    edges of very bright things come out darker than in a photo."""
     time = run.base_time if exposure_time is None else float(exposure_time)
     if not (np.isfinite(time) and time > 0):
         raise SehdrError(f"exposure time {time:g} is not positive and finite; give seconds")
@@ -116,16 +113,16 @@ def ldr_gaussians(run, exposure_time: float | None = None) -> GaussianArrays:
 def _stored(run) -> tuple[GaussianArrays, Colors | None]:
     """The run's Gaussians in its model's colors, and how these become radiance; None where they are exposures."""
     tensors = {name: value.cpu().numpy() for name, value in run.model.gaussians.tensors().items()}
-    harmonics = np.concatenate([tensors["harmonics_dc"], tensors["harmonics_rest"]], axis=1)
-    geometry = (tensors[name] for name in ("means", "log_scales", "quaternions", "opacity_logits"))
-    gaussians = GaussianArrays(*geometry, harmonics, run.model.color_model.name, run.base_time)
+    harmonics = np.concatenate([tensors.pop("harmonics_dc"), tensors.pop("harmonics_rest")], axis=1)
+    color_model = run.model.color_model.name
+    gaussians = GaussianArrays(**tensors, harmonics=harmonics, color_model=color_model, base_time=run.base_time)
     if run.model.color_model.encoded:
         return gaussians, lambda encoded: run.response.decode(np.clip(encoded, 0, 1)) / run.base_time
     return gaussians, None if run.model.fusion is None else lambda exposure: _fuse(run, exposure)
 
 
 def _fuse(run, exposure: np.ndarray) -> np.ndarray:
-    """[N, D, 3] radiance of the fused brackets from [N, D, 3] exposures at the base time."""
+    """[N, D, 3] radiance of [N, D, 3] exposures at the base time."""
     import torch
 
     logs = torch.from_numpy(np.log(np.maximum(exposure, _DARKEST)).reshape(-1, 3).astype(np.float32))
@@ -139,10 +136,8 @@ def _seen_from(run) -> np.ndarray:
 
 
 def harmonic_basis(directions: np.ndarray, degree: int) -> np.ndarray:
-    """[..., (degree + 1)^2] float64 real spherical harmonics of unit directions [..., 3], orthonormal over the sphere.
-
-    With the Condon-Shortley phase and in the order of 3D Gaussian Splatting: l = 0, 1, ..., and m = -l ... l.
-    """
+    """[..., (degree + 1)^2] float64 real spherical harmonics of unit directions [..., 3], orthonormal over the sphere,
+    with the Condon-Shortley phase and in the order of 3D Gaussian Splatting: l = 0, 1, ..., and m = -l ... l."""
     from scipy.special import sph_harm_y
 
     x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
@@ -174,16 +169,14 @@ def evaluate_colors(gaussians: GaussianArrays, directions: np.ndarray) -> np.nda
 def bake(
     gaussians: GaussianArrays, change: Colors, color_model: str, camera_positions: np.ndarray | None = None
 ) -> GaussianArrays:
-    """The same Gaussians with harmonics fitted to changed colors.
+    """The same Gaussians with harmonics of the same degree fitted to changed colors by least squares: a camera response
+    and the fusion of brackets act on the radiance of a direction, not on harmonics.
 
-    A camera response and the fusion of brackets act on the radiance of a direction, not on harmonics. So radiance is
-    evaluated over many directions, changed there, and harmonics of the same degree are fitted to it by least squares.
     Directions in which a Gaussian was photographed count most, since elsewhere its harmonics were never held to
     anything; an even cover of the sphere keeps the fit bounded there.
 
-    change: [N, D, 3] colors of the present model -> [N, D, 3] values that the new harmonics (with "display" after
-    its offset of 0.5) shall give. camera_positions: [C, 3] from where the scene was photographed; without any, all
-    directions weigh alike.
+    change: [N, D, 3] colors of the present model -> [N, D, 3] of color_model. camera_positions: [C, 3] from where the
+    scene was photographed; without any, all directions weigh alike.
     """
     sphere, cameras = sphere_directions(), np.empty((0, 3))
     weights = np.full(len(sphere), 1.0 / len(sphere))
@@ -208,11 +201,8 @@ def bake(
 
 
 def without_unseen_degrees(gaussians: GaussianArrays) -> GaussianArrays:
-    """The Gaussians without the highest degrees that change no color by more than a ten-thousandth ("display": of
-    white) in any direction.
-
-    A degree l with coefficients c changes a color by at most |c| sqrt((2 l + 1) / (4 pi)) (addition theorem).
-    """
+    """Without the highest degrees that change no color by more than a ten-thousandth ("display": of white): degree l
+    with coefficients c changes one by at most |c| sqrt((2 l + 1) / (4 pi)) (addition theorem)."""
     harmonics, degree = gaussians.harmonics.astype(np.float64), gaussians.degree
     scale = np.abs(_HARMONIC_0 * harmonics[:, 0]) if gaussians.color_model == "linear" else 1.0
     while degree > 0:
@@ -225,7 +215,7 @@ def without_unseen_degrees(gaussians: GaussianArrays) -> GaussianArrays:
 
 
 def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: bool = False) -> None:
-    """Writes a PLY file; the color model and the base exposure time are `comment sehdr:...` lines of its header.
+    """The color model and the base exposure time are `comment sehdr:...` lines of the header.
 
     Raises InputError where a value is NaN or infinite (with field and index) or the file exists (unless overwrite),
     SehdrError where it cannot be written.
@@ -249,13 +239,10 @@ def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: b
         bad = ~np.isfinite(values)
         if bad.any():
             index = int(np.argmax(bad))
-            raise InputError(
-                path,
-                f"{name} of {int(bad.sum())} Gaussians is not finite, the first {values[index]} at {index}",
-                "such scenes are not written; train again from an earlier checkpoint or with another seed",
-            )
+            fault = f"{name} of {int(bad.sum())} Gaussians is not finite, the first {values[index]} at {index}"
+            raise InputError(path, fault, NOT_FINITE)
         table[name] = values
-    time = f"sehdr:base_exposure_time {gaussians.base_time!r}"
-    comments = [f"sehdr:color_model {gaussians.color_model}", time]
+    facts = {"color_model": gaussians.color_model, "base_exposure_time": repr(gaussians.base_time)}
+    comments = [f"sehdr:{name} {value}" for name, value in facts.items()]
     with atomic_path(path, overwrite) as temporary, temporary.open("wb") as file:
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=comments).write(file)

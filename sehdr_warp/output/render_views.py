@@ -1,8 +1,7 @@
 """Pictures of a trained scene: HDR files, previews and exposure brackets, for any set of cameras."""
 
 import logging
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from sehdr_warp.scene import Camera, load_cameras
 
 from ..field.exposure import Items
 from ..files import atomic_folder
-from .brackets import BracketFolder, bracket_exposures
+from .brackets import Brackets, bracket_exposures
 from .camera_paths import interpolate, orbit
 from .colorspace import from_rec709
 from .exr import rgb_channels, write_exr
@@ -48,7 +47,7 @@ def render_views(
 
     Always: `hdr/<view>.exr` (R, G, B scene-linear radiance; A coverage; Z distance along the axis, 0 where empty;
     confidence, if the run has it) and `preview/<view>.png` (tone-mapped, sRGB). With evs or exposures: brackets, see
-    write_brackets; ldr_brackets ("jpeg", "png" or "png16") adds simulated photos through the run's response.
+    write_brackets, with ldr_brackets as its ldr, through the run's response.
 
     cameras: "train", "test", "all", "orbit", "interpolate", or a JSON file. count: views of an orbit or interpolation.
     overwrite: replaces the folders hdr, preview and brackets of an earlier render; other files in `out` stay.
@@ -62,40 +61,43 @@ def render_views(
         raise SehdrError("brackets were asked for without exposures; give evs (--evs=-2,0,2) or exposures")
     made = bracket_exposures(run.base_time, evs=evs, exposures=exposures) if wanted else ()
     form, now = (colorspace, pixel, multipart, ldr_brackets, run.response), datetime.now().replace(microsecond=0)
-    brackets = BracketFolder(out, made, run.base_time, *form, now, _provenance(run), overwrite)
+    brackets = Brackets(made, run.base_time, *form, now, _provenance(run))
     views = select_cameras(run, cameras, count=count)
-    with (
-        atomic_folder(out / "hdr", overwrite) as hdr_folder,
-        atomic_folder(out / "preview", overwrite) as preview_folder,
-        brackets if wanted else nullcontext(),
-    ):
+
+    def write_pictures(hdr_folder: Path, preview_folder: Path) -> Iterator[tuple[str, np.ndarray, Camera]]:
+        """Writes each view, and yields what its brackets are made of."""
         tone_map = fit_run_tone_map(run, [camera for _, camera in views])
         for index, (name, camera) in enumerate(views, start=1):
-            rendered = run.render(camera)
-            hdr, layers = as_array(rendered.hdr), {"A": as_array(rendered.alpha), "Z": as_array(rendered.depth)}
-            confidence = run.render_confidence(camera)
+            rendered, confidence = run.render(camera), run.render_confidence(camera)
+            hdr = as_array(rendered.hdr)
+            channels = rgb_channels(from_rec709(hdr, colorspace))
+            channels |= {"A": as_array(rendered.alpha), "Z": as_array(rendered.depth)}
             if confidence is not None:
-                layers["confidence"] = as_array(confidence)
+                channels["confidence"] = as_array(confidence)
             elif index == 1:
                 log.info("without a confidence channel: `sehdr-warp report` measures it, from the photos")
-            channels = rgb_channels(from_rec709(hdr, colorspace)) | layers
             header = brackets.header(name, 1.0, camera)
-            stored = {write_exr(hdr_folder / f"{name}.exr", channels, pixel=pixel, header=header)}
+            stored = write_exr(hdr_folder / f"{name}.exr", channels, pixel=pixel, header=header)
             write_picture(preview_folder / f"{name}.png", quantize(tone_map(hdr)))
-            if wanted:
-                stored.add(brackets.add(name, hdr, camera))
             log.info("%s (%d of %d)", name, index, len(views))
-            if stored != {pixel}:
+            if stored != pixel:
                 log.info("%s: holds values above 65504, which half cannot; written as float", name)
+            yield name, hdr, camera
+
     files = [out / place.format(name) for place in ("hdr/{}.exr", "preview/{}.png") for name, _ in views]
-    return files + ([*brackets.files, out / "brackets.json"] if wanted else [])
+    with atomic_folder(out / "hdr", overwrite) as hdr, atomic_folder(out / "preview", overwrite) as preview:
+        pictures = write_pictures(hdr, preview)
+        if wanted:
+            files += [*brackets.write(out, pictures, overwrite), out / "brackets.json"]
+        else:
+            for _ in pictures:
+                pass
+    return files
 
 
 def select_cameras(run, cameras: str | Path, *, count: int = 60) -> list[tuple[str, Camera]]:
-    """Cameras as render_views takes them, by names that are safe for files and all different.
-
-    Raises SehdrError where the set is empty or the name is neither known nor a file.
-    """
+    """Cameras by names that are safe for files and all different; raises SehdrError where there are none, or for what
+    is neither a known name nor a file."""
     text, known = str(cameras), ", ".join(SPLITS + PATHS)
     if text in SPLITS:
         named = [(entry.name, entry.camera) for entry in run.cameras if text in (entry.split, "all")]
@@ -120,9 +122,8 @@ def fit_run_tone_map(run, cameras: Sequence[Camera]) -> ToneMap:
 
 
 def _provenance(run) -> dict[str, str]:
-    """Text for the EXR attributes `sehdr:<key>`: what the picture was made from, as far as the run knows."""
-    response = getattr(run.response, "name", "")
-    known = {"scene": run.scene_name, "iterations": run.iterations, "response": response, "units": "relative radiance"}
+    known = {"scene": run.scene_name, "iterations": run.iterations, "units": "relative radiance"}
+    known["response"] = getattr(run.response, "name", None)
     return {key: str(value) for key, value in known.items() if value not in (None, "")}
 
 

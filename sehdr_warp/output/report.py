@@ -28,9 +28,8 @@ DARKER = -4
 class Comparison:
     """One view of the report, all [H, W, 3] radiance but where said.
 
-    photo: encoded, in [0, 1]. from_photo: what the photo alone gives, its response undone. hdr: rendered. truth: None
-    without. confidence: [H, W] in [0, 1] of the render; None where the run's was not measured. new: from a place
-    without a photo, on the way to the nearest other view; None for a scene of one view.
+    photo: encoded, in [0, 1]. from_photo: what the photo alone gives, its response undone. hdr: rendered. confidence:
+    [H, W] in [0, 1] of the render, if it was measured. new: rendered half-way to the nearest other view, if any.
     """
 
     name: str
@@ -54,11 +53,11 @@ def write_report(
 
     Raises InputError where a picture exists (unless overwrite), SehdrError for a scene without views.
     """
-    out, metrics = Path(out), run.metrics()
+    metrics = run.metrics()
     charted = any(training_points(metrics, key) for key in PANELS)
-    names = ["comparison.png", "stops.png"] + ["training.png"] * charted
-    for name in names:
-        check_absent(out / name, overwrite)
+    paths = [Path(out, f"{name}.png") for name in ("comparison", "stops", *["training"] * charted)]
+    for path in paths:
+        check_absent(path, overwrite)
     given, held_out = scene.test_views or scene.train_views, bool(scene.test_views)
     if not given:
         raise SehdrError("the scene has no views to report on; check its splits")
@@ -66,40 +65,33 @@ def write_report(
     comparisons = [compare(run, view, scene.views) for view in views]
     brightest = max(comparisons, key=lambda comparison: float((comparison.photo > 0.99).mean()))
     time = views[0].exposure_time
-    figures = [
-        comparison_figure(comparisons, time, _caption(views, metrics, held_out), held_out=held_out),
-        stops_figure(brightest, time),
-    ] + ([training_chart({scene.name: [metrics]})] if charted else [])
+    compared = comparison_figure(comparisons, time, _caption(views, metrics, held_out), held_out=held_out)
+    figures = [compared, stops_figure(brightest, time)] + [training_chart({scene.name: [metrics]})] * charted
     with ExitStack() as stack:
-        for name, figure in zip(names, figures, strict=True):
-            temporary = stack.enter_context(atomic_path(out / name, overwrite))
+        for path, figure in zip(paths, figures, strict=True):
+            temporary = stack.enter_context(atomic_path(path, overwrite))
             figure.savefig(temporary, dpi=160, facecolor="white", format="png")
-    return [out / name for name in names]
+    return paths
 
 
 def comparison_figure(comparisons: Sequence[Comparison], exposure_time: float, caption: str, *, held_out: bool = True):
-    """A matplotlib Figure: one row a view, with what the photo and the scene hold four stops darker, and a new view.
-
-    exposure_time: seconds at 0 EV. The new view is tone-mapped, by one map for all.
-    """
+    """A matplotlib Figure: one row a view, with what the photo and the scene hold four stops darker, and a new view,
+    tone-mapped by one map for all. exposure_time: seconds at 0 EV."""
     columns = {"Held-out photo" if held_out else "Training photo": [c.photo for c in comparisons]}
     for name, key in (("Photo", "from_photo"), ("HDR scene", "hdr"), ("Truth", "truth")):
         radiances = [getattr(c, key) for c in comparisons]
         if all(radiance is not None for radiance in radiances):
             columns[f"{name} at {_stops(DARKER)}"] = [expose(r, DARKER, scale=exposure_time) for r in radiances]
-    if all(c.new is not None for c in comparisons):
-        tone_map = fit_tone_map([c.new for c in comparisons])
-        columns["New view, tone-mapped"] = [tone_map(c.new) for c in comparisons]
+    new = [c.new for c in comparisons if c.new is not None]
+    if len(new) == len(comparisons):
+        columns["New view, tone-mapped"] = list(map(fit_tone_map(new), new))
     rows = list(zip(*columns.values(), strict=True))
     return _grid(rows, list(columns), [c.name for c in comparisons], caption, cell=2.6)
 
 
 def stops_figure(comparison: Comparison, exposure_time: float):
-    """A matplotlib Figure: one view at several exposures on a plain sRGB display: no tone map.
-
-    Rows are the photo alone, the HDR scene with its confidence (where there is one) and the truth. exposure_time:
-    seconds at 0 EV.
-    """
+    """A matplotlib Figure: one view at several exposures on a plain sRGB display, in rows for the photo alone, the HDR
+    scene with its confidence (where there is one) and the truth. exposure_time: seconds at 0 EV."""
     sources = {"Photo alone": comparison.from_photo, "HDR scene": comparison.hdr, "Truth": comparison.truth}
     sources = {name: radiance for name, radiance in sources.items() if radiance is not None}
     rows = [[None, *(expose(radiance, stop, scale=exposure_time) for stop in STOPS)] for radiance in sources.values()]
@@ -117,19 +109,16 @@ def stops_figure(comparison: Comparison, exposure_time: float):
 
 
 def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, cell: float):
-    """Pictures [H, W, 3] in rows and columns with column titles, row names at the left, and a caption below.
-
-    rows: of the titles' length or shorter; None leaves a place empty, and so does the end of a shorter row. cell: width
-    of a picture, inches.
-    """
-    import matplotlib as mpl
+    """Pictures [H, W, 3] with titles above, names at the left and a caption below; None and the end of a shorter row
+    leave a place empty. cell: width of a picture, inches."""
+    from matplotlib import rc_context
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     shapes = [next(picture.shape for picture in row if picture is not None) for row in rows]
     heights, width = [cell * shape[0] / shape[1] for shape in shapes], 0.4 + len(titles) * cell
     untitled = dict(enumerate(titles))
-    with mpl.rc_context(STYLE):
+    with rc_context(STYLE):
         layout = ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.03, wspace=0, hspace=0)
         figure = Figure(figsize=(width, 0.9 + sum(heights)), layout=layout)
         grid = figure.add_gridspec(len(rows), len(titles), height_ratios=heights)
@@ -147,8 +136,7 @@ def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, ce
 
 def compare(run, view: View, views: Sequence[View]) -> Comparison:
     """What comparison_figure shows of a view of the scene whose views are `views`."""
-    confidence, new = run.render_confidence(view.camera), None
-    hdr = as_array(run.render(view.camera).hdr)
+    confidence, hdr, new = run.render_confidence(view.camera), as_array(run.render(view.camera).hdr), None
     others = [other.camera for other in views if other.name != view.name]
     if others:
         nearest = min(others, key=lambda camera: float(np.linalg.norm(camera.position - view.camera.position)))

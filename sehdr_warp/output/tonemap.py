@@ -20,11 +20,8 @@ _LOW, _HIGH, _WHITE = 1.0, 99.0, 99.8
 
 @dataclass(frozen=True)
 class ToneMap:
-    """A fixed tone map, so that the pictures of one scene compare.
-
-    scale: multiplies radiance, so that the scene's log-average comes to its key.
-    white: the smallest scaled luminance that is shown as white.
-    """
+    """scale: multiplies radiance, so that the scene's log-average comes to its key. white: the least scaled luminance
+    that is shown as white."""
 
     scale: float
     white: float
@@ -32,22 +29,19 @@ class ToneMap:
     def __call__(self, radiance: np.ndarray) -> np.ndarray:
         """[..., 3] linear Rec.709 radiance to sRGB-encoded float32 in [0, 1]; negative radiance counts as 0."""
         scaled = np.maximum(np.asarray(radiance, np.float32), 0) * np.float32(self.scale)
-        luminance = scaled @ _LUMINANCE.astype(np.float32)
-        shown = self._curve(luminance)[..., None]
-        by_luminance = scaled * (shown / np.maximum(luminance[..., None], 1e-12))
-        by_channel = self._curve(scaled)
+        luminance = (scaled @ _LUMINANCE.astype(np.float32))[..., None]
+        shown = self._curve(luminance)
+        by_luminance = scaled * (shown / np.maximum(luminance, 1e-12))
         weight = np.minimum(shown, 1)
-        return encode_srgb(by_luminance * (1 - weight) + by_channel * weight)
+        return encode_srgb(by_luminance * (1 - weight) + self._curve(scaled) * weight)
 
     def _curve(self, value: np.ndarray) -> np.ndarray:
         return value * (1 + value / np.float32(self.white**2)) / (1 + value)
 
 
 def fit_tone_map(pictures: Iterable[np.ndarray]) -> ToneMap:
-    """The tone map for a scene seen in one or several pictures, each [H, W, 3] linear Rec.709 radiance.
-
-    Black scenes get the identity scale. Raises ValueError without pictures.
-    """
+    """The one tone map of a scene's pictures, each [H, W, 3] linear Rec.709 radiance; black scenes get the identity
+    scale. Raises ValueError without pictures."""
     # float64 before the logarithm: radiance may be small in its units.
     values = np.concatenate([(np.maximum(np.asarray(p, np.float64), 0) @ _LUMINANCE).ravel() for p in pictures])
     values = values[np.isfinite(values) & (values > 0)]  # Writers refuse what is not finite, and say where.
@@ -55,8 +49,7 @@ def fit_tone_map(pictures: Iterable[np.ndarray]) -> ToneMap:
         return ToneMap(1.0, 1.0)
     values = values[values > np.percentile(values, _HIGH) * _FLOOR]
     logs = np.log2(values)
-    low, high = np.percentile(logs, (_LOW, _HIGH))
-    average = logs.mean()
+    (low, high), average = np.percentile(logs, (_LOW, _HIGH)), logs.mean()
     # Between 0.09 for a mostly dark scene with highlights and 0.36 for a bright one.
     key = 0.18 * 2.0 ** np.clip((2 * average - low - high) / max(high - low, 1e-6), -1, 1)
     scale = key / 2.0**average
@@ -65,10 +58,8 @@ def fit_tone_map(pictures: Iterable[np.ndarray]) -> ToneMap:
 
 
 def expose(radiance: np.ndarray, stops: float, *, scale: float = 1.0) -> np.ndarray:
-    """[..., 3] radiance as a display shows it at an exposure: radiance scale 2^stops, clipped to [0, 1], sRGB-encoded.
-
-    scale: what brings the picture to its normal exposure; the base exposure time, or ToneMap.scale.
-    """
+    """[..., 3] radiance as a display shows it: radiance scale 2^stops, clipped to [0, 1], sRGB-encoded. scale: what
+    brings the picture to its normal exposure; the base exposure time, or ToneMap.scale."""
     return encode_srgb(np.asarray(radiance, np.float32) * np.float32(scale * 2.0**stops))
 
 

@@ -46,7 +46,7 @@ def run_synth(asked: Synth) -> None:
         LOG.info("%s", note)
     noise = None
     if asked.noise is not None:
-        figures = numbers("--noise", asked.noise) or ()
+        figures = numbers("--noise", asked.noise)
         if len(figures) != 2:
             raise SehdrError(f"--noise {asked.noise}: give two numbers, full well and read noise in electrons")
         noise = SensorNoise(*figures)

@@ -60,9 +60,8 @@ def test_torchvisions_own_file_serves_as_backbone(made_up, tmp_path):
 @pytest.mark.parametrize("kept, missing", [("squeeze.pth", "backbone"), ("squeezenet1_1_features.pth", "squeeze.pth")])
 def test_an_incomplete_folder_is_a_reason(made_up, tmp_path, kept, missing):
     shutil.copy(made_up / kept, tmp_path)
-    torch.save({}, tmp_path / "alex.pth")
     metric, reason = load_lpips(tmp_path)
-    assert metric is None and missing in reason and "alex" in reason
+    assert metric is None and missing in reason
     with pytest.raises(InputError, match="does not exist"):
         load_lpips(tmp_path / "nowhere")
 
