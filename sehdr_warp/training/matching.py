@@ -27,7 +27,7 @@ RANGE = 0.1, 30.0  # Depths at which they are looked for, and where nothing is f
 GUESS = 0.25, 8.0
 SLACK = 0.6, 2.0  # Around the range of those found
 ALIKE = 0.05  # Photos whose exposures differ by less, in stops, are compared as they are
-CHUNK = 1 << 22  # Costs held at one time
+CHUNK = 1 << 20  # Costs held at one time
 
 
 @dataclass(frozen=True)
