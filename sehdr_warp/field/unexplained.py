@@ -38,7 +38,8 @@ def unexplained_regions(field: RadianceField, views: Sequence[View], *, degree: 
         exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time
         stops, code = _differences(view, exposure, field.response)
         off = (np.abs(stops) >= LEAST_STOPS) & (code >= LEAST_CODE)
-        labels, _ = ndimage.label(ndimage.binary_opening(off, np.ones((2, 2))), np.ones((3, 3)))
+        labels = np.empty(off.shape, np.int32)
+        ndimage.label(ndimage.binary_opening(off, np.ones((2, 2))), np.ones((3, 3)), output=labels)
         for index, place in enumerate(ndimage.find_objects(labels), start=1):
             row, column = np.nonzero(labels[place] == index)
             if len(row) >= LEAST_PIXELS:
