@@ -12,8 +12,7 @@ from .curve import HALF_CODE, Response
 class PowerLaw:
     """y = toe_slope x below toe_end, (1 + offset) x^(1/exponent) - offset above; 1 at x = 1.
 
-    Covers linear (toe_end 1), a pure gamma, sRGB (IEC 61966-2-1) and Rec.709 (ITU-R BT.709, with BT.2020's exact
-    constants).
+    Covers linear (toe_end 1), a gamma, sRGB (IEC 61966-2-1) and Rec.709 (ITU-R BT.709, BT.2020's exact constants).
     """
 
     def __init__(self, exponent: float, offset: float, toe_slope: float, toe_end: float):
@@ -132,8 +131,7 @@ class AnalyticResponse(Response, kind="analytic"):
 
 
 def _gamma(exponent: float) -> PowerLaw:
-    """A pure gamma has an infinite slope at 0; its toe is the chord from the origin to half an 8-bit code, so every
-    stored code but 0 is exact and the slope stays finite."""
+    """Its toe is the chord from the origin to half an 8-bit code: codes above 0 are exact, and the slope finite."""
     toe_end = HALF_CODE**exponent
     return PowerLaw(exponent, 0.0, HALF_CODE / toe_end, toe_end)
 
@@ -153,11 +151,7 @@ _CURVES = {
     "rec709": (_REC709, None, "Rec.709 video (ITU-R BT.709)"),
     "gamma-2.2": (_gamma(2.2), None, "a power law; gamma-G with any G from 1 to 5"),
     "linear": (PowerLaw(1.0, 0.0, 1.0, 1.0), None, "values proportional to light"),
-    "hdr-nerf": (
-        _gamma(2.2),
-        Reinhard(),
-        "Reinhard's curve and gamma 2.2, of HDR-NeRF's synthetic sets; also called reinhard-gamma",
-    ),
+    "hdr-nerf": (_gamma(2.2), Reinhard(), "Reinhard's curve and gamma 2.2, of HDR-NeRF's sets; also reinhard-gamma"),
     "filmic": (_SRGB, _HABLE, "Hable's filmic curve (Uncharted 2), shown as sRGB"),
     "aces": (_SRGB, _ACES, "Narkowicz's fit to the ACES display transform, shown as sRGB"),
 }

@@ -8,21 +8,14 @@ import numpy as np
 from ..errors import InputError
 from .table import TabulatedResponse
 
+# 8-bit codes outside are clipped, or nearly, and tell nothing.
 DARKEST, BRIGHTEST = 3, 252
-"""8-bit codes outside are clipped, or nearly, and tell nothing."""
 CHANNELS = ("red", "green", "blue")
-CHANNELS_DIFFER = 0.15
-"""Stops, RMS, between a channel's own curve and the shared one from which the channels clearly differ."""
-
-WRONG_TIME = 0.25
-"""Stops by which a photo may be off its time without being named."""
-
 # Weight of the squared second derivative of the curve against the mean weight of a code.
 _SMOOTHNESS = 0.02
-# Residuals in stops from which a sample counts less (movement, misregistration, noise), and rounds of reweighting.
-_OUTLIER, _ROUNDS = 0.1, 4
-# RMS of the residuals in stops from which photos cannot be of one still scene.
-_MISALIGNED = 0.5
+# Residuals in stops from which a sample counts less (movement, noise), rounds of reweighting, and the RMS of residuals
+# from which photos cannot be of one still scene.
+_OUTLIER, _ROUNDS, _MISALIGNED = 0.1, 4, 0.5
 # Least rise of log2 exposure from code to code, where the samples alone would let the curve fall.
 _LEAST_RISE = 1e-4
 _MOST_PIXELS, _SHOWN = 30_000, 3000
@@ -113,10 +106,8 @@ def _spread(codes: np.ndarray, stops: np.ndarray, shared: np.ndarray) -> float:
 
 
 def _solve(codes: np.ndarray, stops: np.ndarray, name: str):
-    """log2 exposure of each code [256], and of samples [J, S]: residuals in stops, weights, and log2 radiance [S].
-
-    Each radiance is eliminated, so that 256 unknowns are left whatever the number of samples.
-    """
+    """log2 exposure of each code [256], and of samples [J, S]: residuals in stops, weights, and log2 radiance [S],
+    which is eliminated, so that 256 unknowns are left."""
     from scipy.linalg import solve
 
     hat = np.sqrt(np.minimum(_CODES - DARKEST + 1, BRIGHTEST - _CODES + 1).clip(min=0) / (0.5 * (BRIGHTEST - DARKEST)))
@@ -124,8 +115,8 @@ def _solve(codes: np.ndarray, stops: np.ndarray, name: str):
     start *= (start > 0).sum(0) >= 2
     if (start > 0).any(0).sum() < 256:
         raise InputError(name, "hardly a pixel is well exposed in two photos", "give photos of closer exposure times")
-    # Second derivatives of the curve, each with the root of its step, so that squares sum to an integral. They are over
-    # nearly the logit of the code: near black and white cameras' curves are almost straight on it.
+    # Second derivatives of the curve over nearly the logit of the code, on which cameras' curves are almost straight;
+    # each with the root of its step, so that squares sum to an integral.
     axis = np.log((_CODES + 1.0) / (280.0 - _CODES))
     bends = np.diff(np.diff(np.eye(256), axis=0) / np.diff(axis)[:, None], axis=0)
     bends /= np.sqrt(0.5 * (axis[2:] - axis[:-2]))[:, None]

@@ -11,12 +11,11 @@ import torch
 from ..errors import SehdrError
 from ..splatting.response_curves import FormulaCurve, encode_with_slope
 
-# Half of one 8-bit code value: an encoded value nearer to white than this is stored as 255.
+# An encoded value nearer to white than this is stored as 255.
 HALF_CODE = 0.5 / 255
 # Rise of encode_extended beyond the clip point for each factor of e in exposure: a tenth of a gamma curve's just below
-# white. Enough for a gradient, too little for a clipped highlight to cost much where no hinge is used.
+# white, enough for a gradient.
 EXTENSION_SLOPE = 0.05
-# Exposures to start from are at least this: a logarithm needs one above 0.
 START_FLOOR = 1e-6
 
 
@@ -60,12 +59,11 @@ class Response(ABC):
 
     @abstractmethod
     def to_dict(self) -> dict:
-        """Plain values for JSON that Response.from_dict turns back into the same curve, with no file needed."""
+        """Plain values for JSON that Response.from_dict turns back into the same curve."""
 
     @classmethod
     @abstractmethod
-    def _from_dict(cls, values: dict) -> "Response":
-        """The curve that to_dict described."""
+    def _from_dict(cls, values: dict) -> "Response": ...
 
     @staticmethod
     def from_dict(values: dict) -> "Response":
@@ -106,10 +104,9 @@ class Response(ABC):
         return self._through(_Encode, exposure, EXTENSION_SLOPE)
 
     def decode(self, value):
-        """The exposure whose encoded value this is: decode(encode(x)) = x for 0 <= x <= clip_exposure.
+        """The exposure of a value, limited to [black, peak]: decode(encode(x)) = x for x in [0, clip_exposure].
 
-        Values are first limited to [black, peak]. A curve that only approaches its peak is inverted up to `white`,
-        since the brightest code says no more than "at least this" and the exact inverse of 1 would be infinite.
+        A curve that only approaches its peak is inverted up to `white`, since the exact inverse of 1 is infinite.
         """
         return self._through(_Decode, value, None)
 
@@ -125,9 +122,8 @@ class Response(ABC):
         array = np.asarray(argument)
         if array.dtype not in (np.float32, np.float64):
             array = array.astype(np.float32 if array.dtype == np.float16 else np.float64)
-        # A negative stride or a read-only array is no tensor; both are common among loaded images.
-        tensor = torch.from_numpy(np.array(array, order="C"))
-        return function.apply(tensor, self, slope).numpy()
+        # A copy: a negative stride or a read-only array is no tensor.
+        return function.apply(torch.from_numpy(np.array(array, order="C")), self, slope).numpy()
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.name!r})"
@@ -144,8 +140,6 @@ class _Pointwise(torch.autograd.Function):
 
 
 class _Encode(_Pointwise):
-    """The curve with the derivative it states itself: one saved tensor, and no NaN from an unused branch."""
-
     @staticmethod
     def forward(ctx, exposure, response, extension_slope):
         differentiate = ctx.needs_input_grad[0]
@@ -165,7 +159,7 @@ class _Encode(_Pointwise):
 
 
 class _Slope:
-    """The derivative, called as the two functions beside it are."""
+    """Called as the two functions beside it are."""
 
     @staticmethod
     @torch.no_grad()

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,8 +15,7 @@ from ..files import read_json, read_text
 from .curve import Response
 from .table import TabulatedResponse
 
-# The largest text file read here (all of DoRF has 5 MB).
-MAX_BYTES = 64 * 2**20
+MAX_BYTES = 64 * 2**20  # Of a text file; all of DoRF has 5 MB.
 
 
 def response_from_file(path: Path, selector: str | None = None) -> Response:
@@ -59,6 +59,7 @@ def colour_response(encoding: str) -> Response:
     """
     import colour
     from colour.utilities import suppress_warnings
+    from scipy.optimize import bisect
 
     known = {_key(name): name for name in reversed(list(colour.CCTF_ENCODINGS))}
     name = known.get(_key(encoding))
@@ -71,16 +72,13 @@ def colour_response(encoding: str) -> Response:
         with np.errstate(all="ignore"), suppress_warnings(colour_warnings=True):
             return np.asarray(colour.CCTF_ENCODINGS[name](np.asarray(exposure, np.float64)), np.float64)
 
-    # White: the first of these stops at which the encoding reaches 1, then by halves.
+    # White: between the first of these stops at which the encoding reaches 1, and the one before.
     bright = np.exp2(np.linspace(-10, 20, 30 * 32 + 1))
     reached = np.flatnonzero(encode(bright) >= 1.0)
     if not len(reached) or reached[0] == 0:
         raise SehdrError(f"response 'colour:{encoding}': the encoding does not pass 1 below 2^20; take another")
-    low, high = bright[reached[0] - 1], bright[reached[0]]
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if encode(middle) >= 1.0 else (middle, high)
-    exposures = np.concatenate([[0.0], high * np.exp2(np.arange(-24 * 32, 1) / 32)])
+    white: Any = bisect(lambda exposure: float(encode(exposure)) - 1.0, *bright[reached[0] - 1 : reached[0] + 1])
+    exposures = np.concatenate([[0.0], white * np.exp2(np.arange(-24 * 32, 1) / 32)])
     # At exactly 0 a pure logarithm gives -infinity: black.
     values = np.nan_to_num(encode(exposures), neginf=0.0, nan=np.nan).clip(0.0, 1.0)
     values[-1] = 1.0

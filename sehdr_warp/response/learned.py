@@ -10,23 +10,21 @@ from ..errors import SehdrError
 from ..splatting.interpolation import interpolate
 from .curve import HALF_CODE, Response
 
+# Added to exposures before the logarithm: a hundredth of 8-bit black in sRGB.
 EXPOSURE_FLOOR = 1e-6
-"""Added to exposures before the logarithm: black stays finite, and what is 100 times darker than 8-bit black in sRGB
-asks for nothing."""
-LOG_RANGE, LOG_NODES = (-20.0, 12.0), 2048
-"""The table from which many exposures are encoded, in their logarithm; below it f is constant, above straight."""
-EXACT_BELOW = 4096
-"""Fewer exposures than this are encoded without the table."""
+# The table from which many exposures are encoded, in their logarithm; below it f is constant, above straight. Fewer
+# than EXACT_BELOW are encoded without it.
+LOG_RANGE, LOG_NODES, EXACT_BELOW = (-20.0, 12.0), 2048, 4096
+# Exposures between which decode() looks for a value, and how many it looks at.
 TABLE_RANGE, TABLE_NODES = (1e-6, 1e6), 8192
-"""Exposures between which decode() looks for a value, and how many it looks at."""
 
 
 class ToneMapper(nn.Module, Response, kind="mlp"):
     """f_c(x) = sigmoid(MLP_c(log x)) for the channels c: exposure x = E dt to an encoded value, learned with the scene.
 
-    Source: HDR-GS (Cai et al., NeurIPS 2024): log exposure in, one hidden layer of 128 with ReLU, a sigmoid at the end,
-    weights as torch.nn.Linear starts them, here turned so that the function rises at first but for a few bends. Nothing
-    keeps it rising, and nothing in photos of one exposure tells its scale.
+    Source: HDR-GS (Cai et al., NeurIPS 2024): a hidden layer of 128 with ReLU, weights as torch.nn.Linear starts them,
+    here turned so that the function rises at first but for a few bends. Nothing keeps it rising, and nothing in photos
+    of one exposure tells its scale.
 
     A Response whose tensors end in a dimension of three channels. encode and encode_extended are the same and
     differentiable in exposure and weights; decode searches a table of the weights as they are, on values made to
@@ -54,8 +52,7 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
 
     @torch.no_grad()
     def _start_rising(self) -> None:
-        """Turns over what was drawn falling: of the units that are active towards dark or towards light, already at
-        log x = 0 or only further on, each of the four groups whose slope is below 0."""
+        """Turns over each of four groups of units (active towards dark or light, at log x = 0 or not) that falls."""
         inner, bias, outer = self.weights[0].mT, self.biases[0].mT, self.weights[1]
         for towards in (inner < 0, inner > 0):
             for group in (towards & (bias < 0), towards & (bias >= 0)):
@@ -73,10 +70,7 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
         return self.encode(exposure)
 
     def encode_log(self, log_exposure: torch.Tensor) -> torch.Tensor:
-        """Encoded values in (0, 1) of natural logarithms of exposures [..., 3].
-
-        Many are interpolated in a table of what the sigmoid takes, which is linear but for kinks.
-        """
+        """Encoded values in (0, 1) of natural logarithms of exposures [..., 3]; many are interpolated in a table."""
         points = log_exposure.reshape(-1, 3)
         if len(points) < EXACT_BELOW or points.dtype != torch.float32 or torch.are_deterministic_algorithms_enabled():
             return self._logits(points).sigmoid().reshape(log_exposure.shape)
@@ -86,8 +80,7 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
         return interpolate(table, LOG_RANGE[0], step, points).sigmoid().reshape(log_exposure.shape)
 
     def _logits(self, log_exposure):
-        """What the perceptrons make of log exposures [N, 3]. By products and sums: matrices this thin gain nothing from
-        cuBLAS, whose workspace would be one more memory that a recorded step depends on."""
+        # By products and sums: cuBLAS gains nothing here, and a recorded step would depend on its workspace.
         (inner, outer), (inner_bias, outer_bias) = self.weights, self.biases
         hidden = torch.addcmul(inner_bias, log_exposure.T[..., None], inner).relu()
         return ((hidden * outer.mT).sum(2) + outer_bias[..., 0]).T

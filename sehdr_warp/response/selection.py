@@ -18,12 +18,9 @@ from .curve import Response
 from .table import TabulatedResponse
 
 CODE = 1.0 / 255
-# Edges: pixels this far on both sides of the middle one; each side must be flat to 3 codes and 20 from the other.
-EDGE_REACH, FLAT_CODES, EDGE_CODES = 2, 3, 20
-# Of a code, in such comparisons: whole codes must not be told apart by how a float rounds.
-SLACK = 0.25
-# The two sides' encoded colors must not be one gray scaled: angle between them, in radians.
-EDGE_ANGLE = 0.05
+# Edges: pixels this far on both sides of the middle one; each side must be flat to 3 codes and 20 from the other, with
+# some slack for how a float rounds, and the sides' encoded colors at an angle (radians), not one gray scaled.
+EDGE_REACH, FLAT_CODES, EDGE_CODES, SLACK, EDGE_ANGLE = 2, 3, 20, 0.25, 0.05
 MAX_EDGES, MIN_EDGES = 12_000, 50
 # The middle lies between these shares of the way from one side to the other, in encoded values.
 LEAST_SHARE, MOST_SHARE = 0.15, 0.85
@@ -31,8 +28,8 @@ LEAST_SHARE, MOST_SHARE = 0.15, 0.85
 CODE_VARIANCE = 1 / 12 + 0.05
 # Student's t: an edge that no mixture explains (a third surface, a highlight) costs a logarithm, not a square.
 EDGE_FREEDOM = 2.0
-# How far edges lie off their line is not known beforehand (texture, denoised or compressed images): the variance is
-# this many times that of rounding, whichever is likeliest under a candidate.
+# The variance off the line is this many times that of rounding (texture, denoised or compressed images), whichever is
+# likeliest under a candidate.
 EDGE_MISFITS = 2.0 ** np.arange(0, 8.5, 0.5)
 # Edges of one set of photos share what is wrong with them: this many count as one, and more than 3000 count as 3000.
 EDGES_PER_FACT, MOST_FACTS = 160.0, 3000 / 160.0
@@ -58,7 +55,6 @@ NO_FORMULA, DECISIVE = 0.5, 0.25
 # Candidates whose edges are judged at once; photos larger than MOST_PIXELS are read in bands.
 BATCH, MOST_PIXELS, BAND_ROWS = 16, 400_000, 32
 
-
 # The smooth family of cameras' curves, for photos that no response with a formula of its own explains:
 # x(z) = z^p (z + TOE)^q (1 + SHOULDER - z)^-r up to scale, z the encoded value: p and p + q are the log-log slopes
 # below and above the toe, r the roll-off into white. Least squares in log x over codes 10 to 245 leaves 0.02 stops on
@@ -83,9 +79,8 @@ class ResponseScore:
 
     dynamic_range: stops between the 0.1th and 99.9th percentile of decoded, unclipped values; roughness: mean absolute
     second difference of their log2; paper_score: range minus roughness, each over its median among the candidates,
-    larger is better. In nats: edges, an edge, that its middle is a mixture of its sides in linear light (NaN for
-    under 50 usable ones); highlights, of the pixels at the brightest code beside those just below it; span and density,
-    of how far and how smoothly light is spread; prior. posterior: the sum, edges times edge_facts(their number).
+    larger is better. In nats: edges, of an edge (NaN for under 50 usable ones); highlights, of the pixels at and below
+    the brightest code; span and density of light; prior. posterior: the sum, edges times edge_facts(their number).
     """
 
     response: Response
@@ -143,8 +138,9 @@ def select_response(
     if not candidates:
         raise SehdrError("select_response: there are no candidates; give at least one response")
     photos = [_bands(each) for each in (image if isinstance(image, list | tuple) else [image])]
-    fullest = max(photos, key=lambda bands: sum(clear.sum() for _, clear in bands))
-    if method == "paper" and sum(clear.sum() for _, clear in fullest) < 100:
+    usable = [sum(clear.sum() for _, clear in each) for each in photos]
+    fullest = photos[int(np.argmax(usable))]
+    if method == "paper" and max(usable) < 100:
         raise SehdrError("select_response: under 100 pixels are neither black nor clipped; name a response instead")
     bands = [band for each in photos for band in each]
     edges = np.concatenate([_edge_colors(*band) for band in bands])
@@ -184,14 +180,13 @@ def edge_facts(count: int) -> float:
 
 
 def _on_grid(response: Response) -> tuple[np.ndarray, np.ndarray]:
-    """[2041] natural log of the exposure at each place of GRID, and d ln x / dz there; below code 1 all count as it."""
+    """[2041] ln x at each place z of GRID, and d ln x / dz there; below code 1 all count as it."""
     exposures = np.asarray(response.decode(np.maximum(GRID, response.black + CODE)))
     return np.log(exposures), 1 / (exposures * np.maximum(np.asarray(response.slope(exposures)), 1e-9))
 
 
 def _bands(image) -> list[tuple[np.ndarray, np.ndarray]]:
-    """A photo, or evenly spaced bands of a large one, as encoded values [h, W, 3] float64, each with where it is
-    neither black nor clipped [h, W]."""
+    """A photo, or bands of a large one: encoded values [h, W, 3] float64, and where neither black nor clipped."""
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3:
         raise SehdrError(f"select_response: an image of shape {list(image.shape)} is not [H, W, 3]")
@@ -208,8 +203,7 @@ def _bands(image) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def _prior(response: Response, from_camera: bool) -> float:
-    """Minus the log prior of a candidate; one that is not of the bank was given on purpose, and is as likely as any."""
-    if response.name not in DESCRIPTIONS:
+    if response.name not in DESCRIPTIONS:  # Given on purpose, and as likely as any.
         return 0.0
     if response.name == "linear":
         return LINEAR_PRIOR
@@ -218,14 +212,12 @@ def _prior(response: Response, from_camera: bool) -> float:
 
 @cache
 def family_logs() -> tuple[np.ndarray, np.ndarray]:
-    """[512, 2041] natural log of the exposure at each place of GRID, and d ln x / dz there, of curves drawn from the
-    family's prior by a fixed seed. Below code 1 all count as it. Unit: code 128 means what it does under `camera`."""
+    """_on_grid, [512, 2041] each, of curves drawn from the family's prior; code 128 means what it does by `camera`."""
     z = np.maximum(GRID, 1 / 255)
     terms = np.stack([np.log(z), np.log(z + TOE), -np.log(1 + SHOULDER - z)])
     rises = np.stack([1 / z, 1 / (z + TOE), 1 / (1 + SHOULDER - z)])
     draws = MEAN + np.random.default_rng(0).normal(size=(2 * MEMBERS, 3)) @ SPREAD.T
-    increasing = (draws @ rises).min(1) > LEAST_RISE
-    draws = draws[increasing][:MEMBERS]
+    draws = draws[(draws @ rises).min(1) > LEAST_RISE][:MEMBERS]
     logs = draws @ terms
     middle = np.log(float(analytic_response("camera").decode(CODES[128])))
     return logs - logs[:, 128 * FINE, None] + middle, draws @ rises
@@ -237,9 +229,8 @@ def family_logs() -> tuple[np.ndarray, np.ndarray]:
 def _highlights(shares: np.ndarray, fine: np.ndarray) -> np.ndarray:
     """Of the shares of values at the brightest code and at the nine codes below it; fine: on GRID.
 
-    If log radiance falls off as exp(-rate stops), the nine codes span S stops and white holds all beyond them, then
-    near / (at + near) = 1 - exp(-rate S): a clipping camera piles values up at 255, a curve that never clips spreads
-    the same light over the codes below. The rate is log-normal.
+    If radiance falls off as exp(-rate stops) over the S stops of the nine codes and beyond, near / (white + near) is
+    1 - exp(-rate S): a camera that clips piles values up at white, others spread them. The rate is log-normal.
     """
     stops = (fine[:, 509 * FINE // 2] - fine[:, 491 * FINE // 2]) / np.log(2)
     white, near = shares[255] + HIGHLIGHT_FLOOR / 2, shares[246:255].sum() + HIGHLIGHT_FLOOR / 2
@@ -249,9 +240,8 @@ def _highlights(shares: np.ndarray, fine: np.ndarray) -> np.ndarray:
 
 
 def _span(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
-    """Of the spread of ln exposure. Scenes span alike many stops, and a wrong curve stretches or squeezes them: above
-    all one that never clips for one that does. The standard deviation is log-normal; its weight is the share of values
-    between black and white."""
+    """Of the spread of ln exposure, which is much the same in all scenes; a wrong curve stretches or squeezes it. The
+    standard deviation is log-normal; its weight is the share of values between black and white."""
     inside, logs = shares[1:255].sum(), logs[:, 1:255]
     if inside <= 0:
         return np.zeros(len(logs))
@@ -262,8 +252,7 @@ def _span(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
 
 
 def _density(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
-    """Of the density of log exposure. A scene's light is spread smoothly over its stops; a wrong curve, which squeezes
-    some codes together and pulls others apart, heaps it up or thins it out."""
+    """Of the density of log exposure: smooth in a scene, while a wrong curve heaps it up or thins it out."""
     edges = 0.5 * (logs[:, DENSITY_EDGES - 1] + logs[:, DENSITY_EDGES]) / np.log(2)
     widths = np.maximum(np.diff(edges), 1e-6)
     counts = np.add.reduceat(shares, DENSITY_EDGES)[:-1]
@@ -282,7 +271,7 @@ def _relative(values: np.ndarray) -> np.ndarray:
 
 
 def _range_and_roughness(bands, logs: np.ndarray) -> tuple[float, float]:
-    """A photo's dynamic range and roughness in stops, under one candidate's log exposures [256]."""
+    """In stops, of a photo under one candidate's log exposures [256]."""
     seen, bends = [], []
     for values, clear in bands:
         stops = np.interp(values, CODES, logs) / np.log(2)
@@ -341,11 +330,9 @@ def _edges(edges: np.ndarray, logs: np.ndarray, rises: np.ndarray) -> np.ndarray
 def _mixture_surprise(exposures: torch.Tensor, slopes: torch.Tensor) -> torch.Tensor:
     """[K] from exposures [K, E, 13] at the points of _edges and the curve's slopes [K, E, 9] at the nine colors.
 
-    The middle color lies on the line of its two sides. Its distance from the line has the variance that rounding of
-    all three colors gives it under this candidate, measured at the middle color in code values, where a photo's own
-    noise is alike for every candidate. Along the line every share in linear light is as likely, within the limits that
-    the choice of edges left. The densities' normalization belongs to both: without, the curve that crowds colors
-    together would win.
+    The middle color's distance from the line of its two sides, in code values at the middle color, has the variance
+    that rounding of all three gives it. Along the line every share of linear light within the limits is as likely.
+    Both densities are normalized: else the curve that crowds colors together would win.
     """
     first, middle, last = exposures[..., :9].unflatten(-1, (3, 3)).unbind(-2)
     slope_first, slope, slope_last = slopes.unflatten(-1, (3, 3)).unbind(-2)

@@ -10,11 +10,8 @@ from .curve import HALF_CODE, Response
 
 # Samples this dense and evenly spaced are joined by straight lines, exactly as stored (DoRF and EMoR have 1024).
 DENSE_SAMPLES = 256
-# Other curves are read off a grid even in log exposure; the straight pieces are then off by less than 1e-6 where the
-# curve is smooth.
-CELLS_PER_OCTAVE = 512
-# A curve's lowest straight piece ends this many octaves below its first sample, and the grid spans at most 40.
-TOE_OCTAVES, MAX_OCTAVES = 6, 40
+# Other curves are read off a grid even in log exposure, whose lowest piece ends so many octaves below the first sample.
+CELLS_PER_OCTAVE, TOE_OCTAVES, MAX_OCTAVES = 512, 6, 40
 # A flat part is tilted by this much over its length (1/64 of an 8-bit code), so that the curve has an inverse there.
 FLAT_TILT = 2.0**-14
 # A rise from sample to sample below this is none: a 16-bit code is 1.5e-5.
@@ -36,9 +33,8 @@ class TabulatedResponse(Response, kind="table"):
 
     def __init__(self, name: str, exposures, values, *, notes: tuple[str, ...] = (), source: str | None = None):
         self.name = name
-        knots, levels, repairs = _monotone(
-            np.asarray(exposures, np.float64), np.asarray(values, np.float64), source or name
-        )
+        samples = np.asarray(exposures, np.float64), np.asarray(values, np.float64)
+        knots, levels, repairs = _monotone(*samples, source or name)
         self.notes = (*notes, *repairs)
         self._knots, self._levels = knots, levels
         self.black, self.peak, self.clip_exposure = float(levels[0]), float(levels[-1]), float(knots[-1])
@@ -135,20 +131,17 @@ def _check(exposures: np.ndarray, values: np.ndarray, source: str):
         raise InputError(source, f"exposure {exposures.min():.6g} is negative", remedy)
     for step in (exposures.max(), np.diff(np.unique(np.r_[0.0, exposures])).min(initial=1.0)):
         if not 1e-30 <= step <= 1e30:
-            raise InputError(source, f"exposures of {step:.3g} apart cannot be computed with",
-                             "divide them by the largest")  # fmt: skip
+            problem = f"exposures of {step:.3g} apart cannot be computed with"
+            raise InputError(source, problem, "divide them by the largest")
     for worst in (values.max(), values.min()):
         if not 0 <= worst <= 1:
-            raise InputError(source, f"value {worst:.6g} is outside [0, 1]",
-                             "divide codes by the largest, 255 or 65535")  # fmt: skip
+            problem = f"value {worst:.6g} is outside [0, 1]"
+            raise InputError(source, problem, "divide codes by the largest, 255 or 65535")
 
 
 def _tilt_flat_parts(exposures: np.ndarray, values: np.ndarray):
-    """Samples up to the clip point with strictly increasing values, of increasing ones.
-
-    Steps under LEAST_STEP are what rounding left of a flat part, and an inverse through them would be decided by the
-    last digit. A flat part becomes a line of FLAT_TILT, less where neighbours are near.
-    """
+    """Samples up to the clip point with strictly increasing values, of increasing ones: a flat part (steps under
+    LEAST_STEP) becomes a line of FLAT_TILT, less where neighbours are near."""
     edges = np.flatnonzero(np.diff(values) >= LEAST_STEP) + 1
     starts, ends = np.r_[0, edges], np.r_[edges, len(values)] - 1
     # The end of each part, so that the peak stays what it is.

@@ -95,10 +95,9 @@ def pose_from_quaternion(quaternion, translation, source: Path, name: str) -> np
 
 
 def pose_from_camera_to_world(matrix, source: Path, name: str) -> np.ndarray:
-    """[4, 4] world_to_camera from a 3 x 4 or 4 x 4 camera-to-world matrix in OpenCV axes.
+    """[4, 4] world_to_camera from a 3 x 4 or 4 x 4 camera-to-world matrix in OpenCV axes, its rotation made proper.
 
-    The rotation is replaced by the nearest proper one where it is off by rounding (up to 1e-3); InputError for a
-    matrix of another shape, values that are not finite, scale, shear or reflection.
+    InputError for another shape, values that are not finite, scale (beyond 1e-3), shear or reflection.
     """
     remedy = "export the poses again without scale"
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():

@@ -1,8 +1,4 @@
-"""COLMAP's sparse models, binary and text (https://colmap.github.io/format.html), read as files that may be hostile.
-
-A count may not promise more records than the bytes left can hold, names are terminated and at most 4096 bytes long,
-values are finite, quaternions are not zero.
-"""
+"""COLMAP's sparse models, binary and text (https://colmap.github.io/format.html), read as files that may be hostile."""
 
 import struct
 from collections.abc import Callable, Iterator
@@ -125,9 +121,8 @@ class _Bytes:
         return count
 
     def skip_list(self, size: int) -> None:
-        """Passes over a count and its records of so many bytes each."""
         count = self.count(size)
-        self.position += count * size
+        self.position += size * count
 
     def name(self) -> str:
         end = self.data.find(b"\0", self.position, self.position + MAX_NAME_BYTES + 1)

@@ -52,8 +52,8 @@ def check_content(photos: Iterable[tuple[np.ndarray, np.ndarray | None]], folder
     if shown < total * 1e-3 or total == 0:
         mean = light / max(total, 1)
         state = "masked out" if total == 0 else f"black or white in {100 - 100 * shown / total:.1f} % (mean {mean:.3f})"
-        raise InputError(folder, f"the training photos are {state}", "expose them so that the scene shows, "
-                         "or choose another exposure index")  # fmt: skip
+        remedy = "expose them so that the scene shows, or choose another exposure index"
+        raise InputError(folder, f"the training photos are {state}", remedy)
 
 
 def told(doing: str, items: Sequence) -> Iterator[tuple[int, Any]]:
@@ -72,24 +72,20 @@ def as_photographed(shot: Shot, *, oriented: bool = False) -> EncodedImage:
 
 
 class _Developer:
-    """Makes views of shots under one choice of size and response."""
-
     def __init__(self, max_size: int | None, response: "Response", alpha: str):
         self.max_size, self.response, self.alpha = max_size, response, alpha
         self._tables: dict[int, np.ndarray] = {}
         self._last: tuple[Lens, Undistortion] | None = None
 
     def view(self, shot: Shot, name: str) -> View:
-        """The shot's view; raises InputError where a file is damaged or its size disagrees with the camera's."""
         lens, oriented = (shot.lens, False) if shot.derived else fitted_lens(shot)
         working, undistortion, full = lens, None, lens.pinhole(shot.world_to_camera)
         if not (lens.is_pinhole or shot.derived):
-            # Distortion is smooth: undone at twice the final size, or a little more, it moves nothing by more than a
-            # fraction of a final pixel, and spares time.
+            # Distortion is smooth: undone at twice the final size or more it is right to a fraction of a final pixel.
             factor = 1 if self.max_size is None else max(lens.width, lens.height) // (2 * self.max_size)
             if factor > 1:
                 working = lens.resized(round(lens.width / factor), round(lens.height / factor))
-            # Sets mostly share one lens; its map is as large as an image, so only the last one is kept.
+            # Sets mostly share one lens, whose map is as large as an image.
             if self._last is None or self._last[0] != working:
                 self._last = working, Undistortion(working)
             undistortion = self._last[1]
@@ -127,8 +123,7 @@ class _Developer:
         clipped = (codes == levels).astype(np.float32)
         if alpha is not None:
             light, clipped = light * alpha[:, :, None], clipped * alpha[:, :, None]
-        # A mean over clipped samples is a lower bound. With half of the area clipped it says little, and white ("at
-        # least this bright") is the honest value; with less the mean stays, a slight underestimate.
+        # A mean over clipped samples is a lower bound: with half of the area clipped, white is the honest value.
         return codes_of(np.where(warped(clipped) >= 0.5, np.float32(1.0), self.response.encode(warped(light))), 16)
 
 
@@ -141,8 +136,8 @@ def _read_truth(path: Path, lens: Lens, camera: Camera, bent: bool) -> np.ndarra
     # Truth may be rendered larger than the photos (HDR-NeRF's evaluation averages it down); never smaller.
     larger = size[0] >= camera.width and size[1] >= camera.height and _same_aspect(size, lens)
     if size != (lens.width, lens.height) and (bent or not larger):
-        raise InputError(path, f"HDR truth is {size[0]} x {size[1]}, the photo {lens.width} x {lens.height}",
-                         "render the truth at the photo's size, or remove it")  # fmt: skip
+        problem = f"HDR truth is {size[0]} x {size[1]}, the photo {lens.width} x {lens.height}"
+        raise InputError(path, problem, "render the truth at the photo's size, or remove it")
     return read_hdr(path)
 
 
@@ -161,8 +156,8 @@ def fitted_lens(shot: Shot) -> tuple[Lens, bool]:
                 return lens, oriented
             if factor > 1 and abs(lens.width / factor - width) < 1 and abs(lens.height / factor - height) < 1:
                 return lens.resized(width, height), oriented
-    raise InputError(shot.image, f"image is {stored[0]} x {stored[1]}, its camera {lens.width} x {lens.height}",
-                     "use the images that the cameras were solved for")  # fmt: skip
+    problem = f"image is {stored[0]} x {stored[1]}, its camera {lens.width} x {lens.height}"
+    raise InputError(shot.image, problem, "use the images that the cameras were solved for")
 
 
 def _fitted_mask(path: Path, lens: Lens, oriented: bool) -> np.ndarray:
@@ -171,10 +166,9 @@ def _fitted_mask(path: Path, lens: Lens, oriented: bool) -> np.ndarray:
     larger = width > lens.width and height > lens.height and _same_aspect((width, height), lens)
     if larger or (width, height) == (lens.width, lens.height):
         return _shrunk(mask, lens)
-    raise InputError(path, f"mask is {width} x {height}, its image {lens.width} x {lens.height}",
-                     "make the mask at the image's size")  # fmt: skip
+    problem = f"mask is {width} x {height}, its image {lens.width} x {lens.height}"
+    raise InputError(path, problem, "make the mask at the image's size")
 
 
 def _same_aspect(size: tuple[int, int], lens: Lens) -> bool:
-    """True where the two sizes have one shape, to a pixel."""
     return abs(size[0] * lens.height - size[1] * lens.width) <= max(size)

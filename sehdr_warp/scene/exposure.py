@@ -73,7 +73,7 @@ def with_exposure_times(shots: list[Shot], source: Path) -> tuple[list[Shot], bo
 
 
 def parse_seconds(value, source: Path, field: str) -> float:
-    """A positive, finite number of seconds from JSON (a number, or a number as text); InputError otherwise."""
+    """A positive, finite number of seconds from JSON; InputError otherwise."""
     try:
         seconds = float(value)
     except (TypeError, ValueError, OverflowError):

@@ -1,6 +1,8 @@
 """Scene-linear pixels from OpenEXR and Radiance files (shared-exponent RGBE; Ward, Graphics Gems II, II.5)."""
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,6 @@ from .images import DAMAGED, MAX_PIXELS, check_size, require_file
 _MOST_PIXELS_PER_BYTE = 4096
 _REMEDY = "export the image again"
 _MAX_HEADER_BYTES = 1 << 16
-_EXR_ERRORS = (RuntimeError, ValueError, KeyError, TypeError, MemoryError)
 
 
 def hdr_size(path: Path) -> tuple[int, int]:
@@ -57,18 +58,13 @@ def read_exr_channels(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[dict
     Pixels of the display window outside the data window are 0. Values are as stored: NaN and infinity pass.
     Raises InputError where the file is missing, damaged, truncated or holds more than max_pixels pixels.
     """
-    import OpenEXR
-
     origin, (width, height) = _exr_window(path, max_pixels)
-    try:
-        with silent_stderr(), OpenEXR.File(str(path), separate_channels=True) as file:
-            # A file whose pixels end early leaves no part behind instead of raising.
-            if not file.parts:
-                raise InputError(path, "pixel data is damaged or ends early", DAMAGED)
-            header = dict(file.header())
-            stored = {name: channel.pixels for name, channel in file.channels().items()}
-    except _EXR_ERRORS as error:
-        raise InputError(path, f"cannot be read as OpenEXR ({error})", DAMAGED) from None
+    with _exr_file(path, separate_channels=True) as file:
+        # A file whose pixels end early leaves no part behind instead of raising.
+        if not file.parts:
+            raise InputError(path, "pixel data is damaged or ends early", DAMAGED)
+        header = dict(file.header())
+        stored = {name: channel.pixels for name, channel in file.channels().items()}
     left, top = (int(a) - b for a, b in zip(header["dataWindow"][0], origin, strict=True))
     channels = {}
     for name, pixels in stored.items():
@@ -79,17 +75,23 @@ def read_exr_channels(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[dict
     return channels, header
 
 
-def _exr_window(path: Path, max_pixels: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """The display window's origin and its (width, height)."""
+@contextmanager
+def _exr_file(path: Path, **options) -> Iterator:
     import OpenEXR
 
     require_file(path)
     try:
-        with silent_stderr(), OpenEXR.File(str(path), header_only=True) as file:
-            header = file.header()
-            windows = [[(int(x), int(y)) for x, y in header[key]] for key in ("displayWindow", "dataWindow")]
-    except _EXR_ERRORS as error:
+        with silent_stderr(), OpenEXR.File(str(path), **options) as file:
+            yield file
+    except (RuntimeError, ValueError, KeyError, TypeError, MemoryError) as error:
         raise InputError(path, f"cannot be read as OpenEXR ({error})", DAMAGED) from None
+
+
+def _exr_window(path: Path, max_pixels: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    """The display window's origin and its (width, height)."""
+    with _exr_file(path, header_only=True) as file:
+        header = file.header()
+        windows = [[(int(x), int(y)) for x, y in header[key]] for key in ("displayWindow", "dataWindow")]
     sizes = [(high[0] - low[0] + 1, high[1] - low[1] + 1) for low, high in windows]
     stored = path.stat().st_size
     for size in sizes:

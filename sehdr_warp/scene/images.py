@@ -10,12 +10,12 @@ from PIL import Image, ImageFile
 from ..errors import InputError
 
 MAX_PIXELS = 160_000_000
-"""Far above any single camera frame (the largest medium-format backs give 151 megapixels) and far below what would
-exhaust memory; Pillow on its own only warns, and OpenEXR has no limit."""
+"""Above any camera's frame (the largest backs give 151 megapixels), far below what would exhaust memory."""
 LDR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 HDR_SUFFIXES = (".exr", ".hdr")
 DAMAGED = "copy or export the image again"
-EXIF_ERRORS = (OSError, SyntaxError, ValueError, KeyError, TypeError, EOFError, MemoryError, struct.error)
+_PILLOW_ERRORS = (OSError, SyntaxError, ValueError, EOFError, MemoryError)
+EXIF_ERRORS = (*_PILLOW_ERRORS, KeyError, TypeError, struct.error)
 """What Pillow raises for damaged EXIF; the pixels may still be good."""
 
 
@@ -33,10 +33,7 @@ class EncodedImage:
 
 
 def image_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
-    """The photo's size in its file and after its EXIF orientation, each (width, height), from the header alone.
-
-    Raises InputError where the file is missing, is no image, or holds more than MAX_PIXELS pixels.
-    """
+    """The photo's size in its file and after its EXIF orientation, each (width, height); errors as open_image."""
     with open_image(path) as image:
         width, height = image.size
         return image.size, (height, width) if _orientation(image) in (5, 6, 7, 8) else image.size
@@ -52,7 +49,7 @@ def read_ldr(path: Path, *, oriented: bool = False) -> EncodedImage:
         try:
             pixels, alpha = _decode(image, path)
             turn = _orientation(image) if oriented else 1
-        except (OSError, SyntaxError, ValueError, EOFError, MemoryError, Image.DecompressionBombError) as error:
+        except (*_PILLOW_ERRORS, Image.DecompressionBombError) as error:
             raise InputError(path, f"cannot be decoded ({error})", DAMAGED) from None
     return EncodedImage(_upright(pixels, turn), None if alpha is None else _upright(alpha, turn))
 
@@ -64,13 +61,13 @@ def read_mask(path: Path, *, oriented: bool = False) -> np.ndarray:
 
 
 def open_image(path: Path) -> ImageFile.ImageFile:
-    """The image with its header read and its pixels not; InputError as image_sizes raises it."""
+    """The image with its header read and its pixels not; InputError where it is missing, none, or too large."""
     require_file(path)
     # Pillow's own limit is global and lower for its warning; ours is checked below, before any pixel is decoded.
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
         image = Image.open(path)
-    except (OSError, SyntaxError, ValueError, EOFError, MemoryError) as error:
+    except _PILLOW_ERRORS as error:
         detail = "" if "cannot identify" in str(error) else f" ({error})"
         raise InputError(path, f"is not a readable image{detail}", DAMAGED) from None
     finally:

@@ -29,10 +29,8 @@ _MAX_SIDE = 1 << 16
 class Lens:
     """A camera's intrinsics as a data set states them.
 
-    model: one of COLMAP's camera models (CAMERA_MODELS).
-    width, height: size in pixels of the images that params speak of.
-    params: the model's parameters in COLMAP's order; the centre of the top left pixel is (0.5, 0.5).
-    source: the file that states them, for messages.
+    model, params: one of CAMERA_MODELS, its parameters in COLMAP's order; the top left pixel's centre is (0.5, 0.5).
+    width, height: size in pixels of the images that params speak of. source: the file that states them.
 
     Raises InputError for an unknown model, a wrong number of parameters, a size outside 1..65536 or bad values.
     """
@@ -46,10 +44,8 @@ class Lens:
     def __post_init__(self):
         remedy, wanted, problem = "correct the camera or export it again", PARAMETER_COUNTS.get(self.model), None
         if wanted is None:
-            problem, remedy = (
-                f"camera model {self.model!r:.40} is not supported",
-                f"use one of {', '.join(PARAMETER_COUNTS)}",
-            )
+            problem = f"camera model {self.model!r:.40} is not supported"
+            remedy = f"use one of {', '.join(PARAMETER_COUNTS)}"
         elif len(self.params) != wanted:
             problem = f"camera model {self.model} has {len(self.params)} parameters, not {wanted}"
         elif not (1 <= self.width <= _MAX_SIDE and 1 <= self.height <= _MAX_SIDE):
@@ -92,9 +88,8 @@ class Lens:
 
 
 class Undistortion:
-    """Resamples photos taken through one distorting lens to the pinhole camera that shows only real pixels.
+    """Resamples photos of one distorting lens, bilinearly, to COLMAP's choice of a pinhole camera.
 
-    The choice of the pinhole camera is COLMAP's; resampling is bilinear, on float images.
     Raises InputError where the lens cannot be undone.
     """
 
@@ -146,10 +141,8 @@ def limited_size(width: int, height: int, max_size: int | None) -> tuple[int, in
 
 
 def area_average(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """[H, W] or [H, W, C] float -> [height, width(, C)] float32: each pixel the mean of the area that it covers.
-
-    Exact for any ratio (pixels on a border count in part); width and height are not above the image's.
-    """
+    """[H, W] or [H, W, C] float -> [height, width(, C)] float32, not larger: each pixel the mean of the area that it
+    covers, exactly for any ratio."""
     for axis, size in enumerate((height, width)):
         if image.shape[axis] != size:
             lines = np.moveaxis(image, axis, 0)

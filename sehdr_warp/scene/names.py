@@ -34,20 +34,18 @@ def sibling(path: Path, suffixes: tuple[str, ...]) -> Path | None:
 
 def photo_beside(hdr: Path) -> Path:
     """The encoded photo of the same stem beside an HDR image; InputError where there is none."""
-    photo = sibling(hdr, LDR_SUFFIXES)
-    if photo is None and not hdr.is_file():
+    if photo := sibling(hdr, LDR_SUFFIXES):
+        return photo
+    if not hdr.is_file():
         raise InputError(hdr, "image file not found", "copy the whole set")
-    if photo is None:
-        raise InputError(hdr, "is the view's only image, and no encoded (LDR) photo lies beside it",
-                         "put the photo (PNG, JPEG or TIFF) of the same name beside it")  # fmt: skip
-    return photo
+    problem = "is the view's only image, and no encoded (LDR) photo lies beside it"
+    raise InputError(hdr, problem, "put the photo (PNG, JPEG or TIFF) of the same name beside it")
 
 
 def mask_of(folder: Path, name: str, source: Path) -> Path | None:
     """The mask of the image called `name`: `masks/<name>.png` (COLMAP's habit) or `masks/<stem>.png`."""
-    places = (
-        contained(folder / "masks", mask, source) for mask in (f"{name}.png", str(Path(name).with_suffix(".png")))
-    )
+    masks = (f"{name}.png", str(Path(name).with_suffix(".png")))
+    places = (contained(folder / "masks", mask, source) for mask in masks)
     return next((place for place in places if place.is_file()), None)
 
 
@@ -58,10 +56,8 @@ def list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 
 def unique_names(shots: Sequence[Shot]) -> list[str]:
-    """A name for each shot that can also name a file, unique without regard to case.
-
-    It is the view's key. Where two shots share one (`train/r_0` and `test/r_0`), a test view keeps it, and the others
-    are called after their folder (`train_r_0`), then numbered.
+    """A name for each shot that can also name a file, unique without regard to case: the view's key. Where two share
+    one (`train/r_0` and `test/r_0`), a test view keeps it, others have their folder before (`train_r_0`), or a number.
     """
     plain = [re.sub(r"[^\w.+-]", "_", shot.view) or "view" for shot in shots]
     counts = Counter(name.lower() for name in plain)

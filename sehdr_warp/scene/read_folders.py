@@ -15,7 +15,7 @@ from .lens import Lens
 from .names import list_images, mask_of, natural_key, photo_beside, sibling, view_and_exposure
 from .sfm import reconstruct
 
-# The images of reduced copies of a set lie in images_2 ... images_8; the full ones are taken where they are there.
+# From the full size to reduced copies.
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 # HDR-NeRF's synthetic exposures, which HDR-GS's folders do not state (its train_synthetic.py holds them as constants).
 _HDR_GS_SECONDS = (0.125, 0.5, 2.0, 8.0, 32.0)
@@ -63,21 +63,19 @@ def is_hdr_gs(folder: Path) -> bool:
 def read_hdr_gs(folder: Path) -> Capture:
     """HDR-GS's synthetic layout: `images/<v>_<e>.png`, `exr/<v>.exr`, and a model with one image of each view."""
     cloud, poses = _poses_by_view(folder)
-    exposures = _exposures_by_view(folder / "images")
+    exposures, shots = _exposures_by_view(folder / "images"), []
     seconds, notes = _hdr_gs_seconds(folder, 1 + max(key for files in exposures.values() for key in files))
-    shots = [
-        Shot(view, image, *camera, exposure_key=key, exposure_time=seconds[key] if seconds else None,
-             hdr=sibling(folder / "exr" / f"{view}.exr", HDR_SUFFIXES))
-        for view, camera in poses.items()
-        for key, image in sorted(exposures.get(view, {}).items())
-    ]  # fmt: skip
+    for view, (lens, pose) in poses.items():
+        hdr = sibling(folder / "exr" / f"{view}.exr", HDR_SUFFIXES)
+        for key, image in sorted(exposures.get(view, {}).items()):
+            shots.append(Shot(view, image, lens, pose, key, seconds[key] if seconds else None, hdr=hdr))
     if not shots:
         raise InputError(folder / "images", "none of the model's images is in images/", _REMEDY)
     return Capture("hdr-gs", tuple(shots), "background", (2, 1), cloud, notes)
 
 
 def _poses_by_view(folder: Path) -> tuple[Cloud, dict[str, tuple]]:
-    """The points and, for each view (names without `_<exposure>`) in natural order, its lens and pose."""
+    """The points, and lens and pose of each view (names without `_<exposure>`) in natural order."""
     model, source = _model(folder)
     poses = {}
     for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
@@ -117,11 +115,8 @@ def _hdr_gs_seconds(folder: Path, count: int) -> tuple[list[float] | None, tuple
 
 
 def read_hdr_nerf_real(folder: Path) -> Capture:
-    """HDR-NeRF's real layout: `input_images/<view>_<k>.jpg`, `poses_bounds_exps.npy` [n, 18], seconds last.
-
-    Rows follow the sorted file names. Where `sparse/0` lies beside (HDR-GS's edition of these sets), its cameras,
-    poses and points are taken, since every exposure of a view then has one pose.
-    """
+    """HDR-NeRF's real layout: `input_images/<view>_<k>.jpg`, `poses_bounds_exps.npy` [n, 18] by sorted file names,
+    seconds last. `sparse/0` beside it (HDR-GS's edition) wins: all exposures of a view then have one pose."""
     path = folder / "poses_bounds_exps.npy"
     rows = _rows(path, 18)
     images = _images(folder / "input_images", path, len(rows))

@@ -48,11 +48,9 @@ def read_transforms(folder: Path) -> Capture:
 def read_hdr_nerf(folder: Path) -> Capture:
     """HDR-NeRF's synthetic layout (xhuangcv/hdr-nerf, load_syn_llff.py).
 
-    `transforms_<split>.json` with camera_angle_x and frames whose file_path lacks the `_<k>.png` of the exposure;
-    `exposure_<split>.json` maps `<file_path>_<k>.png` to seconds; truth in `<split>_hdr/hdr_%03d.exr` by the frame's
-    place. Any number of exposures will do; points come from `sparse/0`, `sparse` or points3d.ply where they are there.
-    `"photo_response": "reinhard-gamma"` in transforms_<split>.json marks a set of truth alone (ours, not HDR-NeRF's):
-    its photos are made of the truth by that curve.
+    `transforms_<split>.json` with frames whose file_path lacks the `_<k>.png` of the exposure; `exposure_<split>.json`
+    maps `<file_path>_<k>.png` to seconds; truth in `<split>_hdr/hdr_%03d.exr` by the frame's place; points where there
+    are some. `"photo_response": "reinhard-gamma"` (ours) marks truth alone: its photos are made of it by that curve.
     """
     shots = []
     for split in ("train", "test"):
@@ -97,7 +95,7 @@ def frames_of(values: dict, path: Path) -> list[tuple[str, dict]]:
 
 
 def _named_splits(values: dict, frames: list[tuple[str, dict]]) -> dict[str, str]:
-    """Each frame's split where the file says so: nerfstudio's <split>_filenames, or a frame's own "split"."""
+    """Splits by file_path: nerfstudio's <split>_filenames, or a frame's own "split"."""
     known = ("train", "test", "val")
     named = {name: frame["split"] for name, frame in frames if frame.get("split") in known}
     for split in ("train", "val", "test"):
@@ -135,10 +133,12 @@ def _matrix(values) -> np.ndarray:
 
 def frame_pose(frame: dict, path: Path, name: str) -> np.ndarray:
     """[4, 4] world_to_camera of a frame's transform_matrix; InputError where it is no pose."""
-    matrix = _matrix(frame.get("transform_matrix"))
+    return _pose_from_opengl(_matrix(frame.get("transform_matrix")), path, name)
+
+
+def _pose_from_opengl(matrix: np.ndarray, path: Path, name: str) -> np.ndarray:
     if matrix.shape in ((4, 4), (3, 4)):
-        # OpenGL's camera looks along -z with y up; OpenCV's along +z with y down.
-        matrix[:3, 1:3] *= -1
+        matrix[:3, 1:3] *= -1  # From x right, y up, -z forward to y down, z forward.
     return pose_from_camera_to_world(matrix, path, name)
 
 
@@ -166,8 +166,8 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
     fx, fy = focal("fl_x", "camera_angle_x", width), focal("fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
         raise InputError(path, "states no focal length", "add camera_angle_x (radians, below pi) or fl_x (pixels)")
-    pinhole: tuple[Any, ...] = (fy if fx is None else fx, fx if fy is None else fy, number("cx", width / 2),
-                                number("cy", height / 2))  # fmt: skip
+    center = number("cx", width / 2), number("cy", height / 2)
+    pinhole: tuple[Any, ...] = fy if fx is None else fx, fx if fy is None else fy, *center
     k1, k2, k3, k4, p1, p2 = (number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model, bent = stated.get("camera_model", "OPENCV"), (k1, k2, p1, p2)
     if model == "OPENCV_FISHEYE" or stated.get("is_fisheye") is True:
@@ -222,8 +222,7 @@ def _exposures_of(values: dict, path: Path) -> dict[str, dict[int, tuple[str, fl
 def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
     """Named cameras from a JSON file, in its order, without distortion.
 
-    Accepted: {"cameras": [{"name": ..., **Camera.to_dict()}, ...]} (each entry may also keep its values under
-    "camera"), nerfstudio's camera_path.json, and transforms.json.
+    Accepted: {"cameras": [{"name": ..., **Camera.to_dict()}, ...]}, nerfstudio's camera_path.json, transforms.json.
     Raises InputError where the file is damaged, a pose or size cannot be, or two cameras share a name.
     """
     path = Path(path)
@@ -234,8 +233,7 @@ def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
         for i, entry in enumerate(listed):
             try:
                 name = str(entry.get("name", f"{i:04d}")) if own else f"{i:04d}"
-                camera = Camera.from_dict(entry.get("camera", entry)) if own else _nerfstudio(entry, i, values, path)
-                cameras.append((name, camera))
+                cameras.append((name, Camera.from_dict(entry) if own else _nerfstudio(entry, i, values, path)))
             except KeyError as error:
                 raise InputError(path, f"camera {i} has no {error.args[0]}", "add the field") from None
             except (ValueError, TypeError, AttributeError, OverflowError, ZeroDivisionError) as error:
@@ -257,8 +255,8 @@ def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
         if not name or any(letter in name for letter in "/\\\0") or name in (".", "..") or len(name) > 200:
             raise InputError(path, f"camera name {name!r:.60} cannot name a file", "use letters, digits, '_' and '-'")
         if camera.width * camera.height > MAX_PIXELS:
-            problem = f"camera {i} is {camera.width} x {camera.height}"
-            raise InputError(path, problem, f"use sizes of 1 to {MAX_PIXELS} pixels")
+            size = f"{camera.width} x {camera.height}"
+            raise InputError(path, f"camera {i} is {size}", f"use sizes of 1 to {MAX_PIXELS} pixels")
     return cameras
 
 
@@ -268,7 +266,6 @@ def _nerfstudio(entry, index: int, values: dict, path: Path) -> Camera:
     matrix = np.array(entry["camera_to_world"], dtype=np.float64).reshape(4, 4)
     if not 1e-6 <= fov < 180:
         raise InputError(path, f"camera {index} has fov {fov}", "use degrees between 0 and 180")
-    matrix[:3, 1:3] *= -1
     focal = 0.5 * height / math.tan(math.radians(fov) / 2)
-    pose = pose_from_camera_to_world(matrix, path, f"camera {index}")
+    pose = _pose_from_opengl(matrix, path, f"camera {index}")
     return Camera(width, height, focal, focal, width / 2, height / 2, pose)

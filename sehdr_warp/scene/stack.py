@@ -3,7 +3,6 @@
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,22 +22,15 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Stack:
-    """Photos of one still scene: their files, codes [H, W, 3] uint8 or uint16 each, and relative times, seconds."""
-
-    files: tuple[Path, ...]
-    codes: tuple[np.ndarray, ...]
-    times: tuple[float, ...]
+# Stops, RMS, from which channels clearly differ from the shared curve; and by which a photo may be off its time.
+CHANNELS_DIFFER, WRONG_TIME = 0.15, 0.25
 
 
-def read_stack(folder: Path | str, times: Sequence[float] | None = None) -> Stack:
-    """The stack in a folder of photos.
+def read_stack(folder: Path, times: Sequence[float] | None = None) -> tuple[list[Path], Sequence[float]]:
+    """The photos of a folder and their times, as calibrate takes them.
 
-    times: seconds, in the order of the files' names; by default exposures.json's, or EXIF's (which counts ISO and
-        f-number too). Raises InputError for a folder without photos, or where there is not one time for each.
+    Raises InputError for a folder without photos, or where there is not one time for each.
     """
-    folder = Path(folder)
     files = list_images(folder, LDR_SUFFIXES) if folder.is_dir() else []
     if not files:
         raise InputError(folder, "is no folder of photos", "give a folder of one scene at several exposure times")
@@ -53,11 +45,11 @@ def read_stack(folder: Path | str, times: Sequence[float] | None = None) -> Stac
         times = [shot.seconds for shot in shots]
     if len(times) != len(files):
         raise InputError(folder, f"has {len(files)} photos, and {len(times)} times are given", "give one for each")
-    return Stack(tuple(files), tuple(read_ldr(file).pixels for file in files), tuple(map(float, times)))
+    return files, times
 
 
 def calibrate(
-    stack: Stack | Path | str,
+    stack: Path | str,
     *,
     times: Sequence[float] | None = None,
     channel: str | None = None,
@@ -66,7 +58,8 @@ def calibrate(
 ) -> "Response":
     """The response of the camera that took an exposure stack (Debevec and Malik 1997); exposure 1 is white.
 
-    stack, times: a folder of photos, or what read_stack makes of one; as read_stack takes them.
+    stack: a folder of photos of one still scene. times: seconds, in the order of the files' names; by default
+        exposures.json's, or EXIF's (which counts ISO and f-number too).
     channel: "red", "green" or "blue" alone; by default one curve for all three.
     out: a CSV file for the curve, which `response_by_name` reads; a plot goes beside it, with the suffix .png.
 
@@ -76,20 +69,20 @@ def calibrate(
     from ..files import atomic_path, check_absent
     from ..response.calibration import calibrate_codes
 
-    place = stack.files[0].parent if isinstance(stack, Stack) else Path(stack)
+    folder = Path(stack)
     paths = [] if out is None else [Path(out), Path(out).with_suffix(".png")]
     for path in paths:
         check_absent(path, overwrite)
-    stack = stack if isinstance(stack, Stack) else read_stack(stack, times)
-    name = place.name if out is None else Path(out).stem
+    files, times = read_stack(folder, times)
+    name = folder.name if out is None else Path(out).stem
     try:
-        found = calibrate_codes(stack.codes, stack.times, channel=channel, name=name)
+        found = calibrate_codes([read_ldr(file).pixels for file in files], times, channel=channel, name=name)
     except InputError as error:
-        raise InputError(place, *error.args[0].split(": ", 1)[1].split("; ", 1)) from None
-    _tell(found, stack, channel)
+        raise InputError(folder, *error.args[0].split(": ", 1)[1].split("; ", 1)) from None
+    _tell(found, files, channel)
     if paths:
         with atomic_path(paths[1], overwrite) as picture:
-            _plot(found, stack, picture)
+            _plot(found, times, picture)
         with atomic_path(paths[0], overwrite) as table:
             rows = zip(found.response.decode(np.arange(256) / 255), range(256), strict=True)
             lines = [f"{exposure:.9g},{code / 255:.9g}" for exposure, code in rows]
@@ -97,21 +90,21 @@ def calibrate(
     return found.response
 
 
-def _tell(found: "Calibration", stack: Stack, channel: str | None) -> None:
-    from ..response.calibration import CHANNELS, CHANNELS_DIFFER, WRONG_TIME
+def _tell(found: "Calibration", files: list[Path], channel: str | None) -> None:
+    from ..response.calibration import CHANNELS
 
-    log.info("%d photos, residual %.3f stops", len(stack.files), found.residual)
+    log.info("%d photos, residual %.3f stops", len(files), found.residual)
     spread = {name: value for name, value in zip(CHANNELS, found.channel_spread, strict=True) if value == value}
     if channel is None and max(spread.values(), default=0.0) > CHANNELS_DIFFER:
         said = ", ".join(f"{name} {value:.2f}" for name, value in spread.items())
         log.warning("the channels' curves differ from the shared one, stops: %s; --channel takes one alone", said)
-    for file, off in zip(stack.files, found.photo_offsets, strict=True):
+    for file, off in zip(files, found.photo_offsets, strict=True):
         if abs(off) > WRONG_TIME:
             side = "brighter" if off > 0 else "darker"
             log.warning("%s is %.2f stops %s than its time says", file.name, abs(off), side)
 
 
-def _plot(found: "Calibration", stack: Stack, path: Path) -> None:
+def _plot(found: "Calibration", times: Sequence[float], path: Path) -> None:
     """The curve over its samples: encoded value against stops from white."""
     from matplotlib.figure import Figure
 
@@ -124,7 +117,7 @@ def _plot(found: "Calibration", stack: Stack, path: Path) -> None:
     axes.set(xlabel="exposure, stops from white", ylabel="8-bit code", ylim=(0, 260))
     axes.set_xlim(left=max(axes.get_xlim()[0], -14))
     axes.grid(color="#e1e4e8", linewidth=0.8)
-    span = f"{len(stack.files)} photos over {math.log2(max(stack.times) / min(stack.times)):.1f} stops"
+    span = f"{len(times)} photos over {math.log2(max(times) / min(times)):.1f} stops"
     title = f"{found.response.name}: {span}, residual {found.residual:.3f} stops"
     axes.set_title(title, loc="left", fontsize=10)
     axes.legend(frameon=False, loc="upper left", markerscale=4)

@@ -16,9 +16,7 @@ from ..scene import Camera, Scene, View, codes_of
 
 # Mertens et al. 2007, "Exposure Fusion": a value's well-exposedness is a Gaussian around one half.
 _WELL_EXPOSED_CENTER, _WELL_EXPOSED_SIGMA = 0.5, 0.2
-# Enough samples for a ladder to a hundredth of a stop, whatever the number and size of the views.
-_MOST_SAMPLES = 200_000
-_STEPS_PER_STOP = 16
+_MOST_SAMPLES, _STEPS_PER_STOP = 200_000, 16
 
 
 @dataclass(frozen=True)
@@ -75,9 +73,8 @@ def expose(scene: Scene, response, exposure_time: float, *, noise: SensorNoise |
 def exposure_ladder(scene: Scene, response, count: int = 5, factor: float = 4.0) -> tuple[float, ...]:
     """`count` exposure times, each `factor` times the last, around a well exposed one.
 
-    The middle time (of an even count, the geometric mean of the two in the middle) maximizes the mean well-exposedness
-    exp(-(Z - 0.5)^2 / (2 * 0.2^2)) of the encoded values Z over the truth of the training views (Mertens et al. 2007),
-    to a sixteenth of a stop. What the photos show decides, not the brightest lamp.
+    Their geometric middle maximizes the mean well-exposedness exp(-(Z - 0.5)^2 / (2 * 0.2^2)) of the encoded values Z
+    over the truth of the training views (Mertens et al. 2007), to a sixteenth of a stop.
 
     Raises InputError where a training view has no truth or all of it is black.
     """

@@ -11,6 +11,7 @@ import sehdr_warp as sw
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.response.calibration import calibrate_codes
+from sehdr_warp.scene.images import read_ldr
 from sehdr_warp.scene.stack import read_stack
 
 CODES = np.arange(10, 246) / 255
@@ -109,9 +110,10 @@ def test_useless_stacks_get_one_line(tmp_path):
 @pytest.mark.parametrize("name", ["frobisher", "library_window_sonyA6000"])
 def test_real_cameras(shared, name):
     """The photos agree, channels do too, half of many photos tells what all tell, and no camera is sRGB."""
-    stack = read_stack(shared / "data" / "stacks" / name)
-    found = calibrate_codes(stack.codes, stack.times)
+    files, times = read_stack(shared / "data" / "stacks" / name)
+    codes = [read_ldr(file).pixels for file in files]
+    found = calibrate_codes(codes, times)
     assert found.residual < 0.1 and max(found.channel_spread) < 0.1
-    if len(stack.times) > 5:
-        assert stops_off(calibrate_codes(stack.codes[::2], stack.times[::2]).response, found.response) < 0.3
+    if len(times) > 5:
+        assert stops_off(calibrate_codes(codes[::2], times[::2]).response, found.response) < 0.3
     assert stops_off(found.response, response_by_name("srgb")) > 0.8

@@ -215,9 +215,7 @@ def test_cameras_from_every_kind_of_file(tmp_path):
     scene = load(tmp_path, cache=tmp_path / "cache")
     expected = scene.views[2].camera
     own = tmp_path / "cameras.json"
-    own.write_text(
-        json.dumps({"cameras": [{"name": "a", **expected.to_dict()}, {"name": "b", "camera": expected.to_dict()}]})
-    )
+    own.write_text(json.dumps({"cameras": [{"name": "a", **expected.to_dict()}, {"name": "b", **expected.to_dict()}]}))
     matrix = expected.camera_to_world.copy()
     matrix[:3, 1:3] *= -1
     path = tmp_path / "camera_path.json"
