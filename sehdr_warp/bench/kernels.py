@@ -74,7 +74,7 @@ def against_gsplat(scene: SplatScene) -> dict:
 
 
 def _checks(scene: SplatScene, peer: bool) -> list[dict]:
-    """What is timed, against float64; on a GPU also against the CPU's kernels at full size."""
+    """Against float64; on a GPU also against the CPU's kernels at full size."""
     made = against_float64(scene, REFERENCE_GAUSSIANS)
     if scene.device.type == "cuda":
         cpu = _image_and_gradients(render, scene.to("cpu"))

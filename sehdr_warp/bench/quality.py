@@ -96,9 +96,7 @@ def plan_jobs(
     """Every combination. Methods that learn the response have one job for known and blind together; those that take
     nothing from photos have none that is blind.
 
-    scenes: folders with HDR truth, or names that load_scene knows. methods: presets, or TOML files. curves: responses
-    that expose the truth. exposures: places in the ladder. iterations: None is the preset's own, or its plan's. device:
-    kind, "cpu" or "cuda". lpips: whether it is judged.
+    exposures: places in the ladder. iterations: None is the preset's own, or its plan's. device: kind, "cpu" or "cuda".
 
     Raises SehdrError for a preset, field, curve or folder that cannot be used, before anything runs.
     """

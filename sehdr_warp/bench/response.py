@@ -33,10 +33,8 @@ def response_error(response: Response, truth: Response) -> float:
 def bench_response(
     data: Sequence[str], curves: Sequence[str], *, exposures: int = 5, max_size: int | None = None
 ) -> dict:
-    """A result: scenes with HDR truth, exposed by each curve at a ladder of exposures, four times apart.
-
-    `rows` sum up over scenes and exposures, by curve and method, and over everything; `trials` are single. Decibels
-    are mu-law PSNR of the photos decoded by the chosen curve and by the true one, aligned; no 3D is involved.
+    """A result: scenes with HDR truth, exposed by each curve at a ladder of exposures; `trials` are single, `rows` the
+    means by curve and method, and over all. Decibels are mu-law PSNR of the decoded photos, aligned; no 3D is involved.
     """
     settings = {"data": list(data), "curves": list(curves), "exposures": exposures, "max_size": max_size}
     result = new_result("response", torch.device("cpu"), settings)

@@ -23,7 +23,8 @@ log = logging.getLogger(__name__)
 
 
 class RunPictures:
-    """What a trained run predicts for views. facts: plain values about it, for the result."""
+    """What a trained run predicts for views, [H, W, 3]: radiance, and the simulated photo in [0, 1] or None. facts:
+    plain values for the result."""
 
     def __init__(self, run):
         self.run = run
@@ -31,11 +32,9 @@ class RunPictures:
         self.facts = {key: getattr(run, name) for key, name in names.items()}
 
     def hdr(self, view: View) -> Tensor:
-        """[H, W, 3] scene-linear radiance."""
         return self.run.render(view.camera).hdr
 
     def ldr(self, view: View) -> Tensor | None:
-        """[H, W, 3] simulated photo in [0, 1]; None where there is none."""
         return self.run.render_ldr(view.camera, view.exposure_time)
 
     def doubt(self, view: View) -> tuple[Tensor, float] | None:

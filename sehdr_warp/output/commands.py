@@ -10,14 +10,26 @@ from tyro.conf import Positional
 from ..training.commands import ensured_scene, open_run
 
 
-@dataclass(frozen=True)
-class Render:
-    """Render HDR EXR, previews and exposure brackets of a trained scene. Needs no photos."""
-
+@dataclass(frozen=True, kw_only=True)
+class _OfRun:
     run: Positional[Path]
     """Folder of a run."""
+    overwrite: bool = False
+    """Replace files that exist."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Rendered(_OfRun):
     out: Path
-    """Folder for the images."""
+    """Folder for the pictures."""
+    device: str | None = None
+    """cpu or cuda:N; by default the first GPU if there is one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render(_Rendered):
+    """Render HDR EXR, previews and exposure brackets of a trained scene. Needs no photos."""
+
     cameras: str = "test"
     """test, train, all, orbit, interpolate, or a JSON file of cameras."""
     count: int = 60
@@ -34,42 +46,26 @@ class Render:
     """Primaries of the EXR files, always scene-linear: rec709, acescg, aces2065-1, rec2020, display-p3 or dci-p3."""
     pixel: Literal["half", "float"] = "half"
     """Pixel type of the EXR files."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
-    overwrite: bool = False
-    """Replace files that exist."""
     json: bool = False
     """Print the written files as JSON on standard output."""
 
 
-@dataclass(frozen=True)
-class Report:
+@dataclass(frozen=True, kw_only=True)
+class Report(_Rendered):
     """Compare input, tone-mapped HDR and truth in pictures, and plot error against training time."""
 
-    run: Positional[Path]
-    """Folder of a run."""
-    out: Path
-    """Folder for the pictures."""
     data: str | None = None
     """The photos, if they have moved since the training."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
-    overwrite: bool = False
-    """Replace files that exist."""
 
 
-@dataclass(frozen=True)
-class Export:
+@dataclass(frozen=True, kw_only=True)
+class Export(_OfRun):
     """Write the Gaussians as PLY: hdr with scene-linear colors, ldr with the display colors of 3DGS viewers."""
 
-    run: Positional[Path]
-    """Folder of a run."""
     out: Path
     """The PLY file."""
     kind: Literal["hdr", "ldr"] = "hdr"
     """Which colors."""
-    overwrite: bool = False
-    """Replace the file if it exists."""
 
 
 def run_render(asked: Render) -> None:
