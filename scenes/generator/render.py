@@ -10,7 +10,6 @@ import time
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -33,8 +32,6 @@ VARIANTS = {"cuda_ad_rgb": 2**24, "llvm_ad_rgb": 2**21, "scalar_rgb": 2**40}
 DENOISERS = ("none", "oidn")
 # Rays of a pixel for the denoiser's guides, to the first surface only.
 _GUIDE_SAMPLES = 64
-# Surface points kept of each training view.
-_POINTS_OF_A_VIEW = 1200
 _OPENCV_TO_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's camera: +x left, +y up, +z forward.
 _WHITE = {"type": "rgb", "value": [1.0, 1.0, 1.0]}
 
@@ -170,7 +167,7 @@ def _claim(folder: Path, recipe: Recipe, settings: Settings) -> None:
 
 
 def _aside(folder: Path, view: int) -> Path:
-    """Surface points and figures of a view, kept for the set's tables."""
+    """Figures of a view, kept for synth.json."""
     return folder / "work" / f"r_{view}.npz"
 
 
@@ -210,11 +207,8 @@ def _render_view(mi, scene, recipe, camera, view: int, settings, denoiser, path:
         radiance = denoiser(radiance, sensor, (settings.seed * VIEWS + view) % 2**32)
         _check_light(radiance, f"{recipe.name}: view {view}, denoised, has", "take --denoise none, with more --samples")
     seconds = time.perf_counter() - started
-    found: dict[str, Any] = {"seconds": seconds, "noise": noise}
-    if split_of(view) == "train":
-        found |= _surface_points(mi, scene, sensor, radiance, view)
     with atomic_path(aside, overwrite=True) as temporary:
-        np.savez_compressed(temporary, **found)
+        np.savez_compressed(temporary, seconds=seconds, noise=noise)
     header = exr_header(camera=camera, provenance={"scene": recipe.name, "samples": str(samples)})
     write_radiance(path, radiance, pixel="float", header=header)
     return f"{seconds:.1f} s, {radiance.min():.3g} to {radiance.max():.4g}, noise {-20 * np.log10(noise + 1e-9):.1f} dB"
@@ -225,16 +219,6 @@ def _noise(first: np.ndarray, second: np.ndarray) -> float:
     scale = max(first.max(), second.max(), 1e-30)
     first, second = (np.log1p(5000 * half / scale) / np.log1p(5000) for half in (first, second))
     return float(np.sqrt(np.mean((first - second) ** 2)) / 2)
-
-
-def _surface_points(mi, scene, sensor, radiance: np.ndarray, view: int) -> dict[str, np.ndarray]:
-    """Places that the view's pixels show (one ray each, none of the sky) and their radiance."""
-    probe = mi.load_dict({"type": "aov", "aovs": "place:position,away:depth"})
-    shown = np.array(mi.render(scene, sensor=sensor, integrator=probe, spp=1, seed=view), np.float32)[..., -4:]
-    row, column = np.nonzero(shown[..., 3] > 0)
-    keep = np.random.default_rng(view).permutation(len(row))[:_POINTS_OF_A_VIEW]
-    row, column = row[keep], column[keep]
-    return {"points": shown[row, column, :3], "radiance": radiance[row, column]}
 
 
 def _finish(mi, recipe: Recipe, folder: Path, settings: Settings, cameras: dict[int, Camera], places: dict[int, Path]):
@@ -257,9 +241,7 @@ def _finish(mi, recipe: Recipe, folder: Path, settings: Settings, cameras: dict[
     }
     if settings.denoise == "oidn":
         making["denoiser"] = f"Open Image Denoise (pyoidn {version('pyoidn')})"
-    empty = np.zeros((0, 3), np.float32)
-    cloud = (np.concatenate([empty, *(f[key] for f in figures if key in f)]) for key in ("points", "radiance"))
-    write_truth_tables(folder, views, *cloud, making=making)
+    write_truth_tables(folder, views, making)
 
 
 class Denoiser:

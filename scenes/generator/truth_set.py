@@ -4,6 +4,7 @@ A set of truth alone, in HDR-NeRF's synthetic layout, has `"photo_response": "re
 `transforms_<split>.json`: load_scene makes its photos by that curve at the times of `exposure_<split>.json`.
 """
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,26 +16,19 @@ from sehdr_warp.scene.capture import DERIVED_PHOTOS, reinhard_gamma
 from sehdr_warp.scene.hdr_files import read_hdr
 from sehdr_warp.synth.expose import RadianceView, ladder_of, write_radiance, write_tables
 
-START_POINTS = 6000
-"""Of a set's points3d.ply; at a point per five pixels and view, as dense as structure from motion gets them."""
 # Below half's 65504 by more than a lossy file errs.
 _LARGEST = 40000.0
 
 
-def write_truth_tables(
-    folder: Path, views: Sequence[RadianceView], points: np.ndarray, point_radiance: np.ndarray, making: dict
-) -> tuple[float, ...]:
+def write_truth_tables(folder: Path, views: Sequence[RadianceView], making: dict) -> tuple[float, ...]:
     """Write all of a set but its EXR files, replacing what is there; returns the five exposure times.
 
-    views: in the order of their files. points, point_radiance: [P, 3]; START_POINTS of them are kept, drawn with
-    seed 0. making: what `synth.json` says of the set.
+    views: in the order of their files. making: what `synth.json` says of the set.
     """
     seen = [view.radiance for view in views if view.split == "train"] or [view.radiance for view in views]
     times = ladder_of(folder.name, seen, reinhard_gamma)
-    keep = np.random.default_rng(0).permutation(len(points))[:START_POINTS]
-    cloud = points[keep], reinhard_gamma(point_radiance[keep] * times[len(times) // 2])
     size = {"w": views[0].camera.width, "h": views[0].camera.height}
-    write_tables(folder, views, times, cloud, **size, photo_response=DERIVED_PHOTOS)
+    write_tables(folder, views, times, None, **size, photo_response=DERIVED_PHOTOS)
     write_json(folder / "synth.json", making, overwrite=True)
     return times
 
@@ -56,7 +50,7 @@ def pack_truth(folder: Path, out: Path, *, compression="dwab", level: float = 45
 
     names = {split: [f"{kind}_{split}.json" for kind in ("transforms", "exposure")] for split in ("train", "test")}
     splits = [split for split in names if all((folder / name).is_file() for name in names[split])]
-    if "train" not in splits or not (folder / "points3d.ply").is_file():
+    if "train" not in splits:
         raise InputError(folder, "is no finished set of truth", "finish it with 'python -m scenes.generator render'")
     tables = {split: read_json(folder / f"exposure_{split}.json") for split in splits}
     times = sorted(set(tables["train"].values()))
@@ -73,8 +67,8 @@ def pack_truth(folder: Path, out: Path, *, compression="dwab", level: float = 45
             squares.append(_squared_errors(read_hdr(target).astype(np.float64), truth.astype(np.float64)))
         for split, table in tables.items():
             write_json(made / f"exposure_{split}.json", {name: time / scale for name, time in table.items()})
-        for name in [f"transforms_{split}.json" for split in splits] + ["points3d.ply"]:
-            (made / name).write_bytes((folder / name).read_bytes())
+        for split in splits:
+            shutil.copyfile(folder / f"transforms_{split}.json", made / f"transforms_{split}.json")
         relative, mu_law = np.mean(squares, 0)
         packing = {
             "compression": f"dwab {level:g}" if compression == "dwab" else compression,

@@ -11,7 +11,7 @@ VIEWS = 6
 
 
 def write_truth(folder, size=32, scale=1.0, peak=None):
-    """Six views, radiance over four decades, 200 points; one pixel of each is `peak`. Returns (views, times)."""
+    """Six views, radiance over four decades; one pixel of each is `peak`. Returns (views, times)."""
     rng = np.random.default_rng(3)
     cameras = make_cameras(Grid((0.0, -3.0, 1.0), (0.0, 0.0, 1.0), 0.8, 0.4), size, size)[:VIEWS]
     y, x = np.mgrid[0:size, 0:size] / size
@@ -25,8 +25,7 @@ def write_truth(folder, size=32, scale=1.0, peak=None):
         write_radiance(truth_path(folder, split, counts[split]), radiance, pixel="float")
         counts[split] += 1
         views.append(RadianceView(f"r_{index}", camera, radiance, split))
-    points = rng.uniform(-1, 1, (200, 3)).astype(np.float32)
-    times = write_truth_tables(folder, views, points, rng.uniform(0, 2, (200, 3)), {"scene": "flat"})
+    times = write_truth_tables(folder, views, {"scene": "flat"})
     return views, times
 
 
