@@ -29,6 +29,7 @@ from ..training.train import train
 from .timing import Variant, forget_peaks, time_variants
 
 LOG = logging.getLogger(__name__)
+MONTH = 30 * 24 * 60  # Minutes, the longest that a worker may take
 FORMAT = 3  # Of a job and of its result; others are run again.
 RESULT, FAILURE = "result.json", "failure.json"
 TESTS, FIRST_TEST = 16, 100
@@ -251,11 +252,14 @@ def _submit(jobs, out: Path, device: str, at_once: int, slurm: dict | None, lpip
     shared = -(-at_once // gpus) if gpus else at_once if slurm is None else 1
     workers = []
     for index in range(at_once):
-        executor = submitit.AutoExecutor(folder=out / "logs", cluster="local" if slurm is None else "slurm")
-        executor.update_parameters(timeout_min=30 * 24 * 60, name="sehdr-warp")
-        if gpus:
-            executor.update_parameters(gpus_per_node=1, visible_gpus=[index % gpus])
-        elif slurm is not None:
+        if slurm is None:
+            executor = submitit.LocalExecutor(folder=out / "logs")
+            executor.update_parameters(timeout_min=MONTH)
+            if gpus:
+                executor.update_parameters(gpus_per_node=1, visible_gpus=[index % gpus])
+        else:
+            executor = submitit.AutoExecutor(folder=out / "logs", cluster="slurm")
+            executor.update_parameters(timeout_min=MONTH, name="sehdr-warp")
             one = {"gpus_per_node": 1} if device == "cuda" else {}
             own = {key if key == "timeout_min" else f"slurm_{key}": value for key, value in slurm.items()}
             executor.update_parameters(**one, **own)
