@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import re
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -79,7 +78,7 @@ def _compared(runs: Sequence) -> ComparedRuns:
 
 def comparison_table(rows: Sequence[ComparedRuns]) -> str:
     """For a terminal: means with their standard deviation over seeds."""
-    return "\n".join(columns(_cells(rows, " ± "), left=2))
+    return "\n".join(columns(_cells(rows), left=2))
 
 
 def comparison_csv(rows: Sequence[ComparedRuns]) -> str:
@@ -93,21 +92,13 @@ def comparison_csv(rows: Sequence[ComparedRuns]) -> str:
     return text.getvalue()
 
 
-def comparison_latex(rows: Sequence[ComparedRuns]) -> str:
-    """A booktabs table."""
-    escaped = [[re.sub(r"([&%$#_{}])", r"\\\1", cell) for cell in line] for line in _cells(rows, "±")]
-    heading, *lines = [" & ".join(line).replace("±", r" $\pm$ ") + r" \\" for line in escaped]
-    begin = rf"\begin{{tabular}}{{ll{'r' * (len(COLUMNS) + 1)}}}"
-    return "\n".join([begin, r"\toprule", heading, r"\midrule", *lines, r"\bottomrule", r"\end{tabular}", ""])
-
-
-def _cells(rows: Sequence[ComparedRuns], between: str) -> list[list[str]]:
-    """A heading, then each row's text; `between` stands between a mean and its spread."""
+def _cells(rows: Sequence[ComparedRuns]) -> list[list[str]]:
+    """A heading, then each row's text."""
     cells = [["run", "scene", "seeds", *(heading for heading, _ in COLUMNS.values())]]
     for row in rows:
         cells.append([row.label, row.scene, str(row.count)])
         for column, (_, digits) in COLUMNS.items():
             spread = row.spread(column)
-            more = f"{between}{spread:.{digits}f}" if spread else ""
+            more = f" ± {spread:.{digits}f}" if spread else ""
             cells[-1].append(number(row.mean(column), digits) + more)
     return cells

@@ -12,12 +12,13 @@ from torch import Tensor
 from ..errors import SehdrError
 from ..scene import Scene, View
 from . import metrics
-from .perceptual import BACKBONE, SMALLEST_EDGE, load_flip, load_lpips
+from .perceptual import BACKBONE, SMALLEST_EDGE, load_lpips
 from .protocols import PROTOCOLS, fit_scale, normalise, tone_map, tone_mapped_psnr
 from .ranking import DARKEST_CODE, ErrorRanking
 
 # cd/m^2 at which the brightest value of a view's truth is shown for PU21: the peak of a common HDR display.
 PEAK_LUMINANCE = 1000.0
+HDR_FIGURES = ("psnr_mu", "ssim_mu", "lpips_mu")
 PERFECT = "there is no error at all, so the PSNR is infinite"
 log = logging.getLogger(__name__)
 
@@ -47,28 +48,27 @@ class RunPictures:
 
 
 @torch.no_grad()
-def evaluate(run: Any, scene: Scene, *, lpips_weights: Path | str | None = None, flip: bool = False) -> dict[str, Any]:
+def evaluate(run: Any, scene: Scene, *, lpips_weights: Path | str | None = None) -> dict[str, Any]:
     """Render the scene's test views with a trained run and compare them with the photos and the HDR truth.
 
     Args:
         run: a Run.
         scene: at the exposure that was trained on. Without test views the training views are taken; "split" says so.
         lpips_weights: a folder, see load_lpips.
-        flip: also HDR-FLIP under each protocol's scale, where flip-evaluator is installed; slow.
 
     Returns:
-        Plain values, ready for strict JSON. "protocol": {name: psnr_mu, ssim_mu, lpips_mu, views, hdr_flip if asked
-        for}, with "scale" for "aligned"; "pu21": {name: psnr, ssim}; "ldr": psnr, ssim, lpips of the simulated photo,
-        unquantised; "regions": {region: fraction, psnr_ldr, psnr_mu}, pooled over views; "confidence": see ranking.py;
-        "views": the same for each view; "split", "lpips_backbone" and the run's facts. What cannot be computed is null
-        with "reason" (or "lpips_reason") beside it. Outside a view's mask the prediction counts as right and nothing
-        is averaged, but by LPIPS and HDR-FLIP; views with an empty mask are left out.
+        Plain values, ready for strict JSON. "protocol": {name: psnr_mu, ssim_mu, lpips_mu, views}, with "scale" for
+        "aligned"; "pu21": {name: psnr, ssim}; "ldr": psnr, ssim, lpips of the simulated photo, unquantised; "regions":
+        {region: fraction, psnr_ldr, psnr_mu}, pooled over views; "confidence": see ranking.py; "views": the same for
+        each view; "split", "lpips_backbone" and the run's facts. What cannot be computed is null with "reason" (or
+        "lpips_reason") beside it. Outside a view's mask the prediction counts as right and nothing is averaged, but by
+        LPIPS; views with an empty mask are left out.
 
     Raises:
         SehdrError: for a scene without views, images that disagree with their camera or a render that is not finite.
         InputError: for LPIPS weights that cannot be read.
     """
-    return Evaluation(RunPictures(run), scene, run.device, lpips_weights, flip).result()
+    return Evaluation(RunPictures(run), scene, run.device, lpips_weights).result()
 
 
 class Evaluation:
@@ -78,7 +78,7 @@ class Evaluation:
     default the training views. The rest is as of evaluate().
     """
 
-    def __init__(self, pictures, scene: Scene, device, lpips_weights, flip: bool, views=(), scale_views=()):
+    def __init__(self, pictures, scene: Scene, device, lpips_weights, views=(), scale_views=()):
         self.pictures, self.scene, self.device = pictures, scene, torch.device(device)
         self.split = "test" if scene.test_views else "train"
         given = views or scene.test_views or scene.train_views
@@ -87,8 +87,6 @@ class Evaluation:
             raise SehdrError(f"scene {scene.name!r} has no views to evaluate; check its splits and masks")
         self.scale_views = [view for view in scale_views or scene.train_views if view.hdr is not None]
         self.lpips, self.lpips_reason = load_lpips(lpips_weights, self.device)
-        self.flip, self.flip_reason = load_flip() if flip else (None, None)
-        self.hdr_figures = ["psnr_mu", "ssim_mu", "lpips_mu"] + ["hdr_flip"] * flip
         self.regions = {region: _RegionErrors() for region in metrics.REGIONS}
         self.ranking = ErrorRanking()
 
@@ -106,7 +104,7 @@ class Evaluation:
             reason = scale_reason if name == "aligned" else missing
             why = {"reason": reason} if reason else {}
             counted = [] if reason else [row for row, known in zip(rows, truths) if known]
-            figures = _mean([row["protocol"][name] for row in counted], *self.hdr_figures)
+            figures = _mean([row["protocol"][name] for row in counted], *HDR_FIGURES)
             hdr[name] = figures | {"views": len(counted)} | (why or self._reasons(figures))
             pu21[name] = _mean([row["pu21"][name] for row in counted], "psnr", "ssim") | why
         hdr["aligned"]["scale"] = scale
@@ -170,7 +168,7 @@ class Evaluation:
             linear = normalise(name, hdr, truth, mask, scale=scale)
             pair, linear = _inside(tone_map(name, *linear), mask), _inside(linear, mask)
             figures = tone_mapped_psnr(name, *pair, mask), metrics.ssim(*pair, mask), self._lpips(*pair)
-            protocol[name] = dict(zip(self.hdr_figures, (*figures, self.flip and self.flip(*linear))))
+            protocol[name] = dict(zip(HDR_FIGURES, figures, strict=True))
             pu21[name] = metrics.pu21_metrics(*linear, mask, peak_luminance=PEAK_LUMINANCE)
             pooled.append((name, *pair))
         for region, inside in regions.items():
@@ -181,11 +179,9 @@ class Evaluation:
         return self.lpips(prediction, truth) if self.lpips and min(truth.shape[:2]) >= SMALLEST_EDGE else None
 
     def _reasons(self, figures: dict) -> dict:
-        """Why LPIPS or HDR-FLIP are missing."""
-        reasons = {"flip_reason": self.flip_reason} if self.flip_reason and "hdr_flip" in figures else {}
-        if None in (figures.get("lpips", 0), figures.get("lpips_mu", 0)):
-            reasons["lpips_reason"] = self.lpips_reason or f"a view is smaller than {SMALLEST_EDGE} pixels"
-        return reasons
+        """Why LPIPS is missing."""
+        reason = self.lpips_reason or f"a view is smaller than {SMALLEST_EDGE} pixels"
+        return {"lpips_reason": reason} if None in (figures.get("lpips", 0), figures.get("lpips_mu", 0)) else {}
 
 
 class _RegionErrors:

@@ -1,12 +1,11 @@
-"""What an eye sees, where the user has what it takes: LPIPS by weights from a folder, HDR-FLIP by a package.
+"""LPIPS v0.1 (Zhang et al. 2018) on SqueezeNet 1.1 features, by weights that the user has.
 
-LPIPS v0.1 (Zhang et al. 2018) is on SqueezeNet 1.1 features. The folder, given by the caller or by the environment
-variable SEHDR_LPIPS, holds `squeeze.pth` (the v0.1 linear heads of the lpips package) and SqueezeNet 1.1 as
-`squeezenet1_1_features.pth` (features only) or under torchvision's own name `squeezenet1_1-*.pth`.
+Their folder, given by the caller or by the environment variable SEHDR_LPIPS, holds `squeeze.pth` (the v0.1 linear heads
+of the lpips package) and SqueezeNet 1.1 as `squeezenet1_1_features.pth` (features only) or under torchvision's own name
+`squeezenet1_1-*.pth`.
 """
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -110,21 +109,3 @@ def _tensors(path: Path) -> dict[str, Tensor]:
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         raise InputError(path, "is not a table of tensors", "take the file of the lpips package or of torchvision")
     return state
-
-
-def load_flip() -> tuple[Callable[[Tensor, Tensor], float] | None, str | None]:
-    """(HDR-FLIP, None), or (None, the reason) where flip-evaluator is not installed.
-
-    HDR-FLIP (Andersson et al. 2021): the mean in [0, 1], 0 for equal images, of prediction and truth, [H, W, 3] linear
-    Rec.709 radiance in one unit, at 67 pixels a degree, over all exposures that the truth asks for.
-    """
-    try:
-        import flip_evaluator
-    except ImportError:
-        return None, "HDR-FLIP needs the package flip-evaluator: pip install sehdr-warp[flip]"
-
-    def distance(prediction: Tensor, truth: Tensor) -> float:
-        right, test = (image.clamp_min(0).float().cpu().contiguous().numpy() for image in (truth, prediction))
-        return float(flip_evaluator.evaluate(right, test, "HDR", applyMagma=False)[1])
-
-    return distance, None

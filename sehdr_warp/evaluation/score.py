@@ -31,14 +31,12 @@ class FolderPictures:
 
 
 @torch.no_grad()
-def score_folder(
-    folder: Path | str, truth: Scene, *, lpips_weights: Path | str | None = None, flip: bool = False
-) -> dict[str, Any]:
+def score_folder(folder: Path | str, truth: Scene, *, lpips_weights: Path | str | None = None) -> dict[str, Any]:
     """Scores pictures of any origin against a scene's HDR truth.
 
     folder: EXR files of scene-linear radiance with Rec.709 primaries, named as the views (`r_0.exr`). truth: a scene
-    whose views hold HDR truth; its test views are scored, or all named ones where it has none. lpips_weights, flip: as
-    of evaluate().
+    whose views hold HDR truth; its test views are scored, or all named ones where it has none. lpips_weights: as of
+    evaluate().
 
     Returns what evaluate() does, without figures of photos; and "missing", test views without a file, "extra", files of
     no view, and "scale_from": the scale of "aligned" is fitted on the training views that have a file ("train"), else
@@ -65,6 +63,6 @@ def score_folder(
         if which:
             log.warning("%d %s: %s", len(which), what, ", ".join(which[:5]) + (", ..." if len(which) > 5 else ""))
     training = [view for view in truth.train_views if view.name in files and view.hdr is not None]
-    evaluation = Evaluation(FolderPictures(folder, files), truth, "cpu", lpips_weights, flip, views, training or views)
+    evaluation = Evaluation(FolderPictures(folder, files), truth, "cpu", lpips_weights, views, training or views)
     more = {"missing": missing, "extra": extra, "scale_from": "train" if training else "scored"}
     return evaluation.result() | more

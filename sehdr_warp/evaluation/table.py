@@ -56,5 +56,5 @@ def _notes(result: dict, has_truth: bool) -> list[str]:
     if result["split"] == "train":
         notes.append("There are no test views: these figures are of the training views.")
     figures = [*([] if "folder" in result else [result["ldr"]]), *result["protocol"].values()]
-    reasons = [entry[key] for entry in figures for key in ("reason", "lpips_reason", "flip_reason") if key in entry]
+    reasons = [entry[key] for entry in figures for key in ("reason", "lpips_reason") if key in entry]
     return notes + [f"-: {reason}." for reason in dict.fromkeys(reasons)]

@@ -5,7 +5,6 @@ float32: x y z, nx ny nz (zero), f_dc_0..2, f_rest_0..3(K-1)-1 (all coefficients
 opacity (logit), scale_0..2 (logarithm), rot_0..3 (w x y z).
 """
 
-import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -19,12 +18,9 @@ from sehdr_warp.errors import InputError, SehdrError
 from ..files import atomic_path, check_absent
 from .exr import NOT_FINITE
 
-log = logging.getLogger(__name__)
 KINDS = ("hdr", "ldr")
 
 _HARMONIC_0 = 0.5 / np.sqrt(np.pi)
-# A degree of the harmonics that changes no color by more than this part is not stored: a half float rounds by more.
-_UNSEEN = 1e-4
 # Radiance below this is written as this: its logarithm must be finite.
 _DARKEST = 1e-12
 # For a fit: more than three directions for each of the 16 coefficients of degree 3, and the sphere's whole weight
@@ -77,10 +73,7 @@ def export(
         raise SehdrError("an HDR PLY has no exposure time; leave it out, or write kind ldr")
     check_absent(path, overwrite)  # Before minutes of fitting.
     gaussians = hdr_gaussians(run) if kind == "hdr" else ldr_gaussians(run, exposure_time)
-    stored = without_unseen_degrees(gaussians)
-    if stored.degree < gaussians.degree:
-        log.info("harmonics above degree %d change no color visibly and are left out", stored.degree)
-    write_gaussians(path, stored, overwrite=overwrite)
+    write_gaussians(path, gaussians, overwrite=overwrite)
     return Path(path)
 
 
@@ -198,20 +191,6 @@ def bake(
         weighted = (basis * weights[:, None]).swapaxes(1, 2)
         fitted[rows] = np.linalg.solve(weighted @ basis, weighted @ wanted)
     return gaussians.with_colors(fitted, color_model)
-
-
-def without_unseen_degrees(gaussians: GaussianArrays) -> GaussianArrays:
-    """Without the highest degrees that change no color by more than a ten-thousandth ("display": of white): degree l
-    with coefficients c changes one by at most |c| sqrt((2 l + 1) / (4 pi)) (addition theorem)."""
-    harmonics, degree = gaussians.harmonics.astype(np.float64), gaussians.degree
-    scale = np.abs(_HARMONIC_0 * harmonics[:, 0]) if gaussians.color_model == "linear" else 1.0
-    while degree > 0:
-        band = harmonics[:, degree**2 : (degree + 1) ** 2]
-        largest = np.sqrt((band**2).sum(1) * (2 * degree + 1) / (4 * np.pi))
-        if not (largest <= _UNSEEN * scale).all():  # NaN counts as seen, and is refused by name when it is written.
-            break
-        degree -= 1
-    return gaussians.with_colors(gaussians.harmonics[:, : (degree + 1) ** 2], gaussians.color_model)
 
 
 def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: bool = False) -> None:
