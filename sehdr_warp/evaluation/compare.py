@@ -78,7 +78,13 @@ def _compared(runs: Sequence) -> ComparedRuns:
 
 def comparison_table(rows: Sequence[ComparedRuns]) -> str:
     """For a terminal: means with their standard deviation over seeds."""
-    return "\n".join(columns(_cells(rows), left=2))
+    cells = [["run", "scene", "seeds", *(heading for heading, _ in COLUMNS.values())]]
+    for row in rows:
+        cells.append([row.label, row.scene, str(row.count)])
+        for column, (_, digits) in COLUMNS.items():
+            spread = row.spread(column)
+            cells[-1].append(number(row.mean(column), digits) + (f" ± {spread:.{digits}f}" if spread else ""))
+    return "\n".join(columns(cells, left=2))
 
 
 def comparison_csv(rows: Sequence[ComparedRuns]) -> str:
@@ -90,15 +96,3 @@ def comparison_csv(rows: Sequence[ComparedRuns]) -> str:
         values = [value for column in COLUMNS for value in (row.mean(column), row.spread(column))]
         writer.writerow([row.label, row.scene, row.count, *values])
     return text.getvalue()
-
-
-def _cells(rows: Sequence[ComparedRuns]) -> list[list[str]]:
-    """A heading, then each row's text."""
-    cells = [["run", "scene", "seeds", *(heading for heading, _ in COLUMNS.values())]]
-    for row in rows:
-        cells.append([row.label, row.scene, str(row.count)])
-        for column, (_, digits) in COLUMNS.items():
-            spread = row.spread(column)
-            more = f" ± {spread:.{digits}f}" if spread else ""
-            cells[-1].append(number(row.mean(column), digits) + more)
-    return cells

@@ -29,8 +29,7 @@ class RunPictures:
 
     def __init__(self, run):
         self.run = run
-        names = {"train_seconds": "train_seconds", "gaussians": "gaussian_count", "iterations": "iterations"}
-        self.facts = {key: getattr(run, name) for key, name in names.items()}
+        self.facts = {"train_seconds": run.train_seconds, "gaussians": run.gaussian_count, "iterations": run.iterations}
 
     def hdr(self, view: View) -> Tensor:
         return self.run.render(view.camera).hdr
@@ -98,7 +97,10 @@ class Evaluation:
         rows = []
         for number, view in enumerate(self.views, 1):
             rows.append(self._view(view, scale))
-            log.info(_line(number, len(self.views), rows[-1]))
+            told = {"LDR": rows[-1]["ldr"]["psnr"]}
+            told |= {f"HDR {name}": figures["psnr_mu"] for name, figures in rows[-1]["protocol"].items()}
+            figures = ", ".join(f"{name} {value:.2f} dB" for name, value in told.items() if value is not None)
+            log.info("view %d/%d %s: %s", number, len(self.views), view.name, figures)
         hdr, pu21 = {}, {}
         for name in PROTOCOLS:
             reason = scale_reason if name == "aligned" else missing
@@ -234,9 +236,3 @@ def _plain(value) -> Any:
     if isinstance(value, list):
         return [_plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _line(number: int, count: int, row: dict) -> str:
-    figures = [] if row["ldr"]["psnr"] is None else [f"LDR {row['ldr']['psnr']:.2f} dB"]
-    figures += [f"HDR {name} {values['psnr_mu']:.2f} dB" for name, values in row["protocol"].items()]
-    return f"view {number}/{count} {row['name']}: {', '.join(figures)}"

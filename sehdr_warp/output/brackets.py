@@ -120,13 +120,7 @@ class Brackets:
     def header(self, view: str, exposure_time: float, camera: Camera | None, **facts: str) -> dict[str, Any]:
         """The EXR attributes of a picture."""
         facts = {**(self.provenance or {}), **facts, "view": view, "baseExposureTime": repr(self.base_time)}
-        return exr_header(
-            colorspace=self.colorspace,
-            exposure_time=exposure_time,
-            camera=camera,
-            captured=self.captured,
-            provenance=facts,
-        )
+        return exr_header(self.colorspace, exposure_time, camera, self.captured, facts)
 
     def write(
         self, out: Path, views: Iterable[tuple[str, np.ndarray, Camera | None]], overwrite: bool = False

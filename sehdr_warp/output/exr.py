@@ -41,7 +41,6 @@ class Part:
 
 
 def exr_header(
-    *,
     colorspace: str = "rec709",
     exposure_time: float | None = None,
     camera: Camera | None = None,
@@ -77,16 +76,9 @@ def stored_pixel_type(arrays: Sequence[np.ndarray], pixel: str = "half") -> str:
     return "half" if pixel == "half" and fits else "float"
 
 
-def write_exr(
-    path: Path | str,
-    channels: Mapping[str, np.ndarray],
-    *,
-    pixel: str = "half",
-    header: Mapping[str, Any] | None = None,
-    overwrite: bool = False,
-) -> str:
-    """write_multipart_exr() for one part without a name."""
-    return write_multipart_exr(path, [Part(channels, header or {})], pixel=pixel, overwrite=overwrite)
+def write_exr(path: Path | str, channels: Mapping[str, np.ndarray], *, header: Any = None, **options: Any) -> str:
+    """write_multipart_exr() for one part without a name; header: as of Part."""
+    return write_multipart_exr(path, [Part(channels, header or {})], **options)
 
 
 def write_multipart_exr(
@@ -138,7 +130,7 @@ def _check(path: Path, part: Part) -> None:
     if len(shapes) != 1 or any(len(shape) != 2 or 0 in shape for shape in shapes):
         raise ValueError(f"channels have the shapes {sorted(shapes)}, not one [H, W]")
     for name, array in part.channels.items():
-        where = f"part {part.name}, channel {name}" if part.name else f"channel {name}"
+        where = f"part {part.name}, " * bool(part.name) + f"channel {name}"
         check_finite(path, np.asarray(array), f"{where}: {{count}} values")
         if (largest := np.abs(array).max()) > np.finfo(np.float32).max:
             raise InputError(path, f"{where} reaches {largest:.3g}, past 32-bit floats", "scale the radiance down")

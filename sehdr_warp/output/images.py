@@ -41,15 +41,11 @@ def exposure_exif(exposure_time: float, *, bias: float | None = None, captured: 
 
 
 def write_picture(path: Path | str, codes: np.ndarray, *, exif: Image.Exif | None = None) -> None:
-    """Writes [H, W] gray or [H, W, 3] RGB code values as PNG (uint8, uint16) or, by a .jpg suffix, JPEG (uint8) without
-    chroma subsampling.
-
-    Raises InputError and SehdrError as atomic_path does, ValueError for another shape or type.
-    """
+    """Writes [H, W, 3] code values as PNG (uint8, uint16) or, by a .jpg suffix, JPEG (uint8) without chroma
+    subsampling. Raises InputError and SehdrError as atomic_path does, ValueError for another type."""
     jpeg = Path(path).suffix == ".jpg"
-    allowed = (np.uint8,) if jpeg else (np.uint8, np.uint16)
-    if codes.dtype not in allowed or codes.shape[2:] not in ((), (3,)) or codes.ndim < 2 or 0 in codes.shape:
-        raise ValueError(f"code values are {codes.dtype} {codes.shape}, not [H, W] or [H, W, 3] of {allowed}")
+    if codes.dtype not in ((np.uint8,) if jpeg else (np.uint8, np.uint16)):
+        raise ValueError(f"code values are {codes.dtype}, not uint8{'' if jpeg else ' or uint16'}")
     options: dict[str, Any] = {"quality": 98, "subsampling": 0} if jpeg else {}
     with atomic_path(path) as temporary:
         if codes.dtype == np.uint16:
@@ -66,12 +62,10 @@ def as_array(value) -> np.ndarray:
 def _png16(codes: np.ndarray, exif: Image.Exif | None) -> bytes:
     """A 16-bit PNG, which Pillow cannot write in color (PNG specification, 3rd edition: sections 5, 9 and 11.3.3)."""
     height, width = codes.shape[:2]
-    rows = codes.astype(">u2").reshape(height, -1).view(np.uint8).reshape(height, -1)
-    filtered = np.empty((height, 1 + rows.shape[1]), np.uint8)
-    filtered[:, 0] = 2  # "Up": each byte less the one above it.
-    filtered[:, 1:] = rows
-    filtered[1:, 1:] -= rows[:-1]
-    header = struct.pack(">IIBBBBB", width, height, 16, 2 if codes.ndim == 3 else 0, 0, 0, 0)
+    rows = codes.astype(">u2").reshape(height, -1).view(np.uint8)
+    # Each row's filter, 2, is "Up": each byte less the one above it.
+    filtered = np.insert(np.diff(rows, axis=0, prepend=np.uint8(0)), 0, 2, axis=1)
+    header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
     exif_data = {} if exif is None else {b"eXIf": exif.tobytes().removeprefix(b"Exif\0\0")}
     written = b"\x89PNG\r\n\x1a\n"
     for kind, data in {b"IHDR": header, **exif_data, b"IDAT": zlib.compress(filtered.tobytes()), b"IEND": b""}.items():

@@ -125,7 +125,7 @@ def _fuse(run, exposure: np.ndarray) -> np.ndarray:
 
 
 def _seen_from(run) -> np.ndarray:
-    return np.array([entry.camera.position for entry in run.cameras if entry.split == "train"])
+    return np.array([entry.camera.position for entry in run.cameras if entry.split == "train"]).reshape(-1, 3)
 
 
 def harmonic_basis(directions: np.ndarray, degree: int) -> np.ndarray:
@@ -159,9 +159,7 @@ def evaluate_colors(gaussians: GaussianArrays, directions: np.ndarray) -> np.nda
     return np.maximum(value + (0.5 if gaussians.color_model == "display" else 0.0), 0)
 
 
-def bake(
-    gaussians: GaussianArrays, change: Colors, color_model: str, camera_positions: np.ndarray | None = None
-) -> GaussianArrays:
+def bake(gaussians: GaussianArrays, change: Colors, color_model: str, camera_positions: np.ndarray) -> GaussianArrays:
     """The same Gaussians with harmonics of the same degree fitted to changed colors by least squares: a camera response
     and the fusion of brackets act on the radiance of a direction, not on harmonics.
 
@@ -169,15 +167,12 @@ def bake(
     anything; an even cover of the sphere keeps the fit bounded there.
 
     change: [N, D, 3] colors of the present model -> [N, D, 3] of color_model. camera_positions: [C, 3] from where the
-    scene was photographed; without any, all directions weigh alike.
+    scene was photographed; with none, all directions weigh alike.
     """
-    sphere, cameras = sphere_directions(), np.empty((0, 3))
-    weights = np.full(len(sphere), 1.0 / len(sphere))
-    if camera_positions is not None and len(camera_positions):
-        count = min(len(camera_positions), _MAX_CAMERAS)
-        chosen = np.linspace(0, len(camera_positions) - 1, count).round().astype(int)
-        cameras = np.asarray(camera_positions, np.float64)[chosen]
-        weights = np.concatenate([weights * _SPHERE_WEIGHT, np.full(count, 1.0 / count)])
+    count = min(len(camera_positions), _MAX_CAMERAS)
+    cameras = camera_positions[np.linspace(0, len(camera_positions) - 1, count).round().astype(int)]
+    sphere = sphere_directions()
+    weights = np.repeat([_SPHERE_WEIGHT / len(sphere), 1 / max(count, 1)], [len(sphere), count])
     offset = 0.5 if color_model == "display" else 0.0
     fitted = np.empty_like(gaussians.harmonics)
     for start in range(0, len(gaussians.means), _CHUNK):

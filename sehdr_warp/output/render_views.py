@@ -1,6 +1,7 @@
 """Pictures of a trained scene: HDR files, previews and exposure brackets, for any set of cameras."""
 
 import logging
+from collections import deque
 from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -89,9 +90,7 @@ def render_views(
         pictures = write_pictures(hdr, preview)
         if wanted:
             files += [*brackets.write(out, pictures, overwrite), out / "brackets.json"]
-        else:
-            for _ in pictures:
-                pass
+        deque(pictures, maxlen=0)
     return files
 
 

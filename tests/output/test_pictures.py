@@ -18,12 +18,10 @@ def test_png_gives_back_its_codes(tmp_path, bits, exif):
 
 def test_other_readers_see_16_bits(tmp_path):
     cv2 = pytest.importorskip("cv2")
-    for shape in ((7, 5, 3), (7, 5)):
-        codes = np.random.default_rng(0).integers(0, 2**16, shape).astype(np.uint16)
-        file = tmp_path / f"{codes.ndim}.png"
-        write_picture(file, codes, exif=exposure_exif(2.0))
-        found = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        np.testing.assert_array_equal(found[..., ::-1] if codes.ndim == 3 else found, codes)
+    codes = np.random.default_rng(0).integers(0, 2**16, (7, 5, 3)).astype(np.uint16)
+    write_picture(tmp_path / "a.png", codes, exif=exposure_exif(2.0))
+    found = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(found[..., ::-1], codes)
 
 
 def test_jpeg_is_close_and_keeps_colour_detail(tmp_path):

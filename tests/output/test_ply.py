@@ -104,7 +104,7 @@ def test_bake_follows_the_cameras_where_harmonics_cannot_hold_all():
     seen /= np.linalg.norm(seen, axis=2, keepdims=True)
     target = wanted(evaluate_colors(start, seen))
     errors = {}
-    for name, given in (("cameras", positions), ("sphere", None)):
+    for name, given in (("cameras", positions), ("sphere", np.empty((0, 3)))):
         baked = bake(start, wanted, "display", camera_positions=given)
         assert baked.degree == 3 and baked.color_model == "display"
         errors[name] = np.abs(evaluate_colors(baked, seen) - target).mean()
