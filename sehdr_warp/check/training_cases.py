@@ -131,7 +131,8 @@ def _guard(device):
     trainer.step()
     gaussians = trainer.field.gaussians
     before = {name: tensor.clone() for name, tensor in gaussians.tensors().items()}
-    hook = gaussians.means.register_hook(lambda gradient: gradient * math.nan)
+    with trainer._launching():  # a hook makes torch keep the stream that it was made on
+        hook = gaussians.means.register_hook(lambda gradient: gradient * math.nan)
     trainer.step()
     hook.remove()
     if trainer._recorder is not None:
