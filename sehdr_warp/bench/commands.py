@@ -127,7 +127,8 @@ class Quality(Output):
         asked: dict[str, Any] = {
             name: _words(getattr(self, name)) for name in ("scenes", "methods", "curves", "responses")
         }
-        asked |= {name: numbers(f"--{name}", getattr(self, name), int, least=0) for name in ("exposures", "seeds")}
+        for name in ("exposures", "seeds"):
+            asked[name] = tuple(dict.fromkeys(numbers(f"--{name}", getattr(self, name), int, least=0)))
         iterations = self.iterations and positive("--iterations", self.iterations)
         jobs = plan_jobs(**asked, iterations=iterations, max_size=self.max_size, device=device, lpips=lpips is not None)
         how = {"at_once": positive("--jobs", self.jobs), "slurm": _pairs("--slurm", self.slurm)}

@@ -45,12 +45,8 @@ def bench_kernels(sizes: Sequence[Size], channels: Sequence[int], device: torch.
     return result
 
 
-def render(scene: SplatScene) -> torch.Tensor:
-    return rasterize(*scene.arguments).image
-
-
-def render_reference(scene: SplatScene) -> torch.Tensor:
-    return rasterize_reference(*scene.arguments).image
+def render(scene: SplatScene, rasterizer: Callable | None = None) -> torch.Tensor:
+    return (rasterizer or rasterize)(*scene.arguments).image
 
 
 def splat_variant(call: Callable[[], torch.Tensor], scene: SplatScene, backward: bool = True) -> Variant:
@@ -64,8 +60,8 @@ def splat_variant(call: Callable[[], torch.Tensor], scene: SplatScene, backward:
 def against_float64(scene: SplatScene, most: int, name: str = OURS) -> list[dict]:
     """Checks of ours, on a scene like this of at most so many Gaussians."""
     small = make_splat_scene(scene.size.reduced(most), scene.channels, scene.device)
-    truth = _image_and_gradients(render_reference, small.to("cpu", torch.float64))
-    return _compared(name, "float64", _image_and_gradients(render, small), truth)
+    truth = _image_and_gradients(small.to("cpu", torch.float64), rasterize_reference)
+    return _compared(name, "float64", _image_and_gradients(small), truth)
 
 
 @torch.no_grad()
@@ -77,17 +73,15 @@ def _checks(scene: SplatScene, peer: bool) -> list[dict]:
     """Against float64; on a GPU also against the CPU's kernels at full size."""
     made = against_float64(scene, REFERENCE_GAUSSIANS)
     if scene.device.type == "cuda":
-        cpu = _image_and_gradients(render, scene.to("cpu"))
-        splat = RecordedRasterizer(scene.device)
-        replayed = _image_and_gradients(lambda s: splat(*s.arguments).image, scene)
-        recorded = _recorded(scene, scene.cotangent())()
-        for name, ours in ((OURS, _image_and_gradients(render, scene)), (REPLAYED, replayed), (RECORDED, recorded)):
+        cpu, recorded = _image_and_gradients(scene.to("cpu")), _recorded(scene, scene.cotangent())()
+        replayed = _image_and_gradients(scene, RecordedRasterizer(scene.device))
+        for name, ours in ((OURS, _image_and_gradients(scene)), (REPLAYED, replayed), (RECORDED, recorded)):
             made += _compared(name, "the CPU's kernels", ours, cpu)
     return [*made, against_gsplat(scene)] if peer else made
 
 
-def _image_and_gradients(rendered: Callable[[SplatScene], torch.Tensor], scene: SplatScene) -> list[torch.Tensor]:
-    image = rendered(scene)
+def _image_and_gradients(scene: SplatScene, rasterizer: Callable | None = None) -> list[torch.Tensor]:
+    image = render(scene, rasterizer)
     return [image.detach(), *torch.autograd.grad(image, scene.leaves, scene.cotangent())]
 
 
@@ -129,9 +123,9 @@ def _rows(scene: SplatScene, peer: bool, repetitions: int) -> list[dict]:
         renderers[GSPLAT] = gsplat_renderer(scene)
     if scene.device.type == "cuda":
         splat = RecordedRasterizer(scene.device)
-        renderers[REPLAYED] = lambda: splat(*scene.arguments).image
+        renderers[REPLAYED] = lambda: render(scene, splat)
     elif entries * TILE_SIZE**2 * 16 * 4 <= PLAIN_TORCH_BYTES:
-        renderers[PLAIN_TORCH] = lambda: render_reference(scene)
+        renderers[PLAIN_TORCH] = lambda: render(scene, rasterize_reference)
     place = {"gaussians": scene.size.gaussians, "width": scene.size.width, "height": scene.size.height}
     rows = []
     for name, backward in (("forward", False), ("forward + backward", True)):

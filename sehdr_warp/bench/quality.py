@@ -19,6 +19,8 @@ from filelock import FileLock, Timeout
 
 from ..errors import InputError, SehdrError
 from ..evaluation.evaluate import evaluate
+from ..evaluation.metrics import REGIONS
+from ..evaluation.protocols import PROTOCOLS
 from ..files import read_json, write_json
 from ..response import response_by_name
 from ..scene import Scene, embedded_folder, is_embedded, load_scene
@@ -107,19 +109,12 @@ def plan_jobs(
         raise SehdrError(f"response {item!r} is not one of {KNOWN}, {BLIND}")
     for note in (note for curve in curves for note in response_by_name(curve).notes):
         LOG.info("%s", note)
-    found = {}
-    for place in scenes:
-        name = place.removeprefix("embedded:") if is_embedded(place) else Path(place).resolve().name
-        found[place] = {"name": name, "sha256": _digest(place)}
-    for what, names, file in (
-        ("scenes", [scene["name"] for scene in found.values()], "folder"),
-        ("methods", [Path(method).stem for method in methods], "TOML file"),
-    ):
+    titles = [place.removeprefix("embedded:") if is_embedded(place) else Path(place).resolve().name for place in scenes]
+    for what, names, file in (("scenes", titles, "folder"), ("methods", [Path(m).stem for m in methods], "TOML file")):
         if len(set(names)) < len(names):
             raise SehdrError(f"two {what} have one name; rename a {file} so that tables can tell them apart")
+    found = {place: {"name": name, "sha256": _digest(place)} for place, name in zip(scenes, titles, strict=True)}
     jobs = []
-    scenes, curves, responses = (list(dict.fromkeys(names)) for names in (scenes, curves, responses))
-    seeds, exposures = (list(dict.fromkeys(items)) for items in (seeds, exposures))
     for method, seed, place, curve, exposure, response in product(methods, seeds, scenes, curves, exposures, responses):
         config = _training(method, iterations, seed)
         if config.response.name == LEARNED:
@@ -223,15 +218,11 @@ def row_of(result: dict) -> dict:
         "scene": config["scene"]["name"],
         **{name: config[name] for name in names},
         **{name: figures[name] for name in ("iterations", "gaussians", "peak_memory_bytes", "renders_per_second")},
-        "gt_max": hdr["gt-max"]["psnr_mu"],
-        "self_max": hdr["self-max"]["psnr_mu"],
-        "aligned": hdr["aligned"]["psnr_mu"],
+        **{name.replace("-", "_"): hdr[name]["psnr_mu"] for name in PROTOCOLS},
         "ssim": hdr["gt-max"]["ssim_mu"],
         "lpips": hdr["gt-max"]["lpips_mu"],
         "ldr": figures["ldr"]["psnr"],
-        "clipped": regions["clipped"]["psnr_mu"]["aligned"],
-        "well_exposed": regions["well-exposed"]["psnr_mu"]["aligned"],
-        "dark": regions["dark"]["psnr_mu"]["aligned"],
+        **{region.replace("-", "_"): regions[region]["psnr_mu"]["aligned"] for region in REGIONS},
         "clipped_share": regions["clipped"]["fraction"],
         "confidence": figures["confidence"]["spearman_log2"],
         "chosen": figures["response"],

@@ -52,11 +52,10 @@ def bench_response(
         LOG.info("%s: exposed by %s", scene.name, curve)
     for curve, method in product((*curves, "all"), dict.fromkeys(trial["method"] for trial in trials)):
         fits = [t for t in trials if t["method"] == method and curve in (t["curve"], "all")]
-        stops = [trial["stops"] for trial in fits]
+        stops, *psnr = ([trial[key] for trial in fits] for key in ("stops", "aligned", "aligned_known"))
         row = {"curve": curve, "method": method, "trials": len(fits), "mean": float(np.mean(stops))}
         row |= {"worst": max(stops), "good": sum(error < GOOD for error in stops)}
-        means = {key: float(np.mean([trial[key] for trial in fits])) for key in ("aligned", "aligned_known")}
-        result["rows"].append(row | means)
+        result["rows"].append(row | {"aligned": float(np.mean(psnr[0])), "aligned_known": float(np.mean(psnr[1]))})
     return result
 
 

@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -85,12 +86,8 @@ def make_splat_scene(size: Size, channels: int, device: torch.device | str = "cp
     """float32 Gaussians at depths of 2 to 8 before a centered pinhole camera at the origin. Deviations follow the mean
     distance between centers, so that any size has some 15 layers over the alpha threshold in a pixel."""
     generator = torch.Generator().manual_seed(0)
-    count, width, height = size.gaussians, size.width, size.height
-
-    def uniform(*shape):
-        return torch.rand(*shape, generator=generator)
-
-    focal = 0.8 * width
+    uniform = partial(torch.rand, generator=generator)
+    count, width, height, focal = size.gaussians, size.width, size.height, 0.8 * size.width
     depth = 2 + 6 * uniform(count)
     across = torch.stack([(uniform(count) - 0.5) * 1.1 * side / focal for side in (width, height)], dim=1)
     means = torch.cat([across * depth[:, None], depth[:, None]], dim=1)

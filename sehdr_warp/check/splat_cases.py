@@ -86,8 +86,7 @@ def compared(make: Callable[[], Splats | Iterable[Splats]]) -> Callable[[torch.d
     """The measure of a case that compares what a function makes."""
 
     def measure(device):
-        made = make()
-        for splats in (made,) if isinstance(made, Splats) else made:
+        for splats in (made,) if isinstance(made := make(), Splats) else made:
             yield from compare_splats(splats, device)
 
     return measure
