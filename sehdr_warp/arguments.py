@@ -8,7 +8,7 @@ import math
 import re
 import typing
 from collections.abc import Iterator
-from contextlib import redirect_stderr
+from contextlib import redirect_stderr, suppress
 
 import tyro
 
@@ -21,23 +21,20 @@ MARKERS = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.Di
 def parse(options: type[Options], words: list[str], program: str) -> Options:
     """The options that the words of a command line state.
 
-    Args:
-        options: a dataclass; its docstring and its fields' are the help. A field may be a dataclass, whose fields form
-            a group of the help, a TypedDict, whose fields are in --help-all alone, or a union of dataclasses, which are
-            subcommands. A class attribute `gone` may say of flags of earlier versions what to do now.
-        program: what stands before the words, such as `sehdr-warp train`.
+    options: a dataclass; its docstring and its fields' are the help. A field may be a dataclass, whose fields form a
+    group of the help, a TypedDict, whose fields are in --help-all alone, or a union of dataclasses, which are
+    subcommands. A class attribute `gone` may say of flags of earlier versions what to do now.
+    program: what stands before the words, such as `sehdr-warp train`.
 
-    Raises:
-        UsageError: in one line, for words that are no options; with the nearest right one where there is one.
-        SystemExit: after --help.
+    Raises UsageError, with the nearest right word, for one that is no option, and SystemExit after --help.
     """
     _hide_empty_defaults(options)
-    details = [name for name, hint in _hints(options).items() if typing.is_typeddict(_plain(hint))]
+    details = {name: hint for name, hint in _hints(options).items() if typing.is_typeddict(_plain(hint))}
     if details and "--help-all" in words:
         words = ["--help"]
     elif details and {"-h", "--help"} & set(words):
         none = dataclasses.field(default_factory=dict)
-        hidden = [(name, tyro.conf.Suppress[_hints(options)[name]], none) for name in details]
+        hidden = [(name, tyro.conf.Suppress[hint], none) for name, hint in details.items()]
         short = dataclasses.make_dataclass(options.__name__, hidden, bases=(options,), frozen=True)
         short.__doc__ = options.__doc__
         try:
@@ -57,8 +54,7 @@ def parse(options: type[Options], words: list[str], program: str) -> Options:
 
 def _check_flags(options: type, words: list[str], program: str) -> None:
     """Refuses words that are no subcommand or no flag of the options."""
-    below = subcommands(options)
-    if below and words and not words[0].startswith("-"):
+    if (below := subcommands(options)) and words and not words[0].startswith("-"):
         if words[0] not in below:
             hint = did_you_mean(words[0], below) or f"; there are {', '.join(below)}"
             raise UsageError(f"{program} {words[0]}: no such command{hint}")
@@ -87,12 +83,9 @@ def _plain(hint) -> typing.Any:
 
 def subcommands(options: type) -> dict[str, type]:
     """The subcommands of options by name."""
-    found = {}
-    for hint in _hints(options).values():
-        for choice in typing.get_args(_plain(hint)):
-            if dataclasses.is_dataclass(_plain(choice)):
-                found |= {mark.name: _plain(choice) for mark in choice.__metadata__ if getattr(mark, "name", None)}
-    return found
+    choices = (choice for hint in _hints(options).values() for choice in typing.get_args(_plain(hint)))
+    below = (choice for choice in choices if dataclasses.is_dataclass(_plain(choice)))
+    return {mark.name: _plain(choice) for choice in below for mark in choice.__metadata__ if getattr(mark, "name", 0)}
 
 
 def flags(options: typing.Any) -> Iterator[str]:
@@ -142,23 +135,21 @@ def _one_line(told: str) -> str:
         names = [line.strip() for line in lines if re.match(r" {4}\S", line)]
         return f"{lines[0].strip(' :').replace('Missing from ', '')} needs {', '.join(names)}"
     text = " ".join(" ".join(lines).split())
-    found = ((re.fullmatch(pattern, text), shorter) for pattern, shorter in _SHORTER)
-    return next((match.expand(shorter) for match, shorter in found if match), text)
+    return next(
+        (match.expand(shorter) for pattern, shorter in _SHORTER if (match := re.fullmatch(pattern, text))), text
+    )
 
 
 def numbers(flag: str, text: str, kind: type = float, least: float = -math.inf) -> tuple:
     """The numbers of a list such as 0.125,0.5,2; raises InputError, with the flag, for anything else and for a number
     below `least`."""
-    try:
+    with suppress(ValueError):
         found = tuple(kind(item) for item in text.split(","))
-        if min(found) < least:
-            raise ValueError
-    except ValueError:
-        wanted = "whole numbers" if kind is int else "numbers"
-        wanted += f" from {least:g}" if least > -math.inf else ""
-        problem = f"not {wanted} separated by commas"
-        raise InputError(f"{flag} {text}", problem, f"write for example {flag}=1,2") from None
-    return found
+        if min(found) >= least:
+            return found
+    wanted = "whole numbers" if kind is int else "numbers"
+    wanted += f" from {least:g}" if least > -math.inf else ""
+    raise InputError(f"{flag} {text}", f"not {wanted} separated by commas", f"write for example {flag}=1,2")
 
 
 def positive(flag: str, value):

@@ -38,6 +38,7 @@ COMMANDS = {
     },
 }
 """Every command, under the headings of the help: its module, dataclass of options, and the function that runs them."""
+_MODULES = {name: command for group in COMMANDS.values() for name, command in group.items()}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -68,11 +69,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def command_options() -> dict[str, type]:
     """The dataclass of options of every command, by its name."""
-    return {name: _load(command)[0] for name, command in _commands().items()}
-
-
-def _commands() -> dict[str, tuple[str, str, str]]:
-    return {name: command for group in COMMANDS.values() for name, command in group.items()}
+    return {name: _load(name)[0] for name in _MODULES}
 
 
 def _run(words: list[str]) -> None:
@@ -101,14 +98,14 @@ def parse_command(words: list[str]) -> tuple[Callable, object]:
     from .arguments import parse
 
     name, *rest = words
-    if name not in (known := _commands()):
-        raise UsageError(f"no command {name}{did_you_mean(name, known)}; {PROGRAM} --help lists them")
-    options, run = _load(known[name])
+    if name not in _MODULES:
+        raise UsageError(f"no command {name}{did_you_mean(name, _MODULES)}; {PROGRAM} --help lists them")
+    options, run = _load(name)
     return run, parse(options, rest, f"{PROGRAM} {name}")
 
 
-def _load(command: tuple[str, str, str]):
-    module, options, run = command
+def _load(name: str):
+    module, options, run = _MODULES[name]
     found = import_module(f".{module}", __package__)
     return getattr(found, options), getattr(found, run)
 
@@ -126,12 +123,13 @@ def _help() -> str:
             told = _summary(*command[:2])
             lines += textwrap.wrap(told, width, initial_indent=f"  {name:<12}", subsequent_indent=" " * 14)
         lines.append("")
-    lines += [
-        f"First try:  {PROGRAM} train embedded --out runs/first",
-        f"{PROGRAM} COMMAND --help explains it. Every command takes -q (quiet),",
-        "--verbose, and --debug (where an error comes from). --version prints it.",
-    ]
-    return "\n".join(lines)
+    return (
+        "\n".join(lines)
+        + f"""
+First try:  {PROGRAM} train embedded --out runs/first
+{PROGRAM} COMMAND --help explains it. Every command takes -q (quiet),
+--verbose, and --debug (where an error comes from). --version prints it."""
+    )
 
 
 def _summary(module: str, options: str) -> str:

@@ -3,15 +3,13 @@
 import logging
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from functools import partial
 
-LINE_EVERY = 10.0
-"""Seconds between lines about a training where there is no terminal."""
-BAR_EVERY = 0.25
-"""Seconds between updates of a bar, at least: one costs a reading of the loss, and takes a twentieth of the time at
-most."""
+LINE_EVERY = 10.0  # Seconds between lines about a training where there is no terminal
+BAR_EVERY = 0.25  # Between updates of a bar, at least: each reads the loss, and takes a twentieth of the time at most
 
 
 class _Lines(logging.Handler):
@@ -24,25 +22,18 @@ class _Lines(logging.Handler):
 def show_logs(level: str = "info") -> None:
     """Shows what the package logs: "warning" and above alone, "info", or "debug" with the name of each logger."""
     logger = logging.getLogger("sehdr_warp")
-    for handler in list(logger.handlers):
-        if isinstance(handler, _Lines):
-            logger.removeHandler(handler)
     handler = _Lines()
     handler.setFormatter(logging.Formatter("%(name)s: %(message)s" if level == "debug" else "%(message)s"))
-    logger.addHandler(handler)
+    logger.handlers = [other for other in logger.handlers if not isinstance(other, _Lines)] + [handler]
     logger.setLevel(level.upper())
     logger.propagate = False
 
 
 def follow(steps: Iterable, total: int) -> None:
-    """Runs a training to its end and tells of it: a bar on a terminal, else a line every LINE_EVERY seconds.
-
-    steps: as of a Training, with iteration, seconds_left, loss, psnr and gaussians; the last three are read only where
-    they are shown.
-    """
+    """Runs the steps of a Training and tells of them: a bar on a terminal, else a line every LINE_EVERY seconds. Loss,
+    psnr and gaussians are read only where they are shown."""
     if not logging.getLogger("sehdr_warp").isEnabledFor(logging.INFO):
-        for _ in steps:
-            pass
+        deque(steps, maxlen=0)
         return
     terminal = sys.stderr.isatty()
     every, due, start = (BAR_EVERY if terminal else LINE_EVERY), 0.0, None
@@ -78,9 +69,7 @@ def _bar(total: int) -> Iterator[Callable]:
 
         def show(iteration, pace, left, loss, psnr, gaussians):
             count = f"{gaussians / 1000:.1f}k" if gaussians >= 10_000 else str(gaussians)
-            figures = f"{psnr:.1f} dB {count}"
-            if console.width >= 75:
-                figures = f"loss {loss:.3f} {figures}"
+            figures = f"loss {loss:.3f} {psnr:.1f} dB {count}" if console.width >= 75 else f"{psnr:.1f} dB {count}"
             if console.width >= 90:
                 figures = f"loss {loss:.4f}  PSNR {psnr:.2f} dB  {count} Gaussians"
             rate = f"{pace:.3g} it/s" if pace else ""

@@ -14,8 +14,9 @@ import platform
 import re
 import secrets
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import takewhile
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -40,62 +41,39 @@ def atomic_path(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     Raises InputError where `path` exists (unless overwrite, and never for a folder), SehdrError where the disk is
     full or the folder is not writable.
     """
-    path = Path(path)
-
-    def put(temporary: Path) -> None:
-        _sync(temporary)
-        check_absent(path, overwrite)
-        os.replace(temporary, path)
-
-    with _written_beside(path, lambda: check_absent(path, overwrite), put) as temporary:
+    with _written_beside(Path(path), overwrite, folder=False) as temporary:
         yield temporary
 
 
 @contextmanager
 def atomic_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
-    """Yields a temporary folder beside `path`; it becomes `path` when the block ends.
-
-    An empty folder at `path` counts as absent. With overwrite an existing folder is set aside, and removed only once
-    the new one stands in its place. If the block raises, nothing new is left and the existing folder is untouched.
-
-    Raises InputError where `path` exists (unless overwrite, and never for a file), SehdrError where the disk is full
-    or the parent is not writable.
-    """
-    path = Path(path)
-
-    def put(temporary: Path) -> None:
-        for folder, _, names in os.walk(temporary):
-            for place in (*names, "."):
-                _sync(Path(folder, place))
-        check_absent(path, overwrite, folder=True)
-        _swap_in(temporary, path)
-
-    with _written_beside(path, lambda: check_absent(path, overwrite, folder=True), put) as temporary:
-        try:
-            temporary.mkdir()
-            yield temporary
-        except SehdrError as error:
-            # Whoever writes into the folder names files by its temporary name, which means nothing to the user.
-            error.args = tuple(str(item).replace(str(temporary), str(path)) for item in error.args)
-            raise
+    """As atomic_path, of a folder. An empty one at `path` counts as absent; with overwrite an existing one is set
+    aside, and removed only once the new one stands in its place."""
+    with _written_beside(Path(path), overwrite, folder=True) as temporary:
+        temporary.mkdir()
+        yield temporary
 
 
 @contextmanager
-def _written_beside(path: Path, check: Callable[[], None], put: Callable[[Path], None]) -> Iterator[Path]:
-    """Yields a temporary name beside `path`, then calls put(name); where either raises, all that was made goes."""
+def _written_beside(path: Path, overwrite: bool, folder: bool) -> Iterator[Path]:
     _remove_stale(path)
-    check()
+    check_absent(path, overwrite, folder=folder)
     with writing(path):
         made, temporary = _make_parents(path), _beside(path)
         try:
             yield temporary
-            put(temporary)
-            _sync(path.parent)
-        except BaseException:
+            for written in (temporary, *temporary.rglob("*")):
+                _sync(written)
+            check_absent(path, overwrite, folder=folder)
+            _put(temporary, path)
+        except BaseException as error:
+            if isinstance(error, SehdrError):
+                # Whoever writes names files by the temporary name, which means nothing to the user.
+                error.args = tuple(str(item).replace(str(temporary), str(path)) for item in error.args)
             _remove(temporary)
             with suppress(OSError):  # Someone else has put a file there in the meantime.
-                for folder in made:
-                    folder.rmdir()
+                for parent in made:
+                    parent.rmdir()
             raise
 
 
@@ -104,7 +82,7 @@ def write_json(path: Path | str, value: Any, overwrite: bool = False) -> None:
 
     Raises InputError and SehdrError as atomic_path does, TypeError for a value that is not plain.
     """
-    text = json.dumps(_finite(value), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    text = json.dumps(_finite(value), indent=2, ensure_ascii=False) + "\n"
     with atomic_path(path, overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
@@ -154,7 +132,6 @@ def contained(folder: Path, name: str, source: Path) -> Path:
     """
     if not isinstance(name, str) or not name or "\0" in name:
         raise InputError(source, f"file name {name!r} is not usable", "correct the entry")
-    problem = None
     try:
         if PurePosixPath(name).is_absolute() or PureWindowsPath(name).anchor:
             problem = "is absolute"
@@ -162,12 +139,12 @@ def contained(folder: Path, name: str, source: Path) -> Path:
             problem = "contains '..'"
         elif not (folder / name).resolve().is_relative_to(folder.resolve()):
             problem = "leads outside the data folder"
+        else:
+            return folder / name
     except (OSError, ValueError, RuntimeError) as error:
         problem = f"cannot be resolved ({error})"
-    if problem:
-        short = repr(name if len(name) <= 80 else name[:77] + "...")
-        raise InputError(source, f"file name {short} {problem}", f"use a path relative to {folder} without '..'")
-    return folder / name
+    short = repr(name if len(name) <= 80 else name[:77] + "...")
+    raise InputError(source, f"file name {short} {problem}", f"use a path relative to {folder} without '..'")
 
 
 def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = False) -> None:
@@ -237,45 +214,40 @@ def _remove(path: Path) -> None:
 
 def _runs(process: int) -> bool:
     """Whether a process of this number runs here; yes where that cannot be told."""
-    if os.name != "posix":  # Elsewhere os.kill ends the process.
-        return True
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):  # Someone else's process, or no number of one.
-        return True
+    with suppress(PermissionError, OverflowError):  # Someone else's process, or no number of one.
+        try:
+            if os.name == "posix":  # Elsewhere os.kill ends the process.
+                os.kill(process, 0)
+        except ProcessLookupError:
+            return False
     return True
 
 
 def _make_parents(path: Path) -> list[Path]:
-    missing = []
-    for parent in path.absolute().parents:
-        if parent.exists():
-            if not parent.is_dir():
-                raise InputError(parent, "is a file, not a folder", "choose another place")
-            break
-        missing.append(parent)
-    for parent in reversed(missing):
-        try:
-            parent.mkdir(exist_ok=True)
-        except FileNotFoundError:  # A file system that makes none, such as /proc, or a folder just deleted.
-            raise SehdrError(f"{parent}: this folder cannot be made; choose another place") from None
+    """Makes the missing folders above a path, and says which, the deepest first."""
+    missing = list(takewhile(lambda parent: not parent.exists(), path.absolute().parents))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise InputError(path.parent, "is a file, or in one, and not a folder", "choose another place") from None
+    except FileNotFoundError:  # A file system that makes none, such as /proc, or a folder just deleted.
+        raise SehdrError(f"{path.parent}: this folder cannot be made; choose another place") from None
     return missing
 
 
-def _swap_in(temporary: Path, path: Path) -> None:
-    old, replaced = _beside(path, "old"), path.exists()
-    if replaced:
+def _put(temporary: Path, path: Path) -> None:
+    """Gives what is written its name; a folder that stands there is set aside until then, and only then removed."""
+    old = _beside(path, "old") if path.is_dir() else None
+    if old:
         os.rename(path, old)
     try:
-        os.rename(temporary, path)
+        os.replace(temporary, path)
     except OSError:
-        if replaced:
+        if old:
             os.rename(old, path)
         raise
     _sync(path.parent)
-    if replaced:
+    if old:
         shutil.rmtree(old, ignore_errors=True)
 
 

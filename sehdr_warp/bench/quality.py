@@ -26,7 +26,7 @@ from ..response import response_by_name
 from ..scene import Scene, embedded_folder, is_embedded, load_scene
 from ..synth.expose import expose, exposure_ladder
 from ..training.config import REFERENCE_ITERATIONS, Config
-from ..training.config_files import config_from_dict, config_to_dict, load_config, override_config, preset_names
+from ..training.config_files import config_from_dict, load_config, override_config, preset_names
 from ..training.train import train
 from .timing import Variant, forget_peaks, time_variants
 
@@ -137,7 +137,7 @@ def plan_jobs(
             "seed": seed,
             "device": device,
             "lpips": lpips,
-            "training": json.loads(json.dumps(config_to_dict(trained))),
+            "training": json.loads(json.dumps(trained.model_dump())),
         }
         jobs.append(Job(decided, place if is_embedded(place) else str(Path(place).absolute())))
     if not jobs:

@@ -77,8 +77,7 @@ def gather_evidence(
     """
     device = field.gaussians.means.device
     total = torch.zeros(field.gaussians.count, 3, device=device)
-    step = -(-len(views) // MOST_VIEWS) or 1
-    for view in views[::step]:
+    for view in views[:: -(-len(views) // MOST_VIEWS) or 1]:
         exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time
         if truth and view.hdr is not None:
             observed = torch.tensor(view.hdr, device=device) * view.exposure_time

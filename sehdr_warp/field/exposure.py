@@ -45,13 +45,10 @@ def read_exposures(items: Items, base_time: float | None, field: str = "exposure
     """Exposures, ascending, from items of the grammar above, given as a sequence or separated by commas.
 
     base_time: the photos' exposure, seconds; None where there are no photos: only seconds can be meant, and `ev` is
-    relative to 1 s. field: what the items are called in errors.
-
-    Raises SehdrError with the item for one in no known form, not positive or not finite, or given twice.
+    relative to 1 s. field: what the items are called in errors, which are SehdrErrors.
     """
     if base_time is not None and not 0 < base_time < math.inf:
-        problem = f"base exposure time = {base_time} is not a positive number of seconds"
-        raise SehdrError(f"{problem}; give the photos' exposure time")
+        raise SehdrError(f"base exposure time = {base_time} is not a positive number of seconds; give the photos' one")
     made = sorted(_exposures(items, base_time, field), key=lambda exposure: exposure.time)
     if not made:
         raise SehdrError(f"{field}: the list is empty; give {_FORMS}")
@@ -109,8 +106,8 @@ def bracket_log_radiance(log_base: "torch.Tensor", times: Sequence[float], base_
 
     times: n exposure times dt_j, and base_time dt_1, in seconds.
     """
-    shifts = [math.log(time) - math.log(base_time) for time in times]
-    offsets = _on_device(tuple(shifts), log_base.dtype, log_base.device)
+    shifts = tuple(math.log(time) - math.log(base_time) for time in times)
+    offsets = _on_device(shifts, log_base.dtype, log_base.device)
     return log_base + offsets.reshape(-1, *[1] * log_base.dim())
 
 

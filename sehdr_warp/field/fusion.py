@@ -107,10 +107,8 @@ def _channel_layers(sizes: list[int], seed: int) -> tuple[nn.ParameterList, nn.P
     """Weights [3, in, out] and biases [3, 1, out], uniform within 1 / sqrt(in) as torch.nn.Linear starts."""
     generator = torch.Generator().manual_seed(seed)
 
-    def layers(middle):
-        shapes = ((3, middle or a, b, a**-0.5) for a, b in pairwise(sizes))
-        return nn.ParameterList(
-            (2.0 * torch.rand(*shape, generator=generator) - 1.0) * bound for *shape, bound in shapes
-        )
+    def layers(rows):
+        drawn = (torch.rand(3, rows or a, b, generator=generator) for a, b in pairwise(sizes))
+        return nn.ParameterList((2.0 * part - 1.0) * a**-0.5 for part, a in zip(drawn, sizes, strict=False))
 
     return layers(None), layers(1)

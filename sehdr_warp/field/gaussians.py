@@ -34,13 +34,12 @@ class Gaussians(nn.Module):
     def __init__(self, means, log_scales, quaternions, opacity_logits, harmonics_dc, harmonics_rest):
         super().__init__()
         given = (means, log_scales, quaternions, opacity_logits, harmonics_dc, harmonics_rest)
-        for name, value in zip(PARAMETER_NAMES, given, strict=True):
-            setattr(self, name, nn.Parameter(value.detach().contiguous()))
         count, harmonics = means.shape[0], 1 + harmonics_rest.shape[1]
         expected = ((count, 3), (count, 3), (count, 4), (count,), (count, 1, 3), (count, harmonics - 1, 3))
         for name, value, shape in zip(PARAMETER_NAMES, given, expected, strict=True):
             if tuple(value.shape) != shape:
                 raise ValueError(f"{name} has shape {tuple(value.shape)}, not {shape}")
+            setattr(self, name, nn.Parameter(value.detach().contiguous()))
         if math.isqrt(harmonics) ** 2 != harmonics:
             raise ValueError(f"{harmonics} harmonics are not a whole number of degrees")
 
@@ -137,10 +136,9 @@ def neighbour_distances(points: Tensor) -> Tensor:
     """[N, 3] float64: exact distances from each point to its three nearest others. Raises SehdrError for a point that
     is not finite."""
     positions = points.detach().double().cpu().numpy()
-    finite = np.isfinite(positions).all(1)
-    if not finite.all():
-        index = int((~finite).argmax())
-        problem = f"point {index} of {len(points)} is {positions[index].tolist()}"
+    broken = np.flatnonzero(~np.isfinite(positions).all(1))
+    if len(broken):
+        problem = f"point {broken[0]} of {len(points)} is {positions[broken[0]].tolist()}"
         raise SehdrError(f"{problem}: a point cloud needs finite coordinates; remove such points")
     tree = KDTree(positions, balanced_tree=False, compact_nodes=False)
     distances = np.empty((len(positions), 4))

@@ -30,11 +30,9 @@ class CameraTensors:
 
     @staticmethod
     def of(camera: Camera, device: torch.device | str) -> "CameraTensors":
-        pose, intrinsics, position = (
-            torch.tensor(value, dtype=torch.float32, device=device)
-            for value in (camera.world_to_camera, camera.intrinsics, camera.position)
-        )
-        return CameraTensors(camera.width, camera.height, pose, intrinsics, position)
+        values = camera.world_to_camera, camera.intrinsics, camera.position
+        tensors = (torch.tensor(value, dtype=torch.float32, device=device) for value in values)
+        return CameraTensors(camera.width, camera.height, *tensors)
 
 
 @dataclass(frozen=True)
@@ -94,9 +92,8 @@ class RadianceField(nn.Module):
         deterministic: bool = False,
     ):
         super().__init__()
-        self.gaussians, self.fusion = gaussians, fusion
+        self.gaussians, self.fusion, self.rasterizer = gaussians, fusion, rasterizer
         self.response, self.base_time = response, base_time
-        self.rasterizer = rasterizer
         self.color_model, self.tone_map = color_model(radiance), tone_map
         self.antialiased, self.deterministic = antialiased, deterministic
         self.register_buffer("confidence", None, persistent=False)
@@ -116,7 +113,10 @@ class RadianceField(nn.Module):
         ratio = exposure_time / self.base_time
         if self.color_model.encoded:
             rendering = self._rasterize(camera, self._colors(camera, degree)[0], capacity)
-            return Photograph(self._reexpose(rendering.image, ratio), None, None, rendering)
+            image = rendering.image
+            if ratio != 1.0:
+                image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
+            return Photograph(image, None, None, rendering)
         base, fused = self._exposures(camera, degree)
         sets = {"fused": fused}
         if self.tone_map == "gaussian":
@@ -188,12 +188,6 @@ class RadianceField(nn.Module):
         if self.fusion is None:
             return base, base
         return base, self.fusion(base.log() if logarithm is None else logarithm) * self.base_time
-
-    def _reexpose(self, encoded: Tensor, ratio: float | Tensor) -> Tensor:
-        """Encoded values at the base time as they would be at `ratio` times it."""
-        if ratio == 1.0:
-            return encoded
-        return self.response.encode_extended(self.response.decode(encoded.clamp(0, 1)) * ratio)
 
     def _rasterize(self, camera: CameraTensors, features: Tensor, capacity: int | None = None) -> Rendering:
         gaussians = self.gaussians

@@ -10,14 +10,13 @@ from ..arguments import numbers
 from ..errors import SehdrError
 
 LOG = logging.getLogger(__name__)
-Positional = tyro.conf.Positional
 
 
 @dataclass(frozen=True)
 class Synth:
     """Write the photos of HDR truth through a camera response, as an HDR-NeRF synthetic set."""
 
-    truth: Positional[str]
+    truth: tyro.conf.Positional[str]
     """A set with truth, or `embedded` or `embedded:NAME`."""
     out: Path
     """Folder for the set."""
@@ -34,7 +33,6 @@ class Synth:
 
 
 def run_synth(asked: Synth) -> None:
-    """Writes the set and says where it is."""
     from ..field.exposure import read_exposures
     from ..files import check_absent
     from ..response import response_by_name

@@ -4,9 +4,11 @@ import math
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
+from numpy.lib.recfunctions import unstructured_to_structured
 from PIL import Image
 
 from ..errors import InputError
@@ -14,8 +16,6 @@ from ..files import atomic_folder, atomic_path, write_json
 from ..output.exr import write_exr
 from ..scene import Camera, Scene, View, codes_of
 
-# Mertens et al. 2007, "Exposure Fusion": a value's well-exposedness is a Gaussian around one half.
-_WELL_EXPOSED_CENTER, _WELL_EXPOSED_SIGMA = 0.5, 0.2
 _MOST_SAMPLES, _STEPS_PER_STOP = 200_000, 16
 
 
@@ -52,8 +52,8 @@ def expose(scene: Scene, response, exposure_time: float, *, noise: SensorNoise |
 
     scene: every view has truth (View.hdr), which is kept. exposure_time: seconds.
     noise: applied to the exposure before the response, drawn for each view from (seed, its name).
-    Each point takes its new color from the training view whose old photo showed it most nearly in its old color, since
-    that view is the likeliest to see it unoccluded; one outside of all training views keeps its own.
+    Each point takes its new color from the training view whose old photo showed it most nearly in its old color, the
+    likeliest to see it unoccluded; one outside of all training views keeps its own.
 
     Raises InputError for a view without truth or an impossible time.
     """
@@ -71,19 +71,18 @@ def expose(scene: Scene, response, exposure_time: float, *, noise: SensorNoise |
 
 
 def exposure_ladder(scene: Scene, response, count: int = 5, factor: float = 4.0) -> tuple[float, ...]:
-    """`count` exposure times, each `factor` times the last, around a well exposed one.
-
-    Their geometric middle maximizes the mean well-exposedness exp(-(Z - 0.5)^2 / (2 * 0.2^2)) of the encoded values Z
-    over the truth of the training views (Mertens et al. 2007), to a sixteenth of a stop.
-
-    Raises InputError where a training view has no truth or all of it is black.
-    """
+    """ladder_of the truth of the training views; raises InputError where one has none."""
     truth = [_truth(scene, view) for view in scene.train_views]
     return ladder_of(scene.name, truth, response.encode, count, factor)
 
 
 def ladder_of(name: str, images: Sequence[np.ndarray], encode: Callable, count: int = 5, factor: float = 4.0):
-    """exposure_ladder of radiance images through a curve; name: of what they show, for errors."""
+    """`count` exposure times, each `factor` times the last, around a well exposed one of radiance images.
+
+    Their geometric middle maximizes the mean well-exposedness exp(-(Z - 0.5)^2 / (2 * 0.2^2)) of the encoded values Z
+    (Mertens et al. 2007, "Exposure Fusion"), to a sixteenth of a stop. Raises InputError, with the name, where all is
+    black.
+    """
     radiance = np.concatenate([image.ravel() for image in images])
     radiance = radiance[:: -(-len(radiance) // _MOST_SAMPLES)].astype(np.float64)
     lit = radiance[radiance > 0]
@@ -91,8 +90,7 @@ def ladder_of(name: str, images: Sequence[np.ndarray], encode: Callable, count: 
         raise InputError(name, "the truth of the training views is black", "render it with light")
 
     def well_exposedness(stop: float) -> float:
-        away = (encode(radiance * 2.0**stop) - _WELL_EXPOSED_CENTER) / _WELL_EXPOSED_SIGMA
-        return float(np.exp(-0.5 * away**2).mean())
+        return float(np.exp(-0.5 * ((encode(radiance * 2.0**stop) - 0.5) / 0.2) ** 2).mean())
 
     low, high = (np.log2(np.percentile(lit, share)) for share in (1, 99))
     # From the brightest parts at black to the darkest at white.
@@ -116,7 +114,7 @@ def _noisy(exposure: np.ndarray, saturation: float, noise: SensorNoise, rng: np.
 
 def _recolored(scene: Scene, views: Sequence[View]) -> np.ndarray:
     """[P, 3] float32 colors of the points in the new photos."""
-    colors = scene.point_colors.astype(np.float32).copy()
+    colors = scene.point_colors.astype(np.float32)
     nearest = np.full(len(colors), np.inf)
     for old, new in zip(scene.views, views, strict=True):
         if old.split != "train":
@@ -136,13 +134,8 @@ def _recolored(scene: Scene, views: Sequence[View]) -> np.ndarray:
 
 
 def write_photo_set(scene: Scene, out: Path, response, times: Sequence[float], *, noise=None, seed=0, overwrite=False):
-    """Write an HDR-NeRF synthetic set of a scene with truth: photos at each time (seconds), poses, truth and points.
-
-    Noise is drawn anew for each time. Points have the colors of the middle time.
-    Raises InputError for a scene without truth, an impossible time, or cameras that the layout cannot hold.
-    """
-    if not times:
-        raise InputError(scene.name, "no exposure times are given", "give one or more, in seconds")
+    """Write an HDR-NeRF synthetic set of a scene with truth: photos at each time (seconds), poses, truth and points in
+    the colors of the middle time. Noise is drawn anew for each time. Raises as expose and write_tables do."""
     exposed = [expose(scene, response, time, noise=noise, seed=seed * len(times) + k) for k, time in enumerate(times)]
     views = [RadianceView(view.name, view.camera, _truth(scene, view), view.split) for view in scene.views]
     points = (scene.points, exposed[len(times) // 2].point_colors) if len(scene.points) else None
@@ -156,23 +149,20 @@ def write_hdr_nerf_scene(
     views: Sequence[RadianceView],
     exposure_times: Sequence[float],
     photos: Sequence[Sequence[np.ndarray]],
-    *,
     points: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> None:
     """Write a set that load_scene reads, with HDR-NeRF's file names.
 
     exposure_times: seconds. photos: at each time one of each view, [H, W, 3] encoded in [0, 1], stored in 8 bits.
-    points: ([P, 3] places, [P, 3] colors in [0, 1]). Truth is stored as half floats where they hold it.
-    Raises InputError for a camera that the layout cannot hold.
+    points: ([P, 3] places, [P, 3] colors in [0, 1]). Raises InputError for a camera that the layout cannot hold.
     """
-    counts = {"train": 0, "test": 0}
+    places = {"train": count(), "test": count()}
     for index, view in enumerate(views):
         (folder / view.split).mkdir(parents=True, exist_ok=True)
         for k, taken in enumerate(photos):
             code = (np.clip(taken[index], 0.0, 1.0) * 255 + 0.5).astype(np.uint8)
             Image.fromarray(code).save(folder / view.split / f"{view.name}_{k}.png")
-        write_radiance(truth_path(folder, view.split, counts[view.split]), view.radiance)
-        counts[view.split] += 1
+        write_radiance(truth_path(folder, view.split, next(places[view.split])), view.radiance)
     write_tables(folder, views, exposure_times, points)
 
 
@@ -208,12 +198,13 @@ def write_tables(folder: Path, views: Sequence[RadianceView], times: Sequence[fl
 
 
 def _view_angle(views: Sequence[RadianceView]) -> float:
-    angles = {2 * math.atan(0.5 * view.camera.width / view.camera.fx) for view in views}
-    for camera in (view.camera for view in views):
-        centered = np.allclose([camera.cx, camera.cy], [camera.width / 2, camera.height / 2], atol=1e-6)
-        if len(angles) > 1 or not centered or not np.isclose(camera.fx, camera.fy, rtol=1e-9):
-            problem = "has cameras that differ, or without square pixels and a centered principal point"
-            raise InputError("the set", problem, "expose a set in HDR-NeRF's layout")
+    cameras = [view.camera for view in views]
+    angles = {2 * math.atan(0.5 * camera.width / camera.fx) for camera in cameras}
+    square = all(np.isclose(camera.fx, camera.fy, rtol=1e-9) for camera in cameras)
+    middle = all(np.allclose(c.intrinsics[2:], [c.width / 2, c.height / 2], atol=1e-6) for c in cameras)
+    if len(angles) > 1 or not (square and middle):
+        problem = "has cameras that differ, or without square pixels and a centered principal point"
+        raise InputError("the set", problem, "expose a set in HDR-NeRF's layout")
     return angles.pop()
 
 
@@ -221,9 +212,7 @@ def _write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
     from plyfile import PlyData, PlyElement
 
     kinds = [(axis, "f4") for axis in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-    columns = [*np.asarray(points).T, *np.clip(np.round(np.asarray(colors).T * 255), 0, 255)]
-    vertices = np.empty(len(points), kinds)
-    for (name, _), column in zip(kinds, columns, strict=True):
-        vertices[name] = column
+    columns = np.hstack([points, np.clip(np.round(np.asarray(colors) * 255), 0, 255)])
+    vertices = unstructured_to_structured(columns, np.dtype(kinds), casting="unsafe")
     with atomic_path(path, overwrite=True) as temporary:
         PlyData([PlyElement.describe(vertices, "vertex")]).write(str(temporary))

@@ -149,11 +149,8 @@ def run_presets(asked: Presets) -> None:
     """Prints every preset with its purpose and cost."""
     names, purpose = configs.preset_names(), configs.preset_purpose
     rows = {name: {"purpose": purpose(name), "cost": _cost(configs.load_config(name))} for name in names}
-    if asked.json:
-        print(json.dumps(rows))
-        return
-    for name, row in rows.items():
-        print(f"{name:<14}{row['purpose']}\n{'':<14}{row['cost']}")
+    lines = (f"{name:<14}{row['purpose']}\n{'':<14}{row['cost']}" for name, row in rows.items())
+    print(json.dumps(rows) if asked.json else "\n".join(lines))
 
 
 def run_config(asked: ShowConfig) -> None:
@@ -162,7 +159,7 @@ def run_config(asked: ShowConfig) -> None:
 
     folder = RunFolder(asked.which)
     config = folder.read_config() if folder.config.is_file() else configs.load_config(asked.which)
-    print(json.dumps(configs.config_to_dict(config)) if asked.json else configs.config_as_toml(config, asked.diff))
+    print(json.dumps(config.model_dump()) if asked.json else configs.config_as_toml(config, asked.diff))
 
 
 def open_run(path: Path, device: str | None):
@@ -205,9 +202,7 @@ def _data(asked: Train, resumed) -> dict:
         known = resumed.read_info()["data"]
         given = {name: known.get(name) if value is None else value for name, value in given.items()}
     if given["path"] is None and asked.output.resume:
-        raise InputError(
-            str(asked.output.out), "holds nothing to resume", "give SCENE to begin, or the folder of a run"
-        )
+        raise SehdrError(f"{asked.output.out}: holds nothing to resume; give SCENE to begin, or the folder of a run")
     if given["path"] is None:
         raise UsageError("train needs SCENE, a folder of photos or `embedded`; see sehdr-warp train --help")
     return given
@@ -216,15 +211,11 @@ def _data(asked: Train, resumed) -> dict:
 def _config(asked: Train, resumed):
     """The preset's config, or that of the RunFolder that is resumed, with what the command line names in it."""
     options = asked.training
-    shortcuts = {
-        "response.name": ("--response", asked.scene.response),
-        "schedule.iterations": ("--iterations", options.iterations),
-        "seed": ("--seed", options.seed),
-    }
-    fields = configs.named_fields(asked.fields)
-    named = {path: value for path, (_, value) in shortcuts.items() if value is not None}
-    named |= {path: configs.value_of(path, text) for path, text in fields.items()}
-    flags = {path: configs.flag_of(path) if path in fields else shortcuts[path][0] for path in named}
+    shortcuts = {"response.name": asked.scene.response, "schedule.iterations": options.iterations, "seed": options.seed}
+    named = {path: value for path, value in shortcuts.items() if value is not None}
+    flags = {"response.name": "--response", "schedule.iterations": "--iterations", "seed": "--seed"}
+    for path, text in configs.named_fields(asked.fields).items():
+        named[path], flags[path] = configs.value_of(path, text), configs.flag_of(path)
     if resumed is not None and options.preset is None:
         return configs.override_config(resumed.read_config(), named, flags=flags)
     config = configs.load_config(options.preset or "default", named, flags)
@@ -245,14 +236,14 @@ def _load(data: Mapping, **response):
 def _cost(config) -> str:
     """How much work a training by a config is, in words."""
     planned = "as many steps as the photos deserve, up to" if config.plan.enabled else "steps:"
-    parts = [f"{planned} {config.schedule.iterations}", f"up to {config.densification.max_gaussians:,} Gaussians"]
-    if config.fusion.enabled:
-        parts.append(f"{len(config.fusion.exposures)} brackets in every step")
-    if config.response.name == "learned":
-        parts.append("a learned response")
-    if config.loss.uses_hdr:
-        parts.append("needs HDR truth")
-    return "; ".join(parts)
+    parts = {
+        f"{planned} {config.schedule.iterations}": True,
+        f"up to {config.densification.max_gaussians:,} Gaussians": True,
+        f"{len(config.fusion.exposures)} brackets in every step": config.fusion.enabled,
+        "a learned response": config.response.name == "learned",
+        "needs HDR truth": config.loss.uses_hdr,
+    }
+    return "; ".join(part for part, holds in parts.items() if holds)
 
 
 def _ending(path: Path, summary: dict) -> str:

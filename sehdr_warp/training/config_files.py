@@ -6,6 +6,7 @@ import textwrap
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from functools import reduce
 from importlib import resources
 from operator import attrgetter
 from pathlib import Path
@@ -43,12 +44,9 @@ def load_config(
 ) -> Config:
     """The config of a preset, a name of preset_names(), or of a TOML file.
 
-    Args:
-        overrides: dotted field names and values that replace the file's, e.g. {"schedule.iterations": 500}.
-        flags: what overrides are called in errors, where they are flags of a command line.
-
-    Raises:
-        InputError: naming file, field and value for a missing file, bad TOML, or a field that is unknown or wrong.
+    overrides: dotted field names and values that replace the file's, e.g. {"schedule.iterations": 500}. flags: what
+    these are called in errors, where they are flags of a command line. What is missing, unknown or wrong is an
+    InputError with file, field and value.
     """
     config = config_from_dict(*_read(preset))
     return override_config(config, overrides or {}, "overrides", flags)
@@ -59,23 +57,20 @@ def override_config(
 ) -> Config:
     """A config with some fields replaced, given as for load_config. Raises InputError that blames the override, by its
     flag where it has one, else as of `source`."""
-    values = config_to_dict(config)
+    values = config.model_dump()
     for path, value in overrides.items():
-        *parents, leaf = path.split(".")
-        table = values
-        for parent in parents:
-            table = table.setdefault(parent, {})
-            if not isinstance(table, dict):
-                raise InputError(path, f"{parent} is a field, not a table", _REMEDY)
-        table[leaf] = value
+        part, _, name = path.rpartition(".")
+        table = values.setdefault(part, {}) if part else values
+        if not isinstance(table, dict):
+            raise InputError(path, f"{part} is a field, not a table", _REMEDY)
+        table[name] = value
     return config_from_dict(values, source, flags)
 
 
 def config_as_toml(config: Config, differing: bool = False) -> str:
     """A config as a TOML file: every field with its meaning, and marked where it is not the default's; or, differing,
     just these, which load_config takes."""
-    lines: list[str] = ['base = "default"'] if differing else []
-    table = ""
+    lines, table = ['base = "default"'] if differing else [], ""
     for path, item in config_fields():
         part, _, name = path.rpartition(".")
         value = attrgetter(path)(config)
@@ -103,22 +98,15 @@ def value_of(path: str, text: str):
 
 
 def _one_value(kind, text: str):
-    kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
-    if kind is str or get_origin(kind) is Literal:
-        return text
-    with suppress(tomllib.TOMLDecodeError):  # The config will say what it takes in place of a word.
-        return tomllib.loads(f"value = {text}")["value"]
+    if _metavar(kind) in ("true|false", "INT", "NUM"):
+        with suppress(tomllib.TOMLDecodeError):  # The config will say what it takes in place of a word.
+            return tomllib.loads(f"value = {text}")["value"]
     return text
 
 
-def config_to_dict(config: Config) -> dict:
-    """Plain nested values; config_from_dict reads them back exactly, through JSON as well."""
-    return config.model_dump()
-
-
 def config_from_dict(values: dict, source: Path | str = "config", flags: Mapping[str, str] | None = None) -> Config:
-    """The config that config_to_dict described. Raises InputError that blames a field by its flag, else as of `source`,
-    and says of one of an earlier version what to do."""
+    """The config of nested values, as its model_dump() gives them and JSON holds them. Raises InputError that blames a
+    field by its flag, else as of `source`, and says of one of an earlier version what to do."""
     try:
         return Config.model_validate(values)
     except ValidationError as error:
@@ -161,47 +149,33 @@ def _read(preset: str | Path) -> tuple[dict, Path]:
             raise InputError(path, f"not valid TOML ({error})", _REMEDY) from None
         base = values.pop("base", None)
         if not isinstance(base, str | None):
-            remedy = f"use one of {', '.join(preset_names())}, or a file"
-            raise InputError(path, f"base = {base!r} is not a name", remedy)
+            raise InputError(path, f"base = {base!r} is not a name", f"use one of {preset_names()}, or a file")
         path = None if base is None else _locate(base, beside=path.parent)
-    merged: dict = {}
-    for values in reversed(chain.values()):
-        _merge(merged, values)
-    return merged, next(iter(chain))
+    return reduce(_merged, reversed(chain.values())), next(iter(chain))
 
 
 def _locate(preset: str | Path, beside: Path | None = None) -> Path:
     if str(preset) in preset_names():
         return Path(str(resources.files("sehdr_warp.configs") / f"{preset}.toml"))
     path = Path(preset) if beside is None else beside / preset
-    try:
-        found = path.is_file()
-    except (OSError, ValueError):  # A name that no file can have.
-        found = False
-    if not found:
-        problem = f"no such preset or file{did_you_mean(str(preset), preset_names())}"
-        raise InputError(str(preset)[:200], problem, f"use one of {', '.join(preset_names())}, or a TOML file")
-    return path
+    with suppress(OSError, ValueError):  # A name that no file can have.
+        if path.is_file():
+            return path
+    problem = f"no such preset or file{did_you_mean(str(preset), preset_names())}"
+    raise InputError(str(preset)[:200], problem, f"use one of {', '.join(preset_names())}, or a TOML file")
 
 
-def _merge(into: dict, values: dict) -> None:
-    for key, value in values.items():
-        if isinstance(value, dict) and isinstance(into.get(key), dict):
-            _merge(into[key], value)
-        else:
-            into[key] = value
+def _merged(below: dict, above: dict) -> dict:
+    both = {key for key in above if isinstance(above[key], dict) and isinstance(below.get(key), dict)}
+    return below | above | {key: below[key] | above[key] for key in both}
 
 
-def config_fields(kind: type[BaseModel] = Config, prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
+def config_fields(kind: Any = Config, prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
     """Dotted name and declaration of every field, those of the config itself first."""
-    nested = []
-    for name, item in kind.model_fields.items():
-        if isinstance(item.annotation, type) and issubclass(item.annotation, BaseModel):
-            nested.append((item.annotation, f"{prefix}{name}."))
-        else:
-            yield prefix + name, item
-    for inner, path in nested:
-        yield from config_fields(inner, path)
+    tables = {name: item for name, item in kind.model_fields.items() if isinstance(item.annotation, type(BaseModel))}
+    yield from ((prefix + name, item) for name, item in kind.model_fields.items() if name not in tables)
+    for name, item in tables.items():
+        yield from config_fields(item.annotation, f"{prefix}{name}.")
 
 
 def flag_of(path: str) -> str:
@@ -246,11 +220,10 @@ def _shown(value) -> str:
 
 
 def _metavar(kind) -> str:
-    origin = get_origin(kind)
-    if origin is Literal:
+    if get_origin(kind) is Literal:
         return "|".join(get_args(kind))
-    if origin is Annotated:
+    if get_origin(kind) is Annotated:
         return _metavar(get_args(kind)[0])
-    if origin is tuple:
+    if get_origin(kind) is tuple:
         return f"{_metavar(get_args(kind)[0])},..."
     return {bool: "true|false", int: "INT", float: "NUM"}.get(kind, "TEXT")

@@ -14,9 +14,7 @@ from .config import LossConfig
 
 CODE = 1 / 255  # One step of an 8-bit photo
 MU = 5000.0  # Of the mu-law in which HDR images are compared
-KNEE = 8.0
-"""The code of 255 whose exposure is white / mu in the mu-law of photos: light below counts as light, above as its
-logarithm."""
+KNEE = 8.0  # The code of 255 at white / mu in the mu-law of photos: light below counts as light, above as its logarithm
 ANCHOR = 0.5  # What anchor_loss wants the unit exposure encoded as: the middle of the encoded range
 
 
@@ -127,9 +125,7 @@ def hdr_loss(photo: Photograph, target: Target, config: LossConfig, largest: flo
 
 def needed_colours(config: LossConfig, has_truth: bool) -> frozenset[str]:
     """What photograph() must render besides the photo for data_loss of a view with or without HDR truth."""
-    wanted = set()
-    if config.hdr_weight > 0 and has_truth:
-        wanted.add("exposure")
+    wanted = {"exposure"} if config.hdr_weight > 0 and has_truth else set()
     if config.linear_weight > 0:
         wanted |= {"base"} if config.hdr_truth and has_truth else {"base", "exposure"}
     return frozenset(wanted)

@@ -45,11 +45,8 @@ def machine_figures(device: torch.device) -> dict:
 
 @contextmanager
 def torch_settings(deterministic: bool) -> Iterator[None]:
-    """torch on one thread: its sums then do not depend on the machine's cores, and a CPU training repeats bit for bit.
-    It costs nothing: the work is in the kernels, which have threads of their own.
-
-    deterministic: also torch's sums on a GPU in a fixed order.
-    """
+    """torch on one thread, so that its sums do not depend on the machine's cores, which costs nothing: the kernels have
+    threads of their own. deterministic: also its sums on a GPU in a fixed order."""
     threads, ordered = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     memory: Any = torch.utils.deterministic
     filled = memory.fill_uninitialized_memory

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from operator import attrgetter
 
@@ -11,7 +11,7 @@ import torch
 
 from ..errors import InputError
 from ..field.exposure import exposure_times, is_seconds
-from ..scene import Scene, View
+from ..scene import Scene
 from ..scene.exposure import made_by_camera
 from ..splatting.threads import thread_count
 from .config import Config
@@ -93,18 +93,17 @@ class Plan:
         for row in self.decisions:
             lines.append(f"{row.name:{name}}  {row.choice:{choice}}  {row.reason}")
             if row.fields:
-                values = ", ".join(f"{path} = {json.dumps(value)}" for path, value in row.fields.items())
-                lines.append(f"{'':{name}}  {'':{choice}}  -> {values}")
-        kept = (f"kept as given: {path} = {json.dumps(value)}" for path, value in self.kept.items())
-        return "\n".join([*lines, *kept])
+                lines.append(f"{'':{name}}  {'':{choice}}  -> {', '.join(_stated(row.fields))}")
+        return "\n".join([*lines, *(f"kept as given: {line}" for line in _stated(self.kept))])
 
-    def lines(self) -> Iterator[str]:
-        """One line for each decision that changes something."""
-        for decision in self.decisions:
-            if decision.fields:
-                yield f"plan: {decision.name}: {decision.choice} ({decision.reason})"
-        for path, value in self.kept.items():
-            yield f"plan: {path} = {json.dumps(value)}, as given"
+    def lines(self) -> list[str]:
+        """One line for each decision that changes something, and for each field that stays."""
+        made = [f"plan: {row.name}: {row.choice} ({row.reason})" for row in self.decisions if row.fields]
+        return made + [f"plan: {line}, as given" for line in _stated(self.kept)]
+
+
+def _stated(fields: dict) -> list[str]:
+    return [f"{path} = {json.dumps(value)}" for path, value in fields.items()]
 
 
 def make_plan(scene: Scene, config: Config, device: str | torch.device | None = None) -> Plan:
@@ -116,14 +115,12 @@ def make_plan(scene: Scene, config: Config, device: str | torch.device | None = 
     device = pick_device(device)
     facts = measure_scene(scene, config.seed)
     check_scene(scene, facts)
-    check_fields(scene, facts, config, config.plan.keep)
+    check_fields(scene, config)
     planned, decisions, kept = config, [], {}
     for name, rule in RULES.items():
         fields, choice, reason = rule(facts, planned, device)
         kept |= {path: attrgetter(path)(planned) for path in fields if path in config.plan.keep}
-        changes = {
-            path: value for path, value in fields.items() if path not in kept and value != attrgetter(path)(planned)
-        }
+        changes = {path: new for path, new in fields.items() if path not in kept and new != attrgetter(path)(planned)}
         decisions.append(Decision(name, changes, choice, reason))
         planned = override_config(planned, changes, f"{scene.name}: plan of {name}")
     planned = override_config(planned, {"plan.enabled": False}, scene.name)
@@ -136,8 +133,7 @@ def apply_plan(scene: Scene, config: Config, device: torch.device) -> tuple[Conf
     if config.plan.enabled:
         plan = make_plan(scene, config, device)
         return plan.config, plan
-    if config.plan.keep:
-        check_fields(scene, measure_scene(scene, config.seed), config, config.plan.keep)
+    check_fields(scene, config)
     return config, None
 
 
@@ -150,8 +146,8 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         count = min(PROBES, len(scene.points))
         probes = np.asarray(scene.points)[rng.choice(len(scene.points), count, replace=False)]
     shown, drawn = (np.array([pixels_of(points, view)[2] for view in views]).sum(0) for points in (probes, drawn))
-    figures = np.mean([_light(view) for view in views[:: -(-len(views) // MOST_VIEWS)]], axis=0)
-    clipped, black, mean, square = (float(figure) for figure in figures)
+    figures = np.mean([_light(view.image) for view in views[:: -(-len(views) // MOST_VIEWS)]], axis=0)
+    clipped, black, mean, square = map(float, figures)
     return SceneFacts(
         photos=len(views),
         pixels=sum(view.camera.width * view.camera.height for view in views),
@@ -166,9 +162,8 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     )
 
 
-def _light(view: View) -> tuple[float, float, float, float]:
+def _light(image: np.ndarray) -> tuple[float, float, float, float]:
     """Parts of the pixels that are clipped and black, and the means of the encoded values and of their squares."""
-    image = view.image
     clipped, black = (image >= 254.5 / 255).any(2).mean(), (image <= 0.5 / 255).all(2).mean()
     return clipped, black, image.mean(dtype=np.float64), np.square(image, dtype=np.float64).mean()
 
@@ -177,22 +172,18 @@ def check_scene(scene: Scene, facts: SceneFacts) -> None:
     """Raises InputError for a scene that no training can make sense of."""
     if facts.photos < FEWEST_PHOTOS:
         problem = f"{facts.photos} training photos: depth and light cannot be told apart from so few"
-        remedy = f"take {FEWEST_PHOTOS} or more photos from different places, better 20"
-    elif facts.contrast < LEAST_CONTRAST:
-        spread = f"standard deviation {255 * facts.contrast:.2f} of 255"
-        problem = f"all photos show a single colour ({spread}): nothing to match"
-        remedy = "check that the files are the photos, and their exposure"
-    elif facts.overlap < LEAST_OVERLAP:
-        places = f"{facts.overlap:.1%} of the places that one shows"
-        problem = f"the photos share no view: {places} are in the field of view of another"
-        remedy = "check the poses and the axes' convention, or take photos that overlap by a half"
-    else:
-        return
-    raise InputError(scene.name, problem, remedy)
+        raise InputError(scene.name, problem, f"take {FEWEST_PHOTOS} or more from different places, better 20")
+    if facts.contrast < LEAST_CONTRAST:
+        problem = f"all photos show a single colour (deviation {255 * facts.contrast:.2f} of 255): nothing to match"
+        raise InputError(scene.name, problem, "check that the files are the photos, and their exposure")
+    if facts.overlap < LEAST_OVERLAP:
+        problem = f"the photos share no view: {facts.overlap:.1%} of the places that one shows another shows too"
+        raise InputError(scene.name, problem, "check poses and axes, or take photos that overlap by a half")
 
 
-def check_fields(scene: Scene, facts: SceneFacts, config: Config, given: Collection[str]) -> None:
-    """Raises InputError, with both values, for fields that the user gave and the scene contradicts. given: names."""
+def check_fields(scene: Scene, config: Config) -> None:
+    """Raises InputError, with both values, for fields in plan.keep, which the user gave, that the scene contradicts."""
+    given, points = config.plan.keep, len(scene.points)
 
     def refuse(path: str, problem: str, remedy: str) -> None:
         raise InputError(scene.name, f"{path} = {json.dumps(attrgetter(path)(config))}, but {problem}", remedy)
@@ -201,17 +192,17 @@ def check_fields(scene: Scene, facts: SceneFacts, config: Config, given: Collect
         base = base_time(scene)
         timed = [item for item in config.fusion.exposures if is_seconds(item)]
         if timed and not scene.exposure_times_known:
-            remedy = "write multiples of the photos' exposure (1/8x) or stops from it (-3ev)"
-            refuse("fusion.exposures", f"{timed[0]} is a time and the photos state none", remedy)
+            problem = f"{timed[0]} is a time and the photos state none"
+            refuse("fusion.exposures", problem, "write multiples of their exposure (1/8x) or stops from it (-3ev)")
         for time in exposure_times(base, config.fusion.exposures):
             if not 1 / REACH <= time / base <= REACH:
                 problem = f"{time:.3g} s is {time / base:.3g} times the photos' {base:.3g} s"
                 refuse("fusion.exposures", problem, f"stay within 1/{REACH:.0f} and {REACH:.0f} times")
     if {"loss.hdr_truth", "loss.linear_weight", "loss.hdr_weight"} & set(given):
         largest_truth(scene, config.loss)
-    if "densification.max_gaussians" in given and config.densification.max_gaussians < facts.points:
-        problem = f"the scene starts from {facts.points} points"
-        refuse("densification.max_gaussians", problem, f"use {facts.points} or more, or leave the field out")
+    if "densification.max_gaussians" in given and config.densification.max_gaussians < points:
+        remedy = f"use {points} or more, or leave the field out"
+        refuse("densification.max_gaussians", f"the scene starts from {points} points", remedy)
 
 
 def _response(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
@@ -231,21 +222,16 @@ def _brackets(facts: SceneFacts, config: Config, device: torch.device) -> Choice
     if not config.fusion.enabled:
         return {}, "plain scaling", reason
     unfused: dict[str, object] = {"fusion.enabled": False}
-    unfused |= {} if _truth(facts, config) else {"loss.linear_weight": 0.0}
+    unfused |= {} if config.loss.hdr_truth and facts.truths else {"loss.linear_weight": 0.0}
     reason = f"{len(config.fusion.exposures)} brackets of one base hold no light of their own; {reason}"
     return unfused, "plain scaling", reason
-
-
-def _truth(facts: SceneFacts, config: Config) -> bool:
-    """Whether the linear loss has truth to compare with."""
-    return config.loss.hdr_truth and facts.truths > 0
 
 
 def _linear_loss(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     shown = f"{facts.truths} of {facts.photos} photos have HDR truth"
     if config.loss.linear_weight == 0:
         return {}, "none", f"loss.linear_weight = 0; {shown}"
-    if _truth(facts, config):
+    if config.loss.hdr_truth and facts.truths:
         return {}, "against truth", shown
     return {"loss.linear_weight": 0.0}, "none", f"{shown}: against its own brackets a base learns nothing"
 
@@ -262,8 +248,8 @@ def _densification(facts: SceneFacts, config: Config, device: torch.device) -> C
         return {}, choice, f"{reason}; {start} to start with"
     # Relocation has this budget by itself; densification by gradients stops nowhere.
     most = min(options.max_gaussians, max(most, 2 * facts.points))
-    fields: dict[str, object] = {"densification.max_gaussians": most}
-    return fields, f"{most} Gaussians", f"{reason}; {facts.points} points to start from"
+    reason += f"; {facts.points} points to start from"
+    return {"densification.max_gaussians": most}, f"{most} Gaussians", reason
 
 
 def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
@@ -274,12 +260,11 @@ def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Choi
         step = cpu_step_seconds(facts, config)
         most = max(CPU_FEWEST, math.ceil(CPU_SECONDS / step / 100) * 100)
         if wanted > most:
-            wanted = most
             # Of the seconds and not of the steps: a step is as slow as its photo is large.
-            took = wanted * step
-            took = f"{max(1, round(took / 60))} min" if took < 5400 else f"{took / 3600:.1f} h"
+            wanted, seconds = most, most * step
+            took = f"{max(1, round(seconds / 60))} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
             reason = f"about {took} on a CPU with {thread_count()} threads; --iterations for more"
-            if wanted == CPU_FEWEST and wanted * step > 2 * CPU_SECONDS:
+            if seconds > 2 * CPU_SECONDS:  # Of the fewest steps, then.
                 reason += ", --max-size for smaller photos and less time"
     return {"schedule.iterations": wanted}, f"{wanted}", reason
 

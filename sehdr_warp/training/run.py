@@ -1,7 +1,6 @@
 """A trained scene, loaded from the folder of its training."""
 
 import logging
-from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -26,27 +25,22 @@ class Run:
 
     path, folder: where it is. config: the choices it was trained with. model: the RadianceField, on `device`.
     cameras: the views of the scene, in its order. response: the camera's curve. base_time: seconds.
-    iterations, train_seconds: how far the training was. checkpoint_hash: of the tensors it was loaded from.
+    iterations, train_seconds, degree of the harmonics: how far the training was. checkpoint_hash: of the tensors.
     data: where the photos were, for load_scene; may be empty.
     """
 
     def __init__(self, folder: RunFolder, config: Config, model: RadianceField, info: dict, values: dict):
         self.folder, self.path = folder, folder.path
         self.config, self.model = config, model
+        self.response: Response = model.response
+        self.base_time: float = model.base_time
         self.cameras: tuple[CameraEntry, ...] = folder.read_cameras()
         self.iterations: int = values["iteration"]
+        self.degree = config.degree_at(self.iterations)
         self.train_seconds: float = values["seconds"]
         self.checkpoint_hash: str = values["sha256"]
         self.data: dict = info["data"]
         self.scene_name: str = info["scene"]
-
-    @property
-    def response(self) -> Response:
-        return self.model.response
-
-    @property
-    def base_time(self) -> float:
-        return self.model.base_time
 
     @property
     def device(self) -> torch.device:
@@ -55,11 +49,6 @@ class Run:
     @property
     def gaussian_count(self) -> int:
         return self.model.gaussians.count
-
-    @cached_property
-    def degree(self) -> int:
-        """The degree of the harmonics that the training had reached."""
-        return self.config.degree_at(self.iterations)
 
     def render(self, camera: Camera) -> RenderedView:
         """HDR radiance [H, W, 3], alpha [H, W] and depth [H, W] from a camera."""

@@ -33,7 +33,7 @@ from ..response import Response
 from ..scene import Camera, Scene
 from ..scene.images import MAX_PIXELS
 from .config import Config
-from .config_files import config_from_dict, config_to_dict, field_and_problem
+from .config_files import config_from_dict, field_and_problem
 
 FORMAT = 2  # Version of what a run holds; a reader refuses others
 TENSORS, VALUES = "state.safetensors", "checkpoint.json"
@@ -87,51 +87,38 @@ class RunFolder:
         self.tensorboard = self.path / "tensorboard"
 
     def check(self, *, resume: bool, overwrite: bool) -> bool:
-        """Whether there is a run to continue. Raises InputError if something is there and neither was asked for, or if
-        what is there is no run."""
+        """Whether there is a run to continue; raises InputError for what is there and no run, or not asked for."""
         if self.path.exists() and not self.path.is_dir():
             raise InputError(self.path, "is a file", "choose another folder for the run")
         if not self.path.exists() or not any(self.path.iterdir()):
             return False
         if not resume and not overwrite:
-            remedy = "choose another folder, or use --resume or --overwrite"
-            raise InputError(self.path, "exists and is not empty", remedy)
+            raise InputError(self.path, "exists and is not empty", "choose another, or use --resume or --overwrite")
         self.require()
         return resume
 
     def require(self) -> None:
         """Raises InputError if this is not the folder of a training."""
-        if self.config.is_file():
-            return
-        problem = f"is not a run (no {self.config.name})" if self.path.is_dir() else "no such folder"
-        if self.path.is_dir() and not any(self.path.iterdir()):
-            problem = "is an empty folder"
-        raise InputError(self.path, problem, "give the folder that `sehdr-warp train --out` wrote")
+        if not self.config.is_file():
+            problem = "is not a run (no config.json)" if self.path.is_dir() else "no such folder"
+            raise InputError(self.path, problem, "give the folder that `sehdr-warp train --out` wrote")
 
     def begin(self, scene: Scene, config: Config, field: RadianceField, data: dict, plan: dict | None) -> None:
-        """Makes the folder, or removes the run in it, and writes what does not change during the training; config.json
-        last: its presence says that the folder is a run."""
+        """Makes the folder, or removes the run in it, and writes what does not change; config.json last: it says that
+        the folder is a run."""
         from .. import __version__
 
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            problem = f"cannot be made ({error.strerror})"
-            raise InputError(self.path, problem, "choose another folder for the run") from None
-        for file in (self.summary, self.metrics, self.confidence, self.plan, self.scene, self.info, self.config):
-            file.unlink(missing_ok=True)
+        with writing(self.path):
+            for file in (self.summary, self.metrics, self.confidence, self.plan, self.scene, self.info, self.config):
+                file.unlink(missing_ok=True)
         shutil.rmtree(self.checkpoints, ignore_errors=True)
         info = {"format": FORMAT, "version": __version__, "scene": scene.name, "data": data}
         info |= {"base_time": field.base_time, "response": field.response.to_dict()}
-        files = {
-            self.plan: plan,
-            self.scene: describe_scene(scene),
-            self.info: info,
-            self.config: config_to_dict(config),
-        }
-        for file, values in files.items():
-            if values is not None:
-                write_json(file, values, overwrite=True)
+        if plan is not None:
+            write_json(self.plan, plan)
+        write_json(self.scene, describe_scene(scene))
+        write_json(self.info, info)
+        write_json(self.config, config.model_dump())
 
     def read_config(self) -> Config:
         """The config of the training."""
@@ -178,34 +165,29 @@ class RunFolder:
         write_json(self.summary, values, overwrite=True)
 
     def append_metrics(self, line: dict) -> None:
-        """Adds a line to metrics.jsonl."""
         with writing(self.metrics), open(self.metrics, "a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
 
     def read_metrics(self) -> list[dict]:
         """The lines of metrics.jsonl; what a killed process left half-written is passed over."""
-        if not self.metrics.exists():
-            return []
         lines = []
-        for text in self.metrics.read_text(encoding="utf-8", errors="replace").splitlines():
-            with suppress(ValueError, RecursionError):
-                line = json.loads(text)
-                if isinstance(line, dict) and isinstance(line.get("iteration", 0), int):
-                    lines.append(line)
+        text = self.metrics.read_text(encoding="utf-8", errors="replace") if self.metrics.exists() else ""
+        for line in text.splitlines():
+            with suppress(ValueError, RecursionError, TypeError, KeyError):
+                values = json.loads(line)
+                if isinstance(values["iteration"], int):
+                    lines.append(values)
         return lines
 
     def rewind_metrics(self, iteration: int) -> None:
         """Drops the evaluations after an iteration: a resumed training makes them again."""
-        kept = [line for line in self.read_metrics() if line.get("iteration", 0) <= iteration]
+        kept = [line for line in self.read_metrics() if line["iteration"] <= iteration]
         with atomic_path(self.metrics, overwrite=True) as beside:
             beside.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
 
     def write_checkpoint(self, tensors: dict[str, Tensor], values: dict, *, kept: int) -> Path:
-        """Writes iteration_N from a state with the value "iteration", then deletes all but the newest `kept`.
-
-        Later checkpoints go too: a training that is at N was resumed from an earlier one because they are damaged.
-        Where that of N exists and is sound it is left alone; so are all where the disk refuses.
-        """
+        """Writes iteration_N from a state with the value "iteration", unless it is there and sound; then deletes all
+        but the newest `kept`, and later ones: a training that is at N was resumed because they are damaged."""
         from safetensors.torch import save
 
         final = self.checkpoints / f"iteration_{values['iteration']:08d}"
@@ -219,27 +201,24 @@ class RunFolder:
             with atomic_folder(final, overwrite=True) as beside:
                 (beside / TENSORS).write_bytes(data)
                 (beside / VALUES).write_text(json.dumps(stated, indent=1) + "\n", encoding="utf-8")
-        folders = self._newest_first()
-        place = folders.index(final)
-        for other in folders[:place] + folders[place + kept :]:
+        folders = sorted(self.checkpoints.glob("iteration_*"))
+        end = folders.index(final) + 1
+        for other in folders[: max(0, end - kept)] + folders[end:]:
             shutil.rmtree(other, ignore_errors=True)
         return final
 
     def newest_checkpoint(self) -> Checkpoint | None:
-        """The newest complete checkpoint, None if there is none; damaged ones, and ones with numbers that are not
-        finite, are passed over, unless all are: then the newest one's InputError is raised."""
-        problems = []
-        for path in self._newest_first():
+        """The newest sound checkpoint, None if there is none at all; where all are damaged, or hold numbers that are
+        not finite, the newest one's InputError is raised."""
+        newest: InputError | None = None
+        for path in sorted(self.checkpoints.glob("iteration_*"), reverse=True):
             try:
                 return read_checkpoint(path)
             except InputError as error:
-                problems.append(error)
-        if problems:
-            raise problems[0]
+                newest = newest or error
+        if newest is not None:
+            raise newest
         return None
-
-    def _newest_first(self) -> list[Path]:
-        return sorted(self.checkpoints.glob("iteration_*"), reverse=True)
 
     def write_confidence(self, evidence: Evidence, checkpoint_hash: str) -> None:
         """Writes the evidence, in place of an earlier one."""
@@ -267,9 +246,9 @@ class RunFolder:
                 confidence = file.get_tensor("confidence")
         except (SafetensorError, OSError, ValueError, KeyError, RuntimeError) as error:
             raise InputError(path, f"not safetensors ({error!s:.200})", remedy) from None
-        count = len(checkpoint.tensors["gaussians.means"])
-        if tuple(confidence.shape) != (count,) or not confidence.is_floating_point():
-            raise InputError(path, f"confidence has shape {tuple(confidence.shape)}, not {(count,)}", remedy)
+        expected = checkpoint.tensors["gaussians.means"].shape[:1]
+        if confidence.shape != expected:
+            raise InputError(path, f"confidence has shape {tuple(confidence.shape)}, not {tuple(expected)}", remedy)
         if not bool(((confidence >= 0) & (confidence <= 1)).all()):  # as NaN is not
             raise InputError(path, "confidence holds values outside of 0 to 1", remedy)
         return confidence.float()
@@ -280,18 +259,18 @@ def read_checkpoint(path: Path) -> Checkpoint:
     from safetensors import SafetensorError
     from safetensors.torch import load
 
-    values = _read_values(path / VALUES, _CheckpointValues, _OLDER)
+    values, file = _read_values(path / VALUES, _CheckpointValues, _OLDER), path / TENSORS
     try:
-        data = (path / TENSORS).read_bytes()
+        data = file.read_bytes()
         if hashlib.sha256(data).hexdigest() != values.get("sha256"):
-            raise InputError(path / TENSORS, f"its SHA-256 is not the {values.get('sha256')} of {VALUES}", _OLDER)
+            raise InputError(file, f"its SHA-256 is not the {values.get('sha256')} of {VALUES}", _OLDER)
         tensors = load(data)
     except OSError as error:
-        raise InputError(path / TENSORS, f"cannot be read ({error.strerror})", _OLDER) from None
+        raise InputError(file, f"cannot be read ({error.strerror})", _OLDER) from None
     except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
-        raise InputError(path / TENSORS, f"not safetensors ({error})", _OLDER) from None
+        raise InputError(file, f"not safetensors ({error})", _OLDER) from None
     if (name := first_not_finite(tensors)) is not None:
-        raise InputError(path / TENSORS, f"{name} holds values that are not finite", _OLDER)
+        raise InputError(file, f"{name} holds values that are not finite", _OLDER)
     return Checkpoint(path, tensors, values)
 
 

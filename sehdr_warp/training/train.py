@@ -109,8 +109,7 @@ class Training:
                 self.trainer = self._continue(config)
             else:
                 self.trainer = self._begin(scene, config or Config(), data or {})
-        self.config = self.trainer.config
-        self.total = self.config.schedule.iterations
+        self.config, self.total = self.trainer.config, self.trainer.config.schedule.iterations
         self._first, self._pace, self._stopped = self.iteration, 0.0, False
         self._run: Run | None = None
         self._writer = make_writer and make_writer(str(self.folder.tensorboard))
@@ -129,8 +128,7 @@ class Training:
     @property
     def run(self) -> Run:
         """The trained scene, from the newest checkpoint."""
-        if self._run is None:
-            self._run = load_run(self.folder.path, device=self.device)
+        self._run = self._run or load_run(self.folder.path, device=self.device)
         return self._run
 
     def stop(self) -> None:
@@ -173,10 +171,10 @@ class Training:
         evaluate, save = iteration in self._evaluate_at, iteration % self._checkpoint_every == 0
         if evaluate or save:
             self._wait()
-            if evaluate:
-                self._evaluate()
-            if save and iteration < self.total:
-                self._checkpoint()
+        if evaluate and self.scene.test_views:
+            self._evaluate()
+        if save and iteration < self.total:
+            self._checkpoint()
         step = Step(self)
         if self._writer is not None and iteration % max(1, self.total // 200) == 0:
             self._log("train", {name: getattr(step, name) for name in ("loss", "psnr", "gaussians")})
@@ -202,18 +200,16 @@ class Training:
         self.trainer.check()
         self._checkpoint()
         trainer, decisions = self.trainer, self.folder.read_decisions()
-        self.folder.write_summary(
-            {
-                "iteration": trainer.iteration,
-                "finished": trainer.iteration >= self.total,
-                "plan": {decision["name"]: decision["choice"] for decision in decisions} or None,
-                "train_seconds": round(self.seconds, 3),
-                "gaussians": trainer.field.gaussians.count,
-                "skipped_steps": trainer.skipped_steps,
-                "steps_without_room": trainer.steps_without_room,
-                **machine_figures(self.device),
-            }
-        )
+        summary = {
+            "iteration": trainer.iteration,
+            "finished": trainer.iteration >= self.total,
+            "plan": {decision["name"]: decision["choice"] for decision in decisions} or None,
+            "train_seconds": round(self.seconds, 3),
+            "gaussians": trainer.field.gaussians.count,
+            "skipped_steps": trainer.skipped_steps,
+            "steps_without_room": trainer.steps_without_room,
+        }
+        self.folder.write_summary(summary | machine_figures(self.device))
         scores = [(line["psnr_ldr"], line["iteration"]) for line in self.folder.read_metrics() if "psnr_ldr" in line]
         if scores and (best := max(scores))[0] > scores[-1][0] + FALL:
             told = "held-out photos were best at iteration %d (%.2f dB), now %.2f dB: fewer iterations would do"
@@ -235,8 +231,6 @@ class Training:
             )
 
     def _evaluate(self) -> None:
-        if not self.scene.test_views:
-            return
         scores = evaluate_views(self.trainer.field, self.scene.test_views, self.trainer.degree)
         line = {"iteration": self.iteration, "seconds": round(self.seconds, 3), "split": "test"}
         line |= {name: round(value, 4) for name, value in scores.items()}
@@ -283,9 +277,11 @@ class Training:
             # As it was planned then: on another machine the same config may be planned otherwise.
             fields = {path: value for made in folder.read_decisions() for path, value in made["fields"].items()}
             config = override_config(config, fields | {"plan.enabled": False})
-        if config is not None and config != saved:
-            remedy = "resume with the run's own config, or train anew"
-            raise InputError(folder.config, _first_difference(saved, config), remedy)
+        for path, _ in config_fields() if config is not None else ():
+            old, new = attrgetter(path)(saved), attrgetter(path)(config)
+            if old != new:
+                problem = f"{path} = {old!r}, but {new!r} was asked for"
+                raise InputError(folder.config, problem, "resume with the run's own config, or train anew")
         folder.check_same_scene(scene)
         checkpoint = folder.newest_checkpoint()
         if checkpoint is None:
@@ -317,11 +313,8 @@ class Training:
 def train(
     scene: Scene, out: Path | str, config: Config | str | Path | Mapping[str, Any] | None = None, **options: Any
 ) -> Run:
-    """Trains a scene to the end and returns the trained run, whose folder is `out`.
-
-    config and options: as of Training. Raises what Training does, and KeyboardInterrupt after an interrupt; a usable
-    checkpoint is left then.
-    """
+    """Trains a scene to the end, as Training does with these arguments, and returns the trained run. Raises also
+    KeyboardInterrupt, with a usable checkpoint left."""
     training = Training(scene, out, config, **options)
     for _ in training:
         pass
@@ -329,7 +322,7 @@ def train(
 
 
 def as_config(config: object) -> Config | None:
-    """A config or None, or the config of a preset's name or file, or the default preset's with some fields replaced."""
+    """The config that Training was given, in any form."""
     if config is None or isinstance(config, Config):
         return config
     if isinstance(config, str | Path):
@@ -361,11 +354,6 @@ def _sizes(scene: Scene, trainer: Trainer | None = None) -> tuple[int, int, int]
     """Gaussians, and width and height of the largest photo."""
     camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
     return len(scene.points) if trainer is None else trainer.field.gaussians.count, camera.width, camera.height
-
-
-def _first_difference(saved: Config, given: Config) -> str:
-    both = ((path, attrgetter(path)(saved), attrgetter(path)(given)) for path, _ in config_fields())
-    return next(f"{path} = {old!r}, but {new!r} was asked for" for path, old, new in both if old != new)
 
 
 def _summary_writer() -> type:

@@ -8,7 +8,7 @@ from sehdr_warp.field.radiance_field import RadianceField
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
 from sehdr_warp.training.config import REFERENCE_ITERATIONS, Config
-from sehdr_warp.training.config_files import config_to_dict, load_config
+from sehdr_warp.training.config_files import load_config
 
 EXPOSURE_TIME = 0.25
 NUMBERS = (
@@ -58,7 +58,7 @@ def load_unscaled(preset: str = "default", overrides: dict | None = None, length
     """load_config without a plan, with iteration numbers as they stand in a training of `length` iterations, by default
     its own."""
     given = {"plan.enabled": False} | (overrides or {})
-    plain = config_to_dict(load_config(preset))
+    plain = load_config(preset).model_dump()
     iterations = length or given.get("schedule.iterations", plain["schedule"]["iterations"])
     for path in NUMBERS:
         part, name = path.split(".")
