@@ -11,7 +11,9 @@ _LONGEST = 120
 def safe_names(names: Sequence[str]) -> list[str]:
     """File names for views, all different, also where upper and lower case are one: what some system forbids becomes
     `_`, leading dots go, 120 bytes are the most, and of equal names the later ones get a number."""
-    cleaned = [_clean(name) for name in names]
+    cleaned = [_FORBIDDEN.sub("_", name).strip().lstrip(".").rstrip(". ") for name in names]
+    # The file system's limit counts bytes, and prefixes and suffixes still come.
+    cleaned = [name.encode("utf-8")[:_LONGEST].decode("utf-8", "ignore") or "view" for name in cleaned]
     wanted, taken, result = {name.casefold() for name in cleaned}, set(), []
     for name in cleaned:
         candidate, number = name, 2
@@ -20,9 +22,3 @@ def safe_names(names: Sequence[str]) -> list[str]:
         taken.add(candidate.casefold())
         result.append(candidate)
     return result
-
-
-def _clean(name: str) -> str:
-    name = _FORBIDDEN.sub("_", name).strip().lstrip(".").rstrip(". ")
-    # The file system's limit counts bytes, and prefixes and suffixes still come.
-    return name.encode("utf-8")[:_LONGEST].decode("utf-8", "ignore") or "view"

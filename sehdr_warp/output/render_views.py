@@ -20,13 +20,13 @@ from .colorspace import from_rec709
 from .exr import rgb_channels, write_exr
 from .images import as_array, quantize, write_picture
 from .names import safe_names
-from .tonemap import ToneMap, fit_tone_map
+from .tonemap import fit_tone_map
 
 log = logging.getLogger(__name__)
 SPLITS = ("train", "test", "all")
 PATHS = ("orbit", "interpolate")
 
-# The tone map is fitted to a few small pictures, so that all previews of a set share it.
+# The tone map is fitted to a few small pictures, evenly chosen, so that all previews of a set share it.
 _FIT_VIEWS, _FIT_SIZE = 4, 160
 
 
@@ -67,7 +67,8 @@ def render_views(
 
     def write_pictures(hdr_folder: Path, preview_folder: Path) -> Iterator[tuple[str, np.ndarray, Camera]]:
         """Writes each view, and yields what its brackets are made of."""
-        tone_map = fit_run_tone_map(run, [camera for _, camera in views])
+        chosen = [views[i][1] for i in sorted({round(i) for i in np.linspace(0, len(views) - 1, _FIT_VIEWS)})]
+        tone_map = fit_tone_map([as_array(run.render(_small(camera)).hdr) for camera in chosen])
         for index, (name, camera) in enumerate(views, start=1):
             rendered, confidence = run.render(camera), run.render_confidence(camera)
             hdr = as_array(rendered.hdr)
@@ -112,12 +113,6 @@ def select_cameras(run, cameras: str | Path, *, count: int = 60) -> list[tuple[s
     else:
         raise SehdrError(f"cameras {text!r} are neither a file nor one of {known}")
     return list(zip(safe_names([name for name, _ in named]), [camera for _, camera in named], strict=True))
-
-
-def fit_run_tone_map(run, cameras: Sequence[Camera]) -> ToneMap:
-    """One tone map for a set of views, from small renders of up to four of them, evenly chosen."""
-    chosen = [cameras[i] for i in sorted({round(i) for i in np.linspace(0, len(cameras) - 1, _FIT_VIEWS)})]
-    return fit_tone_map([as_array(run.render(_small(camera)).hdr) for camera in chosen])
 
 
 def _provenance(run) -> dict[str, str]:
