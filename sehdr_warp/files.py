@@ -25,8 +25,7 @@ from sehdr_warp.errors import InputError, SehdrError
 _REFUSALS = "ENOSPC EDQUOT EFBIG EROFS EACCES EPERM EIO ENAMETOOLONG ENOTDIR EISDIR EMFILE"
 _WRITE_ERRORS = {getattr(errno, name) for name in _REFUSALS.split() if hasattr(errno, name)}
 
-# The largest text or model file that is read whole. The biggest COLMAP models in use (Mip-NeRF 360, city captures)
-# stay well under it; a larger one is far more likely a wrong file than a scene.
+# The largest file that is read whole: the biggest COLMAP models in use (Mip-NeRF 360, city captures) are well under it.
 MAX_FILE_BYTES = 4 << 30
 MAX_JSON_BYTES = 256 << 20
 

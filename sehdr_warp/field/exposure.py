@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
 Items = str | Sequence[str | float]
 
-# The interior figure of the paper writes {1/8, 1/4, dt_1, 8, 16}; read as multiples of dt_1, so that it also serves a
-# photo of 1/1000 s.
+# The paper's figure writes {1/8, 1/4, dt_1, 8, 16}; as multiples of dt_1 it also serves a photo of 1/1000 s.
 PAPER_BRACKETS = ("1/8x", "1/4x", "1x", "8x", "16x")
 _FORMS = "seconds (1/125), stops (-2ev), multiples (1/8x) or base"
 
@@ -37,8 +36,7 @@ class Exposure:
     @property
     def label(self) -> str:
         """`ev-4.0`, with one decimal and always a sign."""
-        # Adding zero turns -0.0 into 0.0.
-        return f"ev{round(self.ev, 1) + 0.0:+.1f}"
+        return f"ev{round(self.ev, 1) + 0.0:+.1f}"  # Adding zero turns -0.0 into 0.0.
 
 
 def read_exposures(items: Items, base_time: float | None, field: str = "exposures") -> tuple[Exposure, ...]:

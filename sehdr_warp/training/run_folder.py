@@ -303,11 +303,8 @@ def _camera_entry(view: dict) -> CameraEntry:
 def _read_values(path: Path, kind: type[BaseModel], remedy: str = _REMEDY) -> dict:
     """The values in a file of this version's format, checked to be of a kind."""
     values = _read_json(path, remedy)
-    if values.get("format") == 1:
-        problem = "was made by version 0.1, whose runs this version does not read"
-        raise InputError(path.parent, problem, "train again")
-    if values.get("format") != FORMAT:
-        raise InputError(path, f"format = {values.get('format')!r:.60} is not {FORMAT}", remedy)
+    if (found := values.get("format")) != FORMAT:
+        raise InputError(path, f"format = {found!r:.60} is not {FORMAT}, which this version reads", remedy)
     try:
         kind.model_validate(values)
     except ValidationError as error:
