@@ -57,6 +57,8 @@ class Compare:
     """Also draw held-out error against training time to this PNG file."""
     csv: Path | None = None
     """Also write the table to this CSV file."""
+    latex: Path | None = None
+    """Also write the table to this LaTeX file (booktabs)."""
     overwrite: bool = False
     """Replace files that exist."""
 
@@ -96,14 +98,15 @@ def run_score(asked: Score) -> None:
 def run_compare(asked: Compare) -> None:
     from ..files import atomic_path, check_absent
     from ..output.charts import training_chart
-    from .compare import compare_runs, comparison_csv, comparison_table
+    from .compare import compare_runs, comparison_csv, comparison_latex, comparison_table
 
-    for path in filter(None, (asked.plot, asked.csv)):
+    for path in filter(None, (asked.plot, asked.csv, asked.latex)):
         check_absent(path, asked.overwrite)
     rows = compare_runs([open_run(path, "cpu") for path in asked.runs])
-    if asked.csv is not None:
-        with atomic_path(asked.csv, asked.overwrite) as file:
-            file.write_text(comparison_csv(rows), encoding="utf-8")
+    for path, text in ((asked.csv, comparison_csv), (asked.latex, comparison_latex)):
+        if path is not None:
+            with atomic_path(path, asked.overwrite) as file:
+                file.write_text(text(rows), encoding="utf-8")
     if asked.plot is not None:
         with atomic_path(asked.plot, asked.overwrite) as file:
             chart = training_chart({row.label: row.curves for row in rows})

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -78,13 +79,25 @@ def _compared(runs: Sequence) -> ComparedRuns:
 
 def comparison_table(rows: Sequence[ComparedRuns]) -> str:
     """For a terminal: means with their standard deviation over seeds."""
+    return "\n".join(columns(_cells(rows), left=2))
+
+
+def comparison_latex(rows: Sequence[ComparedRuns]) -> str:
+    """The same as a booktabs table."""
+    escaped = [[re.sub(r"([&%$#_{}])", r"\\\1", cell) for cell in line] for line in _cells(rows)]
+    heading, *lines = [" & ".join(line).replace(" ± ", r" $\pm$ ") + r" \\" for line in escaped]
+    begin = rf"\begin{{tabular}}{{ll{'r' * (len(COLUMNS) + 1)}}}"
+    return "\n".join([begin, r"\toprule", heading, r"\midrule", *lines, r"\bottomrule", r"\end{tabular}", ""])
+
+
+def _cells(rows: Sequence[ComparedRuns]) -> list[list[str]]:
     cells = [["run", "scene", "seeds", *(heading for heading, _ in COLUMNS.values())]]
     for row in rows:
         cells.append([row.label, row.scene, str(row.count)])
         for column, (_, digits) in COLUMNS.items():
             spread = row.spread(column)
             cells[-1].append(number(row.mean(column), digits) + (f" ± {spread:.{digits}f}" if spread else ""))
-    return "\n".join(columns(cells, left=2))
+    return cells
 
 
 def comparison_csv(rows: Sequence[ComparedRuns]) -> str:

@@ -304,7 +304,8 @@ def _read_values(path: Path, kind: type[BaseModel], remedy: str = _REMEDY) -> di
     """The values in a file of this version's format, checked to be of a kind."""
     values = _read_json(path, remedy)
     if (found := values.get("format")) != FORMAT:
-        raise InputError(path, f"format = {found!r:.60} is not {FORMAT}, which this version reads", remedy)
+        problem = f"format = {found!r:.60} is not {FORMAT}, which this version reads"
+        raise InputError(path, problem, "train again, or use the version that wrote it")
     try:
         kind.model_validate(values)
     except ValidationError as error:

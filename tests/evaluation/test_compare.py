@@ -9,7 +9,7 @@ import pytest
 
 import sehdr_warp as sw
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.evaluation.compare import compare_runs, comparison_csv, comparison_table
+from sehdr_warp.evaluation.compare import compare_runs, comparison_csv, comparison_latex, comparison_table
 from sehdr_warp.evaluation.evaluate import evaluate
 from sehdr_warp.evaluation.table import format_table
 from sehdr_warp.output.exr import write_exr
@@ -44,6 +44,8 @@ def test_runs_that_differ_by_their_seed_share_a_row(tmp_path):
     assert "26.00 ± 1.41" in table and "30.00" in table and "100 ±" not in table and len(table.splitlines()) == 3
     found = list(csv.DictReader(comparison_csv(rows).splitlines()))
     assert float(found[0]["psnr_ldr_sd"]) == pytest.approx(2**0.5) and found[1]["psnr_ldr_sd"] == ""
+    latex = comparison_latex(rows)
+    assert r"26.00 $\pm$ 1.41" in latex and r"room\_1" in latex and latex.count(r"\\") == 3
 
 
 def test_what_cannot_be_compared_is_one_line(tmp_path):
