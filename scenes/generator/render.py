@@ -271,7 +271,7 @@ class Denoiser:
 def denoise(radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray, straight: np.ndarray) -> np.ndarray:
     """radiance, straight (of it, what lights and the sky send to the camera themselves): [H, W, 3] >= 0; albedo in
     [0, 1]; normal in [-1, 1]."""
-    import pyoidn
+    import pyoidn  # pyright: ignore[reportMissingImports]
 
     images = radiance, np.clip(albedo, 0, 1), np.clip(normal, -1, 1)
     found = pyoidn.denoise(*(np.ascontiguousarray(image, np.float32) for image in images), hdr=True, clean_aux=True)
