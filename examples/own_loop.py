@@ -12,15 +12,16 @@ import sehdr_warp as sw
 def main(steps: int = 90, max_size: int = 64) -> list[float]:
     """Fits colored Gaussians to the embedded scene's photos; the loss of each step."""
     scene = sw.load_scene("embedded", max_size=max_size)
-    means = torch.tensor(scene.points, dtype=torch.float32)
-    distances, _ = KDTree(scene.points).query(scene.points, k=4)  # of each point to itself and its three nearest
+    points, colors = sw.match_points(scene, 3000)  # or scene.points, where the set has some
+    means = torch.tensor(points, dtype=torch.float32)
+    distances, _ = KDTree(points).query(points, k=4)  # of each point to itself and its three nearest
     spacing = torch.tensor(distances[:, 1:].mean(axis=1, keepdims=True), dtype=torch.float32)
     parameters = {
         "means": means,
         "log_scales": spacing.log().expand(-1, 3).clone(),
         "quaternions": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(means), 1),  # (w, x, y, z)
         "opacity_logits": torch.zeros(len(means)),
-        "colors": torch.tensor(scene.point_colors),
+        "colors": torch.tensor(colors),
     }
     rates = {"means": 1e-3, "log_scales": 1e-2, "quaternions": 1e-3, "opacity_logits": 5e-2, "colors": 1e-2}
     optimizer = torch.optim.Adam([{"params": [p.requires_grad_()], "lr": rates[n]} for n, p in parameters.items()])

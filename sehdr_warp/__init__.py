@@ -29,6 +29,7 @@ _HOMES = {
     "splatting": ("Rendering", "differentiable", "rasterize", "spherical_harmonics", "ssim"),
     "training.config": ("Config",),
     "training.config_files": ("load_config", "preset_names"),
+    "training.initialization": ("match_points",),
     "training.plan": ("Plan", "make_plan"),
     "training.run": ("Run", "load_run"),
     "training.train": ("Step", "Training", "train"),

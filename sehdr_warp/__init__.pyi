@@ -14,6 +14,7 @@ from .scene.stack import calibrate
 from .splatting import Rendering, differentiable, rasterize, spherical_harmonics, ssim
 from .training.config import Config
 from .training.config_files import load_config, preset_names
+from .training.initialization import match_points
 from .training.plan import Plan, make_plan
 from .training.run import Run, load_run
 from .training.train import Step, Training, train
@@ -42,6 +43,7 @@ __all__ = [
     "load_run",
     "load_scene",
     "make_plan",
+    "match_points",
     "preset_names",
     "rasterize",
     "render_views",

@@ -82,15 +82,31 @@ def start_points(scene: Scene, config: Config, response: Response, device, rng) 
     points, colors = scene.points, scene.point_colors
     wanted = start_count(config, sum(view.camera.width * view.camera.height for view in scene.train_views))
     if wanted > len(points):
-        matcher = make_matcher(scene, response, device)
-        found = matcher.match(matcher.pixels(wanted - len(points), rng))
-        points = np.concatenate([points, found.points.cpu().numpy()])
-        colors = np.concatenate([colors, found.colors.cpu().numpy()])
-        _log.info("%d points matched between the photos", len(found.points))
+        found = match_points(scene, wanted - len(points), response=response, device=device, seed=config.seed)
+        points, colors = (np.concatenate(both) for both in zip((points, colors), found, strict=True))
+        _log.info("%d points matched between the photos", len(found[0]))
     if len(points) < FEWEST_POINTS:
         drawn = random_points(scene, max(wanted, FEWEST_DRAWN), rng)
         points, colors = (np.concatenate(both) for both in zip((points, colors), drawn, strict=True))
     return points, colors
+
+
+def match_points(
+    scene: Scene,
+    count: int,
+    *,
+    response: Response | None = None,
+    device: torch.device | str = "cpu",
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """[N, 3] points of the surfaces that the training photos show, and their encoded colors [N, 3] in [0, 1].
+
+    A plane sweep (Collins 1996) for about `count` pixels all over the photos; N of them have a depth on which photos
+    agree. response: by which photos of differing exposure are compared, None for the scene's own.
+    """
+    matcher = make_matcher(scene, response or scene.response or response_by_name("srgb"), device)
+    found = matcher.match(matcher.pixels(count, np.random.default_rng(seed)))
+    return found.points.double().cpu().numpy(), found.colors.cpu().numpy()
 
 
 def start_count(config: Config, pixels: int) -> int:
