@@ -112,6 +112,10 @@ def _quality_tables(result: dict) -> Iterable[str]:
         table = []
         for (method,), mine in groups(members, "method").items():
             line = {"method": method, "n": len(mine), "worst": min(row["gt_max"] for row in mine)}
+            line |= {name: sum(row[name] for row in mine) for name in ("lights_count", "lights_lost")}
+            seeds = [[row["gt_max"] for row in here] for here in groups(mine, "scene", "exposure").values()]
+            if max(map(len, seeds)) > 1:
+                line["below_mean"] = max(fmean(values) - min(values) for values in seeds)
             for _, field, _ in parted(columns):
                 values = [row[field] for row in mine if field not in line and row[field] is not None]
                 line |= {field: fmean(values)} if values else {}

@@ -12,6 +12,7 @@ from torch import Tensor
 from ..errors import SehdrError
 from ..scene import Scene, View
 from . import metrics
+from .lights import LightRegion, count_lights, light_regions
 from .perceptual import BACKBONE, SMALLEST_EDGE, load_lpips
 from .protocols import PROTOCOLS, fit_scale, normalise, tone_map, tone_mapped_psnr
 from .ranking import DARKEST_CODE, ErrorRanking
@@ -58,8 +59,8 @@ def evaluate(run: Any, scene: Scene, *, lpips_weights: Path | str | None = None)
     Returns:
         Plain values, ready for strict JSON. "protocol": {name: psnr_mu, ssim_mu, lpips_mu, views}, with "scale" for
         "aligned"; "pu21": {name: psnr, ssim}; "ldr": psnr, ssim, lpips of the simulated photo, unquantised; "regions":
-        {region: fraction, psnr_ldr, psnr_mu}, pooled over views; "confidence": see ranking.py; "views": the same for
-        each view; "split", "lpips_backbone" and the run's facts. What cannot be computed is null with "reason" (or
+        {region: fraction, psnr_ldr, psnr_mu}, pooled over views; "lights": count and lost, see lights.py;
+        "confidence": see ranking.py; "views": the same for each view; "split", "lpips_backbone" and the run's facts. What cannot be computed is null with "reason" (or
         "lpips_reason") beside it. Outside a view's mask the prediction counts as right and nothing is averaged, but by
         LPIPS; views with an empty mask are left out.
 
@@ -88,6 +89,7 @@ class Evaluation:
         self.lpips, self.lpips_reason = load_lpips(lpips_weights, self.device)
         self.regions = {region: _RegionErrors() for region in metrics.REGIONS}
         self.ranking = ErrorRanking()
+        self.lights: list[LightRegion] = []
 
     def result(self) -> dict:
         """The figures, as evaluate() describes them."""
@@ -120,6 +122,7 @@ class Evaluation:
             "pu21": pu21 | {"peak_luminance": PEAK_LUMINANCE},
             "ldr": ldr,
             "regions": {region: errors.result(missing) for region, errors in self.regions.items()},
+            "lights": {"count": None, "lost": None, "reason": missing} if missing else count_lights(self.lights),
             "confidence": self.ranking.result() | ({"reason": missing} if missing else {}),
             "views": rows,
             "lpips_backbone": BACKBONE if self.lpips else None,
@@ -164,6 +167,9 @@ class Evaluation:
             pooled.append(("ldr", *pair))
         if truth is not None and (doubt := self.pictures.doubt(view)):
             self.ranking.add(doubt[0], hdr, truth, regions["well-exposed"], doubt[1], mask)
+        if truth is not None:
+            light = [image.mean(2).cpu().numpy() for image in (truth, hdr * (scale or 1.0))]
+            self.lights += light_regions(*light, view.camera)
         for name in PROTOCOLS:
             if truth is None or (name == "aligned" and scale is None):
                 continue

@@ -33,6 +33,8 @@ def format_table(result: dict) -> str:
     if ranking["spearman_log2"] is not None:
         correlations = f"{ranking['spearman_log2']:.2f} (log2), {ranking['spearman_mu']:.2f} (mu-law)"
         lines += ["", f"confidence ranks errors: {correlations}; mean confidence {ranking['mean']:.2f}"]
+    if result["lights"]["count"]:
+        lines += ["", "lights: {count} in the truth, {lost} lost".format(**result["lights"])]
     return "\n".join([*lines, "", *_notes(result, bool(names))])
 
 

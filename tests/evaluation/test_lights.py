@@ -1,0 +1,51 @@
+"""Lights of a made-up truth: discs where cameras see three places."""
+
+import numpy as np
+import pytest
+
+from sehdr_warp.evaluation.lights import count_lights, light_regions
+from sehdr_warp.scene import Camera, look_at
+
+PLACES = np.array([[0.0, 0.0, 0.0], [0.8, 0.3, -0.5], [-0.7, -0.4, 0.6]])
+CAMERAS = [
+    Camera(96, 72, 80.0, 80.0, 48.0, 36.0, look_at(np.array([x, 0.2, -4.0]), np.zeros(3), up=(0.0, 1.0, 0.0)))
+    for x in (-1.5, -0.5, 0.5, 1.5)
+]
+
+
+def picture(camera, places, radius=3.0):
+    image = np.full((camera.height, camera.width), 0.01)
+    rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
+    for place in places:
+        x, y, depth = camera.world_to_camera[:3, :3] @ place + camera.world_to_camera[:3, 3]
+        middle = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
+        image[np.hypot(columns - middle[0], rows - middle[1]) < radius] = 50.0
+    return image
+
+
+def count(render, radius=3.0):
+    views = enumerate(CAMERAS)
+    return count_lights(
+        [
+            region
+            for index, camera in views
+            for region in light_regions(picture(camera, PLACES, radius), render(index, camera), camera)
+        ]
+    )
+
+
+def test_a_light_that_is_missing_is_lost_once():
+    assert count(lambda _, camera: picture(camera, PLACES)) == {"count": 3, "lost": 0}
+    assert count(lambda _, camera: picture(camera, PLACES[:2])) == {"count": 3, "lost": 1}
+    assert count(lambda _, camera: 0.4 * picture(camera, PLACES)) == {"count": 3, "lost": 3}
+
+
+@pytest.mark.parametrize("views, lost", [(2, 0), (3, 1)])
+def test_a_light_is_lost_where_most_views_lack_it(views, lost):
+    assert count(lambda index, camera: picture(camera, PLACES[index < views :]))["lost"] == lost
+
+
+def test_specks_and_what_one_view_shows_are_no_lights():
+    assert count(lambda _, camera: picture(camera, PLACES), radius=1.0) == {"count": 0, "lost": 0}
+    alone = light_regions(picture(CAMERAS[0], PLACES[:1]), picture(CAMERAS[0], []), CAMERAS[0])
+    assert len(alone) == 1 and count_lights(alone) == {"count": 0, "lost": 0}
