@@ -60,9 +60,9 @@ def evaluate(run: Any, scene: Scene, *, lpips_weights: Path | str | None = None)
         Plain values, ready for strict JSON. "protocol": {name: psnr_mu, ssim_mu, lpips_mu, views}, with "scale" for
         "aligned"; "pu21": {name: psnr, ssim}; "ldr": psnr, ssim, lpips of the simulated photo, unquantised; "regions":
         {region: fraction, psnr_ldr, psnr_mu}, pooled over views; "lights": count and lost, see lights.py;
-        "confidence": see ranking.py; "views": the same for each view; "split", "lpips_backbone" and the run's facts. What cannot be computed is null with "reason" (or
-        "lpips_reason") beside it. Outside a view's mask the prediction counts as right and nothing is averaged, but by
-        LPIPS; views with an empty mask are left out.
+        "confidence": see ranking.py; "views": the same for each view; "split", "lpips_backbone" and the run's facts.
+        What cannot be computed is null with "reason" (or "lpips_reason") beside it. Outside a view's mask the
+        prediction counts as right and nothing is averaged, but by LPIPS; views with an empty mask are left out.
 
     Raises:
         SehdrError: for a scene without views, images that disagree with their camera or a render that is not finite.

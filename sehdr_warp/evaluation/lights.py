@@ -1,4 +1,4 @@
-"""Which lights of the truth a trained scene holds: regions of the views, joined to lights by the places they point at."""
+"""Which lights of the truth a trained scene holds: bright regions of the views, joined by the places they point at."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
