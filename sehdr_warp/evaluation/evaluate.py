@@ -168,8 +168,8 @@ class Evaluation:
         if truth is not None and (doubt := self.pictures.doubt(view)):
             self.ranking.add(doubt[0], hdr, truth, regions["well-exposed"], doubt[1], mask)
         if truth is not None:
-            light = [image.mean(2).cpu().numpy() for image in (truth, hdr * (scale or 1.0))]
-            self.lights += light_regions(*light, view.camera)
+            light, shown = (image.mean(2).cpu().numpy() for image in (truth, hdr * (scale or 1.0)))
+            self.lights += light_regions(light, shown, view.camera)
         for name in PROTOCOLS:
             if truth is None or (name == "aligned" and scale is None):
                 continue

@@ -73,8 +73,8 @@ def _meetings(one: LightRegion, regions: Sequence[LightRegion]) -> Iterator[np.n
             continue
         depths = [np.cross(apart, ray) @ normal / square for ray in (other.direction, one.direction)]
         if min(depths) > 0:
-            ends = (r.camera.position + depth * r.direction for r, depth in zip((one, other), depths, strict=True))
-            yield sum(ends) / 2
+            ends = [r.camera.position + depth * r.direction for r, depth in zip((one, other), depths, strict=True)]
+            yield np.mean(ends, axis=0)
 
 
 def _pointed_at(place: np.ndarray, regions: Sequence[LightRegion]) -> list[LightRegion]:
