@@ -1,49 +1,35 @@
 """Responses with a formula: power laws with a linear toe, and tone curves followed by one."""
 
 import math
+from typing import NamedTuple
 
 import torch
 
 from ..errors import SehdrError, did_you_mean
-from ..splatting.response_curves import FormulaCurve
+from ..splatting.response_curves import FormulaCurve, encode_with_slope
 from .curve import HALF_CODE, Response
 
 
-class PowerLaw:
+class PowerLaw(NamedTuple):
     """y = toe_slope x below toe_end, (1 + offset) x^(1/exponent) - offset above; 1 at x = 1.
 
     Covers linear (toe_end 1), a gamma, sRGB (IEC 61966-2-1) and Rec.709 (ITU-R BT.709, BT.2020's exact constants).
     """
 
-    def __init__(self, exponent: float, offset: float, toe_slope: float, toe_end: float):
-        self.numbers = (exponent, offset, toe_slope, toe_end)
-
-    def evaluate(self, exposure, with_slope):
-        exponent, offset, toe_slope, toe_end = self.numbers
-        line = toe_slope * exposure
-        if toe_end >= 1.0:
-            return line, torch.full_like(exposure, toe_slope) if with_slope else None
-        power, toe = exposure.pow(1.0 / exponent) * (1.0 + offset), exposure < toe_end
-        value = torch.where(toe, line, power - offset).clamp_max(1.0)
-        return value, torch.where(toe, toe_slope, power / (exponent * exposure)) if with_slope else None
+    exponent: float
+    offset: float
+    toe_slope: float
+    toe_end: float
 
     def invert(self, value):
-        exponent, offset, toe_slope, toe_end = self.numbers
-        if toe_end >= 1.0:
-            return value / toe_slope
-        power = ((value + offset) / (1.0 + offset)).pow(exponent)
-        return torch.where(value < toe_slope * toe_end, value / toe_slope, power)
+        power = ((value + self.offset) / (1.0 + self.offset)).pow(self.exponent)
+        return torch.where(value < self.toe_slope * self.toe_end, value / self.toe_slope, power)
 
 
 class Reinhard:
     """y = x / (1 + x), which approaches 1 and never reaches it (Reinhard et al. 2002)."""
 
     kind, numbers, clip_exposure = "reinhard", (), math.inf
-
-    def evaluate(self, exposure, with_slope):
-        # As 1 / (1 + 1/x): exact at both ends in float32, also for x = 0 and infinity.
-        value = 1.0 / (1.0 + 1.0 / exposure)
-        return value, (1.0 + exposure).square().reciprocal() if with_slope else None
 
     def invert(self, value):
         return value / (1.0 - value)
@@ -58,12 +44,6 @@ class Filmic:
         x = self.clip_exposure = clip_exposure
         peak = (a * x * x + b * x) / (d * x * x + e * x + g)
         self.numbers = (a / peak, b / peak, d, e, g)
-
-    def evaluate(self, exposure, with_slope):
-        a, b, d, e, g = self.numbers
-        below = exposure * (d * exposure + e) + g
-        value = exposure * (a * exposure + b) / below
-        return value, (2.0 * a * exposure + b - value * (2.0 * d * exposure + e)) / below if with_slope else None
 
     def invert(self, value):
         # P x^2 + Q x = g y, by whichever form of the positive root does not cancel.
@@ -85,12 +65,6 @@ class Knee:
         self.numbers = (start, softness)
         self.clip_exposure = start + softness * math.expm1((1.0 - start) / softness)
 
-    def evaluate(self, exposure, with_slope):
-        start, softness = self.numbers
-        beyond = (exposure - start).clamp_min(0.0) / softness
-        value = exposure.clamp_max(start) + softness * beyond.log1p()
-        return value, (1.0 + beyond).reciprocal() if with_slope else None
-
     def invert(self, value):
         start, softness = self.numbers
         return value.clamp_max(start) + softness * ((value - start).clamp_min(0.0) / softness).expm1()
@@ -103,20 +77,14 @@ class AnalyticResponse(Response, kind="analytic"):
 
     def __init__(self, name: str, display: PowerLaw, tone: Reinhard | Filmic | Knee | None = None):
         self.name = name
-        self.clip_exposure = 1.0 if tone is None else tone.clip_exposure
         self._display, self._tone = display, tone
+        self.curve = FormulaCurve(display)
+        if tone is not None:
+            self.curve = FormulaCurve(display, tone.kind, tone.numbers, tone.clip_exposure)
+        self.clip_exposure = self.curve.clip
 
-    def formula(self):
-        if self._tone is None:
-            return FormulaCurve(self._display.numbers)
-        return FormulaCurve(self._display.numbers, self._tone.kind, self._tone.numbers, self.clip_exposure)
-
-    def _evaluate(self, exposure, with_slope):
-        if self._tone is None:
-            return self._display.evaluate(exposure, with_slope)
-        light, tone_slope = self._tone.evaluate(exposure, with_slope)
-        value, slope = self._display.evaluate(light.clamp(0.0, 1.0), with_slope)
-        return value, None if slope is None or tone_slope is None else slope * tone_slope
+    def _encode(self, exposure, extension_slope):
+        return encode_with_slope(exposure, self.curve, extension_slope)
 
     def _invert(self, value):
         light = self._display.invert(value)

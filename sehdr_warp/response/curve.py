@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from ..errors import SehdrError
-from ..splatting.response_curves import FormulaCurve, encode_with_slope
 
 # An encoded value nearer to white than this is stored as 255.
 HALF_CODE = 0.5 / 255
@@ -50,8 +49,9 @@ class Response(ABC):
             Response._kinds[kind] = cls
 
     @abstractmethod
-    def _evaluate(self, exposure: torch.Tensor, with_slope: bool) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Value and df/dx for exposures within [0, clip_exposure]; called without autograd."""
+    def _encode(self, exposure: torch.Tensor, extension_slope: float) -> tuple[torch.Tensor, torch.Tensor]:
+        """f, with extension_slope log(x / clip) added beyond the clip point, and its slope there, 0 below 0; called
+        without autograd."""
 
     @abstractmethod
     def _invert(self, value: torch.Tensor) -> torch.Tensor:
@@ -76,10 +76,6 @@ class Response(ABC):
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise SehdrError(f"response: the stored {kind} curve is damaged ({error!r:.200})") from error
 
-    def formula(self) -> FormulaCurve | None:
-        """The curve as one launch evaluates it with its slope; None where there is no such kernel."""
-        return None
-
     def start_exposures(self, encoded: np.ndarray) -> np.ndarray:
         """Exposures above 0 for Gaussians to start from, of encoded values in (0, 1); same shape, float64."""
         return np.maximum(self.decode(np.asarray(encoded, np.float64)), START_FLOOR)
@@ -96,85 +92,57 @@ class Response(ABC):
 
     def encode(self, exposure):
         """f(x), in [black, peak]. Exposures below 0 count as 0; the gradient is 0 there and beyond the clip point."""
-        return self._through(_Encode, exposure, 0.0)
+        return self._through(lambda x: _Pointwise.apply(x, self._encode, 0.0), exposure)
 
     def encode_extended(self, exposure):
         """f(x) up to the clip point; beyond it f(clip) + EXTENSION_SLOPE log(x / clip), which leaves a gradient and a
         surplus over 1 that a hinge can weigh. Equals encode for a curve that never clips."""
-        return self._through(_Encode, exposure, EXTENSION_SLOPE)
+        return self._through(lambda x: _Pointwise.apply(x, self._encode, EXTENSION_SLOPE), exposure)
 
     def decode(self, value):
         """The exposure of a value, limited to [black, peak]: decode(encode(x)) = x for x in [0, clip_exposure].
 
         A curve that only approaches its peak is inverted up to `white`, since the exact inverse of 1 is infinite.
         """
-        return self._through(_Decode, value, None)
+        return self._through(lambda y: _Pointwise.apply(y, self._decode), value)
 
     def slope(self, exposure):
         """df/dx of encode, shaped like the exposures; 0 beyond the clip point. Not differentiable itself."""
-        return self._through(_Slope, exposure, None)
+        return self._through(lambda x: self._encode(x.detach(), 0.0)[1], exposure)
 
-    def _through(self, function, argument, slope):
+    def _decode(self, value: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        limit = self.peak if self.clips else self.peak - HALF_CODE
+        exposure = self._invert(value.clamp(self.black, limit)).clamp_max(self.clip_exposure)
+        _, slope = self._encode(exposure, 0.0)
+        return exposure, torch.where((value < self.black) | (value > limit), 0.0, 1.0 / slope)
+
+    @staticmethod
+    def _through(function, argument):
         if isinstance(argument, torch.Tensor):
             if argument.dtype not in (torch.float32, torch.float64):
                 raise TypeError(f"a response takes float32 or float64 tensors, not {argument.dtype}")
-            return function.apply(argument, self, slope)
+            return function(argument)
         array = np.asarray(argument)
         if array.dtype not in (np.float32, np.float64):
             array = array.astype(np.float32 if array.dtype == np.float16 else np.float64)
         # A copy: a negative stride or a read-only array is no tensor.
-        return function.apply(torch.from_numpy(np.array(array, order="C")), self, slope).numpy()
+        return function(torch.from_numpy(np.array(array, order="C"))).numpy()
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.name!r})"
 
 
 class _Pointwise(torch.autograd.Function):
-    """forward saves the slope."""
+    """A function of each number by itself that gives values and slopes."""
+
+    @staticmethod
+    def forward(ctx, argument, function, *options):
+        value, slope = function(argument, *options)
+        ctx.save_for_backward(slope)
+        return value
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):
         (slope,) = ctx.saved_tensors
         return gradient * slope, None, None
-
-
-class _Encode(_Pointwise):
-    @staticmethod
-    def forward(ctx, exposure, response, extension_slope):
-        differentiate = ctx.needs_input_grad[0]
-        clip = response.clip_exposure
-        if differentiate and (formula := response.formula()) is not None:
-            value, slope = encode_with_slope(exposure, formula, extension_slope)
-            ctx.save_for_backward(slope)
-            return value
-        inside = exposure.clamp(0.0, clip if response.clips else None)
-        value, slope = response._evaluate(inside, differentiate)
-        if response.clips and extension_slope:
-            value = value + extension_slope * (exposure.clamp_min(clip) / clip).log()
-        if differentiate:
-            slope = torch.where(exposure > clip, extension_slope / exposure, slope)
-            ctx.save_for_backward(torch.where(exposure < 0, 0.0, slope))
-        return value
-
-
-class _Slope:
-    """Called as the two functions beside it are."""
-
-    @staticmethod
-    @torch.no_grad()
-    def apply(exposure, response, _):
-        clip = response.clip_exposure
-        _, slope = response._evaluate(exposure.clamp(0.0, clip if response.clips else None), True)
-        return torch.where((exposure < 0) | (exposure > clip), 0.0, slope)
-
-
-class _Decode(_Pointwise):
-    @staticmethod
-    def forward(ctx, value, response, _):
-        limit = response.peak if response.clips else response.peak - HALF_CODE
-        exposure = response._invert(value.clamp(response.black, limit))
-        if ctx.needs_input_grad[0]:
-            _, slope = response._evaluate(exposure, True)
-            ctx.save_for_backward(torch.where((value < response.black) | (value > limit), 0.0, 1.0 / slope))
-        return exposure

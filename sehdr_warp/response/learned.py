@@ -131,8 +131,8 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
         with torch.no_grad():
             return function(tensor).cpu().numpy().astype(array.dtype if array.dtype.kind == "f" else np.float64)
 
-    def _evaluate(self, exposure, with_slope):
-        return self.encode(exposure), self.slope(exposure) if with_slope else None
+    def _encode(self, exposure, extension_slope):
+        return self.encode(exposure), self.slope(exposure)
 
     def _invert(self, value):
         return self.decode(value)

@@ -65,19 +65,23 @@ class TabulatedResponse(Response, kind="table"):
             self._tensors[key] = (*cells, *nodes)
         return self._tensors[key]
 
-    def _evaluate(self, exposure, with_slope):
+    def _encode(self, exposure, extension_slope):
         intercept, slope, _, _ = self._table(exposure)
-        last = len(slope) - 1
+        last, clip = len(slope) - 1, self.clip_exposure
+        inside = exposure.clamp(0.0, clip)
         if self._even:
-            position = exposure * (len(slope) / self.clip_exposure)
+            position = inside * (len(slope) / clip)
         else:
             # Cell 0 is the toe; a position rounded across a node evaluates the neighbour's line, equal there.
-            position = (exposure / self.clip_exposure).log2() * CELLS_PER_OCTAVE + (last + 1)
+            position = (inside / clip).log2() * CELLS_PER_OCTAVE + (last + 1)
         cell = position.nan_to_num(0.0).clamp(0, last).long()
         slope = slope[cell]
         # Rounding may leave [black, peak] by a last digit.
-        value = torch.addcmul(intercept[cell], slope, exposure).clamp_(self.black, self.peak)
-        return value, slope if with_slope else None
+        value = torch.addcmul(intercept[cell], slope, inside).clamp_(self.black, self.peak)
+        if extension_slope:
+            value = value + extension_slope * (exposure.clamp_min(clip) / clip).log()
+        slope = torch.where(exposure > clip, extension_slope / exposure, slope)
+        return value, torch.where(exposure < 0, 0.0, slope)
 
     def _invert(self, value):
         _, _, nodes, levels = self._table(value)

@@ -14,7 +14,7 @@ TONES = {"none": NO_TONE, "reinhard": REINHARD, "filmic": FILMIC, "knee": KNEE}
 
 @dataclass(frozen=True)
 class FormulaCurve:
-    """power_law: exponent, offset, slope and end of the toe, as model.response_analytic's PowerLaw takes them; tone:
+    """power_law: exponent, offset, slope and end of the toe, as response.analytic.PowerLaw holds them; tone:
     the curve before it, a name in TONES, with its numbers; clip: the clip point, infinite for none."""
 
     power_law: tuple[float, float, float, float]
