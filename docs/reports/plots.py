@@ -10,9 +10,6 @@ import numpy as np
 from sehdr_warp.bench.results import groups
 from sehdr_warp.output.charts import COLORS, RULE
 
-SMALLEST = 2.0**-28
-"""An exact result has no place on a logarithmic axis: it is drawn here."""
-
 
 def plot_kernels(result: dict, path: Path) -> None:
     """Median times over channels: a panel for each size, a line for each implementation, forward and backward."""
@@ -69,42 +66,23 @@ def error_over_time(trainings: Sequence[Sequence], count: int = 60) -> list[tupl
     return list(zip(seconds, np.mean(values, axis=0), strict=True))
 
 
-def plot_stability(result: dict, path: Path) -> None:
-    """Errors as solid lines over each sweep, their bounds as dotted ones of the same color."""
-    panels = []
-    for sweep in result["sweeps"]:
-        lines, bounds = {}, {}
-        for name, readings in sweep["readings"].items():
-            lines[name] = [(x, max(error or 0.0, SMALLEST)) for x, (error, _) in zip(sweep["values"], readings)]
-            bounds[name] = [(x, bound) for x, (_, bound) in zip(sweep["values"], readings)]
-        scale = "log" if sweep["values"][-1] > 1000 else "linear"
-        labels = {"xlabel": sweep["label"], "ylabel": "relative error", "xscale": scale, "yscale": "log"}
-        panels.append((lines, labels, bounds))
-    _draw(path, [panels[:2], panels[2:]])
-
-
-def _draw(path: Path, panels: Sequence[Sequence[tuple]], form: str = "o-") -> None:
-    """A PNG of 32 colors, which is all that lines need. panels: rows of ({label: points}, what Axes.set() takes) and,
-    with a legend of its own, {label: points of a dotted line}; without, one legend below names all lines of a row."""
+def _draw(path: Path, panels: Sequence[Sequence[tuple[dict, dict]]], form: str = "o-") -> None:
+    """A PNG of 32 colors, which is all that lines need. panels: rows of ({label: points}, what Axes.set() takes); one
+    legend below names all lines."""
     from matplotlib.figure import Figure
     from PIL import Image
 
     width = max((len(row) for row in panels), default=1)
     figure = Figure(figsize=(max(4.2 * width, 6.4), 3.2 * len(panels) + 0.5), layout="constrained")
     named = {}
-    for place, (lines, labels, *bounds) in enumerate(panel for row in panels for panel in row):
+    for place, (lines, labels) in enumerate(panel for row in panels for panel in row):
         axes = figure.add_subplot(len(panels), width, place + 1)
         for (name, points), color in zip(lines.items(), cycle(COLORS)):
             if points:
                 (named[name],) = axes.plot(*zip(*points, strict=True), form, color=color, markersize=3, label=name)
-            if bounds:
-                axes.plot(*zip(*bounds[0][name], strict=True), ":", color=color, linewidth=1)
         axes.set(**labels)
         axes.grid(color=RULE, linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
-        if bounds:
-            axes.legend(frameon=False, fontsize=7)
-            named = {}
     if named:
         figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     buffer = io.BytesIO()

@@ -168,7 +168,6 @@ PLOTS: dict[str, Callable[[dict, Path], None]] = {
     "quality": plots.plot_quality,
     "kernels": plots.plot_kernels,
     "scale": plots.plot_scale,
-    "stability": plots.plot_stability,
 }
 
 

@@ -14,8 +14,6 @@ class Check:
     """Cases or groups (splat, light, poison, training) separated by commas; by default all."""
     quick: bool = False
     """Leave out the cases that take seconds."""
-    sweeps: bool = False
-    """Also measure error over scale ratio, radiance range, overlap and exposure, for --json."""
     json: Path | None = None
     """Write the result to this file."""
     device: str | None = None
@@ -29,13 +27,12 @@ def run_check(command: Check) -> None:
     from ..bench.results import new_result
     from ..files import check_absent, write_json
     from ..training.train import pick_device
-    from .catalogue import choose_cases, run_cases, run_sweeps
+    from .catalogue import choose_cases, run_cases
 
     if command.json is not None:
         check_absent(command.json, command.overwrite)
     device, cases = pick_device(command.device), choose_cases(command.cases, command.quick)
     result = new_result("stability", device, {"device": str(device)}) | {"rows": run_cases(cases, device)}
-    result["sweeps"] = run_sweeps(device) if command.sweeps else []
     if command.json is not None:
         write_json(command.json, result, command.overwrite)
     if failed := [row["case"] for row in result["rows"] if not row["holds"]]:

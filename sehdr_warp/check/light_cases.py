@@ -22,19 +22,14 @@ VARIANCE_ERROR = 8 * UNIT / 9e-4
 """E[x^2] - E[x]^2 of values up to 1 has an error of some units, next to the constant C2 = 9e-4 of SSIM's quotient."""
 
 
-def encode_readings(curve: Response, device, exposures, **options) -> list[Reading]:
-    # A filmic curve's derivative is the difference of terms that are up to 50 times as large (x near its white).
-    extra = 64 * UNIT if curve.name in ("filmic", "aces") else 0.0
-    options = {"elementwise": True, "extra": extra, "label": f"{curve.name} {{}}"} | options
-    return compare(lambda x: {"f": curve.encode(x)}, {"x": exposures}, device, **options)
-
-
 def _response_readings(curve: Response, device, exposures, **options) -> list[Reading]:
     """Photo, its derivative where asked for, and the exposure that the photo decodes to, of one curve."""
     values = torch.linspace(curve.black + 2 * CODE, curve.peak - 2 * CODE, 97, dtype=torch.float64)
     given = {"elementwise": True, "floor": 1e-6, "label": f"{curve.name} {{}}"}
-    decoded = compare(lambda v: {"decode": curve.decode(v)}, {"v": values}, device, **given)
-    return [*encode_readings(curve, device, exposures, floor=1e-6, **options), *decoded]
+    # A filmic curve's derivative is the difference of terms that are up to 50 times as large (x near its white).
+    options["extra"] = 64 * UNIT if curve.name in ("filmic", "aces") else 0.0
+    encoded = compare(lambda x: {"f": curve.encode(x)}, {"x": exposures}, device, **given, **options)
+    return encoded + compare(lambda v: {"decode": curve.decode(v)}, {"v": values}, device, **given)
 
 
 def _exposures(device):
