@@ -30,13 +30,11 @@ def rasterize_with_gsplat(
     means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics, width: int, height: int, *,
     low_pass: float = LOW_PASS, antialiased: bool = False, capacity: int | None = None, deterministic: bool = False,
 ) -> Rendering:  # fmt: skip
-    """rasterize() by gsplat. capacity and deterministic mean nothing there; there is no transmittance, and
-    densification by gradients cannot watch its centers."""
+    """rasterize() by gsplat, also with intrinsics as gsplat takes them, [1, 3, 3]. capacity and deterministic mean
+    nothing there; there is no transmittance, and densification by gradients cannot watch its centers."""
     from gsplat import rasterization  # pyright: ignore[reportMissingImports]
 
-    fx, fy, cx, cy = intrinsics
-    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    matrix = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).reshape(1, 3, 3)
+    matrix = intrinsics if intrinsics.ndim == 3 else _matrix(intrinsics)
     image, _, info = rasterization(
         means, quaternions, log_scales.exp(), opacities, features, world_to_camera[None], matrix, width, height,
         packed=False, rasterize_mode="antialiased" if antialiased else "classic", eps2d=low_pass,
@@ -48,17 +46,15 @@ def rasterize_with_gsplat(
     return Rendering(image[0], unknown, info["means2d"][0], info["depths"][0], radii, 0)
 
 
+def _matrix(intrinsics: torch.Tensor) -> torch.Tensor:
+    """[1, 3, 3] of fx, fy, cx, cy."""
+    fx, fy, cx, cy = intrinsics
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    return torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).reshape(1, 3, 3)
+
+
 def gsplat_renderer(scene: SplatScene) -> Callable[[], torch.Tensor]:
     """A function that renders [H, W, C]; what does not change between calls is prepared."""
-    from gsplat import rasterization  # pyright: ignore[reportMissingImports]
-
-    means, log_scales, quaternions, opacities, features = scene.leaves
-    fx, fy, cx, cy = scene.intrinsics.tolist()
-    intrinsics = torch.tensor([[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]], device=scene.device)
-    camera = scene.world_to_camera[None], intrinsics, scene.size.width, scene.size.height
-
-    def render():
-        given = means, quaternions, log_scales.exp(), opacities, features, *camera
-        return rasterization(*given, packed=False)[0][0]
-
-    return render
+    *splat, intrinsics, width, height = scene.arguments
+    given = (*splat, _matrix(intrinsics), width, height)
+    return lambda: rasterize_with_gsplat(*given).image
