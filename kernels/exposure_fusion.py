@@ -21,6 +21,7 @@ def fusion_kernels(dtype) -> SimpleNamespace:
     outer_bias [3]: the perceptrons' weights; log_sigma: [3]; results: [M, 3].
     """
     real, options = dtype, {"enable_backward": False}
+    reals, reals2d, reals3d = wp.array(dtype=real), wp.array2d(dtype=real), wp.array3d(dtype=real)
 
     @wp.func
     def deviation_of(encoded: real, log_sigma: real, most_log: real) -> real:
@@ -28,7 +29,7 @@ def fusion_kernels(dtype) -> SimpleNamespace:
 
     @wp.func
     def largest_logit(
-        outputs: wp.array2d(dtype=real), exposedness: wp.array2d(dtype=real),
+        outputs: reals2d, exposedness: reals2d,
         channel: int, place: int, count: int, brackets: int,
     ) -> real:
         """What softmax subtracts from the logits of one colour's brackets, so that its exponentials stay finite."""
@@ -39,10 +40,9 @@ def fusion_kernels(dtype) -> SimpleNamespace:
 
     @wp.kernel(module="unique", module_options=options)
     def perceptrons(
-        encoded: wp.array2d(dtype=real), log_sigma: wp.array(dtype=real),
+        encoded: reals2d, log_sigma: reals,
         most_log: real, most: real,
-        inner: wp.array3d(dtype=real), inner_bias: wp.array2d(dtype=real), outer: wp.array2d(dtype=real),
-        outer_bias: wp.array(dtype=real), exposedness: wp.array2d(dtype=real), outputs: wp.array2d(dtype=real),
+        inner: reals3d, inner_bias: reals2d, outer: reals2d, outer_bias: reals, exposedness: reals2d, outputs: reals2d,
     ):
         """exposedness: exp(-d^2 / 2) of the deviations from mid grey; outputs: of the perceptron of both."""
         channel, point = wp.tid()
@@ -58,9 +58,9 @@ def fusion_kernels(dtype) -> SimpleNamespace:
 
     @wp.kernel(module="unique", module_options=options)
     def mix(
-        encoded: wp.array2d(dtype=real), exposedness: wp.array2d(dtype=real), outputs: wp.array2d(dtype=real),
+        encoded: reals2d, exposedness: reals2d, outputs: reals2d,
         brackets: int, scale: real,
-        results: wp.array2d(dtype=real),
+        results: reals2d,
     ):
         """scale times the mean of the encoded brackets, weighted by the softmax of outputs times exposedness."""
         place, channel = wp.tid()
@@ -77,10 +77,9 @@ def fusion_kernels(dtype) -> SimpleNamespace:
 
     @wp.kernel(module="unique", module_options=options)
     def mix_adjoint(
-        encoded: wp.array2d(dtype=real), exposedness: wp.array2d(dtype=real), outputs: wp.array2d(dtype=real),
+        encoded: reals2d, exposedness: reals2d, outputs: reals2d,
         brackets: int, scale: real,
-        results: wp.array2d(dtype=real), result_gradients: wp.array2d(dtype=real),
-        by_exposedness: wp.array2d(dtype=real), by_output: wp.array2d(dtype=real),
+        results: reals2d, result_gradients: reals2d, by_exposedness: reals2d, by_output: reals2d,
     ):
         """by_exposedness: through the logits alone."""
         place, channel = wp.tid()
@@ -100,11 +99,9 @@ def fusion_kernels(dtype) -> SimpleNamespace:
 
     @wp.kernel(module="unique", module_options=options)
     def unit_adjoint(
-        encoded: wp.array2d(dtype=real), exposedness: wp.array2d(dtype=real), by_output: wp.array2d(dtype=real),
-        inner: wp.array3d(dtype=real), inner_bias: wp.array2d(dtype=real), outer: wp.array2d(dtype=real),
-        points: int,
-        by_inner: wp.array3d(dtype=real), by_inner_bias: wp.array2d(dtype=real),
-        by_outer: wp.array2d(dtype=real), by_outer_bias: wp.array(dtype=real),
+        encoded: reals2d, exposedness: reals2d, by_output: reals2d,
+        inner: reals3d, inner_bias: reals2d, outer: reals2d, points: int,
+        by_inner: reals3d, by_inner_bias: reals2d, by_outer: reals2d, by_outer_bias: reals,
     ):
         """Added to: the gradients by the perceptrons' weights, of `points` points a thread."""
         channel, chunk, unit = wp.tid()
@@ -138,12 +135,9 @@ def fusion_kernels(dtype) -> SimpleNamespace:
 
     @wp.kernel(module="unique", module_options=options)
     def point_adjoint(
-        encoded: wp.array2d(dtype=real), exposedness: wp.array2d(dtype=real),
-        by_exposedness: wp.array2d(dtype=real), by_output: wp.array2d(dtype=real),
-        log_sigma: wp.array(dtype=real),
+        encoded: reals2d, exposedness: reals2d, by_exposedness: reals2d, by_output: reals2d, log_sigma: reals,
         most_log: real, most: real,
-        inner: wp.array3d(dtype=real), inner_bias: wp.array2d(dtype=real), outer: wp.array2d(dtype=real),
-        by_log_sigma: wp.array2d(dtype=real),
+        inner: reals3d, inner_bias: reals2d, outer: reals2d, by_log_sigma: reals2d,
     ):
         """by_log_sigma: [3, Q], to be summed over Q."""
         channel, point = wp.tid()

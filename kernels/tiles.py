@@ -21,6 +21,8 @@ def tile_kernels(dtype) -> SimpleNamespace:
     """pack_records, key_by_depth, count_tiles, emit_entries and gather_entries for one scalar type."""
     g = geometry(dtype)
     real, vec2, vec3, vec4 = g.real, g.vec2, g.vec3, g.vec4
+    reals, reals2d, ints = wp.array(dtype=real), wp.array2d(dtype=real), wp.array(dtype=wp.int32)
+    vec2s, vec4s = wp.array(dtype=vec2), wp.array(dtype=vec4)
     size = float(TILE_SIZE)
     # Without fused multiply-adds: count_tiles and emit_entries must decide alike; a compiler fuses each its own way.
     options = {"enable_backward": False, "fuse_fp": False}
@@ -42,10 +44,9 @@ def tile_kernels(dtype) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def pack_records(
         first: int,
-        means2d: wp.array(dtype=vec2), conics: wp.array(dtype=vec3), opacities: wp.array(dtype=real),
-        features: wp.array2d(dtype=real),
+        means2d: vec2s, conics: wp.array(dtype=vec3), opacities: reals, features: reals2d,
         channels: int, alpha_threshold: real,
-        extents: wp.array(dtype=vec2), shapes: wp.array(dtype=vec4), ellipses: wp.array(dtype=vec4),
+        extents: vec2s, shapes: vec4s, ellipses: vec4s,
     ):
         """shapes: (x, y, opacity, half-height); ellipses: (conic a, b, c, level at which alpha meets the threshold).
         extents: changed to 0 for a Gaussian with a feature that is not finite: the CPU blend multiplies what a pixel
@@ -67,8 +68,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def key_by_depth(
         first: int,
-        depths: wp.array(dtype=real), extents: wp.array(dtype=vec2), keys: wp.array(dtype=real),
-        places: wp.array(dtype=int),
+        depths: reals, extents: vec2s, keys: reals, places: wp.array(dtype=int),
     ):
         """What sorts Gaussians nearest first, culled ones last, and their indices."""
         i = first + wp.tid()
@@ -81,10 +81,9 @@ def tile_kernels(dtype) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def count_tiles(
         first: int,
-        order: wp.array(dtype=wp.int32), shapes: wp.array(dtype=vec4), ellipses: wp.array(dtype=vec4),
-        extents: wp.array(dtype=vec2),
+        order: ints, shapes: vec4s, ellipses: vec4s, extents: vec2s,
         columns: int, rows: int,
-        counts: wp.array(dtype=wp.int32),
+        counts: ints,
     ):
         place = first + wp.tid()
         i = order[place]
@@ -104,12 +103,11 @@ def tile_kernels(dtype) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def emit_entries(
         first: int,
-        order: wp.array(dtype=wp.int32), shapes: wp.array(dtype=vec4), ellipses: wp.array(dtype=vec4),
-        extents: wp.array(dtype=vec2),
+        order: ints, shapes: vec4s, ellipses: vec4s, extents: vec2s,
         columns: int, rows: int,
-        ends: wp.array(dtype=wp.int32),
+        ends: ints,
         capacity: int,
-        tiles: wp.array(dtype=wp.int32), gaussians: wp.array(dtype=wp.int32),
+        tiles: ints, gaussians: ints,
     ):
         """ends: the running sum of the counts: Gaussian `place` fills the entries before ends[place] and `capacity`,
         with columns * rows, no tile at all, where there are fewer tiles than were counted."""
@@ -139,10 +137,9 @@ def tile_kernels(dtype) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def gather_entries(
         first: int,
-        order: wp.array(dtype=wp.int32), ends: wp.array(dtype=wp.int32),
-        entry_gradients: wp.array2d(dtype=real),
+        order: ints, ends: ints, entry_gradients: reals2d,
         columns: int,
-        rows: wp.array2d(dtype=real),
+        rows: reals2d,
     ):
         """rows[order[place]]: the sum of entry_gradients [M, columns] over the entries of Gaussian `place`, in their
         order, which end at ends[place]."""

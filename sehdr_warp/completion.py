@@ -1,7 +1,5 @@
 """The command line of `sehdr-warp completion`: what a shell needs to complete commands and flags."""
 
-import functools
-import operator
 import os
 from contextlib import suppress
 from dataclasses import dataclass, field, make_dataclass
@@ -34,11 +32,10 @@ def run_completion(asked: Completion) -> None:
     # What every command takes; cli.py reads these flags before a command does.
     short = {"quiet": ["-q"], "verbose": None, "debug": None}
     common = [(name, Annotated[bool, tyro.conf.arg(aliases=of)], field(default=False)) for name, of in short.items()]
-    choices = []
+    commands = {}
     for name, options in command_options().items():
-        known = make_dataclass(options.__name__, common, bases=(options,), frozen=True, kw_only=True)
-        known.__doc__ = options.__doc__
-        choices.append(Annotated[known, tyro.conf.subcommand(name)])
-    commands = functools.reduce(operator.or_, choices)
+        commands[name] = make_dataclass(options.__name__, common, bases=(options,), frozen=True, kw_only=True)
+        commands[name].__doc__ = options.__doc__
+    asked_for = ["--tyro-write-completion", shell, "-"]
     with suppress(SystemExit):
-        tyro.cli(commands, prog=PROGRAM, args=["--tyro-write-completion", shell, "-"], config=MARKERS)
+        tyro.extras.subcommand_cli_from_dict(commands, prog=PROGRAM, args=asked_for, config=MARKERS)

@@ -5,7 +5,6 @@ import math
 import os
 import platform
 import shlex
-import subprocess
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch.utils.collect_env import get_nvidia_driver_version, run
 
 from .. import __version__
 from ..errors import SehdrError
@@ -45,7 +45,7 @@ def _describe_machine(device: torch.device) -> dict[str, Any]:
     gpu = None
     if device.type == "cuda":
         properties = torch.cuda.get_device_properties(device)
-        driver = {"driver": _driver_version(), "cuda": torch.version.cuda}
+        driver = {"driver": get_nvidia_driver_version(run), "cuda": torch.version.cuda}
         gpu = {"name": properties.name, "memory_bytes": properties.total_memory} | driver
     return {
         "cpu": _cpu_model(),
@@ -70,13 +70,6 @@ def _cpu_model() -> str | None:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or None
-
-
-def _driver_version() -> str | None:
-    command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-    with suppress(OSError, subprocess.SubprocessError, IndexError):
-        return subprocess.run(command, capture_output=True, text=True, timeout=20, check=True).stdout.split()[0]
-    return None
 
 
 def machine_line(result: dict) -> str:

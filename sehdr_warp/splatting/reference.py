@@ -4,6 +4,7 @@ Every formula is written once more, densely, tile by tile, and differentiated by
 """
 
 import math
+from itertools import product
 
 import torch
 
@@ -73,40 +74,30 @@ def blend_reference(
     transmittance_min=TRANSMITTANCE_MIN,
 ):
     """Front-to-back blending in torch: image [H, W, C] and the transmittance left [H, W]."""
-    device, dtype = means2d.device, means2d.dtype
-    image_rows, left_over_rows = [], []
     order = torch.where(extents[:, 0] > 0, depths, math.inf).argsort(stable=True)
     order = order[: int((extents[:, 0] > 0).sum())]
-    for top in range(0, height, TILE_SIZE):
-        image_tiles, left_over_tiles = [], []
-        for left in range(0, width, TILE_SIZE):
-            right, bottom = min(left + TILE_SIZE, width), min(top + TILE_SIZE, height)
-            near_x = (means2d[order, 0] + extents[order, 0] > left) & (means2d[order, 0] - extents[order, 0] < right)
-            near_y = (means2d[order, 1] + extents[order, 1] > top) & (means2d[order, 1] - extents[order, 1] < bottom)
-            here = order[near_x & near_y]
-            y, x = torch.meshgrid(
-                torch.arange(top, bottom, device=device, dtype=dtype) + 0.5,
-                torch.arange(left, right, device=device, dtype=dtype) + 0.5,
-                indexing="ij",
-            )
-            dx = means2d[here, 0, None] - x.reshape(1, -1)
-            dy = means2d[here, 1, None] - y.reshape(1, -1)
-            a, b, c = (conics[here, k, None] for k in range(3))
-            exponent = (-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy).clamp(max=0.0)
-            value = (opacities[here, None] * exponent.exp()).clamp(max=ALPHA_MAX)
-            value = torch.where(value > alpha_threshold, value, 0.0)
-            # A pixel stops before its transmittance would fall to the limit, so later Gaussians count nothing there.
-            running = torch.cumprod(1 - value, 0)
-            value = torch.where(running > transmittance_min, value, 0.0)
-            after = torch.cumprod(1 - value, 0)
-            before = torch.cat([torch.ones_like(after[:1]), after[:-1]]) if len(here) else after
-            tile = torch.einsum("gp,gc->pc", value * before, features[here])
-            left_over = after[-1] if len(here) else torch.ones_like(x.reshape(-1))
-            image_tiles.append(tile.reshape(bottom - top, right - left, -1))
-            left_over_tiles.append(left_over.reshape(bottom - top, right - left))
-        image_rows.append(torch.cat(image_tiles, 1))
-        left_over_rows.append(torch.cat(left_over_tiles, 1))
-    return torch.cat(image_rows, 0), torch.cat(left_over_rows, 0)
+    low, high = means2d[order] - extents[order], means2d[order] + extents[order]
+    pixels = torch.arange(height * width, device=means2d.device).reshape(height, width)
+    places, images, left_over = [], [], []
+    for corner in product(range(0, width, TILE_SIZE), range(0, height, TILE_SIZE)):
+        left, top = means2d.new_tensor(corner)
+        here = order[(high[:, 0] > left) & (low[:, 0] < left + TILE_SIZE)
+                     & (high[:, 1] > top) & (low[:, 1] < top + TILE_SIZE)]
+        places.append(pixels[corner[1] : corner[1] + TILE_SIZE, corner[0] : corner[0] + TILE_SIZE].flatten())
+        dx = means2d[here, 0, None] - (places[-1] % width + 0.5)
+        dy = means2d[here, 1, None] - (places[-1] // width + 0.5)
+        a, b, c = conics[here].T[..., None]
+        exponent = (-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy).clamp(max=0.0)
+        value = (opacities[here, None] * exponent.exp()).clamp(max=ALPHA_MAX)
+        value = torch.where(value > alpha_threshold, value, 0.0)
+        # A pixel stops before its transmittance would fall to the limit, so later Gaussians count nothing there.
+        value = torch.where(torch.cumprod(1 - value, 0) > transmittance_min, value, 0.0)
+        # What each Gaussian finds left, and what all leave.
+        transmittance = torch.cumprod(torch.cat([value.new_ones(1, value.shape[1]), 1 - value]), 0)
+        images.append(torch.einsum("gp,gc->pc", value * transmittance[:-1], features[here]))
+        left_over.append(transmittance[-1])
+    place = torch.cat(places).argsort()
+    return torch.cat(images)[place].reshape(height, width, -1), torch.cat(left_over)[place].reshape(height, width)
 
 
 def rasterize_reference(

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypedDict, get_args, get_origin
 
 import tyro
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 from tyro.constructors import PrimitiveConstructorSpec
 
@@ -89,19 +89,13 @@ def config_as_toml(config: Config, differing: bool = False) -> str:
 
 
 def value_of(path: str, text: str):
-    """A field's value as written behind its flag, for the config to check: text as it is, lists separated by commas,
-    and everything else as in TOML."""
-    kind = dict(config_fields())[path].annotation
-    if get_origin(kind) is tuple:
-        return [_one_value(get_args(kind)[0], item) for item in map(str.strip, text.split(",")) if item]
-    return _one_value(kind, text)
-
-
-def _one_value(kind, text: str):
-    if _metavar(kind) in ("true|false", "INT", "NUM"):
-        with suppress(tomllib.TOMLDecodeError):  # The config will say what it takes in place of a word.
-            return tomllib.loads(f"value = {text}")["value"]
-    return text
+    """A field's value as written behind its flag, lists separated by commas; what is none stays text, of which the
+    config says what it takes in its place."""
+    kind: Any = dict(config_fields())[path].annotation
+    given = [item for item in map(str.strip, text.split(",")) if item] if get_origin(kind) is tuple else text
+    with suppress(ValidationError):
+        return TypeAdapter(kind).validate_python(given)
+    return given
 
 
 def config_from_dict(values: dict, source: Path | str = "config", flags: Mapping[str, str] | None = None) -> Config:

@@ -136,12 +136,13 @@ def test_a_run_of_an_earlier_version_is_told_so(tmp_path, table, field, value):
 @pytest.mark.parametrize(
     "path,text,value",
     [
-        ("fusion.exposures", "1/8x, 1x", ["1/8x", "1x"]),
+        ("fusion.exposures", "1/8x, 1x", ("1/8x", "1x")),
         ("response.name", "201", "201"),
-        ("schedule.evaluate_at", "100,200", [100, 200]),
+        ("schedule.evaluate_at", "100,200", (100, 200)),
         ("loss.clipping", "false", False),
+        ("loss.clipping", "perhaps", "perhaps"),
         ("optimizer.means", "1e-4", 1e-4),
-        ("plan.keep", "", []),
+        ("plan.keep", "", ()),
     ],
 )
 def test_values_of_flags(path, text, value):
