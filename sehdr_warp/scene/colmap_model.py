@@ -12,6 +12,7 @@ from ..files import read_bytes, read_text
 from .capture import NO_POINTS, Cloud, pose_from_quaternion
 from .lens import CAMERA_MODELS, Lens
 
+# Not through pycolmap, which hangs on a count that is damaged and takes a truncated file for a whole one.
 MAX_NAME_BYTES = 4096
 _REMEDY = "export the model again with COLMAP"
 
@@ -34,8 +35,10 @@ class SparseModel:
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder among sparse/0, sparse, colmap/sparse/0 and dense/sparse that holds cameras, or None."""
-    places = (folder / name for name in ("sparse/0", "sparse", "colmap/sparse/0", "dense/sparse"))
+    """The folder that holds cameras, or None: sparse/0, sparse, or a text export beside them (sparse/txt, sparse_txt,
+    sparse_txt/0), of the folder itself, else of its colmap/ or dense/."""
+    names = ("sparse/0", "sparse", "sparse/txt", "sparse_txt", "sparse_txt/0")
+    places = (folder / above / name for above in (".", "colmap", "dense") for name in names)
     return next((p for p in places if any((p / f"cameras{end}").is_file() for end in (".bin", ".txt"))), None)
 
 

@@ -61,7 +61,7 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Spar
     with _cached(cache, f"sfm-{key}", solve) as folder:
         model = read_model(folder)
         sizes = json.loads((folder / "sizes.json").read_text())
-    images = (replace(image, lens=image.lens.resized(*sizes[_index(image.name)])) for image in model.images)
+    images = (replace(image, lens=image.lens.resized(*sizes[int(Path(image.name).stem)])) for image in model.images)
     return SparseModel(tuple(images), model.cloud)
 
 
@@ -116,17 +116,14 @@ def _name(index: int) -> str:
     return f"{index:05d}.png"
 
 
-def _index(name: str) -> int:
-    return int(name.removesuffix(".png"))
-
-
 def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Oriented 8-bit copies of at most MAX_SIDE pixels; returns the oriented full sizes and the copies' sizes."""
     folder.mkdir()
     sizes, small, shown = [], [], False
     for i, photo in told("reading photos", photos):
         codes = read_ldr(photo, oriented=True).pixels
-        image = _reduced(codes)
+        image = Image.fromarray(codes if codes.dtype == np.uint8 else (codes >> 8).astype(np.uint8))
+        image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
         sizes.append(codes.shape[1::-1])
         small.append(image.size)
         values = np.asarray(image)
@@ -136,13 +133,6 @@ def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tup
         problem = "the photos are all black or all white"
         raise InputError(photos[0].parent, problem, "expose them so that the scene shows")
     return sizes, small
-
-
-def _reduced(codes: np.ndarray) -> Image.Image:
-    """An 8-bit picture of at most MAX_SIDE pixels."""
-    image = Image.fromarray(codes if codes.dtype == np.uint8 else (codes >> 8).astype(np.uint8))
-    image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
-    return image
 
 
 def _focal_prior(equivalent: str, width: int, height: int) -> float:
@@ -197,10 +187,6 @@ def _match(database: Path, count: int) -> None:
             pycolmap.match_sequential(database, pairing_options=pairing, **options)
 
 
-def _seed(options) -> None:
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = _SEED
-
-
 def _map(database: Path, work: Path, count: int, source: Path):
     """The largest reconstruction; where photos are left, after a second try with weaker conditions."""
     import pycolmap
@@ -208,7 +194,7 @@ def _map(database: Path, work: Path, count: int, source: Path):
     best = None
     for patient in (False, True):
         options = pycolmap.IncrementalPipelineOptions(min_model_size=2)
-        _seed(options)
+        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = _SEED
         if patient:
             options.min_num_matches = 10
             options.mapper.init_min_tri_angle = 4.0

@@ -5,6 +5,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.scene.colmap_model import find_model
 from sehdr_warp.scene.lens import CAMERA_MODELS
 from tests.make_scenes import arc_poses, load, pattern, write_colmap
 
@@ -26,6 +27,18 @@ def test_model_is_what_pycolmap_wrote(tmp_path, binary):
         np.testing.assert_array_equal(view.image, pattern(64, 48, int(view.name)).astype(np.float32) / np.float32(255))
     cloud = {tuple(point.xyz): tuple(point.color) for point in oracle.points3D.values()}
     assert {tuple(p): tuple(np.round(c * 255)) for p, c in zip(scene.points, scene.point_colors, strict=True)} == cloud
+
+
+@pytest.mark.parametrize(
+    "place", ["sparse", "sparse/txt", "sparse_txt", "sparse_txt/0", "colmap/sparse/0", "dense/sparse"]
+)
+def test_models_are_found_where_people_keep_them(tmp_path, place):
+    write_colmap(tmp_path, binary=False)
+    model = (tmp_path / "sparse" / "0").rename(tmp_path / "model")
+    (tmp_path / "sparse").rmdir()
+    (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+    model.rename(tmp_path / place)
+    assert find_model(tmp_path) == tmp_path / place and load(tmp_path).format == "colmap"
 
 
 def test_every_camera_model_has_pycolmaps_id_and_parameters():
