@@ -15,6 +15,7 @@ from ..splatting.reference import blend_reference, project_reference, rasterize_
 from .case import ROUNDINGS, UNIT, Case, Reading, as_float32, compare, count, not_finite
 
 NAMES = ("means", "log_scales", "quaternions", "opacities", "features", "world_to_camera", "intrinsics")
+SIZES = ((1, 1), (17, 33), (15, 1), (1, 50))
 POISON = (math.nan, math.inf, -math.inf, 3e38, -3e38, 1e-40)
 
 
@@ -25,11 +26,11 @@ class Splats:
     order is by index: they are not disturbed. label, extra: as compare() takes them.
     """
 
-    ties, label, extra = False, "{}", 0.0
+    ties, extra = False, 0.0
 
-    def __init__(self, count: int = 40, width: int = 40, height: int = 30, *, spread=2.0, scales=None, radiance=None):
+    def __init__(self, count=40, width=40, height=30, *, spread=2.0, scales=None, radiance=None, label="{}"):
         given: dict[str, Any] = {"generator": torch.Generator().manual_seed(0), "dtype": torch.float64}
-        self.width, self.height = width, height
+        self.width, self.height, self.label = width, height, label
         self.means = (torch.rand(count, 3, **given) - 0.5) * torch.tensor([spread, spread, 2.0])
         self.means[:, 2] += 3
         self.log_scales = torch.log(0.05 + 0.25 * torch.rand(count, 3, **given))
@@ -129,18 +130,10 @@ def _far_away() -> Splats:
 def _light_behind() -> Iterator[Splats]:
     """Dim Gaussians, whose own gradients are to stay, before a bright one; and before one as dim."""
     for radiance, label in ((1e8, "{}"), (1e-8, "{}, dim alone")):
-        splats = Splats(30, spread=0.8)
-        splats.label = label
+        splats = Splats(30, spread=0.8, label=label)
         splats.opacities *= 0.4
         splats.features[:] = 1e-8
         splats.features[splats.means[:, 2].argmax()] = radiance
-        yield splats
-
-
-def _image_sizes() -> Iterator[Splats]:
-    for width, height in ((1, 1), (17, 33), (15, 1), (1, 50)):
-        splats = Splats(30, width, height)
-        splats.label = f"{{}} {width} x {height}"
         yield splats
 
 
@@ -310,7 +303,8 @@ SPLAT_CASES = (
     Case("radiance-bright", "radiance from 1e5 to 1e9", compared(lambda: Splats(50, radiance=(5, 9)))),
     Case("radiance-range", "radiance from 1e-12 to 1e9 in one image", compared(lambda: Splats(50, radiance=(-12, 9)))),
     Case("decades", "16 decades of radiance within a pixel", compared(_light_behind)),
-    Case("image-sizes", "images of 1 x 1 and of odd size", compared(_image_sizes)),
+    Case("image-sizes", "images of 1 x 1 and of odd size",
+         compared(lambda: (Splats(30, *size, label="{{}} {} x {}".format(*size)) for size in SIZES))),
     Case("quaternions", "unnormalized, zero and huge quaternions", _quaternions),
     Case("far-1e3", "scene and camera 1e3 units from the origin", partial(_far, 1e3)),
     Case("far-1e6", "scene and camera 1e6 units from the origin", partial(_far, 1e6),

@@ -6,6 +6,7 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -87,7 +88,9 @@ class Evaluation:
             raise SehdrError(f"scene {scene.name!r} has no views to evaluate; check its splits and masks")
         self.scale_views = [view for view in scale_views or scene.train_views if view.hdr is not None]
         self.lpips, self.lpips_reason = load_lpips(lpips_weights, self.device)
-        self.regions = {region: _RegionErrors() for region in metrics.REGIONS}
+        # By region and name: weighted squared error and weight, pooled over views, which may have none of a region; and
+        # under "share" the pixels of the region, and all.
+        self.pooled: dict[tuple[str, str], np.ndarray] = defaultdict(lambda: np.zeros(2))
         self.ranking = ErrorRanking()
         self.lights: list[LightRegion] = []
 
@@ -121,7 +124,7 @@ class Evaluation:
             "protocol": hdr,
             "pu21": pu21 | {"peak_luminance": PEAK_LUMINANCE},
             "ldr": ldr,
-            "regions": {region: errors.result(missing) for region, errors in self.regions.items()},
+            "regions": {region: self._region(region, missing) for region in metrics.REGIONS},
             "lights": {"count": None, "lost": None, "reason": missing} if missing else count_lights(self.lights),
             "confidence": self.ranking.result() | ({"reason": missing} if missing else {}),
             "views": rows,
@@ -180,8 +183,23 @@ class Evaluation:
             pu21[name] = metrics.pu21_metrics(*linear, mask, peak_luminance=PEAK_LUMINANCE)
             pooled.append((name, *pair))
         for region, inside in regions.items():
-            self.regions[region].add(inside if mask is None else inside * mask, mask, pooled)
+            weight = inside if mask is None else inside * mask
+            counted = weight.numel() if mask is None else float(mask.sum())
+            self.pooled[region, "share"] += float(weight.sum()), counted
+            for name, prediction, goal in pooled:
+                error, total = metrics.squared_error(prediction, goal, weight)
+                self.pooled[region, name] += float(error.mean()), total
         return {"name": view.name, "ldr": ldr, "protocol": protocol, "pu21": pu21}
+
+    def _region(self, region: str, missing: str | None) -> dict:
+        inside, counted = self.pooled[region, "share"]
+        reason = missing if inside else "no pixel of the photos lies in this region"
+        sums = {name: self.pooled[region, name] for name in ("ldr", *PROTOCOLS)}
+        found = {
+            name: metrics.decibels(error / weight if weight else math.nan) for name, (error, weight) in sums.items()
+        }
+        figures = {"fraction": float(inside / counted), "psnr_ldr": found.pop("ldr"), "psnr_mu": found}
+        return figures | ({"reason": reason} if reason else {})
 
     def _lpips(self, prediction, truth) -> float | None:
         return self.lpips(prediction, truth) if self.lpips and min(truth.shape[:2]) >= SMALLEST_EDGE else None
@@ -190,34 +208,6 @@ class Evaluation:
         """Why LPIPS is missing."""
         reason = self.lpips_reason or f"a view is smaller than {SMALLEST_EDGE} pixels"
         return {"lpips_reason": reason} if None in (figures.get("lpips", 0), figures.get("lpips_mu", 0)) else {}
-
-
-class _RegionErrors:
-    """Squared errors of one region, pooled over views: a view may have few of its pixels, or none."""
-
-    def __init__(self):
-        self.inside = self.counted = 0.0
-        self.errors: dict[str, float] = defaultdict(float)
-        self.weights: dict[str, float] = defaultdict(float)
-
-    def add(self, weight, mask, pairs) -> None:
-        """weight: [H, W] of the region, 0 outside the mask. pairs: (name, prediction, truth) to be compared in it."""
-        self.inside += float(weight.sum())
-        self.counted += weight.numel() if mask is None else float(mask.sum())
-        for name, prediction, truth in pairs:
-            error, total = metrics.squared_error(prediction, truth, weight)
-            self.errors[name] += float(error.mean())
-            self.weights[name] += total
-
-    def result(self, missing: str | None) -> dict:
-        reason = missing if self.inside else "no pixel of the photos lies in this region"
-        figures = {"fraction": self.inside / self.counted, "psnr_ldr": self._decibels("ldr")}
-        figures["psnr_mu"] = {name: self._decibels(name) for name in PROTOCOLS}
-        return figures | ({"reason": reason} if reason else {})
-
-    def _decibels(self, name: str) -> float:
-        weight = self.weights[name]
-        return metrics.decibels(self.errors[name] / weight if weight else math.nan)
 
 
 def _inside(pair: tuple[Tensor, Tensor], mask: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ..response import Response
+from ..response.curve import HALF_CODE
 from ..scene import View
 from .radiance_field import CameraTensors, RadianceField
 
@@ -20,8 +21,6 @@ PARTLY_CLIPPED_STOPS = 0.25  # Of a clipped channel beside others, which say whe
 MOST_STOPS = 4.0  # A misfit counts no more than this: 1/16 of the confidence already says that nothing is known
 LEAST_SEEN = 0.01  # Pixels of blending weight, over all photos, at which half of the confidence that they give counts
 MOST_VIEWS = 200  # Training views that are looked at, evenly chosen: more change the means little
-
-_HALF_CODE = 0.5 / 255
 
 
 @dataclass(frozen=True)
@@ -51,15 +50,15 @@ def pixel_uncertainty(photo: Tensor, exposure: Tensor, response: Response) -> tu
                                 channels are clipped, else PARTLY_CLIPPED_STOPS
         a black channel         by how much the exposure is above half a code, if it is, plus 1
     """
-    dark = response.decode(photo.new_full((1, 3), _HALF_CODE))
+    dark = response.decode(photo.new_full((1, 3), HALF_CODE))
     white = response.white
-    clipped, black = photo >= 1 - _HALF_CODE, photo <= _HALF_CODE
+    clipped, black = photo >= 1 - HALF_CODE, photo <= HALF_CODE
     # Below half a code two exposures are the same to the photo.
     lit = torch.maximum(exposure, dark)
     misfit = (lit / torch.maximum(response.decode(photo), dark)).log2().abs()
     misfit = torch.where(clipped, (white / lit).log2().clamp_min(0), misfit)
     misfit = torch.where(black, (lit / dark).log2(), misfit).clamp_max(MOST_STOPS)
-    low, high = (response.decode((photo + offset).clamp(0, 1)) for offset in (-_HALF_CODE, _HALF_CODE))
+    low, high = (response.decode((photo + offset).clamp(0, 1)) for offset in (-HALF_CODE, HALF_CODE))
     rounding = ((high.clamp_min(1e-12) / low.clamp_min(1e-12)).log2() / 4).clamp(0, 1)
     unknown = torch.where(clipped.all(2, keepdim=True), CLIPPED_STOPS, PARTLY_CLIPPED_STOPS).expand_as(photo)
     stops = misfit + torch.where(clipped, unknown, rounding)
