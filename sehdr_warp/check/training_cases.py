@@ -32,11 +32,10 @@ def _photos(clipped: float = 0.0) -> Scene:
     return replace(scene, point_colors=np.full_like(scene.point_colors, 0.5))
 
 
-def _trainer(device, clipped: float = 0.0, *, recorded: bool = True, **rates: float) -> Trainer:
-    """A short training that neither adds nor moves Gaussians by itself."""
+def _trainer(device, clipped: float = 0.0, fields: dict[str, object] | None = None) -> Trainer:
+    """A short training that neither adds nor moves Gaussians by itself. fields: of the config."""
     still = {"densification.stop": 0, "densification.noise": 0.0, "schedule.harmonics_every": 30_000}
-    fixed = {"schedule.iterations": STEPS, "schedule.recorded": recorded, "seed": 1} | still
-    config = load_config("default", fixed | {f"optimizer.{name}": rate for name, rate in rates.items()})
+    config = load_config("default", {"schedule.iterations": STEPS, "seed": 1} | still | (fields or {}))
     scene = _photos(clipped)
     return Trainer(scene, config, make_field(scene, config, response_by_name("srgb"), device))
 
@@ -56,7 +55,9 @@ def _state_not_finite(trainer: Trainer) -> int:
 def _learning_rates(device):
     """All learning rates times 1, 10, 100 and 1000: the loss relative to the start's, and what stays finite."""
     for factor in (1, 10, 100, 1000):
-        trainer = _trainer(device, **{name: min(1.0, getattr(Config().optimizer, name) * factor) for name in RATES})
+        rates = {name: getattr(Config().optimizer, name) for name in RATES}
+        fields = {f"optimizer.{name}": min(1.0, rate * factor) for name, rate in rates.items()}
+        trainer = _trainer(device, fields=fields)
         losses = _losses(trainer, STEPS)
         yield count(f"rates x {factor}: numbers of the state not finite", _state_not_finite(trainer))
         # At its own rates a training must descend. Far above, the loss of encoded values must stay bounded.
@@ -127,7 +128,7 @@ def _clipped_batches(device):
 
 def _guard(device):
     """A step whose gradient is NaN changes nothing; the next one goes on."""
-    trainer = _trainer(device, recorded=False)  # a hook cannot be recorded
+    trainer = _trainer(device, fields={"schedule.recorded": False})  # a hook cannot be recorded
     trainer.step()
     gaussians = trainer.field.gaussians
     before = {name: tensor.clone() for name, tensor in gaussians.tensors().items()}
