@@ -1,25 +1,21 @@
 """The command line of `sehdr-warp check`. torch is imported when it runs."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
+from ..bench.commands import Output
 from ..errors import SehdrError
 
 
-@dataclass(frozen=True)
-class Check:
+@dataclass(frozen=True, kw_only=True)
+class Check(Output):
     """Check numerical stability on this device: stiff and extreme cases against float64, each with its bound."""
 
     cases: str | None = None
     """Cases or groups (splat, light, poison, training) separated by commas; by default all."""
     quick: bool = False
     """Leave out the cases that take seconds."""
-    json: Path | None = None
-    """Write the result to this file."""
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
-    overwrite: bool = False
-    """Replace files that exist."""
 
 
 def run_check(command: Check) -> None:

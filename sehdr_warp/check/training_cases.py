@@ -1,6 +1,7 @@
 """The catalogue's training: where it diverges, what the guards do, and what resets and clipped batches do to it."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 
@@ -32,10 +33,10 @@ def _photos(clipped: float = 0.0) -> Scene:
     return replace(scene, point_colors=np.full_like(scene.point_colors, 0.5))
 
 
-def _trainer(device, clipped: float = 0.0, fields: dict[str, object] | None = None) -> Trainer:
+def _trainer(device, clipped: float = 0.0, fields: Mapping[str, object] | None = None) -> Trainer:
     """A short training that neither adds nor moves Gaussians by itself. fields: of the config."""
     still = {"densification.stop": 0, "densification.noise": 0.0, "schedule.harmonics_every": 30_000}
-    config = load_config("default", {"schedule.iterations": STEPS, "seed": 1} | still | (fields or {}))
+    config = load_config("default", {"schedule.iterations": STEPS, "seed": 1} | still | dict(fields or {}))
     scene = _photos(clipped)
     return Trainer(scene, config, make_field(scene, config, response_by_name("srgb"), device))
 

@@ -33,7 +33,6 @@ class Responses:
 
 
 def run_calibrate(asked: Calibrate) -> None:
-    """Measures and writes the curve."""
     from ..field.exposure import seconds
     from ..scene.stack import calibrate
 
@@ -43,7 +42,6 @@ def run_calibrate(asked: Calibrate) -> None:
 
 
 def run_responses(asked: Responses) -> None:
-    """Prints the names and what they stand for."""
     from . import response_names
 
     names = response_names()
