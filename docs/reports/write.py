@@ -117,7 +117,7 @@ def _quality_tables(result: dict) -> Iterable[str]:
             if max(map(len, seeds)) > 1:
                 line["below_mean"] = max(fmean(values) - min(values) for values in seeds)
             for _, field, _ in parted(columns):
-                values = [row[field] for row in mine if field not in line and row[field] is not None]
+                values = [row[field] for row in mine if field not in line and row.get(field) is not None]
                 line |= {field: fmean(values)} if values else {}
             table.append(line)
         yield f"## Curve {curve}, response {response}"
