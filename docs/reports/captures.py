@@ -12,6 +12,7 @@ import logging
 import shutil
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,7 @@ from sehdr_warp.splatting.ssim import image_distance
 from sehdr_warp.training.config import REFERENCE_ITERATIONS
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.densification import gaussian_budget
-from sehdr_warp.training.initialization import choose_response, scene_extent, start_points
+from sehdr_warp.training.initialization import choose_response, make_matcher, scene_extent, start_points
 from sehdr_warp.training.plan import make_plan
 from sehdr_warp.training.train import train
 
@@ -148,7 +149,8 @@ def train_gsplat(scene: Scene, strategy: str, config, budget: int, device: str) 
     from gsplat import DefaultStrategy, MCMCStrategy  # pyright: ignore[reportMissingImports]
 
     rng = np.random.default_rng(config.seed)
-    points, colors = start_points(scene, config, choose_response(scene, config), device, rng)
+    matcher = partial(make_matcher, scene, choose_response(scene, config), device)
+    points, colors = start_points(scene, config, matcher, rng)
     points, colors = (torch.tensor(values, dtype=torch.float32) for values in (points, colors))
     opacity, scale = (0.5, 0.1) if strategy == "mcmc" else (0.1, 1.0)
     model = _Gsplat(Gaussians.from_points(points, colors - 0.5, 3, opacity=opacity, scale=scale), device)

@@ -2,6 +2,8 @@
 
 import logging
 import math
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -61,11 +63,19 @@ def choose_response(scene: Scene, config: Config) -> Response:
     return best_response(codes, [view.source for view in views], options.method, options.candidates)
 
 
-def make_field(scene: Scene, config: Config, response: Response, device: torch.device | str) -> RadianceField:
-    """The field at iteration 0. Raises InputError for a scene that cannot be trained."""
+def make_field(
+    scene: Scene,
+    config: Config,
+    response: Response,
+    device: torch.device | str,
+    matcher: Callable[[], Matcher] | None = None,
+) -> RadianceField:
+    """The field at iteration 0. matcher: makes what matches the photos. Raises InputError for a scene that cannot be
+    trained."""
     check_views(scene)
     rng = np.random.default_rng(config.seed)
-    points, colors = start_points(scene, config, response, device, rng)
+    matcher = matcher or partial(make_matcher, scene, response, device)
+    points, colors = start_points(scene, config, matcher, rng)
     most = config.densification.max_gaussians
     if len(points) > most:
         chosen = np.sort(rng.choice(len(points), most, replace=False))
@@ -76,13 +86,15 @@ def make_field(scene: Scene, config: Config, response: Response, device: torch.d
     return assemble_field(gaussians, config, response, base_time(scene)).to(device)
 
 
-def start_points(scene: Scene, config: Config, response: Response, device, rng) -> tuple[np.ndarray, np.ndarray]:
+def start_points(
+    scene: Scene, config: Config, matcher: Callable[[], Matcher], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """[N, 3] points to start from and their encoded colors [N, 3]: the scene's and, up to model.initial_density, those
     matched between its photos; where they are too few, points drawn where several cameras look."""
     points, colors = scene.points, scene.point_colors
     wanted = start_count(config, sum(view.camera.width * view.camera.height for view in scene.train_views))
     if wanted > len(points):
-        found = match_points(scene, wanted - len(points), response=response, device=device, seed=config.seed)
+        found = _matched(matcher(), wanted - len(points), config.seed)
         points, colors = (np.concatenate(both) for both in zip((points, colors), found, strict=True))
         _log.info("%d points matched between the photos", len(found[0]))
     if len(points) < FEWEST_POINTS:
@@ -104,7 +116,10 @@ def match_points(
     A plane sweep (Collins 1996) for about `count` pixels all over the photos; N of them have a depth on which photos
     agree. response: by which photos of differing exposure are compared, None for the scene's own.
     """
-    matcher = make_matcher(scene, response or scene.response or response_by_name("srgb"), device)
+    return _matched(make_matcher(scene, response or scene.response or response_by_name("srgb"), device), count, seed)
+
+
+def _matched(matcher: Matcher, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     found = matcher.match(matcher.pixels(count, np.random.default_rng(seed)))
     return found.points.double().cpu().numpy(), found.colors.cpu().numpy()
 

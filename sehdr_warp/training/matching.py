@@ -154,16 +154,14 @@ def _chances(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
 
 def _one_for_each_square(chance: np.ndarray, side: float, rng: np.random.Generator, view: int) -> np.ndarray:
     """[N, 3] view, column, row: from each square of a photo one pixel, drawn in proportion to its chance."""
-    row, column = np.indices(chance.shape).reshape(2, -1)
-    square = (row // side) * np.ceil(chance.shape[1] / side) + column // side
-    chance = chance.ravel()
+    # The largest power u^(1 / chance) of a uniform u is drawn so (Efraimidis and Spirakis 2006).
     with np.errstate(divide="ignore"):
-        # The largest power u^(1 / chance) of a uniform u is drawn so (Efraimidis and Spirakis 2006).
-        key = np.log(rng.random(len(chance))) / chance
-    order = np.lexsort((key, square))
-    last = order[np.append(np.diff(square[order]) != 0, True)]
-    last = last[chance[last] > 0]
-    return np.stack([np.full_like(last, view), column[last], row[last]], 1)
+        key = np.log(rng.random(chance.shape, np.float32)) / chance
+    edges = [np.arange(0, size, side).astype(int) for size in chance.shape]
+    largest = np.maximum.reduceat(np.maximum.reduceat(key, edges[0], axis=0), edges[1], axis=1)
+    sizes = [np.diff(edge, append=size) for edge, size in zip(edges, chance.shape, strict=True)]
+    row, column = np.nonzero((key == largest.repeat(sizes[0], 0).repeat(sizes[1], 1)) & (chance > 0))
+    return np.stack([np.full_like(row, view), column, row], 1)
 
 
 def _neighbors(cameras: Sequence[Camera]) -> np.ndarray:

@@ -4,6 +4,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
+from functools import cache, partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from ..scene import Scene, View
 from ..splatting.memory import memory_told
 from .config import Config
 from .config_files import config_fields, load_config, override_config
-from .initialization import choose_response, make_field
+from .initialization import choose_response, make_field, make_matcher
 from .machine import interruptible, machine_figures, pick_device, torch_settings
 from .plan import apply_plan
 from .run import Run, field_from_checkpoint, load_run
@@ -261,13 +262,18 @@ class Training:
 
     def _begin(self, scene: Scene, config: Config, data: dict) -> Trainer:
         config, plan = apply_plan(scene, config, self.device)
-        response = choose_response(scene, config)
-        trainer = Trainer(scene, config, make_field(scene, config, response, self.device))
+        trainer = self._at_start(scene, config)
         # Nothing is made or removed before the scene is known to be good.
         self.folder.begin(scene, config, trainer.field, data, plan and plan.to_dict())
         for line in plan.lines() if plan is not None else ():
             log.info("%s", line)
         return trainer
+
+    def _at_start(self, scene: Scene, config: Config) -> Trainer:
+        response = choose_response(scene, config)
+        matcher = cache(partial(make_matcher, scene, response, self.device))
+        field = self.timed(partial(make_field, scene, config, response, self.device, matcher))
+        return Trainer(scene, config, field, matcher)
 
     def _continue(self, config: Config | None) -> Trainer:
         """The trainer as the newest checkpoint has it; as at the start where there is none yet."""
@@ -286,7 +292,7 @@ class Training:
         checkpoint = folder.newest_checkpoint()
         if checkpoint is None:
             folder.rewind_metrics(0)
-            return Trainer(scene, saved, make_field(scene, saved, choose_response(scene, saved), self.device))
+            return self._at_start(scene, saved)
         trainer = Trainer(scene, saved, field_from_checkpoint(checkpoint, saved, info).to(self.device))
         try:
             trainer.load_state(checkpoint.tensors, checkpoint.values)

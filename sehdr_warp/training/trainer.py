@@ -1,8 +1,10 @@
 """The training loop's state and its single step. What happens around steps is train.py's business."""
 
 import operator
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import cache, partial
 
 import torch
 from torch import Tensor
@@ -34,7 +36,9 @@ class Trainer:
     CPU. No global random state is used.
     """
 
-    def __init__(self, scene: Scene, config: Config, field: RadianceField):
+    def __init__(
+        self, scene: Scene, config: Config, field: RadianceField, matcher: Callable[[], Matcher] | None = None
+    ):
         self.config, self.field = config, field
         self.iteration = 0  # Steps done
         self.device = field.gaussians.means.device
@@ -42,8 +46,8 @@ class Trainer:
         self.optimizer = adam.make_optimizer(field, config, self.extent)
         pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
         self.densification = make_densification(config, self.extent, pixels)
-        self._scene, self._views = scene, scene.train_views
-        self._matcher: Matcher | None = None
+        self._views = scene.train_views
+        self._matcher = matcher or cache(partial(make_matcher, scene, field.response, self.device))
         # Where light is compared, nothing needs the photo encoded.
         self._encoded = not compares_light(config.loss, field)
         self._largest_truth = largest_truth(scene, config.loss) * field.base_time
@@ -119,11 +123,9 @@ class Trainer:
     def _births(self, count: int) -> dict[str, Tensor]:
         """New Gaussians where the photos are explained worst; of the iteration alone, so that a resumed training has
         the same."""
-        if self._matcher is None:
-            self._matcher = make_matcher(self._scene, self.field.response, self.device)
         seed = self.config.seed * SEED_STEP + self.iteration
         with self._launching():
-            return born_rows(self.field, self._matcher, self._training_views(), count, self.degree, seed)
+            return born_rows(self.field, self._matcher(), self._training_views(), count, self.degree, seed)
 
     def _optimise(self, view: TrainingView, watched: bool, capacity: int | None = None) -> Tensor:
         """Photograph, compare, differentiate, step; the loss. With a capacity all of it works on fixed memory and

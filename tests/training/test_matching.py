@@ -1,6 +1,7 @@
 """Points matched between photos lie on what the photos show, and errors are where Gaussians are born."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -57,17 +58,21 @@ def test_pixels_repeat_and_avoid_borders_and_masks(device):
     assert 150 < len(pixels) < 500 and set(pixels[:, 0].tolist()) == set(range(9))
 
 
+def never():
+    raise AssertionError("nothing is to be matched")
+
+
 def test_start_points_are_the_scenes_and_matched_ones():
     scene, config = wall_and_lamp(), load_config("default", {"model.initial_density": 4.0})
     assert start_count(config, 9 * 64 * 64) == 768
     own = np.array([[0.0, 0.0, 3.0]] * 300)
     given = replace(scene, points=own, point_colors=np.full((300, 3), 0.5, np.float32))
-    points, colors = start_points(given, config, LINEAR, "cpu", np.random.default_rng(0))
+    points, colors = start_points(given, config, partial(make_matcher, given, LINEAR, "cpu"), np.random.default_rng(0))
     assert 300 < len(points) == len(colors) <= 800 and np.array_equal(points[:300], own)
     none = load_config("default", {"model.initial_density": 0.0})
-    assert len(start_points(given, none, LINEAR, "cpu", np.random.default_rng(0))[0]) == 300
+    assert len(start_points(given, none, never, np.random.default_rng(0))[0]) == 300
     # Without any, they are drawn where cameras look.
-    assert len(start_points(scene, none, LINEAR, "cpu", np.random.default_rng(0))[0]) == 5000
+    assert len(start_points(scene, none, never, np.random.default_rng(0))[0]) == 5000
 
 
 def test_gaussians_are_born_where_the_photos_are_not_explained(device):
