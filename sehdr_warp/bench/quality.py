@@ -42,8 +42,6 @@ KNOWN, BLIND, LEARNED = "known", "blind", "learned"
 """Whether a method is told the curve, chooses one, or learns it: then known and blind are one training."""
 UPPER_BOUND = "truth"
 """3DGS trained on the HDR truth, which every method is compared with."""
-WITH_TRUTH = ("truth", "paper-truth", "hdr-gs-truth")
-"""Presets that see the HDR truth of the training views; no other method does."""
 WARM_UP_ITERATIONS = 30
 """Of a training that is thrown away before the first of its kind in a process: kernels are compiled, steps recorded.
 All schedules scale with the length, so every part of a training is in it."""
@@ -132,7 +130,7 @@ def plan_jobs(
             "curve_sha256": _digest(curve) if Path(curve).is_file() else None,
             "exposure": exposure,
             "method": Path(method).stem,
-            "sees_truth": method in WITH_TRUTH,
+            "sees_truth": trained.loss.uses_hdr,
             "response": response,
             "seed": seed,
             "device": device,
