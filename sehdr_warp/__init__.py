@@ -20,7 +20,7 @@ _HOMES = {
     "evaluation.evaluate": ("evaluate",),
     "evaluation.score": ("score_folder",),
     "output.brackets": ("write_brackets",),
-    "output.ply": ("export",),
+    "output.export": ("export",),
     "output.render_views": ("render_views",),
     "output.report": ("write_report",),
     "response": ("Response", "response_by_name", "response_names"),
@@ -31,7 +31,7 @@ _HOMES = {
     "training.config_files": ("load_config", "preset_names"),
     "training.initialization": ("match_points",),
     "training.plan": ("Plan", "make_plan"),
-    "training.run": ("Run", "load_run"),
+    "training.run": ("Run", "Splats", "load_run", "load_splats"),
     "training.train": ("Step", "Training", "train"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

@@ -5,7 +5,7 @@ from .evaluation.compare import compare_runs
 from .evaluation.evaluate import evaluate
 from .evaluation.score import score_folder
 from .output.brackets import write_brackets
-from .output.ply import export
+from .output.export import export
 from .output.render_views import render_views
 from .output.report import write_report
 from .response import Response, response_by_name, response_names
@@ -16,7 +16,7 @@ from .training.config import Config
 from .training.config_files import load_config, preset_names
 from .training.initialization import match_points
 from .training.plan import Plan, make_plan
-from .training.run import Run, load_run
+from .training.run import Run, Splats, load_run, load_splats
 from .training.train import Step, Training, train
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "Run",
     "Scene",
     "SehdrError",
+    "Splats",
     "Step",
     "Training",
     "View",
@@ -42,6 +43,7 @@ __all__ = [
     "load_config",
     "load_run",
     "load_scene",
+    "load_splats",
     "make_plan",
     "match_points",
     "preset_names",

@@ -20,6 +20,7 @@ COMMANDS = {
         "eval": ("evaluation.commands", "Evaluate", "run_evaluate"),
         "report": ("output.commands", "Report", "run_report"),
         "export": ("output.commands", "Export", "run_export"),
+        "convert": ("output.commands", "Convert", "run_convert"),
         "compare": ("evaluation.commands", "Compare", "run_compare"),
         "score": ("evaluation.commands", "Score", "run_score"),
     },

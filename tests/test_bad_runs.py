@@ -227,8 +227,9 @@ def test_nothing_is_replaced(trained, tmp_path, capfd):
     (tmp_path / "report" / "stops.png").write_text("mine")
     assert "--overwrite" in refused(capfd, "report", trained, "--out", tmp_path / "report", "--device", "cpu")
     assert (tmp_path / "scene.ply").read_text() == (tmp_path / "report" / "stops.png").read_text() == "mine"
+    (tmp_path / "a.ply").mkdir()
     assert "is a file" in refused(capfd, "render", trained, "--out", tmp_path / "scene.ply", "--device", "cpu")
-    assert "is a folder" in refused(capfd, "export", trained, "--out", out)
+    assert "is a folder" in refused(capfd, "export", trained, "--out", tmp_path / "a.ply")
 
 
 # --------------------------------------------------------------------------------------------- full disks and signals
@@ -239,9 +240,9 @@ def test_nothing_is_replaced(trained, tmp_path, capfd):
 )
 def test_full_disk(trained, tmp_path, capfd, command):
     out = tmp_path / "out"
-    device = () if command[0] == "export" else ("--device", "cpu")
+    out = out.with_suffix(".ply") if command[0] == "export" else out
     with full_disk():
-        line = refused(capfd, command[0], trained, "--out", out, *device, *command[1:])
+        line = refused(capfd, command[0], trained, "--out", out, "--device", "cpu", *command[1:])
     assert "cannot be written" in line and ".tmp" not in line and list(tmp_path.iterdir()) == []
 
 
@@ -262,7 +263,7 @@ def test_full_disk_while_training_keeps_the_last_checkpoint(trained, tmp_path, c
 def test_read_only_place(trained, tmp_path, capfd):
     """/proc takes no new files, not even root's."""
     for command in ("render", "export", "report"):
-        line = refused(capfd, command, trained, "--out", "/proc/sehdr/out")
+        line = refused(capfd, command, trained, "--out", "/proc/sehdr/out.ply")
         assert "/proc/sehdr" in line
     assert "/proc/sehdr" in refused(capfd, "train", "embedded", "--out", "/proc/sehdr", "--max-size", "40")
 

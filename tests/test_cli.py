@@ -303,11 +303,14 @@ def test_eval_writes_json_and_prints_a_table(run, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["ldr"] == result["ldr"]
 
 
-@pytest.mark.parametrize("kind", ["hdr", "ldr"])
-def test_export_writes_ply(run, tmp_path, kind, capsys):
-    file = tmp_path / "scene.ply"
-    assert call("export", run, "--out", file, "--kind", kind) == 0
+def test_export_writes_files_that_render_and_convert(run, tmp_path, capsys):
+    file, other = tmp_path / "scene.ply", tmp_path / "scene.glb"
+    assert call("export", run, "--out", file, "--kind", "hdr", "--cameras", "--device", "cpu") == 0
     assert file.read_bytes().startswith(b"ply\n") and str(file) in capsys.readouterr().out
+    assert call("convert", file, other, "--degree", 3, "--device", "cpu") == 0
+    assert call("render", other, "--cameras", "train", "--out", tmp_path / "views", "--device", "cpu") == 0
+    assert call("convert", file, tmp_path / "scene.splat") == 1
+    assert "holds 8 bits" in capsys.readouterr().err and not (tmp_path / "scene.splat").exists()
 
 
 def test_report_writes_pictures(run, tmp_path, capsys):

@@ -7,13 +7,13 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from ..training.commands import ensured_scene, open_run
+from ..training.commands import ensured_scene, open_run, open_scene
 
 
 @dataclass(frozen=True, kw_only=True)
 class _OfRun:
     run: Positional[Path]
-    """Folder of a run."""
+    """Folder of a run, or a file of Gaussians (not for reports)."""
     overwrite: bool = False
     """Replace files that exist."""
 
@@ -31,9 +31,13 @@ class Render(_Rendered):
     """Render HDR EXR, previews and exposure brackets of a trained scene. Needs no photos."""
 
     cameras: str = "test"
-    """test, train, all, orbit, interpolate, or a JSON file of cameras."""
+    """test, train, all, orbit, interpolate, or cameras of your own: JSON, OpenUSD, or a COLMAP model's folder."""
     count: int = 60
     """Views of an orbit or interpolation."""
+    size: str | None = None
+    """Width and height in pixels, such as 1920x1080; by default the cameras' own."""
+    passes: str = ""
+    """Parts of the EXR files beside the picture, such as depth,normals: depth, position, normals, alpha, confidence."""
     evs: str | None = None
     """Brackets in stops from the photos' exposure, such as --evs=-4,-2,0,2,4."""
     exposures: str | None = None
@@ -58,21 +62,49 @@ class Report(_Rendered):
     """The photos, if they have moved since the training."""
 
 
+@dataclass(frozen=True)
+class _SplatFile:
+    """"""
+
+    kind: Literal["hdr", "ldr"] | None = None
+    """ldr: the colors of a photo, as viewers show them. hdr: scene-linear radiance. By default ldr, of USD hdr."""
+    exposure: str | None = None
+    """Of ldr colors: seconds (1/125), stops from the photos' exposure (-2ev) or multiples of it (1/8x)."""
+    degree: int | None = None
+    """Pad the harmonics with zeros up to this degree, for readers that take 3 alone."""
+    device: str | None = None
+    """cpu or cuda:N; by default the first GPU if there is one."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Export(_OfRun):
-    """Write the Gaussians as PLY: hdr with scene-linear colors, ldr with the display colors of 3DGS viewers."""
+    """Write the Gaussians as PLY, OpenUSD or glTF, for viewers and other tools; says what the file keeps."""
 
     out: Path
-    """The PLY file."""
-    kind: Literal["hdr", "ldr"] = "hdr"
-    """Which colors."""
+    """The file; its suffix decides: .ply, .glb (glTF), .usda, .usdc or .usdz (OpenUSD)."""
+    file: _SplatFile = _SplatFile()
+    cameras: bool = False
+    """Also write cameras.json beside it, as viewers of the reference release read it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convert:
+    """Turn a file of Gaussians into one of another kind: PLY, OpenUSD or glTF."""
+
+    source: Positional[Path]
+    """The file: .ply, .glb, .usda, .usdc or .usdz."""
+    out: Positional[Path]
+    """The file to write; its suffix decides."""
+    file: _SplatFile = _SplatFile()
+    overwrite: bool = False
+    """Replace a file that exists."""
 
 
 def run_render(asked: Render) -> None:
     from .render_views import render_views
 
     options = {name: value for name, value in vars(asked).items() if name not in ("run", "device", "json")}
-    written = render_views(open_run(asked.run, asked.device), **options)
+    written = render_views(open_scene(asked.run, asked.device), **options)
     if asked.json:
         print(json.dumps({"files": [str(path) for path in written]}))
     else:
@@ -88,6 +120,22 @@ def run_report(asked: Report) -> None:
 
 
 def run_export(asked: Export) -> None:
-    from .ply import export
+    _export(asked.run, asked.out, asked.file, cameras=asked.cameras, overwrite=asked.overwrite)
 
-    print(export(open_run(asked.run, "cpu"), asked.out, kind=asked.kind, overwrite=asked.overwrite))
+
+def run_convert(asked: Convert) -> None:
+    from ..splats import check_suffix
+
+    check_suffix(asked.source)
+    _export(asked.source, asked.out, asked.file, overwrite=asked.overwrite)
+
+
+def _export(source: Path, out: Path, asked: _SplatFile, **options) -> None:
+    from ..field.exposure import exposure_times
+    from ..splats import check_suffix
+    from .export import export
+
+    check_suffix(out)  # Before the scene is opened.
+    run = open_scene(source, asked.device)
+    time = None if asked.exposure is None else exposure_times(run.base_time, asked.exposure)[0]
+    print(export(run, out, kind=asked.kind, exposure_time=time, degree=asked.degree, **options))

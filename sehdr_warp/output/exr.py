@@ -87,8 +87,8 @@ def write_multipart_exr(
     """Writes a file with ZIP compression; returns the pixel type of the colors.
 
     pixel: "half" or "float". Where half cannot hold a value (above 65504 in size), all channels of the file are float
-    instead, and each part's `sehdr:pixelType` says so: nothing is clipped. Depth (`Z`, or a layer's `.Z`) is always
-    float: half's 11 bits are too few for it.
+    instead, and each part's `sehdr:pixelType` says so: nothing is clipped. Depth (`Z`, or a layer's `.Z`) and places
+    are always float: half's 11 bits are too few for them.
 
     Raises InputError where a value is NaN or infinite (with channel and place) or `path` exists (unless overwrite);
     SehdrError where the file cannot be written; ValueError for an unknown pixel type, unequal shapes or names.
@@ -147,7 +147,8 @@ def check_finite(path: Path, image: np.ndarray, what: str) -> None:
 
 
 def _is_depth(name: str) -> bool:
-    return name == "Z" or name.endswith(".Z")
+    """Also places in the world, for which half is too coarse as well."""
+    return name == "Z" or name.endswith(".Z") or name.startswith("position.")
 
 
 def _camera_attributes(camera: Camera) -> dict[str, Any]:

@@ -11,16 +11,19 @@ import numpy as np
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera, load_cameras
+from sehdr_warp.scene.images import MAX_PIXELS
 
 from ..field.exposure import Items
-from ..files import atomic_folder
+from ..files import atomic_folder, atomic_path
 from .brackets import Brackets, bracket_exposures
 from .camera_paths import interpolate, orbit
 from .colorspace import from_rec709
-from .exr import rgb_channels, write_exr
+from .exr import Part, rgb_channels, write_multipart_exr
 from .images import as_array, quantize, write_picture
 from .names import safe_names
+from .passes import data_parts, read_passes
 from .tonemap import fit_tone_map
+from .usd_cameras import usd_cameras
 
 log = logging.getLogger(__name__)
 SPLITS = ("train", "test", "all")
@@ -28,6 +31,7 @@ PATHS = ("orbit", "interpolate")
 
 # The tone map is fitted to a few small pictures, evenly chosen, so that all previews of a set share it.
 _FIT_VIEWS, _FIT_SIZE = 4, 160
+_SEEN = 0.01  # Mean coverage below which a picture shows nothing: stray Gaussians are nearly everywhere
 
 
 def render_views(
@@ -43,15 +47,20 @@ def render_views(
     pixel: str = "half",
     overwrite: bool = False,
     ldr_brackets: str | None = None,
+    passes: str | Sequence[str] = (),
+    size: str | tuple[int, int] | None = None,
 ) -> list[Path]:
     """Renders views of a run into `out`; returns the files written.
 
     Always: `hdr/<view>.exr` (R, G, B scene-linear radiance; A coverage; Z distance along the axis, 0 where empty;
-    confidence, if the run has it) and `preview/<view>.png` (tone-mapped, sRGB). With evs or exposures: brackets, see
-    write_brackets, with ldr_brackets as its ldr, through the run's response.
+    confidence, if the run has it), `preview/<view>.png` (tone-mapped, sRGB) and `cameras.usda`. With evs or exposures:
+    brackets, see write_brackets, with ldr_brackets as its ldr, through the run's response.
 
-    cameras: "train", "test", "all", "orbit", "interpolate", or a JSON file. count: views of an orbit or interpolation.
+    cameras: "train", "test", "all", "orbit", "interpolate", or a file (see load_cameras). count: views of an orbit or
+    interpolation. size: width and height in pixels, or "1920x1080", in place of the cameras' own: the vertical field of
+    view stays. passes: of depth, position, normals, alpha and confidence, each a part of `hdr/<view>.exr` of its own.
     overwrite: replaces the folders hdr, preview and brackets of an earlier render; other files in `out` stay.
+    Cameras that see nothing are named in a warning.
 
     Everything appears when the last view is done. Raises SehdrError for unusable options or an empty set of cameras,
     InputError where something would be replaced or a pixel is not finite.
@@ -63,7 +72,12 @@ def render_views(
     made = bracket_exposures(run.base_time, evs=evs, exposures=exposures) if wanted else ()
     form, now = (colorspace, pixel, multipart, ldr_brackets, run.response), datetime.now().replace(microsecond=0)
     brackets = Brackets(made, run.base_time, *form, now, _provenance(run))
+    passes = read_passes(passes) if passes else ()
     views = select_cameras(run, cameras, count=count)
+    if size is not None:
+        width, height = read_size(size)
+        views = [(name, framed(camera, width, height)) for name, camera in views]
+    empty = []
 
     def write_pictures(hdr_folder: Path, preview_folder: Path) -> Iterator[tuple[str, np.ndarray, Camera]]:
         """Writes each view, and yields what its brackets are made of."""
@@ -79,7 +93,11 @@ def render_views(
             elif index == 1:
                 log.info("without a confidence channel: `sehdr-warp report` measures it, from the photos")
             header = brackets.header(name, 1.0, camera)
-            stored = write_exr(hdr_folder / f"{name}.exr", channels, pixel=pixel, header=header)
+            parts = [Part(channels, header, "rgba" if passes else "")]
+            parts += data_parts(passes, run, rendered, camera, header)
+            stored = write_multipart_exr(hdr_folder / f"{name}.exr", parts, pixel=pixel)
+            if channels["A"].mean() < _SEEN:
+                empty.append(name)
             write_picture(preview_folder / f"{name}.png", quantize(tone_map(hdr)))
             log.info("%s (%d of %d)", name, index, len(views))
             if stored != pixel:
@@ -87,12 +105,40 @@ def render_views(
             yield name, hdr, camera
 
     files = [out / place.format(name) for place in ("hdr/{}.exr", "preview/{}.png") for name, _ in views]
-    with atomic_folder(out / "hdr", overwrite) as hdr, atomic_folder(out / "preview", overwrite) as preview:
+    with (
+        atomic_path(out / "cameras.usda", overwrite) as stage,
+        atomic_folder(out / "hdr", overwrite) as hdr,
+        atomic_folder(out / "preview", overwrite) as preview,
+    ):
+        stage.write_text(usd_cameras(views), encoding="utf-8")
         pictures = write_pictures(hdr, preview)
         if wanted:
             files += [*brackets.write(out, pictures, overwrite), out / "brackets.json"]
         deque(pictures, maxlen=0)
-    return files
+    if empty:
+        listed = ", ".join(empty[:5]) + (", ..." if len(empty) > 5 else "")
+        problem = "see nothing of the scene, or next to nothing: are they in its coordinates, and do they look at it?"
+        log.warning("%d of %d cameras (%s) %s", len(empty), len(views), listed, problem)
+    return [*files, out / "cameras.usda"]
+
+
+def read_size(size: str | tuple[int, int]) -> tuple[int, int]:
+    """Width and height in pixels, of "1920x1080" or a pair; SehdrError for what is none."""
+    try:
+        width, height = (int(side) for side in (size.lower().split("x") if isinstance(size, str) else size))
+    except (ValueError, TypeError):
+        width = height = 0
+    if min(width, height) < 1 or width * height > MAX_PIXELS:
+        raise SehdrError(f"size {size!r} cannot be; write width and height in pixels, such as 1920x1080")
+    return width, height
+
+
+def framed(camera: Camera, width: int, height: int) -> Camera:
+    """A camera of another size with the same vertical field of view and square pixels as before; at the sides more or
+    less is seen."""
+    scale = height / camera.height
+    cx = width / 2 + (camera.cx - camera.width / 2) * scale
+    return Camera(width, height, camera.fx * scale, camera.fy * scale, cx, camera.cy * scale, camera.world_to_camera)
 
 
 def select_cameras(run, cameras: str | Path, *, count: int = 60) -> list[tuple[str, Camera]]:
@@ -108,7 +154,7 @@ def select_cameras(run, cameras: str | Path, *, count: int = 60) -> list[tuple[s
         path = interpolate(seen, count) if text == "interpolate" else orbit(seen, count, _focus_distance(run, seen))
         digits = max(3, len(str(count - 1)))
         return [(f"{text}_{index:0{digits}d}", camera) for index, camera in enumerate(path)]
-    elif Path(cameras).is_file():
+    elif Path(cameras).exists():
         named = load_cameras(Path(cameras))
     else:
         raise SehdrError(f"cameras {text!r} are neither a file nor one of {known}")

@@ -1,4 +1,4 @@
-"""transforms.json and its kin (nerfstudio, instant-ngp, Blender, HDR-NeRF's synthetic sets), and files of cameras."""
+"""transforms.json and its kin (nerfstudio, instant-ngp, Blender, HDR-NeRF's synthetic sets)."""
 
 import math
 import re
@@ -9,14 +9,13 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import contained, read_json
-from .camera import Camera
 from .capture import DERIVED_PHOTOS, NO_POINTS, Capture, Cloud, Shot, pose_from_camera_to_world
 from .colmap_model import find_model, read_ply_points, read_points
 from .exposure import parse_seconds
 from .hdr_files import hdr_size
-from .images import HDR_SUFFIXES, LDR_SUFFIXES, MAX_PIXELS, image_sizes
+from .images import HDR_SUFFIXES, LDR_SUFFIXES, image_sizes
 from .lens import Lens
-from .names import natural_key, photo_beside, sibling
+from .names import photo_beside, sibling
 
 _REMEDY = "correct the file or export it again"
 _INCOMPLETE = "copy the whole set"
@@ -133,10 +132,10 @@ def _matrix(values) -> np.ndarray:
 
 def frame_pose(frame: dict, path: Path, name: str) -> np.ndarray:
     """[4, 4] world_to_camera of a frame's transform_matrix; InputError where it is no pose."""
-    return _pose_from_opengl(_matrix(frame.get("transform_matrix")), path, name)
+    return pose_from_opengl(_matrix(frame.get("transform_matrix")), path, name)
 
 
-def _pose_from_opengl(matrix: np.ndarray, path: Path, name: str) -> np.ndarray:
+def pose_from_opengl(matrix: np.ndarray, path: Path, name: str) -> np.ndarray:
     if matrix.shape in ((4, 4), (3, 4)):
         matrix[:3, 1:3] *= -1  # From x right, y up, -z forward to y down, z forward.
     return pose_from_camera_to_world(matrix, path, name)
@@ -217,55 +216,3 @@ def _exposures_of(values: dict, path: Path) -> dict[str, dict[int, tuple[str, fl
             name = _plain(key) if match[3] else f"{_plain(key)}.png"
             found.setdefault(match[1], {})[int(match[2])] = (name, parse_seconds(value, path, key))
     return found
-
-
-def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
-    """Named cameras from a JSON file, in its order, without distortion.
-
-    Accepted: {"cameras": [{"name": ..., **Camera.to_dict()}, ...]}, nerfstudio's camera_path.json, transforms.json.
-    Raises InputError where the file is damaged, a pose or size cannot be, or two cameras share a name.
-    """
-    path = Path(path)
-    values = read_json(path)
-    listed = next((values[key] for key in ("cameras", "camera_path") if isinstance(values.get(key), list)), None)
-    if listed is not None:
-        own, cameras = isinstance(values.get("cameras"), list), []
-        for i, entry in enumerate(listed):
-            try:
-                name = str(entry.get("name", f"{i:04d}")) if own else f"{i:04d}"
-                cameras.append((name, Camera.from_dict(entry) if own else _nerfstudio(entry, i, values, path)))
-            except KeyError as error:
-                raise InputError(path, f"camera {i} has no {error.args[0]}", "add the field") from None
-            except (ValueError, TypeError, AttributeError, OverflowError, ZeroDivisionError) as error:
-                raise InputError(path, f"camera {i} cannot be used ({error!s:.120})", "correct the camera") from None
-    elif "frames" in values:
-        cameras = [
-            (Path(name).stem, frame_lens(values, frame, None, path).pinhole(frame_pose(frame, path, name)))
-            for name, frame in frames_of(values, path)
-        ]
-    else:
-        raise InputError(path, "has none of cameras, camera_path and frames", "export cameras as the manual describes")
-    if not cameras:
-        raise InputError(path, "lists no cameras", "add at least one")
-    names = [name.lower() for name, _ in cameras]
-    if len(set(names)) < len(names):
-        twice = min((name for name in names if names.count(name) > 1), key=natural_key)
-        raise InputError(path, f"camera name {twice!r} is used twice", "give every camera its own name")
-    for i, (name, camera) in enumerate(cameras):
-        if not name or any(letter in name for letter in "/\\\0") or name in (".", "..") or len(name) > 200:
-            raise InputError(path, f"camera name {name!r:.60} cannot name a file", "use letters, digits, '_' and '-'")
-        if camera.width * camera.height > MAX_PIXELS:
-            size = f"{camera.width} x {camera.height}"
-            raise InputError(path, f"camera {i} is {size}", f"use sizes of 1 to {MAX_PIXELS} pixels")
-    return cameras
-
-
-def _nerfstudio(entry, index: int, values: dict, path: Path) -> Camera:
-    """An entry of camera_path.json: camera_to_world (OpenGL axes, 16 numbers by rows) and fov (vertical, degrees)."""
-    width, height, fov = int(values["render_width"]), int(values["render_height"]), float(entry["fov"])
-    matrix = np.array(entry["camera_to_world"], dtype=np.float64).reshape(4, 4)
-    if not 1e-6 <= fov < 180:
-        raise InputError(path, f"camera {index} has fov {fov}", "use degrees between 0 and 180")
-    focal = 0.5 * height / math.tan(math.radians(fov) / 2)
-    pose = _pose_from_opengl(matrix, path, f"camera {index}")
-    return Camera(width, height, focal, focal, width / 2, height / 2, pose)

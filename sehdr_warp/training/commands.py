@@ -170,6 +170,16 @@ def open_run(path: Path, device: str | None):
     return load_run(path, device=pick_device(device))
 
 
+def open_scene(path: Path, device: str | None):
+    """The run in a folder or the Gaussians in a file, on the device that a command line names."""
+    from ..splats import SUFFIXES
+    from .machine import pick_device
+    from .run import load_splats
+
+    splats = path.is_file() or path.suffix.lower() in SUFFIXES
+    return load_splats(path, device=pick_device(device)) if splats else open_run(path, device)
+
+
 def ensured_scene(run, data: str | None):
     """The scene a run was trained on, read again in the same way, after the run's confidence was measured on it.
 

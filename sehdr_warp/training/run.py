@@ -1,4 +1,4 @@
-"""A trained scene, loaded from the folder of its training."""
+"""A trained scene, loaded from the folder of its training or from a file of Gaussians."""
 
 import logging
 from pathlib import Path
@@ -7,11 +7,13 @@ import torch
 from torch import Tensor
 
 from ..errors import InputError, SehdrError
+from ..field.baking import field_of
 from ..field.confidence import Evidence, gather_evidence
 from ..field.gaussians import PARAMETER_NAMES, Gaussians
 from ..field.radiance_field import RadianceField, RenderedView
 from ..response import Response
-from ..scene import Camera, Scene
+from ..scene import Camera, Scene, load_cameras
+from ..splats import read_gaussians
 from .config import Config
 from .initialization import assemble_field
 from .optimizer import under
@@ -20,27 +22,11 @@ from .run_folder import CameraEntry, Checkpoint, RunFolder
 log = logging.getLogger(__name__)
 
 
-class Run:
-    """A trained scene.
+class _Rendered:
+    """What a RadianceField with harmonics up to `degree` looks like from cameras."""
 
-    path, folder: where it is. config: the choices it was trained with. model: the RadianceField, on `device`.
-    cameras: the views of the scene, in its order. response: the camera's curve. base_time: seconds.
-    iterations, train_seconds, degree of the harmonics: how far the training was. checkpoint_hash: of the tensors.
-    data: where the photos were, for load_scene; may be empty.
-    """
-
-    def __init__(self, folder: RunFolder, config: Config, model: RadianceField, info: dict, values: dict):
-        self.folder, self.path = folder, folder.path
-        self.config, self.model = config, model
-        self.response: Response = model.response
-        self.base_time: float = model.base_time
-        self.cameras: tuple[CameraEntry, ...] = folder.read_cameras()
-        self.iterations: int = values["iteration"]
-        self.degree = config.degree_at(self.iterations)
-        self.train_seconds: float = values["seconds"]
-        self.checkpoint_hash: str = values["sha256"]
-        self.data: dict = info["data"]
-        self.scene_name: str = info["scene"]
+    model: RadianceField
+    degree: int
 
     @property
     def device(self) -> torch.device:
@@ -61,6 +47,58 @@ class Run:
     def render_confidence(self, camera: Camera) -> Tensor | None:
         """[H, W] in [0, 1]: how far the photos vouch for what a camera sees; None where that was not measured."""
         return self.model.render_confidence(camera)
+
+
+class Splats(_Rendered):
+    """A file of Gaussians as a scene to render, re-expose and export. Its response is sRGB.
+
+    path: of the file. model: the RadianceField. base_time: seconds, as the file states it, else 1. cameras: those of a
+    cameras.json beside the file, as the reference release of 3D Gaussian Splatting writes it; else none.
+    """
+
+    iterations = None
+
+    def __init__(self, path: Path, model: RadianceField, cameras: tuple[CameraEntry, ...]):
+        self.path, self.model, self.cameras = path, model, cameras
+        self.response, self.base_time, self.degree = model.response, model.base_time, model.gaussians.degree
+        self.scene_name = path.stem
+
+
+def load_splats(path: Path | str, *, device: str | torch.device = "cpu") -> Splats:
+    """The scene in a file of Gaussians: PLY, glTF (.glb) or OpenUSD (.usda, .usdc, .usdz).
+
+    Raises InputError where the file, or the cameras.json beside it, is missing, damaged or of another kind.
+    """
+    path = Path(path)
+    model = field_of(read_gaussians(path)).to(device)
+    beside, cameras = path.with_name("cameras.json"), ()
+    if beside.is_file():
+        named = load_cameras(beside)
+        cameras = tuple(CameraEntry(name, "train", camera, model.base_time) for name, camera in named)
+    return Splats(path, model, cameras)
+
+
+class Run(_Rendered):
+    """A trained scene.
+
+    path, folder: where it is. config: the choices it was trained with. model: the RadianceField, on `device`.
+    cameras: the views of the scene, in its order. response: the camera's curve. base_time: seconds.
+    iterations, train_seconds, degree of the harmonics: how far the training was. checkpoint_hash: of the tensors.
+    data: where the photos were, for load_scene; may be empty.
+    """
+
+    def __init__(self, folder: RunFolder, config: Config, model: RadianceField, info: dict, values: dict):
+        self.folder, self.path = folder, folder.path
+        self.config, self.model = config, model
+        self.response: Response = model.response
+        self.base_time: float = model.base_time
+        self.cameras: tuple[CameraEntry, ...] = folder.read_cameras()
+        self.iterations: int = values["iteration"]
+        self.degree = config.degree_at(self.iterations)
+        self.train_seconds: float = values["seconds"]
+        self.checkpoint_hash: str = values["sha256"]
+        self.data: dict = info["data"]
+        self.scene_name: str = info["scene"]
 
     def metrics(self) -> list[dict]:
         """The evaluations made during training, as in metrics.jsonl."""

@@ -3,9 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from plyfile import PlyData
 
-from sehdr_warp.output.ply import GaussianArrays
 from sehdr_warp.scene import Camera, look_at
 from sehdr_warp.scene.hdr_files import read_exr_channels
 
@@ -82,31 +80,6 @@ class AnalyticRun:
         return Rendered(
             hdr.astype(np.float32), np.full(x.shape, 0.75, np.float32), (2 + x * 0 + y * 1e-4).astype(np.float32)
         )
-
-
-def read_gaussians(path) -> GaussianArrays:
-    """What write_gaussians wrote."""
-    ply = PlyData.read(path)
-    vertex = ply["vertex"]
-
-    def columns(*names):
-        return np.stack([vertex[name] for name in names], axis=1)
-
-    rest = [p.name for p in vertex.properties if p.name.startswith("f_rest_")]
-    harmonics = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
-    if rest:
-        higher = columns(*rest).reshape(len(harmonics), 3, -1).swapaxes(1, 2)
-        harmonics = np.concatenate([harmonics, higher], axis=1)
-    comments = dict(line.removeprefix("sehdr:").split() for line in ply.comments)
-    return GaussianArrays(
-        columns("x", "y", "z"),
-        columns("scale_0", "scale_1", "scale_2"),
-        columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        vertex["opacity"],
-        harmonics,
-        comments["color_model"],
-        float(comments["base_exposure_time"]),
-    )
 
 
 def read_exr(path):

@@ -9,6 +9,7 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.camera_paths import common_focus, interpolate, orbit
 from sehdr_warp.output.names import safe_names
 from sehdr_warp.output.render_views import render_views, select_cameras
+from sehdr_warp.scene import Camera, load_cameras
 
 from .helpers import AnalyticRun, Entry, camera, read_exr
 
@@ -19,7 +20,7 @@ def tree(folder):
 
 def test_layout_on_disk(tmp_path, logged):
     files = render_views(AnalyticRun(), tmp_path / "out", evs=[-2, 0, 2])
-    expected = ["hdr/t_0.exr", "hdr/t_1.exr", "preview/t_0.png", "preview/t_1.png", "brackets.json"]
+    expected = ["hdr/t_0.exr", "hdr/t_1.exr", "preview/t_0.png", "preview/t_1.png", "brackets.json", "cameras.usda"]
     expected += [
         f"brackets/{v}/{v}_b{i}_ev{ev}.exr" for v in ("t_0", "t_1") for i, ev in enumerate(("-2.0", "+0.0", "+2.0"))
     ]
@@ -173,3 +174,63 @@ def test_paths_need_cameras():
         interpolate([], 3)
     with pytest.raises(SehdrError, match="path of 0 views"):
         orbit(arc(3, 30), 0, 1)
+
+
+def test_passes_are_parts_of_their_own(tmp_path):
+    OpenEXR = pytest.importorskip("OpenEXR")
+    run = AnalyticRun()
+    render_views(run, tmp_path, passes="depth,position,normals,alpha,confidence")
+    view, rendered = run.cameras[3].camera, run.render(run.cameras[3].camera)
+    with OpenEXR.File(str(tmp_path / "hdr" / "t_0.exr"), separate_channels=True) as file:
+        headers = {part.name(): dict(part.header) for part in file.parts}
+        pixels = {name: channel.pixels for part in file.parts for name, channel in part.channels.items()}
+    assert list(headers) == ["rgba", "depth", "position", "normals", "alpha", "confidence"]
+    assert headers.pop("rgba")["colorInteropID"] == "lin_rec709_scene"
+    assert all(h["colorInteropID"] == "data" and "chromaticities" not in h for h in headers.values())
+    points = np.stack([pixels[f"position.{axis}"] for axis in "XYZ"], 2)
+    np.testing.assert_allclose(np.linalg.norm(points - view.position, axis=2), pixels["distance.Z"], rtol=1e-5)
+    np.testing.assert_allclose((points - view.position) @ view.world_to_camera[2, :3], rendered.depth, rtol=1e-5)
+    # A plane across the view, nearly: its normal is against the axis.
+    normal = np.stack([pixels[f"N.{axis}"] for axis in "XYZ"], 2)[1:-1, 1:-1]
+    np.testing.assert_allclose(normal @ -view.world_to_camera[2, :3], 1, atol=2e-3)
+    for passes, words in (("depht", "did you mean depth"), ("alpha,alpha", "named twice")):
+        with pytest.raises(SehdrError, match=words):
+            render_views(run, tmp_path, passes=passes, overwrite=True)
+
+
+def test_cameras_go_to_usd_and_come_back(tmp_path):
+    pytest.importorskip("pxr")
+    run = AnalyticRun([("a 1", "train"), ("a_1", "train"), ("2", "train")])
+    render_views(run, tmp_path, cameras="train")
+    read = load_cameras(tmp_path / "cameras.usda")
+    assert [name for name, _ in read] == ["a_1", "a_1_2", "_2"]
+    for entry, (_, camera_) in zip(run.cameras, read, strict=True):
+        np.testing.assert_allclose(camera_.world_to_camera, entry.camera.world_to_camera, atol=1e-9)
+        np.testing.assert_allclose(camera_.intrinsics, entry.camera.intrinsics, rtol=1e-6)
+        assert (camera_.width, camera_.height) == (entry.camera.width, entry.camera.height)
+
+
+def test_size_keeps_the_vertical_field_of_view(tmp_path):
+    run = AnalyticRun()
+    render_views(run, tmp_path, size="64x36")
+    camera_ = Camera.from_dict(json.loads(read_exr(tmp_path / "hdr" / "t_0.exr")[2]["sehdr:camera"]))
+    given = run.cameras[3].camera
+    assert (camera_.width, camera_.height) == (64, 36) and camera_.fy / 36 == given.fy / given.height
+    assert (camera_.cx - 32) / camera_.fx == pytest.approx((given.cx - given.width / 2) / given.fx)
+    for size in ("64", "0x9", "axb", "99999x99999"):
+        with pytest.raises(SehdrError, match="such as 1920x1080"):
+            render_views(run, tmp_path / "other", size=size)
+
+
+def test_cameras_that_see_nothing_are_warned_of(tmp_path, logged, monkeypatch):
+    run = AnalyticRun()
+    rendered = run.render
+
+    def nothing(view):
+        seen = rendered(view)
+        seen.alpha *= 0.001
+        return seen
+
+    monkeypatch.setattr(run, "render", nothing)
+    render_views(run, tmp_path)
+    assert any("2 of 2 cameras (t_0, t_1) see nothing" in line for line in logged)

@@ -232,7 +232,7 @@ def test_cameras_from_every_kind_of_file(tmp_path):
 @pytest.mark.parametrize(
     "content, message",
     [
-        ("[]", "JSON list"),
+        ("[]", "no cameras"),
         ("{", "not valid JSON"),
         ("[" * 100000, "not valid JSON"),
         ("{}", "none of cameras"),

@@ -1,0 +1,173 @@
+"""Trained scenes as Gaussians whose harmonics mean what a file can say, and back.
+
+A response and the fusion of brackets act on the light of a direction, and viewers blend what a photo shows instead of
+light: no harmonics are exactly the scene's. They are fitted for each Gaussian by itself (bake), then all together to
+the scene's own pictures (refine).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..response import response_by_name
+from ..scene import Camera
+from ..splats.arrays import HARMONIC_0, GaussianArrays, evaluate_colors, harmonic_basis
+from .gaussians import Gaussians
+from .radiance_field import CameraTensors, RadianceField
+
+# Radiance below this counts as this: its logarithm must be finite.
+DARKEST = 1e-12
+STEPS = 150
+RATES = {"harmonics_dc": 0.03, "harmonics_rest": 0.01, "opacity_logits": 0.3}
+# For a fit: more than three directions for each of the 16 coefficients of degree 3, and the sphere's whole weight
+# against 1 for all the cameras together; more cameras than these only cost time.
+_SPHERE_DIRECTIONS, _SPHERE_WEIGHT, _MAX_CAMERAS = 64, 0.05, 48
+_CHUNK = 4096
+
+Colors = Callable[[np.ndarray], np.ndarray]
+
+
+def field_of(gaussians: GaussianArrays) -> RadianceField:
+    """The field that a file of Gaussians is; its response is sRGB."""
+    harmonics = gaussians.harmonics.astype(np.float64)
+    if gaussians.color_model == "log":
+        harmonics[:, 0] += np.log(gaussians.base_time) / HARMONIC_0
+    elif gaussians.color_model == "linear":
+        harmonics *= gaussians.base_time
+    harmonics = torch.from_numpy(harmonics.astype(np.float32))
+    given = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits)
+    tensors = [torch.from_numpy(np.array(values, np.float32)) for values in given]
+    made = Gaussians(*tensors, harmonics[:, :1], harmonics[:, 1:])  # pyright: ignore[reportCallIssue]
+    options = {"base_time": gaussians.base_time, "radiance": gaussians.color_model}
+    return RadianceField(made, response_by_name("srgb"), **options).requires_grad_(False)
+
+
+def gaussians_of(
+    field: RadianceField, color_model: str, seen_from: np.ndarray, exposure_time: float | None = None
+) -> GaussianArrays:
+    """A field's Gaussians in the colors of a file.
+
+    color_model: "log" or "linear" for scene-linear radiance, "display" for what the field's response makes of it at
+    exposure_time: seconds, by default the base time. seen_from: [C, 3] where the scene was photographed from.
+
+    Exact where the field's own harmonics mean that; else fitted for each Gaussian (see bake).
+    """
+    stored, to_radiance = _stored(field)
+    time = exposure_time or field.base_time
+    if color_model == "display":
+        if stored.color_model == "display" and time == field.base_time:
+            return stored
+        radiance = to_radiance or (lambda exposure: exposure / field.base_time)
+        return bake(stored, lambda colors: field.response.encode(radiance(colors) * time), "display", seen_from)
+    if to_radiance is None and color_model == stored.color_model:
+        harmonics = stored.harmonics.astype(np.float64)
+        if color_model == "linear":
+            return stored.with_colors(harmonics / field.base_time, "linear")
+        harmonics[:, 0] -= np.log(field.base_time) / HARMONIC_0
+        return stored.with_colors(harmonics, "log")
+    radiance = to_radiance or (lambda exposure: exposure / field.base_time)
+    if color_model == "linear":
+        return bake(stored, radiance, "linear", seen_from)
+    return bake(stored, lambda colors: np.log(np.maximum(radiance(colors), DARKEST)), "log", seen_from)
+
+
+def _stored(field: RadianceField) -> tuple[GaussianArrays, Colors | None]:
+    """The Gaussians in the field's own colors, and how these become radiance; None where they are exposures."""
+    tensors = {name: value.cpu().numpy() for name, value in field.gaussians.tensors().items()}
+    harmonics = np.concatenate([tensors.pop("harmonics_dc"), tensors.pop("harmonics_rest")], axis=1)
+    name = field.color_model.name
+    gaussians = GaussianArrays(**tensors, harmonics=harmonics, color_model=name, base_time=field.base_time)
+    if field.color_model.encoded:
+        return gaussians, lambda encoded: field.response.decode(np.clip(encoded, 0, 1)) / field.base_time
+    return gaussians, None if field.fusion is None else lambda exposure: _fuse(field, exposure)
+
+
+@torch.no_grad()
+def _fuse(field: RadianceField, exposure: np.ndarray) -> np.ndarray:
+    """[N, D, 3] radiance of [N, D, 3] exposures at the base time."""
+    assert field.fusion is not None
+    logs = torch.from_numpy(np.log(np.maximum(exposure, DARKEST)).reshape(-1, 3).astype(np.float32))
+    fused = field.fusion(logs.to(field.gaussians.means.device))
+    return fused.cpu().numpy().reshape(exposure.shape).astype(np.float64)
+
+
+def sphere_directions(count: int = _SPHERE_DIRECTIONS) -> np.ndarray:
+    """[count, 3] unit vectors, evenly over the sphere (a Fibonacci lattice)."""
+    index = np.arange(count) + 0.5
+    z = 1 - 2 * index / count
+    azimuth, ring = np.pi * (1 + np.sqrt(5)) * index, np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
+
+
+def bake(gaussians: GaussianArrays, change: Colors, color_model: str, camera_positions: np.ndarray) -> GaussianArrays:
+    """The same Gaussians with harmonics of the same degree fitted to changed colors by least squares.
+
+    Directions in which a Gaussian was photographed count most, since elsewhere its harmonics were never held to
+    anything; an even cover of the sphere keeps the fit bounded there.
+
+    change: [N, D, 3] colors of the present model -> [N, D, 3] of color_model. camera_positions: [C, 3] from where the
+    scene was photographed; with none, all directions weigh alike.
+    """
+    count = min(len(camera_positions), _MAX_CAMERAS)
+    cameras = camera_positions[np.linspace(0, len(camera_positions) - 1, count).round().astype(int)]
+    sphere = sphere_directions()
+    weights = np.repeat([_SPHERE_WEIGHT / len(sphere), 1 / max(count, 1)], [len(sphere), count])
+    offset = 0.5 if color_model == "display" else 0.0
+    fitted = np.empty_like(gaussians.harmonics)
+    for start in range(0, len(gaussians.means), _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        part = replace(gaussians, means=gaussians.means[rows], harmonics=gaussians.harmonics[rows])
+        seen = part.means[:, None].astype(np.float64) - cameras
+        seen /= np.maximum(np.linalg.norm(seen, axis=2, keepdims=True), 1e-12)
+        directions = np.concatenate([np.broadcast_to(sphere, (len(seen), *sphere.shape)), seen], axis=1)
+        wanted = change(evaluate_colors(part, directions)) - offset
+        basis = harmonic_basis(directions, gaussians.degree)
+        weighted = (basis * weights[:, None]).swapaxes(1, 2)
+        fitted[rows] = np.linalg.solve(weighted @ basis, weighted @ wanted)
+    return gaussians.with_colors(fitted, color_model)
+
+
+def refine(
+    gaussians: GaussianArrays, picture: Callable[[Camera], Tensor], cameras: Sequence[Camera], *, steps: int = STEPS
+) -> GaussianArrays:
+    """Gaussians of display colors whose harmonics and opacities are fitted to pictures by Adam; shapes stay.
+
+    picture: the encoded picture [H, W, 3] in [0, 1] that a camera is to see. cameras: visited in an order of a fixed
+    seed, each as often as the others.
+    """
+    random = np.random.default_rng(0)
+    order = [int(i) for _ in range(-(-steps // max(len(cameras), 1))) for i in random.permutation(len(cameras))][:steps]
+    if not order:
+        return gaussians
+    wanted = {index: picture(cameras[index]) for index in sorted(set(order))}
+    device = next(iter(wanted.values())).device
+    field = field_of(gaussians).to(device)
+    changed = {name: getattr(field.gaussians, name).requires_grad_() for name in RATES}
+    optimizer = torch.optim.Adam([{"params": [value], "lr": RATES[name]} for name, value in changed.items()], eps=1e-15)
+    fading = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, len(order))
+    for index in order:
+        shown = field.photograph(CameraTensors.of(cameras[index], device), field.base_time).encoded
+        assert shown is not None
+        optimizer.zero_grad()
+        (shown.clamp(0, 1) - wanted[index]).square().mean().backward()
+        optimizer.step()
+        fading.step()
+    return _stored(field)[0]
+
+
+@torch.no_grad()
+def agreement(
+    gaussians: GaussianArrays, picture: Callable[[Camera], Tensor], cameras: Sequence[Camera], time: float
+) -> float:
+    """dB, at most 120: the PSNR of pictures of Gaussians, encoded by sRGB at an exposure time, against those of
+    picture(), over all pixels of some cameras."""
+    field, errors = field_of(gaussians), []
+    for camera in cameras:
+        wanted = picture(camera)
+        shown = field.to(wanted.device).render_ldr(camera, time)
+        errors.append(float((shown - wanted).square().mean()))
+    return -10 * math.log10(max(float(np.mean(errors)), 1e-12))

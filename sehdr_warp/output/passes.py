@@ -1,0 +1,92 @@
+"""Data passes of a view: depth, position, normals, coverage, confidence, each a part of its own, tagged as data."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from sehdr_warp.errors import SehdrError, did_you_mean
+from sehdr_warp.scene import Camera
+
+from .exr import Part
+from .images import as_array
+
+Channels = Mapping[str, np.ndarray]
+
+
+def _depth(run, rendered, camera: Camera) -> Channels:
+    """Z along the camera's axis, and the distance from the camera; 0 where nothing is."""
+    depth = as_array(rendered.depth)
+    return {"Z": depth, "distance.Z": depth * np.linalg.norm(_rays(camera), axis=2)}
+
+
+def _position(run, rendered, camera: Camera) -> Channels:
+    points = _points(rendered, camera)
+    return {f"position.{axis}": points[..., i] for i, axis in enumerate("XYZ")}
+
+
+def _normals(run, rendered, camera: Camera) -> Channels:
+    """Of the surface that depth makes, towards the camera, in world axes; 0 where nothing is and at the border."""
+    points = _points(rendered, camera)
+    down, right = (np.gradient(points, axis=axis) if points.shape[axis] > 1 else 0 * points for axis in (0, 1))
+    normal = np.cross(down, right)
+    normal *= np.where((normal * (camera.position - points)).sum(2, keepdims=True) < 0, -1, 1)
+    length = np.linalg.norm(normal, axis=2, keepdims=True)
+    # A difference with a pixel where nothing is says nothing.
+    seen = as_array(rendered.depth) > 0
+    whole = np.pad(seen, 1)
+    whole = whole[1:-1, 1:-1] & whole[:-2, 1:-1] & whole[2:, 1:-1] & whole[1:-1, :-2] & whole[1:-1, 2:]
+    normal = np.where(whole[..., None] & (length > 0), normal / np.where(length > 0, length, 1), 0)
+    return {f"N.{axis}": normal[..., i] for i, axis in enumerate("XYZ")}
+
+
+def _alpha(run, rendered, camera: Camera) -> Channels:
+    return {"A": as_array(rendered.alpha)}
+
+
+def _confidence(run, rendered, camera: Camera) -> Channels:
+    measured = run.render_confidence(camera)
+    if measured is None:
+        raise SehdrError(f"{run.path}: its confidence was not measured; `sehdr-warp report` does, from the photos")
+    return {"confidence": as_array(measured)}
+
+
+PASSES: Mapping[str, Callable[[Any, Any, Camera], Channels]] = {
+    "depth": _depth,
+    "position": _position,
+    "normals": _normals,
+    "alpha": _alpha,
+    "confidence": _confidence,
+}
+
+
+def read_passes(names: str | Sequence[str]) -> tuple[str, ...]:
+    """Names of PASSES, given as a sequence or separated by commas; SehdrError for an unknown or repeated one."""
+    listed = [name.strip() for name in names.split(",")] if isinstance(names, str) else list(names)
+    for name in listed:
+        if name not in PASSES:
+            known = ", ".join(PASSES)
+            raise SehdrError(f"pass {name!r} is not one of {known}{did_you_mean(name, PASSES)}")
+    if len(set(listed)) < len(listed):
+        raise SehdrError(f"passes {', '.join(listed)}: one is named twice; leave it out")
+    return tuple(listed)
+
+
+def data_parts(names: Sequence[str], run: Any, rendered: Any, camera: Camera, header: Mapping[str, Any]) -> list[Part]:
+    """The parts of a file that hold passes of a rendered view; header: of its picture."""
+    colors = ("chromaticities", "sehdr:colorSpace", "colorInteropID")
+    header = {key: value for key, value in header.items() if key not in colors} | {"colorInteropID": "data"}
+    return [Part(PASSES[name](run, rendered, camera), header, name) for name in names]
+
+
+def _rays(camera: Camera) -> np.ndarray:
+    """[H, W, 3] in the camera's axes, 1 along its own."""
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    return np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=2)
+
+
+def _points(rendered, camera: Camera) -> np.ndarray:
+    """[H, W, 3] world coordinates of what is seen; 0 where nothing is."""
+    depth = as_array(rendered.depth)[..., None]
+    points = (_rays(camera) * depth) @ camera.world_to_camera[:3, :3] + camera.position
+    return np.where(depth > 0, points, 0)

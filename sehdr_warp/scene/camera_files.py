@@ -1,0 +1,179 @@
+"""Cameras of one's own: JSON of this package, nerfstudio and 3DGS, transforms.json, COLMAP models, OpenUSD cameras."""
+
+import json
+import logging
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..files import read_json, read_text
+from ..splats.usd import open_stage, pxr
+from .camera import Camera
+from .capture import pose_from_camera_to_world
+from .colmap_model import find_model, read_model
+from .images import MAX_PIXELS
+from .names import natural_key
+from .read_transforms import frame_lens, frame_pose, frames_of, pose_from_opengl
+
+log = logging.getLogger(__name__)
+USD_SUFFIXES = (".usda", ".usdc", ".usd", ".usdz")
+USD_SIZE = ("sehdr:width", "sehdr:height")
+"""Attributes of a UsdGeomCamera that state its picture's size in pixels, which USD itself does not."""
+_USD_WIDTH = 1920
+_DATAPARSER = "dataparser_transforms.json"
+
+
+def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
+    """Named cameras from a file, in its order, without distortion.
+
+    Accepted: {"cameras": [{"name": ..., **Camera.to_dict()}, ...]}, nerfstudio's camera_path.json, transforms.json, the
+    cameras.json of 3DGS's reference release, a COLMAP model's folder, and the cameras of an OpenUSD stage, one for each
+    frame if they move. nerfstudio's paths lie in the space of its dataparser: a dataparser_transforms.json beside the
+    file, which it writes with a training, leads back to the photos' own.
+
+    Raises InputError where the file is damaged, a pose or size cannot be, or two cameras share a name.
+    """
+    path = Path(path)
+    if path.is_dir():
+        cameras = _of_colmap(path)
+    elif path.suffix.lower() in USD_SUFFIXES:
+        cameras = _of_usd(path)
+    else:
+        cameras = _of_json(path)
+    if not cameras:
+        raise InputError(path, "lists no cameras", "add at least one")
+    names = [name.lower() for name, _ in cameras]
+    if len(set(names)) < len(names):
+        twice = min((name for name in names if names.count(name) > 1), key=natural_key)
+        raise InputError(path, f"camera name {twice!r} is used twice", "give every camera its own name")
+    for i, (name, camera) in enumerate(cameras):
+        if not name or any(letter in name for letter in "/\\\0") or name in (".", "..") or len(name) > 200:
+            raise InputError(path, f"camera name {name!r:.60} cannot name a file", "use letters, digits, '_' and '-'")
+        if camera.width * camera.height > MAX_PIXELS:
+            size = f"{camera.width} x {camera.height}"
+            raise InputError(path, f"camera {i} is {size}", f"use sizes of 1 to {MAX_PIXELS} pixels")
+    return cameras
+
+
+def _of_json(path: Path) -> list[tuple[str, Camera]]:
+    if read_text(path).lstrip().startswith("["):
+        return _listed(path, _list(path), lambda entry, _: (str(entry["img_name"]), _inria(entry, path)))
+    values = read_json(path)
+    if isinstance(values.get("cameras"), list):
+        return _listed(path, values["cameras"], lambda e, i: (str(e.get("name", f"{i:04d}")), Camera.from_dict(e)))
+    if isinstance(values.get("camera_path"), list):
+        back = _dataparser(path)
+        return _listed(path, values["camera_path"], lambda e, i: (f"{i:04d}", _nerfstudio(e, i, values, path, back)))
+    if "frames" in values:
+        return [
+            (Path(name).stem, frame_lens(values, frame, None, path).pinhole(frame_pose(frame, path, name)))
+            for name, frame in frames_of(values, path)
+        ]
+    raise InputError(path, "has none of cameras, camera_path and frames", "export cameras as the manual describes")
+
+
+def _listed(path: Path, entries: list, read) -> list[tuple[str, Camera]]:
+    """read(entry, index) of each, with an error that names the camera."""
+    cameras = []
+    for i, entry in enumerate(entries):
+        try:
+            cameras.append(read(entry, i))
+        except KeyError as error:
+            raise InputError(path, f"camera {i} has no {error.args[0]}", "add the field") from None
+        except (ValueError, TypeError, AttributeError, OverflowError, ZeroDivisionError) as error:
+            raise InputError(path, f"camera {i} cannot be used ({error!s:.120})", "correct the camera") from None
+    return cameras
+
+
+def _list(path: Path) -> list[Any]:
+    try:
+        return json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, f"is not valid JSON ({error})", "export the file again") from None
+
+
+def _inria(entry: dict, path: Path) -> Camera:
+    """position and rotation (its rows) of camera to world in OpenCV axes, fx and fy in pixels, axis in the middle."""
+    width, height = int(entry["width"]), int(entry["height"])
+    matrix = np.c_[np.array(entry["rotation"], np.float64).reshape(3, 3), np.array(entry["position"], np.float64)]
+    pose = pose_from_camera_to_world(matrix, path, str(entry["img_name"]))
+    return Camera(width, height, float(entry["fx"]), float(entry["fy"]), width / 2, height / 2, pose)
+
+
+def _nerfstudio(entry, index: int, values: dict, path: Path, back: np.ndarray | None) -> Camera:
+    """An entry of camera_path.json: camera_to_world (OpenGL axes, 16 numbers by rows) and fov (vertical, degrees)."""
+    width, height, fov = int(values["render_width"]), int(values["render_height"]), float(entry["fov"])
+    matrix = np.array(entry["camera_to_world"], dtype=np.float64).reshape(4, 4)
+    if not 1e-6 <= fov < 180:
+        raise InputError(path, f"camera {index} has fov {fov}", "use degrees between 0 and 180")
+    if back is not None:
+        matrix = back @ matrix
+        matrix[:3, :3] /= np.cbrt(np.linalg.det(matrix[:3, :3]))
+    focal = 0.5 * height / math.tan(math.radians(fov) / 2)
+    pose = pose_from_opengl(matrix, path, f"camera {index}")
+    return Camera(width, height, focal, focal, width / 2, height / 2, pose)
+
+
+def _dataparser(path: Path) -> np.ndarray | None:
+    """[4, 4] from nerfstudio's space to the photos', by the file beside a camera path; None without one."""
+    beside = path.with_name(_DATAPARSER)
+    if not beside.is_file():
+        log.warning("%s: no %s beside it; its cameras are taken as they stand", path, _DATAPARSER)
+        return None
+    values = read_json(beside)
+    try:
+        matrix, scale = np.array(values["transform"], np.float64).reshape(3, 4), float(values["scale"])
+        return np.linalg.inv(np.diag([scale, scale, scale, 1.0]) @ np.r_[matrix, [[0, 0, 0, 1]]])
+    except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
+        problem = f"has no usable transform and scale ({error!r:.80})"
+        raise InputError(beside, problem, "copy nerfstudio's file of the training") from None
+
+
+def _of_colmap(folder: Path) -> list[tuple[str, Camera]]:
+    source = find_model(folder)
+    if source is None:
+        raise InputError(folder, "holds no COLMAP model", "give cameras.bin or .txt and its kin, or a camera file")
+    images = sorted(read_model(source).images, key=lambda image: natural_key(image.name))
+    return [(Path(image.name).stem, image.lens.pinhole(image.world_to_camera)) for image in images]
+
+
+def _of_usd(path: Path) -> list[tuple[str, Camera]]:
+    """Every UsdGeomCamera, at each frame of the stage where it moves; of 1920 pixels' width where it states no size."""
+    Usd, UsdGeom = pxr("Usd"), pxr("UsdGeom")
+    stage = open_stage(path)
+    cameras = []
+    for prim in stage.Traverse():
+        if not prim.IsA(UsdGeom.Camera):
+            continue
+        camera, frames = UsdGeom.Camera(prim), [Usd.TimeCode.Default()]
+        if camera.TransformMightBeTimeVarying():
+            first, last = int(stage.GetStartTimeCode()), int(stage.GetEndTimeCode())
+            frames = [Usd.TimeCode(frame) for frame in range(first, last + 1)]
+        name, moving = prim.GetName(), len(frames) > 1
+        for frame in frames:
+            label = f"{name}_{int(frame.GetValue()):04d}" if moving else name
+            cameras.append((label, _usd_camera(camera, frame, path)))
+    return cameras
+
+
+def _usd_camera(camera, frame, path: Path) -> Camera:
+    """USD's lens lengths share one unit; its axes are OpenGL's; matrices act on row vectors."""
+    seen, prim = camera.GetCamera(frame), camera.GetPrim()
+    aperture, vertical = seen.horizontalAperture, seen.verticalAperture
+    stated = [prim.GetAttribute(name).Get() if prim.HasAttribute(name) else None for name in USD_SIZE]
+    width = int(stated[0] or _USD_WIDTH)
+    height = int(stated[1] or round(width * vertical / aperture))
+    fx, fy = seen.focalLength / aperture * width, seen.focalLength / vertical * height
+    cx = width / 2 - seen.horizontalApertureOffset / aperture * width
+    cy = height / 2 + seen.verticalApertureOffset / vertical * height
+    matrix = np.array(seen.transform, np.float64).T
+    size = np.linalg.norm(matrix[:3, :3], axis=0)
+    matrix[:3, :3] /= np.where(size > 0, size, 1)
+    pose = pose_from_opengl(matrix, path, prim.GetName())
+    try:
+        return Camera(width, height, fx, fy, cx, cy, pose)
+    except ValueError as error:
+        raise InputError(path, f"camera {prim.GetPath()} cannot be used ({error})", "correct the camera") from None

@@ -1,0 +1,75 @@
+"""Files of Gaussians, and Gaussians as plain arrays: PLY of 3D Gaussian Splatting, OpenUSD, glTF. The suffix decides.
+
+NumPy alone is loaded here; USD needs the extra `usd`.
+"""
+
+from pathlib import Path
+
+from ..errors import InputError
+from .arrays import GaussianArrays
+from .gltf import read_glb, write_glb
+from .ply import read_ply, write_ply
+from .usd import read_usd, write_usd
+
+USD_SUFFIXES = (".usda", ".usdc", ".usd", ".usdz")
+SUFFIXES = (".ply", *USD_SUFFIXES, ".glb")
+"""Of the files that are read and written."""
+_OTHER = {
+    ".splat": "holds 8 bits and no harmonics",
+    ".ksplat": "holds a viewer's own compression",
+    ".spz": "ends at 1.44 times white",
+    ".sog": "holds a viewer's own compression",
+    ".gltf": "is glTF in pieces",
+}
+
+
+def check_suffix(path: Path | str) -> str:
+    """The suffix of a splat file, in lower case; InputError for one that is not read and written."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        problem = f"is no splat file: {suffix or 'no suffix'} {_OTHER.get(suffix, 'is not known')}"
+        raise InputError(path, problem, f"choose one of {' '.join(SUFFIXES)}")
+    return suffix
+
+
+def color_model_of(path: Path | str) -> str | None:
+    """The one color model that a file of this suffix can hold; None where it can hold any (PLY)."""
+    suffix = check_suffix(path)
+    return {".ply": None, ".glb": "display"}.get(suffix, "linear")
+
+
+def read_gaussians(path: Path | str) -> GaussianArrays:
+    """The Gaussians in a file of one of SUFFIXES.
+
+    Raises InputError where it is missing, damaged, of another kind or holds no Gaussian. Gaussians with a value that is
+    not finite are left out, with a warning.
+    """
+    suffix = check_suffix(path)
+    read = {".ply": read_ply, ".glb": read_glb}.get(suffix, read_usd)
+    return read(Path(path)).checked(path)
+
+
+def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: bool = False) -> None:
+    """Writes a file of one of SUFFIXES.
+
+    Raises InputError where a value is NaN or infinite (with field and index), the file exists (unless overwrite), or
+    cannot hold these colors (see color_model_of); SehdrError where it cannot be written.
+    """
+    held, suffix = color_model_of(path), check_suffix(path)
+    if held not in (None, gaussians.color_model):
+        problem = f"holds {held} colors, and these are {gaussians.color_model}"
+        raise InputError(path, problem, "choose another suffix, or let export change the colors")
+    gaussians.require_finite(path)
+    write = {".ply": write_ply, ".glb": write_glb}.get(suffix, write_usd)
+    write(Path(path), gaussians, overwrite)
+
+
+__all__ = [
+    "SUFFIXES",
+    "USD_SUFFIXES",
+    "GaussianArrays",
+    "check_suffix",
+    "color_model_of",
+    "read_gaussians",
+    "write_gaussians",
+]

@@ -1,0 +1,124 @@
+"""Gaussians as plain arrays, and their harmonics as functions of a direction."""
+
+import logging
+import math
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+
+log = logging.getLogger(__name__)
+HARMONIC_0 = 0.5 / math.sqrt(math.pi)
+"""The harmonic of degree 0."""
+MAX_DEGREE = 3
+_NOT_FINITE = "it is not written; train again from an earlier checkpoint or with another seed"
+# A logit beyond this is an opacity of 0 or 1 in float32.
+_MOST_LOGIT = 20.0
+
+
+@dataclass(frozen=True)
+class GaussianArrays:
+    """N Gaussians as NumPy arrays, float32.
+
+    means [N, 3] world; log_scales [N, 3], natural logarithm of the standard deviations; quaternions [N, 4] (w x y z);
+    opacity_logits [N]; harmonics [N, (degree + 1)^2, 3], degree 0 to 3. color_model: what their sum over a viewing
+    direction means, per channel: "display": sRGB-encoded color max(sum + 0.5, 0), as every 3DGS viewer takes it; "log":
+    scene-linear radiance exp(sum); "linear": max(sum, 0). base_time: seconds at which the scene was photographed.
+    """
+
+    means: np.ndarray
+    log_scales: np.ndarray
+    quaternions: np.ndarray
+    opacity_logits: np.ndarray
+    harmonics: np.ndarray
+    color_model: str
+    base_time: float
+
+    @property
+    def count(self) -> int:
+        return len(self.means)
+
+    @property
+    def degree(self) -> int:
+        return math.isqrt(self.harmonics.shape[1]) - 1
+
+    @property
+    def opacities(self) -> np.ndarray:
+        """[N] in (0, 1)."""
+        return (1 / (1 + np.exp(-self.opacity_logits.astype(np.float64)))).astype(np.float32)
+
+    @property
+    def unit_quaternions(self) -> np.ndarray:
+        """[N, 4] of length 1; the identity where they are zero."""
+        length = np.linalg.norm(self.quaternions, axis=1, keepdims=True)
+        return np.where(length > 0, self.quaternions / np.where(length > 0, length, 1), [1, 0, 0, 0]).astype(np.float32)
+
+    def with_colors(self, harmonics: np.ndarray, color_model: str) -> "GaussianArrays":
+        return replace(self, harmonics=np.ascontiguousarray(harmonics, np.float32), color_model=color_model)
+
+    def padded(self, degree: int) -> "GaussianArrays":
+        """With harmonics up to `degree`, zero beyond their own; never fewer."""
+        missing = max((degree + 1) ** 2 - self.harmonics.shape[1], 0)
+        return replace(self, harmonics=np.pad(self.harmonics, ((0, 0), (0, missing), (0, 0))))
+
+    def rows(self, index: np.ndarray) -> "GaussianArrays":
+        """Those at an index or mask [N]."""
+        return replace(self, **{name: getattr(self, name)[index] for name in _ARRAYS})
+
+    def checked(self, path: Path | str) -> "GaussianArrays":
+        """Without Gaussians that are not finite; InputError where none is left."""
+        logits = np.clip(self.opacity_logits, -_MOST_LOGIT, _MOST_LOGIT)
+        given = replace(self, opacity_logits=logits)
+        finite = np.all([np.isfinite(getattr(given, name)).reshape(self.count, -1).all(1) for name in _ARRAYS], axis=0)
+        if not finite.any():
+            found = "all of its Gaussians have values that are not finite" if self.count else "holds no Gaussian"
+            raise InputError(path, found, "export it again")
+        if finite.all():
+            return given
+        log.warning("%s: %d of %d Gaussians are not finite and were left out", path, (~finite).sum(), self.count)
+        return given.rows(finite)
+
+    def require_finite(self, path: Path | str) -> None:
+        """Raises InputError with field, count and the first index where a value is NaN or infinite."""
+        for name in _ARRAYS:
+            bad = ~np.isfinite(getattr(self, name)).reshape(self.count, -1).all(1)
+            if bad.any():
+                fault = f"{name} of {int(bad.sum())} Gaussians are not finite, the first at {int(np.argmax(bad))}"
+                raise InputError(path, fault, _NOT_FINITE)
+
+
+_ARRAYS = tuple(field.name for field in fields(GaussianArrays))[:5]
+
+
+def degree_of(coefficients: float, path: Path) -> int:
+    """The degree of so many coefficients for each channel; InputError for a number that no degree has."""
+    degree = round(math.sqrt(coefficients)) - 1
+    if (degree + 1) ** 2 != coefficients or not 0 <= degree <= MAX_DEGREE:
+        problem = f"has {coefficients:.4g} harmonics for each channel, not 1, 4, 9 or 16"
+        raise InputError(path, problem, "export it with degree 0 to 3")
+    return degree
+
+
+def harmonic_basis(directions: np.ndarray, degree: int) -> np.ndarray:
+    """[..., (degree + 1)^2] float64 real spherical harmonics of unit directions [..., 3], orthonormal over the sphere,
+    with the Condon-Shortley phase and in the order of 3D Gaussian Splatting: l = 0, 1, ..., and m = -l ... l."""
+    from scipy.special import sph_harm_y
+
+    x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
+    polar, azimuth = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x)
+    basis = []
+    for order in range(degree + 1):
+        for m in range(-order, order + 1):
+            value = sph_harm_y(order, abs(m), polar, azimuth)
+            basis.append(value.real if m == 0 else np.sqrt(2) * (value.real if m > 0 else value.imag))
+    return np.stack(basis, axis=-1)
+
+
+def evaluate_colors(gaussians: GaussianArrays, directions: np.ndarray) -> np.ndarray:
+    """[N, D, 3] colors in the model's own meaning for directions [D, 3] or [N, D, 3]."""
+    value = harmonic_basis(directions, gaussians.degree) @ gaussians.harmonics.astype(np.float64)
+    if gaussians.color_model == "log":
+        return np.exp(np.clip(value, -80, 80))
+    return np.maximum(value + (0.5 if gaussians.color_model == "display" else 0.0), 0)

@@ -1,0 +1,139 @@
+"""Binary glTF with KHR_gaussian_splatting: display-referred colors, as its color spaces ask.
+
+Scales are linear, opacities in [0, 1], rotations (x y z w); COLOR_0 is what viewers without the extension show.
+"""
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import __version__
+from ..errors import InputError
+from ..files import atomic_path, read_bytes
+from .arrays import HARMONIC_0, GaussianArrays, degree_of
+
+EXTENSION = "KHR_gaussian_splatting"
+_SPACE = "srgb_rec709_display"
+_MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
+_FLOAT, _POINTS = 5126, 0
+# Components, and for each their type and the value of 1 where they are normalized integers.
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_TYPES = {5120: ("<i1", 127), 5121: ("<u1", 255), 5122: ("<i2", 32767), 5123: ("<u2", 65535), _FLOAT: ("<f4", 1)}
+_DAMAGED = "export it again"
+
+
+def write_glb(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
+    color = np.clip(gaussians.harmonics[:, 0] * HARMONIC_0 + 0.5, 0, 1)
+    attributes = {
+        "POSITION": gaussians.means,
+        "COLOR_0": np.concatenate([color, gaussians.opacities[:, None]], axis=1),
+        f"{EXTENSION}:ROTATION": np.roll(gaussians.unit_quaternions, -1, axis=1),
+        f"{EXTENSION}:SCALE": np.exp(gaussians.log_scales),
+        f"{EXTENSION}:OPACITY": gaussians.opacities[:, None],
+    }
+    attributes |= {name: gaussians.harmonics[:, i] for i, name in enumerate(_harmonic_names(gaussians.degree))}
+    blobs = [np.ascontiguousarray(values, "<f4").tobytes() for values in attributes.values()]
+    views, accessors, offset = [], [], 0
+    for index, (values, blob) in enumerate(zip(attributes.values(), blobs, strict=True)):
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(blob)})
+        kind = next(name for name, width in _WIDTHS.items() if width == values.shape[1])
+        accessors.append({"bufferView": index, "componentType": _FLOAT, "count": len(values), "type": kind})
+        offset += len(blob)
+    accessors[0] |= {name: getattr(gaussians.means, name)(axis=0).tolist() for name in ("min", "max")}
+    extension = {"kernel": "ellipse", "colorSpace": _SPACE}
+    extension |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
+    primitive = {
+        "mode": _POINTS,
+        "attributes": {name: index for index, name in enumerate(attributes)},
+        "extensions": {EXTENSION: extension},
+    }
+    described = {
+        "asset": {"version": "2.0", "generator": f"sehdr-warp {__version__}"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive], "extras": {"base_exposure_time": gaussians.base_time}}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    }
+    text = json.dumps(described, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    length = 12 + 8 + len(text) + 8 + offset
+    with atomic_path(path, overwrite) as temporary, temporary.open("wb") as file:
+        file.write(struct.pack("<5I", _MAGIC, 2, length, len(text), _JSON) + text + struct.pack("<2I", offset, _BIN))
+        file.writelines(blobs)
+
+
+def read_glb(path: Path) -> GaussianArrays:
+    """The one primitive with the extension, of display colors in sRGB."""
+    described, binary = _chunks(path)
+    try:
+        meshes = [(mesh, each) for mesh in described["meshes"] for each in mesh["primitives"]]
+        found = [(mesh, each) for mesh, each in meshes if EXTENSION in each.get("extensions", {})]
+        if len(found) != 1:
+            problem = f"has {len(found)} primitives with {EXTENSION}, not one"
+            raise InputError(path, problem, "export one scene of Gaussians")
+        mesh, primitive = found[0]
+        attributes = primitive["attributes"]
+        stated = primitive["extensions"][EXTENSION]
+        for key, known in (("colorSpace", _SPACE), ("kernel", "ellipse")):
+            if stated.get(key) != known:
+                problem = f"its {key} is {stated.get(key)!r:.60}, not {known}"
+                raise InputError(path, problem, "export it as display colors in sRGB, of ellipses")
+        if any({"matrix", "translation", "rotation", "scale"} & set(node) for node in described.get("nodes", [])):
+            raise InputError(path, "moves its Gaussians by a node's transform", "bake the transform into the Gaussians")
+
+        def values(name: str, columns: int) -> np.ndarray:
+            if name not in attributes:
+                raise InputError(path, f"has no attribute {name}", "export it by the ratified extension")
+            return _accessor(described, binary, attributes[name], columns)
+
+        kept = (name for name in attributes if name.startswith(f"{EXTENSION}:SH_DEGREE_"))
+        degree = degree_of(sum(1 for _ in kept), path)
+        means, scales = values("POSITION", 3), values(f"{EXTENSION}:SCALE", 3)
+        quaternions = np.roll(values(f"{EXTENSION}:ROTATION", 4), 1, axis=1)
+        opacities = values(f"{EXTENSION}:OPACITY", 1)[:, 0]
+        harmonics = np.stack([values(name, 3) for name in _harmonic_names(degree)], axis=1)
+        base_time = float(mesh.get("extras", {}).get("base_exposure_time", 1.0))
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
+        raise InputError(path, f"is damaged glTF ({error!r:.120})", _DAMAGED) from None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_scales, logits = np.log(scales), np.log(opacities) - np.log1p(-opacities)
+    return GaussianArrays(means, log_scales, quaternions, logits, harmonics, "display", base_time)
+
+
+def _harmonic_names(degree: int) -> list[str]:
+    return [f"{EXTENSION}:SH_DEGREE_{l}_COEF_{n}" for l in range(degree + 1) for n in range(2 * l + 1)]  # noqa: E741
+
+
+def _chunks(path: Path) -> tuple[dict[str, Any], bytes]:
+    """The description and the binary chunk."""
+    data = read_bytes(path)
+    if len(data) < 20 or struct.unpack_from("<2I", data) != (_MAGIC, 2):
+        raise InputError(path, "is not binary glTF 2.0", _DAMAGED)
+    length, kind = struct.unpack_from("<2I", data, 12)
+    try:
+        described = json.loads(data[20 : 20 + length])
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, f"its description is not JSON ({error!s:.80})", _DAMAGED) from None
+    if kind != _JSON or not isinstance(described, dict):
+        raise InputError(path, "its first chunk is no description", _DAMAGED)
+    return described, data[28 + length :]
+
+
+def _accessor(described: dict, binary: bytes, index: int, columns: int) -> np.ndarray:
+    """[count, columns] float32; ValueError or KeyError where the file is damaged."""
+    accessor = described["accessors"][index]
+    view = described["bufferViews"][accessor["bufferView"]]
+    kind, one = _TYPES[accessor["componentType"]]
+    if _WIDTHS[accessor["type"]] != columns or (one > 1 and not accessor.get("normalized")):
+        raise ValueError(f"accessor {index} is {accessor['type']}")
+    row = np.dtype(kind).itemsize * columns
+    offset, stride = view.get("byteOffset", 0) + accessor.get("byteOffset", 0), view.get("byteStride", row)
+    stored = np.ndarray((accessor["count"], columns), kind, binary, offset, (stride, row // columns))
+    return np.maximum(stored.astype(np.float32) / one, -np.inf if one == 1 else -1)

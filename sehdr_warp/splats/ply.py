@@ -1,0 +1,118 @@
+"""PLY of 3D Gaussian Splatting (Kerbl et al. 2023, the reference release), little-endian float32.
+
+Attributes: x y z, nx ny nz (zero), f_dc_0..2, f_rest_0..3(K-1)-1 (all coefficients of red, then of green, then of
+blue), opacity (logit), scale_0..2 (logarithm), rot_0..3 (w x y z). The color model and the base exposure time are
+`comment sehdr:...` lines of the header; a file without them holds display colors.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from ..files import atomic_path
+from .arrays import GaussianArrays, degree_of
+
+_DAMAGED = "copy or export the file again"
+_COLOR_MODELS = ("display", "log", "linear")
+_GROUPS = ("x y z", "scale_0 scale_1 scale_2", "rot_0 rot_1 rot_2 rot_3", "opacity", "f_dc_0 f_dc_1 f_dc_2")
+_MOST_HEADER = 1 << 16
+
+
+def write_ply(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
+    from plyfile import PlyData, PlyElement
+
+    rest = gaussians.harmonics[:, 1:].swapaxes(1, 2).reshape(gaussians.count, -1)
+    parts = {
+        "x y z": gaussians.means,
+        "nx ny nz": np.zeros((gaussians.count, 3)),
+        "f_dc_0 f_dc_1 f_dc_2": gaussians.harmonics[:, 0],
+        " ".join(f"f_rest_{i}" for i in range(rest.shape[1])): rest,
+        "opacity": gaussians.opacity_logits[:, None],
+        "scale_0 scale_1 scale_2": gaussians.log_scales,
+        "rot_0 rot_1 rot_2 rot_3": gaussians.quaternions,
+    }
+    columns = [pair for names, values in parts.items() for pair in zip(names.split(), values.T, strict=True)]
+    table = np.empty(gaussians.count, [(name, "<f4") for name, _ in columns])
+    for name, values in columns:
+        table[name] = values
+    facts = {"color_model": gaussians.color_model, "base_exposure_time": repr(gaussians.base_time)}
+    comments = [f"sehdr:{name} {value}" for name, value in facts.items()]
+    with atomic_path(path, overwrite) as temporary, temporary.open("wb") as file:
+        PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=comments).write(file)
+
+
+def read_ply(path: Path) -> GaussianArrays:
+    """Of the reference release, gsplat, nerfstudio and this package; other properties are passed over."""
+    from plyfile import PlyData, PlyParseError
+
+    _check_header(path)
+    try:
+        read = PlyData.read(str(path), mmap="r")
+        vertex = read["vertex"]
+        names = {each.name for each in vertex.properties}
+        missing = [name for group in _GROUPS for name in group.split() if name not in names]
+        if missing:
+            raise InputError(path, _without(missing, names), "export 3D Gaussians as an uncompressed PLY")
+        rest = sorted((n for n in names if re.fullmatch(r"f_rest_\d{1,4}", n)), key=lambda name: int(name[7:]))
+        degree_of(1 + len(rest) / 3, path)
+        groups = (*(group.split() for group in _GROUPS), rest)
+        columns = [_columns([np.asarray(vertex[name], np.float32) for name in group]) for group in groups]
+    except (PlyParseError, KeyError, ValueError, OSError, MemoryError) as error:
+        raise InputError(path, f"cannot be read as PLY ({error!s:.120})", _DAMAGED) from None
+    means, log_scales, quaternions, opacity, constant, rest = columns
+    higher = rest.reshape(len(means), 3, -1).swapaxes(1, 2)
+    harmonics = np.concatenate([constant[:, None], higher], axis=1)
+    return GaussianArrays(means, log_scales, quaternions, opacity[:, 0], harmonics, *_facts(read.comments, path))
+
+
+def _columns(columns: list[np.ndarray]) -> np.ndarray:
+    return np.stack(columns, axis=1) if columns else np.zeros(0, np.float32)
+
+
+def _check_header(path: Path) -> None:
+    """Refuses a file that claims more than it can hold, before anything is read: of a text plyfile would first ask for
+    the memory of all that is claimed."""
+    size = len(read_start := _start(path))
+    header = read_start.partition(b"end_header")[0]
+    if not header.startswith(b"ply") or size == len(header):
+        raise InputError(path, "is not a PLY file", _DAMAGED)
+    claimed = [int(number) for number in re.findall(rb"^element\s+\S+\s+(\d{1,19})\s*$", header, re.MULTILINE)]
+    smallest = len(re.findall(rb"^property\s", header, re.MULTILINE)) if len(claimed) == 1 else 1
+    if sum(claimed) * smallest > path.stat().st_size:
+        raise InputError(
+            path, f"claims {sum(claimed)} elements, more than its {path.stat().st_size} bytes hold", _DAMAGED
+        )
+
+
+def _start(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(_MOST_HEADER)
+    except FileNotFoundError:
+        raise InputError(path, "file not found", "check the name") from None
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror or error})", "check the file and its rights") from None
+
+
+def _without(missing: list[str], names: set[str]) -> str:
+    if "packed_position" in names:
+        return "is a compressed PLY (SuperSplat)"
+    if "red" in names and len(missing) > 6:
+        return "is a point cloud, not Gaussians"
+    return f"has no {', '.join(missing[:4])}"
+
+
+def _facts(comments: list[str], path: Path) -> tuple[str, float]:
+    """The color model and the base exposure time that the header states."""
+    stated = dict(line.removeprefix("sehdr:").split(maxsplit=1) for line in comments if re.match(r"sehdr:\w+ \S", line))
+    color_model = stated.get("color_model", "display")
+    try:
+        base_time = float(stated.get("base_exposure_time", 1.0))
+    except ValueError:
+        base_time = np.nan
+    if color_model not in _COLOR_MODELS or not 0 < base_time < np.inf:
+        problem = f"its header states color model {color_model!r:.40} at {base_time} s"
+        raise InputError(path, problem, f"state one of {', '.join(_COLOR_MODELS)} and a positive time")
+    return color_model, base_time

@@ -1,0 +1,71 @@
+import json
+
+import numpy as np
+import pytest
+
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.field.baking import field_of
+from sehdr_warp.output.export import export
+from sehdr_warp.scene import load_cameras
+from sehdr_warp.splats import read_gaussians, write_gaussians
+from sehdr_warp.training.run import Splats, load_splats
+
+from ..splats.test_splat_files import gaussians
+from .helpers import Entry, camera
+
+
+@pytest.fixture
+def run(tmp_path):
+    cameras = [Entry(str(i), "train", camera(position=(i, 0, -6))) for i in range(3)]
+    return Splats(tmp_path / "run", field_of(gaussians(degree=1)), tuple(cameras))
+
+
+def test_suffix_and_kind_decide(tmp_path, run, logged):
+    for name, kind, color_model in (("a.ply", None, "display"), ("b.ply", "hdr", "log"), ("c.glb", None, "display")):
+        assert export(run, tmp_path / name, kind=kind, degree=3) == tmp_path / name
+        read = read_gaussians(tmp_path / name)
+        assert (read.color_model, read.degree, read.count) == (color_model, 3, 50)
+    assert "b.ply: 50 Gaussians, harmonics of degree 3, scene-linear radiance" in logged
+    assert "kept: 120.0 dB of the scene at 0 EV, 120.0 dB at -4 EV, in 3 views" in logged
+    assert sum(line.startswith("kept:") for line in logged) == 3
+
+
+def test_exposure_of_display_colors(tmp_path, run):
+    export(run, tmp_path / "a.ply")
+    export(run, tmp_path / "b.ply", exposure_time=2.0)
+    shown = [load_splats(tmp_path / name).render_ldr(camera()).mean() for name in ("a.ply", "b.ply")]
+    wanted = [run.render_ldr(camera(), time).mean() for time in (0.5, 2.0)]
+    np.testing.assert_allclose(shown, wanted, rtol=0.05)
+
+
+def test_cameras_beside_are_read_again(tmp_path, run):
+    export(run, tmp_path / "a.ply", kind="hdr", cameras=True)
+    first = json.loads((tmp_path / "cameras.json").read_text())[1]
+    assert set(first) == {"id", "img_name", "width", "height", "position", "rotation", "fy", "fx"}
+    splats = load_splats(tmp_path / "a.ply")
+    for entry, given in zip(splats.cameras, run.cameras, strict=True):
+        np.testing.assert_allclose(entry.camera.world_to_camera, given.camera.world_to_camera, atol=1e-9)
+    assert [name for name, _ in load_cameras(tmp_path / "cameras.json")] == ["0", "1", "2"]
+    with pytest.raises(InputError, match=r"cameras.json: exists already"):
+        export(run, tmp_path / "b.ply", cameras=True)
+    assert not (tmp_path / "b.ply").exists()
+
+
+def test_unusable_requests(tmp_path, run):
+    for name, options, words in (
+        ("a.ply", {"kind": "sdr"}, "'sdr' is not one of ldr, hdr"),
+        ("a.ply", {"exposure_time": 0}, "exposure time 0 is not"),
+        ("a.ply", {"kind": "hdr", "exposure_time": 1}, "has no exposure time"),
+        ("a.ply", {"degree": 4}, "degree 4"),
+        ("a.glb", {"kind": "hdr"}, "knows display colors only"),
+        ("a.usdc", {"kind": "ldr"}, "is tagged as scene-linear"),
+        ("a.splat", {}, "is no splat file"),
+    ):
+        with pytest.raises(SehdrError, match=words):
+            export(run, tmp_path / name, **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_files_hold_one_color_model(tmp_path):
+    with pytest.raises(InputError, match="holds display colors, and these are log"):
+        write_gaussians(tmp_path / "a.glb", gaussians())

@@ -1,0 +1,63 @@
+import json
+
+import numpy as np
+import pytest
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.scene import load_cameras, look_at
+
+POSE = look_at((1.0, 2.0, 3.0), (0.0, 0.5, 0.0))
+
+
+def nerfstudio(folder, world_to_camera):
+    matrix = np.linalg.inv(world_to_camera) @ np.diag([1.0, -1, -1, 1])
+    entry = {"camera_to_world": matrix.ravel().tolist(), "fov": 50, "aspect": 1.5}
+    values = {"render_width": 60, "render_height": 40, "camera_path": [entry]}
+    (folder / "camera_path.json").write_text(json.dumps(values))
+    return load_cameras(folder / "camera_path.json")[0][1]
+
+
+def test_nerfstudio_paths_come_back_from_the_dataparsers_space(tmp_path, logged):
+    np.testing.assert_allclose(nerfstudio(tmp_path, POSE).world_to_camera, POSE, atol=1e-9)
+    assert "no dataparser_transforms.json beside it" in logged[0]
+    # As nerfstudio moves poses: rotated and shifted, then places scaled.
+    turn, scale = look_at((0.3, -1.0, 0.2), (1.0, 0.0, 0.0)), 0.25
+    moved = turn @ np.linalg.inv(POSE)
+    moved[:3, 3] *= scale
+    stated = {"transform": turn[:3].tolist(), "scale": scale}
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(stated))
+    np.testing.assert_allclose(nerfstudio(tmp_path, np.linalg.inv(moved)).world_to_camera, POSE, atol=1e-9)
+    (tmp_path / "dataparser_transforms.json").write_text("{}")
+    with pytest.raises(InputError, match="no usable transform and scale"):
+        nerfstudio(tmp_path, POSE)
+
+
+def test_a_colmap_model_is_a_camera_file(tmp_path):
+    model = tmp_path / "sparse" / "0"
+    model.mkdir(parents=True)
+    (model / "cameras.txt").write_text("1 PINHOLE 64 48 50 51 32 24\n")
+    (model / "images.txt").write_text("1 1 0 0 0 0.5 0 2 1 photo_2.jpg\n\n2 1 0 0 0 0 0 2 1 photo_1.jpg\n\n")
+    named = load_cameras(tmp_path)
+    assert [name for name, _ in named] == ["photo_1", "photo_2"] and named[0][1].fy == 51
+    with pytest.raises(InputError, match="holds no COLMAP model"):
+        load_cameras(model)
+
+
+def test_moving_usd_cameras_give_a_camera_a_frame(tmp_path):
+    Usd, UsdGeom, Gf = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom", "Gf"))
+    stage = Usd.Stage.CreateNew(str(tmp_path / "shot.usda"))
+    stage.SetStartTimeCode(1001)
+    stage.SetEndTimeCode(1003)
+    camera = UsdGeom.Camera.Define(stage, "/shot")
+    camera.CreateHorizontalApertureAttr(24.0)
+    camera.CreateVerticalApertureAttr(13.5)
+    camera.CreateFocalLengthAttr(24.0)
+    move = camera.AddTranslateOp()
+    for frame in (1001, 1003):
+        move.Set(Gf.Vec3d(frame - 1001, 0, 5), frame)
+    stage.GetRootLayer().Save()
+    named = load_cameras(tmp_path / "shot.usda")
+    assert [name for name, _ in named] == ["shot_1001", "shot_1002", "shot_1003"]
+    np.testing.assert_allclose(named[1][1].position, (1, 0, 5))
+    np.testing.assert_allclose(named[1][1].world_to_camera[2, :3], (0, 0, -1))
+    assert (named[0][1].width, named[0][1].height, named[0][1].fx) == (1920, 1080, 1920)

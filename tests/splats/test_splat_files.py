@@ -1,0 +1,169 @@
+import json
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.splats import GaussianArrays, read_gaussians, write_gaussians
+
+ARRAYS = ("means", "log_scales", "opacity_logits", "harmonics", "unit_quaternions")
+
+
+def gaussians(count=50, degree=3, color_model="log", seed=0) -> GaussianArrays:
+    random = np.random.default_rng(seed)
+    harmonics = 0.3 * random.normal(size=(count, (degree + 1) ** 2, 3))
+    harmonics[:, 0] -= 2
+    shapes = ((count, 3), (count, 3), (count, 4), (count,))
+    drawn = (random.normal(size=shape).astype(np.float32) for shape in shapes)
+    return GaussianArrays(*drawn, harmonics.astype(np.float32), color_model, 0.5)
+
+
+@pytest.mark.parametrize(
+    "suffix, color_model, degree, tolerance",
+    [
+        (".ply", "log", 0, 0), (".ply", "linear", 1, 0), (".ply", "display", 2, 0),
+        (".usda", "linear", 3, 1e-5), (".usdc", "linear", 1, 1e-5), (".usdz", "linear", 0, 1e-5),
+        (".glb", "display", 3, 1e-5), (".glb", "display", 0, 1e-5),
+    ],
+)  # fmt: skip
+def test_round_trip(tmp_path, suffix, color_model, degree, tolerance):
+    if suffix.startswith(".usd"):
+        pytest.importorskip("pxr")
+    written, file = gaussians(degree=degree, color_model=color_model), tmp_path / f"a{suffix}"
+    write_gaussians(file, written)
+    read = read_gaussians(file)
+    for name in ARRAYS:
+        np.testing.assert_allclose(getattr(read, name), getattr(written, name), atol=tolerance, rtol=tolerance)
+    assert (read.color_model, read.base_time, read.degree) == (color_model, 0.5, degree)
+    assert [path.name for path in tmp_path.iterdir()] == [file.name]
+    with pytest.raises(InputError, match="exists already"):
+        write_gaussians(file, written)
+    broken = replace(written, opacity_logits=np.where(np.arange(50) == 7, np.nan, 0).astype(np.float32))
+    with pytest.raises(InputError, match="opacity_logits of 1 Gaussians are not finite, the first at 7"):
+        write_gaussians(tmp_path / f"b{suffix}", broken)
+    assert [path.name for path in tmp_path.iterdir()] == [file.name]
+
+
+def test_ply_has_the_names_and_order_of_the_reference_release(tmp_path):
+    written = gaussians()
+    write_gaussians(tmp_path / "a.ply", written)
+    vertex = PlyData.read(tmp_path / "a.ply")["vertex"]
+    names = ["x", "y", "z", "nx", "ny", "nz"] + [f"f_dc_{i}" for i in range(3)] + [f"f_rest_{i}" for i in range(45)]
+    names += ["opacity"] + [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
+    assert [p.name for p in vertex.properties] == names
+    # All of red's higher coefficients, then green's, then blue's.
+    np.testing.assert_array_equal(vertex["f_rest_16"], written.harmonics[:, 2, 1])
+    np.testing.assert_array_equal(vertex["rot_0"], written.quaternions[:, 0])
+
+
+def test_usd_is_of_the_schema_and_tagged(tmp_path):
+    Usd, UsdVol = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdVol")
+    UsdValidation = pytest.importorskip("pxr.UsdValidation")
+    written = gaussians(color_model="linear")
+    write_gaussians(tmp_path / "a.usda", written)
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    splat = UsdVol.ParticleField3DGaussianSplat(stage.GetDefaultPrim())
+    assert Usd.ColorSpaceAPI(splat).GetColorSpaceNameAttr().Get() == "lin_rec709_scene"
+    assert splat.GetRadianceSphericalHarmonicsCoefficientsAttr().GetMetadata("elementSize") == 16
+    # A color is max(sum + 0.5, 0), as in 3DGS: the constant term says so.
+    constant = np.array(splat.GetRadianceSphericalHarmonicsCoefficientsAttr().Get()).reshape(-1, 16, 3)[:, 0]
+    np.testing.assert_allclose(constant * 0.28209479 + 0.5, written.harmonics[:, 0] * 0.28209479, atol=1e-6)
+    np.testing.assert_allclose(splat.GetScalesAttr().Get(), np.exp(written.log_scales), rtol=1e-5)
+    found = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators()).Validate(stage)
+    assert [str(error.GetMessage()) for error in found] == []
+
+
+def test_glb_is_laid_out_as_the_extension_says(tmp_path):
+    write_gaussians(tmp_path / "a.glb", gaussians(degree=1, color_model="display"))
+    data = (tmp_path / "a.glb").read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    described = json.loads(data[20 : 20 + length])
+    assert struct.unpack_from("<3I", data) == (0x46546C67, 2, len(data)) and length % 4 == 0
+    primitive = described["meshes"][0]["primitives"][0]
+    assert primitive["mode"] == 0 and described["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    assert primitive["extensions"]["KHR_gaussian_splatting"]["colorSpace"] == "srgb_rec709_display"
+    names = {name.removeprefix("KHR_gaussian_splatting:") for name in primitive["attributes"]}
+    harmonics = {"SH_DEGREE_0_COEF_0", *(f"SH_DEGREE_1_COEF_{n}" for n in range(3))}
+    assert names == {"POSITION", "COLOR_0", "ROTATION", "SCALE", "OPACITY"} | harmonics
+    assert all({"min", "max"} <= set(described["accessors"][i]) for i in [primitive["attributes"]["POSITION"]])
+
+
+def test_glb_of_normalized_integers_and_strides_is_read(tmp_path):
+    """As other writers quantize."""
+    write_gaussians(tmp_path / "a.glb", gaussians(2, 0, "display"))
+    data = (tmp_path / "a.glb").read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    described, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
+    opacity = described["meshes"][0]["primitives"][0]["attributes"]["KHR_gaussian_splatting:OPACITY"]
+    described["accessors"][opacity] |= {"componentType": 5121, "normalized": True}
+    view = {"buffer": 0, "byteOffset": len(binary), "byteLength": 8, "byteStride": 4}
+    described["bufferViews"][described["accessors"][opacity]["bufferView"]] = view
+    text, binary = json.dumps(described).encode(), binary + bytes([51, 0, 0, 0, 204, 0, 0, 0])
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<5I", 0x46546C67, 2, 28 + len(text) + len(binary), len(text), 0x4E4F534A)
+    (tmp_path / "b.glb").write_bytes(head + text + struct.pack("<2I", len(binary), 0x4E4942) + binary)
+    np.testing.assert_allclose(read_gaussians(tmp_path / "b.glb").opacities, [0.2, 0.8], rtol=1e-6)
+
+
+def test_ply_of_others(tmp_path, shared, logged):
+    folder = shared / "data" / "splats"
+    read = read_gaussians(folder / "plush_dog_point_cloud_29999_clean.ply")
+    assert (read.count, read.degree, read.color_model) == (15105, 3, "display")
+    with pytest.raises(InputError, match="compressed PLY"):
+        read_gaussians(folder / "plush_dog_point_cloud_29999_clean.compressed.ply")
+    if (folder / "handmade_minimal.usda").is_file():
+        pytest.importorskip("pxr")
+        minimal = read_gaussians(folder / "handmade_minimal.usda")
+        assert minimal.count == 2 and minimal.harmonics[1, 0, 0] > 10
+
+
+def ply(header: str, body: bytes = b"") -> bytes:
+    return f"ply\nformat binary_little_endian 1.0\n{header}end_header\n".encode() + body
+
+
+BAD = {
+    "a.ply": (ply("element vertex 2147483648\nproperty float x\n"), "claims 2147483648 elements"),
+    "b.ply": (b"ply\nformat ascii 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n1\n", "claims"),
+    "c.ply": (b"no ply", "is not a PLY file"),
+    "d.ply": (ply("element vertex 1\nproperty float x\nproperty uchar red\n", bytes(5)), "point cloud"),
+    "e.ply": (ply("element vertex 3\nproperty float x\n", bytes(9)), "cannot be read as PLY"),
+    "a.glb": (b"glTF" + bytes(40), "is not binary glTF"),
+    "b.glb": (struct.pack("<5I", 0x46546C67, 2, 22, 2, 0x4E4F534A) + b"{}", "is damaged glTF"),
+    "a.spz": (b"x", "is no splat file"),
+    "a.usda": (b"#usda 1.0\ndef Sphere \"a\" {}\n", "has 0 prims of ParticleField3DGaussianSplat"),
+    "b.usda": (b"#usda 1.0\ndef {", "cannot be read as USD"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files_are_refused_in_one_line(tmp_path, name):
+    if name.endswith(".usda"):
+        pytest.importorskip("pxr")
+    data, words = BAD[name]
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(InputError, match=words):
+        read_gaussians(tmp_path / name)
+
+
+def test_what_is_not_finite_is_left_out_and_odd_harmonics_are_refused(tmp_path, logged):
+    given = gaussians(degree=1)
+    write_gaussians(tmp_path / "a.ply", given)
+    data = PlyData.read(tmp_path / "a.ply", mmap=False)
+    data["vertex"]["x"][3], data["vertex"]["opacity"][4] = np.nan, np.inf  # An opacity of 1.
+    data.write(tmp_path / "b.ply")
+    assert read_gaussians(tmp_path / "b.ply").count == 49 and "1 of 50" in logged[0]
+    data["vertex"]["y"][:] = np.inf
+    data.write(tmp_path / "c.ply")
+    with pytest.raises(InputError, match="all of its Gaussians"):
+        read_gaussians(tmp_path / "c.ply")
+    text = (tmp_path / "a.ply").read_bytes().replace(b"f_rest_8", b"f_othe_8")
+    (tmp_path / "d.ply").write_bytes(text)
+    with pytest.raises(InputError, match=r"has 3.667 harmonics for each channel, not 1, 4, 9 or 16"):
+        read_gaussians(tmp_path / "d.ply")
+    foreign = (tmp_path / "a.ply").read_bytes().replace(b"color_model log", b"color_model hsv")
+    (tmp_path / "e.ply").write_bytes(foreign)
+    with pytest.raises(InputError, match="color model 'hsv'"):
+        read_gaussians(tmp_path / "e.ply")
