@@ -6,6 +6,7 @@ from .evaluation.evaluate import evaluate
 from .evaluation.score import score_folder
 from .output.brackets import write_brackets
 from .output.export import export
+from .output.panorama import write_panorama
 from .output.render_views import render_views
 from .output.report import write_report
 from .response import Response, response_by_name, response_names
@@ -56,6 +57,7 @@ __all__ = [
     "ssim",
     "train",
     "write_brackets",
+    "write_panorama",
     "write_report",
 ]
 

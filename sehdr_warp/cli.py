@@ -19,6 +19,7 @@ COMMANDS = {
         "render": ("output.commands", "Render", "run_render"),
         "eval": ("evaluation.commands", "Evaluate", "run_evaluate"),
         "report": ("output.commands", "Report", "run_report"),
+        "panorama": ("output.commands", "Panorama", "run_panorama"),
         "export": ("output.commands", "Export", "run_export"),
         "convert": ("output.commands", "Convert", "run_convert"),
         "compare": ("evaluation.commands", "Compare", "run_compare"),

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from ..response import Response
 from ..scene import Camera
-from ..splatting import Rendering, rasterize, spherical_harmonics
+from ..splatting import Rendering, rasterize, rasterize_directions, spherical_harmonics
 from .color_models import color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
@@ -67,6 +67,20 @@ class RenderedView:
     depth: Tensor
 
 
+@dataclass(frozen=True)
+class Surroundings:
+    """What a trained scene looks like along given directions from one point, composited over black; [H, W] each.
+
+    hdr [H, W, 3], alpha: as of RenderedView. distance: mean distance where alpha is above 0.001, else 0; world units.
+    confidence: in [0, 1], as of render_confidence; None where it was not measured.
+    """
+
+    hdr: Tensor
+    alpha: Tensor
+    distance: Tensor
+    confidence: Tensor | None
+
+
 class RadianceField(nn.Module):
     """A scene: Gaussians, the camera response that photographed them, and, where used, the fusion of brackets.
 
@@ -112,12 +126,12 @@ class RadianceField(nn.Module):
         capacity: as rasterize() takes it; encode: False leaves a photo that has an exposure at that."""
         ratio = exposure_time / self.base_time
         if self.color_model.encoded:
-            rendering = self._rasterize(camera, self._colors(camera, degree)[0], capacity)
+            rendering = self._rasterize(camera, self._colors(camera.position, degree)[0], capacity)
             image = rendering.image
             if ratio != 1.0:
                 image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
             return Photograph(image, None, None, rendering)
-        base, fused = self._exposures(camera, degree)
+        base, fused = self._exposures(camera.position, degree)
         sets = {"fused": fused}
         if self.tone_map == "gaussian":
             wanted = "exposure" in also or ("base" in also and self.fusion is None)
@@ -142,12 +156,43 @@ class RadianceField(nn.Module):
         pose = tensors.world_to_camera
         depth = self.gaussians.means @ pose[2, :3, None] + pose[2, 3]
         encoded = self.color_model.encoded
-        colors = self._colors(tensors, degree)[0] if encoded else self._exposures(tensors, degree)[1]
+        colors = self._colors(tensors.position, degree)[0] if encoded else self._exposures(tensors.position, degree)[1]
         rendering = self._rasterize(tensors, torch.cat([colors, depth], dim=1))
         colors, depth = rendering.image[..., :3], rendering.image[..., 3]
         if encoded:
             colors = self.response.decode(colors.clamp(0, 1))
         return RenderedView(colors / self.base_time, rendering.alpha, _mean_of_seen(depth, rendering.alpha))
+
+    @torch.no_grad()
+    def render_directions(
+        self,
+        position: Tensor,
+        directions: Tensor,
+        *,
+        focal_length: float,
+        pixel_angle: float,
+        degree: int | None = None,
+    ) -> Surroundings:
+        """What is seen along unit directions [H, W, 3] from a position [3], float32 on the field's device; focal_length
+        (pixels) and pixel_angle (radians) as rasterize_directions() takes them."""
+        gaussians = self.gaussians
+        encoded = self.color_model.encoded
+        colors = self._colors(position, degree)[0] if encoded else self._exposures(position, degree)[1]
+        features = [colors, (gaussians.means - position).norm(dim=1, keepdim=True)]
+        if self.confidence is not None:
+            features.append(self.confidence[:, None])
+        image, transmittance = rasterize_directions(
+            *(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacities()),
+            *(torch.cat(features, dim=1), position, directions),
+            focal_length=focal_length,
+            pixel_angle=pixel_angle,
+            antialiased=self.antialiased,
+        )
+        alpha, colors = 1 - transmittance, image[..., :3]
+        colors = self.response.decode(colors.clamp(0, 1)) if encoded else colors
+        distance, *confidence = (_mean_of_seen(image[..., i], alpha) for i in range(3, image.shape[2]))
+        confidence = confidence[0].clamp(0, 1) if confidence else None
+        return Surroundings(colors / self.base_time, alpha, distance, confidence)
 
     @torch.no_grad()
     def render_ldr(self, camera: Camera, exposure_time: float | None = None, *, degree: int | None = None) -> Tensor:
@@ -176,15 +221,15 @@ class RadianceField(nn.Module):
             blended = self._rasterize(camera, features).image
             return torch.autograd.grad(blended, features, images)[0]
 
-    def _colors(self, camera: CameraTensors, degree: int | None) -> tuple[Tensor, Tensor | None]:
+    def _colors(self, position: Tensor, degree: int | None) -> tuple[Tensor, Tensor | None]:
         gaussians = self.gaussians
         used = gaussians.degree if degree is None else min(degree, gaussians.degree)
         coefficients = gaussians.harmonics_dc, gaussians.harmonics_rest
-        return self.color_model.colors(spherical_harmonics(used, coefficients, gaussians.means, camera.position))
+        return self.color_model.colors(spherical_harmonics(used, coefficients, gaussians.means, position))
 
-    def _exposures(self, camera: CameraTensors, degree: int | None) -> tuple[Tensor, Tensor]:
+    def _exposures(self, position: Tensor, degree: int | None) -> tuple[Tensor, Tensor]:
         """Exposures at the base time of each Gaussian's base colour and of its HDR colour, [N, 3] each."""
-        base, logarithm = self._colors(camera, degree)
+        base, logarithm = self._colors(position, degree)
         if self.fusion is None:
             return base, base
         return base, self.fusion(base.log() if logarithm is None else logarithm) * self.base_time

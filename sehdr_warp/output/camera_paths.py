@@ -42,7 +42,7 @@ def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[
     middle = cameras[int(np.argmin(np.linalg.norm(positions - positions.mean(axis=0), axis=1)))]
     if focus is None:
         focus = middle.position + focus_distance * middle.world_to_camera[2, :3]
-    up = _unit(-_axes(cameras, 1).mean(axis=0), fallback=-middle.world_to_camera[1, :3])
+    up = mean_up(cameras, middle)
     back = _unit(np.mean(positions, axis=0) - focus, fallback=-middle.world_to_camera[2, :3])
     back = _unit(back - up * (back @ up), fallback=np.linalg.svd(up[None])[2][1])
     right = np.cross(up, back)
@@ -64,6 +64,12 @@ def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[
         ring, height = distance * np.cos(elevation), distance * np.sin(elevation)
     directions = np.cos(azimuth)[:, None] * back + np.sin(azimuth)[:, None] * right
     return [_moved(middle, _look_at(p, focus, up)) for p in focus + ring[:, None] * directions + height[:, None] * up]
+
+
+def mean_up(cameras: Sequence[Camera], fallback: Camera | None = None) -> np.ndarray:
+    """[3] the unit vector that is up in most pictures; where they cancel out, the fallback's or the first camera's."""
+    alone = fallback or cameras[0]
+    return _unit(-_axes(cameras, 1).mean(axis=0), fallback=-alone.world_to_camera[1, :3])
 
 
 def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:

@@ -100,6 +100,37 @@ class Convert:
     """Replace a file that exists."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Panorama(_OfRun):
+    """Write an environment map: the light that reaches a point of the scene from all directions."""
+
+    out: Path
+    """The file: .exr, or .hdr without alpha and confidence."""
+    at: str = "center"
+    """x,y,z in the scene's coordinates, camera:NAME, or center: the middle of the training cameras."""
+    size: int = 2048
+    """Pixels across; of a cube those of one face."""
+    layout: Literal["latlong", "cube"] = "latlong"
+    """Latitude and longitude, twice as wide as high; or OpenEXR's six faces, one above the other."""
+    axes: Literal["upright", "scene"] = "upright"
+    """upright: +Y is up in the photos, and what is ahead stands in the middle. scene: the scene's own coordinates."""
+    fill: bool = False
+    """Give directions that no photo saw the light around them; alpha tells them still."""
+    colorspace: str = "rec709"
+    """Primaries, always scene-linear: rec709, acescg, aces2065-1, rec2020, display-p3 or dci-p3."""
+    pixel: Literal["half", "float"] = "half"
+    """Pixel type of an EXR file."""
+    device: str | None = None
+    """cpu or cuda:N; by default the first GPU if there is one."""
+
+
+def run_panorama(asked: Panorama) -> None:
+    from .panorama import write_panorama
+
+    options = {name: value for name, value in vars(asked).items() if name not in ("run", "out", "device")}
+    print(write_panorama(open_scene(asked.run, asked.device), asked.out, **options))
+
+
 def run_render(asked: Render) -> None:
     from .render_views import render_views
 

@@ -63,6 +63,12 @@ def exr_header(
     return header | {f"sehdr:{key}": str(value) for key, value in (provenance or {}).items()}
 
 
+def as_data(header: Mapping[str, Any]) -> dict[str, Any]:
+    """The attributes of a picture's part, for one that holds no colors."""
+    colors = ("chromaticities", "sehdr:colorSpace", "colorInteropID")
+    return {key: value for key, value in header.items() if key not in colors} | {"colorInteropID": "data"}
+
+
 def rgb_channels(image: np.ndarray) -> dict[str, np.ndarray]:
     """R, G and B of [H, W, 3]."""
     return dict(zip("RGB", np.moveaxis(image, 2, 0), strict=True))

@@ -8,7 +8,7 @@ import numpy as np
 from sehdr_warp.errors import SehdrError, did_you_mean
 from sehdr_warp.scene import Camera
 
-from .exr import Part
+from .exr import Part, as_data
 from .images import as_array
 
 Channels = Mapping[str, np.ndarray]
@@ -74,9 +74,7 @@ def read_passes(names: str | Sequence[str]) -> tuple[str, ...]:
 
 def data_parts(names: Sequence[str], run: Any, rendered: Any, camera: Camera, header: Mapping[str, Any]) -> list[Part]:
     """The parts of a file that hold passes of a rendered view; header: of its picture."""
-    colors = ("chromaticities", "sehdr:colorSpace", "colorInteropID")
-    header = {key: value for key, value in header.items() if key not in colors} | {"colorInteropID": "data"}
-    return [Part(PASSES[name](run, rendered, camera), header, name) for name in names]
+    return [Part(PASSES[name](run, rendered, camera), as_data(header), name) for name in names]
 
 
 def _rays(camera: Camera) -> np.ndarray:

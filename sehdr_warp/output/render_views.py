@@ -71,7 +71,7 @@ def render_views(
         raise SehdrError("brackets were asked for without exposures; give evs (--evs=-2,0,2) or exposures")
     made = bracket_exposures(run.base_time, evs=evs, exposures=exposures) if wanted else ()
     form, now = (colorspace, pixel, multipart, ldr_brackets, run.response), datetime.now().replace(microsecond=0)
-    brackets = Brackets(made, run.base_time, *form, now, _provenance(run))
+    brackets = Brackets(made, run.base_time, *form, now, provenance(run))
     passes = read_passes(passes) if passes else ()
     views = select_cameras(run, cameras, count=count)
     if size is not None:
@@ -161,7 +161,8 @@ def select_cameras(run, cameras: str | Path, *, count: int = 60) -> list[tuple[s
     return list(zip(safe_names([name for name, _ in named]), [camera for _, camera in named], strict=True))
 
 
-def _provenance(run) -> dict[str, str]:
+def provenance(run) -> dict[str, str]:
+    """Where a picture came from, as text by key."""
     known = {"scene": run.scene_name, "iterations": run.iterations, "units": "relative radiance"}
     known["response"] = getattr(run.response, "name", None)
     return {key: str(value) for key, value in known.items() if value not in (None, "")}

@@ -5,6 +5,7 @@ from .harmonics import spherical_harmonics
 from .rasterization import Rendering, rasterize
 from .recorded_rasterizer import RecordedRasterizer
 from .recording import GraphRecorder
+from .sphere import rasterize_directions
 from .ssim import ssim, ssim_map
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "Rendering",
     "differentiable",
     "rasterize",
+    "rasterize_directions",
     "spherical_harmonics",
     "ssim",
     "ssim_map",

@@ -3,6 +3,7 @@
 import logging
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -10,7 +11,7 @@ from ..errors import InputError, SehdrError
 from ..field.baking import field_of
 from ..field.confidence import Evidence, gather_evidence
 from ..field.gaussians import PARAMETER_NAMES, Gaussians
-from ..field.radiance_field import RadianceField, RenderedView
+from ..field.radiance_field import RadianceField, RenderedView, Surroundings
 from ..response import Response
 from ..scene import Camera, Scene, load_cameras
 from ..splats import read_gaussians
@@ -39,6 +40,14 @@ class _Rendered:
     def render(self, camera: Camera) -> RenderedView:
         """HDR radiance [H, W, 3], alpha [H, W] and depth [H, W] from a camera."""
         return self.model.render(camera, degree=self.degree)
+
+    def render_directions(
+        self, position: np.ndarray, directions: np.ndarray, *, focal_length: float, pixel_angle: float
+    ) -> Surroundings:
+        """What is seen along unit directions [H, W, 3] from a position [3], as of RadianceField.render_directions."""
+        given = (torch.tensor(values, dtype=torch.float32, device=self.device) for values in (position, directions))
+        options = {"focal_length": focal_length, "pixel_angle": pixel_angle, "degree": self.degree}
+        return self.model.render_directions(*given, **options)
 
     def render_ldr(self, camera: Camera, exposure_time: float | None = None) -> Tensor:
         """[H, W, 3] in [0, 1]: the simulated photo of exposure_time seconds, by default the base exposure."""

@@ -1,0 +1,220 @@
+"""Environment maps of a trained scene: scene-linear light from all directions, in OpenEXR's conventions."""
+
+import json
+import logging
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.scene import Camera
+
+from ..files import check_absent
+from .camera_paths import mean_up
+from .colorspace import from_rec709
+from .exr import Part, as_data, exr_header, rgb_channels, write_multipart_exr
+from .images import as_array
+from .radiance_file import write_radiance
+from .render_views import provenance
+
+log = logging.getLogger(__name__)
+LAYOUTS = ("latlong", "cube")
+AXES = ("upright", "scene")
+SUFFIXES = (".exr", ".hdr")
+# Coverage above which a direction counts as seen; of the directions, fewer than the first share make a warning, and
+# surfaces nearer than the part of the cameras' spread in more than half of them mean that the point is in a wall.
+_SEEN, _LEAST_SEEN, _NEAR, _LARGEST = 0.5, 0.1, 0.02, 1 << 15
+_COARSE, _DARKEST = 128, 1e-9  # Of a fill: columns of the map that it is made on, and the least light
+# The nearest axes of a cube's faces in OpenEXR's order (+X -X +Y -Y +Z -Z): to the right, down, and out.
+_FACES = np.array(
+    [
+        [(0, 0, 1), (0, -1, 0), (1, 0, 0)],
+        [(0, 0, -1), (0, -1, 0), (-1, 0, 0)],
+        [(1, 0, 0), (0, 0, -1), (0, 1, 0)],
+        [(1, 0, 0), (0, 0, 1), (0, -1, 0)],
+        [(-1, 0, 0), (0, -1, 0), (0, 0, 1)],
+        [(1, 0, 0), (0, -1, 0), (0, 0, -1)],
+    ],
+    dtype=float,
+)
+
+
+def write_panorama(
+    run: Any,
+    path: Path | str,
+    *,
+    at: str | tuple[float, float, float] = "center",
+    size: int = 2048,
+    layout: str = "latlong",
+    axes: str = "upright",
+    fill: bool = False,
+    colorspace: str = "rec709",
+    pixel: str = "half",
+    overwrite: bool = False,
+) -> Path:
+    """Writes the light that reaches a point of a trained scene from all directions; returns the path.
+
+    path: .exr (R, G, B radiance; A how far a direction was seen; in a second part, `data`, distance.Z and, if the run
+        has it, confidence; attribute `envmap`) or .hdr (Radiance, no more than R, G, B). at: a point in the scene's
+        coordinates, "camera:NAME", or "center": the middle of the training cameras. size: pixels across, of a cube
+        those of one face.
+    layout: "latlong": size x size / 2, the left edge at longitude pi, its middle along +Z, +X at a quarter, +Y up.
+        "cube": OpenEXR's six faces, one above the other. axes: "upright": +Y is up in the photos, +Z is ahead of the
+        named camera or of the middle one; "scene": those of the scene's coordinates.
+    fill: directions that no photo saw get the light around them, smoothly; A tells them still.
+
+    Raises SehdrError for options that do not fit, or a point that sees next to nothing; InputError where the file
+    exists (unless overwrite) or a pixel is not finite.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise SehdrError(f"{path}: an environment map is one of {', '.join(SUFFIXES)}; choose a suffix")
+    for name, value, known in (("layout", layout, LAYOUTS), ("axes", axes, AXES)):
+        if value not in known:
+            raise SehdrError(f"{name} {value!r} is not one of {', '.join(known)}")
+    if size < 16 or size % 2 or size > _LARGEST:
+        raise SehdrError(f"size {size} cannot be; give an even number of pixels from 16 to {_LARGEST}")
+    check_absent(path, overwrite)
+    cameras = {entry.name: entry.camera for entry in run.cameras}
+    seen = [entry.camera for entry in run.cameras if entry.split == "train"]
+    position, ahead = _point(at, cameras, seen)
+    to_world = np.eye(3) if axes == "scene" else _upright(seen, ahead)
+    directions = (latlong if layout == "latlong" else cube)(size) @ to_world.T
+    pixel_angle = 2 * np.pi / size if layout == "latlong" else 2 / size
+    focal = float(np.median([np.sqrt(c.fx * c.fy) for c in seen])) if seen else 1 / pixel_angle
+    found = run.render_directions(position, directions, focal_length=focal, pixel_angle=pixel_angle)
+    hdr, alpha, distance = (as_array(values) for values in (found.hdr, found.alpha, found.distance))
+    weight = solid_angles(size, layout)
+    _judge(run, position, seen, alpha, distance, weight)
+    if fill:
+        hdr = hdr + np.maximum(1 - alpha[..., None] / _SEEN, 0) * filled(hdr, alpha, directions, weight)
+    log.info("%s: %.0f %% of all directions seen", path.name, 100 * weight[alpha > _SEEN].sum() / weight.sum())
+    hdr = from_rec709(hdr, colorspace)
+    if path.suffix.lower() == ".hdr":
+        write_radiance(path, hdr, overwrite=overwrite)
+        return path
+    data = {"distance.Z": distance}
+    if found.confidence is not None:
+        data["confidence"] = as_array(found.confidence)
+    facts = {**provenance(run), "position": json.dumps(position.tolist()), "axes": axes}
+    header = exr_header(colorspace, 1.0, None, datetime.now().replace(microsecond=0), facts)
+    header |= {"sehdr:mapToWorld": json.dumps(to_world.tolist()), "envmap": _envmap(layout)}
+    # In a part of their own: Mitsuba takes a map with a fifth channel for no map at all.
+    parts = [Part(rgb_channels(hdr) | {"A": alpha}, header, "rgba"), Part(data, as_data(header), "data")]
+    stored = write_multipart_exr(path, parts, pixel=pixel, overwrite=overwrite)
+    if stored != pixel:
+        log.info("%s: holds values above 65504, which half cannot; written as float", path.name)
+    return path
+
+
+def _envmap(layout: str) -> Any:
+    """The value of OpenEXR's attribute."""
+    import OpenEXR
+
+    return OpenEXR.Envmap.ENVMAP_LATLONG if layout == "latlong" else OpenEXR.Envmap.ENVMAP_CUBE
+
+
+def latlong(size: int) -> np.ndarray:
+    """[size / 2, size, 3] unit directions of the centers of a latitude-longitude map's pixels."""
+    longitude = np.pi - 2 * np.pi * (np.arange(size) + 0.5) / size
+    latitude = (np.pi / 2 - np.pi * (np.arange(size // 2) + 0.5) / (size // 2))[:, None]
+    across = np.cos(latitude)
+    up = np.broadcast_to(np.sin(latitude), (size // 2, size))
+    return np.stack([across * np.sin(longitude), up, across * np.cos(longitude)], axis=2)
+
+
+def cube(size: int) -> np.ndarray:
+    """[6 size, size, 3] unit directions of OpenEXR's cube map."""
+    place = 2 * (np.arange(size) + 0.5) / size - 1
+    local = np.stack([*np.meshgrid(place, place), np.ones((size, size))], axis=2)
+    faces = np.concatenate([local @ axes for axes in _FACES])
+    return faces / np.linalg.norm(faces, axis=2, keepdims=True)
+
+
+def solid_angles(size: int, layout: str) -> np.ndarray:
+    """[H, W] what part of the sphere each pixel is, up to scale."""
+    if layout == "latlong":
+        latitude = np.pi / 2 - np.pi * (np.arange(size // 2) + 0.5) / (size // 2)
+        return np.repeat(np.cos(latitude)[:, None], size, axis=1)
+    place = 2 * (np.arange(size) + 0.5) / size - 1
+    face = (1 + place[:, None] ** 2 + place**2) ** -1.5
+    return np.tile(face, (6, 1))
+
+
+def filled(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """[H, W, 3] for each direction the geometric mean of the light in those that were seen, weighted by the inverse
+    fourth power of the distance on the sphere: lamps do not flood what lies beside them."""
+    from scipy.ndimage import map_coordinates
+
+    x, y, z = np.moveaxis(directions, 2, 0)
+    columns, rows = _COARSE, _COARSE // 2
+    across, down = (np.pi - np.arctan2(x, z)) / (2 * np.pi) * columns, np.arccos(np.clip(y, -1, 1)) / np.pi * rows
+    cells = np.minimum(down.astype(int), rows - 1) * columns + across.astype(int) % columns
+    seen = alpha > _SEEN
+    logs = np.log(np.maximum(hdr[seen] / alpha[seen][:, None], _DARKEST))
+    values = np.concatenate([logs, np.ones((len(logs), 1))], axis=1) * weight[seen][:, None]
+    sums = np.stack([np.bincount(cells[seen], column, rows * columns) for column in values.T], axis=1)
+    known, places = sums[:, 3] > 0, latlong(columns).reshape(-1, 3)
+    near = sums[known, 3] / (2 - 2 * places @ places[known].T + (2 * np.pi / columns) ** 2) ** 2
+    light = np.exp(near @ (sums[known, :3] / sums[known, 3:]) / near.sum(axis=1, keepdims=True))
+    wrapped = np.pad(light.reshape(rows, columns, 3), ((0, 0), (1, 1), (0, 0)), mode="wrap")
+    at = np.stack([down - 0.5, across + 0.5])
+    return np.stack([map_coordinates(wrapped[..., i], at, order=1, mode="nearest") for i in range(3)], axis=2)
+
+
+def _point(at, cameras: dict[str, Camera], seen: list[Camera]) -> tuple[np.ndarray, Camera | None]:
+    """The point, and the camera that says what is ahead."""
+    middle = None
+    if seen:
+        places = np.stack([camera.position for camera in seen])
+        middle = seen[int(np.argmin(np.linalg.norm(places - np.median(places, axis=0), axis=1)))]
+    if isinstance(at, str) and at == "center":
+        if middle is None:
+            raise SehdrError("the scene has no cameras, so no center; say where with --at x,y,z")
+        return np.mean([camera.position for camera in seen], axis=0), middle
+    if isinstance(at, str) and at.startswith("camera:"):
+        name = at.partition(":")[2]
+        if name not in cameras:
+            some = ", ".join(list(cameras)[:5])
+            raise SehdrError(f"camera {name!r} is none of the scene's ({some} ...); see scene.json of the run")
+        return cameras[name].position, cameras[name]
+    try:
+        position = np.array([float(v) for v in (at.split(",") if isinstance(at, str) else at)])
+    except (ValueError, TypeError):
+        position = np.array([])
+    if position.shape != (3,) or not np.isfinite(position).all():
+        raise SehdrError(f"point {at!r} is neither x,y,z nor camera:NAME nor center")
+    return position, middle
+
+
+def _upright(seen: list[Camera], ahead: Camera | None) -> np.ndarray:
+    """[3, 3] map to world axes: columns are +X (left of what is ahead), +Y (up) and +Z (ahead)."""
+    if ahead is None:
+        return np.eye(3)
+    up = mean_up(seen or [ahead])
+    forward = ahead.world_to_camera[2, :3]
+    forward = forward - up * (forward @ up)
+    if np.linalg.norm(forward) < 1e-3:  # It looks straight up or down.
+        forward = np.linalg.svd(up[None])[2][1]
+    forward /= np.linalg.norm(forward)
+    return np.stack([np.cross(up, forward), up, forward], axis=1)
+
+
+def _judge(run, position, seen: list[Camera], alpha: np.ndarray, distance: np.ndarray, weight: np.ndarray) -> None:
+    """Raises SehdrError for a point that nothing is seen from, and warns of one from which little or only near
+    things are."""
+    share = weight[alpha > _SEEN].sum() / weight.sum()
+    place = ", ".join(f"{value:.4g}" for value in position)
+    if share < 1e-3:
+        remedy = "choose a point among the cameras (center, camera:NAME)"
+        raise SehdrError(f"{run.path}: from ({place}) nothing of the scene is seen; {remedy}")
+    if share < _LEAST_SEEN:
+        log.warning("from (%s) only %.1f %% of all directions are seen: is it within the scene?", place, 100 * share)
+    spread = np.linalg.norm(np.ptp([camera.position for camera in seen], axis=0)) if len(seen) > 1 else 0.0
+    near = weight[(alpha > _SEEN) & (distance < _NEAR * spread)].sum() / weight.sum()
+    if near > 0.5:
+        log.warning(
+            "from (%s) %.0f %% of all directions are blocked at once: is it inside of something?", place, 100 * near
+        )

@@ -1,0 +1,161 @@
+import json
+
+import numpy as np
+import pytest
+
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.field.baking import field_of
+from sehdr_warp.output.panorama import cube, filled, latlong, solid_angles, write_panorama
+from sehdr_warp.output.radiance_file import write_radiance
+from sehdr_warp.scene.hdr_files import read_exr_channels, read_hdr
+from sehdr_warp.splats import GaussianArrays
+from sehdr_warp.training.run import Splats
+
+from .helpers import Entry, camera
+
+AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=np.float32)
+LIGHT = np.array([[9, 1, 1], [1, 9, 9], [1, 9, 1], [9, 1, 9], [1, 1, 9], [9, 9, 1]], dtype=np.float32)
+
+
+def lamps(width=0.15):
+    """A lamp on each of the six axes, each of a color of its own."""
+    shape = np.full((6, 3), np.log(5 * width), np.float32), np.tile(np.float32([1, 0, 0, 0]), (6, 1))
+    harmonics = LIGHT[:, None] / 0.28209479
+    return GaussianArrays(5 * AXES, *shape, np.full(6, 5, np.float32), harmonics, "linear", 0.5)
+
+
+@pytest.fixture
+def run(tmp_path):
+    cameras = tuple(Entry(str(i), "train", camera(position=(0.1 * i - 0.1, 0, 0), target=(0, 0, 9))) for i in range(3))
+    return Splats(tmp_path / "run", field_of(lamps()), cameras)
+
+
+def read(path):
+    channels, header = read_exr_channels(path)
+    return np.stack([channels[name] for name in "RGB"], axis=2), channels, header
+
+
+def test_a_map_has_openexrs_orientation(tmp_path, run):
+    import OpenEXR
+
+    write_panorama(run, tmp_path / "env.exr", at=(0, 0, 0), size=128, axes="scene", pixel="float")
+    image, channels, header = read(tmp_path / "env.exr")
+    assert image.shape == (64, 128, 3) and header["envmap"] == OpenEXR.Envmap.ENVMAP_LATLONG and header["expTime"] == 1
+    rows, columns = (32, 32, 0, 63, 32, 32), (32, 96, 64, 64, 64, 0)
+    np.testing.assert_allclose(image[rows, columns], 0.95 * LIGHT, rtol=0.01)
+    with OpenEXR.File(str(tmp_path / "env.exr"), separate_channels=True) as file:
+        np.testing.assert_allclose(file.channels(1)["distance.Z"].pixels[rows, columns], 5, rtol=1e-3)
+        assert file.header(1)["colorInteropID"] == "data"
+    assert channels["A"][32, 48] < 0.01 and channels["A"][32, 32] > 0.93
+    # Neither the wrap nor the poles show: what lies beside the edge goes on behind it.
+    np.testing.assert_allclose(image[:, 0], image[:, -1], atol=1e-5)
+    assert np.ptp(image[0], axis=0).max() < 1e-4
+
+
+def test_upright_maps_look_ahead_with_up_above(tmp_path, run):
+    """The cameras look along +Z with -Y up, as COLMAP's often do."""
+    write_panorama(run, tmp_path / "env.exr", at="camera:1", size=128)
+    image, _, header = read(tmp_path / "env.exr")
+    ahead, above, left = (image[place] for place in ((32, 64), (0, 64), (32, 32)))
+    np.testing.assert_allclose([ahead, above, left], 0.95 * LIGHT[[4, 3, 1]], rtol=0.01)
+    np.testing.assert_allclose(json.loads(header["sehdr:mapToWorld"]), np.diag([-1.0, -1, 1]), atol=1e-9)
+    assert json.loads(header["sehdr:position"]) == [0, 0, 0]
+
+
+def test_mitsuba_sees_the_same(tmp_path, run):
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    write_panorama(run, tmp_path / "env.exr", at=(0, 0, 0), size=256, axes="scene", pixel="float")
+    scene = mi.load_dict({"type": "scene", "env": {"type": "envmap", "filename": str(tmp_path / "env.exr")}})
+    for axis, light in zip(AXES, LIGHT, strict=True):
+        seen = eval_map(mi, scene, axis)
+        np.testing.assert_allclose(seen, 0.98 * light, rtol=0.01)
+
+
+def eval_map(mi, scene, axis):
+    interaction = mi.SurfaceInteraction3f()
+    interaction.wi = -mi.Vector3f(*axis.tolist())
+    return np.array(scene.environment().eval(interaction)).ravel()
+
+
+def test_a_cube_holds_the_same_light(tmp_path, run):
+    write_panorama(run, tmp_path / "env.exr", at=(0, 0, 0), size=64, layout="cube", axes="scene", pixel="float")
+    image = read(tmp_path / "env.exr")[0]
+    assert image.shape == (6 * 64, 64, 3)
+    np.testing.assert_allclose(image.reshape(6, 64, 64, 3)[:, 32, 32], 0.993 * LIGHT, rtol=0.02)
+    for size, layout, directions in ((64, "cube", cube(64)), (256, "latlong", latlong(256))):
+        weight = solid_angles(size, layout)
+        np.testing.assert_allclose(np.linalg.norm(directions, axis=2), 1)
+        mean = (directions**2 * weight[..., None]).sum((0, 1)) / weight.sum()
+        np.testing.assert_allclose(mean, 1 / 3, rtol=1e-3)
+
+
+def test_openimageio_and_opencv_read_it(tmp_path, run):
+    write_panorama(run, tmp_path / "env.exr", at=(0, 0, 0), size=64, axes="scene")
+    write_panorama(run, tmp_path / "env.hdr", at=(0, 0, 0), size=64, axes="scene")
+    image = read(tmp_path / "env.exr")[0]
+    radiance = read_hdr(tmp_path / "env.hdr")
+    assert np.abs(radiance - image).max() < image.max() / 100
+    oiio = pytest.importorskip("OpenImageIO")
+    buffer = oiio.ImageBuf(str(tmp_path / "env.exr"))
+    assert buffer.spec().getattribute("textureformat") == "LatLong Environment"
+    cv2 = pytest.importorskip("cv2")
+    np.testing.assert_allclose(
+        cv2.imread(str(tmp_path / "env.hdr"), cv2.IMREAD_UNCHANGED)[..., ::-1], radiance, atol=0.05
+    )
+
+
+def test_radiance_files_keep_seven_bits(tmp_path):
+    image = np.float32(10.0) ** np.random.default_rng(0).uniform(-6, 6, (5, 7, 1)) * np.float32([1, 0.3, 0])
+    write_radiance(tmp_path / "a.hdr", image)
+    read_back = read_hdr(tmp_path / "a.hdr")
+    assert (np.abs(read_back - image) <= image.max(2, keepdims=True) / 128).all()
+    with pytest.raises(InputError, match="not finite"):
+        write_radiance(tmp_path / "b.hdr", np.full((2, 2, 3), np.nan))
+
+
+def test_unseen_directions_are_filled_on_request(tmp_path, run, logged):
+    write_panorama(run, tmp_path / "env.exr", at=(0, 0, 0), size=64, axes="scene")
+    write_panorama(run, tmp_path / "fill.exr", at=(0, 0, 0), size=64, axes="scene", fill=True)
+    (plain, channels, _), (full, again, _) = read(tmp_path / "env.exr"), read(tmp_path / "fill.exr")
+    np.testing.assert_array_equal(channels["A"], again["A"])
+    seen = channels["A"] > 0.5
+    np.testing.assert_array_equal(plain[seen], full[seen])
+    assert plain.min() < 1e-3 and full.min() > 0.4 and full.max() < 9.1
+    share = (seen * solid_angles(64, "latlong")).sum() / solid_angles(64, "latlong").sum()
+    assert f"env.exr: {100 * share:.0f} % of all directions seen" in logged
+
+
+def test_a_fill_is_the_light_of_what_is_seen():
+    directions, weight = latlong(64), solid_angles(64, "latlong")
+    alpha = np.where(directions[..., 2] > 0.5, 1.0, 0)
+    light = filled(np.where(alpha[..., None] > 0, np.array([1.0, 2, 4]), 1e5), alpha, directions, weight)
+    np.testing.assert_allclose(light, np.broadcast_to([1.0, 2, 4], light.shape), rtol=1e-6)
+
+
+def test_points_and_options_that_cannot_be(tmp_path, run, logged):
+    for options, words in (
+        ({"at": "camera:x"}, r"'x' is none of the scene's \(0, 1, 2"),
+        ({"at": "1,2"}, "neither x,y,z nor camera:NAME nor center"),
+        ({"at": "1,2,nan"}, "neither"),
+        ({"at": "1e6,0,0"}, "nothing of the scene is seen"),
+        ({"size": 7}, "size 7 cannot be"),
+        ({"layout": "ball"}, "is not one of latlong, cube"),
+    ):
+        with pytest.raises(SehdrError, match=words):
+            write_panorama(run, tmp_path / "a.exr", **{"size": 64, **options})
+    with pytest.raises(SehdrError, match="one of .exr, .hdr"):
+        write_panorama(run, tmp_path / "a.png")
+    assert list(tmp_path.iterdir()) == []
+    write_panorama(run, tmp_path / "a.exr", size=64)
+    assert any("is it within the scene?" in line for line in logged)
+    with pytest.raises(InputError, match="exists already"):
+        write_panorama(run, tmp_path / "a.exr", size=64)
+
+
+def test_a_point_inside_of_something_is_warned_of(tmp_path, run, logged):
+    """Lamps as wide as they are far, at a five hundredth of what the cameras went."""
+    run.model = field_of(lamps(1.5))
+    run.cameras = tuple(Entry(str(x), "train", camera(position=(x, 0, 0), target=(x, 0, 9))) for x in (-2e3, 2e3))
+    write_panorama(run, tmp_path / "a.exr", at=(0, 0, 0), size=64)
+    assert any("inside of something" in line for line in logged)
