@@ -202,7 +202,7 @@ def test_camera_files(trained, tmp_path, capfd, case):
         (("--cameras", "orbit", "--count", "0"), "path of 0 views"),
         (("--cameras", "orbit", "--count", "-3"), "path of -3 views"),
         (("--cameras", "interpolate", "--count", "100000000"), "path of 100000000 views"),
-        (("--cameras", "."), "'.'"),
+        (("--cameras", "."), "holds no COLMAP model"),
         (("--colorspace", "cmyk"), "cmyk"),
         (("--device", "tpu"), "tpu"),
     ],
