@@ -134,7 +134,8 @@ def _plain_torch(*arguments, capacity=None, deterministic=False, **options):
 
 def _amortized(trainer: Trainer) -> dict:
     """The mean step over whole densification intervals, changes of the count included."""
-    trainer.iteration = thick_of_training(trainer.config)
+    trainer.iteration = thick_of_training(trainer.config) - 1
+    trainer.step()  # the first change prepares what the others use
     steps = INTERVALS[trainer.device.type] * trainer.config.scaled(trainer.config.densification.every)
     wait(trainer.device)
     started = time.perf_counter()
