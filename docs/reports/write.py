@@ -12,7 +12,7 @@ from typing import Any
 
 import plots
 
-from sehdr_warp.bench.quality import LEARNED, UPPER_BOUND
+from sehdr_warp.bench.quality import EXPOSURES, KNOWN, LEARNED, UPPER_BOUND
 from sehdr_warp.bench.results import COLUMNS, groups, machine_line, markdown_table, parted
 from sehdr_warp.errors import InputError
 from sehdr_warp.evaluation.protocols import PROTOCOLS
@@ -108,6 +108,19 @@ def _quality_tables(result: dict) -> Iterable[str]:
     for row in rows:
         (bound, *_) = bounds.get(tuple(row[field] for field in places), [row])
         row["to_bound"] = None if bound is row else row["gt_max"] - bound["gt_max"]
+    middle = [row for row in rows if (row["exposure"], row["seed"]) == (EXPOSURES // 2, rows[0]["seed"])]
+    short = [
+        {
+            "method": method,
+            "HDR dB": fmean(row["gt_max"] for row in mine),
+            "photos dB": fmean(row["ldr"] for row in mine),
+            "lost": f"{sum(row['lights_lost'] for row in mine)} of {sum(row['lights_count'] for row in mine)} lights",
+        }
+        for (method, response), mine in groups(middle, "method", "response").items()
+        if response in (KNOWN, LEARNED)
+    ]
+    yield "## In short: the middle exposure, one seed, the curve known"
+    yield markdown_table(short, {"method": "", "HDR dB": ".1f", "photos dB": ".1f", "lost": ""})
     for curve, response in groups([row for row in rows if row["response"] != LEARNED], "curve", "response"):
         members = [row for row in rows if row["curve"] == curve and row["response"] in (response, LEARNED)]
         table = []
