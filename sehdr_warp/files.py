@@ -1,7 +1,8 @@
 """Files: written whole or not at all, and read within bounds, under names that stay in their folder.
 
 What is written lies beside its place, is flushed to the disk, then renamed; what a killed process left is removed when
-something is written to the same folder again.
+something is written to the same folder again. What is written stands with its hash in the list LIST of its folder: only
+what is as listed there is ever replaced.
 """
 
 import errno
@@ -28,62 +29,124 @@ _WRITE_ERRORS = {getattr(errno, name) for name in _REFUSALS.split() if hasattr(e
 # The largest file that is read whole: the biggest COLMAP models in use (Mip-NeRF 360, city captures) are well under it.
 MAX_FILE_BYTES = 4 << 30
 MAX_JSON_BYTES = 256 << 20
+LIST = ".sehdr-warp"
+"""The list of a folder: a line `SHA-256  name` for each file that this program has written there."""
 
 
 @contextmanager
-def atomic_path(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
+def atomic_path(path: Path | str, overwrite: bool = False, *, ours: bool = False) -> Iterator[Path]:
     """Yields a temporary path in the folder of `path`; what is written there becomes `path` when the block ends.
 
     The temporary name keeps the suffix, for writers that choose a format by it. Missing parent folders are made.
     If the block raises, the temporary file and the folders made are removed, and an existing `path` stays as it was.
 
-    Raises InputError where `path` exists (unless overwrite, and never for a folder), SehdrError where the disk is
-    full or the folder is not writable.
+    overwrite: a file that this program wrote may be replaced. ours: `path` is a name of the program's own in a folder
+    of its own: whatever file is there is replaced, and the list is not kept.
+
+    Raises InputError where `path` exists (unless it may be replaced, and never for a folder, a link or a device),
+    SehdrError where the disk is full or the folder is not writable.
     """
-    with _written_beside(Path(path), overwrite, folder=False) as temporary:
+    with _written_beside(Path(path), overwrite, ours, folder=False) as temporary:
         yield temporary
 
 
 @contextmanager
-def atomic_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
-    """As atomic_path, of a folder. An empty one at `path` counts as absent; with overwrite an existing one is set
-    aside, and removed only once the new one stands in its place."""
-    with _written_beside(Path(path), overwrite, folder=True) as temporary:
+def atomic_folder(path: Path | str, overwrite: bool = False, *, ours: bool = False) -> Iterator[Path]:
+    """As atomic_path, of a folder. An empty one at `path` counts as absent; with overwrite one that holds nothing but
+    what this program wrote is set aside, and removed only once the new one stands in its place."""
+    with _written_beside(Path(path), overwrite, ours, folder=True) as temporary:
         temporary.mkdir()
         yield temporary
 
 
 @contextmanager
-def _written_beside(path: Path, overwrite: bool, folder: bool) -> Iterator[Path]:
-    _remove_stale(path)
-    check_absent(path, overwrite, folder=folder)
+def _written_beside(path: Path, overwrite: bool, ours: bool, folder: bool) -> Iterator[Path]:
+    remove_stale(path)
+    ours = ours or any(_NAMES.fullmatch(part.name) for part in (path, *path.absolute().parents))
+    check_absent(path, overwrite, folder=folder, ours=ours)
     with writing(path):
-        made, temporary = _make_parents(path), _beside(path)
+        made, temporary = make_parents(path), _beside(path)
         try:
             yield temporary
+            if folder and not ours:
+                seal(temporary)
             for written in (temporary, *temporary.rglob("*")):
                 _sync(written)
-            check_absent(path, overwrite, folder=folder)
+            check_absent(path, overwrite, folder=folder, ours=ours)
+            if not (folder or ours):
+                _list(temporary, path)
             _put(temporary, path)
         except BaseException as error:
             if isinstance(error, SehdrError):
                 # Whoever writes names files by the temporary name, which means nothing to the user.
                 error.args = tuple(str(item).replace(str(temporary), str(path)) for item in error.args)
-            _remove(temporary)
+            remove(temporary)
             with suppress(OSError):  # Someone else has put a file there in the meantime.
                 for parent in made:
                     parent.rmdir()
             raise
 
 
-def write_json(path: Path | str, value: Any, overwrite: bool = False) -> None:
+def write_json(path: Path | str, value: Any, overwrite: bool = False, *, ours: bool = False) -> None:
     """Writes plain values as indented UTF-8 JSON, atomically; NaN and infinity become null, as JSON has neither.
 
     Raises InputError and SehdrError as atomic_path does, TypeError for a value that is not plain.
     """
     text = json.dumps(_finite(value), indent=2, ensure_ascii=False) + "\n"
-    with atomic_path(path, overwrite) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    with atomic_path(path, overwrite, ours=ours) as temporary:
+        # Bytes of a file's name that are no UTF-8 become escapes, which JSON has as well.
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+
+
+def seal(folder: Path) -> None:
+    """Lists all files of a folder as they are, for foreign() and is_sealed()."""
+    (folder / LIST).write_bytes(b"".join(line + b"\n" for line in _lines(folder)))
+
+
+def is_sealed(folder: Path) -> bool:
+    """Whether a folder holds the files of its list, all of them as they were, and nothing else."""
+    with suppress(OSError):
+        return set(_lines(folder)) == _listed(folder) != set()
+    return False
+
+
+def foreign(path: Path) -> Path | None:
+    """The first file at or in `path` that this program did not write, or that was changed since; None if there is
+    none."""
+    folder = path if path.is_dir() else path.parent
+    listed = _listed(folder)
+    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+        if file.is_symlink() or not (file.is_dir() or file == folder / LIST):
+            name = file.relative_to(folder).as_posix()
+            if file.is_symlink() or not file.is_file() or _line(file, name) not in listed:
+                return file
+    return None
+
+
+def _line(file: Path, name: str) -> bytes:
+    with open(file, "rb") as opened:
+        digest = hashlib.file_digest(opened, "sha256").hexdigest()
+    return os.fsencode(f"{digest}  {name}".replace("\n", "\\n"))
+
+
+def _lines(folder: Path) -> list[bytes]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != LIST)
+    return [_line(path, path.relative_to(folder).as_posix()) for path in files]
+
+
+def _listed(folder: Path) -> set[bytes]:
+    with suppress(OSError, InputError):
+        return set(read_bytes(folder / LIST, MAX_JSON_BYTES).split(b"\n")) - {b""}
+    return set()
+
+
+def _list(temporary: Path, path: Path) -> None:
+    """Adds a file that is about to get its name to the list of its folder, in one write, as others may list theirs."""
+    handle = os.open(path.parent / LIST, os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+    try:
+        os.write(handle, _line(temporary, path.name) + b"\n")
+    finally:
+        os.close(handle)
 
 
 def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
@@ -115,11 +178,19 @@ def read_json(path: Path) -> dict:
     """The JSON object in a file; raises InputError where it is missing, broken or not an object."""
     text = read_text(path, MAX_JSON_BYTES)
     try:
-        values = json.loads(text)
+        values = json.loads(text, object_pairs_hook=_unique)
     except (ValueError, RecursionError) as error:
         raise InputError(path, f"is not valid JSON ({error})", "export the file again") from None
     if not isinstance(values, dict):
         raise InputError(path, f"holds a JSON {type(values).__name__}, not an object", "export the file again")
+    return values
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict:
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"the key {next(name for name in names if names.count(name) > 1)!r:.80} stands twice")
     return values
 
 
@@ -146,17 +217,23 @@ def contained(folder: Path, name: str, source: Path) -> Path:
     raise InputError(source, f"file name {short} {problem}", f"use a path relative to {folder} without '..'")
 
 
-def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = False) -> None:
-    """Raises InputError where a file (or a folder that is not empty) at `path` would have to be replaced without leave,
-    or the other of both is in the way."""
+def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = False, ours: bool = False) -> None:
+    """Raises InputError where a file (or a folder that is not empty) at `path` would have to be replaced without leave
+    or is not this program's, or something else is in the way."""
     path = Path(path)
     if not (path.exists() or path.is_symlink()):
         return
-    if path.is_dir() != folder:
-        here, wanted = ("a file", "a folder") if folder else ("a folder", "a file")
-        raise InputError(path, f"is {here}, not {wanted}", "choose another name")
-    if not overwrite and not (folder and not any(path.iterdir())):
+    if path.is_dir() != folder or path.is_symlink() or not (path.is_dir() or path.is_file()):
+        kinds = {"a link": path.is_symlink(), "a folder": path.is_dir(), "a file": path.is_file()}
+        here = next((kind for kind, holds in kinds.items() if holds), "a device or a pipe")
+        raise InputError(path, f"is {here}, not {'a folder' if folder else 'a file'}", "choose another name")
+    if ours or (folder and not any(path.iterdir())):
+        return
+    if not overwrite:
         raise InputError(path, "exists already", "choose another place, or ask for it to be replaced (--overwrite)")
+    if (other := foreign(path)) is not None:
+        problem = "was not written by sehdr-warp, or was changed since, and is never replaced"
+        raise InputError(other, problem, "move it away, or choose another place")
 
 
 @contextmanager
@@ -171,11 +248,19 @@ def writing(path: Path | str) -> Iterator[None]:
         raise SehdrError(f"{path}: cannot be written ({reason}); free space or choose another folder") from error
 
 
+_NAMES = re.compile(r"\.(.*)\.([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.(tmp|old)(\.[^.]*)?", re.ASCII | re.DOTALL)
+
+
 def _beside(path: Path, kind: str = "tmp") -> Path:
     """A new hidden name beside `path` that says whose it is, and whether it is written (`tmp`) or set aside (`old`)."""
-    # Short stems keep the temporary name within the 255 bytes that file systems allow.
     owner = f"{_process_space()}-{os.getpid()}-{secrets.token_hex(4)}"
-    return path.with_name(f".{path.stem[:40]}.{owner}.{kind}{path.suffix[:20]}")
+    return path.with_name(f".{_stem(path)}.{owner}.{kind}{path.suffix[:20]}")
+
+
+def _stem(path: Path) -> str:
+    """The stem of a path, or what stands for a long one: names beside it keep within file systems' 255 bytes."""
+    digest = hashlib.blake2s(os.fsencode(path.name), digest_size=4).hexdigest()
+    return path.stem if len(path.stem) <= 40 else f"{path.stem[:31]}~{digest}"
 
 
 @functools.cache
@@ -188,24 +273,23 @@ def _process_space() -> str:
     return hashlib.blake2s(f"{platform.node()} {space}".encode(), digest_size=4).hexdigest()
 
 
-def _remove_stale(path: Path) -> None:
+def remove_stale(path: Path) -> None:
     """Removes what killed processes of this machine left in the folder of `path`. A folder that was set aside to be
     replaced by `path` goes back where nothing stands in its place; what others may still be writing is left alone."""
-    names = re.compile(rf"\.(.*)\.{_process_space()}-(\d+)-[0-9a-f]{{8}}\.(tmp|old)(\.[^.]*)?", re.ASCII)
     try:
-        found = [match for name in os.listdir(path.parent) if (match := names.fullmatch(name))]
+        found = [match for name in os.listdir(path.parent) if (match := _NAMES.fullmatch(name))]
     except OSError:  # No such folder yet, or not ours to read.
         return
-    for match in (match for match in found if not _runs(int(match[2]))):
-        left, ours = path.parent / match[0], match[1] + (match[4] or "") == path.name
-        if match[3] == "tmp" or (ours and path.exists()):
-            _remove(left)
+    for match in (match for match in found if match[2] == _process_space() and not _runs(int(match[3]))):
+        left, ours = path.parent / match[0], (match[1], match[5] or "") == (_stem(path), path.suffix[:20])
+        if match[4] == "tmp" or (ours and path.exists()):
+            remove(left)
         elif ours:
             with suppress(OSError):  # Another process was as quick.
                 os.rename(left, path)
 
 
-def _remove(path: Path) -> None:
+def remove(path: Path) -> None:
     shutil.rmtree(path, ignore_errors=True)
     with suppress(OSError):
         path.unlink(missing_ok=True)
@@ -222,7 +306,7 @@ def _runs(process: int) -> bool:
     return True
 
 
-def _make_parents(path: Path) -> list[Path]:
+def make_parents(path: Path) -> list[Path]:
     """Makes the missing folders above a path, and says which, the deepest first."""
     missing = list(takewhile(lambda parent: not parent.exists(), path.absolute().parents))
     try:

@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+from sehdr_warp.training.run_folder import RunFolder
+
 from .full_disk import full_disk
 from .refusals import call, refused
 
@@ -66,7 +68,8 @@ def resign(run, change):
     change(tensors)
     content = save(tensors)
     (folder / "state.safetensors").write_bytes(content)
-    edit_json(folder / "checkpoint.json", sha256=hashlib.sha256(content).hexdigest())
+    hashes = {"sha256": hashlib.sha256(content).hexdigest(), "run": RunFolder(run).hashes()}
+    edit_json(folder / "checkpoint.json", **hashes)
 
 
 RUNS = {
@@ -145,11 +148,17 @@ def test_damaged_run_is_not_resumed(run, capfd):
 def test_a_folder_of_other_things_is_no_run(tmp_path, capfd):
     (tmp_path / "letters").mkdir()
     (tmp_path / "letters" / "mother.txt").write_text("dear")
+    (tmp_path / "other" / "checkpoints").mkdir(parents=True)
+    (tmp_path / "other" / "config.json").write_text("{}")
+    (tmp_path / "other" / "checkpoints" / "weights.bin").write_text("theirs")
+    before = snapshot(tmp_path)
     for flag in ((), ("--overwrite",), ("--resume",)):
-        line = refused(capfd, "train", "embedded", "--out", tmp_path / "letters", "--device", "cpu", *flag)
-        assert "letters" in line
+        for name in ("letters", "other"):
+            assert name in refused(capfd, "train", "embedded", "--out", tmp_path / name, "--device", "cpu", *flag)
     assert "no such folder" in refused(capfd, "render", tmp_path / "gone", "--out", tmp_path / "out")
-    assert snapshot(tmp_path) == {(tmp_path / "letters" / "mother.txt").relative_to(tmp_path): b"dear"}
+    (tmp_path / "empty").mkdir()
+    assert "nothing to resume" in refused(capfd, "train", "embedded", "--out", tmp_path / "empty", "--resume")
+    assert snapshot(tmp_path) == before
 
 
 def test_moved_photos(run, tmp_path, capfd):
@@ -221,6 +230,11 @@ def test_nothing_is_replaced(trained, tmp_path, capfd):
     assert "--overwrite" in refused(capfd, *arguments)
     assert snapshot(out) == before
     assert call(*arguments, "--overwrite") == 0 and (out / "notes.txt").read_text() == "mine"
+    for place in ("hdr/truth.exr", "preview/holiday.png"):
+        (out / place).write_text("mine")
+        assert place in refused(capfd, *arguments, "--overwrite")
+        assert (out / place).read_text() == "mine"
+        (out / place).unlink()
     (tmp_path / "scene.ply").write_text("mine")
     assert "--overwrite" in refused(capfd, "export", trained, "--out", tmp_path / "scene.ply")
     (tmp_path / "report").mkdir()
@@ -252,6 +266,7 @@ def test_full_disk_while_training_keeps_the_last_checkpoint(trained, tmp_path, c
     values = json.loads((out / "config.json").read_text())
     values["schedule"]["iterations"] = 8
     (out / "config.json").write_text(json.dumps(values))
+    resign(out, lambda tensors: None)
     before = snapshot(out / "checkpoints")
     flags = ("--max-size", "40", "--device", "cpu", "--resume")
     with full_disk():

@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -7,13 +8,18 @@ import sys
 import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.files import atomic_folder, atomic_path, write_json
+from sehdr_warp.files import LIST, atomic_folder, atomic_path, is_sealed, read_json, seal, write_json
 
 from .full_disk import full_disk
 
 
 def listing(folder):
-    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.name != LIST)
+
+
+def write(path, text="x", **how):
+    with atomic_path(path, **how) as temporary:
+        temporary.write_text(text)
 
 
 def test_file_appears_when_the_block_ends(tmp_path):
@@ -28,13 +34,73 @@ def test_file_appears_when_the_block_ends(tmp_path):
 
 def test_existing_file_is_kept_unless_asked(tmp_path):
     target = tmp_path / "a.txt"
-    target.write_text("old")
+    write(target, "old")
     with pytest.raises(InputError, match="a.txt: exists already;") as caught, atomic_path(target):
         pytest.fail("the block must not run")
     assert "\n" not in str(caught.value)
-    with atomic_path(target, overwrite=True) as temporary:
-        temporary.write_text("new")
+    write(target, "new", overwrite=True)
     assert target.read_text() == "new"
+
+
+@pytest.mark.parametrize("change", ["never ours", "changed since", "another name", "no list"])
+def test_what_this_program_did_not_write_is_never_replaced(tmp_path, change):
+    target = tmp_path / "a.txt"
+    write(tmp_path / "b.txt" if change == "another name" else target, "ours")
+    if change == "another name":
+        (tmp_path / "b.txt").rename(target)
+    elif change == "no list":
+        (tmp_path / LIST).unlink()
+    else:
+        target.write_text("theirs")
+    if change == "never ours":
+        (tmp_path / LIST).write_bytes(b"\xff\n" * 3)
+    kept = target.read_text()
+    with pytest.raises(InputError, match="a.txt: was not written by sehdr-warp, or was changed since"):
+        write(target, overwrite=True)
+    assert target.read_text() == kept and listing(tmp_path) == ["a.txt"]
+
+
+def test_links_devices_and_pipes_are_never_replaced(tmp_path):
+    write(tmp_path / "a.txt", "whole")
+    (tmp_path / "link.txt").symlink_to("a.txt")
+    (tmp_path / "dangling.txt").symlink_to("nowhere")
+    (tmp_path / "set").symlink_to(".")
+    os.mkfifo(tmp_path / "pipe")
+    for name, told in (("link.txt", "link"), ("dangling.txt", "link"), ("pipe", "a pipe"), ("/dev/null", "a device")):
+        with pytest.raises(InputError, match=told):
+            write(tmp_path / name, overwrite=True)
+    with pytest.raises(InputError, match="link"), atomic_folder(tmp_path / "set", overwrite=True):
+        pass
+    (tmp_path / LIST).unlink()
+    (tmp_path / LIST).symlink_to("a.txt")
+    with pytest.raises(OSError):
+        write(tmp_path / "b.txt")
+    assert (tmp_path / "a.txt").read_text() == "whole"
+
+
+def test_a_sealed_folder_tells_when_it_is_damaged(tmp_path):
+    def made():
+        folder = tmp_path / "set"
+        shutil.rmtree(folder, ignore_errors=True)
+        (folder / "deep").mkdir(parents=True)
+        for name in ("a", "deep/b", "deep/\udcff\n"):
+            (folder / name).write_text(name.encode("utf-8", "replace").decode())
+        seal(folder)
+        return folder
+
+    changes = [
+        lambda folder: (folder / "a").write_text("b"),
+        lambda folder: (folder / "deep" / "b").unlink(),
+        lambda folder: (folder / "c").write_text(""),
+        lambda folder: (folder / LIST).write_text(""),
+        lambda folder: (folder / LIST).unlink(),
+        lambda folder: (folder / "deep").joinpath("l").symlink_to("b"),
+    ]
+    assert is_sealed(made())
+    for change in changes:
+        folder = made()
+        change(folder)
+        assert not is_sealed(folder)
 
 
 def test_file_that_appears_meanwhile_is_kept(tmp_path):
@@ -48,7 +114,7 @@ def test_file_that_appears_meanwhile_is_kept(tmp_path):
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
 def test_failure_leaves_nothing_new_and_keeps_the_old(tmp_path, error):
-    (tmp_path / "old.txt").write_text("old")
+    write(tmp_path / "old.txt", "old")
     with pytest.raises(error), atomic_path(tmp_path / "old.txt", overwrite=True) as temporary:
         temporary.write_text("half")
         raise error
@@ -89,8 +155,12 @@ def test_long_names_fit_the_file_system(tmp_path):
 
 def test_folder_replaces_whole_or_not_at_all(tmp_path):
     target = tmp_path / "set"
-    target.mkdir()
-    (target / "old").write_text("old")
+    with atomic_folder(target) as folder:
+        (folder / "old").write_text("old")
+    (target / "theirs").write_text("theirs")
+    with pytest.raises(InputError, match="theirs: was not written"), atomic_folder(target, overwrite=True):
+        pass
+    (target / "theirs").unlink()
     with pytest.raises(InputError, match="exists already"), atomic_folder(target):
         pass
     with pytest.raises(RuntimeError), atomic_folder(target, overwrite=True) as folder:
@@ -115,6 +185,12 @@ def test_folder_appears_whole_where_none_or_an_empty_one_stood(tmp_path):
 def test_json_has_no_nan(tmp_path):
     write_json(tmp_path / "a.json", {"a": float("nan"), "b": [1.5, float("inf")], "c": "ä"})
     assert json.loads((tmp_path / "a.json").read_text(encoding="utf-8")) == {"a": None, "b": [1.5, None], "c": "ä"}
+    write_json(tmp_path / "a.json", {"name": "\udcff"}, overwrite=True)
+    assert read_json(tmp_path / "a.json") == {"name": "\udcff"}
+    (tmp_path / "twice.json").write_text('{"a": {"b": 1, "b": 2}}')
+    with pytest.raises(InputError, match="'b' stands twice"):
+        read_json(tmp_path / "twice.json")
+    (tmp_path / "twice.json").unlink()
     with pytest.raises(TypeError):
         write_json(tmp_path / "b.json", {"a": object()})
     assert listing(tmp_path) == ["a.json"]
@@ -128,7 +204,7 @@ def killed(code, folder):
     """Runs code in a process that is killed where it says so; the names it left."""
     result = subprocess.run([sys.executable, "-c", HEAD + DIE + code], cwd=folder, timeout=60, check=False)
     assert result.returncode == -signal.SIGKILL
-    return sorted(os.listdir(folder))
+    return sorted(name for name in os.listdir(folder) if name != LIST)
 
 
 def test_what_a_killed_process_left_goes_with_the_next_write(tmp_path):
@@ -155,8 +231,8 @@ with files.atomic_folder(Path("set")) as folder, files.atomic_path(Path("a.txt")
 )
 def test_a_folder_that_was_being_replaced_by_a_killed_process_is_never_lost(tmp_path, hook, left, kept):
     """Killed between the two renames, or before what was set aside is removed."""
-    (tmp_path / "set").mkdir()
-    (tmp_path / "set" / "old").write_text("1")
+    with atomic_folder(tmp_path / "set") as folder:
+        (folder / "old").write_text("1")
     code = """
 with files.atomic_folder(Path("set"), overwrite=True) as folder:
     (folder / "new").write_text("1")
@@ -178,8 +254,7 @@ with files.atomic_path(Path("a.txt"), overwrite=True) as file:
         [sys.executable, "-c", HEAD + code], cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as other:
         other.stdout.readline()
-        with atomic_path(tmp_path / "a.txt") as temporary:
-            temporary.write_text("ours")
+        write(tmp_path / "a.txt", "ours")
         assert (tmp_path / "a.txt").read_text() == "ours"
         other.communicate(b"\n")
     assert other.returncode == 0 and (tmp_path / "a.txt").read_text() == "theirs"

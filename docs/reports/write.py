@@ -37,7 +37,7 @@ def write_reports(folder: Path) -> list[Path]:
         parts = [f"# {page['title']}", page["text"], f"```sh\n{result['command']}\n```", machine_line(result) + "."]
         if name in PLOTS:
             written.append(folder / f"{name}.png")
-            with atomic_path(written[-1], overwrite=True) as temporary:
+            with atomic_path(written[-1], ours=True) as temporary:
                 PLOTS[name](result, temporary)
             parts.append(f"![{page['caption']}]({name}.png)")
         written.append(_write(folder / f"{name}.md", [*parts, *TABLES[name](result), *result["notes"]]))
@@ -60,7 +60,7 @@ def _read(path: Path) -> dict:
 
 
 def _write(path: Path, parts: Sequence[str]) -> Path:
-    with atomic_path(path, overwrite=True) as temporary:
+    with atomic_path(path, ours=True) as temporary:
         temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     return path
 

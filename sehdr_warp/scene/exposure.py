@@ -14,6 +14,8 @@ from .images import EXIF_ERRORS, open_image
 
 _EXIF_IFD = 0x8769
 _EXPOSURE_TIME, _F_NUMBER, _SPEED, _SHUTTER_APEX = 33434, 33437, 34855, 37377
+SHORTEST, LONGEST = 1e-12, 1e12
+"""Seconds: what an exposure time may be."""
 _REMEDY = "correct it, or state every image's seconds in exposures.json"
 
 
@@ -60,8 +62,8 @@ def with_exposure_times(shots: list[Shot], source: Path) -> tuple[list[Shot], bo
         if time is None and times:
             problem = f"exposure time is absent in {len(shots) - len(times)} of {len(shots)} images"
             raise InputError(shot.image, problem, "state all in exposures.json, or strip them all")
-        if time is not None and not (math.isfinite(time) and time > 0):
-            raise InputError(shot.image, f"exposure time {time} s is not positive and finite", _REMEDY)
+        if time is not None and not SHORTEST <= time <= LONGEST:
+            raise InputError(shot.image, f"exposure time {time} s is not in {SHORTEST} to {LONGEST}", _REMEDY)
     if not times:
         notes.append("no exposure times were found: each view counts as 1 s")
         return [replace(shot, exposure_time=1.0) for shot in shots], False, notes
@@ -78,7 +80,7 @@ def parse_seconds(value, source: Path, field: str) -> float:
         seconds = float(value)
     except (TypeError, ValueError, OverflowError):
         seconds = math.nan
-    if not (math.isfinite(seconds) and seconds > 0):
+    if not SHORTEST <= seconds <= LONGEST:
         raise InputError(source, f"exposure time of {field!r:.90} is {value!r:.40}", "state seconds above zero")
     return seconds
 

@@ -212,7 +212,7 @@ def _data(asked: Train, resumed) -> dict:
         known = resumed.read_info()["data"]
         given = {name: known.get(name) if value is None else value for name, value in given.items()}
     if given["path"] is None and asked.output.resume:
-        raise SehdrError(f"{asked.output.out}: holds nothing to resume; give SCENE to begin, or the folder of a run")
+        raise SehdrError(f"{asked.output.out}: does not say where its photos are; give SCENE")
     if given["path"] is None:
         raise UsageError("train needs SCENE, a folder of photos or `embedded`; see sehdr-warp train --help")
     return given

@@ -66,19 +66,34 @@ def torch_settings(deterministic: bool) -> Iterator[None]:
 
 @contextmanager
 def interruptible() -> Iterator[threading.Event]:
-    """An event that the first interrupt sets, so that a step is never cut in two; a second interrupt stops at once."""
+    """An event that the first signal to end (Ctrl-C, SLURM's and containers' SIGTERM, the SIGHUP of a terminal that
+    closes) sets, so that a step is never cut in two. It takes effect when the block ends, a second one at once."""
     event = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield event
         return
-    previous = signal.getsignal(signal.SIGINT)
+    signals = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    # What nohup or a shell's background ignores stays ignored.
+    previous = {each: kept for each in signals if (kept := signal.getsignal(each)) not in (signal.SIG_IGN, None)}
+    caught = []
 
-    def on_interrupt(*_):
+    def restore():
+        for each, handler in previous.items():
+            signal.signal(each, handler)
+
+    def on_signal(number, _):
+        caught.append(number)
         event.set()
-        signal.signal(signal.SIGINT, previous)
+        restore()
 
-    signal.signal(signal.SIGINT, on_interrupt)
+    for each in previous:
+        signal.signal(each, on_signal)
     try:
         yield event
+    except Exception:
+        caught.clear()  # What went wrong is to be told.
+        raise
     finally:
-        signal.signal(signal.SIGINT, previous)
+        restore()
+        if caught:
+            signal.raise_signal(caught[0])

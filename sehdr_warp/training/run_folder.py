@@ -10,47 +10,67 @@ confidence.safetensors      how far the photos vouch for each Gaussian, and of w
 summary.json                times, memory and counts, when the training ended
 
 A checkpoint is written beside its final place, flushed to the disk and renamed: what a killed process left is never
-mistaken for one. Nothing is pickled.
+mistaken for one. So is a new run, with a checkpoint of its start, before it takes the place of another. A checkpoint
+holds the hashes of what else decides the picture. Only names of this list are ever replaced. Nothing is pickled.
 """
 
 import hashlib
 import json
 import math
+import os
+import re
 import shutil
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, Field, ValidationError
+from filelock import FileLock, Timeout
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from ..errors import InputError, SehdrError
 from ..field.confidence import Evidence
 from ..field.radiance_field import RadianceField
-from ..files import atomic_folder, atomic_path, read_json, write_json, writing
+from ..files import atomic_folder, atomic_path, make_parents, read_json, remove_stale, write_json, writing
 from ..response import Response
 from ..scene import Camera, Scene
+from ..scene.exposure import LONGEST, SHORTEST
 from ..scene.images import MAX_PIXELS
 from .config import Config
 from .config_files import config_from_dict, field_and_problem
 
 FORMAT = 2  # Version of what a run holds; a reader refuses others
 TENSORS, VALUES = "state.safetensors", "checkpoint.json"
+_LOCK, _NEW, _READY = ".lock", ".new", ".ready"
 _REMEDY = "the run is damaged: train again"
 _OLDER = "remove this folder to use an older checkpoint, or train again"
+_OWN = "choose another folder, or remove this one yourself"
+_Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
-class _RunValues(BaseModel):
+class _Values(BaseModel):
+    model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
+
+
+class _DataValues(_Values):
+    path: Annotated[str, Field(max_length=4096)] | None = None
+    exposure_index: _Count | None = None
+    max_size: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
+    holdout: _Count | None = None
+
+
+class _RunValues(_Values):
     scene: str
-    data: dict
-    base_time: Annotated[float, Field(gt=0, le=1e300)]
+    data: _DataValues
+    base_time: Annotated[float, Field(ge=SHORTEST, le=LONGEST)]
     response: dict
 
 
-class _CheckpointValues(BaseModel):
-    iteration: Annotated[int, Field(ge=0)]
-    seconds: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+class _CheckpointValues(_Values):
+    iteration: Annotated[int, Field(ge=0, le=10_000_000)]
+    seconds: Annotated[float, Field(ge=0)]
+    run: dict[str, str] = {}
 
 
 @dataclass(frozen=True)
@@ -85,40 +105,133 @@ class RunFolder:
         self.checkpoints = self.path / "checkpoints"
         self.confidence = self.path / "confidence.safetensors"
         self.tensorboard = self.path / "tensorboard"
+        self._lock = FileLock(self.path / _LOCK, thread_local=False)
+        self._hashes: dict[str, str] | None = None
+
+    def lock(self) -> None:
+        """Keeps the folder, made where it is missing, for one training until unlock() or the end of the process; raises
+        InputError where another training has it."""
+        if self._lock.is_locked:
+            return
+        with writing(self.path):
+            make_parents(self._lock_file)
+            try:
+                self._lock.acquire(timeout=0)
+            except Timeout:
+                problem = "another training is at work in it"
+                raise InputError(self.path, problem, "wait for its end, or choose another folder") from None
+
+    def unlock(self) -> None:
+        """Lets go of the folder, which goes where no run was begun in it."""
+        if self._lock.is_locked:
+            self._lock.release()
+            with suppress(OSError):
+                if self._is_empty():
+                    self._lock_file.unlink()
+                    self.path.rmdir()
 
     def check(self, *, resume: bool, overwrite: bool) -> bool:
-        """Whether there is a run to continue; raises InputError for what is there and no run, or not asked for."""
+        """Whether there is a run to continue; raises InputError for what is there and no run of ours, not asked for, or
+        being trained."""
         if self.path.exists() and not self.path.is_dir():
             raise InputError(self.path, "is a file", "choose another folder for the run")
-        if not self.path.exists() or not any(self.path.iterdir()):
+        remove_stale(self.config)
+        if not self.path.exists() or self._is_empty():
+            if resume:
+                raise InputError(self.path, "holds nothing to resume", "leave --resume out to begin a training")
             return False
         if not resume and not overwrite:
             raise InputError(self.path, "exists and is not empty", "choose another, or use --resume or --overwrite")
         self.require()
+        if self.checkpoints.is_symlink():
+            raise InputError(self.checkpoints, "is a link, and what it leads to is not replaced", _OWN)
+        if not {"format", "base_time", "response"} <= _read_json(self.info, _OWN).keys():
+            raise InputError(self.info, "is not that of a run of sehdr-warp", _OWN)
+        if not self._lock.is_locked:
+            self.lock()
+            self.unlock()
         return resume
 
     def require(self) -> None:
-        """Raises InputError if this is not the folder of a training."""
-        if not self.config.is_file():
-            problem = "is not a run (no config.json)" if self.path.is_dir() else "no such folder"
-            raise InputError(self.path, problem, "give the folder that `sehdr-warp train --out` wrote")
+        """Raises InputError if this is not the folder of a training; finishes what a killed process had begun."""
+        if any((self.path / name).is_dir() for name in (_NEW, _READY)):
+            held = self._lock.is_locked
+            with suppress(InputError):  # Whoever has the lock does it.
+                self.lock()
+                self._settle()
+            if not held:
+                self.unlock()
+        for file in (self.config, self.info):
+            if not file.is_file():
+                problem = f"is not a run (no {file.name})" if self.path.is_dir() else "no such folder"
+                raise InputError(self.path, problem, "give the folder that `sehdr-warp train --out` wrote")
 
-    def begin(self, scene: Scene, config: Config, field: RadianceField, data: dict, plan: dict | None) -> None:
-        """Makes the folder, or removes the run in it, and writes what does not change; config.json last: it says that
-        the folder is a run."""
+    def begin(
+        self,
+        scene: Scene,
+        config: Config,
+        field: RadianceField,
+        data: dict,
+        plan: dict | None,
+        state: tuple[dict[str, Tensor], dict],
+        *,
+        overwrite: bool = False,
+    ) -> None:
+        """Makes the folder, locked, with all that does not change and a checkpoint of the start. All of it is there
+        before anything of a run to be overwritten goes."""
         from .. import __version__
 
-        with writing(self.path):
-            for file in (self.summary, self.metrics, self.confidence, self.plan, self.scene, self.info, self.config):
-                file.unlink(missing_ok=True)
-        shutil.rmtree(self.checkpoints, ignore_errors=True)
+        self.lock()
+        self.check(resume=False, overwrite=overwrite)  # Photos were read since.
         info = {"format": FORMAT, "version": __version__, "scene": scene.name, "data": data}
         info |= {"base_time": field.base_time, "response": field.response.to_dict()}
-        if plan is not None:
-            write_json(self.plan, plan)
-        write_json(self.scene, describe_scene(scene))
-        write_json(self.info, info)
-        write_json(self.config, config.model_dump())
+        with atomic_folder(self.path / _NEW, ours=True) as beside:
+            new = RunFolder(beside)
+            if plan is not None:
+                write_json(new.plan, plan)
+            write_json(new.scene, describe_scene(scene))
+            write_json(new.info, info)
+            write_json(new.config, config.model_dump())
+            new.write_checkpoint(*state, kept=1)
+        self._settle()
+        self._hashes = new._hashes
+
+    def _settle(self) -> None:
+        """Puts a new run that is whole in the place of the one before; each step can be done again after a kill."""
+        new, ready = self.path / _NEW, self.path / _READY
+        with writing(self.path):
+            if new.is_dir():
+                for name in ("summary", "metrics", "confidence", "plan", "scene", "info", "config"):
+                    getattr(self, name).unlink(missing_ok=True)
+                for checkpoint in self._found_checkpoints():
+                    _remove_checkpoint(checkpoint)
+                os.rename(new, ready)
+            if ready.is_dir():
+                self.checkpoints.mkdir(exist_ok=True)
+                for part in (*ready.glob("checkpoints/*"), *(path for path in ready.iterdir() if path.is_file())):
+                    os.replace(part, self.path / part.relative_to(ready))
+                shutil.rmtree(ready)
+
+    @property
+    def _lock_file(self) -> Path:
+        return self.path / _LOCK
+
+    def _is_empty(self) -> bool:
+        return not {path.name for path in self.path.iterdir()} - {_LOCK}
+
+    def _found_checkpoints(self) -> list[Path]:
+        """The folders with names of checkpoints, the oldest first."""
+        found = (path for path in self.checkpoints.glob("iteration_*") if re.fullmatch(r"iteration_\d{8}", path.name))
+        return sorted(found)
+
+    def hashes(self) -> dict[str, str]:
+        """Of the values in the files that decide the picture beside the checkpoint; run.json's place of the photos is
+        none of them."""
+        values = {file.name: _read_json(file) for file in (self.config, self.scene, self.info) if file.is_file()}
+        values.get(self.info.name, {}).pop("data", None)
+        return {
+            name: hashlib.sha256(json.dumps(each, sort_keys=True).encode()).hexdigest() for name, each in values.items()
+        }
 
     def read_config(self) -> Config:
         """The config of the training."""
@@ -162,7 +275,7 @@ class RunFolder:
         return _read_json(self.summary) if self.summary.exists() else {}
 
     def write_summary(self, values: dict) -> None:
-        write_json(self.summary, values, overwrite=True)
+        write_json(self.summary, values, ours=True)
 
     def append_metrics(self, line: dict) -> None:
         with writing(self.metrics), open(self.metrics, "a", encoding="utf-8") as file:
@@ -173,16 +286,17 @@ class RunFolder:
         lines = []
         text = self.metrics.read_text(encoding="utf-8", errors="replace") if self.metrics.exists() else ""
         for line in text.splitlines():
-            with suppress(ValueError, RecursionError, TypeError, KeyError):
+            with suppress(ValueError, RecursionError, TypeError, KeyError, AttributeError, OverflowError):
                 values = json.loads(line)
-                if isinstance(values["iteration"], int):
+                figures = [values.get(name, 0.0) for name in ("seconds", "psnr_ldr", "psnr_mu", "gaussians")]
+                if type(values["iteration"]) is int and all(map(math.isfinite, figures)):
                     lines.append(values)
         return lines
 
     def rewind_metrics(self, iteration: int) -> None:
         """Drops the evaluations after an iteration: a resumed training makes them again."""
         kept = [line for line in self.read_metrics() if line["iteration"] <= iteration]
-        with atomic_path(self.metrics, overwrite=True) as beside:
+        with atomic_path(self.metrics, ours=True) as beside:
             beside.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
 
     def write_checkpoint(self, tensors: dict[str, Tensor], values: dict, *, kept: int) -> Path:
@@ -194,28 +308,37 @@ class RunFolder:
         try:
             read_checkpoint(final)
         except InputError:
-            for leftover in self.checkpoints.glob(".iteration_*"):
-                shutil.rmtree(leftover, ignore_errors=True)
+            self._hashes = self._hashes or self.hashes()
             data = save({name: value.detach().cpu().contiguous() for name, value in tensors.items()})
-            stated = values | {"format": FORMAT, "sha256": hashlib.sha256(data).hexdigest()}
-            with atomic_folder(final, overwrite=True) as beside:
+            stated = values | {"format": FORMAT, "sha256": hashlib.sha256(data).hexdigest(), "run": self._hashes}
+            _remove_checkpoint(final)
+            with atomic_folder(final, ours=True) as beside:
                 (beside / TENSORS).write_bytes(data)
                 (beside / VALUES).write_text(json.dumps(stated, indent=1) + "\n", encoding="utf-8")
-        folders = sorted(self.checkpoints.glob("iteration_*"))
+        folders = self._found_checkpoints()
         end = folders.index(final) + 1
         for other in folders[: max(0, end - kept)] + folders[end:]:
-            shutil.rmtree(other, ignore_errors=True)
+            _remove_checkpoint(other)
         return final
 
     def newest_checkpoint(self) -> Checkpoint | None:
         """The newest sound checkpoint, None if there is none at all; where all are damaged, or hold numbers that are
-        not finite, the newest one's InputError is raised."""
+        not finite, the newest one's InputError is raised, and one where the files beside it were changed since."""
         newest: InputError | None = None
-        for path in sorted(self.checkpoints.glob("iteration_*"), reverse=True):
+        for path in reversed(found := self._found_checkpoints()):
             try:
-                return read_checkpoint(path)
+                checkpoint = read_checkpoint(path)
             except InputError as error:
                 newest = newest or error
+                continue
+            self._hashes = self.hashes()
+            for name, value in checkpoint.values.get("run", {}).items():
+                if self._hashes.get(name) != value:
+                    problem = "was changed since its checkpoint was written"
+                    raise InputError(self.path / name, problem, "put it back as it was, or train again")
+            return checkpoint
+        if found != self._found_checkpoints():  # A training that runs has written another and removed these.
+            return self.newest_checkpoint()
         if newest is not None:
             raise newest
         return None
@@ -227,7 +350,7 @@ class RunFolder:
         tensors = {**vars(evidence), "confidence": evidence.confidence()}
         stated = {"format": str(FORMAT), "checkpoint": checkpoint_hash}
         data = save({name: value.float().cpu().contiguous() for name, value in tensors.items()}, stated)
-        with atomic_path(self.confidence, overwrite=True) as beside:
+        with atomic_path(self.confidence, ours=True) as beside:
             beside.write_bytes(data)
 
     def read_confidence(self, checkpoint: Checkpoint) -> Tensor | None:
@@ -272,6 +395,14 @@ def read_checkpoint(path: Path) -> Checkpoint:
     if (name := first_not_finite(tensors)) is not None:
         raise InputError(file, f"{name} holds values that are not finite", _OLDER)
     return Checkpoint(path, tensors, values)
+
+
+def _remove_checkpoint(path: Path) -> None:
+    """Removes a checkpoint, and its folder where nothing else is in it."""
+    with suppress(OSError):
+        for name in (VALUES, TENSORS):
+            (path / name).unlink(missing_ok=True)
+        path.rmdir()
 
 
 def first_not_finite(tensors: dict[str, Tensor]) -> str | None:

@@ -4,6 +4,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from functools import cache, partial
 from operator import attrgetter
 from pathlib import Path
@@ -68,7 +69,8 @@ class Training:
         run = training.run
 
     Leaving the loop, or stop(), ends the training: a checkpoint is written, and resume=True goes on from there. While
-    it is iterated, torch runs on one thread, and the first interrupt ends it after a step, as KeyboardInterrupt.
+    it is iterated, torch runs on one thread, and the first SIGINT, SIGTERM or SIGHUP ends it after a step: it takes
+    effect (KeyboardInterrupt) once the checkpoint is written. Until then no other training may use the folder.
 
     Args:
         scene: of load_scene; its training views are trained on, its test views are the held-out ones.
@@ -76,9 +78,9 @@ class Training:
         config: a Config, a preset's name or file, or a mapping of fields that differ from the default preset; by
             default that preset, or, resuming, the run's own config.
         device: "cpu", "cuda:0", ...; by default the first GPU if there is one.
-        resume: continue the run in `out`, if there is one, from its newest complete checkpoint: on the CPU the result
-            is bit for bit that of an uninterrupted training.
-        overwrite: replace the run in `out`.
+        resume: continue the run in `out` from its newest complete checkpoint: on the CPU the result is bit for bit
+            that of an uninterrupted training.
+        overwrite: replace the run in `out`, once there is a checkpoint of the new one's start.
         tensorboard: event files in out/tensorboard (needs the extra `tensorboard`).
         data: how load_scene made the scene ("path", "exposure_index", "max_size" ...), saved to load it again.
 
@@ -106,10 +108,15 @@ class Training:
         self.seconds = 0.0
         with memory_told(self.device, lambda: _sizes(scene)):
             self.scene = scene
-            if self.folder.check(resume=resume, overwrite=overwrite):
-                self.trainer = self._continue(config)
-            else:
-                self.trainer = self._begin(scene, config or Config(), data or {})
+            resumed = self.folder.check(resume=resume, overwrite=overwrite)
+            try:
+                if resumed:
+                    self.trainer = self._continue(config)
+                else:
+                    self.trainer = self._begin(scene, config or Config(), data or {}, overwrite)
+            except BaseException:
+                self.folder.unlock()
+                raise
         self.config, self.total = self.trainer.config, self.trainer.config.schedule.iterations
         self._first, self._pace, self._stopped = self.iteration, 0.0, False
         self._run: Run | None = None
@@ -149,7 +156,10 @@ class Training:
             memory_told(self.device, lambda: _sizes(self.scene, self.trainer)),
             torch_settings(self.config.deterministic),
             interruptible() as interrupted,
+            ExitStack() as leaving,
         ):
+            self.folder.lock()
+            leaving.callback(self.folder.unlock)
             try:
                 while self.iteration < self.total and not (interrupted.is_set() or self._stopped):
                     yield self._step()
@@ -159,7 +169,7 @@ class Training:
             self._save()
             if interrupted.is_set() and self.iteration < self.total:
                 log.info("stopped at iteration %d; continue with --resume", self.iteration)
-                raise KeyboardInterrupt
+                return
             self._run = None
             run = self.run
             self.folder.write_confidence(run.measure_confidence(self.scene), run.checkpoint_hash)
@@ -260,11 +270,13 @@ class Training:
             for name, value in figures.items():
                 self._writer.add_scalar(f"{split}/{name}", value, self.iteration)
 
-    def _begin(self, scene: Scene, config: Config, data: dict) -> Trainer:
+    def _begin(self, scene: Scene, config: Config, data: dict, overwrite: bool) -> Trainer:
         config, plan = apply_plan(scene, config, self.device)
         trainer = self._at_start(scene, config)
         # Nothing is made or removed before the scene is known to be good.
-        self.folder.begin(scene, config, trainer.field, data, plan and plan.to_dict())
+        tensors, values = trainer.state()
+        state = tensors, values | {"seconds": self.seconds}
+        self.folder.begin(scene, config, trainer.field, data, plan and plan.to_dict(), state, overwrite=overwrite)
         for line in plan.lines() if plan is not None else ():
             log.info("%s", line)
         return trainer
@@ -276,8 +288,9 @@ class Training:
         return Trainer(scene, config, field, matcher)
 
     def _continue(self, config: Config | None) -> Trainer:
-        """The trainer as the newest checkpoint has it; as at the start where there is none yet."""
+        """The trainer as the newest checkpoint has it."""
         folder, scene = self.folder, self.scene
+        folder.lock()
         info, saved = folder.read_info(), folder.read_config()
         if config is not None and config.plan.enabled:
             # As it was planned then: on another machine the same config may be planned otherwise.
@@ -291,8 +304,7 @@ class Training:
         folder.check_same_scene(scene)
         checkpoint = folder.newest_checkpoint()
         if checkpoint is None:
-            folder.rewind_metrics(0)
-            return self._at_start(scene, saved)
+            raise InputError(folder.checkpoints, "holds no complete checkpoint", "train again, with --overwrite")
         trainer = Trainer(scene, saved, field_from_checkpoint(checkpoint, saved, info).to(self.device))
         try:
             trainer.load_state(checkpoint.tensors, checkpoint.values)

@@ -137,9 +137,9 @@ def _run(folder: Path) -> None:
     scene = toy_scene(2, 8)
     field = assemble_field(gaussians, config, response_by_name("srgb"), 0.25)
     run = RunFolder(folder)
-    run.begin(scene, config, field, {"path": "embedded"}, None)
     tensors, values = Trainer(scene, config, field).state()
-    run.write_checkpoint(tensors, values | {"seconds": 1.0}, kept=1)
+    run.begin(scene, config, field, {"path": "embedded"}, None, (tensors, values | {"seconds": 1.0}))
+    run.unlock()
     run.append_metrics({"iteration": 1, "seconds": 0.5, "psnr_ldr": 20.0})
     run.write_summary({"iteration": 10, "train_seconds": 2.0})
 
@@ -155,10 +155,11 @@ def _resume(folder: Path):
 
 def _resign(folder: Path) -> None:
     for path in folder.glob("checkpoints/*/checkpoint.json"):
-        with suppress(OSError, ValueError, TypeError, RecursionError):
+        with suppress(OSError, ValueError, TypeError, RecursionError, SehdrError):
             values = json.loads(path.read_bytes())
             data = (path.parent / "state.safetensors").read_bytes()
-            path.write_text(json.dumps(values | {"sha256": hashlib.sha256(data).hexdigest()}))
+            hashes = {"sha256": hashlib.sha256(data).hexdigest(), "run": RunFolder(folder).hashes()}
+            path.write_text(json.dumps(values | hashes))
 
 
 def _responses(folder: Path) -> None:
@@ -214,7 +215,7 @@ READERS = {
     "radiance": Reader(_radiance, ("*.hdr",), each(read_hdr)),
     "photos": Reader(_photos, ("*",), each(image_sizes, read_mask, exif_exposure, _read_photo)),
     "config": Reader(_config, ("*.toml",), each(load_config), text=True),
-    "run": Reader(_run, _RUN_FILES, _read_run, text=True),
+    "run": Reader(_run, _RUN_FILES, _read_run, text=True, repair=_resign),
     "checkpoint": Reader(_run, ("checkpoints/*/*",), _read_run, text=True, repair=_resign),
     "resume": Reader(_run, (*_RUN_FILES, "checkpoints/*/*"), _resume, text=True, repair=_resign),
     "responses": Reader(_responses, ("*",), each(_read_response), text=True),

@@ -1,11 +1,14 @@
 """Checkpoints: complete or absent, hashed, newest first."""
 
 import json
+import os
+import subprocess
 
 import pytest
 import torch
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.files import _beside
 from sehdr_warp.training.run_folder import RunFolder, read_checkpoint
 
 
@@ -58,12 +61,33 @@ def test_a_damaged_newest_falls_back(folder):
 
 
 def test_what_a_killed_writer_left_is_no_checkpoint(folder):
-    left = folder.checkpoints / ".iteration_00000005.123.tmp"
-    left.mkdir(parents=True)
-    (left / "state.safetensors").write_bytes(b"half")
-    assert folder.newest_checkpoint() is None
+    """Nor is what somebody else keeps there; that stays."""
+    with subprocess.Popen(["true"]) as dead:
+        pass
+    left = _beside(folder.checkpoints / "iteration_00000005")
+    left = left.with_name(left.name.replace(f"-{os.getpid()}-", f"-{dead.pid}-"))
+    theirs = [folder.checkpoints / name for name in ("iteration_best", "iteration_00000001", ".iteration_x")]
+    for place in (left, *theirs):
+        place.mkdir(parents=True)
+        (place / "half").write_bytes(b"half")
+    with pytest.raises(InputError, match="iteration_00000001"):
+        folder.newest_checkpoint()
     folder.write_checkpoint(*state(6), kept=1)
-    assert not left.exists()
+    assert not left.exists() and all((place / "half").exists() for place in theirs)
+
+
+def test_what_decides_the_picture_is_hashed_with_the_checkpoint(folder):
+    for file in (folder.config, folder.scene, folder.info):
+        file.write_text('{"a": 1, "data": {"path": "here"}}')
+    folder.write_checkpoint(*state(1), kept=1)
+    folder.info.write_text('{"data": {"path": "moved"}, "a": 1}')
+    assert RunFolder(folder.path).newest_checkpoint().values["iteration"] == 1
+    for file in (folder.config, folder.scene, folder.info):
+        text = file.read_text()
+        file.write_text(text.replace("1", "2"))
+        with pytest.raises(InputError, match=f"{file.name}: was changed since"):
+            RunFolder(folder.path).newest_checkpoint()
+        file.write_text(text)
 
 
 def test_a_wrong_tensor_file_with_a_right_hash_is_refused(folder):

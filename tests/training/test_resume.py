@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from sehdr_warp.errors import InputError
 from sehdr_warp.training.initialization import choose_response, make_field
-from sehdr_warp.training.run import field_from_checkpoint
+from sehdr_warp.training.run import field_from_checkpoint, load_run
 from sehdr_warp.training.run_folder import Checkpoint, RunFolder
-from sehdr_warp.training.train import train
+from sehdr_warp.training.train import Training, train
 from sehdr_warp.training.trainer import Trainer
 
 from .test_train import QUICK
@@ -53,7 +54,7 @@ def kill_after_checkpoint(out, strategy):
         env=os.environ | {"PYTHONPATH": f"{root}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"},
     )
     deadline = time.monotonic() + 120
-    while not list((out / "checkpoints").glob("iteration_*")):
+    while not (out / "checkpoints" / "iteration_00000060").exists():
         assert process.poll() is None and time.monotonic() < deadline, "the training ended before its checkpoint"
         time.sleep(0.05)
     time.sleep(1.2)
@@ -82,17 +83,60 @@ def test_resume_is_exact(scene, tmp_path, strategy):
     assert lines == [10, 120], "each evaluation once"
 
 
-def test_resume_before_the_first_checkpoint_starts_over(scene, tmp_path):
+def test_a_run_begins_with_a_checkpoint_of_its_start(scene, tmp_path):
     config = configuration("gradient")
     whole = train(scene, tmp_path / "whole", config, device="cpu")
-    train(scene, tmp_path / "cut", config, device="cpu")
-    for folder in (tmp_path / "cut" / "checkpoints").iterdir():
-        for file in folder.iterdir():
-            file.unlink()
-        folder.rmdir()
+    begun = Training(scene, tmp_path / "cut", config, device="cpu")
+    assert RunFolder(tmp_path / "cut").newest_checkpoint().values["iteration"] == 0
+    with pytest.raises(InputError, match="another training is at work"):
+        train(scene, tmp_path / "cut", device="cpu", resume=True)
+    del begun
     again = train(scene, tmp_path / "cut", device="cpu", resume=True)
     assert torch.equal(whole.model.gaussians.means, again.model.gaussians.means)
     assert len(again.metrics()) == len(whole.metrics())
+
+
+KILL = """
+import os, signal, sys
+sys.path.insert(0, sys.argv[1])
+from tests.training.test_resume import configuration
+from tests.training.toy import toy_scene
+from sehdr_warp.training.train import train
+left = int(sys.argv[3])
+def dying(function):
+    def call(*arguments, **options):
+        global left
+        left -= 1
+        if left < 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return function(*arguments, **options)
+    return call
+for name in ("rename", "replace", "unlink", "rmdir", "mkdir", "fsync"):
+    setattr(os, name, dying(getattr(os, name)))
+config = configuration("gradient").model_copy(update={"seed": 5})
+train(toy_scene(), sys.argv[2], config, device="cpu", overwrite=True)
+"""
+
+
+@pytest.mark.parametrize("moment", [3, 33, 40, 46])
+def test_a_run_is_replaced_whole_or_not_at_all(scene, tmp_path, moment):
+    """Killed at any change of the disk, the old run or the new one is there, and what is another's stays."""
+    out = tmp_path / "run"
+    old = train(scene, out, configuration("gradient").model_copy(update={"seed": 4}), device="cpu").model
+    for name in ("notes.txt", "checkpoints/iteration_best"):
+        (out / name).write_text("mine")
+    root = Path(__file__).resolve().parents[2]
+    call = [sys.executable, "-c", KILL, str(root), str(out), str(moment)]
+    ended = subprocess.run(call, check=False, capture_output=True, text=True)
+    assert ended.returncode == -signal.SIGKILL, ended.stderr
+    run = load_run(out)
+    assert (run.config.seed, run.iterations) in ((4, 120), (5, 0))
+    assert run.config.seed == 5 or torch.equal(run.model.gaussians.means, old.gaussians.means)
+    again = train(scene, out, device="cpu", resume=True)
+    assert again.iterations == 120
+    assert (out / "notes.txt").read_text() == (out / "checkpoints" / "iteration_best").read_text() == "mine"
+    hidden = [path.name for path in out.rglob(".*") if path.name != ".lock"]
+    assert hidden == []
 
 
 def test_resume_of_a_finished_run_changes_nothing(scene, tmp_path):

@@ -103,7 +103,7 @@ def test_run_folder_is_complete_and_loads_without_photos(scene, tmp_path):
     run = train(scene, out, quick(), device="cpu", data={"path": "somewhere"})
     names = {path.name for path in out.iterdir()}
     files = {"config.json", "scene.json", "run.json", "metrics.jsonl", "summary.json", "confidence.safetensors"}
-    assert names == files | {"checkpoints"}
+    assert names == files | {"checkpoints", ".lock"}
     again = load_run(out)
     assert again.config == run.config == quick() and again.data == {"path": "somewhere"}
     assert [entry.name for entry in again.cameras] == [view.name for view in scene.views]
