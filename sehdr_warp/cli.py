@@ -5,14 +5,16 @@ a line of COMMANDS. Modules are imported by the commands that need them: nothing
 """
 
 import os
+import shutil
 import sys
 from collections.abc import Callable
 from importlib import import_module
 
 from . import __version__
-from .errors import SehdrError, UsageError, did_you_mean
+from .errors import UsageError, did_you_mean, surroundings_told
 
 PROGRAM = "sehdr-warp"
+LEAST_COLUMNS = 40
 COMMANDS = {
     "train and use a scene": {
         "train": ("training.commands", "Train", "run_train"),
@@ -52,13 +54,6 @@ def main(arguments: list[str] | None = None) -> None:
             _run([word for word in words if word != "--debug"])
         finally:
             sys.stdout.flush()
-    except SehdrError as error:
-        if "--debug" in words:
-            import traceback
-
-            traceback.print_exc()
-        _tell(f"{PROGRAM}: {str(error).removeprefix(PROGRAM + ' ')}")
-        sys.exit(2 if isinstance(error, UsageError) else 1)
     except KeyboardInterrupt:
         _tell(f"{PROGRAM}: interrupted")
         sys.exit(130)
@@ -66,6 +61,16 @@ def main(arguments: list[str] | None = None) -> None:
         # As of `sehdr-warp ... | head`; Python would complain again when it closes what nobody reads.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
+    except Exception as error:
+        told = surroundings_told(error)
+        if told is None:
+            raise
+        if "--debug" in words:
+            import traceback
+
+            traceback.print_exc()
+        _tell(f"{PROGRAM}: {str(told).removeprefix(PROGRAM + ' ')}")
+        sys.exit(2 if isinstance(told, UsageError) else 1)
     sys.exit(0)
 
 
@@ -78,6 +83,8 @@ def _run(words: list[str]) -> None:
     # torch's OpenMP threads spin while they wait, which on a processor shared with other programs costs a training on
     # the CPU most of its time; read once, when torch is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    if shutil.get_terminal_size().columns < LEAST_COLUMNS:  # No table fits, and to try takes minutes.
+        os.environ["COLUMNS"] = str(LEAST_COLUMNS)
     from .console import show_logs
     from .quiet import silence_exit
 
@@ -114,7 +121,6 @@ def _load(name: str):
 
 def _help() -> str:
     """The commands under their headings, each with the first sentence of its help."""
-    import shutil
     import textwrap
 
     width = min(shutil.get_terminal_size().columns, 100)

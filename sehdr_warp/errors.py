@@ -1,6 +1,8 @@
 """The errors a user can act on, and the nearest right word for a wrong one."""
 
 import difflib
+import os
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -45,3 +47,23 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     """`, did you mean X?` for the nearest known word, or nothing: to be put behind a message."""
     near = nearest(word, known)
     return f", did you mean {near}?" if near else ""
+
+
+_NO_MEMORY = re.compile(r"allocate memory|[Ff]ailed to allocate|bad_alloc|out of memory|map segment|start new thread")
+
+
+def surroundings_told(error: Exception) -> SehdrError | None:
+    """What went wrong around the program, as an error of one line: a path that the system refuses, a name that is no
+    text, no memory. None for what is a defect."""
+    if isinstance(error, SehdrError):
+        return error
+    short = isinstance(error, RuntimeError | ImportError | OSError) and _NO_MEMORY.search(str(error))
+    if short or isinstance(error, MemoryError):
+        told = (str(error).splitlines() or ["no more"])[0]
+        return SehdrError(f"out of memory ({told}); use smaller photos (--max-size) or a larger machine")
+    if isinstance(error, OSError) and error.strerror:
+        place = error.filename if isinstance(error.filename, str | bytes) else "a file"
+        return InputError(os.fsdecode(place), f"cannot be used ({error.strerror})", "check the path and its rights")
+    if isinstance(error, UnicodeEncodeError):
+        return InputError(ascii(error.object), "is a name that is not UTF-8 text", "rename it")
+    return None

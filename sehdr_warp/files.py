@@ -15,6 +15,7 @@ import platform
 import re
 import secrets
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import takewhile
@@ -104,9 +105,9 @@ def seal(folder: Path) -> None:
 
 
 def is_sealed(folder: Path) -> bool:
-    """Whether a folder holds the files of its list, all of them as they were, and nothing else."""
+    """Whether a folder holds the files of its list, all of them as they were."""
     with suppress(OSError):
-        return set(_lines(folder)) == _listed(folder) != set()
+        return set() != listed(folder) <= set(_lines(folder))
     return False
 
 
@@ -114,16 +115,33 @@ def foreign(path: Path) -> Path | None:
     """The first file at or in `path` that this program did not write, or that was changed since; None if there is
     none."""
     folder = path if path.is_dir() else path.parent
-    listed = _listed(folder)
+    known = listed(folder)
     for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
         if file.is_symlink() or not (file.is_dir() or file == folder / LIST):
             name = file.relative_to(folder).as_posix()
-            if file.is_symlink() or not file.is_file() or _line(file, name) not in listed:
+            if file.is_symlink() or not file.is_file() or hash_line(file, name) not in known:
                 return file
     return None
 
 
-def _line(file: Path, name: str) -> bytes:
+def usable(folder: Path) -> bool:
+    """Whether files can be made in a folder, which is made where it is missing."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except (OSError, ValueError):
+        return False
+
+
+def user_cache(name: str) -> Path | None:
+    """The user's folder for what a program can make again; None where there is no home."""
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return None if home.startswith("~") else Path(home) / name
+
+
+def hash_line(file: Path, name: str) -> bytes:
+    """A file as its line in a list has it, without the end of the line."""
     with open(file, "rb") as opened:
         digest = hashlib.file_digest(opened, "sha256").hexdigest()
     return os.fsencode(f"{digest}  {name}".replace("\n", "\\n"))
@@ -131,10 +149,11 @@ def _line(file: Path, name: str) -> bytes:
 
 def _lines(folder: Path) -> list[bytes]:
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != LIST)
-    return [_line(path, path.relative_to(folder).as_posix()) for path in files]
+    return [hash_line(path, path.relative_to(folder).as_posix()) for path in files]
 
 
-def _listed(folder: Path) -> set[bytes]:
+def listed(folder: Path) -> set[bytes]:
+    """The lines of a folder's list; none where it cannot be read."""
     with suppress(OSError, InputError):
         return set(read_bytes(folder / LIST, MAX_JSON_BYTES).split(b"\n")) - {b""}
     return set()
@@ -144,7 +163,7 @@ def _list(temporary: Path, path: Path) -> None:
     """Adds a file that is about to get its name to the list of its folder, in one write, as others may list theirs."""
     handle = os.open(path.parent / LIST, os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
     try:
-        os.write(handle, _line(temporary, path.name) + b"\n")
+        os.write(handle, hash_line(temporary, path.name) + b"\n")
     finally:
         os.close(handle)
 

@@ -91,10 +91,8 @@ def test_a_sealed_folder_tells_when_it_is_damaged(tmp_path):
     changes = [
         lambda folder: (folder / "a").write_text("b"),
         lambda folder: (folder / "deep" / "b").unlink(),
-        lambda folder: (folder / "c").write_text(""),
         lambda folder: (folder / LIST).write_text(""),
         lambda folder: (folder / LIST).unlink(),
-        lambda folder: (folder / "deep").joinpath("l").symlink_to("b"),
     ]
     assert is_sealed(made())
     for change in changes:

@@ -1,4 +1,8 @@
-"""LDR pixels from files: PNG (8 and 16 bits), JPEG, TIFF, WebP and BMP, with sizes known before decoding."""
+"""LDR pixels from files: PNG (8 and 16 bits), JPEG, TIFF, WebP and BMP, with sizes known before decoding.
+
+open_image is the one place where pictures are opened: what a file is says its content, and nothing but these formats is
+decoded. Pillow knows many more, and hands some (EPS) to other programs.
+"""
 
 import struct
 from dataclasses import dataclass
@@ -13,6 +17,14 @@ MAX_PIXELS = 160_000_000
 """Above any camera's frame (the largest backs give 151 megapixels), far below what would exhaust memory."""
 LDR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 HDR_SUFFIXES = (".exr", ".hdr")
+_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP")
+_MODES = ("L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "I", "I;16", "I;16L", "I;16B", "I;16N")
+_OTHER_MODES = {
+    "1": "one bit a pixel, black or white",
+    "CMYK": "inks (CMYK), not light",
+    "LAB": "CIELAB, not RGB",
+    "F": "floating-point values, not encoded ones",
+}
 DAMAGED = "copy or export the image again"
 _PILLOW_ERRORS = (OSError, SyntaxError, ValueError, EOFError, MemoryError)
 EXIF_ERRORS = (*_PILLOW_ERRORS, KeyError, TypeError, struct.error)
@@ -39,13 +51,13 @@ def image_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
         return image.size, (height, width) if _orientation(image) in (5, 6, 7, 8) else image.size
 
 
-def read_ldr(path: Path, *, oriented: bool = False) -> EncodedImage:
+def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> EncodedImage:
     """Decode a photo; 16-bit files keep their 16 bits, palettes and grey become RGB.
 
-    oriented: turn the pixels as the EXIF orientation says.
+    oriented: turn the pixels as the EXIF orientation says. mask: one bit a pixel is enough.
     Raises InputError where the file is missing, damaged, truncated, of another kind, or larger than MAX_PIXELS.
     """
-    with open_image(path) as image:
+    with open_image(path, mask=mask) as image:
         try:
             pixels, alpha = _decode(image, path)
             turn = _orientation(image) if oriented else 1
@@ -56,24 +68,31 @@ def read_ldr(path: Path, *, oriented: bool = False) -> EncodedImage:
 
 def read_mask(path: Path, *, oriented: bool = False) -> np.ndarray:
     """[H, W] float32 in [0, 1] from grey, colour (its mean) or transparent (its alpha); 1 counts."""
-    image = read_ldr(path, oriented=oriented)
+    image = read_ldr(path, oriented=oriented, mask=True)
     return image.alpha if image.alpha is not None else (image.pixels.mean(axis=2) / image.levels).astype(np.float32)
 
 
-def open_image(path: Path) -> ImageFile.ImageFile:
-    """The image with its header read and its pixels not; InputError where it is missing, none, or too large."""
+def open_image(path: Path, *, mask: bool = False) -> ImageFile.ImageFile:
+    """The image with its header read and its pixels not; InputError where it is missing, none, too large, one of
+    several pictures in its file, or not of grey or RGB. Of a stereo pair or a photo with a gain map (MPO) it is the
+    first."""
     require_file(path)
     # Pillow's own limit is global and lower for its warning; ours is checked below, before any pixel is decoded.
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
-        image = Image.open(path)
+        image = Image.open(path, formats=_FORMATS)
     except _PILLOW_ERRORS as error:
-        detail = "" if "cannot identify" in str(error) else f" ({error})"
+        detail = f", which is one of {', '.join(_FORMATS)}" if "cannot identify" in str(error) else f" ({error})"
         raise InputError(path, f"is not a readable image{detail}", DAMAGED) from None
     finally:
         Image.MAX_IMAGE_PIXELS = limit
     try:
         check_size(path, *image.size)
+        if getattr(image, "is_animated", False) and image.format != "MPO":
+            raise InputError(path, "holds several pictures, pages or an animation", "save the one that counts")
+        if image.mode not in (*_MODES, *("1" * mask)):
+            found = _OTHER_MODES.get(image.mode, f"{image.mode}, not RGB")
+            raise InputError(path, f"holds {found}", "export it as RGB or grey, in PNG or JPEG")
     except InputError:
         image.close()
         raise
@@ -97,7 +116,7 @@ def check_size(path: Path, width: int, height: int, most: int = MAX_PIXELS) -> N
 def _decode(image: ImageFile.ImageFile, path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Code values [H, W, 3] and alpha [H, W] in [0, 1] or None."""
     if image.mode in ("RGB", "RGBA") and (low := _low_byte_tiles(image)):
-        with Image.open(path) as second:
+        with open_image(path) as second:
             second.tile = low
             low_bytes = np.asarray(second)
         return _split(np.asarray(image).astype(np.uint16) << 8 | low_bytes)
@@ -107,8 +126,6 @@ def _decode(image: ImageFile.ImageFile, path: Path) -> tuple[np.ndarray, np.ndar
             found = f"32-bit values up to {int(values.max())} have no known white"
             raise InputError(path, found, "export it with 16 bits")
         return _split(values.astype(np.uint16))
-    if image.mode == "F":
-        raise InputError(path, "holds floating-point values, not encoded ones", "export it as PNG or JPEG")
     transparent = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
     return _split(np.asarray(image.convert("RGBA" if transparent else "RGB")))
 

@@ -11,6 +11,7 @@ import json
 import logging
 import math
 import os
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -20,7 +21,7 @@ import numpy as np
 from PIL import Image
 
 from ..errors import InputError, SehdrError
-from ..files import atomic_folder
+from ..files import atomic_folder, is_sealed, usable, user_cache
 from .colmap_model import SparseModel, read_model
 from .develop import told
 from .images import EXIF_ERRORS, open_image, read_ldr
@@ -30,7 +31,7 @@ _log = logging.getLogger("sehdr_warp.scene")
 # SIFT finds little more above this size, and extraction time grows with the area.
 MAX_SIDE = 1200
 _SEED = 0
-_VERSION = 2
+_VERSION = 3
 # Up to here every pair is matched; beyond, each photo with its neighbors by name (a walk or a video).
 _EXHAUSTIVE_LIMIT = 150
 
@@ -65,27 +66,24 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Spar
     return SparseModel(tuple(images), model.cloud)
 
 
-def user_cache() -> Path:
-    """$SEHDR_CACHE, else sehdr-warp/ in $XDG_CACHE_HOME or ~/.cache."""
-    if stated := os.environ.get("SEHDR_CACHE"):
-        return Path(stated)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sehdr-warp"
-
-
 @contextlib.contextmanager
 def _cached(cache: Path | str | None, name: str, solve: Callable[[Path, Path], None]) -> Iterator[Path]:
     """The folder of a finished result: the cached one, or a new one that solve(work, result) fills.
 
-    A user's cache that cannot be written is done without; a named one is asked for.
+    The user's is $SEHDR_CACHE, or sehdr-warp/ in $XDG_CACHE_HOME or ~/.cache; one that cannot be written is done
+    without, and a damaged result is made again. A named one is asked for.
     """
     with contextlib.ExitStack() as stack:
-        folder = user_cache() if cache is None else Path(cache)
-        place = folder / name
-        if place.is_dir():
+        stated = cache or os.environ.get("SEHDR_CACHE")
+        folder = user_cache("sehdr-warp") if stated is None else Path(stated)
+        place = (folder or Path()) / name
+        if folder and place.is_dir() and not is_sealed(place):
+            _log.warning("%s is damaged and is made again", place)
+            shutil.rmtree(place, ignore_errors=True)
+        if folder and place.is_dir() and is_sealed(place):
             _log.info("using the cached result %s", place)
         else:
-            there = next(each for each in (folder, *folder.absolute().parents) if each.is_dir())
-            if cache is None and not os.access(there, os.W_OK):
+            if cache is None and not (folder and usable(folder) and not place.exists()):
                 place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sehdr-sfm-"))) / name
             try:
                 with (

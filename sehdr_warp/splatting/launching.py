@@ -10,12 +10,14 @@ import warp as wp
 from torch import Tensor
 
 from ..quiet import silent_stderr
-from . import threads
+from . import kernel_cache, threads
 
 # The start-up banner, and the warning where there is no GPU, are not for a library to print.
 wp.config.log_level = wp.LOG_WARNING
+kernel_cache.choose()
 with silent_stderr():
     wp.init()
+kernel_cache.check()
 
 _SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 _streams: dict[tuple[int, int], wp.Stream] = {}

@@ -15,10 +15,11 @@ from ..field.radiance_field import RadianceField, RenderedView, Surroundings
 from ..response import Response
 from ..scene import Camera, Scene, load_cameras
 from ..splats import read_gaussians
+from .checkpoint import Checkpoint
 from .config import Config
 from .initialization import assemble_field
 from .optimizer import under
-from .run_folder import CameraEntry, Checkpoint, RunFolder
+from .run_folder import CameraEntry, RunFolder
 
 log = logging.getLogger(__name__)
 

@@ -26,51 +26,49 @@ from pathlib import Path
 from typing import Annotated
 
 from filelock import FileLock, Timeout
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 from torch import Tensor
 
 from ..errors import InputError, SehdrError
 from ..field.confidence import Evidence
 from ..field.radiance_field import RadianceField
-from ..files import atomic_folder, atomic_path, make_parents, read_json, remove_stale, write_json, writing
+from ..files import atomic_folder, atomic_path, make_parents, remove_stale, write_json, writing
 from ..response import Response
 from ..scene import Camera, Scene
 from ..scene.exposure import LONGEST, SHORTEST
 from ..scene.images import MAX_PIXELS
+from .checkpoint import (
+    FORMAT,
+    REMEDY,
+    TENSORS,
+    VALUES,
+    Checkpoint,
+    Values,
+    read_checkpoint,
+    read_run_json,
+    read_values,
+    remove_checkpoint,
+)
 from .config import Config
-from .config_files import config_from_dict, field_and_problem
+from .config_files import config_from_dict
 
-FORMAT = 2  # Version of what a run holds; a reader refuses others
-TENSORS, VALUES = "state.safetensors", "checkpoint.json"
 _LOCK, _NEW, _READY = ".lock", ".new", ".ready"
-_REMEDY = "the run is damaged: train again"
-_OLDER = "remove this folder to use an older checkpoint, or train again"
 _OWN = "choose another folder, or remove this one yourself"
 _Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
-class _Values(BaseModel):
-    model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
-
-
-class _DataValues(_Values):
+class _DataValues(Values):
     path: Annotated[str, Field(max_length=4096)] | None = None
     exposure_index: _Count | None = None
     max_size: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     holdout: _Count | None = None
 
 
-class _RunValues(_Values):
+class _RunValues(Values):
     scene: str
     data: _DataValues
     base_time: Annotated[float, Field(ge=SHORTEST, le=LONGEST)]
     response: dict
-
-
-class _CheckpointValues(_Values):
-    iteration: Annotated[int, Field(ge=0, le=10_000_000)]
-    seconds: Annotated[float, Field(ge=0)]
-    run: dict[str, str] = {}
 
 
 @dataclass(frozen=True)
@@ -81,15 +79,6 @@ class CameraEntry:
     split: str
     camera: Camera
     exposure_time: float
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """One checkpoint as read: named tensors on the CPU, and plain values."""
-
-    path: Path
-    tensors: dict[str, Tensor]
-    values: dict
 
 
 class RunFolder:
@@ -145,7 +134,7 @@ class RunFolder:
         self.require()
         if self.checkpoints.is_symlink():
             raise InputError(self.checkpoints, "is a link, and what it leads to is not replaced", _OWN)
-        if not {"format", "base_time", "response"} <= _read_json(self.info, _OWN).keys():
+        if not {"format", "base_time", "response"} <= read_run_json(self.info, _OWN).keys():
             raise InputError(self.info, "is not that of a run of sehdr-warp", _OWN)
         if not self._lock.is_locked:
             self.lock()
@@ -204,7 +193,7 @@ class RunFolder:
                 for name in ("summary", "metrics", "confidence", "plan", "scene", "info", "config"):
                     getattr(self, name).unlink(missing_ok=True)
                 for checkpoint in self._found_checkpoints():
-                    _remove_checkpoint(checkpoint)
+                    remove_checkpoint(checkpoint)
                 os.rename(new, ready)
             if ready.is_dir():
                 self.checkpoints.mkdir(exist_ok=True)
@@ -227,7 +216,7 @@ class RunFolder:
     def hashes(self) -> dict[str, str]:
         """Of the values in the files that decide the picture beside the checkpoint; run.json's place of the photos is
         none of them."""
-        values = {file.name: _read_json(file) for file in (self.config, self.scene, self.info) if file.is_file()}
+        values = {file.name: read_run_json(file) for file in (self.config, self.scene, self.info) if file.is_file()}
         values.get(self.info.name, {}).pop("data", None)
         return {
             name: hashlib.sha256(json.dumps(each, sort_keys=True).encode()).hexdigest() for name, each in values.items()
@@ -236,27 +225,27 @@ class RunFolder:
     def read_config(self) -> Config:
         """The config of the training."""
         self.read_info()
-        return config_from_dict(_read_json(self.config), self.config)
+        return config_from_dict(read_run_json(self.config), self.config)
 
     def read_info(self) -> dict:
         """What run.json holds; InputError also for a run of another version's format."""
-        info = _read_values(self.info, _RunValues)
+        info = read_values(self.info, _RunValues)
         try:
             Response.from_dict(info["response"])
         except SehdrError as error:
-            raise InputError(self.info, str(error), _REMEDY) from None
+            raise InputError(self.info, str(error), REMEDY) from None
         return info
 
     def read_cameras(self) -> tuple[CameraEntry, ...]:
         """The views in scene.json."""
         try:
-            return tuple(_camera_entry(view) for view in _read_json(self.scene)["views"])
+            return tuple(_camera_entry(view) for view in read_run_json(self.scene)["views"])
         except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise InputError(self.scene, f"a view is damaged ({error!r:.200})", _REMEDY) from None
+            raise InputError(self.scene, f"a view is damaged ({error!r:.200})", REMEDY) from None
 
     def check_same_scene(self, scene: Scene) -> None:
         """Raises InputError if the run was trained on another scene than this one."""
-        saved, given = _read_json(self.scene), json.loads(json.dumps(describe_scene(scene)))
+        saved, given = read_run_json(self.scene), json.loads(json.dumps(describe_scene(scene)))
         for name in ("layout", "views"):
             if saved.get(name) != given[name]:
                 problem = f"its {name} differ from those of {scene.name}"
@@ -272,7 +261,7 @@ class RunFolder:
 
     def read_summary(self) -> dict:
         """Times, memory and counts of the training; empty if it has not ended."""
-        return _read_json(self.summary) if self.summary.exists() else {}
+        return read_run_json(self.summary) if self.summary.exists() else {}
 
     def write_summary(self, values: dict) -> None:
         write_json(self.summary, values, ours=True)
@@ -311,14 +300,14 @@ class RunFolder:
             self._hashes = self._hashes or self.hashes()
             data = save({name: value.detach().cpu().contiguous() for name, value in tensors.items()})
             stated = values | {"format": FORMAT, "sha256": hashlib.sha256(data).hexdigest(), "run": self._hashes}
-            _remove_checkpoint(final)
+            remove_checkpoint(final)
             with atomic_folder(final, ours=True) as beside:
                 (beside / TENSORS).write_bytes(data)
                 (beside / VALUES).write_text(json.dumps(stated, indent=1) + "\n", encoding="utf-8")
         folders = self._found_checkpoints()
         end = folders.index(final) + 1
         for other in folders[: max(0, end - kept)] + folders[end:]:
-            _remove_checkpoint(other)
+            remove_checkpoint(other)
         return final
 
     def newest_checkpoint(self) -> Checkpoint | None:
@@ -377,40 +366,6 @@ class RunFolder:
         return confidence.float()
 
 
-def read_checkpoint(path: Path) -> Checkpoint:
-    """One checkpoint; raises InputError if a file is missing, damaged, of another format, or holds NaN or infinity."""
-    from safetensors import SafetensorError
-    from safetensors.torch import load
-
-    values, file = _read_values(path / VALUES, _CheckpointValues, _OLDER), path / TENSORS
-    try:
-        data = file.read_bytes()
-        if hashlib.sha256(data).hexdigest() != values.get("sha256"):
-            raise InputError(file, f"its SHA-256 is not the {values.get('sha256')} of {VALUES}", _OLDER)
-        tensors = load(data)
-    except OSError as error:
-        raise InputError(file, f"cannot be read ({error.strerror})", _OLDER) from None
-    except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
-        raise InputError(file, f"not safetensors ({error})", _OLDER) from None
-    if (name := first_not_finite(tensors)) is not None:
-        raise InputError(file, f"{name} holds values that are not finite", _OLDER)
-    return Checkpoint(path, tensors, values)
-
-
-def _remove_checkpoint(path: Path) -> None:
-    """Removes a checkpoint, and its folder where nothing else is in it."""
-    with suppress(OSError):
-        for name in (VALUES, TENSORS):
-            (path / name).unlink(missing_ok=True)
-        path.rmdir()
-
-
-def first_not_finite(tensors: dict[str, Tensor]) -> str | None:
-    """The name of the first tensor that holds NaN or infinity, None if all numbers are finite."""
-    floats = ((name, tensor) for name, tensor in tensors.items() if tensor.is_floating_point())
-    return next((name for name, tensor in floats if not bool(tensor.isfinite().all())), None)
-
-
 def describe_scene(scene: Scene) -> dict:
     """What scene.json holds."""
     views = [
@@ -429,23 +384,3 @@ def _camera_entry(view: dict) -> CameraEntry:
     if not (math.isfinite(time) and time > 0):
         raise ValueError(f"exposure_time = {time} is not a positive number of seconds")
     return CameraEntry(str(view["name"]), str(view["split"]), camera, time)
-
-
-def _read_values(path: Path, kind: type[BaseModel], remedy: str = _REMEDY) -> dict:
-    """The values in a file of this version's format, checked to be of a kind."""
-    values = _read_json(path, remedy)
-    if (found := values.get("format")) != FORMAT:
-        problem = f"format = {found!r:.60} is not {FORMAT}, which this version reads"
-        raise InputError(path, problem, "train again, or use the version that wrote it")
-    try:
-        kind.model_validate(values)
-    except ValidationError as error:
-        raise InputError(path, field_and_problem(error)[1], remedy) from None
-    return values
-
-
-def _read_json(path: Path, remedy: str = _REMEDY) -> dict:
-    try:
-        return read_json(path)
-    except InputError as error:
-        raise InputError(path, error.problem, remedy) from None

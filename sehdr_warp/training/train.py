@@ -19,13 +19,14 @@ from ..field.radiance_field import RadianceField
 from ..field.unexplained import MOST_NAMED, told, unexplained_regions
 from ..scene import Scene, View
 from ..splatting.memory import memory_told
+from .checkpoint import first_not_finite
 from .config import Config
 from .config_files import config_fields, load_config, override_config
 from .initialization import choose_response, make_field, make_matcher
 from .machine import interruptible, machine_figures, pick_device, torch_settings
 from .plan import apply_plan
 from .run import Run, field_from_checkpoint, load_run
-from .run_folder import RunFolder, first_not_finite
+from .run_folder import RunFolder
 from .trainer import Trainer
 
 log = logging.getLogger(__name__)

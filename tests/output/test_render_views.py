@@ -6,6 +6,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.files import LIST
 from sehdr_warp.output.camera_paths import common_focus, interpolate, orbit
 from sehdr_warp.output.names import safe_names
 from sehdr_warp.output.render_views import render_views, select_cameras
@@ -15,7 +16,8 @@ from .helpers import AnalyticRun, Entry, camera, read_exr
 
 
 def tree(folder):
-    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != LIST)
+    return sorted(str(path.relative_to(folder)) for path in files)
 
 
 def test_layout_on_disk(tmp_path, logged):
@@ -79,7 +81,7 @@ def test_nothing_is_replaced_unless_asked_and_rendering_does_not_start(tmp_path)
         render_views(run, tmp_path)
     assert run.rendered == 0
     render_views(run, tmp_path, cameras="train", evs=[1], overwrite=True)
-    assert [path.name for path in sorted((tmp_path / "hdr").iterdir())] == ["r_0.exr", "r_1.exr", "r_2.exr"]
+    assert [path.name for path in sorted((tmp_path / "hdr").glob("[!.]*"))] == ["r_0.exr", "r_1.exr", "r_2.exr"]
     assert (tmp_path / "note.txt").read_text() == "mine"
 
 

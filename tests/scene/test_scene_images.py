@@ -12,7 +12,7 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.hdr_files import hdr_size, read_hdr
-from sehdr_warp.scene.images import image_sizes, read_ldr
+from sehdr_warp.scene.images import image_sizes, read_ldr, read_mask
 from sehdr_warp.scene.lens import area_average, limited_size
 
 RNG = np.random.default_rng(1)
@@ -105,6 +105,54 @@ def test_exr_data_window_inside_the_display_window(tmp_path):
         assert file.header()["dataWindow"][0].tolist() == [2, 1]
     read = read_hdr(tmp_path / "a.exr")
     assert read.shape == (8, 10, 3) and read[1:4, 2:6].min() == 1 and read.sum() == 36
+
+
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n"
+RGB = Image.fromarray(RNG.integers(0, 256, (6, 8, 3), dtype=np.uint8))
+
+
+@pytest.mark.parametrize(
+    "kind, told",
+    [
+        ("EPS", "is not a readable image, which is one of PNG"),
+        ("GIF", "is not a readable image"),
+        ("PPM", "is not a readable image"),
+        ("LAB", "holds CIELAB"),
+        ("CMYK", r"holds inks \(CMYK\)"),
+        ("1", "holds one bit a pixel"),
+        ("F", "holds floating-point values"),
+        ("YCbCr", "holds YCbCr, not RGB"),
+        ("animation", "holds several pictures"),
+        ("pages", "holds several pictures"),
+    ],
+)
+def test_other_formats_and_colors_are_refused_and_no_program_is_started(tmp_path, monkeypatch, kind, told):
+    """Whatever the name says. A stand-in on the PATH would tell that Ghostscript was asked for."""
+    (tmp_path / "gs").write_text(f"#!/bin/sh\ntouch {tmp_path}/started\n")
+    (tmp_path / "gs").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    path = tmp_path / "photo.png"
+    if kind == "EPS":
+        path.write_bytes(EPS)
+    elif kind in ("GIF", "PPM"):
+        RGB.save(path, format=kind)
+    elif kind in ("animation", "pages"):
+        RGB.save(path, format="PNG" if kind == "animation" else "TIFF", save_all=True, append_images=[RGB.rotate(180)])
+    else:
+        image = Image.new("LAB", (8, 6)) if kind == "LAB" else RGB.convert("L").convert(kind)
+        image.save(path, format="TIFF")
+    for read in (read_ldr, image_sizes):
+        with pytest.raises(InputError, match=told):
+            read(path)
+    assert not (tmp_path / "started").exists()
+    if kind == "1":
+        assert set(np.unique(read_mask(path))) == {0.0, 1.0}
+
+
+def test_the_first_picture_of_an_mpo_is_the_photo(tmp_path):
+    RGB.save(tmp_path / "a.jpg", format="MPO", save_all=True, append_images=[RGB.rotate(180)])
+    RGB.save(tmp_path / "b.jpg")
+    np.testing.assert_array_equal(read_ldr(tmp_path / "a.jpg").pixels, read_ldr(tmp_path / "b.jpg").pixels)
 
 
 def test_damaged_files_raise_input_errors(tmp_path):

@@ -1,0 +1,89 @@
+"""What the process of a command line meets: signals that end it, and standard streams that are closed, full or read by
+nobody. What a program says of its work never ends the work; what is asked of it, on standard output, fails in one line.
+"""
+
+import os
+import signal
+import sys
+import threading
+import time
+from typing import Any, TextIO
+
+from .errors import SehdrError
+
+_SOON = 3.0  # Seconds within which another Ctrl-C says nothing new
+_interrupted = -_SOON
+
+
+class _Stream:
+    """A standard stream; once it fails it leads nowhere. asked: that it failed is an error, else it is passed over."""
+
+    def __init__(self, stream: TextIO, number: int, asked: bool):
+        self._stream, self._number, self._asked = stream, number, asked
+
+    def write(self, text: str) -> int:
+        self._attempt(self._stream.write, text)
+        return len(text)
+
+    def flush(self) -> None:
+        self._attempt(self._stream.flush)
+
+    def _attempt(self, do, *arguments) -> None:
+        try:
+            do(*arguments)
+        except (OSError, ValueError) as error:
+            _lead_nowhere(self._number, os.O_WRONLY)
+            if self._asked and isinstance(error, BrokenPipeError):
+                raise
+            if self._asked:
+                reason = getattr(error, "strerror", None) or error
+                raise SehdrError(f"standard output cannot be written ({reason}); send it elsewhere") from None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def prepare() -> None:
+    """Makes signals and standard streams of this process what the head of this file says."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:  # The next file that is opened would be taken for it. What is asked for must still fail.
+            _lead_nowhere(number, os.O_WRONLY if name == "stderr" else os.O_RDONLY)
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", encoding="utf-8", closefd=False))
+    for number, stream in ((1, sys.stdout), (2, sys.stderr)):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+        setattr(sys, ("stdout", "stderr")[number - 1], _Stream(stream, number, asked=number == 1))
+    os.environ["MPLBACKEND"] = "agg"  # Pictures go to files, whatever a shell was set up for.
+    for each, handler in (("SIGINT", _interrupt), ("SIGTERM", _end), ("SIGHUP", _end)):
+        number = getattr(signal, each, None)
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:  # As nohup asks.
+            signal.signal(number, handler)
+    hook, thread_hook = sys.unraisablehook, threading.excepthook
+    sys.unraisablehook = lambda told: None if interrupted() else hook(told)
+    threading.excepthook = lambda told: None if interrupted() else thread_hook(told)
+
+
+def interrupted() -> bool:
+    """Whether Ctrl-C was pressed a moment ago: whatever is raised now may be its doing."""
+    return time.monotonic() - _interrupted < _SOON
+
+
+def _interrupt(*_) -> None:
+    global _interrupted
+    if not interrupted():
+        _interrupted = time.monotonic()
+        raise KeyboardInterrupt
+
+
+def _end(number: int, _) -> None:
+    raise SystemExit(128 + number)
+
+
+def _lead_nowhere(number: int, mode: int) -> None:
+    handle = os.open(os.devnull, mode)
+    if handle != number:
+        os.dup2(handle, number)
+        os.close(handle)

@@ -1,0 +1,92 @@
+"""One checkpoint of a run: tensors, plain values, and the hash that binds them; and JSON of a run, typed."""
+
+import hashlib
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from torch import Tensor
+
+from ..errors import InputError
+from ..files import read_json
+from .config_files import field_and_problem
+
+FORMAT = 2  # Version of what a run holds; a reader refuses others
+TENSORS, VALUES = "state.safetensors", "checkpoint.json"
+REMEDY = "the run is damaged: train again"
+_OLDER = "remove this folder to use an older checkpoint, or train again"
+
+
+class Values(BaseModel):
+    model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
+
+
+class _CheckpointValues(Values):
+    iteration: Annotated[int, Field(ge=0, le=10_000_000)]
+    seconds: Annotated[float, Field(ge=0)]
+    run: Annotated[dict[str, str], Field(default_factory=dict)]
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """One checkpoint as read: named tensors on the CPU, and plain values."""
+
+    path: Path
+    tensors: dict[str, Tensor]
+    values: dict
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """One checkpoint; raises InputError if a file is missing, damaged, of another format, or holds NaN or infinity."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    values, file = read_values(path / VALUES, _CheckpointValues, _OLDER), path / TENSORS
+    try:
+        data = file.read_bytes()
+        if hashlib.sha256(data).hexdigest() != values.get("sha256"):
+            raise InputError(file, f"its SHA-256 is not the {values.get('sha256')} of {VALUES}", _OLDER)
+        tensors = load(data)
+    except OSError as error:
+        raise InputError(file, f"cannot be read ({error.strerror})", _OLDER) from None
+    except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
+        raise InputError(file, f"not safetensors ({error})", _OLDER) from None
+    if (name := first_not_finite(tensors)) is not None:
+        raise InputError(file, f"{name} holds values that are not finite", _OLDER)
+    return Checkpoint(path, tensors, values)
+
+
+def remove_checkpoint(path: Path) -> None:
+    """Removes a checkpoint, and its folder where nothing else is in it."""
+    with suppress(OSError):
+        for name in (VALUES, TENSORS):
+            (path / name).unlink(missing_ok=True)
+        path.rmdir()
+
+
+def first_not_finite(tensors: dict[str, Tensor]) -> str | None:
+    """The name of the first tensor that holds NaN or infinity, None if all numbers are finite."""
+    floats = ((name, tensor) for name, tensor in tensors.items() if tensor.is_floating_point())
+    return next((name for name, tensor in floats if not bool(tensor.isfinite().all())), None)
+
+
+def read_values(path: Path, kind: type[BaseModel], remedy: str = REMEDY) -> dict:
+    """The values in a file of this version's format, checked to be of a kind."""
+    values = read_run_json(path, remedy)
+    if (found := values.get("format")) != FORMAT:
+        problem = f"format = {found!r:.60} is not {FORMAT}, which this version reads"
+        raise InputError(path, problem, "train again, or use the version that wrote it")
+    try:
+        kind.model_validate(values)
+    except ValidationError as error:
+        raise InputError(path, field_and_problem(error)[1], remedy) from None
+    return values
+
+
+def read_run_json(path: Path, remedy: str = REMEDY) -> dict:
+    try:
+        return read_json(path)
+    except InputError as error:
+        raise InputError(path, error.problem, remedy) from None
