@@ -57,7 +57,8 @@ def surroundings_told(error: Exception) -> SehdrError | None:
     text, no memory. None for what is a defect."""
     if isinstance(error, SehdrError):
         return error
-    short = isinstance(error, RuntimeError | ImportError | OSError) and _NO_MEMORY.search(str(error))
+    said = f"{error} {error.__cause__ or error.__context__ or ''}"
+    short = isinstance(error, RuntimeError | ImportError | OSError) and _NO_MEMORY.search(said)
     if short or isinstance(error, MemoryError):
         told = (str(error).splitlines() or ["no more"])[0]
         return SehdrError(f"out of memory ({told}); use smaller photos (--max-size) or a larger machine")

@@ -116,8 +116,8 @@ def select_response(
     """The candidate under which photos look most like linear light, up to the exposure's scale.
 
     Args:
-        image: [H, W, 3] codes as photographed, uint8 or uint16, or encoded values in [0, 1]; or a list of such photos
-            of one camera. Resampling in encoded values mixes colors, which edges then tell of.
+        image: [H, W, 3] codes as photographed, uint8 or uint16, or encoded values in [0, 1]; or several such photos
+            of one camera, taken one by one. Resampling in encoded values mixes colors, which edges then tell of.
         candidates: by default the responses with a formula.
         method: "posterior" judges edges (Lin et al. 2004), clipped pixels, the spread and smoothness of light, and
             a prior; it needs none of them. Without `candidates`, and for photos that are not a camera's own, a smooth
@@ -137,7 +137,7 @@ def select_response(
     candidates = [analytic_response(name) for name in DESCRIPTIONS] if candidates is None else candidates
     if not candidates:
         raise SehdrError("select_response: there are no candidates; give at least one response")
-    photos = [_bands(each) for each in (image if isinstance(image, list | tuple) else [image])]
+    photos = list(map(_bands, [image] if isinstance(image, np.ndarray) else image))
     usable = [sum(clear.sum() for _, clear in each) for each in photos]
     fullest = photos[int(np.argmax(usable))]
     if method == "paper" and max(usable) < 100:

@@ -1,6 +1,7 @@
 """From shots to views: decode, orient, undistort and scale, every average taken over light by one response."""
 
 import logging
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,13 +32,14 @@ def develop(capture: Capture, response: "Response", max_size: int | None = None)
     """
     developer, names = _Developer(max_size, response, capture.alpha), unique_names(capture.shots)
     views = [developer.view(shot, names[i]) for i, shot in told("reading views", capture.shots)]
-    check_content(((view.codes, view.mask) for view in views if view.split == "train"), capture.folder)
+    deque(with_content(((view.codes, view.mask) for view in views if view.split == "train"), capture.folder), maxlen=0)
     stated = *capture.cloud, capture.times_known, capture.notes
     return Scene(capture.name, capture.format, tuple(views), *stated, response=response)
 
 
-def check_content(photos: Iterable[tuple[np.ndarray, np.ndarray | None]], folder: Path) -> None:
-    """Refuse sets that show nothing: fewer than one sample in a thousand between black and white.
+def with_content(photos: Iterable[tuple[np.ndarray, np.ndarray | None]], folder: Path) -> Iterator[np.ndarray]:
+    """The codes of photos, one by one; then refuses sets that show nothing: fewer than one sample in a thousand between
+    black and white.
 
     photos: codes and mask of each. Large photos are looked at on a grid of about a million pixels.
     """
@@ -49,6 +51,8 @@ def check_content(photos: Iterable[tuple[np.ndarray, np.ndarray | None]], folder
         values = values if mask is None else values[mask[::step, ::step] > 0.5]
         shown += int(((values > white * 1.5 / 255) & (values < white * (1 - 1.5 / 255))).sum())
         total, light = total + values.size, light + float(values.sum(dtype=np.float64)) / white
+        yield codes
+        del codes, values  # Before the next is read: they may be large.
     if shown < total * 1e-3 or total == 0:
         mean = light / max(total, 1)
         state = "masked out" if total == 0 else f"black or white in {100 - 100 * shown / total:.1f} % (mean {mean:.3f})"
@@ -92,9 +96,11 @@ class _Developer:
             full = undistortion.camera(shot.world_to_camera)
         camera = full.resized(*limited_size(full.width, full.height, self.max_size))
 
-        def warped(image: np.ndarray) -> np.ndarray:
-            """[H, W] or [H, W, C] at the photo's size -> float32 at the camera's, undistorted."""
-            return _shrunk(undistortion.apply(_shrunk(image, working)) if undistortion else image, camera)
+        def warped(image: np.ndarray, values: Callable[[slice], np.ndarray] | None = None) -> np.ndarray:
+            """[H, W] or [H, W, C] at the photo's size -> float32 at the camera's, undistorted; see area_average."""
+            if not undistortion:
+                return _shrunk(image, camera, values)
+            return _shrunk(undistortion.apply(_shrunk(image, working, values)), camera)
 
         hdr = None if shot.hdr is None else warped(_read_truth(shot.hdr, lens, camera, undistortion is not None))
         stated = camera, shot.seconds, shot.split or "train"
@@ -119,16 +125,18 @@ class _Developer:
         if levels not in self._tables:
             light = self.response.decode(np.arange(levels + 1, dtype=np.float64) / levels)
             self._tables[levels] = np.maximum(light, 0.0).astype(np.float32)
-        light = self._tables[levels][codes]
-        clipped = (codes == levels).astype(np.float32)
-        if alpha is not None:
-            light, clipped = light * alpha[:, :, None], clipped * alpha[:, :, None]
+
+        def seen(values: np.ndarray, rows: slice) -> np.ndarray:
+            return values if alpha is None else values * alpha[rows, :, None]
+
+        light = warped(codes, lambda rows: seen(self._tables[levels][codes[rows]], rows))
+        clipped = warped(codes, lambda rows: seen((codes[rows] == levels).astype(np.float32), rows))
         # A mean over clipped samples is a lower bound: with half of the area clipped, white is the honest value.
-        return codes_of(np.where(warped(clipped) >= 0.5, np.float32(1.0), self.response.encode(warped(light))), 16)
+        return codes_of(np.where(clipped >= 0.5, np.float32(1.0), self.response.encode(light)), 16)
 
 
-def _shrunk(image: np.ndarray, to: Lens | Camera) -> np.ndarray:
-    return area_average(image.astype(np.float32, copy=False), to.width, to.height)
+def _shrunk(image: np.ndarray, to: Lens | Camera, values: Callable[[slice], np.ndarray] | None = None) -> np.ndarray:
+    return area_average(image, to.width, to.height, values)
 
 
 def _read_truth(path: Path, lens: Lens, camera: Camera, bent: bool) -> np.ndarray:

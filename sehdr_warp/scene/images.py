@@ -17,6 +17,7 @@ MAX_PIXELS = 160_000_000
 """Above any camera's frame (the largest backs give 151 megapixels), far below what would exhaust memory."""
 LDR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 HDR_SUFFIXES = (".exr", ".hdr")
+_BAND_ROWS = 512
 _FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP")
 _MODES = ("L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "I", "I;16", "I;16L", "I;16B", "I;16N")
 _OTHER_MODES = {
@@ -127,7 +128,17 @@ def _decode(image: ImageFile.ImageFile, path: Path) -> tuple[np.ndarray, np.ndar
             raise InputError(path, found, "export it with 16 bits")
         return _split(values.astype(np.uint16))
     transparent = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
-    return _split(np.asarray(image.convert("RGBA" if transparent else "RGB")))
+    return _split(_converted(image, "RGBA" if transparent else "RGB"))
+
+
+def _converted(image: Image.Image, mode: str) -> np.ndarray:
+    """[H, W, C] uint8, made in bands: Pillow copies what it converts and hands over."""
+    width, height = image.size
+    codes = np.empty((height, width, len(mode)), np.uint8)
+    for top in range(0, height, _BAND_ROWS):
+        band = image.crop((0, top, width, min(top + _BAND_ROWS, height)))
+        codes[top : top + _BAND_ROWS] = np.asarray(band if band.mode == mode else band.convert(mode))
+    return codes
 
 
 def _split(values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

@@ -1,5 +1,6 @@
 """Cameras as photographed, with lens distortion, and how photos are resampled: to pinhole cameras, and smaller."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +24,7 @@ _ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEY
 _NEUTRAL_AT_ZERO = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV",
                     "SIMPLE_DIVISION", "DIVISION"}  # fmt: skip
 _MAX_SIDE = 1 << 16
+_BAND_VALUES = 1 << 24  # Averaged at once: 64 MB
 
 
 @dataclass(frozen=True)
@@ -140,14 +142,29 @@ def limited_size(width: int, height: int, max_size: int | None) -> tuple[int, in
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def area_average(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """[H, W] or [H, W, C] float -> [height, width(, C)] float32, not larger: each pixel the mean of the area that it
-    covers, exactly for any ratio."""
-    for axis, size in enumerate((height, width)):
-        if image.shape[axis] != size:
-            lines = np.moveaxis(image, axis, 0)
-            mean = _overlaps(len(lines), size) @ lines.reshape(len(lines), -1)
-            image = np.moveaxis(mean.reshape(size, *lines.shape[1:]), 0, axis)
+def area_average(
+    image: np.ndarray, width: int, height: int, values: Callable[[slice], np.ndarray] | None = None
+) -> np.ndarray:
+    """[H, W] or [H, W, C] -> [height, width(, C)] float32, not larger: each pixel the mean of the area that it covers,
+    exactly for any ratio. values: what rows of the image count as, float32; by default themselves. They are asked for a
+    few at a time: a photo may be too large to be made floats at once."""
+    values = values or (lambda rows: image[rows].astype(np.float32, copy=False))
+    count = image.shape[0]
+    if height != count:
+        shares, means = _overlaps(count, height), []
+        step = max(1, height * _BAND_VALUES // image.size)
+        for start in range(0, height, step):
+            part = shares[start : start + step]
+            first, last = int(part.indices.min()), int(part.indices.max()) + 1
+            lines = values(slice(first, last))
+            means.append((part[:, first:last] @ lines.reshape(len(lines), -1)).reshape(-1, *lines.shape[1:]))
+        image = np.concatenate(means)
+    else:
+        image = values(slice(None))
+    if image.shape[1] != width:
+        lines = np.moveaxis(image, 1, 0)
+        mean = _overlaps(len(lines), width) @ lines.reshape(len(lines), -1)
+        image = np.moveaxis(mean.reshape(width, *lines.shape[1:]), 0, 1)
     return np.ascontiguousarray(image, dtype=np.float32)
 
 

@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import InputError, did_you_mean
 from .capture import Capture, Shot
 from .colmap_model import find_model
-from .develop import as_photographed, check_content, develop, fitted_lens
+from .develop import as_photographed, develop, fitted_lens, with_content
 from .exposure import choose_exposure, made_by_camera, with_exposure_times
 from .read_folders import (
     image_folder,
@@ -111,13 +111,18 @@ def choose_response(capture: Capture, method: str = "posterior", candidates: Seq
     files of one curve or of many; none: the built-in ones. Raises InputError where photos show nothing.
     """
     shots = capture.training
-    photos = []
-    for shot in photos_to_judge(shots, method):
-        image = as_photographed(shot)
-        if image.alpha is not None:  # What is not there has no colour.
-            image.pixels[image.alpha < 1] = 0
-        photos.append(image.pixels)
-    check_content(((codes, None) for codes in photos), capture.folder)
+
+    def codes() -> Iterator[tuple[np.ndarray, None]]:
+        for shot in photos_to_judge(shots, method):
+            image = as_photographed(shot)
+            if image.alpha is not None:  # What is not there has no colour.
+                image.pixels[image.alpha < 1] = 0
+            photo = image.pixels, None
+            del image  # Before the next is read: they may be large.
+            yield photo
+            del photo
+
+    photos = with_content(codes(), capture.folder)  # One at a time: they may be large.
     return best_response(photos, [None if shot.derived else shot.image for shot in shots], method, candidates)
 
 
@@ -131,7 +136,7 @@ def photos_to_judge(photos: Sequence, method: str) -> Sequence:
 
 
 def best_response(
-    codes: list[np.ndarray], files: list[Path | None], method: str, candidates: Sequence[str]
+    codes: Iterable[np.ndarray], files: list[Path | None], method: str, candidates: Sequence[str]
 ) -> "Response":
     """The candidate that fits the codes of photos_to_judge best; files: of all training photos."""
     from ..response import responses_named
