@@ -273,7 +273,10 @@ class Training:
 
     def _begin(self, scene: Scene, config: Config, data: dict, overwrite: bool) -> Trainer:
         config, plan = apply_plan(scene, config, self.device)
-        trainer = self._at_start(scene, config)
+        response = choose_response(scene, config)
+        matcher = cache(partial(make_matcher, scene, response, self.device))
+        field = self.timed(partial(make_field, scene, config, response, self.device, matcher))
+        trainer = Trainer(scene, config, field, matcher)
         # Nothing is made or removed before the scene is known to be good.
         tensors, values = trainer.state()
         state = tensors, values | {"seconds": self.seconds}
@@ -281,12 +284,6 @@ class Training:
         for line in plan.lines() if plan is not None else ():
             log.info("%s", line)
         return trainer
-
-    def _at_start(self, scene: Scene, config: Config) -> Trainer:
-        response = choose_response(scene, config)
-        matcher = cache(partial(make_matcher, scene, response, self.device))
-        field = self.timed(partial(make_field, scene, config, response, self.device, matcher))
-        return Trainer(scene, config, field, matcher)
 
     def _continue(self, config: Config | None) -> Trainer:
         """The trainer as the newest checkpoint has it."""
