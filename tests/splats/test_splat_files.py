@@ -38,13 +38,13 @@ def test_round_trip(tmp_path, suffix, color_model, degree, tolerance):
     for name in ARRAYS:
         np.testing.assert_allclose(getattr(read, name), getattr(written, name), atol=tolerance, rtol=tolerance)
     assert (read.color_model, read.base_time, read.degree) == (color_model, 0.5, degree)
-    assert [path.name for path in tmp_path.iterdir()] == [file.name]
+    assert [path.name for path in tmp_path.glob("[!.]*")] == [file.name]
     with pytest.raises(InputError, match="exists already"):
         write_gaussians(file, written)
     broken = replace(written, opacity_logits=np.where(np.arange(50) == 7, np.nan, 0).astype(np.float32))
     with pytest.raises(InputError, match="opacity_logits of 1 Gaussians are not finite, the first at 7"):
         write_gaussians(tmp_path / f"b{suffix}", broken)
-    assert [path.name for path in tmp_path.iterdir()] == [file.name]
+    assert [path.name for path in tmp_path.glob("[!.]*")] == [file.name]
 
 
 def test_ply_has_the_names_and_order_of_the_reference_release(tmp_path):
