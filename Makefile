@@ -33,8 +33,8 @@ demo: $(VENV)/installed
 	$(BIN)/sehdr-warp report $(DEMO)/run --out $(DEMO)/report --device cpu --overwrite
 	@echo
 	@echo "Made: a trained HDR scene in $(DEMO)/run, its figures in $(DEMO)/eval.json."
-	@echo "Open: $(DEMO)/report/stops.png (the scene at five exposures), $(DEMO)/views/brackets (OpenEXR)."
-	@echo "Next: source $(BIN)/activate, then sehdr-warp --help"
+	@echo "Next: source $(BIN)/activate, then sehdr-warp --help. Brackets as OpenEXR: $(DEMO)/views/brackets"
+	@echo "Open in a browser: $(DEMO)/report/report.html"
 
 test: $(VENV)/installed-test
 	$(BIN)/python -m pytest $(PYTEST)
@@ -59,7 +59,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(PIP) torch==$(TORCH)+cpu 2>/dev/null || $(PIP) torch==$(TORCH) --extra-index-url $(TORCH_INDEX)
 	$(PIP) setuptools wheel
-	$(EDITABLE) .
+	$(EDITABLE) '.[hdr]'
 	touch $@
 
 $(VENV)/installed-test: $(VENV)/installed

@@ -20,13 +20,15 @@ MOST_NAMED = 20
 @dataclass(frozen=True)
 class Region:
     """photo: the view's name. column, row: of the region's middle; pixels: its area; at the size of training. stops: by
-    how much the photo is brighter than the scene, in the mean; where the photo is clipped, at least."""
+    how much the photo is brighter than the scene, in the mean; where the photo is clipped, at least. box: left, top,
+    width and height around it."""
 
     photo: str
     column: float
     row: float
     pixels: int
     stops: float
+    box: tuple[int, int, int, int]
 
 
 @torch.no_grad()
@@ -45,7 +47,9 @@ def unexplained_regions(field: RadianceField, views: Sequence[View], *, degree: 
             if len(row) >= LEAST_PIXELS:
                 mean = float(stops[place][row, column].mean())
                 x, y = column.mean() + place[1].start + 0.5, row.mean() + place[0].start + 0.5
-                found.append(Region(view.name, round(float(x), 1), round(float(y), 1), len(row), round(mean, 2)))
+                middle = round(float(x), 1), round(float(y), 1)
+                box = place[1].start, place[0].start, *(side.stop - side.start for side in reversed(place))
+                found.append(Region(view.name, *middle, len(row), round(mean, 2), box))
     return sorted(found, key=lambda region: -region.pixels * abs(region.stops))
 
 

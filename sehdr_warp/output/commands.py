@@ -7,6 +7,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
+from ..files import check_absent
 from ..training.commands import ensured_scene, open_run, open_scene
 
 
@@ -56,7 +57,7 @@ class Render(_Rendered):
 
 @dataclass(frozen=True, kw_only=True)
 class Report(_Rendered):
-    """Compare input, tone-mapped HDR and truth in pictures, and plot error against training time."""
+    """Write report.html: figures, photo, scene and truth side by side, brackets, where it fails; and pictures."""
 
     data: str | None = None
     """The photos, if they have moved since the training."""
@@ -143,11 +144,17 @@ def run_render(asked: Render) -> None:
 
 
 def run_report(asked: Report) -> None:
+    from ..evaluation.evaluate import evaluate
+    from .light_pictures import WITHOUT_GAIN_MAPS, gain_maps
     from .report import write_report
 
     run = open_run(asked.run, asked.device)
-    for path in write_report(run, ensured_scene(run, asked.data), asked.out, overwrite=asked.overwrite):
+    scene = ensured_scene(run, asked.data)
+    check_absent(asked.out / "report.html", asked.overwrite)
+    for path in write_report(run, scene, asked.out, overwrite=asked.overwrite, evaluation=evaluate(run, scene)):
         print(path)
+    if not gain_maps():
+        print(f"its pictures are plain JPEG; Ultra HDR needs imagecodecs: {WITHOUT_GAIN_MAPS}")
 
 
 def run_export(asked: Export) -> None:

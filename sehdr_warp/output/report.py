@@ -1,7 +1,8 @@
-"""Pictures of what a training achieved: what the photo lost and HDR held, exposure stops, error against time."""
+"""What a training achieved: a page to look through, and pictures for papers: what the photo lost and HDR held, exposure
+stops, error against time."""
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +17,11 @@ from ..files import atomic_path, check_absent
 from .camera_paths import interpolate
 from .charts import PANELS, QUIET, STYLE, training_chart, training_points
 from .images import as_array
+from .report_page import STOPS, report_page
+from .report_page import seconds as _seconds
+from .report_page import stops_text as _stops
 from .tonemap import expose, fit_tone_map
 
-STOPS = (-4, -2, 0, 2, 4)
-"""Stops from the photos' exposure in the strip."""
 DARKER = -4
 """Stops at which photo, scene and truth stand side by side: what was clipped tells them apart."""
 
@@ -42,20 +44,30 @@ class Comparison:
 
 
 def write_report(
-    run: Any, scene: Scene, out: Path | str, *, view_count: int = 3, overwrite: bool = False
+    run: Any,
+    scene: Scene,
+    out: Path | str,
+    *,
+    view_count: int = 3,
+    overwrite: bool = False,
+    evaluation: Mapping[str, Any] | None = None,
 ) -> list[Path]:
-    """Renders some held-out views of a trained run and writes the report's pictures; returns their paths.
+    """Renders some held-out views of a trained run and writes the report; returns the paths of its files.
 
+    `report.html`: one page without a network: figures (of evaluation, which evaluate() gives), what was left out and
+    why, photo, scene and truth as Ultra HDR (the extra `hdr`; else plain), brackets with an exposure dial, confidence,
+    unexplained regions, error against time, cameras. For papers:
     `comparison.png`: photo; photo, HDR scene and truth (where there is some) at -4 EV; a new view; one row for each of
     view_count views, evenly chosen. `stops.png`: the view of most clipped light from -4 to +4 stops: the photo alone,
     the HDR scene with its confidence, the truth. `training.png`: held-out error against training time; left out for a
     run without evaluations. Of a scene without test views the training views are shown, and captions say so.
 
-    Raises InputError where a picture exists (unless overwrite), SehdrError for a scene without views.
+    Raises InputError where a file exists (unless overwrite), SehdrError for a scene without views.
     """
     metrics = run.metrics()
     charted = any(training_points(metrics, key) for key in PANELS)
-    paths = [Path(out, f"{name}.png") for name in ("comparison", "stops", *["training"] * charted)]
+    names = ("report.html", "comparison.png", "stops.png", *["training.png"] * charted)
+    paths = [Path(out, name) for name in names]
     for path in paths:
         check_absent(path, overwrite)
     given, held_out = scene.test_views or scene.train_views, bool(scene.test_views)
@@ -67,8 +79,10 @@ def write_report(
     time = views[0].exposure_time
     compared = comparison_figure(comparisons, time, _caption(views, metrics, held_out), held_out=held_out)
     figures = [compared, stops_figure(brightest, time)] + [training_chart({scene.name: [metrics]})] * charted
+    page = report_page(run, scene, comparisons, brightest, held_out=held_out, evaluation=evaluation)
     with ExitStack() as stack:
-        for path, figure in zip(paths, figures, strict=True):
+        stack.enter_context(atomic_path(paths[0], overwrite)).write_text(page, encoding="utf-8")
+        for path, figure in zip(paths[1:], figures, strict=True):
             temporary = stack.enter_context(atomic_path(path, overwrite))
             figure.savefig(temporary, dpi=160, facecolor="white", format="png")
     return paths
@@ -156,11 +170,3 @@ def _caption(views: Sequence[View], metrics: Sequence[dict], held_out: bool) -> 
         seconds = max(seconds for seconds, _ in last.values())
         text += f" PSNR of all held-out views after {seconds:.0f} s of training: {'; '.join(figures)}."
     return text
-
-
-def _stops(stops: float) -> str:
-    return f"{stops:+g} EV".replace("-", "\N{MINUS SIGN}") if stops else "0 EV"
-
-
-def _seconds(time: float) -> str:
-    return f"1/{1 / time:.0f} s" if time < 0.3 else f"{time:.3g} s"

@@ -118,6 +118,10 @@ class Run(_Rendered):
         """Times, memory and counts of the training; empty if it has not ended."""
         return self.folder.read_summary()
 
+    def decisions(self) -> list[dict]:
+        """What the run's plan decided: name, choice, reason and fields of each; none without a plan."""
+        return self.folder.read_decisions()
+
     def measure_confidence(self, scene: Scene) -> Evidence:
         """What the training photos of a scene say of the Gaussians; the model has their confidence from then on. Their
         HDR truth counts only if it was trained on."""

@@ -255,7 +255,8 @@ class RunFolder:
         """The decisions of the run's plan, as Plan.to_dict gave them; none without a plan, or where it is damaged."""
         try:
             decisions = json.loads(self.plan.read_text(encoding="utf-8"))["decisions"]
-            return [{"name": d["name"], "choice": d["choice"], "fields": dict(d["fields"])} for d in decisions]
+            told = ("name", "choice", "reason")
+            return [{name: d[name] for name in told} | {"fields": dict(d["fields"])} for d in decisions]
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return []
 

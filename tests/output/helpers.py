@@ -53,6 +53,7 @@ class AnalyticRun:
     base_time = 0.5
     scene_name = "sky"
     iterations = 7
+    gaussian_count, train_seconds, path = 1234, 65.0, "runs/sky"
 
     def __init__(self, names=(("r_0", "train"), ("r_1", "train"), ("r_2", "train"), ("t_0", "test"), ("t_1", "test"))):
         self.cameras = [
@@ -61,6 +62,15 @@ class AnalyticRun:
         ]
         self.gain, self.confident = 1.0, True
         self.rendered = 0
+
+    def summary(self):
+        return {"device": "abacus"}
+
+    def decisions(self):
+        return []
+
+    def metrics(self):
+        return []
 
     def render_confidence(self, view):
         """Falls from left to right, and from 1; none where it is switched off."""

@@ -1,0 +1,132 @@
+"""Diagrams of the report as SVG: held-out error against time, and where the photos were taken."""
+
+import base64
+import io
+import math
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from sehdr_warp.scene import Camera
+
+from .charts import PANELS, training_points
+from .images import as_array, quantize
+
+LINE, COLORS = "#363636", ("#e0a458", "#7fb2c4")
+_MAP_VIEWS, _MAP_SIZE, _SAMPLES = 12, 640, 200
+
+
+def training_svg(metrics: Sequence[Mapping]) -> str:
+    """Held-out PSNR in dB against seconds of training, a line for each of PANELS that has figures; or nothing."""
+    lines = {title: points for key, title in PANELS.items() if (points := training_points(metrics, key))}
+    if not lines:
+        return ""
+    points = [point for line in lines.values() for point in line]
+    longest = max(seconds for seconds, _ in points) or 1.0
+    low = math.floor(min(decibels for _, decibels in points))
+    step = max(1, math.ceil((max(decibels for _, decibels in points) - low) / 5))
+    high = low + 5 * step
+
+    def place(seconds: float, decibels: float) -> tuple[float, float]:
+        return 40 + 620 * seconds / longest, 250 - 225 * (decibels - low) / (high - low)
+
+    drawn = []
+    for decibels in range(low, high + 1, step):
+        y = place(0, decibels)[1]
+        drawn.append(f'<path d="M40 {y:.1f}H660" stroke="{LINE}"/><text x="0" y="{y + 4:.1f}">{decibels} dB</text>')
+    for seconds in np.linspace(0, longest, 5):
+        x, anchor = place(seconds, low)[0], "middle" if 0 < seconds < longest else "start" if not seconds else "end"
+        drawn.append(f'<text x="{x:.1f}" y="272" text-anchor="{anchor}">{seconds:.0f} s</text>')
+    for color, (title, line) in zip(COLORS, lines.items()):
+        path = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*point) for point in line))
+        x, y = place(*line[-1])
+        drawn.append(f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="2"/>')
+        drawn += [f'<circle cx="{a:.1f}" cy="{b:.1f}" r="2.5" fill="{color}"/>' for a, b in (place(*p) for p in line)]
+        label = f"{escape(title)}: {line[-1][1]:.1f} dB"
+        drawn.append(f'<text x="{x + 12:.1f}" y="{y + 4:.1f}" style="fill:{color}">{label}</text>')
+    return _svg(860, 280, "Held-out PSNR against training time", drawn)
+
+
+def camera_map(run: Any, tone_map: Any, names: Sequence[str] = ()) -> str:
+    """The scene from above, as its training photos see it, with their cameras and the held-out ones.
+
+    tone_map: radiance [N, 3] to sRGB. names: cameras that are labelled. Empty where there are no cameras.
+    """
+    entries = run.cameras
+    if not entries:
+        return ""
+    cameras = [entry.camera for entry in entries]
+    up = -np.mean([camera.world_to_camera[1, :3] for camera in cameras], axis=0)
+    up /= max(float(np.linalg.norm(up)), 1e-9)
+    east = cameras[0].world_to_camera[0, :3] - up * (up @ cameras[0].world_to_camera[0, :3])
+    east /= max(float(np.linalg.norm(east)), 1e-9)
+    plane = np.stack([east, np.cross(up, east)])  # Away from the first camera is up on the page.
+    positions = np.array([camera.position for camera in cameras]) @ plane.T
+    points, colors = _seen([entry.camera for entry in entries if entry.split == "train"] or cameras, run, up)
+    ground = points @ plane.T
+    spread = np.concatenate([positions, np.percentile(ground, (2, 98), axis=0)] if len(ground) else [positions])
+    low, high = spread.min(axis=0), spread.max(axis=0)
+    margin = 0.08 * max(float((high - low).max()), 1e-6)
+    low, size = low - margin, float((high - low).max()) + 2 * margin
+    width, height = (_MAP_SIZE * (high - low + margin) / size).tolist()
+
+    def place(at: np.ndarray) -> np.ndarray:
+        return np.stack([(at[..., 0] - low[0]) / size, (at[..., 1] - low[1]) / size], -1) * [1, -1] * _MAP_SIZE + [
+            0,
+            height,
+        ]
+
+    drawn = [_ground(place(ground), tone_map(colors), round(width), round(height))] if len(ground) else []
+    for entry, at in zip(entries, place(positions)):
+        camera, color = entry.camera, COLORS[entry.split != "train"]
+        across = camera.width / camera.fx / 2
+        corners = [plane @ (camera.world_to_camera[:3, :3].T @ [side * across, 0, 1]) for side in (-1, 1)]
+        ends = [at + 26 * corner * [1, -1] / max(np.linalg.norm(corner), 1e-9) for corner in corners]
+        wedge = " ".join(f"{x:.1f},{y:.1f}" for x, y in (at, *ends))
+        title = f"<title>{escape(entry.name)} ({entry.split})</title>"
+        drawn.append(f'<g fill="{color}" stroke="{color}">{title}<polygon points="{wedge}" fill-opacity="0.18"/>')
+        drawn.append(f'<circle cx="{at[0]:.1f}" cy="{at[1]:.1f}" r="3"/></g>')
+        if entry.name in names:
+            drawn.append(f'<text x="{at[0] + 7:.1f}" y="{at[1] - 6:.1f}" style="fill:#fff">{escape(entry.name)}</text>')
+    return f'<div class="map">{_svg(round(width), round(height), "Cameras from above", drawn)}</div>'
+
+
+def _seen(cameras: Sequence[Camera], run: Any, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the scene [N, 3] and their radiance, from small renders of some cameras; what lies higher than the
+    cameras, such as a ceiling, is left out."""
+    chosen = [cameras[i] for i in sorted({round(i) for i in np.linspace(0, len(cameras) - 1, _MAP_VIEWS)})]
+    ceiling, points, colors = max(float(camera.position @ up) for camera in chosen), [], []
+    for camera in chosen:
+        small = camera.resized(_SAMPLES, max(1, round(_SAMPLES * camera.height / camera.width)))
+        rendered = run.render(small)
+        depth, alpha = as_array(rendered.depth), as_array(rendered.alpha)
+        row, column = np.nonzero((depth > 0) & (alpha > 0.9))
+        rays = np.stack([(column + 0.5 - small.cx) / small.fx, (row + 0.5 - small.cy) / small.fy, np.ones(len(row))], 1)
+        points.append((rays * depth[row, column, None]) @ small.world_to_camera[:3, :3] + small.position)
+        colors.append(as_array(rendered.hdr)[row, column])
+    found, light = np.concatenate(points), np.concatenate(colors)
+    below = found @ up < ceiling
+    order = np.argsort(found[below] @ up)
+    return found[below][order], light[below][order]
+
+
+def _ground(at: np.ndarray, colors: np.ndarray, width: int, height: int) -> str:
+    """An <image> of points in pixels; later ones lie over earlier ones."""
+    inside = ((at >= 0) & (at < [width - 1, height - 1])).all(axis=1)
+    column, row = at[inside].astype(int).T
+    picture = np.zeros((height, width, 4), np.uint8)
+    codes = quantize(colors[inside])
+    for x, y in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        picture[row + y, column + x] = np.append(codes, np.full((len(codes), 1), 170, np.uint8), axis=1)
+    buffer = io.BytesIO()
+    Image.fromarray(picture).quantize(128).save(buffer, "PNG", optimize=True)
+    source = "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+    return f'<image href="{source}" width="{width}" height="{height}"/>'
+
+
+def _svg(width: int, height: int, title: str, parts: Sequence[str]) -> str:
+    label = f'role="img" aria-label="{title}"'
+    return f'<svg viewBox="0 0 {width} {height}" {label}>\n' + "\n".join(parts) + "\n</svg>"

@@ -1,0 +1,105 @@
+"""Light inside pages: Ultra HDR JPEG, plain JPEG, and float pictures for a dial, as text that stands in the page."""
+
+import base64
+import io
+import zlib
+from collections.abc import Mapping
+from functools import cache
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from .images import quantize
+from .tonemap import encode_srgb
+
+MIDDLE_GREY = 0.18
+MOST_STOPS = 5.5
+"""Stops over white that a gain map holds here; brighter light is shown at that."""
+WITHOUT_GAIN_MAPS = "pip install sehdr-warp[hdr]"
+
+
+def display_gain(response: Any) -> float:
+    """What turns exposures of a response into display light, so that a photo's middle grey is shown as middle grey: 1
+    for an sRGB or linear camera."""
+    grey = float(response.decode(encode_srgb(np.array([MIDDLE_GREY])).astype(np.float64))[0])
+    return MIDDLE_GREY / grey if grey > 0 else 1.0
+
+
+@cache
+def gain_maps() -> bool:
+    """Whether pictures can be Ultra HDR, which imagecodecs writes."""
+    try:
+        import imagecodecs
+    except ImportError:
+        return False
+    return bool(imagecodecs.ULTRAHDR.available)
+
+
+def ultra_hdr(light: np.ndarray) -> bytes:
+    """A JPEG with a gain map (Ultra HDR 1.1, ISO 21496-1) of [H, W, 3] linear Rec.709 display light, in which 1 is
+    white: an HDR display shows up to MOST_STOPS more, any other the JPEG. Needs the extra `hdr`."""
+    import imagecodecs
+
+    kinds: Any = imagecodecs.ULTRAHDR
+    pixels = np.ones((*light.shape[:2], 4), np.float16)
+    pixels[..., :3] = np.clip(light, 0, 2**MOST_STOPS)
+    return bytes(imagecodecs.ultrahdr_encode(pixels, gamut=kinds.CG.BT_709, transfer=kinds.CT.LINEAR))
+
+
+def jpeg(encoded: np.ndarray, quality: int = 88) -> bytes:
+    """A JPEG of [H, W, 3] sRGB-encoded values in [0, 1]."""
+    buffer = io.BytesIO()
+    Image.fromarray(quantize(encoded)).save(buffer, "JPEG", quality=quality, optimize=True)
+    return buffer.getvalue()
+
+
+def img(data: bytes, alternative: str, size: tuple[int, int], **attributes: str) -> str:
+    """An <img> that holds a JPEG. size: width and height."""
+    extra = "".join(f' {name.replace("_", "-")}="{escape(value)}"' for name, value in attributes.items())
+    source = "data:image/jpeg;base64," + base64.b64encode(data).decode()
+    return f'<img src="{source}" alt="{escape(alternative)}" width="{size[0]}" height="{size[1]}"{extra}>'
+
+
+def packed_light(light: np.ndarray) -> str:
+    """[H, W, 3] as deflated half floats in base64: what light.js unpacks."""
+    half = np.clip(light, 0, np.finfo(np.float16).max).astype("<f2")
+    return base64.b64encode(zlib.compress(half.tobytes(), 9)).decode()
+
+
+def dial(lights: Mapping[str, np.ndarray], base_time: float, gain: float, right: str, stops: float = 8.0) -> str:
+    """Pictures of one size under one exposure dial, two of them side by side: HTML that light.js brings to life.
+
+    lights: name -> [H, W, 3] exposures at the base time, seconds. gain: see display_gain. right: which is on the right.
+    """
+    height, width = next(iter(lights.values())).shape[:2]
+    scripts = "".join(
+        f'<script type="text/plain" data-light="{escape(name)}">{packed_light(light)}</script>\n'
+        for name, light in lights.items()
+    )
+    split = '<div class="split" style="left: 50%"></div>' if len(lights) > 1 else ""
+    sides = side_choices(list(lights), next(iter(lights)), right) if len(lights) > 1 else ""
+    facts = {"width": width, "height": height, "time": base_time, "grey": gain}
+    data = " ".join(f'data-{name}="{value!r}"' for name, value in facts.items())
+    return f"""<div class="dial" {data}>
+{scripts}{sides}<div class="stage"><canvas width="{width}" height="{height}"></canvas>{split}</div>
+<label>Exposure <input type="range" min="{-stops}" max="{stops}" step="0.05" value="0"><output>0 EV</output></label>
+</div>"""
+
+
+def side_choices(names: list[str], left: str, right: str) -> str:
+    """What stands left and right of a split."""
+    choices = "".join(
+        f'<select aria-label="{side}">'
+        + "".join(f"<option{' selected' * (name == chosen)}>{escape(name)}</option>" for name in names)
+        + "</select>"
+        for side, chosen in (("left", left), ("right", right))
+    )
+    return f'<div class="sides">{choices}</div>\n'
+
+
+def page_file(name: str) -> str:
+    """A file of the folder `page`."""
+    return Path(__file__).parent.joinpath("page", name).read_text(encoding="utf-8")

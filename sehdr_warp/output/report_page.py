@@ -1,0 +1,344 @@
+"""The report as one HTML file: what was trained, how well, where it fails, with nothing loaded from elsewhere."""
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from string import Template
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from sehdr_warp import __version__
+from sehdr_warp.scene import Scene
+
+from .diagrams import camera_map, training_svg
+from .light_pictures import (
+    MOST_STOPS,
+    WITHOUT_GAIN_MAPS,
+    dial,
+    display_gain,
+    gain_maps,
+    img,
+    jpeg,
+    page_file,
+    side_choices,
+    ultra_hdr,
+)
+from .tonemap import expose, fit_tone_map
+
+if TYPE_CHECKING:
+    from .report import Comparison
+
+STOPS = (-4, -2, 0, 2, 4)
+_PICTURE, _DIAL, _STRIP = 880, 420, 220  # Longest sides of pictures, pixels
+_MOST_PHOTOS = 6  # With unexplained regions
+SPACE = "\N{NARROW NO-BREAK SPACE}"
+
+
+def report_page(
+    run: Any,
+    scene: Scene,
+    comparisons: Sequence["Comparison"],
+    brightest: "Comparison",
+    *,
+    held_out: bool,
+    evaluation: Mapping[str, Any] | None = None,
+) -> str:
+    """The whole page, HTML.
+
+    comparisons: views that are shown; brightest: the one of most clipped light, for the brackets. held_out: whether
+    they were not trained on. evaluation: of evaluate(), for the table of held-out views.
+    """
+    gain = display_gain(run.response)
+    times = {view.name: view.exposure_time for view in scene.views}
+    sections = [
+        _header(run, scene),
+        _pictures(comparisons, times, gain, held_out),
+        _brackets(brightest, times[brightest.name], gain),
+        _confidence(comparisons),
+        _unexplained(run, scene),
+        _plan(run.decisions()),
+        _table(evaluation, held_out),
+        _section(
+            "Error against time", "Of all held-out photos, while it was trained.", _figure(training_svg(run.metrics()))
+        ),
+        _map(run, comparisons),
+        _footer(run),
+    ]
+    return Template(page_file("report.html")).substitute(
+        version=__version__,
+        title=f"{escape(scene.name)}: sehdr-warp report",
+        style=page_file("style.css") + page_file("report.css"),
+        script=page_file("light.js") + page_file("report.js"),
+        body="\n".join(filter(None, sections)),
+    )
+
+
+def _section(title: str, lead: str, body: str) -> str:
+    """Nothing without a body."""
+    return f"<section>\n<h2>{title}</h2>\n<p>{lead}</p>\n{body}\n</section>" if body else ""
+
+
+def _figure(body: str, caption: str = "") -> str:
+    told = f"\n<figcaption>{caption}</figcaption>" if caption else ""
+    return f"<figure>\n{body}{told}\n</figure>" if body else ""
+
+
+def _header(run: Any, scene: Scene) -> str:
+    summary, last = run.summary(), next((line for line in reversed(run.metrics()) if "psnr_ldr" in line), {})
+    camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
+    times = sorted({view.exposure_time for view in scene.train_views or scene.views})
+    facts = {
+        "photos trained on": len(scene.train_views),
+        "photos held out": len(scene.test_views),
+        "pixels each": f"{camera.width} \N{MULTIPLICATION SIGN} {camera.height}",
+        "exposure": seconds(times[0]) if len(times) == 1 else f"{seconds(times[0])} to {seconds(times[-1])}",
+        "response": escape(str(run.response.name)),
+        "Gaussians": f"{run.gaussian_count:,}".replace(",", SPACE),
+        "steps": run.iterations,
+        "training": duration(run.train_seconds),
+        "held-out photos": f"{last['psnr_ldr']:.1f} dB" if "psnr_ldr" in last else None,
+        "held-out HDR, mu-law": f"{last['psnr_mu']:.1f} dB" if "psnr_mu" in last else None,
+    }
+    shown = "".join(f"<li>{name}<b>{value}</b></li>" for name, value in facts.items() if value is not None)
+    notes = "".join(f"<li>{escape(note)}</li>" for note in scene.notes)
+    told = f"Trained on {escape(summary['device'])}." if "device" in summary else "The training has not ended."
+    return (
+        f'<header>\n<p class="quiet">sehdr-warp report</p>\n<h1>{escape(scene.name)}</h1>\n'
+        f'<p class="quiet">{told}</p>\n'
+        f'<ul class="facts">{shown}</ul>{f"<ul>{notes}</ul>" if notes else ""}\n</header>'
+    )
+
+
+def _pictures(comparisons: Sequence["Comparison"], times: Mapping[str, float], gain: float, held_out: bool) -> str:
+    """Photo, scene and truth, two at a time with a slider between them."""
+    figures = []
+    plain = None if gain_maps() else fit_tone_map([each.hdr for each in comparisons])
+    for each in comparisons:
+        lights = {"Photo": None, "Scene": each.hdr, "Truth": each.truth}
+        lights = {name: light for name, light in lights.items() if name == "Photo" or light is not None}
+        tags, size = [], _size(each.photo, _PICTURE)
+        for name, light in lights.items():
+            if light is None:
+                data = jpeg(smaller(each.photo, _PICTURE))
+            elif plain:
+                data = jpeg(plain(smaller(light, _PICTURE)))
+            else:
+                data = ultra_hdr(smaller(light * (times[each.name] * gain), _PICTURE))
+            tags.append(img(data, f"{name} of {each.name}", size, data_name=name))
+        split = '<div class="split" style="left: 50%"></div>'
+        ratio = f'style="aspect-ratio: {size[0]} / {size[1]}" tabindex="0" role="group"'
+        pair = f'<div class="pair" {ratio}>' + "\n".join(tags) + split + "</div>"
+        figures.append(_figure(side_choices(list(lights), "Photo", "Scene") + pair, escape(each.name)))
+    what = (
+        "Held-out views, which the training never saw" if held_out else "Views that were trained on; none is held out"
+    )
+    lead = f"{what}. Drag across a picture; choose what stands on either side."
+    if plain:
+        lead += (
+            f" Plain JPEG, tone-mapped; with imagecodecs (<code>{WITHOUT_GAIN_MAPS}</code>) they would be Ultra HDR."
+        )
+    else:
+        lead += (
+            f" Scene and truth are Ultra HDR: up to {MOST_STOPS:g} stops over white on an HDR display, plain on others."
+        )
+    return _section("Photo, scene, truth", lead, f'<div class="views">{"".join(figures)}</div>')
+
+
+def _brackets(shown: "Comparison", time: float, gain: float) -> str:
+    sources = {"Photo alone": shown.from_photo, "Scene": shown.hdr, "Truth": shown.truth}
+    known = {name: light for name, light in sources.items() if light is not None}
+    lights = {name: smaller(light * time, _DIAL) for name, light in known.items()}
+    cells = ["<span>&nbsp;</span>", *(f"<span>{stops_text(stop)}</span>" for stop in STOPS)]
+    for name, light in known.items():
+        small = smaller(light, _STRIP)
+        cells.append(f'<span class="name">{name}</span>')
+        for stop in STOPS:
+            picture = jpeg(expose(small, stop, scale=time * gain), 82)
+            cells.append(img(picture, f"{name} at {stops_text(stop)}", (small.shape[1], small.shape[0])))
+    lead = (
+        f"View {escape(shown.name)}, re-exposed from {seconds(time)} (0 EV) and shown as a plain display does. "
+        "What the photo clipped stays flat; the scene keeps its light."
+    )
+    body = _figure(dial(lights, time, gain, "Scene")) + _figure(f'<div class="strip">{"".join(cells)}</div>')
+    return _section("Brackets", lead, body)
+
+
+def _confidence(comparisons: Sequence["Comparison"]) -> str:
+    figures = [
+        _figure(
+            img(jpeg(smaller(np.repeat(each.confidence[..., None], 3, 2), 560)), f"confidence of {each.name}", size),
+            f"{escape(each.name)}: {float((each.confidence > 0.5).mean()):.0%} of the picture above a half",
+        )
+        for each in comparisons
+        if each.confidence is not None and (size := _size(each.photo, 560))
+    ]
+    if not figures:
+        return ""
+    ends = "<span>0: no photo tells</span><span>1: photos vouch for it</span>"
+    lead = (
+        "White where photos show the light unclipped and the scene agrees; a half where it is known to a factor of two."
+    )
+    return _section(
+        "Confidence",
+        lead,
+        f'<div class="views">{"".join(figures)}</div><div class="scale"></div><div class="ends">{ends}</div>',
+    )
+
+
+def _unexplained(run: Any, scene: Scene) -> str:
+    """The photos with the worst regions, each in a box."""
+    found = run.summary().get("unexplained")
+    if found is None:
+        return ""
+    views, photos = {view.name: view for view in scene.views}, {}
+    for region in found["worst"]:
+        if region["photo"] in views:
+            photos.setdefault(region["photo"], []).append(region)
+    figures = []
+    for name, regions in list(photos.items())[:_MOST_PHOTOS]:
+        image = views[name].image
+        (height, width), size = image.shape[:2], _size(image, _PICTURE)
+        # Lines and letters that look the same on any size of photo.
+        unit, boxes = width / 420, []
+        for region in regions:
+            side = region["pixels"] ** 0.5
+            left, top, wide, high = region.get("box") or (
+                region["column"] - side / 2,
+                region["row"] - side / 2,
+                side,
+                side,
+            )
+            color = "#ffb454" if region["stops"] > 0 else "#6cc7e8"
+            x, y, w, h = left - 3 * unit, top - 3 * unit, wide + 6 * unit, high + 6 * unit
+            place = f'x="{x:.1f}" y="{y:.1f}" width="{w:.1f}" height="{h:.1f}"'
+            boxes.append(f'<rect {place} fill="none" stroke="{color}" stroke-width="{1.6 * unit:.2f}"/>')
+            below = y < 16 * unit
+            at = f'x="{min(x, width - 60 * unit):.1f}" y="{y + h + 14 * unit if below else y - 5 * unit:.1f}"'
+            shadow = (
+                f"fill:{color};font-size:{13 * unit:.1f}px;paint-order:stroke;stroke:#000;stroke-width:{3 * unit:.2f}px"
+            )
+            boxes.append(f'<text {at} style="{shadow}">{stops_text(region["stops"]).removesuffix(" EV")}</text>')
+        picture = (
+            img(jpeg(smaller(image, _PICTURE), 84), "", size)
+            .replace("<img src=", "<image href=")
+            .replace(' alt=""', "")
+        )
+        picture = picture.replace(f'width="{size[0]}" height="{size[1]}">', f'width="{width}" height="{height}"/>')
+        label = f'role="img" aria-label="unexplained regions of {escape(name)}"'
+        drawn = f'<svg viewBox="0 0 {width} {height}" {label}>{picture}{"".join(boxes)}</svg>'
+        figures.append(_figure(drawn, f"{escape(name)}: {len(regions)} of the worst regions"))
+    counted = f"{found['regions']} regions in {found['photos']} training photos" if found["regions"] else "None"
+    lead = f"{counted}: places that photo and scene show at least a stop apart."
+    if figures:
+        lead += " Amber: the photo is brighter than the scene, by so many stops; blue: darker."
+    return _section("What stays unexplained", lead, f'<div class="views">{"".join(figures)}</div>')
+
+
+def _plan(decisions: Sequence[Mapping]) -> str:
+    rows = [(d["name"], d["choice"], d.get("reason", "")) for d in decisions]
+    return _section(
+        "What was left out, and why",
+        "Decided before the training, from the photos.",
+        _rows(("", "choice", "why"), rows),
+    )
+
+
+def _table(evaluation: Mapping[str, Any] | None, held_out: bool) -> str:
+    if evaluation is None:
+        return ""
+    hdr = evaluation["protocol"]["gt-max"]
+
+    def figures(ldr: Mapping, protocol: Mapping) -> list[str]:
+        return [
+            number(ldr["psnr"], 2),
+            number(ldr["ssim"], 3),
+            number(protocol["psnr_mu"], 2),
+            number(protocol["ssim_mu"], 3),
+        ]
+
+    none = {"psnr_mu": None, "ssim_mu": None}
+    rows = [[row["name"], *figures(row["ldr"], row["protocol"].get("gt-max", none))] for row in evaluation["views"]]
+    titles = ("view", "photo PSNR, dB", "photo SSIM", "HDR mu-law PSNR, dB", "HDR mu-law SSIM")
+    body = _rows(titles, rows, mean=["mean", *figures(evaluation["ldr"], hdr)], first_number=1)
+    regions = [
+        [name, f"{values['fraction']:.1%}", number(values["psnr_ldr"], 2), number(values["psnr_mu"]["gt-max"], 2)]
+        for name, values in evaluation["regions"].items()
+    ]
+    titles = ("part of the photos", "pixels", "photo PSNR, dB", "HDR mu-law PSNR, dB")
+    body += "\n<br>\n" + _rows(titles, regions, first_number=1)
+    split = "Held-out views" if held_out else "Training views, since none is held out: figures flatter"
+    return _section(
+        "Figures", f"{split}. HDR under the protocol gt-max; <code>sehdr-warp eval</code> has the others.", body
+    )
+
+
+def _map(run: Any, comparisons: Sequence["Comparison"]) -> str:
+    tone_map = fit_tone_map([each.hdr for each in comparisons])
+    lead = (
+        'From above, as the photos see it. <span style="color: #e0a458">Amber</span>: trained on. '
+        '<span style="color: #7fb2c4">Blue</span>: held out.'
+    )
+    drawn = camera_map(run, tone_map, [each.name for each in comparisons])
+    return _section("Cameras", lead, _figure(drawn))
+
+
+def _footer(run: Any) -> str:
+    path = escape(str(run.path))
+    return (
+        f"<footer>\n<p>sehdr-warp {__version__}. Brackets as OpenEXR: <code>sehdr-warp render {path} --out views "
+        f"--evs=-4,-2,0,2,4</code></p>\n<p>Radiance is relative, and clipped light is not in the photos.</p>\n</footer>"
+    )
+
+
+def _rows(titles: Sequence[str], rows: Sequence[Sequence], mean: Sequence = (), first_number: int = 99) -> str:
+    """A table; columns from first_number on hold numbers. Nothing without rows."""
+    if not rows:
+        return ""
+
+    def line(cells: Sequence, tag: str, mark: str = "") -> str:
+        kinds = [' class="number"' * (column >= first_number) for column in range(len(cells))]
+        return f"<tr{mark}>" + "".join(f"<{tag}{k}>{escape(str(c))}</{tag}>" for c, k in zip(cells, kinds)) + "</tr>"
+
+    body = [line(row, "td") for row in rows] + [line(mean, "td", ' class="mean"')] * bool(mean)
+    head = f'<div class="table"><table>\n<thead>{line(titles, "th")}</thead>'
+    return f"{head}\n<tbody>{''.join(body)}</tbody>\n</table></div>"
+
+
+def smaller(picture: np.ndarray, longest: int) -> np.ndarray:
+    """[H, W, 3] with at most `longest` pixels on a side, each the mean of what it covers."""
+    width, height = _size(picture, longest)
+    if (height, width) == picture.shape[:2]:
+        return picture
+    planes = (Image.fromarray(np.ascontiguousarray(plane, np.float32)) for plane in np.moveaxis(picture, 2, 0))
+    return np.stack([np.asarray(plane.resize((width, height), Image.Resampling.BOX)) for plane in planes], axis=2)
+
+
+def _size(picture: np.ndarray, longest: int) -> tuple[int, int]:
+    """Width and height of a picture that is reduced to a longest side."""
+    height, width = picture.shape[:2]
+    factor = min(1.0, longest / max(height, width))
+    return max(1, round(width * factor)), max(1, round(height * factor))
+
+
+def stops_text(stops: float) -> str:
+    """`+2 EV`, `-1.5 EV` with a true minus sign, `0 EV`."""
+    return f"{round(stops, 1):+g} EV".replace("-", "\N{MINUS SIGN}") if stops else "0 EV"
+
+
+def seconds(time: float) -> str:
+    """An exposure time as photographers write it."""
+    return f"1/{1 / time:.0f} s" if time < 0.3 else f"{time:.3g} s"
+
+
+def duration(time: float) -> str:
+    """`45 s`, `3 min 20 s`, `2 h 5 min`."""
+    minutes, rest = divmod(round(time), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+    return f"{minutes // 60} h {minutes % 60} min"
+
+
+def number(value: float | None, digits: int) -> str:
+    """A figure, or a dash where there is none."""
+    return "\N{EN DASH}" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,107 @@
+"""report.html as strangers meet it: valid, alone, small, and with the light that it says it has."""
+
+import base64
+import re
+import shutil
+import subprocess
+import zlib
+
+import numpy as np
+import pytest
+
+from sehdr_warp.output.light_pictures import dial, display_gain, jpeg, packed_light, ultra_hdr
+from sehdr_warp.output.report import write_report
+from sehdr_warp.output.report_page import smaller
+
+from .test_report import make
+
+PLAN = [{"name": "brackets", "choice": "plain <scaling>", "reason": "0.0% of the pixels clip"}]
+FIGURES = {"psnr": 31.4, "ssim": 0.9}, {"psnr_mu": 28.2, "ssim_mu": None}
+EVALUATION = {
+    "views": [{"name": "v_1", "ldr": FIGURES[0], "protocol": {"gt-max": FIGURES[1]}}],
+    "ldr": FIGURES[0],
+    "protocol": {"gt-max": FIGURES[1]},
+    "regions": {"clipped": {"fraction": 0.25, "psnr_ldr": 20.0, "psnr_mu": {"gt-max": None}}},
+}
+
+
+def page(tmp_path, *, unexplained=True, **options):
+    run, scene = make(tmp_path, **options)
+    named = {"photo": "v_0", "column": 5.0, "row": 7.0, "pixels": 9, "stops": 1.25}
+    worst = [named | {"box": [4, 6, 3, 3]}, named | {"stops": -2.0}]
+    run.summary = lambda: {"unexplained": {"regions": 2, "photos": 1, "worst": worst}} if unexplained else {}
+    run.decisions = lambda: PLAN
+    return write_report(run, scene, tmp_path / "report", evaluation=EVALUATION)[0].read_text()
+
+
+def headings(text):
+    return re.findall(r"<h2>(.*?)</h2>", text)
+
+
+def test_the_page_is_valid_alone_and_complete(tmp_path):
+    html5lib = pytest.importorskip("html5lib")
+    text = page(tmp_path)
+    html5lib.HTMLParser(strict=True).parse(text)
+    if tidy := shutil.which("tidy"):
+        told = subprocess.run([tidy, "-q", "-e"], input=text, capture_output=True, text=True)
+        assert told.returncode == 0 and not told.stderr
+    assert not re.findall(r"""(?:src|href)\s*=\s*["'](?!data:)""", text) and "url(" not in text
+    assert len(text) < 5e6
+    expected = ["Photo, scene, truth", "Brackets", "Confidence", "What stays unexplained"]
+    assert headings(text) == [*expected, "What was left out, and why", "Figures", "Error against time", "Cameras"]
+    for told in ("plain &lt;scaling&gt;", "31.40", "25.0%", "26.0 dB", "1 min 5 s", "+1.2<", "\N{MINUS SIGN}2<"):
+        assert told in text
+    assert '<rect x="3.8" y="5.8"' in text  # Around the box, by three units of a 32-pixel photo
+
+
+def test_what_is_not_known_is_left_out(tmp_path):
+    text = page(tmp_path, truth=False, splits=("train", "train"), metrics=None, unexplained=False)
+    assert "What stays unexplained" not in headings(text) and "Error against time" not in headings(text)
+    assert "none is held out" in text and 'data-name="Truth"' not in text
+
+
+def test_ultra_hdr_keeps_the_light(tmp_path):
+    imagecodecs = pytest.importorskip("imagecodecs")
+    x, y = np.meshgrid(np.linspace(-5, 4, 256), np.linspace(0, 1, 192))
+    light = (2.0**x)[..., None] * (1 - 0.3 * y[..., None] * [0, 0.5, 1])
+    kept = imagecodecs.ultrahdr_decode(ultra_hdr(light)).astype(np.float64)[..., :3] / light
+    for column in range(8, 248, 16):
+        np.testing.assert_allclose(np.median(kept[:, column : column + 16], axis=(0, 1)), 1, atol=0.02)
+    # As the page holds it: the scene's pictures decode to the render's light.
+    run, scene = make(tmp_path)
+    text = page(tmp_path)
+    shown = re.search(r'src="data:image/jpeg;base64,([^"]*)" alt="Scene of v_1"', text)
+    decoded = imagecodecs.ultrahdr_decode(base64.b64decode(shown[1])).astype(np.float64)[..., :3]
+    truth = run.render(scene.views[1].camera).hdr * 0.5 * display_gain(run.response)
+    inside = truth < 16
+    assert inside.any() and np.median(decoded[inside] / truth[inside]) == pytest.approx(1, abs=0.02)
+
+
+def test_without_imagecodecs_pictures_are_plain_and_it_is_said(tmp_path, monkeypatch):
+    monkeypatch.setattr("sehdr_warp.output.report_page.gain_maps", lambda: False)
+    text = page(tmp_path)
+    assert "pip install sehdr-warp[hdr]" in text and "are Ultra HDR" not in text
+
+
+def test_a_dial_holds_half_floats():
+    light = np.geomspace(1e-3, 1e3, 4 * 3 * 3).reshape(4, 3, 3)
+    found = np.frombuffer(zlib.decompress(base64.b64decode(packed_light(light))), "<f2").reshape(4, 3, 3)
+    np.testing.assert_allclose(found, light, rtol=1e-3)
+    html = dial({"A & B": light}, 0.5, 1.0, "A & B")
+    assert 'data-light="A &amp; B"' in html and "split" not in html
+
+
+def test_middle_grey_of_the_photo_is_shown_as_middle_grey():
+    from sehdr_warp.response import response_by_name
+
+    assert display_gain(response_by_name("srgb")) == pytest.approx(1, rel=1e-4)
+    response = response_by_name("hdr-nerf")
+    grey = response.encode(np.array([0.18 / display_gain(response)]))
+    assert grey[0] == pytest.approx(0.4614, abs=1e-3)
+
+
+def test_smaller_pictures_hold_means():
+    picture = np.random.default_rng(0).uniform(size=(6, 8, 3)).astype(np.float32)
+    half = smaller(picture, 4)
+    np.testing.assert_allclose(half, picture.reshape(3, 2, 4, 2, 3).mean((1, 3)), rtol=1e-5)
+    assert smaller(picture, 100) is picture and jpeg(picture)[:2] == b"\xff\xd8"
