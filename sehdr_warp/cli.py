@@ -19,6 +19,7 @@ COMMANDS = {
     "train and use a scene": {
         "train": ("training.commands", "Train", "run_train"),
         "render": ("output.commands", "Render", "run_render"),
+        "view": ("viewer.commands", "View", "run_view"),
         "eval": ("evaluation.commands", "Evaluate", "run_evaluate"),
         "report": ("output.commands", "Report", "run_report"),
         "panorama": ("output.commands", "Panorama", "run_panorama"),

@@ -25,6 +25,7 @@ ALLOWED = {
     "scene": ANY | {"response", "splats"},
     "field": ANY | {"scene", "response", "splatting", "splats"},
     "output": ANY | {"scene", "response", "splats", "field.exposure", "field.baking"},
+    "viewer": ANY | {"scene", "output"},
     "evaluation": ANY | {"scene", "splatting.ssim", "output.names", "output.charts"},
     "training": ANY
     | {"scene", "response", "field", "splatting", "splats", "evaluation.metrics", "evaluation.protocols"},
@@ -46,7 +47,7 @@ ALLOWED = {
 }
 # Packages that only some rooms may import.
 ONLY_IN = {
-    "torch": {"response", "field", "splatting", "training", "output", "evaluation", "bench", "check"},
+    "torch": {"response", "field", "splatting", "training", "output", "evaluation", "viewer", "bench", "check"},
     "warp": {"kernels", "splatting"},
 }
 LARGEST_FILE = 400

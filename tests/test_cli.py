@@ -109,7 +109,7 @@ def test_help_is_quick_and_needs_no_torch():
         ("train x --out y --predict-hdr net.pt", "--predict-hdr is gone: it gained nothing"),
         ("train x --out y --loss.predictor net.pt", "--loss.predictor is gone: it gained nothing"),
         ("train x --out y --response.form mlp", 'write response.name = "learned"'),
-        ("render x", "render needs --out PATH"),
+        ("render x", "render needs --out, a folder"),
         ("render x --out y --pixel byte", "--pixel byte: is none of 'half', 'float'"),
         ("bench setp", "bench setp: no such command, did you mean step?"),
         ("bench step --repetitions many", "--repetitions many: is no number"),

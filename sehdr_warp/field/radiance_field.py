@@ -206,10 +206,14 @@ class RadianceField(nn.Module):
     def render_confidence(self, camera: Camera) -> Tensor | None:
         """[H, W] in [0, 1]: the mean confidence of what a camera sees, 0 where alpha is not above 0.001; None where it
         was not measured."""
-        if self.confidence is None:
-            return None
+        return None if self.confidence is None else self.render_mean(camera, self.confidence)
+
+    @torch.no_grad()
+    def render_mean(self, camera: Camera, values: Tensor) -> Tensor:
+        """[H, W] in [0, 1]: the mean of the Gaussians' values [N] over what a camera sees, 0 where alpha is not above
+        0.001."""
         # As wide as a training's features, though one channel is meant: no further kernel is compiled.
-        features = self.confidence[:, None].expand(-1, 3).contiguous()
+        features = values[:, None].expand(-1, 3).contiguous()
         rendering = self._rasterize(CameraTensors.of(camera, features.device), features)
         return _mean_of_seen(rendering.image[..., 0], rendering.alpha).clamp(0, 1)
 

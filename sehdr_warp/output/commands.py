@@ -1,14 +1,20 @@
 """The command lines of `sehdr-warp render`, `report` and `export`. torch is imported when they run."""
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from tyro.conf import Positional
 
+from ..arguments import positive
+from ..errors import InputError, UsageError
 from ..files import check_absent
 from ..training.commands import ensured_scene, open_run, open_scene
+
+_NOT_OF_VIEWS = {"run", "device", "json", "video", "fps", "transfer", "ev_ramp"}
+_MOST_STOPS = 30
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,8 +35,10 @@ class _Rendered(_OfRun):
 
 @dataclass(frozen=True, kw_only=True)
 class Render(_Rendered):
-    """Render HDR EXR, previews and exposure brackets of a trained scene. Needs no photos."""
+    """Render HDR EXR, previews and exposure brackets of a trained scene, or a film. Needs no photos."""
 
+    out: Path | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    """Folder for the pictures."""
     cameras: str = "test"
     """test, train, all, orbit, interpolate, or cameras of your own: JSON, OpenUSD, or a COLMAP model's folder."""
     count: int = 60
@@ -51,6 +59,14 @@ class Render(_Rendered):
     """Primaries of the EXR files, always scene-linear: rec709, acescg, aces2065-1, rec2020, display-p3 or dci-p3."""
     pixel: Literal["half", "float"] = "half"
     """Pixel type of the EXR files."""
+    video: Path | None = None
+    """A film of the cameras, such as orbit.mp4; without --out no pictures are written."""
+    fps: float = 24.0
+    """Frames a second of the film."""
+    transfer: Literal["sdr", "hlg", "hdr10"] = "sdr"
+    """What the film is for: any display (H.264), or HDR displays (HEVC, 10 bits)."""
+    ev_ramp: str | None = None
+    """Exposure of the film from its first frame to its last, in stops from the photos': --ev-ramp=-4:4."""
     json: bool = False
     """Print the written files as JSON on standard output."""
 
@@ -135,12 +151,45 @@ def run_panorama(asked: Panorama) -> None:
 def run_render(asked: Render) -> None:
     from .render_views import render_views
 
-    options = {name: value for name, value in vars(asked).items() if name not in ("run", "device", "json")}
-    written = render_views(open_scene(asked.run, asked.device), **options)
+    if asked.out is None and asked.video is None:
+        raise UsageError(
+            "render needs --out, a folder for the pictures, or --video, a film; see sehdr-warp render --help"
+        )
+    if asked.video is None and (asked.ev_ramp is not None or (asked.fps, asked.transfer) != (24.0, "sdr")):
+        raise UsageError("--ev-ramp, --fps and --transfer are of a film; name it with --video")
+    written, ramp = [], _ramp(asked.ev_ramp)
+    if asked.video is not None:
+        check_absent(asked.video, asked.overwrite)
+    run = open_scene(asked.run, asked.device)
+    if asked.out is not None:
+        written = render_views(run, **{name: value for name, value in vars(asked).items() if name not in _NOT_OF_VIEWS})
+    if asked.video is not None:
+        from .film import write_film
+        from .render_views import framed, read_size, select_cameras
+
+        cameras = [camera for _, camera in select_cameras(run, asked.cameras, count=asked.count)]
+        if asked.size is not None:
+            cameras = [framed(camera, *read_size(asked.size)) for camera in cameras]
+        options = {"fps": positive("--fps", asked.fps), "transfer": asked.transfer, "ev_ramp": ramp}
+        written.append(write_film(run, asked.video, cameras, **options, overwrite=asked.overwrite))
     if asked.json:
         print(json.dumps({"files": [str(path) for path in written]}))
+    elif asked.out is None:
+        print(asked.video)
     else:
         print(f"{asked.out}: {len(written)} files")
+
+
+def _ramp(text: str | None) -> tuple[float, float]:
+    """The stops of --ev-ramp, a number or two with a colon between."""
+    if text is None:
+        return 0.0, 0.0
+    with suppress(ValueError):
+        stops = [float(part) for part in text.split(":")]
+        if len(stops) in (1, 2) and all(abs(stop) <= _MOST_STOPS for stop in stops):
+            return stops[0], stops[-1]
+    problem = f"is not stops from -{_MOST_STOPS} to {_MOST_STOPS}, with a colon between"
+    raise InputError(f"--ev-ramp {text}", problem, "write for example --ev-ramp=-4:4")
 
 
 def run_report(asked: Report) -> None:

@@ -181,12 +181,17 @@ def open_scene(path: Path, device: str | None):
 
 
 def ensured_scene(run, data: str | None):
-    """The scene a run was trained on, read again in the same way, after the run's confidence was measured on it.
-
-    data: where the photos are, if they have moved.
-    """
-    from ..scene import is_embedded
+    """The scene of read_scene, after the run's confidence was measured on it."""
     from .run import ensure_confidence
+
+    scene = read_scene(run, data)
+    ensure_confidence(run, scene)
+    return scene
+
+
+def read_scene(run, data: str | None):
+    """The scene a run was trained on, read again in the same way. data: where the photos are, if they have moved."""
+    from ..scene import is_embedded
 
     place = data or run.data.get("path")
     if place is None:
@@ -195,9 +200,7 @@ def ensured_scene(run, data: str | None):
         raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
     # A learned response was not known when the photos of the training were developed.
     learned = run.config.response.name == "learned"
-    scene = _load({**run.data, "path": place}, response="learned" if learned else run.response)
-    ensure_confidence(run, scene)
-    return scene
+    return _load({**run.data, "path": place}, response="learned" if learned else run.response)
 
 
 def _data(asked: Train, resumed) -> dict:

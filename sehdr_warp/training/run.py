@@ -110,6 +110,13 @@ class Run(_Rendered):
         self.data: dict = info["data"]
         self.scene_name: str = info["scene"]
 
+    def clipped_share(self) -> Tensor | None:
+        """[N] in [0, 1]: which share of the values that show a Gaussian were clipped; None where not measured."""
+        if self.model.confidence is None:
+            return None
+        clipped = self.folder.read_clipped()
+        return None if clipped is None else clipped.to(self.device)
+
     def metrics(self) -> list[dict]:
         """The evaluations made during training, as in metrics.jsonl."""
         return self.folder.read_metrics()

@@ -366,6 +366,14 @@ class RunFolder:
             raise InputError(path, "confidence holds values outside of 0 to 1", remedy)
         return confidence.float()
 
+    def read_clipped(self) -> Tensor | None:
+        """[N] the share of clipped values, beside the confidence that was read; None where there is none."""
+        from safetensors import SafetensorError, safe_open
+
+        with suppress(SafetensorError, OSError), safe_open(str(self.confidence), framework="pt") as file:
+            return file.get_tensor("clipped")
+        return None
+
 
 def describe_scene(scene: Scene) -> dict:
     """What scene.json holds."""

@@ -76,7 +76,7 @@ class AnalyticRun:
         """Falls from left to right, and from 1; none where it is switched off."""
         if not self.confident:
             return None
-        return np.broadcast_to(np.linspace(1, 0, view.width, dtype=np.float32), (view.height, view.width))
+        return np.tile(np.linspace(1, 0, view.width, dtype=np.float32), (view.height, 1))
 
     def render(self, view):
         self.rendered += 1

@@ -4,6 +4,7 @@
 
 const TONES = ["none", "reinhard", "filmic", "aces", "response"];
 const OVERLAYS = ["none", "stops", "confidence", "depth", "normals", "error", "clipped"];
+const TEXTURES = ["scene", "other", "depth", "clipped", "photo", "curve"];
 const CURVE_LOW = -20, CURVE_HIGH = 20, CURVE_SIZE = 1024;  // Stops that a response's table spans
 
 const VERTEX = `#version 300 es
@@ -13,17 +14,19 @@ void main() {
   gl_Position = vec4(at * 2.0 - 1.0, 0, 1);
 }`;
 
-const FRAGMENT = `#version 300 es
+// Looks are constants of a program, made when first used: software renderers pay for every branch there is.
+const FRAGMENT = looks => `#version 300 es
+const int ${Object.entries(looks).map(([name, value]) => `${name} = ${value}`).join(", ")};
 precision highp float;
 precision highp sampler2D;
 in vec2 at;
 out vec4 color;
 uniform sampler2D scene, other, depth, clipped, photo, curve;
-uniform float gain, grey, white, split, far;
-uniform int tone, overlay, left;             // left of the split: 0 scene, 1 other, 2 photo
+uniform float gain, grey, white, split, far, middle;
 uniform mat4 toPhoto;                        // camera of the view to camera of the photo
 uniform vec4 lens, photoLens;                // fx, fy, cx, cy over width and height
 
+// tone and overlay: of the lists above. left of the split: 0 scene, 1 other, 2 photo
 const vec3 LUMINANCE = vec3(0.2126, 0.7152, 0.0722);
 
 vec3 srgb(vec3 x) {
@@ -47,8 +50,8 @@ vec3 aces(vec3 x) {                          // Hill's fit of the ACES reference
 vec3 response(vec3 x) {
   vec3 place = (log2(max(x, 1e-9)) - float(${CURVE_LOW})) / float(${CURVE_HIGH - CURVE_LOW});
   place = (clamp(place, 0.0, 1.0) * float(${CURVE_SIZE - 1}) + 0.5) / float(${CURVE_SIZE});
-  return vec3(texture(curve, vec2(place.r, 0.5)).r, texture(curve, vec2(place.g, 0.5)).g,
-              texture(curve, vec2(place.b, 0.5)).b);
+  return vec3(texture(curve, vec2(place.r, 0.5)).r, texture(curve, vec2(place.g, 0.5)).r,
+              texture(curve, vec2(place.b, 0.5)).r);
 }
 vec3 shown(vec3 light) {
   vec3 x = max(light, 0.0) * gain;
@@ -94,7 +97,7 @@ void main() {
   }
   if (overlay == 1) color.rgb = stops(log2(max(dot(light.rgb, LUMINANCE) * gain * grey, 1e-9) / 0.18));
   if (overlay == 2) color.rgb = ramp(light.a);
-  if (overlay == 3) color.rgb = texture(depth, uv).r > 0.0 ? ramp(1.0 - texture(depth, uv).r / far) : vec3(0.0);
+  if (overlay == 3) color.rgb = texture(depth, uv).r > 0.0 ? ramp(middle / (middle + texture(depth, uv).r)) : vec3(0.0);
   if (overlay == 4) {
     vec2 e = 1.0 / vec2(textureSize(depth, 0));
     vec3 n = cross(place(uv + vec2(0, e.y)) - place(uv - vec2(0, e.y)), place(uv + vec2(e.x, 0)) - place(uv - vec2(e.x, 0)));
@@ -112,11 +115,24 @@ class LightCanvas {
   constructor(canvas) {
     const gl = canvas.getContext("webgl2", {antialias: false, preserveDrawingBuffer: true});
     if (!gl) throw new Error("this browser has no WebGL2");
-    this.canvas = canvas, this.gl = gl, this.textures = {}, this.frames = {}, this.places = {};
-    this.settings = {stops: 0, tone: "none", white: 4, overlay: "none", split: 0, left: 0, grey: 1, far: 1,
+    this.canvas = canvas, this.gl = gl, this.textures = {}, this.frames = {}, this.programs = {};
+    this.settings = {stops: 0, tone: "none", white: 4, overlay: "none", split: 0, left: 0, grey: 1, far: 1, middle: 1,
                      toPhoto: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], lens: [1, 1, .5, .5], photoLens: [1, 1, .5, .5]};
-    const program = this.program = gl.createProgram();
-    for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    TEXTURES.forEach((name, unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, this.textures[name] = gl.createTexture());
+      for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
+      for (const size of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, size, gl.LINEAR);
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+    });
+  }
+
+  program(looks) {
+    const gl = this.gl, key = JSON.stringify(looks);
+    if (this.programs[key]) return this.programs[key];
+    const program = gl.createProgram();
+    for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT(looks)]]) {
       const shader = gl.createShader(kind);
       gl.shaderSource(shader, source);
       gl.compileShader(shader);
@@ -124,42 +140,35 @@ class LightCanvas {
       gl.attachShader(program, shader);
     }
     gl.linkProgram(program);
-    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
     gl.useProgram(program);
-    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-    ["scene", "other", "depth", "clipped", "photo", "curve"].forEach((name, unit) => {
-      gl.activeTexture(gl.TEXTURE0 + unit);
-      gl.bindTexture(gl.TEXTURE_2D, this.textures[name] = gl.createTexture());
-      for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
-      for (const size of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, size, gl.LINEAR);
-      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
-      gl.uniform1i(gl.getUniformLocation(program, name), unit);
-    });
+    TEXTURES.forEach((name, unit) => gl.uniform1i(gl.getUniformLocation(program, name), unit));
+    return this.programs[key] = {program, places: {}};
   }
 
   // Half floats (Uint16Array) of 1, 3 or 4 channels, top row first, for the texture of a name.
   put(name, width, height, half, channels) {
-    const gl = this.gl, unit = Object.keys(this.textures).indexOf(name);
+    const gl = this.gl;
     const [inside, format] = {1: [gl.R16F, gl.RED], 3: [gl.RGB16F, gl.RGB], 4: [gl.RGBA16F, gl.RGBA]}[channels];
-    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.activeTexture(gl.TEXTURE0 + TEXTURES.indexOf(name));
+    const filter = width === this.canvas.width && height === this.canvas.height ? gl.NEAREST : gl.LINEAR;
+    for (const size of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, size, filter);
     gl.texImage2D(gl.TEXTURE_2D, 0, inside, width, height, 0, format, gl.HALF_FLOAT, half);
     this.frames[name] = {width, height, half, channels};
   }
 
   putPhoto(image) {
     const gl = this.gl;
-    gl.activeTexture(gl.TEXTURE0 + Object.keys(this.textures).indexOf("photo"));
+    gl.activeTexture(gl.TEXTURE0 + TEXTURES.indexOf("photo"));
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
   }
 
   draw(changes = {}) {
     const gl = this.gl, s = Object.assign(this.settings, changes);
-    const at = name => this.places[name] ??= gl.getUniformLocation(this.program, name);
-    for (const [name, value] of Object.entries({gain: 2 ** s.stops, grey: s.grey, white: s.white, split: s.split, far: s.far}))
+    const looks = {tone: TONES.indexOf(s.tone), overlay: OVERLAYS.indexOf(s.overlay), left: s.left};
+    const {program, places} = this.program(looks), at = name => places[name] ??= gl.getUniformLocation(program, name);
+    gl.useProgram(program);
+    for (const [name, value] of Object.entries({gain: 2 ** s.stops, grey: s.grey, white: s.white, split: s.split, far: s.far, middle: s.middle}))
       gl.uniform1f(at(name), value);
-    gl.uniform1i(at("tone"), TONES.indexOf(s.tone));
-    gl.uniform1i(at("overlay"), OVERLAYS.indexOf(s.overlay));
-    gl.uniform1i(at("left"), s.left);
     gl.uniform4fv(at("lens"), s.lens);
     gl.uniform4fv(at("photoLens"), s.photoLens);
     gl.uniformMatrix4fv(at("toPhoto"), true, s.toPhoto);

@@ -1,0 +1,153 @@
+"""Films of camera paths: H.264 for any display, or HEVC with 10 bits as HLG or HDR10 for HDR displays."""
+
+import logging
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.scene import Camera
+
+from ..console import format_seconds
+from ..files import atomic_path
+from .colorspace import matrix_from_rec709
+from .images import as_array
+from .light_pictures import display_gain
+from .tonemap import encode_srgb, fit_tone_map
+
+log = logging.getLogger(__name__)
+
+TELL_EVERY = 10.0
+REFERENCE_WHITE, PEAK = 203.0, 1000.0
+"""cd/m^2 of the photos' white in HDR (ITU-R BT.2408), and of the brightest that is shown."""
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """How light becomes codes. codec, pixels: of FFmpeg. primaries, curve, matrix: code points of ITU-T H.273."""
+
+    codec: str
+    pixels: str
+    options: dict[str, str]
+    primaries: int
+    curve: int
+    matrix: int
+
+
+_X265 = "log-level=error:repeat-headers=1"
+# As if mastered on a Rec.2020 display of PEAK; the steps are 0.00002 and 0.0001 cd/m2.
+_MASTER = (
+    "hdr-opt=1:master-display=G(8500,39850)B(6550,2300)R(35400,14600)WP(15635,16450)L(10000000,50):max-cll=1000,400"
+)
+TRANSFERS = {
+    "sdr": Transfer("libx264", "yuv420p", {"crf": "16", "preset": "medium"}, 1, 1, 1),
+    "hlg": Transfer("libx265", "yuv420p10le", {"crf": "18", "x265-params": _X265}, 9, 18, 9),
+    "hdr10": Transfer("libx265", "yuv420p10le", {"crf": "18", "x265-params": f"{_X265}:{_MASTER}"}, 9, 16, 9),
+}
+
+
+def write_film(
+    run: Any,
+    out: Path | str,
+    cameras: Sequence[Camera],
+    *,
+    fps: float = 24.0,
+    transfer: str = "sdr",
+    ev_ramp: tuple[float, float] = (0.0, 0.0),
+    exposed: bool = False,
+    overwrite: bool = False,
+) -> Path:
+    """Renders a film of cameras, one each frame, at the size of the first; returns `out`, whose suffix says the format.
+
+    transfer: "sdr": H.264, Rec.709, tone-mapped by one map for all frames; "hlg" or "hdr10": HEVC of 10 bits in
+    Rec.2020, in which a photo's white is 203 cd/m2 and light is kept up to 1000. ev_ramp: stops from the photos'
+    exposure at the first and the last frame, changing evenly. exposed: SDR is not tone-mapped but exposed and clipped,
+    as a camera does; so too where the ramp moves.
+
+    Raises SehdrError without PyAV (the extra `film`) or its encoder, InputError where `out` exists (unless overwrite).
+    """
+    av, kind = _library(), TRANSFERS[transfer]
+    out, first = Path(out), cameras[0]
+    # Chroma of 4:2:0 covers two by two pixels.
+    width, height = (max(2, side - side % 2) for side in (first.width, first.height))
+    gain = run.base_time * display_gain(run.response)
+    stops = np.linspace(*ev_ramp, len(cameras))
+    look = None
+    if transfer == "sdr" and not exposed and ev_ramp[0] == ev_ramp[1]:
+        chosen = [cameras[i] for i in sorted({round(i) for i in np.linspace(0, len(cameras) - 1, 4)})]
+        look = fit_tone_map([as_array(run.render(camera.resized(160, 120)).hdr) for camera in chosen])
+    with atomic_path(out, overwrite) as temporary:
+        try:
+            with av.open(str(temporary), "w", options={"movflags": "faststart"}) as container:
+                stream = container.add_stream(kind.codec, rate=Fraction(fps).limit_denominator(1001))
+                stream.width, stream.height, stream.pix_fmt = width, height, kind.pixels
+                stream.options = kind.options
+                if kind.codec == "libx265":
+                    stream.codec_context.codec_tag = "hvc1"  # What Apple's players look for.
+                context = stream.codec_context
+                context.color_primaries, context.color_trc, context.colorspace = kind.primaries, kind.curve, kind.matrix
+                context.color_range = 1
+                for camera, ev in zip(_told(cameras, out), stops):
+                    hdr = as_array(run.render(camera.resized(width, height)).hdr) * np.float32(2.0**ev)
+                    shown = look(hdr) if look else encode(hdr * np.float32(gain), transfer)
+                    for packet in stream.encode(_frame(av, shown, kind)):
+                        container.mux(packet)
+                for packet in stream.encode():
+                    container.mux(packet)
+        except (av.FFmpegError, ValueError) as error:
+            raise SehdrError(f"{out}: cannot be written as a film ({error}); choose another size or .mp4") from error
+    return out
+
+
+def encode(light: np.ndarray, transfer: str) -> np.ndarray:
+    """[..., 3] linear Rec.709 display light, in which 1 is the photos' white, as R'G'B' in [0, 1] of a transfer.
+
+    sdr: Rec.709's primaries, the sRGB curve. hdr10: Rec.2020, SMPTE ST 2084 of cd/m2. hlg: Rec.2020, BT.2100's OETF of
+    the scene light that its system gamma of 1.2 shows so on a display of 1000 cd/m2.
+    """
+    if transfer == "sdr":
+        return encode_srgb(light)
+    wide = np.maximum(np.asarray(light, np.float64) @ matrix_from_rec709("rec2020").T, 0) * REFERENCE_WHITE
+    shown = np.minimum(wide, PEAK)
+    if transfer == "hdr10":
+        powered = (shown / 10000) ** 0.1593017578125
+        return ((0.8359375 + 18.8515625 * powered) / (1 + 18.6875 * powered)) ** 78.84375
+    luminance = (shown / PEAK) @ np.array([0.2627, 0.6780, 0.0593])
+    scene = shown / PEAK * np.maximum(luminance, 1e-12)[..., None] ** (1 / 1.2 - 1)
+    scene = np.clip(scene, 0, 1)
+    high = 0.17883277 * np.log(np.maximum(12 * scene - 0.28466892, 1e-9)) + 0.55991073
+    return np.where(scene <= 1 / 12, np.sqrt(3 * scene), high)
+
+
+def _frame(av: Any, encoded: np.ndarray, kind: Transfer) -> Any:
+    """A video frame of R'G'B' [H, W, 3] in [0, 1]; FFmpeg's scaler makes Y'CbCr of it by the matrix of the transfer."""
+    deep = np.rint(np.clip(encoded, 0, 1) * 65535).astype(np.uint16)
+    frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(deep), format="rgb48le")
+    spaces = {1: "ITU709", 9: "BT2020"}
+    made = frame.reformat(format=kind.pixels, dst_colorspace=spaces[kind.matrix], dst_color_range="MPEG")
+    made.color_primaries, made.color_trc, made.colorspace = kind.primaries, kind.curve, kind.matrix
+    return made
+
+
+def _told(cameras: Sequence[Camera], out: Path) -> Iterator[Camera]:
+    """The cameras; meanwhile the log says how far the film is."""
+    started = due = time.monotonic()
+    for index, camera in enumerate(cameras):
+        if index and time.monotonic() > due + TELL_EVERY:
+            due = time.monotonic()
+            left = (due - started) / index * (len(cameras) - index)
+            log.info("%s: frame %d of %d, %s left", out.name, index, len(cameras), format_seconds(left))
+        yield camera
+
+
+def _library() -> Any:
+    try:
+        import av
+    except ImportError:
+        raise SehdrError("films need PyAV; run `pip install sehdr-warp[film]`") from None
+    return av

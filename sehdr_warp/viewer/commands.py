@@ -1,0 +1,58 @@
+"""The command line of `sehdr-warp view`. torch is imported when it runs."""
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from ..training.commands import open_scene, read_scene
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Look at trained scenes in a browser: fly through, expose, probe, compare, save. Runs until Ctrl-C."""
+
+    runs: Positional[tuple[Path, ...]]
+    """Folders of runs, or files of Gaussians; with several, the page compares them."""
+    port: int = 8080
+    """Port; the next free one where it is taken."""
+    host: str = "127.0.0.1"
+    """Address to serve: this machine alone, or 0.0.0.0 for all that can reach it."""
+    device: str | None = None
+    """cpu or cuda:N; by default the first GPU if there is one."""
+    data: str | None = None
+    """The photos, if they have moved since the training."""
+
+
+def run_view(asked: View) -> None:
+    from functools import cache
+
+    from ..errors import InputError, UsageError
+    from .frames import Rendering
+    from .server import Server, Viewer
+
+    if not asked.runs:
+        raise UsageError("view needs RUN, the folder of a run; see sehdr-warp view --help")
+    if not 0 <= asked.port < 65536:
+        raise UsageError(f"--port {asked.port}: is no port; give 1 to 65535, or 0 for any")
+    runs: list[Any] = [open_scene(path, asked.device) for path in asked.runs]
+    clipped = [run.clipped_share() if path.is_dir() else None for run, path in zip(runs, asked.runs)]
+    shown = [Rendering(run, str(path), share) for run, path, share in zip(runs, asked.runs, clipped)]
+
+    @cache
+    def photos(index: int) -> dict:
+        if not asked.runs[index].is_dir():
+            raise InputError(asked.runs[index], "is a file of Gaussians, without photos", "view the run it came from")
+        return {view.name: view for view in read_scene(runs[index], asked.data).views}
+
+    with Server(Viewer(shown, photos), asked.host, asked.port) as server:
+        print(f"{server.url}  (Ctrl-C ends it)", flush=True)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            log.info("the viewer has ended")
+        for run in shown:  # What is being rendered is waited for: kernels must not outlive Python.
+            run.lock.acquire(timeout=30)

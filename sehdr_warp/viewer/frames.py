@@ -1,0 +1,103 @@
+"""What the page asks of a run: float frames of a camera, and the facts that it draws with."""
+
+import base64
+import json
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sehdr_warp.scene import Camera
+
+from ..output.camera_paths import common_focus
+from ..output.images import as_array
+from ..output.light_pictures import display_gain
+
+MOST_PIXELS = 4096 * 2304
+CURVE_STOPS, CURVE_SIZE = (-20.0, 20.0), 1024  # As light.js has them
+_HALF_MOST = 65504.0
+
+
+class Rendering:
+    """A run that several threads may render from, one at a time; otherwise the run.
+
+    clipped: for each Gaussian the share of photographed values that were clipped, [N]; None where it is not known.
+    """
+
+    def __init__(self, run: Any, name: str, clipped: Tensor | None = None):
+        self.run, self.name, self.clipped = run, name, clipped
+        self.lock = threading.Lock()
+
+    def __getattr__(self, name: str):
+        return getattr(self.run, name)
+
+    def render(self, camera: Camera):
+        with self.lock:
+            return self.run.render(camera)
+
+    def render_confidence(self, camera: Camera) -> Tensor | None:
+        with self.lock:
+            return self.run.render_confidence(camera)
+
+    def frame(self, camera: Camera, *, draft: bool = False, clipped: bool = False) -> bytes:
+        """Half floats, row by row: [H, W, 4] exposure at the base time and confidence (1 in a draft, and where it is
+        not known), [H, W] depth, and with `clipped` [H, W] the share of clipped values."""
+        with torch.no_grad():
+            rendered = self.render(camera)
+            light = torch.as_tensor(rendered.hdr) * self.run.base_time
+            confidence = None if draft else self.render_confidence(camera)
+            alpha = torch.ones_like(light[..., 0]) if confidence is None else torch.as_tensor(confidence).to(light)
+            planes = [torch.cat([light, alpha[..., None]], dim=2), torch.as_tensor(rendered.depth)]
+            if clipped and self.clipped is not None:
+                with self.lock:
+                    planes.append(self.run.model.render_mean(camera, self.clipped))
+            return b"".join(as_array(plane.clamp(0, _HALF_MOST).half()).tobytes() for plane in planes)
+
+    def facts(self) -> dict[str, Any]:
+        """What the page knows of the run: plain values."""
+        run, cameras = self.run, [entry.camera for entry in self.run.cameras]
+        positions = np.array([camera.position for camera in cameras]).reshape(-1, 3)
+        up = -np.sum([camera.world_to_camera[1, :3] for camera in cameras], axis=0) if cameras else [0.0, -1.0, 0.0]
+        focus = common_focus(cameras) if cameras else None
+        size = float(np.linalg.norm(np.ptp(positions, axis=0))) if cameras else 1.0
+        return {
+            "name": self.name,
+            "scene": run.scene_name,
+            "gaussians": run.gaussian_count,
+            "iterations": run.iterations,
+            "response": run.response.name,
+            "base_time": run.base_time,
+            "grey": display_gain(run.response),
+            "curve": _curve(run.response),
+            "clipped": self.clipped is not None,
+            "up": (np.asarray(up) / max(float(np.linalg.norm(up)), 1e-9)).tolist(),
+            "focus": None if focus is None else focus.tolist(),
+            "size": size or 1.0,
+            "views": [
+                {"name": entry.name, "split": entry.split, "camera": entry.camera.to_dict()} for entry in run.cameras
+            ],
+        }
+
+
+def camera_of(values: dict) -> Camera:
+    """The camera that a page describes; raises ValueError, KeyError or TypeError for a bad one, or one too large."""
+    camera = Camera.from_dict(values)
+    if camera.width * camera.height > MOST_PIXELS:
+        raise ValueError(f"{camera.width} x {camera.height} is more than {MOST_PIXELS} pixels")
+    return camera
+
+
+def camera_file(cameras: Sequence[Camera]) -> str:
+    """Cameras as `render --cameras` reads them."""
+    digits = max(3, len(str(len(cameras) - 1)))
+    named = [{"name": f"view_{i:0{digits}d}"} | camera.to_dict() for i, camera in enumerate(cameras)]
+    return json.dumps({"cameras": named}, indent=1)
+
+
+def _curve(response: Any) -> str:
+    """The response over CURVE_STOPS of exposure as half floats in base64."""
+    values = response.encode(2.0 ** np.linspace(*CURVE_STOPS, CURVE_SIZE))
+    return base64.b64encode(np.asarray(values).astype("<f2").tobytes()).decode()

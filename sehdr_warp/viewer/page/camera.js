@@ -1,0 +1,72 @@
+// The camera that flies: OpenCV axes, an orbit about a point ahead.
+"use strict";
+
+const add = (a, b, t = 1) => a.map((x, i) => x + t * b[i]);
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+const unit = a => { const l = Math.hypot(...a) || 1; return a.map(x => x / l); };
+function turned(v, axis, angle) {  // Rodrigues
+  const c = Math.cos(angle), s = Math.sin(angle), w = cross(axis, v), d = dot(axis, v) * (1 - c);
+  return v.map((x, i) => x * c + w[i] * s + axis[i] * d);
+}
+
+class FlyingCamera {
+  constructor(up) { this.up = unit(up); }
+
+  // Takes a camera's place (of /scene); ahead: distance of the point that an orbit turns about.
+  jump(camera, ahead) {
+    const m = camera.world_to_camera;
+    this.lens = camera, this.ahead = ahead;
+    this.right = m[0].slice(0, 3), this.down = m[1].slice(0, 3), this.forward = m[2].slice(0, 3);
+    const t = m.map(row => row[3]);
+    this.position = [0, 1, 2].map(i => -(this.right[i] * t[0] + this.down[i] * t[1] + this.forward[i] * t[2]));
+  }
+  get pivot() { return add(this.position, this.forward, this.ahead); }
+  turn(axis, angle) {
+    for (const name of ["right", "down", "forward"]) this[name] = turned(this[name], axis, angle);
+    this.right = unit(this.right), this.forward = unit(add(this.forward, this.right, -dot(this.forward, this.right)));
+    this.down = cross(this.forward, this.right);
+  }
+  orbit(x, y) {
+    const about = this.pivot;
+    this.look(x, y);
+    this.position = add(about, this.forward, -this.ahead);
+  }
+  look(x, y) {
+    this.turn(this.up, -x);
+    const tilt = Math.asin(Math.max(-1, Math.min(1, dot(this.forward, this.up))));
+    this.turn(this.right, Math.max(-1.5 - tilt, Math.min(1.5 - tilt, -y)));  // Not over the poles
+  }
+  pan(x, y) { this.position = add(add(this.position, this.right, -x * this.ahead), this.down, -y * this.ahead); }
+  dolly(factor) {
+    const about = this.pivot;
+    this.ahead *= factor;
+    this.position = add(about, this.forward, -this.ahead);
+  }
+  fly(right, up, forward) {
+    this.position = add(add(add(this.position, this.right, right), this.down, -up), this.forward, forward);
+  }
+  // As the server takes it, for a picture of so many pixels; the photo's frame fits into it. zoom: factor of the lens.
+  at(width, height, zoom = 1) {
+    const l = this.lens, s = zoom * Math.min(width / l.width, height / l.height), p = this.position;
+    const rows = [this.right, this.down, this.forward].map(axis => [...axis, -dot(axis, p)]);
+    return {width, height, fx: l.fx * s, fy: l.fy * s, cx: width / 2 + (l.cx - l.width / 2) * s,
+            cy: height / 2 + (l.cy - l.height / 2) * s, world_to_camera: [...rows, [0, 0, 0, 1]]};
+  }
+}
+
+// Row by row, the 4 x 4 matrix from one camera's coordinates to another's.
+function between(from, to) {
+  const a = from.world_to_camera, b = to.world_to_camera;
+  const center = [0, 1, 2].map(i => -(a[0][i] * a[0][3] + a[1][i] * a[1][3] + a[2][i] * a[2][3]));
+  return b.slice(0, 3).flatMap(row => [...[0, 1, 2].map(j => dot(row, a[j])), dot(row, center) + row[3]]).concat([0, 0, 0, 1]);
+}
+const lensOf = c => [c.fx / c.width, c.fy / c.height, c.cx / c.width, c.cy / c.height];
+function project(camera, point) {  // Pixels, or null behind
+  const m = camera.world_to_camera, [x, y, z] = [0, 1, 2].map(i => dot(m[i], point) + m[i][3]);
+  return z > 1e-6 ? [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy] : null;
+}
+function centerOf(camera) {
+  const m = camera.world_to_camera;
+  return [0, 1, 2].map(i => -(m[0][i] * m[0][3] + m[1][i] * m[1][3] + m[2][i] * m[2][3]));
+}

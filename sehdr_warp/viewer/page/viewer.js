@@ -1,0 +1,388 @@
+// The viewer's page: asks for float frames as the camera moves; exposure and looks are the page's own.
+"use strict";
+
+const $ = id => document.getElementById(id);
+const stage = $("stage"), picture = $("picture"), drawing = $("drawing");
+const DRAFT_TIME = 90, STILL_AFTER = 140;  // Milliseconds that a picture may take while moving; then comes the full one
+let runs, light, camera, facts, state = {stops: 0, photo: 0, split: 0.5, pointer: null, keys: new Set(), path: []};
+let draftScale = 0.5, busy = false, wanted = null, stillTimer = 0, drawn = null, playing = 0;
+
+async function ask(path, body) {
+  const given = body && {method: "POST", headers: {"Content-Type": "application/json"}, body: JSON.stringify(body)};
+  const answer = await fetch(path, given);
+  if (!answer.ok) throw new Error(await answer.text());
+  return answer;
+}
+
+async function start() {
+  const told = await (await ask("/scene")).json();
+  runs = told.runs, facts = runs[0], light = new LightCanvas(picture);
+  document.title = facts.scene + " \u00b7 sehdr-warp";
+  camera = new FlyingCamera(facts.up);
+  facts.views.forEach((view, i) => $("view").add(new Option(`${view.name} (${view.split})`, i)));
+  runs.forEach((run, i) => {
+    $("run").add(new Option(run.name, i));
+    if (runs.length > 1) $("left").add(new Option(run.name, "run" + i));
+  });
+  $("runRow").hidden = runs.length < 2;
+  if (!facts.clipped) $("overlay").querySelector("[value=clipped]").disabled = true;
+  if (told.training) startTraining();
+  useRun(0);
+  new ResizeObserver(resize).observe(stage);
+  jump(0);
+}
+
+function useRun(index) {
+  facts = runs[index];
+  const curve = Uint8Array.from(atob(facts.curve), c => c.charCodeAt(0));
+  light.put("curve", CURVE_SIZE, 1, new Uint16Array(curve.buffer), 1);
+  light.settings.grey = facts.grey;
+  state.run = index;
+  expose();
+}
+
+function resize() {
+  const ratio = window.devicePixelRatio || 1, width = Math.round(stage.clientWidth * ratio), height = Math.round(stage.clientHeight * ratio);
+  if (!width || !height) return;
+  drawing.width = width, drawing.height = height;
+  paint();
+  moved();
+}
+
+function jump(index) {
+  const view = facts.views[index];
+  if (!view) { camera.jump({width: 4, height: 3, fx: 3, fy: 3, cx: 2, cy: 1.5, world_to_camera: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, 1); return moved(); }
+  $("view").value = index, $("zoom").value = 0;
+  const from = centerOf(view.camera), ahead = facts.focus ? dot(add(facts.focus, from, -1), view.camera.world_to_camera[2].slice(0, 3)) : 0;
+  camera.jump(view.camera, ahead > 0 ? ahead : facts.size / 2);
+  loadPhoto(index);
+  moved();
+}
+
+async function loadPhoto(index) {
+  state.photo = index, state.photoReady = null;
+  if (!usesPhoto()) return;
+  try {
+    const blob = await (await ask(`/photo/${state.run}/${index}`)).blob();
+    const image = await createImageBitmap(blob, {colorSpaceConversion: "none"});
+    if (state.photo !== index) return;
+    light.putPhoto(image);
+    state.photoReady = index;
+    paint();
+  } catch (error) { tell(error.message); }
+}
+const usesPhoto = () => $("left").value === "photo" || $("overlay").value === "error";
+function nearestPhoto() {
+  if (!usesPhoto() || !facts.views.length) return;
+  const distances = facts.views.map(view => Math.hypot(...add(centerOf(view.camera), camera.position, -1)) / facts.size
+    + 1 - dot(view.camera.world_to_camera[2].slice(0, 3), camera.forward));
+  const nearest = distances.indexOf(Math.min(...distances));
+  if (nearest !== state.photo || state.photoReady !== nearest) loadPhoto(nearest);
+}
+
+// Asks for a draft now and for the full picture when nothing has moved for a while.
+function moved() {
+  clearTimeout(stillTimer);
+  stillTimer = setTimeout(() => request(false), STILL_AFTER);
+  request(true);
+}
+async function request(draft) {
+  if (!drawing.width) return;
+  wanted = wanted === null ? draft : wanted && draft;
+  if (busy) return;
+  busy = true;
+  while (wanted !== null) {
+    const isDraft = wanted;
+    wanted = null;
+    try { await load(isDraft); } catch (error) { tell(error.message || "the server is gone"); await new Promise(done => setTimeout(done, 500)); }
+  }
+  busy = false;
+}
+async function load(draft) {
+  const scale = draft ? draftScale : 1, width = Math.max(16, Math.round(drawing.width * scale)), height = Math.max(16, Math.round(drawing.height * scale));
+  const seen = camera.at(width, height, zoom()), started = performance.now(), clipped = $("overlay").value === "clipped";
+  const left = $("left").value, other = left.startsWith("run") ? Number(left.slice(3)) : null;
+  const fetched = async (run, clip) => new Uint16Array(await (await ask("/frame", {run, camera: seen, draft, clipped: clip})).arrayBuffer());
+  const [half, second] = await Promise.all([fetched(state.run, clipped), other === null ? null : fetched(other, false)]);
+  const n = width * height, took = performance.now() - started;
+  picture.width = width, picture.height = height;  // Shaded at the frame's size: the browser enlarges drafts.
+  light.put("scene", width, height, half.subarray(0, 4 * n), 4);
+  light.put("depth", width, height, half.subarray(4 * n, 5 * n), 1);
+  if (half.length > 5 * n) light.put("clipped", width, height, half.subarray(5 * n), 1);
+  if (second) light.put("other", width, height, second.subarray(0, 4 * n), 4);
+  if (draft) draftScale = Math.min(1, Math.max(0.08, draftScale * Math.min(1.5, Math.max(0.5, Math.sqrt(DRAFT_TIME / took)))));
+  drawn = {camera: seen, draft};
+  const depths = half.subarray(4 * n, 5 * n).filter((d, i) => d > 0 && i % 13 === 0).sort();  // Positive halves sort as integers.
+  Object.assign(light.settings, {far: fromHalf(depths.at(-1) || 0x3c00), middle: fromHalf(depths[depths.length >> 1] || 0x3c00)});
+  tell(`${width} \u00d7 ${height} \u00b7 ${took.toFixed(0)} ms \u00b7 ${facts.gaussians.toLocaleString("en").replaceAll(",", "\u202f")} Gaussians`);
+  if (!draft) nearestPhoto();
+  histogram();
+  paint();
+  stage.dataset.frame = draft ? "draft" : "full";  // For tests: what is on the canvas
+}
+const tell = text => { $("told").textContent = text; };
+const zoom = () => 2 ** Number($("zoom").value);
+
+function paint() {
+  if (!drawn || !facts) return;
+  const left = $("left").value, split = left === "0" ? 0 : state.split, view = facts.views[state.photo];
+  const photo = view ? {toPhoto: between(drawn.camera, view.camera), photoLens: lensOf(view.camera)} : {};
+  light.draw({stops: state.stops, tone: $("tone").value, white: 2 ** Number($("white").value), overlay: $("overlay").value,
+              split, left: left === "photo" ? 2 : left === "0" ? 0 : 1, lens: lensOf(drawn.camera), ...photo});
+  $("handle").hidden = left === "0";
+  $("handle").style.left = 100 * state.split + "%";
+  frusta();
+  probe();
+}
+
+function expose() {
+  $("stops").value = state.stops;
+  $("stopsTold").textContent = stopsText(state.stops);
+  if (document.activeElement !== $("seconds")) $("seconds").value = secondsText(facts.base_time * 2 ** state.stops);
+  bars();
+  paint();
+}
+function secondsOf(text) {
+  const [a, b] = text.replace("s", "").split("/").map(Number);
+  return b === undefined ? a : a / b;
+}
+
+function frusta() {
+  const context = drawing.getContext("2d"), scale = drawing.width / drawn.camera.width;
+  context.clearRect(0, 0, drawing.width, drawing.height);
+  state.apexes = [];
+  if (!$("frusta").checked) return;
+  context.lineWidth = 1.2 * (window.devicePixelRatio || 1);
+  facts.views.forEach((view, i) => {
+    const c = view.camera, m = c.world_to_camera, center = centerOf(c), size = facts.size * 0.06;
+    const corner = (x, y) => {
+      const ray = [(x - c.cx) / c.fx, (y - c.cy) / c.fy, 1].map(v => v * size);
+      return project(drawn.camera, [0, 1, 2].map(k => center[k] + m[0][k] * ray[0] + m[1][k] * ray[1] + m[2][k] * ray[2]));
+    };
+    const apex = project(drawn.camera, center), corners = [corner(0, 0), corner(c.width, 0), corner(c.width, c.height), corner(0, c.height)];
+    if (!apex || corners.includes(null)) return;
+    context.strokeStyle = view.split === "train" ? "#e0a458" : "#7fb2c4";
+    context.beginPath();
+    corners.forEach((at, k) => {
+      const next = corners[(k + 1) % 4];
+      context.moveTo(apex[0] * scale, apex[1] * scale);
+      context.lineTo(at[0] * scale, at[1] * scale);
+      context.lineTo(next[0] * scale, next[1] * scale);
+    });
+    context.stroke();
+    state.apexes.push([i, apex[0] * scale, apex[1] * scale]);
+  });
+}
+
+function probe() {
+  const at = state.pointer, side = at && $("left").value.startsWith("run") && at[0] < state.split ? "other" : "scene";
+  const value = at && light.value(side, ...at), rows = [];
+  if (value) {
+    const [r, g, b, sure] = value, time = facts.base_time, l = luminance(value) * facts.grey * 2 ** state.stops;
+    const figure = x => x === 0 ? "0" : Math.abs(x) < 1e-3 || x >= 1e5 ? x.toExponential(1) : x.toPrecision(3);
+    rows.push(["radiance", [r, g, b].map(x => figure(x / time)).join("&ensp;")]);
+    rows.push(["from middle grey", l > 0 ? stopsText(Math.log2(l / 0.18)) : "\u2013"]);
+    rows.push(["confidence", drawn.draft || side === "other" ? "\u2013" : `${Math.round(100 * sure)} %`]);
+    rows.push(["depth", figure(light.value("depth", ...at)[0])]);
+    state.probed = [r, g, b].map(x => x / time);
+  }
+  $("probe").innerHTML = rows.map(([name, text]) => `<dt>${name}</dt><dd>${text}</dd>`).join("");
+}
+
+const BINS = 96, LOWEST = -16, HIGHEST = 16;  // Stops from middle grey at 0 EV
+function histogram() {
+  const {half, width, height} = light.frames.scene, step = Math.max(1, Math.floor(width * height / 40000)), bins = new Float32Array(BINS);
+  for (let i = 0; i < width * height; i += step) {
+    const l = luminance([half[4 * i], half[4 * i + 1], half[4 * i + 2]].map(fromHalf)) * facts.grey / 0.18;
+    const bin = Math.floor((Math.log2(l) - LOWEST) / (HIGHEST - LOWEST) * BINS);
+    if (bin >= 0 && bin < BINS) bins[bin]++;
+  }
+  state.bins = bins;
+  bars();
+}
+function bars() {
+  const canvas = $("histogram"), context = canvas.getContext("2d"), bins = state.bins, most = bins ? Math.max(...bins, 1) : 1;
+  context.clearRect(0, 0, 248, 74);
+  const place = stops => (stops + 10) / 20 * 248;  // The axis is what is shown: the bars move with the exposure.
+  context.fillStyle = "#3a3835";
+  context.fillRect(place(0), 0, 1, 60);
+  context.fillRect(place(Math.log2(1 / 0.18)), 0, 1, 60);
+  for (let i = 0; bins && i < BINS; i++) {
+    const stops = LOWEST + i * (HIGHEST - LOWEST) / BINS + state.stops, high = 58 * Math.sqrt(bins[i] / most);
+    context.fillStyle = stops >= Math.log2(1 / 0.18) ? "#e0a458" : "#a6a29c";
+    context.fillRect(place(stops), 60 - high, 248 / 20 * (HIGHEST - LOWEST) / BINS - 0.5, high);
+  }
+  context.fillStyle = "#8a8783";
+  context.font = "10px system-ui";
+  context.textAlign = "center";
+  for (const stops of [-8, -4, 0, 4, 8]) context.fillText(stops === 0 ? "grey" : stops > 0 ? "+" + stops : "\u2212" + -stops, place(stops), 72);
+}
+
+function legend() {
+  const ramp = ["#1a1738", "#1b3f5f", "#216b8c", "#8da973", "#fae059"], kind = $("overlay").value;
+  const ends = {confidence: ["unknown", "known"], depth: ["far", "near"], error: ["0", "\u00bc"]}[kind];
+  if (kind === "stops") {
+    const color = s => s === 0 ? "#808080" : s < 0 ? mix([64, 158, 184], [41, 10, 82], -s / 8)
+      : s < 4 ? mix([115, 179, 89], [242, 217, 64], s / 3) : mix([242, 140, 38], [217, 20, 31], (s - 4) / 4);
+    $("legend").innerHTML = Array.from({length: 17}, (_, i) => `<i style="background:${color(i - 8)}"><span>${i % 4 ? "" : i - 8}</span></i>`).join("");
+  } else $("legend").innerHTML = ends ? ramp.map((c, i) => `<i style="background:${c}"><span>${i === 0 ? ends[0] : i === 4 ? ends[1] : ""}</span></i>`).join("") : "";
+}
+const mix = (a, b, t) => `rgb(${a.map((x, i) => Math.round(x + (b[i] - x) * Math.min(1, t)))})`;
+
+// Controls
+$("stops").addEventListener("input", () => { state.stops = Number($("stops").value); expose(); });
+$("seconds").addEventListener("change", () => {
+  const time = secondsOf($("seconds").value);
+  if (time > 0) state.stops = Math.log2(time / facts.base_time);
+  $("seconds").blur();
+  expose();
+});
+$("tone").addEventListener("change", () => { $("whiteRow").hidden = !["reinhard", "filmic"].includes($("tone").value); paint(); });
+$("white").addEventListener("input", paint);
+$("frusta").addEventListener("change", paint);
+$("overlay").addEventListener("change", () => { legend(); nearestPhoto(); $("overlay").value === "clipped" ? moved() : paint(); });
+$("left").addEventListener("change", () => { nearestPhoto(); $("left").value.startsWith("run") ? moved() : paint(); });
+$("run").addEventListener("change", () => { useRun(Number($("run").value)); moved(); });
+$("view").addEventListener("change", () => jump(Number($("view").value)));
+$("zoom").addEventListener("input", moved);
+
+$("handle").addEventListener("pointerdown", event => { event.stopPropagation(); $("handle").setPointerCapture(event.pointerId); });
+$("handle").addEventListener("pointermove", event => {
+  if (!event.buttons) return;
+  const box = stage.getBoundingClientRect();
+  state.split = Math.min(1, Math.max(0, (event.clientX - box.left) / box.width));
+  paint();
+});
+const inside = event => {
+  const box = stage.getBoundingClientRect();
+  return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
+};
+picture.addEventListener("pointerdown", event => { picture.setPointerCapture(event.pointerId); stage.focus(); state.drag = [event.clientX, event.clientY, 0]; });
+picture.addEventListener("pointermove", event => {
+  state.pointer = inside(event);
+  if (state.drag && event.buttons) {
+    const x = event.clientX - state.drag[0], y = event.clientY - state.drag[1], size = Math.min(stage.clientWidth, stage.clientHeight);
+    state.drag = [event.clientX, event.clientY, state.drag[2] + Math.abs(x) + Math.abs(y)];
+    if (event.buttons & 2 || event.buttons & 4 || event.shiftKey) camera.pan(x / size, y / size);
+    else if (event.altKey) camera.look(-x / size, -y / size);
+    else camera.orbit(2.5 * x / size, 2.5 * y / size);
+    if (x || y) moved();
+  }
+  probe();
+});
+picture.addEventListener("pointerup", event => {
+  const still = state.drag && state.drag[2] < 4, ratio = window.devicePixelRatio || 1, box = stage.getBoundingClientRect();
+  state.drag = null;
+  const near = still && (state.apexes || []).find(([, x, y]) => Math.hypot(x / ratio - event.clientX + box.left, y / ratio - event.clientY + box.top) < 9);
+  if (near) jump(near[0]);
+});
+picture.addEventListener("pointerleave", () => { state.pointer = null; probe(); });
+picture.addEventListener("contextmenu", event => event.preventDefault());
+picture.addEventListener("wheel", event => { event.preventDefault(); camera.dolly(Math.exp(Math.sign(event.deltaY) * Math.min(60, Math.abs(event.deltaY)) / 500)); moved(); }, {passive: false});
+picture.addEventListener("dblclick", event => {
+  const depth = light.value("depth", ...inside(event));
+  if (!depth || !(depth[0] > 0)) return;
+  const [u, v] = inside(event), l = lensOf(drawn.camera), d = depth[0];
+  const target = add(add(add(camera.position, camera.right, (u - l[2]) / l[0] * d), camera.down, (v - l[3]) / l[1] * d), camera.forward, d);
+  camera.ahead = d;
+  const away = add(target, camera.pivot, -1);
+  camera.position = add(camera.position, away);
+  moved();
+});
+stage.addEventListener("keydown", event => {
+  const key = event.key.toLowerCase(), count = facts.views.length;
+  if (event.ctrlKey || event.metaKey) return;
+  if ("wasdqe".includes(key)) { if (!state.keys.size) requestAnimationFrame(fly); state.keys.add(key); }
+  if (key === "[" || key === "]") { state.stops = Math.max(-12, Math.min(12, Math.round(3 * state.stops + (key === "]" ? 1 : -1)) / 3)); expose(); }
+  if (count && (key === "arrowleft" || key === "arrowright")) jump((Number($("view").value) + (key === "arrowright" ? 1 : count - 1)) % count);
+});
+stage.addEventListener("keyup", event => state.keys.delete(event.key.toLowerCase()));
+stage.addEventListener("blur", () => state.keys.clear());
+let flown = 0;
+function fly(now) {
+  const pace = facts.size * 0.5 * Math.min(0.1, flown ? (now - flown) / 1000 : 0.016), on = key => state.keys.has(key) ? pace : 0;
+  flown = state.keys.size ? now : 0;
+  if (!state.keys.size) return;
+  camera.fly(on("d") - on("a"), on("e") - on("q"), on("w") - on("s"));
+  moved();
+  requestAnimationFrame(fly);
+}
+
+// Saving and films
+const filmSize = () => [Math.round(drawing.width / 2) * 2, Math.round(drawing.height / 2) * 2];
+const now = () => camera.at(...filmSize(), zoom());
+function download(blob, name) {
+  const link = Object.assign(document.createElement("a"), {href: URL.createObjectURL(blob), download: name});
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+}
+const counted = () => Math.max(2, Math.round(24 * (Number($("length").value) || 6)));
+for (const button of document.querySelectorAll("[data-save]")) button.addEventListener("click", async () => {
+  const kind = button.dataset.save, film = kind === "film";
+  if (film && state.path.length < 2) return void ($("saved").textContent = "add two views or more first");
+  $("saved").textContent = "rendering \u2026";
+  try {
+    const body = {run: state.run, kind, evs: $("evs").value, cameras: film ? state.path : [now()], count: film ? counted() : null, stops: state.stops};
+    download(await (await ask("/save", body)).blob(), facts.scene + {exr: ".exr", brackets: "_brackets.zip", film: ".mp4"}[kind]);
+    $("saved").textContent = "saved by your browser";
+  } catch (error) { $("saved").textContent = error.message; }
+});
+$("addView").addEventListener("click", () => { state.path.push(now()); $("saved").textContent = `${state.path.length} views in the path`; });
+$("clearPath").addEventListener("click", () => { state.path = []; playing = 0; $("saved").textContent = ""; });
+const path = async () => (await (await ask("/path", {cameras: state.path, count: counted()})).json()).cameras;
+$("savePath").addEventListener("click", async () => {
+  if (!state.path.length) return void ($("saved").textContent = "add a view first");
+  download(new Blob([JSON.stringify({cameras: await path()})], {type: "application/json"}), "path.json");
+  $("saved").textContent = "render it: sehdr-warp render RUN --cameras path.json --video film.mp4";
+});
+$("play").addEventListener("click", async () => {
+  if (state.path.length < 2) return void ($("saved").textContent = "add two views or more first");
+  const cameras = await path(), turn = ++playing, started = performance.now(), step = async () => {
+    const index = Math.floor((performance.now() - started) / 1000 * 24);
+    if (turn !== playing || index >= cameras.length) return moved();
+    camera.jump(cameras[index], camera.ahead);
+    $("zoom").value = 0;
+    await request(true);
+    requestAnimationFrame(step);
+  };
+  step();
+});
+
+// Training
+async function startTraining() {
+  $("training").hidden = false;
+  const control = name => ask("/training", {do: name}).catch(error => tell(error.message));
+  $("pause").addEventListener("click", () => control($("pause").textContent === "Pause" ? "pause" : "resume"));
+  $("step").addEventListener("click", () => control("step"));
+  let last = -1;
+  for (;;) {
+    try {
+      const t = await (await ask("/training")).json();
+      $("progress").textContent = `${t.iteration} of ${t.total} \u00b7 loss ${t.loss.toFixed(4)} \u00b7 ${t.psnr.toFixed(1)} dB \u00b7 ${t.gaussians} Gaussians`
+        + (t.ended ? " \u00b7 ended" : t.left === null ? "" : ` \u00b7 ${t.left} left`);
+      $("pause").textContent = t.paused ? "Resume" : "Pause";
+      facts.gaussians = t.gaussians;
+      curve(t.curve);
+      if (t.iteration !== last && !document.hidden) moved();
+      last = t.iteration;
+    } catch { $("progress").textContent = "the training has ended"; }
+    await new Promise(done => setTimeout(done, 1000));
+  }
+}
+function curve(points) {
+  const context = $("curves").getContext("2d");
+  context.clearRect(0, 0, 248, 86);
+  [["loss", "#e0a458"], ["psnr", "#7fb2c4"], ["gaussians", "#8a8783"]].forEach(([name, color], k) => {
+    const values = points.map(p => p[k + 1]).filter(Number.isFinite), low = Math.min(...values), high = Math.max(...values);
+    context.strokeStyle = context.fillStyle = color;
+    context.lineWidth = 1.5;
+    context.beginPath();
+    points.forEach((p, i) => context.lineTo(i / Math.max(1, points.length - 1) * 247, 70 - 60 * (p[k + 1] - low) / (high - low || 1)));
+    context.stroke();
+    context.font = "10px system-ui";
+    context.fillText(name, k * 84, 84);
+  });
+}
+
+window.viewer = {state, probed: () => state.probed, camera: () => drawn && drawn.camera};
+start().catch(error => tell(error.message));

@@ -1,0 +1,87 @@
+"""Films read back by FFmpeg: frames, tags, and the light in their codes."""
+
+import numpy as np
+import pytest
+
+from sehdr_warp.errors import InputError, SehdrError, UsageError
+from sehdr_warp.output import film
+from sehdr_warp.output.commands import Render, _ramp, run_render
+from sehdr_warp.output.film import encode, write_film
+from sehdr_warp.output.light_pictures import display_gain
+
+from .helpers import AnalyticRun
+
+av = pytest.importorskip("av")
+
+
+def frames(path):
+    """Frames as [H, W, 3] in [0, 1], and the codec."""
+    with av.open(str(path)) as container:
+        context = container.streams.video[0].codec_context
+        pictures = [frame.to_ndarray(format="rgb48le") / 65535 for frame in container.decode(video=0)]
+        return np.stack(pictures), context
+
+
+def smooth_run():
+    run = AnalyticRun()
+    run.gain = 3.0
+    return run, [entry.camera.resized(97, 64) for entry in run.cameras]
+
+
+@pytest.mark.parametrize(
+    "transfer, codec, tags", [("sdr", "h264", (1, 1, 1)), ("hlg", "hevc", (9, 18, 9)), ("hdr10", "hevc", (9, 16, 9))]
+)
+def test_a_film_holds_the_light_and_says_how(tmp_path, transfer, codec, tags):
+    run, cameras = smooth_run()
+    shown, context = frames(
+        write_film(run, tmp_path / "f.mp4", cameras, transfer=transfer, exposed=True, fps=24000 / 1001)
+    )
+    assert shown.shape == (5, 64, 96, 3) and context.name == codec
+    assert (context.color_primaries, context.color_trc, context.colorspace) == tags
+    gain = run.base_time * display_gain(run.response)
+    for picture, camera in zip(shown, cameras, strict=True):
+        light = run.render(camera.resized(96, 64)).hdr * gain
+        assert np.abs(picture - encode(light, transfer)).mean() < 0.02
+    if transfer == "hdr10":  # Clipped where SDR clips it is not: codes of white, and of the light above.
+        assert encode(np.ones(3), "hdr10") == pytest.approx(0.581, abs=2e-3) and shown.max() > 0.65
+
+
+def test_references_of_the_curves():
+    # ITU-R BT.2408: diffuse white of 203 cd/m2 is 58 % PQ and 75 % HLG; 1000 cd/m2 is 75 % PQ and 100 % HLG.
+    assert encode(np.full(3, 1.0), "hlg") == pytest.approx(0.75, abs=3e-3)
+    assert encode(np.full(3, 1e3), "hlg") == pytest.approx(1, abs=1e-3)
+    assert encode(np.full(3, 1e3), "hdr10") == pytest.approx(0.7518, abs=1e-3)
+    assert encode(np.zeros(3), "hlg") == pytest.approx(0) and encode(np.zeros(3), "hdr10") == pytest.approx(0, abs=1e-5)
+
+
+def test_a_ramp_runs_through_the_stops(tmp_path):
+    run, cameras = smooth_run()
+    still = [cameras[0]] * 5
+    shown, _ = frames(write_film(run, tmp_path / "f.mp4", still, ev_ramp=(-4, 0)))
+    light = run.render(cameras[0].resized(96, 64)).hdr * run.base_time * display_gain(run.response)
+    for stops, picture in zip(range(-4, 1), shown, strict=True):
+        assert picture.mean() == pytest.approx(encode(light * 2.0**stops, "sdr").mean(), abs=0.01)
+    assert _ramp("-4:4") == (-4, 4) and _ramp("1.5") == (1.5, 1.5) and _ramp(None) == (0, 0)
+    for bad in ("", "a:b", "1:2:3", "99:0", "nan:1"):
+        with pytest.raises(InputError, match="--ev-ramp"):
+            _ramp(bad)
+
+
+def test_refusals(tmp_path, monkeypatch):
+    run, cameras = smooth_run()
+    (tmp_path / "mine.mp4").write_text("mine")
+    with pytest.raises(InputError, match="exists already"):
+        write_film(run, tmp_path / "mine.mp4", cameras)
+    with pytest.raises(SehdrError, match="cannot be written as a film"):
+        write_film(run, tmp_path / "film.txt", cameras)
+    assert [file.name for file in tmp_path.iterdir()] == ["mine.mp4"]
+    for asked in (Render(run=tmp_path), Render(run=tmp_path, out=tmp_path, ev_ramp="1:2")):
+        with pytest.raises(UsageError, match="--video"):
+            run_render(asked)
+
+    def missing():
+        raise SehdrError("films need PyAV; run `pip install sehdr-warp[film]`")
+
+    monkeypatch.setattr(film, "_library", missing)
+    with pytest.raises(SehdrError, match="pip install"):
+        write_film(run, tmp_path / "new.mp4", cameras)

@@ -1,0 +1,54 @@
+"""Chromium from the system, driven by Playwright; tests are skipped where either is absent."""
+
+import os
+import shutil
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from PIL import Image
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+# Software rendering, so that a test needs no GPU; Chromium as root has no sandbox.
+ARGUMENTS = ["--enable-unsafe-swiftshader", "--use-angle=swiftshader", *["--no-sandbox"] * (os.geteuid() == 0)]
+
+
+@contextmanager
+def browser():
+    """A Chromium; contexts and pages are the caller's."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    found = next(filter(None, map(shutil.which, NAMES)), None)
+    if found is None:
+        pytest.skip("Chromium is not installed")
+    with playwright.sync_playwright() as driver:
+        made = driver.chromium.launch(executable_path=found, args=ARGUMENTS)
+        yield made
+        made.close()
+
+
+@contextmanager
+def page_of(made, url, width=700, height=420):
+    """A page that may reach nothing but its own server or file, and must not complain."""
+    complaints = []
+    context = made.new_context(viewport={"width": width, "height": height}, accept_downloads=True)
+    page = context.new_page()
+    page.on("console", lambda line: complaints.append(line.text) if line.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on(
+        "request",
+        lambda request: None if request.url.startswith((url, "blob:", "data:")) else complaints.append(request.url),
+    )
+    page.goto(url)
+    yield page
+    context.close()
+    # What the driver of a software GPU says of its speed is none of the page's.
+    assert [line for line in complaints if "GPU stall" not in line and "swiftshader" not in line.lower()] == []
+
+
+def pixels(page, selector):
+    """What a canvas of the page shows: [H, W, 3] in [0, 1], at its own size."""
+    import base64
+    import io
+
+    data = page.locator(selector).evaluate("canvas => canvas.toDataURL('image/png')")
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2]))).convert("RGB")) / 255

@@ -1,0 +1,35 @@
+"""A server over an analytic scene, on a free port."""
+
+import threading
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from sehdr_warp.viewer.frames import Rendering
+from sehdr_warp.viewer.server import Server, Viewer
+
+from ..output.helpers import AnalyticRun
+from ..output.test_report import make
+
+
+@pytest.fixture
+def serve(tmp_path):
+    """serve(**options) starts a server of two runs with photos, and returns it."""
+    servers = []
+
+    def start(count=1, **options):
+        run, scene = make(tmp_path)
+        run.model = SimpleNamespace(render_mean=lambda camera, values: torch.full((camera.height, camera.width), 0.25))
+        runs = [run, AnalyticRun()][:count]
+        shown = [Rendering(each, f"run {i}", torch.ones(1) if i == 0 else None) for i, each in enumerate(runs)]
+        viewer = Viewer(shown, lambda index: {view.name: view for view in scene.views}, **options)
+        server = Server(viewer, port=18080)
+        servers.append(server)
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        return server
+
+    yield start
+    for server in servers:
+        server.shutdown()
+        server.server_close()

@@ -1,0 +1,126 @@
+"""The viewer in a real browser: what a lighting artist does, checked on pixels."""
+
+import numpy as np
+import pytest
+
+from sehdr_warp.output.light_pictures import display_gain
+from sehdr_warp.output.tonemap import encode_srgb
+from sehdr_warp.scene import Camera
+
+from ..output.helpers import read_exr
+from .browser import browser, page_of, pixels
+
+FULL = "#stage[data-frame=full]"
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    with browser() as made:
+        yield made
+
+
+def settle(page, action=lambda: None):
+    """Waits for the full frame after an action that asks for one."""
+    page.wait_for_selector(FULL)
+    page.locator("#stage").evaluate("stage => delete stage.dataset.frame")
+    action()
+    page.wait_for_selector(FULL)
+
+
+def light_of(page, run):
+    """What the page shows now, rendered here: exposures at 0 EV [H, W, 3], as display light."""
+    camera = Camera.from_dict(page.evaluate("window.viewer.camera()"))
+    return run.render(camera).hdr * run.base_time * display_gain(run.response)
+
+
+def slide(page, selector, value):
+    page.locator(selector).evaluate(
+        "(range, value) => { range.value = value; range.dispatchEvent(new Event('input')); }", str(value)
+    )
+
+
+def test_exposure_probe_and_saved_exr_agree(chromium, serve, tmp_path):
+    server = serve()
+    run = server.viewer.runs[0].run
+    with page_of(chromium, server.url) as page:
+        page.wait_for_selector(FULL)
+        rendered, light = run.rendered, light_of(page, run)
+        rendered = run.rendered
+        for stops in (-3, 0, 2):
+            slide(page, "#stops", stops)
+            np.testing.assert_allclose(pixels(page, "#picture"), encode_srgb(light * 2.0**stops), atol=2.5 / 255)
+        page.fill("#seconds", "1/16")
+        page.press("#seconds", "Enter")
+        assert page.text_content("#stopsTold") == "\N{MINUS SIGN}3.0 EV"
+        assert run.rendered == rendered  # Exposure renders nothing.
+        page.mouse.move(130, 90)
+        probed, told = page.evaluate("window.viewer.probed()"), page.text_content("#probe")
+        with page.expect_download() as download:
+            page.click("[data-save=exr]")
+        download.value.save_as(tmp_path / "view.exr")
+        saved, _, _ = read_exr(tmp_path / "view.exr")
+        x, y = 130 / light.shape[1], 90 / light.shape[0]
+        np.testing.assert_allclose(probed, saved[int(y * saved.shape[0]), int(x * saved.shape[1]), :3], rtol=0.01)
+        assert "radiance" in told and "%" in told and "EV" in told
+
+
+def test_looks_overlays_and_the_photo_beside(chromium, serve):
+    server = serve(count=2)
+    run = server.viewer.runs[0].run
+    with page_of(chromium, server.url) as page:
+        page.wait_for_selector(FULL)
+        looks = [pixels(page, "#picture")]
+        for tone in ("reinhard", "filmic", "aces", "response"):
+            page.select_option("#tone", tone)
+            looks.append(pixels(page, "#picture"))
+        light = light_of(page, run) / display_gain(run.response)
+        np.testing.assert_allclose(looks[4], run.response.encode(light), atol=2.5 / 255)
+        page.select_option("#left", "photo")
+        page.wait_for_timeout(1500)
+        half = pixels(page, "#picture").shape[1] // 2
+        beside = pixels(page, "#picture")
+        # The photo is of this camera, and what the camera would see is what the scene shows.
+        left, outside = slice(0, half - 4), np.full(3, 26 / 255)
+        inside = np.abs(beside[:, left] - outside).max(axis=2) > 1 / 255
+        assert inside.mean() > 0.3
+        assert np.abs(beside[:, left] - looks[4][:, left])[inside].mean() < 0.02
+        for overlay in ("stops", "confidence", "depth", "normals", "error", "clipped"):
+            page.select_option("#overlay", overlay)
+            page.wait_for_timeout(300)
+            looks.append(pixels(page, "#picture"))
+        for first in range(len(looks)):
+            for second in range(first):
+                assert np.abs(looks[first] - looks[second])[:, half + 4 :].mean() > 1e-3, (first, second)
+        page.select_option("#overlay", "none")
+        settle(page, lambda: page.select_option("#left", "run1"))
+        page.check("#frusta")
+
+
+def test_moving_resizing_and_two_at_once(chromium, serve):
+    server = serve()
+    with page_of(chromium, server.url) as page, page_of(chromium, server.url) as other:
+        other.wait_for_selector(FULL)
+        before, theirs = None, pixels(other, "#picture")
+        page.wait_for_selector(FULL)
+        for button in ("left", "right"):
+            before = page.evaluate("window.viewer.camera().world_to_camera")
+            page.mouse.move(150, 150)
+            page.mouse.down(button=button)
+            page.mouse.move(190, 170, steps=4)
+            page.mouse.up(button=button)
+            settle(page, lambda: page.mouse.wheel(0, 120))
+            assert page.evaluate("window.viewer.camera().world_to_camera") != before
+        settle(page, lambda: page.set_viewport_size({"width": 900, "height": 600}))
+        assert pixels(page, "#picture").shape[:2] == (600, 900 - 288)
+        page.focus("#stage")
+        settle(page, lambda: page.keyboard.press("ArrowRight"))
+        assert page.input_value("#view") == "1"
+        page.focus("#stage")
+        settle(page, lambda: (page.keyboard.down("w"), page.wait_for_timeout(80), page.keyboard.up("w")))
+        for _ in range(2):
+            page.click("#addView")
+        page.fill("#length", "0.2")
+        with page.expect_download() as download:
+            page.click("#savePath")
+        assert '"cameras"' in download.value.path().read_text()
+        np.testing.assert_array_equal(pixels(other, "#picture"), theirs)

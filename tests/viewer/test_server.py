@@ -1,0 +1,201 @@
+"""The viewer's server as browsers and others ask it: frames, files, refusals, and that it stays up."""
+
+import http.client
+import io
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import zipfile
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sehdr_warp.scene import look_at
+from sehdr_warp.viewer.server import MOST_BODY, MOST_VIEWS, Server
+
+from ..output.helpers import camera, read_exr
+
+
+def ask(server, path, body=None, method=None, **headers):
+    """Status, content type and content of an answer."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=30)
+    data = None if body is None else body if isinstance(body, bytes) else json.dumps(body).encode()
+    known = {} if data is None else {"Content-Type": "application/json"}
+    named = {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request(method or ("GET" if data is None else "POST"), path, data, known | named)
+    answer = connection.getresponse()
+    content = answer.read()
+    connection.close()
+    return answer.status, answer.headers.get_content_type(), content
+
+
+def frame(server, view, **options):
+    """Planes of a frame: light and confidence, depth, and perhaps the share of clipped values."""
+    status, _, content = ask(server, "/frame", {"run": 0, "camera": view.to_dict(), **options})
+    assert status == 200, content
+    planes, size = np.frombuffer(content, "<f2").astype(np.float32), view.width * view.height
+    return planes[: 4 * size].reshape(view.height, view.width, 4), planes[4 * size : 5 * size], planes[5 * size :]
+
+
+def test_a_frame_is_the_render(serve):
+    server, view = serve(), camera(33, 21)
+    run = server.viewer.runs[0].run
+    light, depth, clipped = frame(server, view, clipped=True)
+    rendered = run.render(view)
+    np.testing.assert_allclose(light[..., :3], rendered.hdr * run.base_time, rtol=1e-3)
+    np.testing.assert_allclose(light[..., 3], run.render_confidence(view), atol=1e-3)
+    np.testing.assert_allclose(depth.reshape(21, 33), rendered.depth, rtol=1e-3)
+    assert (clipped == 0.25).all() and clipped.size == 33 * 21
+    draft, _, none = frame(server, view, draft=True)
+    assert (draft[..., 3] == 1).all() and not none.size
+
+
+def test_the_page_its_facts_and_photos(serve):
+    server = serve(count=2)
+    for path in ("/", "/viewer.css", "/light.js", "/camera.js", "/viewer.js"):
+        status, kind, content = ask(server, path)
+        assert status == 200 and kind.startswith("text/")
+        assert not re.findall(rb"(?:src|href)=\"(?:https?:)?//|@import|url\(", content)
+    facts = json.loads(ask(server, "/scene")[2])
+    assert [run["name"] for run in facts["runs"]] == ["run 0", "run 1"] and not facts["training"]
+    assert [view["name"] for view in facts["runs"][0]["views"]] == ["v_0", "v_1", "v_2"]
+    picture = np.asarray(Image.open(io.BytesIO(ask(server, "/photo/0/1")[2])))
+    view = server.viewer._photos(0)["v_1"]
+    np.testing.assert_allclose(picture / 255, view.image, atol=0.5 / 255 + 1e-6)
+
+
+def test_what_is_saved_is_what_render_writes(serve, tmp_path):
+    server, view = serve(), camera(24, 16)
+    hdr = server.viewer.runs[0].run.render(view).hdr
+    asked = {"cameras": [view.to_dict()], "kind": "exr"}
+    (tmp_path / "view.exr").write_bytes(ask(server, "/save", asked)[2])
+    pixels, names, header = read_exr(tmp_path / "view.exr")
+    np.testing.assert_allclose(pixels[..., :3], hdr, rtol=1e-3)
+    assert names[:4] == ("R", "G", "B", "A") and "worldToCamera" in header
+    with zipfile.ZipFile(io.BytesIO(ask(server, "/save", asked | {"kind": "brackets", "evs": "-2,0,2"})[2])) as packed:
+        assert sum(name.endswith(".exr") for name in packed.namelist()) == 4
+    other = view.to_dict() | {"world_to_camera": look_at((1, 0, -3)).tolist()}
+    path = json.loads(ask(server, "/path", {"cameras": [view.to_dict(), other], "count": 9})[2])
+    assert len(path["cameras"]) == 9 and path["cameras"][0]["name"] == "view_000"
+    if pytest.importorskip("av"):
+        film = ask(server, "/save", {"cameras": [view.to_dict(), other], "kind": "film", "count": 3, "stops": -1})
+        assert film[:2] == (200, "video/mp4") and b"ftyp" in film[2][:16]
+
+
+@pytest.mark.parametrize(
+    "path, body, status",
+    [
+        ("/../../etc/passwd", None, 404),
+        ("/photo/0/../../../etc/passwd", None, 404),
+        ("/photo/9/0", None, 404),
+        ("/photo/0/99", None, 404),
+        ("/photo/-1/0", None, 404),
+        ("/%2e%2e/secret", None, 404),
+        ("/frame", b"{", 400),
+        ("/frame", b"[1]", 400),
+        ("/frame", b"[" * 100_000, 400),
+        ("/frame", {}, 400),
+        ("/frame", {"run": 7, "camera": {}}, 404),
+        ("/frame", {"run": "x", "camera": {}}, 400),
+        ("/frame", {"camera": camera().to_dict() | {"width": 10**9}}, 400),
+        ("/frame", {"camera": camera().to_dict() | {"fx": float("nan")}}, 400),
+        ("/frame", {"camera": camera().to_dict() | {"world_to_camera": [[0] * 4] * 4}}, 400),
+        ("/save", {"cameras": [camera().to_dict()], "kind": "brackets", "evs": "x"}, 409),
+        ("/save", {"cameras": [], "kind": "exr"}, 409),
+        ("/path", {"cameras": [camera().to_dict()], "count": "many"}, 400),
+        ("/training", {"do": "pause"}, 404),
+    ],
+)
+def test_bad_questions_are_answered_in_a_line(serve, path, body, status):
+    server = serve()
+    found, kind, content = ask(server, path, body)
+    assert found == status and kind == "text/plain" and b"\n" not in content and len(content) < 400
+    assert ask(server, "/scene")[0] == 200
+
+
+def test_other_sites_may_not_ask(serve):
+    server, good = serve(), {"camera": camera().to_dict()}
+    port = server.server_address[1]
+    assert ask(server, "/frame", good, Origin=f"http://127.0.0.1:{port}")[0] == 200
+    assert ask(server, "/frame", good, Origin="http://evil.example")[0] == 403
+    assert ask(server, "/scene", Host=f"evil.example:{port}")[0] == 403  # A name that was made to lead here
+    assert ask(server, "/scene", Host=f"localhost:{port}")[0] == 200
+    assert ask(server, "/frame", json.dumps(good).encode(), Content_Type="text/plain")[0] == 415
+    assert ask(server, "/scene", method="DELETE")[0] == 501
+
+
+def test_sizes_are_bounded(serve):
+    server = serve()
+    with socket.create_connection(server.server_address[:2], timeout=10) as connection:
+        host = f"127.0.0.1:{server.server_address[1]}"
+        connection.sendall(f"POST /frame HTTP/1.1\r\nHost: {host}\r\nContent-Length: {MOST_BODY + 1}\r\n\r\n".encode())
+        assert b" 413 " in connection.recv(4096)
+    with socket.create_connection(server.server_address[:2], timeout=10) as connection:
+        connection.sendall(b"GET /" + b"a" * 70_000)
+        assert b" 414 " in connection.recv(4096)
+    many = {"cameras": [camera(8, 8).to_dict()] * 2, "count": 10**9}
+    assert len(json.loads(ask(server, "/path", many)[2])["cameras"]) == MOST_VIEWS
+
+
+def test_twenty_clients_and_some_that_leave(serve):
+    server, view, found = serve(), camera(64, 48), []
+    body = json.dumps({"camera": view.to_dict()})
+
+    def look(number):
+        if number % 4 == 0:  # Leaves before the answer.
+            with socket.create_connection(server.server_address[:2]) as connection:
+                head = "POST /frame HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+                connection.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n{body}".encode())
+            return
+        found.append(frame(server, view)[0])
+
+    clients = [threading.Thread(target=look, args=(number,)) for number in range(20)]
+    for client in clients:
+        client.start()
+    for client in clients:
+        client.join(60)
+    assert len(found) == 15 and all((each == found[0]).all() for each in found)
+    assert ask(server, "/scene")[0] == 200
+
+
+def test_a_taken_port_leads_to_the_next(serve, logged):
+    first = serve()
+    with Server(first.viewer, port=first.server_address[1]) as second:
+        assert second.server_address[1] > first.server_address[1] and f":{second.server_address[1]}/" in second.url
+    assert any("is in use" in line for line in logged)
+
+
+def test_photos_that_are_gone_are_told(serve):
+    server = serve()
+
+    def gone(index):
+        from sehdr_warp.errors import InputError
+
+        raise InputError("photos", "are no longer here", "say where")
+
+    server.viewer._photos = gone
+    assert ask(server, "/photo/0/0")[::2] == (409, b"photos: are no longer here; say where")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="sends SIGINT")
+def test_the_command_serves_and_ends_cleanly(tmp_path):
+    from sehdr_warp.training.train import train
+
+    from ..training.toy import toy_scene
+
+    train(toy_scene(), tmp_path / "run", {"schedule.iterations": 5, "plan.enabled": False}, device="cpu")
+    command = [sys.executable, "-m", "sehdr_warp", "view", str(tmp_path / "run"), "--port", "18300", "--device", "cpu"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)
+    url = process.stdout.readline().split()[0]
+    connection = http.client.HTTPConnection(url.removeprefix("http://").strip("/"), timeout=30)
+    connection.request("GET", "/scene")
+    assert json.loads(connection.getresponse().read())["runs"][0]["iterations"] == 5
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 0 and not output and "Traceback" not in errors and "ended" in errors
