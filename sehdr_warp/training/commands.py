@@ -6,6 +6,7 @@ torch is imported when they run.
 import json
 import logging
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -60,6 +61,8 @@ class OutputOptions:
     """Replace the run in --out."""
     tensorboard: bool = False
     """Write TensorBoard event files into the run."""
+    view: bool = False
+    """Serve the page of `view` meanwhile, from port 8080 or the next free one."""
     json: bool = False
     """Print the result as JSON on standard output."""
 
@@ -136,10 +139,12 @@ def run_train(asked: Train) -> None:
         print(json.dumps(plan.to_dict()) if output.json else plan.table())
         return
     from ..console import follow
+    from ..viewer.commands import viewed
     from .train import Training
 
     training = Training(scene, out, config, device=device, tensorboard=output.tensorboard, data=data, **how)
-    follow(training, training.total)
+    with viewed(training, str(out)) if output.view else nullcontext(training) as steps:
+        follow(steps, training.total)
     run = training.run
     summary = run.summary() | {"run": str(run.path), "metrics": run.metrics()}
     print(json.dumps(summary) if output.json else _ending(run.path, summary))

@@ -2,6 +2,7 @@
 
 import logging
 import math
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
@@ -15,9 +16,9 @@ import torch
 from ..errors import InputError, SehdrError
 from ..evaluation.metrics import psnr
 from ..evaluation.protocols import normalise, tone_map
-from ..field.radiance_field import RadianceField
+from ..field.radiance_field import RadianceField, RenderedView
 from ..field.unexplained import MOST_NAMED, told, unexplained_regions
-from ..scene import Scene, View
+from ..scene import Camera, Scene, View
 from ..splatting.memory import memory_told
 from .checkpoint import first_not_finite
 from .config import Config
@@ -120,6 +121,7 @@ class Training:
                 raise
         self.config, self.total = self.trainer.config, self.trainer.config.schedule.iterations
         self._first, self._pace, self._stopped = self.iteration, 0.0, False
+        self._interrupted = threading.Event()
         self._run: Run | None = None
         self._writer = make_writer and make_writer(str(self.folder.tensorboard))
         self._evaluate_at = {self.config.scaled(n) for n in self.config.schedule.evaluate_at} | {self.total}
@@ -139,6 +141,15 @@ class Training:
         """The trained scene, from the newest checkpoint."""
         self._run = self._run or load_run(self.folder.path, device=self.device)
         return self._run
+
+    @property
+    def ending(self) -> bool:
+        """Whether no further step is made: the training was stopped or interrupted."""
+        return self._stopped or self._interrupted.is_set()
+
+    def render(self, camera: Camera) -> RenderedView:
+        """What the scene shows now from a camera, between steps; its time is not the training's."""
+        return self.trainer.render(camera)
 
     def stop(self) -> None:
         """Ends the training after the step that is being made."""
@@ -161,8 +172,9 @@ class Training:
         ):
             self.folder.lock()
             leaving.callback(self.folder.unlock)
+            self._interrupted = interrupted
             try:
-                while self.iteration < self.total and not (interrupted.is_set() or self._stopped):
+                while self.iteration < self.total and not self.ending:
                     yield self._step()
             except GeneratorExit:
                 self._save()

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from ..errors import SehdrError
-from ..field.radiance_field import RadianceField
+from ..field.radiance_field import RadianceField, RenderedView
 from ..response.learned import EXACT_BELOW
-from ..scene import Scene
+from ..scene import Camera, Scene
 from ..splatting import GraphRecorder
 from ..splatting.memory import bytes_asked_for
 from . import optimizer as adam
@@ -81,6 +81,11 @@ class Trainer:
         with self._launching():
             photo = self.field.photograph(view.camera, view.exposure_time, degree=self.degree).encoded
         return float(-10 * (photo.clamp(0, 1) - view.target.encoded).square().mean().clamp_min(1e-10).log10())
+
+    def render(self, camera: Camera) -> RenderedView:
+        """The scene as it is now, between steps."""
+        with self._launching():
+            return self.field.render(camera, degree=self.degree)
 
     @property
     def skipped_steps(self) -> int:

@@ -47,7 +47,7 @@ class Rendering:
         not known), [H, W] depth, and with `clipped` [H, W] the share of clipped values."""
         with torch.no_grad():
             rendered = self.render(camera)
-            light = torch.as_tensor(rendered.hdr) * self.run.base_time
+            light = torch.as_tensor(rendered.hdr) * self.base_time
             confidence = None if draft else self.render_confidence(camera)
             alpha = torch.ones_like(light[..., 0]) if confidence is None else torch.as_tensor(confidence).to(light)
             planes = [torch.cat([light, alpha[..., None]], dim=2), torch.as_tensor(rendered.depth)]
@@ -58,26 +58,26 @@ class Rendering:
 
     def facts(self) -> dict[str, Any]:
         """What the page knows of the run: plain values."""
-        run, cameras = self.run, [entry.camera for entry in self.run.cameras]
+        cameras = [entry.camera for entry in self.cameras]
         positions = np.array([camera.position for camera in cameras]).reshape(-1, 3)
         up = -np.sum([camera.world_to_camera[1, :3] for camera in cameras], axis=0) if cameras else [0.0, -1.0, 0.0]
         focus = common_focus(cameras) if cameras else None
         size = float(np.linalg.norm(np.ptp(positions, axis=0))) if cameras else 1.0
         return {
             "name": self.name,
-            "scene": run.scene_name,
-            "gaussians": run.gaussian_count,
-            "iterations": run.iterations,
-            "response": run.response.name,
-            "base_time": run.base_time,
-            "grey": display_gain(run.response),
-            "curve": _curve(run.response),
+            "scene": self.scene_name,
+            "gaussians": self.gaussian_count,
+            "iterations": self.iterations,
+            "response": self.response.name,
+            "base_time": self.base_time,
+            "grey": display_gain(self.response),
+            "curve": _curve(self.response),
             "clipped": self.clipped is not None,
             "up": (np.asarray(up) / max(float(np.linalg.norm(up)), 1e-9)).tolist(),
             "focus": None if focus is None else focus.tolist(),
             "size": size or 1.0,
             "views": [
-                {"name": entry.name, "split": entry.split, "camera": entry.camera.to_dict()} for entry in run.cameras
+                {"name": entry.name, "split": entry.split, "camera": entry.camera.to_dict()} for entry in self.cameras
             ],
         }
 

@@ -110,7 +110,7 @@ async function load(draft) {
   light.put("depth", width, height, half.subarray(4 * n, 5 * n), 1);
   if (half.length > 5 * n) light.put("clipped", width, height, half.subarray(5 * n), 1);
   if (second) light.put("other", width, height, second.subarray(0, 4 * n), 4);
-  if (draft) draftScale = Math.min(1, Math.max(0.08, draftScale * Math.min(1.5, Math.max(0.5, Math.sqrt(DRAFT_TIME / took)))));
+  if (draft && $("training").hidden) draftScale = Math.min(1, Math.max(0.08, draftScale * Math.min(1.5, Math.max(0.5, Math.sqrt(DRAFT_TIME / took)))));
   drawn = {camera: seen, draft};
   const depths = half.subarray(4 * n, 5 * n).filter((d, i) => d > 0 && i % 13 === 0).sort();  // Positive halves sort as integers.
   Object.assign(light.settings, {far: fromHalf(depths.at(-1) || 0x3c00), middle: fromHalf(depths[depths.length >> 1] || 0x3c00)});
@@ -358,14 +358,15 @@ async function startTraining() {
   for (;;) {
     try {
       const t = await (await ask("/training")).json();
+      if (t.iteration === undefined) throw new Error("not yet");
       $("progress").textContent = `${t.iteration} of ${t.total} \u00b7 loss ${t.loss.toFixed(4)} \u00b7 ${t.psnr.toFixed(1)} dB \u00b7 ${t.gaussians} Gaussians`
-        + (t.ended ? " \u00b7 ended" : t.left === null ? "" : ` \u00b7 ${t.left} left`);
+        + (t.ended ? " \u00b7 ended" : t.left === null ? "" : ` \u00b7 ${t.left} left`) + ` \u00b7 ${(100 * t.share).toFixed(0)} % for pictures`;
       $("pause").textContent = t.paused ? "Resume" : "Pause";
       facts.gaussians = t.gaussians;
       curve(t.curve);
-      if (t.iteration !== last && !document.hidden) moved();
+      if (t.iteration !== last && !document.hidden) request(false);
       last = t.iteration;
-    } catch { $("progress").textContent = "the training has ended"; }
+    } catch (error) { $("progress").textContent = error.message === "not yet" ? "kernels are being compiled" : "the training has ended"; }
     await new Promise(done => setTimeout(done, 1000));
   }
 }

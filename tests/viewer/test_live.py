@@ -1,0 +1,130 @@
+"""`train --view`: the result is that without a viewer, and pictures take their share."""
+
+import http.client
+import json
+import re
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.training.train import Training, train
+from sehdr_warp.viewer.commands import viewed
+from sehdr_warp.viewer.live import SHARE, LiveTraining
+
+from ..training.toy import toy_scene
+
+CONFIG = {"schedule.iterations": 60, "plan.enabled": False}
+
+
+def ask(address, path, body=None):
+    connection = http.client.HTTPConnection(address, timeout=30)
+    headers = {"Content-Type": "application/json"}
+    connection.request("GET" if body is None else "POST", path, body and json.dumps(body), headers)
+    answer = connection.getresponse()
+    return answer.status, answer.read()
+
+
+def test_the_result_is_that_without_a_viewer(tmp_path, logged):
+    scene = toy_scene()
+    alone = train(scene, tmp_path / "alone", CONFIG, device="cpu")
+    training, seen = Training(scene, tmp_path / "seen", CONFIG, device="cpu"), []
+
+    def look(address):
+        camera = scene.views[0].camera.resized(48, 48).to_dict()
+        while not done.is_set():
+            status, content = ask(address, "/frame", {"camera": camera})
+            told = json.loads(ask(address, "/training")[1])
+            seen.append((status, np.frombuffer(content, "<f2") if status == 200 else content, told))
+
+    done = threading.Event()
+    with viewed(training, "toy") as steps:
+        address = re.search(r"http://([^/]*)/", logged[-1])[1]
+        looking = threading.Thread(target=look, args=(address,))
+        looking.start()
+        ask(address, "/training", {"do": "pause"})
+        for step in steps:
+            if step.iteration == 2:  # Single steps, then on.
+                assert json.loads(ask(address, "/training")[1])["paused"]
+                ask(address, "/training", {"do": "resume"})
+            elif step.iteration == 1:
+                ask(address, "/training", {"do": "step"})
+        done.set()
+        looking.join()
+    assert training.run.checkpoint_hash == alone.checkpoint_hash
+    frames = [frame for status, frame, _ in seen if status == 200]
+    assert len(frames) >= 2 and all(frame.size == 48 * 48 * 5 for frame in frames)
+    assert np.abs(frames[-1][:100] - frames[0][:100]).max() > 0
+    assert seen[-1][2]["iteration"] > 2 and len(seen[-1][2]["curve"]) >= 2
+    assert ask_fails(address)
+
+
+def ask_fails(address):
+    try:
+        ask(address, "/scene")
+    except OSError:
+        return True
+    return False
+
+
+class Steps:
+    """Stands for a training of even steps, each `seconds` long, whose pictures take `picture` seconds."""
+
+    def __init__(self, count, seconds, picture):
+        self.count, self.seconds, self.picture = count, seconds, picture
+        self.ending, self.total = False, count
+        self.loss, self.psnr, self.gaussians, self.seconds_left = 0.5, 20.0, 3, None
+
+    def __iter__(self):
+        for iteration in range(1, self.count + 1):
+            if self.ending:
+                return
+            self.iteration = iteration
+            time.sleep(self.seconds)
+            yield self
+
+    def render(self, camera):
+        time.sleep(self.picture)
+        return camera
+
+
+@pytest.mark.parametrize("watched", [True, False])
+def test_pictures_take_their_share_and_no_more(watched):
+    live = LiveTraining(Steps(60, 0.01, 0.01), "even")
+
+    def look():
+        try:
+            while True:
+                live.render(None)
+        except SehdrError as error:
+            assert "has ended" in str(error)
+
+    looking = threading.Thread(target=look)
+    if watched:
+        looking.start()
+    started = time.perf_counter()
+    assert sum(1 for _ in live.attend()) == 60
+    share = live._spent / (time.perf_counter() - started)
+    assert (0.02 < share < 1.6 * SHARE) if watched else share == 0
+    if watched:
+        looking.join(10)
+    with pytest.raises(SehdrError, match="has ended"):
+        live.render(None)
+
+
+def test_an_interrupt_ends_a_pause_and_errors_reach_who_asked():
+    steps = Steps(50, 0.001, 0)
+    live = LiveTraining(steps, "paused")
+    live.control("pause")
+    threading.Timer(0.3, lambda: setattr(steps, "ending", True)).start()
+    started = time.perf_counter()
+    assert sum(1 for _ in live.attend()) == 1 and 0.2 < time.perf_counter() - started < 5
+    steps = Steps(50, 0.005, 0)
+    live, steps.render = LiveTraining(steps, "broken"), lambda camera: 1 / 0
+    threading.Thread(target=lambda: list(live.attend()), daemon=True).start()
+    with pytest.raises(ZeroDivisionError):
+        live.render(None)
+    with pytest.raises(ValueError, match="none of pause"):
+        live.control("explode")
