@@ -82,6 +82,7 @@ function nearestPhoto() {
 
 // Asks for a draft now and for the full picture when nothing has moved for a while.
 function moved() {
+  delete stage.dataset.frame;
   clearTimeout(stillTimer);
   stillTimer = setTimeout(() => request(false), STILL_AFTER);
   request(true);
@@ -118,7 +119,7 @@ async function load(draft) {
   if (!draft) nearestPhoto();
   histogram();
   paint();
-  stage.dataset.frame = draft ? "draft" : "full";  // For tests: what is on the canvas
+  if (!draft && wanted === null) stage.dataset.frame = "full";  // Nothing better is to come
 }
 const tell = text => { $("told").textContent = text; };
 const zoom = () => 2 ** Number($("zoom").value);
