@@ -270,5 +270,6 @@ def _ending(path: Path, summary: dict) -> str:
     heldout = f", held-out PSNR {scores[-1][0]:.2f} dB" if scores else ""
     made = f"{summary['iteration']} iterations, {summary['gaussians']} Gaussians{heldout}"
     return f"""{path}: {made}, {summary["train_seconds"]:.1f} s on {summary["device"]}
+look at it:         sehdr-warp view {path}
 exposure brackets:  sehdr-warp render {path} --out {path}/views --evs=-4,-2,0,2,4
 pictures, splats:   sehdr-warp report {path} --out {path}/report;  sehdr-warp export {path} --out scene.ply"""

@@ -1,6 +1,7 @@
 """A trained scene, loaded from the folder of its training or from a file of Gaussians."""
 
 import logging
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +110,10 @@ class Run(_Rendered):
         self.checkpoint_hash: str = values["sha256"]
         self.data: dict = info["data"]
         self.scene_name: str = info["scene"]
+
+    def _repr_html_(self) -> str:
+        # By name: no room below output may know it, but a notebook asks the run itself.
+        return import_module("sehdr_warp.output.notebook").run_html(self)
 
     def clipped_share(self) -> Tensor | None:
         """[N] in [0, 1]: which share of the values that show a Gaussian were clipped; None where not measured."""

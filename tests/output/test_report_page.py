@@ -1,6 +1,7 @@
 """report.html as strangers meet it: valid, alone, small, and with the light that it says it has."""
 
 import base64
+import html
 import re
 import shutil
 import subprocess
@@ -10,9 +11,11 @@ import numpy as np
 import pytest
 
 from sehdr_warp.output.light_pictures import dial, display_gain, jpeg, packed_light, ultra_hdr
+from sehdr_warp.output.notebook import run_html
 from sehdr_warp.output.report import write_report
 from sehdr_warp.output.report_page import smaller
 
+from .helpers import AnalyticRun
 from .test_report import make
 
 PLAN = [{"name": "brackets", "choice": "plain <scaling>", "reason": "0.0% of the pixels clip"}]
@@ -105,3 +108,16 @@ def test_smaller_pictures_hold_means():
     half = smaller(picture, 4)
     np.testing.assert_allclose(half, picture.reshape(3, 2, 4, 2, 3).mean((1, 3)), rtol=1e-5)
     assert smaller(picture, 100) is picture and jpeg(picture)[:2] == b"\xff\xd8"
+
+
+def test_a_run_shows_itself_in_a_notebook():
+    run = AnalyticRun()
+    text = run_html(run)
+    page = html.unescape(re.fullmatch(r'<iframe srcdoc="([^"]*)" [^<>]*></iframe>', text)[1])
+    pytest.importorskip("html5lib").HTMLParser(strict=True).parse(page)
+    assert "1,234 Gaussians" in page and "t_0" in page and not re.findall(r"https?://", page)
+    packed = re.search(r'data-light="scene">([^<]*)<', page)[1]
+    light = np.frombuffer(zlib.decompress(base64.b64decode(packed)), "<f2").reshape(24, 32, 3)
+    np.testing.assert_allclose(light, run.render(run.cameras[3].camera).hdr * 0.5, rtol=1e-3)
+    run.cameras = []
+    assert "dial" in run_html(run) and "data-light=" not in run_html(run).replace("script[data-light]", "")

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from sehdr_warp.output.light_pictures import display_gain
+from sehdr_warp.output.notebook import run_html
 from sehdr_warp.output.tonemap import encode_srgb
 from sehdr_warp.scene import Camera
 
-from ..output.helpers import read_exr
+from ..output.helpers import AnalyticRun, read_exr
 from .browser import browser, page_of, pixels
 
 FULL = "#stage[data-frame=full]"
@@ -124,3 +125,18 @@ def test_moving_resizing_and_two_at_once(chromium, serve):
             page.click("#savePath")
         assert '"cameras"' in download.value.path().read_text()
         np.testing.assert_array_equal(pixels(other, "#picture"), theirs)
+
+
+def test_the_dial_of_a_notebook_exposes_in_a_static_page(chromium, tmp_path):
+    run = AnalyticRun()
+    (tmp_path / "notebook.html").write_text(f'<!DOCTYPE html><meta charset="utf-8"><title>n</title>{run_html(run)}')
+    light = run.render(run.cameras[3].camera).hdr * run.base_time * display_gain(run.response)
+    with page_of(chromium, (tmp_path / "notebook.html").as_uri()) as page:
+        frame = page.frame_locator("iframe")
+        frame.locator("output", has_text="s").wait_for()
+        for stops in (0, -3):
+            frame.locator("input").evaluate(
+                "(range, value) => { range.value = value; range.dispatchEvent(new Event('input')); }", str(stops)
+            )
+            shown = pixels(frame, "canvas")
+            np.testing.assert_allclose(shown, encode_srgb(light * 2.0**stops), atol=2.5 / 255)
