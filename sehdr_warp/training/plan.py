@@ -33,6 +33,7 @@ FEWEST_POINTS = 100  # With fewer sparse points places along the cameras' rays s
 FEWEST_PHOTOS = 3
 LEAST_OVERLAP = 0.02
 LEAST_CONTRAST = 1 / 255
+DRIFT = 3.0  # Stops of brightness between photos from which exposure is taken to have changed unsaid
 MOST_VIEWS = 64  # Photos that codes are read from, evenly spread; geometry is of all
 
 Choice = tuple[dict[str, object], str, str]
@@ -47,6 +48,7 @@ class SceneFacts:
     points: sparse points. seen: mean number of photos whose field of view holds a probe.
     overlap: part of the probes, or of places along the cameras' rays if that is more, that two photos show.
     clipped, black: part of the pixels with a channel at white, with all at 0. contrast: deviation of all codes.
+    drift: stops, about, between the darkest and the brightest photo's median where no exposure times are known; else 0.
     """
 
     photos: int
@@ -59,6 +61,7 @@ class SceneFacts:
     clipped: float
     black: float
     contrast: float
+    drift: float
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,9 @@ class Plan:
     def lines(self) -> list[str]:
         """One line for each decision that changes something, and for each field that stays."""
         made = [f"plan: {row.name}: {row.choice} ({row.reason})" for row in self.decisions if row.fields]
+        if self.facts.drift >= DRIFT:
+            spread = f"the photos' brightness differs by {self.facts.drift:.1f} stops and no exposure times are known"
+            made.append(f"plan: {spread}: if exposure changed between them, give their times in exposures.json")
         return made + [f"plan: {line}, as given" for line in _stated(self.kept)]
 
 
@@ -146,8 +152,8 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         count = min(PROBES, len(scene.points))
         probes = np.asarray(scene.points)[rng.choice(len(scene.points), count, replace=False)]
     shown, drawn = (np.array([pixels_of(points, view)[2] for view in views]).sum(0) for points in (probes, drawn))
-    figures = np.mean([_light(view.image) for view in views[:: -(-len(views) // MOST_VIEWS)]], axis=0)
-    clipped, black, mean, square = map(float, figures)
+    figures = np.array([_light(view.image) for view in views[:: -(-len(views) // MOST_VIEWS)]])
+    clipped, black, mean, square, _ = map(float, figures.mean(0))
     return SceneFacts(
         photos=len(views),
         pixels=sum(view.camera.width * view.camera.height for view in views),
@@ -159,13 +165,16 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         clipped=clipped,
         black=black,
         contrast=float(np.sqrt(max(square - mean**2, 0.0))),
+        drift=0.0 if scene.exposure_times_known else float(np.ptp(figures[:, -1])),
     )
 
 
-def _light(image: np.ndarray) -> tuple[float, float, float, float]:
-    """Parts of the pixels that are clipped and black, and the means of the encoded values and of their squares."""
+def _light(image: np.ndarray) -> tuple[float, float, float, float, float]:
+    """Parts of the pixels that are clipped and black, the means of the encoded values and of their squares, and the
+    median's light in stops, by a gamma of 2.2."""
     clipped, black = (image >= 254.5 / 255).any(2).mean(), (image <= 0.5 / 255).all(2).mean()
-    return clipped, black, image.mean(dtype=np.float64), np.square(image, dtype=np.float64).mean()
+    median = 2.2 * math.log2(max(float(np.median(image)), 0.5 / 255))
+    return clipped, black, image.mean(dtype=np.float64), np.square(image, dtype=np.float64).mean(), median
 
 
 def check_scene(scene: Scene, facts: SceneFacts) -> None:

@@ -84,6 +84,16 @@ def test_a_plan_says_whether_relocation_has_room(facts, points, choice):
     assert choice in chosen and f"{max(points, 1568)} to start with" in reason
 
 
+def test_photos_whose_exposure_drifts_unsaid_get_a_line(scene):
+    shares = iter(np.linspace(0.1, 0.9, len(scene.views)))
+    drifting = with_images(scene, lambda view: np.full_like(view.image, 0.02) + view.image * next(shares))
+    for known, told in ((False, 1), (True, 0)):
+        lines = make_plan(replace(drifting, exposure_times_known=known), config_of()).lines()
+        assert len([line for line in lines if "no exposure times" in line and "exposures.json" in line]) == told
+    plain = make_plan(replace(scene, exposure_times_known=False), config_of())
+    assert not any("exposure times" in line for line in plain.lines())
+
+
 def test_a_cpu_gets_the_iterations_that_fit_into_minutes(facts, monkeypatch):
     monkeypatch.setattr("sehdr_warp.training.plan.thread_count", lambda: 2)
     config, rule = config_of(), RULES["iterations"]
