@@ -18,6 +18,7 @@ from ..scene import Camera
 from ..splats.arrays import HARMONIC_0, GaussianArrays, evaluate_colors, harmonic_basis
 from .gaussians import Gaussians
 from .radiance_field import CameraTensors, RadianceField
+from .sensor_colors import rec709_of
 
 # Radiance below this counts as this: its logarithm must be finite.
 DARKEST = 1e-12
@@ -47,19 +48,26 @@ def field_of(gaussians: GaussianArrays) -> RadianceField:
 
 
 def gaussians_of(
-    field: RadianceField, color_model: str, seen_from: np.ndarray, exposure_time: float | None = None
+    field: RadianceField,
+    color_model: str,
+    seen_from: np.ndarray,
+    exposure_time: float | None = None,
+    color_matrix: np.ndarray | None = None,
 ) -> GaussianArrays:
     """A field's Gaussians in the colors of a file.
 
     color_model: "log" or "linear" for scene-linear radiance, "display" for what the field's response makes of it at
     exposure_time: seconds, by default the base time. seen_from: [C, 3] where the scene was photographed from.
+    color_matrix: [3, 3] from the field's colors to linear Rec.709, if they are others.
 
     Exact where the field's own harmonics mean that; else fitted for each Gaussian (see bake).
     """
     stored, to_radiance = _stored(field)
+    if color_matrix is not None:
+        to_radiance = _in_rec709(to_radiance or (lambda x: x / field.base_time), color_matrix, field.base_time)
     time = exposure_time or field.base_time
     if color_model == "display":
-        if stored.color_model == "display" and time == field.base_time:
+        if stored.color_model == "display" and time == field.base_time and color_matrix is None:
             return stored
         radiance = to_radiance or (lambda exposure: exposure / field.base_time)
         return bake(stored, lambda colors: field.response.encode(radiance(colors) * time), "display", seen_from)
@@ -73,6 +81,10 @@ def gaussians_of(
     if color_model == "linear":
         return bake(stored, radiance, "linear", seen_from)
     return bake(stored, lambda colors: np.log(np.maximum(radiance(colors), DARKEST)), "log", seen_from)
+
+
+def _in_rec709(native: Colors, matrix: np.ndarray, base_time: float) -> Colors:
+    return lambda colors: rec709_of(torch.from_numpy(np.asarray(native(colors))), matrix, base_time).numpy()
 
 
 def _stored(field: RadianceField) -> tuple[GaussianArrays, Colors | None]:

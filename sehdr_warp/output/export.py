@@ -54,12 +54,12 @@ def export(
     positions = np.array([camera.position for camera in seen]).reshape(-1, 3)
     if kind == "ldr":
         time = run.base_time if exposure_time is None else float(exposure_time)
-        gaussians = gaussians_of(run.model, "display", positions, time)
+        gaussians = gaussians_of(run.model, "display", positions, time, run.color_matrix)
         if gaussians.color_model != run.model.color_model.name:
-            gaussians = refine(gaussians, lambda camera: run.render_ldr(camera, time), seen)
+            gaussians = refine(gaussians, _photographed(run, time), seen)
     else:
         color_model = held or ("linear" if run.model.color_model.name == "linear" else "log")
-        gaussians = gaussians_of(run.model, color_model, positions)
+        gaussians = gaussians_of(run.model, color_model, positions, color_matrix=run.color_matrix)
     gaussians = gaussians.padded(degree or 0)
     write_gaussians(path, gaussians, overwrite=overwrite)
     if cameras:
@@ -90,7 +90,7 @@ def _tell(path: Path, run, gaussians, kind: str, exposure_time: float | None) ->
     if not views:
         log.info("it is not compared with the scene, which has no cameras of its own")
     elif kind == "ldr":
-        kept = agreement(gaussians, lambda camera: run.render_ldr(camera, time), views, time)
+        kept = agreement(gaussians, _photographed(run, time), views, time)
         log.info("kept: %.1f dB of the scene's own pictures in %d views; lost: light above white", kept, len(views))
     else:
         dark = time / 2**_DARKER
@@ -102,6 +102,11 @@ def _judged(run) -> Sequence[Camera]:
     held_out = [entry.camera for entry in run.cameras if entry.split == "test"]
     views = held_out or [entry.camera for entry in run.cameras]
     return views[:: -(-len(views) // _JUDGED) or 1]
+
+
+def _photographed(run, time: float) -> Callable:
+    """Simulated photos; of a scene in a sensor's colors, pictures of its light."""
+    return _shown(run, time) if run.color_matrix is not None else lambda camera: run.render_ldr(camera, time)
 
 
 def _shown(run, time: float) -> Callable:

@@ -27,6 +27,7 @@ class Shot:
     exposure_key: the exposure's number where a view has several (the k of `<view>_<k>.png`); None otherwise.
     exposure_time: seconds from the set's own files; None lets EXIF speak. split: "train" or "test", if stated.
     derived: the set has no photos; this one is made of the truth, and `image` names the truth's file.
+    linear: the codes are proportional to light, and become those of sRGB.
     oriented: the lens speaks of the pixels after EXIF orientation; None finds out from the sizes.
     """
 
@@ -40,6 +41,7 @@ class Shot:
     mask: Path | None = None
     hdr: Path | None = None
     derived: bool = False
+    linear: bool = False
     oriented: bool | None = None
 
     @property
@@ -63,6 +65,7 @@ class Capture:
     holdout: (every so many views, from this one) is held out in the protocol that the layout is published with; None
         for a layout without one.
     times_known: False where no file stated exposure times.
+    kind: of the photos: encoded, linear, raw or float; see linear_photos.py.
     """
 
     format: str
@@ -74,6 +77,7 @@ class Capture:
     name: str = ""
     folder: Path = Path()
     times_known: bool = True
+    kind: str = "encoded"
 
     @property
     def training(self) -> tuple[Shot, ...]:

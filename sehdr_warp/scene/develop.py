@@ -14,6 +14,7 @@ from .capture import Capture, Shot, reinhard_gamma
 from .hdr_files import hdr_size, read_hdr
 from .images import EncodedImage, image_sizes, read_ldr, read_mask
 from .lens import Lens, Undistortion, area_average, limited_size
+from .linear_photos import float_codes, kind_of, srgb_codes
 from .names import unique_names
 from .types import Scene, View, codes_of
 
@@ -70,8 +71,11 @@ def told(doing: str, items: Sequence) -> Iterator[tuple[int, Any]]:
 
 def as_photographed(shot: Shot, *, oriented: bool = False) -> EncodedImage:
     """A shot's codes before anything is undistorted or averaged; of a set of truth alone, HDR-NeRF's photo of it."""
+    if not shot.derived and kind_of(shot.image) == "float":
+        return EncodedImage(float_codes(read_hdr(shot.image), shot.seconds), None)
     if not shot.derived:
-        return read_ldr(shot.image, oriented=oriented)
+        read = read_ldr(shot.image, oriented=oriented)
+        return EncodedImage(srgb_codes(read.pixels / read.levels), read.alpha) if shot.linear else read
     return EncodedImage(codes_of(reinhard_gamma(read_hdr(shot.image) * shot.seconds), 8), None)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from ..errors import InputError
 from ..files import read_bytes
 from .capture import Shot
-from .images import EXIF_ERRORS, open_image
+from .images import EXIF_ERRORS, HDR_SUFFIXES, RAW_SUFFIXES, open_image
 
 _EXIF_IFD = 0x8769
 _EXPOSURE_TIME, _F_NUMBER, _SPEED, _SHUTTER_APEX = 33434, 33437, 34855, 37377
@@ -121,7 +121,13 @@ def exif_exposure(path: Path) -> tuple[float | None, float | None, float | None]
 
     Raises InputError for an exposure time of zero or one that is not a number, and where the file is no image.
     """
+    if path.suffix.lower() in HDR_SUFFIXES:
+        return None, None, None
     try:
+        if path.suffix.lower() in RAW_SUFFIXES:
+            from .linear_photos import raw_exposure
+
+            return raw_exposure(path)
         with open_image(path) as image:
             table = image.getexif().get_ifd(_EXIF_IFD)
             tags = (_EXPOSURE_TIME, _SHUTTER_APEX, _SPEED, _F_NUMBER)

@@ -17,6 +17,8 @@ MAX_PIXELS = 160_000_000
 """Above any camera's frame (the largest backs give 151 megapixels), far below what would exhaust memory."""
 LDR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 HDR_SUFFIXES = (".exr", ".hdr")
+RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw")
+PHOTO_SUFFIXES = (*LDR_SUFFIXES, *RAW_SUFFIXES, *HDR_SUFFIXES)
 _BAND_ROWS = 512
 _FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP")
 _MODES = ("L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "I", "I;16", "I;16L", "I;16B", "I;16N")
@@ -47,6 +49,14 @@ class EncodedImage:
 
 def image_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     """The photo's size in its file and after its EXIF orientation, each (width, height); errors as open_image."""
+    if path.suffix.lower() in RAW_SUFFIXES:
+        from .linear_photos import raw_sizes
+
+        return raw_sizes(path)
+    if path.suffix.lower() in HDR_SUFFIXES:
+        from .hdr_files import hdr_size
+
+        return hdr_size(path), hdr_size(path)
     with open_image(path) as image:
         width, height = image.size
         return image.size, (height, width) if _orientation(image) in (5, 6, 7, 8) else image.size
@@ -56,8 +66,17 @@ def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> Encod
     """Decode a photo; 16-bit files keep their 16 bits, palettes and grey become RGB.
 
     oriented: turn the pixels as the EXIF orientation says. mask: one bit a pixel is enough.
+    RAW files become 16-bit codes of the sensor's colors, float pictures 8-bit ones at an exposure of their own; see
+    linear_photos.py.
+
     Raises InputError where the file is missing, damaged, truncated, of another kind, or larger than MAX_PIXELS.
     """
+    if path.suffix.lower() in (*RAW_SUFFIXES, *HDR_SUFFIXES):
+        from . import linear_photos
+
+        raw = path.suffix.lower() in RAW_SUFFIXES
+        codes = linear_photos.raw_codes(path, oriented=oriented) if raw else linear_photos.tone_mapped(path)
+        return EncodedImage(codes, None)
     with open_image(path, mask=mask) as image:
         try:
             pixels, alpha = _decode(image, path)
@@ -65,6 +84,12 @@ def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> Encod
         except (*_PILLOW_ERRORS, Image.DecompressionBombError) as error:
             raise InputError(path, f"cannot be decoded ({error})", DAMAGED) from None
     return EncodedImage(_upright(pixels, turn), None if alpha is None else _upright(alpha, turn))
+
+
+def has_16_bits(path: Path) -> bool:
+    """Whether a photo that read_ldr decodes has 16 bits; errors as open_image."""
+    with open_image(path) as image:
+        return image.mode.startswith("I") or bool(_low_byte_tiles(image))
 
 
 def read_mask(path: Path, *, oriented: bool = False) -> np.ndarray:

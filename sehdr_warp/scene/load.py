@@ -15,6 +15,8 @@ from .capture import Capture, Shot
 from .colmap_model import find_model
 from .develop import as_photographed, develop, fitted_lens, with_content
 from .exposure import choose_exposure, made_by_camera, with_exposure_times
+from .images import has_16_bits
+from .linear_photos import CURVES, color_matrix, float_time, one_kind
 from .read_folders import (
     image_folder,
     is_hdr_gs,
@@ -53,7 +55,9 @@ def load_scene(
     path: a folder (COLMAP, transforms.json, HDR-NeRF synthetic or real, HDR-GS, LLFF, or bare photos), "embedded"
         for the room that comes with the package, or "embedded:NAME" for another of embedded_scenes().
     response: the camera's: a name, a file or an object; "auto" chooses it from the training photos' codes by `method`
-        among `candidates` (names and files; none: the built-in ones); "learned" stands for sRGB here.
+        among `candidates` (names and files; none: the built-in ones); "learned" stands for sRGB here. "linear" is of
+        photos whose 16-bit codes are proportional to light. The light of RAW files, OpenEXR and Radiance pictures is
+        known: they take none.
     exposure_index: the exposure to take where each view has several (the k of `<view>_<k>.png`); None: the middle one.
     max_size: longest side of the views in pixels; None keeps the photos' sizes. Averages are exact areas, of light
         for photos and of values for truth and masks; a value of 1 stays 1 where half of its area was clipped.
@@ -71,6 +75,16 @@ def load_scene(
         raise InputError(path, f"longest side of {max_size} pixels asked for", "give at least 1 pixel")
     capture = read_capture(path, exposure_index=exposure_index, holdout=holdout, cache=cache)
     chosen_by = None
+    if capture.kind == "encoded" and str(response) == "linear":
+        capture = as_linear(capture)
+        response = "auto" if capture.kind == "linear" else response
+    if capture.kind != "encoded":
+        chosen = response_by_name(CURVES[capture.kind])
+        if isinstance(response, str | Path) and str(response) not in ("auto", chosen.name):
+            problem = f"its photos are {capture.kind}: their light is known, and response {response} is not theirs"
+            raise InputError(path, problem, "leave the response out")
+        matrix = color_matrix([shot.image for shot in capture.shots]) if capture.kind == "raw" else None
+        return replace(develop(capture, chosen, max_size), color_matrix=matrix, light_known=True)
     if isinstance(response, str) and response == "auto":
         response, chosen_by = choose_response(capture, method, candidates), (method, tuple(map(str, candidates)))
     elif isinstance(response, str | Path):
@@ -90,7 +104,14 @@ def read_capture(
     if not capture.shots:
         raise InputError(folder, "has no views", "check the data folder")
     shots, notes = choose_exposure(capture.shots, exposure_index, folder)
-    shots, times_known, more = with_exposure_times(shots, folder)
+    kind, more = one_kind([shot.image for shot in shots if not shot.derived] or [Path("derived")]), []
+    if kind == "float" and all(shot.exposure_time is None for shot in shots):
+        time = float_time([shot.image for shot in shots])
+        shots = [replace(shot, exposure_time=time, hdr=shot.hdr or shot.image) for shot in shots]
+        times_known = True
+        more = ["float pictures: their values are taken as light, at no exposure"]
+    else:
+        shots, times_known, more = with_exposure_times(shots, folder)
     shots, split = _with_splits(shots, capture, holdout)
     training = sum(shot.split == "train" for shot in shots)
     if training < 2:
@@ -101,7 +122,15 @@ def read_capture(
             fitted_lens(shot)
     notes = (*capture.notes, *notes, *more, *split)
     name = str(path) if is_embedded(path) else folder.resolve().name
-    return replace(capture, shots=tuple(shots), notes=notes, name=name, folder=folder, times_known=times_known)
+    told = {"notes": notes, "name": name, "folder": folder, "times_known": times_known, "kind": kind}
+    return replace(capture, shots=tuple(shots), **told)
+
+
+def as_linear(capture: Capture) -> Capture:
+    """A capture whose photos are proportional to light, if all of them have 16 bits; of 8 bits codes stay codes."""
+    if any(shot.derived for shot in capture.shots) or not all(has_16_bits(shot.image) for shot in capture.shots):
+        return capture
+    return replace(capture, kind="linear", shots=tuple(replace(shot, linear=True) for shot in capture.shots))
 
 
 def choose_response(capture: Capture, method: str = "posterior", candidates: Sequence[str] = ()) -> "Response":

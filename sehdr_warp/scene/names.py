@@ -6,10 +6,8 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..errors import InputError
 from ..files import contained
 from .capture import Shot
-from .images import LDR_SUFFIXES
 
 
 def natural_key(name: str) -> tuple:
@@ -30,16 +28,6 @@ def sibling(path: Path, suffixes: tuple[str, ...]) -> Path | None:
         return next((candidate for candidate in candidates if candidate.is_file()), None)
     except (OSError, ValueError):  # A name from a data file that no file can have.
         return None
-
-
-def photo_beside(hdr: Path) -> Path:
-    """The encoded photo of the same stem beside an HDR image; InputError where there is none."""
-    if photo := sibling(hdr, LDR_SUFFIXES):
-        return photo
-    if not hdr.is_file():
-        raise InputError(hdr, "image file not found", "copy the whole set")
-    problem = "is the view's only image, and no encoded (LDR) photo lies beside it"
-    raise InputError(hdr, problem, "put the photo (PNG, JPEG or TIFF) of the same name beside it")
 
 
 def mask_of(folder: Path, name: str, source: Path) -> Path | None:

@@ -10,9 +10,10 @@ from ..files import contained, read_bytes, read_json
 from .capture import NO_POINTS, Capture, Cloud, Shot, pose_from_camera_to_world
 from .colmap_model import SparseModel, find_model, read_model
 from .exposure import parse_seconds
-from .images import HDR_SUFFIXES, LDR_SUFFIXES, image_sizes
+from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES, image_sizes
 from .lens import Lens
-from .names import list_images, mask_of, natural_key, photo_beside, sibling, view_and_exposure
+from .linear_photos import one_kind
+from .names import list_images, mask_of, natural_key, sibling, view_and_exposure
 from .sfm import reconstruct
 
 # From the full size to reduced copies.
@@ -36,8 +37,8 @@ def read_colmap(folder: Path) -> Capture:
     shots, absent = [], []
     for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
         image = contained(images, entry.name, source)
-        if image.suffix.lower() in HDR_SUFFIXES:
-            hdr, image = image, photo_beside(image)
+        if image.suffix.lower() in HDR_SUFFIXES and (photo := sibling(image, LDR_SUFFIXES)):
+            hdr, image = image, photo
         elif not image.is_file():
             absent.append(entry.name)
             continue
@@ -180,11 +181,11 @@ def _camera(row: np.ndarray, path: Path, name: str) -> tuple[Lens, np.ndarray]:
 def read_photos(folder: Path, cache: Path | str | None = None) -> Capture:
     """One shot for each photo of the folder, or of its `images/`, that structure from motion could place."""
     places = (place for place in (folder, folder / "images") if place.is_dir())
-    photos = next((found for place in places if (found := list_images(place, LDR_SUFFIXES))), [])
+    photos = next((found for place in places if (found := list_images(place, PHOTO_SUFFIXES))), [])
     if not photos:
-        kinds = sorted({file.suffix.lower() for file in folder.iterdir() if file.suffix.lower() in HDR_SUFFIXES})
-        found = f"only {', '.join(kinds)} files" if kinds else "no photos and no known layout"
-        raise InputError(folder, f"has {found}", "give photos (PNG, JPEG, TIFF), a COLMAP set or a transforms.json")
+        remedy = "give photos (JPEG, PNG, TIFF, RAW, EXR), a COLMAP set or a transforms.json"
+        raise InputError(folder, "has no photos and no known layout", remedy)
+    one_kind(photos)
     if len(photos) < 2:
         raise InputError(photos[0], "is the only photo; one view does not show depth", "add photos from other places")
     for photo in photos:

@@ -12,10 +12,9 @@ from ..files import contained, read_json
 from .capture import DERIVED_PHOTOS, NO_POINTS, Capture, Cloud, Shot, pose_from_camera_to_world
 from .colmap_model import find_model, read_ply_points, read_points
 from .exposure import parse_seconds
-from .hdr_files import hdr_size
-from .images import HDR_SUFFIXES, LDR_SUFFIXES, image_sizes
+from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES, image_sizes
 from .lens import Lens
-from .names import photo_beside, sibling
+from .names import sibling
 
 _REMEDY = "correct the file or export it again"
 _INCOMPLETE = "copy the whole set"
@@ -107,14 +106,14 @@ def _named_splits(values: dict, frames: list[tuple[str, dict]]) -> dict[str, str
 
 def _frame_shot(folder: Path, path: Path, values: dict, frame: dict, name: str, split: str | None) -> Shot:
     image, hdr = contained(folder, name, path), None
-    if image.suffix.lower() not in (*LDR_SUFFIXES, *HDR_SUFFIXES):
+    if image.suffix.lower() not in PHOTO_SUFFIXES:
         # Blender's file_path has no ending; a dot in the stem must not be taken for one.
         stated = image.with_name(image.name + ".png")
         image = sibling(stated, LDR_SUFFIXES)
         if image is None:
             raise InputError(stated, "image file not found", _INCOMPLETE)
-    if image.suffix.lower() in HDR_SUFFIXES:
-        hdr, image = image, photo_beside(image)
+    if image.suffix.lower() in HDR_SUFFIXES and (photo := sibling(image, LDR_SUFFIXES)):
+        hdr, image = image, photo
     lens, pose = frame_lens(values, frame, image, path), frame_pose(frame, path, name)
     mask, time = frame.get("mask_path"), frame.get("exposure_time")
     mask = None if mask is None else contained(folder, mask, path)
@@ -161,7 +160,7 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
     if width is None or height is None:
         if image is None:
             raise InputError(path, "states no image size", "add w and h")
-        width, height = hdr_size(image) if image.suffix.lower() in HDR_SUFFIXES else image_sizes(image)[0]
+        width, height = image_sizes(image)[0]
     fx, fy = focal("fl_x", "camera_angle_x", width), focal("fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
         raise InputError(path, "states no focal length", "add camera_angle_x (radians, below pi) or fl_x (pixels)")

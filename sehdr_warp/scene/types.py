@@ -62,6 +62,8 @@ class Scene:
     notes: one line each on what the user should know (differing exposures, views left out, ...).
     response: the curve the photos were averaged by; None for a scene made by hand.
     chosen_by: the method and the candidates that chose the response; None where it was named.
+    light_known: the photos' codes were made of light by `response`, of no camera's choice: RAW, linear, float.
+    color_matrix: [3, 3] from the colors of the codes' light to linear Rec.709; None where these are Rec.709 themselves.
     """
 
     name: str
@@ -73,6 +75,8 @@ class Scene:
     notes: tuple[str, ...] = ()
     response: "Response | None" = None
     chosen_by: tuple[str, tuple[str, ...]] | None = None
+    color_matrix: np.ndarray | None = None
+    light_known: bool = False
 
     @property
     def train_views(self) -> tuple[View, ...]:

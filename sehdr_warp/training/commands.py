@@ -203,9 +203,9 @@ def read_scene(run, data: str | None):
         raise SehdrError(f"{run.path}: does not say where its photos are; give --data")
     if data is None and not is_embedded(place) and not Path(place).is_dir():
         raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
-    # A learned response was not known when the photos of the training were developed.
-    learned = run.config.response.name == "learned"
-    return _load({**run.data, "path": place}, response="learned" if learned else run.response)
+    # A learned response was not known when the photos of the training were developed, and linear codes became others.
+    named = run.config.response.name
+    return _load({**run.data, "path": place}, response=named if named in ("learned", "linear") else run.response)
 
 
 def _data(asked: Train, resumed) -> dict:

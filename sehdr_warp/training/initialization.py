@@ -52,6 +52,8 @@ def choose_response(scene: Scene, config: Config) -> Response:
     """The response that the config names; "learned": one to be learned; "auto": the one that the scene was developed
     with, if it was chosen as the config asks, else the one that fits its views best."""
     options = config.response
+    if scene.light_known and scene.response is not None:
+        return scene.response
     if options.name == "learned":
         return ToneMapper(seed=config.seed)
     if options.name != "auto":

@@ -1,6 +1,7 @@
 """A trained scene, loaded from the folder of its training or from a file of Gaussians."""
 
 import logging
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from ..field.baking import field_of
 from ..field.confidence import Evidence, gather_evidence
 from ..field.gaussians import PARAMETER_NAMES, Gaussians
 from ..field.radiance_field import RadianceField, RenderedView, Surroundings
+from ..field.sensor_colors import rec709_of
 from ..response import Response
 from ..scene import Camera, Scene, load_cameras
 from ..splats import read_gaussians
@@ -26,10 +28,16 @@ log = logging.getLogger(__name__)
 
 
 class _Rendered:
-    """What a RadianceField with harmonics up to `degree` looks like from cameras."""
+    """What a RadianceField with harmonics up to `degree` looks like from cameras.
+
+    color_matrix: [3, 3] from the field's colors to linear Rec.709, where it was trained on a sensor's own; else None.
+    Radiance is Rec.709; simulated photos are in the colors of the photos.
+    """
 
     model: RadianceField
     degree: int
+    base_time: float
+    color_matrix: np.ndarray | None = None
 
     @property
     def device(self) -> torch.device:
@@ -41,7 +49,8 @@ class _Rendered:
 
     def render(self, camera: Camera) -> RenderedView:
         """HDR radiance [H, W, 3], alpha [H, W] and depth [H, W] from a camera."""
-        return self.model.render(camera, degree=self.degree)
+        rendered = self.model.render(camera, degree=self.degree)
+        return replace(rendered, hdr=self._rec709(rendered.hdr))
 
     def render_directions(
         self, position: np.ndarray, directions: np.ndarray, *, focal_length: float, pixel_angle: float
@@ -49,7 +58,11 @@ class _Rendered:
         """What is seen along unit directions [H, W, 3] from a position [3], as of RadianceField.render_directions."""
         given = (torch.tensor(values, dtype=torch.float32, device=self.device) for values in (position, directions))
         options = {"focal_length": focal_length, "pixel_angle": pixel_angle, "degree": self.degree}
-        return self.model.render_directions(*given, **options)
+        seen = self.model.render_directions(*given, **options)
+        return replace(seen, hdr=self._rec709(seen.hdr))
+
+    def _rec709(self, hdr: Tensor) -> Tensor:
+        return hdr if self.color_matrix is None else rec709_of(hdr, self.color_matrix, self.base_time)
 
     def render_ldr(self, camera: Camera, exposure_time: float | None = None) -> Tensor:
         """[H, W, 3] in [0, 1]: the simulated photo of exposure_time seconds, by default the base exposure."""
@@ -102,7 +115,7 @@ class Run(_Rendered):
         self.folder, self.path = folder, folder.path
         self.config, self.model = config, model
         self.response: Response = model.response
-        self.base_time: float = model.base_time
+        self.base_time = model.base_time
         self.cameras: tuple[CameraEntry, ...] = folder.read_cameras()
         self.iterations: int = values["iteration"]
         self.degree = config.degree_at(self.iterations)
@@ -110,6 +123,8 @@ class Run(_Rendered):
         self.checkpoint_hash: str = values["sha256"]
         self.data: dict = info["data"]
         self.scene_name: str = info["scene"]
+        if info.get("color_matrix"):
+            self.color_matrix = np.array(info["color_matrix"], np.float64)
 
     def _repr_html_(self) -> str:
         # By name: no room below output may know it, but a notebook asks the run itself.

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Annotated
 
 from filelock import FileLock, Timeout
-from pydantic import Field
+from pydantic import Field, FiniteFloat
 from torch import Tensor
 
 from ..errors import InputError, SehdrError
@@ -55,6 +55,7 @@ from .config_files import config_from_dict
 _LOCK, _NEW, _READY = ".lock", ".new", ".ready"
 _OWN = "choose another folder, or remove this one yourself"
 _Count = Annotated[int, Field(ge=0, le=1_000_000)]
+_Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 class _DataValues(Values):
@@ -69,6 +70,7 @@ class _RunValues(Values):
     data: _DataValues
     base_time: Annotated[float, Field(ge=SHORTEST, le=LONGEST)]
     response: dict
+    color_matrix: tuple[_Row, _Row, _Row] | None = None
 
 
 @dataclass(frozen=True)
@@ -174,6 +176,8 @@ class RunFolder:
         self.check(resume=False, overwrite=overwrite)  # Photos were read since.
         info = {"format": FORMAT, "version": __version__, "scene": scene.name, "data": data}
         info |= {"base_time": field.base_time, "response": field.response.to_dict()}
+        if scene.color_matrix is not None:
+            info["color_matrix"] = scene.color_matrix.tolist()
         with atomic_folder(self.path / _NEW, ours=True) as beside:
             new = RunFolder(beside)
             if plan is not None:

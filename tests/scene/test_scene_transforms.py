@@ -97,7 +97,7 @@ def test_bad_transforms_are_refused(tmp_path, fields, message):
         load(tmp_path)
 
 
-def test_exr_alone_is_refused_and_beside_a_photo_is_truth(tmp_path):
+def test_exr_among_photos_is_refused_and_beside_one_is_truth(tmp_path):
     import OpenEXR
 
     write_blender(tmp_path)
@@ -110,7 +110,7 @@ def test_exr_alone_is_refused_and_beside_a_photo_is_truth(tmp_path):
     scene = load(tmp_path, cache=tmp_path / "cache")
     assert [view.hdr.max() for view in scene.views] == [1, 2, 3, 4, 5, 6]
     (tmp_path / "images" / "r_2.png").unlink()
-    with pytest.raises(InputError, match=r"r_2.exr: is the view's only image"):
+    with pytest.raises(InputError, match=r"r_2.exr: is float, and r_0.png is encoded"):
         load(tmp_path)
 
 

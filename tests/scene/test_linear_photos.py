@@ -1,0 +1,156 @@
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.field.baking import field_of
+from sehdr_warp.field.sensor_colors import rec709_of
+from sehdr_warp.output.exr import rgb_channels, write_exr
+from sehdr_warp.output.images import write_picture
+from sehdr_warp.output.radiance_file import write_radiance
+from sehdr_warp.scene import load_scene
+from sehdr_warp.scene.linear_photos import color_matrix, raw_codes, raw_exposure
+from sehdr_warp.training.run import Splats
+
+from ..output.helpers import camera
+from ..splats.test_splat_files import gaussians
+from .raw_files import TO_CAMERA, write_dng
+
+BALANCE = np.array([0.5, 1.0, 0.7])
+
+
+def picture(seed=0, height=24, width=32):
+    """[H, W, 3] smooth light over three decades, as a neutral-free gradient."""
+    random = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, :width] / width
+    return np.exp(4 * np.sin(3 * x + random.uniform(0, 3)) + 2 * y)[..., None] * random.uniform(0.3, 1, 3)
+
+
+def posed(folder, write, suffix, count=6):
+    """A transforms.json of photos that write(path, index) makes."""
+    frames = []
+    for i in range(count):
+        write(folder / f"{i}{suffix}", i)
+        pose = np.linalg.inv(camera(position=(0.3 * i, 0, -3)).world_to_camera) @ np.diag([1.0, -1, -1, 1])
+        frames.append({"file_path": f"{i}{suffix}", "transform_matrix": pose.tolist()})
+    values = {"w": 32, "h": 24, "fl_x": 40, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(values))
+    return folder
+
+
+def light_of(view, scene):
+    return scene.response.decode(view.codes / 65535) / view.exposure_time
+
+
+@pytest.mark.parametrize("suffix, tolerance", [(".exr", 2e-3), (".hdr", 0.02)])
+def test_float_pictures_are_photos_whose_light_is_known(tmp_path, suffix, tolerance):
+    def write(path, i):
+        if suffix == ".exr":
+            write_exr(path, rgb_channels(picture(i)), pixel="float")
+        else:
+            write_radiance(path, picture(i))
+
+    scene = load_scene(posed(tmp_path, write, suffix))
+    assert scene.response.name == "hdr-nerf" and scene.color_matrix is None and len(scene.test_views) == 1
+    for i, view in enumerate(scene.views):
+        np.testing.assert_allclose(light_of(view, scene), picture(i), rtol=tolerance, atol=1e-3)
+        assert view.codes.max() < 65535
+        np.testing.assert_allclose(view.hdr, picture(i), rtol=tolerance)
+    with pytest.raises(InputError, match="its photos are float: their light is known, and response srgb"):
+        load_scene(tmp_path, response="srgb")
+
+
+def test_linear_16_bit_photos(tmp_path):
+    def write(path, i):
+        write_picture(path, np.rint(np.clip(picture(i) / 20, 0, 1) * 65535).astype(np.uint16))
+
+    scene = load_scene(posed(tmp_path, write, ".png"), response="linear")
+    assert scene.response.name == "srgb"
+    for i, view in enumerate(scene.views):
+        expected = np.clip(picture(i) / 20, 0, 1)
+        np.testing.assert_allclose(light_of(view, scene), expected, atol=2e-5, rtol=1e-4)
+        np.testing.assert_array_equal(view.codes == 65535, expected >= 1 - 1e-5)
+
+
+def test_raw_files_clip_by_channel_in_the_sensors_colors(tmp_path):
+    pytest.importorskip("rawpy")
+    # A surface from dark to three times white: green clips first.
+    light = BALANCE * np.linspace(0.02, 3, 96)[None, :, None] * np.ones((64, 1, 1))
+    write_dng(tmp_path / "a.dng", light, balance=BALANCE)
+    codes = raw_codes(tmp_path / "a.dng", oriented=False)
+    found, expected = np.zeros(codes.shape), np.clip(light, 0, 1)
+    found = np.where(codes / 65535 <= 0.04045, codes / 65535 / 12.92, ((codes / 65535 + 0.055) / 1.055) ** 2.4)
+    inside = slice(4, -4), slice(4, -4)
+    np.testing.assert_allclose(found[inside], expected[inside], rtol=0.03)
+    assert ((codes == 65535) == (expected >= 0.99))[inside].mean() > 0.999
+    assert raw_exposure(tmp_path / "a.dng")[0] == pytest.approx(1 / 60, rel=1e-4)
+    matrix = color_matrix([tmp_path / "a.dng"])
+    np.testing.assert_allclose(matrix @ BALANCE, 1, atol=1e-3)
+    # A color in the sensor's own comes back as what it is in Rec.709.
+    to_rec709 = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
+    assert np.sign(matrix).tolist() == np.sign(to_rec709 @ np.linalg.inv(TO_CAMERA)).tolist()
+
+
+def test_a_set_of_raw_files_becomes_a_scene(tmp_path):
+    pytest.importorskip("rawpy")
+
+    def write(path, i):
+        write_dng(path, np.clip(picture(i) / 20, 0, 2) * BALANCE, balance=BALANCE)
+
+    scene = load_scene(posed(tmp_path, write, ".dng"))
+    assert scene.response.name == "srgb" and scene.light_known
+    np.testing.assert_allclose([view.exposure_time for view in scene.views], 1 / 60, rtol=1e-4)
+    np.testing.assert_allclose(scene.color_matrix @ BALANCE, 1, atol=1e-3)
+    codes = [np.array(view.codes) for view in scene.views]
+    assert 0.01 < np.mean([(c == 65535).mean() for c in codes]) < 0.6
+
+
+def test_kinds_and_cameras_are_not_mixed(tmp_path):
+    for i in range(2):
+        write_exr(tmp_path / f"{i}.exr", rgb_channels(picture(i)))
+    Image.fromarray(np.zeros((24, 32, 3), np.uint8)).save(tmp_path / "2.png")
+    with pytest.raises(InputError, match=r"2.png: is encoded, and 0.exr is float"):
+        load_scene(tmp_path)
+
+
+def test_files_that_are_no_photos_of_a_camera(tmp_path, shared):
+    pytest.importorskip("rawpy")
+    (tmp_path / "a.nef").write_bytes(b"II*\0" + bytes(100))
+    write_dng(tmp_path / "b.dng", np.ones((64, 64, 3)))
+    (tmp_path / "c.dng").write_bytes((tmp_path / "b.dng").read_bytes()[:3000])
+    for name in ("a.nef", "c.dng"):
+        with pytest.raises(InputError, match="cannot be read as RAW"):
+            raw_codes(tmp_path / name, oriented=False)
+    folder = shared / "data" / "raw"
+    with pytest.raises(InputError, match="no photo through a filter of three colors"):
+        raw_codes(folder / "Nikon_uncompressed.nef", oriented=False)
+    shutil.copy(folder / "RAW_KODAK_DC50.KDC", tmp_path / "d.dng")
+    with pytest.raises(InputError, match="states no color matrix"):
+        color_matrix([tmp_path / "d.dng"])
+    matrix = color_matrix([folder / "Blackmagic.dng"])
+    np.testing.assert_allclose(matrix @ (1 / np.array([2.2060447, 1.0, 1.8867925])), 1, atol=0.02)
+
+
+def test_what_is_clipped_in_a_sensor_is_neutral_or_keeps_the_color_it_shows():
+    matrix = np.diag(1 / BALANCE)
+    light = torch.tensor([[1.0, 1, 1], [0.4, 0.2, 0.1], [0.6, 1.0, 0.7], [0.1, 1.0, 0.1]], dtype=torch.float64)
+    # All clipped: white. None: as it is. Green alone, beside brighter ones: as bright. A green lamp: green.
+    expected = [[2, 2, 2], [0.8, 0.2, 0.1 / 0.7], [1.2, 1.2, 1], [0.2, 1, 0.1 / 0.7]]
+    np.testing.assert_allclose(rec709_of(light / 0.25, matrix, 0.25), np.array(expected) / 0.25, rtol=1e-9)
+
+
+def test_a_scene_in_a_sensors_colors_is_rendered_in_rec709(tmp_path):
+    scene = Splats(tmp_path, field_of(gaussians()), ())
+    plain = scene.render(camera()).hdr.numpy()
+    scene.color_matrix = np.array([[2, 0, 0], [0, 1, 0], [0, -1, 3.0]])
+    dark = plain.max(axis=2) < 0.75 / scene.base_time
+    expected = np.maximum(plain @ scene.color_matrix.T, 0)
+    assert dark.mean() > 0.5
+    np.testing.assert_allclose(scene.render(camera()).hdr.numpy()[dark], expected[dark], rtol=1e-5)
+    options = {"focal_length": 50.0, "pixel_angle": 0.0}
+    seen = scene.render_directions(np.zeros(3), np.array([[[0.0, 0, 1]]]), **options)
+    assert seen.hdr.shape == (1, 1, 3)
