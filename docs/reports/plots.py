@@ -41,13 +41,16 @@ def plot_scale(result: dict, path: Path) -> None:
 
 
 def plot_quality(result: dict, path: Path) -> None:
-    """Mean held-out PSNR over training seconds, a panel for each curve and response, a line for each method."""
+    """Mean held-out PSNR over training seconds, a panel for each curve and response, a line for each method; of the
+    scenes, exposures and seeds that all methods of a panel have, if there are any."""
     rows, panels = [row for row in result["rows"] if row["tests"]], []
     for curve, response in groups([row for row in rows if row["response"] != "learned"], "curve", "response"):
-        lines = {}
-        for (method,), mine in groups(rows, "method").items():
-            here = [row for row in mine if row["curve"] == curve and row["response"] in (response, "learned")]
-            lines[method] = error_over_time([row["tests"] for row in here]) if here else []
+        shown = [row for row in rows if row["curve"] == curve and row["response"] in (response, "learned")]
+        places = groups(shown, "scene", "exposure", "seed").values()
+        methods = {row["method"] for row in shown}
+        shared = [row for here in places if {row["method"] for row in here} == methods for row in here]
+        found = groups(shared or shown, "method").items()
+        lines = {method: error_over_time([row["tests"] for row in mine]) for (method,), mine in found}
         labels = {"xlabel": "training seconds", "ylabel": "held-out HDR PSNR, dB", "xscale": "log"}
         panels.append((lines, labels | {"title": f"{curve}, {response}"}))
     _draw(path, [panels], form="-")
