@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -97,6 +98,22 @@ def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
     poses[:, :3, :3] = RotationSpline(times, Rotation.from_matrix(axes[keep]))(at).as_matrix()
     poses[:, :3, 3] = CubicSpline(times, positions[keep])(at)
     return [_moved(cameras[0], pose) for pose in poses]
+
+
+def facts_of_cameras(entries: Sequence[Any]) -> dict[str, Any]:
+    """What a page flies by, of views with name, split and camera: plain values. up, focus: [3], or None; size: of the
+    space that the cameras take up."""
+    cameras = [entry.camera for entry in entries]
+    focus, up, size = None, np.array([0.0, -1.0, 0.0]), 0.0
+    if cameras:
+        focus, size = common_focus(cameras), float(np.linalg.norm(np.ptp(_positions(cameras), axis=0)))
+        up = _unit(-_axes(cameras, 1).sum(axis=0), fallback=up)
+    return {
+        "up": up.tolist(),
+        "focus": None if focus is None else focus.tolist(),
+        "size": size or 1.0,
+        "views": [{"name": entry.name, "split": entry.split, "camera": entry.camera.to_dict()} for entry in entries],
+    }
 
 
 def _check(cameras: Sequence[Camera], count: int) -> None:

@@ -95,10 +95,10 @@ class _SplatFile:
 
 @dataclass(frozen=True, kw_only=True)
 class Export(_OfRun):
-    """Write the Gaussians as PLY, OpenUSD or glTF, for viewers and other tools; says what the file keeps."""
+    """Write the Gaussians as PLY, OpenUSD or glTF, for viewers and other tools, or as a page that shows them in HDR."""
 
     out: Path
-    """The file; its suffix decides: .ply, .glb (glTF), .usda, .usdc or .usdz (OpenUSD)."""
+    """The file; its suffix decides: .ply, .glb (glTF), .usda, .usdc or .usdz (OpenUSD), .html (a page to send)."""
     file: _SplatFile = _SplatFile()
     cameras: bool = False
     """Also write cameras.json beside it, as viewers of the reference release read it."""
@@ -207,6 +207,13 @@ def run_report(asked: Report) -> None:
 
 
 def run_export(asked: Export) -> None:
+    if asked.out.suffix.lower() == ".html":
+        from .scene_page import write_scene_page
+
+        if asked.cameras or (asked.file.kind, asked.file.exposure, asked.file.degree) != (None, None, None):
+            raise UsageError("a page has its exposure, cameras and harmonics; --out alone goes with .html")
+        print(write_scene_page(open_scene(asked.run, asked.file.device), asked.out, overwrite=asked.overwrite))
+        return
     _export(asked.run, asked.out, asked.file, cameras=asked.cameras, overwrite=asked.overwrite)
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sehdr_warp.scene import Camera
 
-from ..output.camera_paths import common_focus
+from ..output.camera_paths import facts_of_cameras
 from ..output.images import as_array
 from ..output.light_pictures import display_gain
 
@@ -58,11 +58,6 @@ class Rendering:
 
     def facts(self) -> dict[str, Any]:
         """What the page knows of the run: plain values."""
-        cameras = [entry.camera for entry in self.cameras]
-        positions = np.array([camera.position for camera in cameras]).reshape(-1, 3)
-        up = -np.sum([camera.world_to_camera[1, :3] for camera in cameras], axis=0) if cameras else [0.0, -1.0, 0.0]
-        focus = common_focus(cameras) if cameras else None
-        size = float(np.linalg.norm(np.ptp(positions, axis=0))) if cameras else 1.0
         return {
             "name": self.name,
             "scene": self.scene_name,
@@ -73,13 +68,7 @@ class Rendering:
             "grey": display_gain(self.response),
             "curve": _curve(self.response),
             "clipped": self.clipped is not None,
-            "up": (np.asarray(up) / max(float(np.linalg.norm(up)), 1e-9)).tolist(),
-            "focus": None if focus is None else focus.tolist(),
-            "size": size or 1.0,
-            "views": [
-                {"name": entry.name, "split": entry.split, "camera": entry.camera.to_dict()} for entry in self.cameras
-            ],
-        }
+        } | facts_of_cameras(self.cameras)
 
 
 def camera_of(values: dict) -> Camera:

@@ -69,7 +69,7 @@ class Viewer:
                 page_file("style.css") + page.joinpath("viewer.css").read_text(encoding="utf-8"),
             ),
             "/light.js": ("text/javascript", page_file("light.js")),
-            "/camera.js": ("text/javascript", page.joinpath("camera.js").read_text(encoding="utf-8")),
+            "/camera.js": ("text/javascript", page_file("camera.js")),
             "/viewer.js": ("text/javascript", page.joinpath("viewer.js").read_text(encoding="utf-8")),
         }
 

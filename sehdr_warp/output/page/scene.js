@@ -1,0 +1,126 @@
+// A scene in one file: PlayCanvas blends its Gaussians as linear light into half floats; light.js exposes them.
+"use strict";
+
+const $ = id => document.getElementById(id);
+const facts = JSON.parse($("facts").textContent), light = new LightCanvas($("picture")), camera = new FlyingCamera(facts.up);
+const stage = $("stage"), STILL_AFTER = 160, DRAFT_TIME = 60;
+let app, eye, color, target, sorted = 0, wanted = null, busy = false, timer = 0, scale = 0.5;
+
+async function start() {
+  const means = new Float32Array((await unpackLight($("means").textContent)).buffer), half = await unpackLight($("rest").textContent);
+  const table = Float32Array.from({length: 65536}, (_, i) => fromHalf(i)), count = means.length / 3;
+  const properties = facts.columns.map((name, k) => {
+    const storage = k < 3 ? means.subarray(k * count, (k + 1) * count) : Float32Array.from(half.subarray((k - 3) * count, (k - 2) * count), h => table[h]);
+    return {name, type: "float", storage, byteSize: 4};
+  });
+  const device = await pc.createGraphicsDevice($("engine"), {deviceTypes: ["webgl2"], antialias: false});
+  const options = new pc.AppOptions();
+  options.graphicsDevice = device;
+  options.componentSystems = [pc.CameraComponentSystem, pc.GSplatComponentSystem];
+  options.resourceHandlers = [pc.TextureHandler, pc.ContainerHandler, pc.GSplatHandler];
+  app = new pc.AppBase($("engine"));
+  app.init(options);
+  app.setCanvasResolution(pc.RESOLUTION_FIXED, 16, 16);
+  app.autoRender = false;
+  const splat = new pc.Entity();
+  // Not unified: that renderer keeps colors in formats that end at 1.
+  splat.addComponent("gsplat", {unified: false});
+  splat.gsplat.resource = new pc.GSplatResource(device, new pc.GSplatData([{name: "vertex", count, properties}]));
+  app.root.addChild(splat);
+  eye = new pc.Entity();
+  // As far as the engine knows its colors are encoded, and it leaves them as they are.
+  eye.addComponent("camera", {clearColor: new pc.Color(0, 0, 0, 1), toneMapping: pc.TONEMAP_NONE, gammaCorrection: pc.GAMMA_SRGB});
+  app.root.addChild(eye);
+  app.start();
+  splat.gsplat.instance.sorter.on("updated", () => { sorted++; request(wanted ?? false); });
+  facts.views.forEach((view, i) => $("view").add(new Option(view.name, i)));
+  new ResizeObserver(moved).observe(stage);
+  jump(0);
+}
+
+function resize(width, height) {
+  if (target && target.width === width && target.height === height) return;
+  if (target) target.destroy(), color.destroy();
+  const filters = {minFilter: pc.FILTER_NEAREST, magFilter: pc.FILTER_NEAREST};
+  color = new pc.Texture(app.graphicsDevice, {width, height, format: pc.PIXELFORMAT_RGBA16F, mipmaps: false, ...filters});
+  target = new pc.RenderTarget({colorBuffer: color, depth: true});
+  eye.camera.renderTarget = target;
+}
+
+function place(c) {  // The engine's camera: OpenGL axes, +y up and +z back
+  const [x, y, z] = c.world_to_camera, at = centerOf(c), pose = new pc.Mat4(), near = facts.size * 1e-3, far = facts.size * 1e3;
+  pose.set([x[0], x[1], x[2], 0, -y[0], -y[1], -y[2], 0, -z[0], -z[1], -z[2], 0, ...at, 1]);
+  eye.setPosition(pose.getTranslation());
+  eye.setRotation(new pc.Quat().setFromMat4(pose));
+  eye.camera.nearClip = near, eye.camera.farClip = far;
+  eye.camera.calculateProjection = matrix => matrix.set([2 * c.fx / c.width, 0, 0, 0, 0, 2 * c.fy / c.height, 0, 0,
+    1 - 2 * c.cx / c.width, 2 * c.cy / c.height - 1, -(far + near) / (far - near), -1, 0, 0, -2 * far * near / (far - near), 0]);
+}
+
+function moved() {
+  delete stage.dataset.frame;
+  clearTimeout(timer);
+  timer = setTimeout(() => request(false), STILL_AFTER);
+  request(true);
+}
+async function request(draft) {
+  if (!stage.clientWidth) return;
+  wanted = wanted === null ? draft : wanted && draft;
+  if (busy) return;
+  busy = true;
+  while (wanted !== null) {
+    const isDraft = wanted, started = performance.now();
+    wanted = null;
+    await render(isDraft ? scale : 1);
+    if (isDraft) scale = Math.min(1, Math.max(0.15, scale * Math.min(1.5, Math.max(0.5, Math.sqrt(DRAFT_TIME / (performance.now() - started))))));
+    else if (wanted === null && sorted) stage.dataset.frame = "full";
+  }
+  busy = false;
+}
+async function render(part) {
+  const ratio = Math.min(window.devicePixelRatio || 1, 2) * part, [width, height] = [stage.clientWidth, stage.clientHeight].map(x => Math.max(8, Math.round(x * ratio)));
+  resize(width, height);
+  place(stage.seen = camera.at(width, height));
+  app.renderNextFrame = true;
+  await new Promise(done => app.once("frameend", done));
+  const rows = await color.read(0, 0, width, height, {renderTarget: target, immediate: true}), upright = new Uint16Array(rows.length);
+  for (let y = 0; y < height; y++) upright.set(rows.subarray(4 * width * (height - 1 - y), 4 * width * (height - y)), 4 * width * y);
+  $("picture").width = width, $("picture").height = height;
+  light.put("scene", width, height, upright, 4);
+  paint();
+}
+function paint() {
+  const stops = Number($("stops").value);
+  $("stopsTold").textContent = `${stopsText(stops)} \u00b7 ${secondsText(facts.base_time * 2 ** stops)}`;
+  if (light.frames.scene) light.draw({stops, tone: $("tone").value, grey: facts.grey});
+}
+function jump(index) {
+  const view = facts.views[index].camera, from = centerOf(view);
+  const ahead = facts.focus ? dot(add(facts.focus, from, -1), view.world_to_camera[2].slice(0, 3)) : 0;
+  camera.jump(view, ahead > 0 ? ahead : facts.size / 2);
+  moved();
+}
+
+$("stops").addEventListener("input", paint);
+$("tone").addEventListener("change", paint);
+$("view").addEventListener("change", () => $("view").value && jump(Number($("view").value)));
+$("panel").addEventListener("submit", event => event.preventDefault());
+let drag = null;
+stage.addEventListener("pointerdown", event => { stage.setPointerCapture(event.pointerId); drag = [event.clientX, event.clientY]; });
+stage.addEventListener("pointermove", event => {
+  if (!drag || !event.buttons) return;
+  const size = Math.min(stage.clientWidth, stage.clientHeight), x = (event.clientX - drag[0]) / size, y = (event.clientY - drag[1]) / size;
+  drag = [event.clientX, event.clientY];
+  if (event.buttons & 6 || event.shiftKey) camera.pan(x, y);
+  else if (event.altKey) camera.look(-x, -y);
+  else camera.orbit(2.5 * x, 2.5 * y);
+  moved();
+});
+stage.addEventListener("contextmenu", event => event.preventDefault());
+stage.addEventListener("wheel", event => { event.preventDefault(); camera.dolly(Math.exp(Math.sign(event.deltaY) * Math.min(60, Math.abs(event.deltaY)) / 500)); moved(); }, {passive: false});
+stage.addEventListener("keydown", event => {
+  const pace = facts.size * 0.03, step = {w: [0, 0, pace], s: [0, 0, -pace], a: [-pace, 0, 0], d: [pace, 0, 0], e: [0, pace, 0], q: [0, -pace, 0]}[event.key.toLowerCase()];
+  if (step) camera.fly(...step), moved();
+  if (event.key === "[" || event.key === "]") { $("stops").value = Number($("stops").value) + (event.key === "]" ? 1 : -1) / 3; paint(); }
+});
+start().catch(error => { $("told").textContent = error.message; });

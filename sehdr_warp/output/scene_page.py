@@ -1,0 +1,74 @@
+"""A scene as one HTML file that opens from disk: its Gaussians as linear light, and an engine that blends them so.
+
+The engine is PlayCanvas 2.23.3 (MIT, page/playcanvas.LICENSE), unchanged. It blends into half floats, which light.js
+exposes: light above white stays.
+"""
+
+import base64
+import json
+import zlib
+from html import escape
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from sehdr_warp import __version__
+from sehdr_warp.errors import InputError
+
+from ..field.baking import gaussians_of
+from ..files import atomic_path, check_absent
+from ..splats.arrays import HARMONIC_0
+from .camera_paths import facts_of_cameras
+from .light_pictures import display_gain, page_file
+
+_HALF = float(np.finfo(np.float16).max)
+
+
+def write_scene_page(run: Any, path: Path | str, *, overwrite: bool = False) -> Path:
+    """Writes a run as one HTML file, which shows it in any browser with WebGL2, under an exposure slider and without a
+    network; returns the path.
+
+    Means are float32, all else half. Raises InputError where the file exists (unless overwrite), a value is not finite
+    or the scene has no cameras to look from.
+    """
+    path = Path(path)
+    check_absent(path, overwrite)
+    if not run.cameras:
+        raise InputError(path, "the scene has no cameras to look from", "export the run, or put cameras.json beside it")
+    seen = [entry.camera for entry in run.cameras if entry.split == "train"] or [e.camera for e in run.cameras]
+    gaussians = gaussians_of(run.model, "linear", np.array([camera.position for camera in seen]))
+    gaussians.require_finite(path)
+    harmonics = np.clip(gaussians.harmonics * np.float32(run.base_time), -_HALF, _HALF)
+    columns = dict(zip("xyz", gaussians.means.T))
+    # As 3DGS has them: a color is 0.5 and the sum.
+    columns |= {f"f_dc_{i}": harmonics[:, 0, i] - 0.5 / HARMONIC_0 for i in range(3)}
+    higher = harmonics[:, 1:].transpose(2, 1, 0).reshape(-1, gaussians.count)
+    columns |= {f"f_rest_{i}": column for i, column in enumerate(higher)}
+    columns["opacity"] = gaussians.opacity_logits
+    columns |= {f"scale_{i}": column for i, column in enumerate(gaussians.log_scales.T)}
+    columns |= {f"rot_{i}": column for i, column in enumerate(gaussians.unit_quaternions.T)}
+    values = np.stack(list(columns.values()))
+    facts = facts_of_cameras(run.cameras) | {
+        "columns": list(columns),
+        "base_time": run.base_time,
+        "grey": display_gain(run.response),
+    }
+    page = Template(page_file("scene.html")).substitute(
+        version=__version__,
+        title=escape(str(run.scene_name)),
+        style=page_file("style.css") + page_file("scene.css"),
+        facts=json.dumps(facts).replace("<", "\\u003c"),
+        means=_packed(values[:3].astype("<f4")),
+        rest=_packed(values[3:].astype("<f2")),
+        engine=page_file("playcanvas.min.js").replace("</script", "<\\/script"),
+        script=page_file("light.js") + page_file("camera.js") + page_file("scene.js"),
+    )
+    with atomic_path(path, overwrite) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    return path
+
+
+def _packed(values: np.ndarray) -> str:
+    return base64.b64encode(zlib.compress(np.ascontiguousarray(values).tobytes(), 6)).decode()

@@ -1,0 +1,64 @@
+"""The page to send, in a real browser and from disk: the light is that of our own renders."""
+
+import time
+
+import numpy as np
+import pytest
+
+from sehdr_warp.errors import InputError, UsageError
+from sehdr_warp.output.commands import Export, run_export
+from sehdr_warp.output.images import as_array
+from sehdr_warp.output.light_pictures import display_gain
+from sehdr_warp.output.scene_page import write_scene_page
+from sehdr_warp.output.tonemap import encode_srgb
+from sehdr_warp.scene import Camera
+from sehdr_warp.training.train import train
+
+from ..training.toy import toy_scene
+from .browser import browser, page_of, pixels
+
+FULL = "#stage[data-frame=full]"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    config = {"schedule.iterations": 60, "plan.enabled": False}
+    return train(toy_scene(), tmp_path_factory.mktemp("toy") / "run", config, device="cpu")
+
+
+def test_the_page_shows_the_light_of_the_scene(run, tmp_path):
+    file = write_scene_page(run, tmp_path / "scene.html")
+    assert file.stat().st_size < 30e6
+    with browser() as chromium, page_of(chromium, file.as_uri(), 240, 200) as page:
+        started = time.monotonic()
+        page.wait_for_selector(FULL)
+        loaded = time.monotonic() - started
+        camera = Camera.from_dict(page.evaluate("document.getElementById('stage').seen"))
+        light = as_array(run.render(camera).hdr) * run.base_time * display_gain(run.response)
+        for stops in (-4, 0, 3):
+            page.locator("#stops").evaluate(
+                "(s, v) => { s.value = v; s.dispatchEvent(new Event('input')); }", str(stops)
+            )
+            error = pixels(page, "#picture") - encode_srgb(light * 2.0**stops)
+            assert -10 * np.log10(np.mean(error**2)) > 30, stops
+        assert "EV" in page.text_content("#stopsTold") and loaded < 30  # In software, on a machine with other work
+        page.locator("#stage").evaluate("stage => delete stage.dataset.frame")
+        page.mouse.move(100, 80)
+        page.mouse.down()
+        page.mouse.move(140, 90, steps=3)
+        page.mouse.up()
+        page.wait_for_selector(FULL)
+        assert page.evaluate("document.getElementById('stage').seen.world_to_camera") != camera.world_to_camera.tolist()
+
+
+def test_refusals(run, tmp_path):
+    (tmp_path / "mine.html").write_text("mine")
+    with pytest.raises(InputError, match="exists already"):
+        write_scene_page(run, tmp_path / "mine.html")
+    with pytest.raises(UsageError, match="--out alone"):
+        run_export(Export(run=run.path, out=tmp_path / "new.html", cameras=True))
+    cameras, run.cameras = run.cameras, ()
+    with pytest.raises(InputError, match="no cameras"):
+        write_scene_page(run, tmp_path / "new.html")
+    run.cameras = cameras
+    assert [file.name for file in tmp_path.iterdir()] == ["mine.html"]
