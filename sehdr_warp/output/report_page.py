@@ -134,15 +134,15 @@ def _pictures(comparisons: Sequence["Comparison"], times: Mapping[str, float], g
         "Held-out views, which the training never saw" if held_out else "Views that were trained on; none is held out"
     )
     lead = f"{what}. Drag across a picture; choose what stands on either side."
+    known = any(each.truth is not None for each in comparisons)
     if plain:
-        lead += (
-            f" Plain JPEG, tone-mapped; with imagecodecs (<code>{WITHOUT_GAIN_MAPS}</code>) they would be Ultra HDR."
-        )
+        lead += f" Plain JPEG, tone-mapped; imagecodecs (<code>{WITHOUT_GAIN_MAPS}</code>) would make them Ultra HDR."
     else:
-        lead += (
-            f" Scene and truth are Ultra HDR: up to {MOST_STOPS:g} stops over white on an HDR display, plain on others."
-        )
-    return _section("Photo, scene, truth", lead, f'<div class="views">{"".join(figures)}</div>')
+        lead += f" {'Scene and truth are' if known else 'The scene is'} Ultra HDR: "
+        lead += f"up to {MOST_STOPS:g} stops over white on an HDR display, plain on others."
+    return _section(
+        "Photo, scene, truth" if known else "Photo and scene", lead, f'<div class="views">{"".join(figures)}</div>'
+    )
 
 
 def _brackets(shown: "Comparison", time: float, gain: float) -> str:
@@ -248,29 +248,26 @@ def _table(evaluation: Mapping[str, Any] | None, held_out: bool) -> str:
     if evaluation is None:
         return ""
     hdr = evaluation["protocol"]["gt-max"]
+    known = hdr["psnr_mu"] is not None
 
     def figures(ldr: Mapping, protocol: Mapping) -> list[str]:
-        return [
-            number(ldr["psnr"], 2),
-            number(ldr["ssim"], 3),
-            number(protocol["psnr_mu"], 2),
-            number(protocol["ssim_mu"], 3),
-        ]
+        light = [number(protocol["psnr_mu"], 2), number(protocol["ssim_mu"], 3)] if known else []
+        return [number(ldr["psnr"], 2), number(ldr["ssim"], 3), *light]
 
     none = {"psnr_mu": None, "ssim_mu": None}
     rows = [[row["name"], *figures(row["ldr"], row["protocol"].get("gt-max", none))] for row in evaluation["views"]]
-    titles = ("view", "photo PSNR, dB", "photo SSIM", "HDR mu-law PSNR, dB", "HDR mu-law SSIM")
+    titles = ["view", "photo PSNR, dB", "photo SSIM", *["HDR mu-law PSNR, dB", "HDR mu-law SSIM"] * known]
     body = _rows(titles, rows, mean=["mean", *figures(evaluation["ldr"], hdr)], first_number=1)
     regions = [
-        [name, f"{values['fraction']:.1%}", number(values["psnr_ldr"], 2), number(values["psnr_mu"]["gt-max"], 2)]
+        [name, f"{values['fraction']:.1%}", number(values["psnr_ldr"], 2)]
+        + [number(values["psnr_mu"]["gt-max"], 2)] * known
         for name, values in evaluation["regions"].items()
     ]
-    titles = ("part of the photos", "pixels", "photo PSNR, dB", "HDR mu-law PSNR, dB")
+    titles = ["part of the photos", "pixels", "photo PSNR, dB", *["HDR mu-law PSNR, dB"] * known]
     body += "\n<br>\n" + _rows(titles, regions, first_number=1)
     split = "Held-out views" if held_out else "Training views, since none is held out: figures flatter"
-    return _section(
-        "Figures", f"{split}. HDR under the protocol gt-max; <code>sehdr-warp eval</code> has the others.", body
-    )
+    told = " HDR under the protocol gt-max; <code>sehdr-warp eval</code> has the others." if known else ""
+    return _section("Figures", f"{split}.{told}", body)
 
 
 def _map(run: Any, comparisons: Sequence["Comparison"]) -> str:

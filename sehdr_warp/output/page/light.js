@@ -192,7 +192,7 @@ function fromHalf(h) {
 }
 
 const luminance = ([r, g, b]) => 0.2126 * r + 0.7152 * g + 0.0722 * b;
-const stopsText = stops => (stops < 0 ? "\u2212" : "+") + Math.abs(stops).toFixed(1) + " EV";
+const stopsText = stops => (Math.abs(stops) < 0.05 ? "" : stops < 0 ? "\u2212" : "+") + Math.abs(stops).toFixed(1) + " EV";
 const secondsText = time => time < 0.3 ? `1/${(1 / time).toFixed(time < 0.05 ? 0 : 1)} s` : `${Number(time.toPrecision(3))} s`;
 
 // Deflated half floats in base64, as the report and notebooks carry them.
