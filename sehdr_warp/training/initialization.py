@@ -3,12 +3,14 @@
 import logging
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import torch
 
 from ..errors import InputError, SehdrError
+from ..field.baking import field_of, gaussians_of
 from ..field.color_models import color_model
 from ..field.exposure import exposure_times
 from ..field.fusion import NeuralExposureFusion
@@ -17,6 +19,7 @@ from ..field.radiance_field import RadianceField
 from ..response import Response, ToneMapper, response_by_name
 from ..scene import Scene, View
 from ..scene.load import best_response, photos_to_judge
+from ..splats import read_gaussians
 from .config import Config
 from .densification import gaussian_budget
 from .matching import Matcher
@@ -76,6 +79,9 @@ def make_field(
     trained."""
     check_views(scene)
     rng = np.random.default_rng(config.seed)
+    if config.model.start:
+        gaussians = start_gaussians(scene, config, response, rng)
+        return assemble_field(gaussians, config, response, base_time(scene)).to(device)
     matcher = matcher or partial(make_matcher, scene, response, device)
     points, colors = start_points(scene, config, matcher, rng)
     most = config.densification.max_gaussians
@@ -86,6 +92,23 @@ def make_field(
     points, dc = (torch.tensor(values, dtype=torch.float32) for values in (points, dc))
     gaussians = Gaussians.from_points(points, dc, config.model.harmonics_degree)
     return assemble_field(gaussians, config, response, base_time(scene)).to(device)
+
+
+def start_gaussians(scene: Scene, config: Config, response: Response, rng: np.random.Generator) -> Gaussians:
+    """Those of the file that model.start names, in the config's color model and degree. Display colors count as codes
+    of the scene's own photos; radiance is in the scene's units."""
+    read, time = read_gaussians(config.model.start), base_time(scene)
+    if read.count > config.densification.max_gaussians:
+        read = read.rows(np.sort(rng.choice(read.count, config.densification.max_gaussians, replace=False)))
+    degree = config.model.harmonics_degree
+    read = replace(read.padded(degree), base_time=time if read.color_model == "display" else read.base_time)
+    read = replace(read, harmonics=read.harmonics[:, : (degree + 1) ** 2])
+    field = field_of(read)
+    field.response = response
+    positions = np.stack([view.camera.position for view in scene.train_views])
+    wanted = gaussians_of(field, config.model.radiance, positions, time)
+    _log.info("starting from the %d Gaussians of %s", read.count, config.model.start)
+    return field_of(replace(wanted, base_time=time)).gaussians.requires_grad_()
 
 
 def start_points(

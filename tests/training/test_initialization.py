@@ -6,18 +6,22 @@ import numpy as np
 import pytest
 
 from sehdr_warp.errors import SehdrError
+from sehdr_warp.field.baking import field_of
 from sehdr_warp.field.color_models import color_model
 from sehdr_warp.response import response_by_name
+from sehdr_warp.splats import write_gaussians
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.initialization import (
     base_time,
     choose_response,
     colors_in_views,
     focus_distance,
+    make_field,
     random_points,
     scene_extent,
 )
 
+from ..splats.test_splat_files import gaussians
 from .toy import orbit_camera, toy_scene
 
 RADIUS = np.hypot(4.0, 0.8)
@@ -35,6 +39,26 @@ def test_cameras_at_one_place_have_an_extent(scene):
     assert scene_extent(dataclasses.replace(scene, views=still)) > 0
     assert scene_extent(dataclasses.replace(scene, views=still, points=np.zeros((0, 3)))) == 1.0
     assert focus_distance(still) > 0
+
+
+@pytest.mark.parametrize("radiance, degree", [("log", 1), ("linear", 3), ("display", 1)])
+def test_a_training_starts_from_a_file_of_gaussians(scene, tmp_path, radiance, degree):
+    file = tmp_path / "start.ply"
+    written = gaussians(200, degree=1, color_model="display" if radiance == "display" else "log")
+    write_gaussians(file, written)
+    config = {"model.start": str(file), "model.radiance": radiance, "model.harmonics_degree": degree}
+    response = response_by_name("srgb")
+    field = make_field(scene, load_config("default", config), response, "cpu")
+    assert field.gaussians.count == 200 and field.gaussians.degree == degree
+    camera = scene.views[0].camera
+    expected = field_of(written).render(camera).hdr
+    if radiance == "display":  # Colors of the scene's own photos.
+        expected = expected * written.base_time / base_time(scene)
+    found = field.render(camera).hdr
+    assert float(expected.max()) > 0.01
+    assert float((found - expected).abs().mean()) < 0.02 * float(expected.mean())
+    few = load_config("default", config | {"densification.max_gaussians": 50})
+    assert make_field(scene, few, response, "cpu").gaussians.count == 50
 
 
 def test_drawn_points_are_seen_and_repeat(scene):
