@@ -46,7 +46,8 @@ class Render(_Rendered):
     size: str | None = None
     """Width and height in pixels, such as 1920x1080; by default the cameras' own."""
     passes: str = ""
-    """Parts of the EXR files beside the picture, such as depth,normals: depth, position, normals, alpha, confidence."""
+    """Parts of the EXR files beside the picture, such as depth,normals: depth, position, normals, alpha, confidence,
+    clipped."""
     evs: str | None = None
     """Brackets in stops from the photos' exposure, such as --evs=-4,-2,0,2,4."""
     exposures: str | None = None

@@ -1,4 +1,4 @@
-"""Data passes of a view: depth, position, normals, coverage, confidence, each a part of its own, tagged as data."""
+"""Data passes of a view: depth, position, normals, coverage, confidence, clipped share, each a part of its own, tagged as data."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -45,10 +45,17 @@ def _alpha(run, rendered, camera: Camera) -> Channels:
 
 
 def _confidence(run, rendered, camera: Camera) -> Channels:
-    measured = run.render_confidence(camera)
-    if measured is None:
+    return {"confidence": _measured(run, run.render_confidence(camera))}
+
+
+def _clipped(run, rendered, camera: Camera) -> Channels:
+    return {"clipped": _measured(run, run.render_clipped(camera))}
+
+
+def _measured(run, values) -> np.ndarray:
+    if values is None:
         raise SehdrError(f"{run.path}: its confidence was not measured; `sehdr-warp report` does, from the photos")
-    return {"confidence": as_array(measured)}
+    return as_array(values)
 
 
 PASSES: Mapping[str, Callable[[Any, Any, Camera], Channels]] = {
@@ -57,6 +64,7 @@ PASSES: Mapping[str, Callable[[Any, Any, Camera], Channels]] = {
     "normals": _normals,
     "alpha": _alpha,
     "confidence": _confidence,
+    "clipped": _clipped,
 }
 
 

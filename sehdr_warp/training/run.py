@@ -73,6 +73,17 @@ class _Rendered:
         return self.model.render_confidence(camera)
 
 
+    def clipped_share(self) -> Tensor | None:
+        """[N] in [0, 1]: which share of the values that show a Gaussian were clipped; None where not measured."""
+        return None
+
+    def render_clipped(self, camera: Camera) -> Tensor | None:
+        """[H, W] in [0, 1]: which share of the values that show what a camera sees were clipped; None where that was
+        not measured."""
+        share = self.clipped_share()
+        return None if share is None else self.model.render_mean(camera, share)
+
+
 class Splats(_Rendered):
     """A file of Gaussians as a scene to render, re-expose and export. Its response is sRGB.
 
@@ -131,7 +142,6 @@ class Run(_Rendered):
         return import_module("sehdr_warp.output.notebook").run_html(self)
 
     def clipped_share(self) -> Tensor | None:
-        """[N] in [0, 1]: which share of the values that show a Gaussian were clipped; None where not measured."""
         if self.model.confidence is None:
             return None
         clipped = self.folder.read_clipped()

@@ -53,6 +53,7 @@ class AnalyticRun:
     base_time = 0.5
     scene_name = "sky"
     iterations = 7
+    path = "runs/sky"
     gaussian_count, train_seconds, path = 1234, 65.0, "runs/sky"
 
     def __init__(self, names=(("r_0", "train"), ("r_1", "train"), ("r_2", "train"), ("t_0", "test"), ("t_1", "test"))):
@@ -77,6 +78,9 @@ class AnalyticRun:
         if not self.confident:
             return None
         return np.tile(np.linspace(1, 0, view.width, dtype=np.float32), (view.height, 1))
+
+    def render_clipped(self, view):
+        return np.full((view.height, view.width), 0.25, np.float32) if self.confident else None
 
     def render(self, view):
         self.rendered += 1

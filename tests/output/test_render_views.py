@@ -181,12 +181,12 @@ def test_paths_need_cameras():
 def test_passes_are_parts_of_their_own(tmp_path):
     OpenEXR = pytest.importorskip("OpenEXR")
     run = AnalyticRun()
-    render_views(run, tmp_path, passes="depth,position,normals,alpha,confidence")
+    render_views(run, tmp_path, passes="depth,position,normals,alpha,confidence,clipped")
     view, rendered = run.cameras[3].camera, run.render(run.cameras[3].camera)
     with OpenEXR.File(str(tmp_path / "hdr" / "t_0.exr"), separate_channels=True) as file:
         headers = {part.name(): dict(part.header) for part in file.parts}
         pixels = {name: channel.pixels for part in file.parts for name, channel in part.channels.items()}
-    assert list(headers) == ["rgba", "depth", "position", "normals", "alpha", "confidence"]
+    assert list(headers) == ["rgba", "depth", "position", "normals", "alpha", "confidence", "clipped"]
     assert headers.pop("rgba")["colorInteropID"] == "lin_rec709_scene"
     assert all(h["colorInteropID"] == "data" and "chromaticities" not in h for h in headers.values())
     points = np.stack([pixels[f"position.{axis}"] for axis in "XYZ"], 2)
@@ -195,6 +195,10 @@ def test_passes_are_parts_of_their_own(tmp_path):
     # A plane across the view, nearly: its normal is against the axis.
     normal = np.stack([pixels[f"N.{axis}"] for axis in "XYZ"], 2)[1:-1, 1:-1]
     np.testing.assert_allclose(normal @ -view.world_to_camera[2, :3], 1, atol=2e-3)
+    assert (pixels["clipped"] == 0.25).all()
+    run.confident = False
+    with pytest.raises(SehdrError, match="was not measured"):
+        render_views(run, tmp_path, passes="clipped", overwrite=True)
     for passes, words in (("depht", "did you mean depth"), ("alpha,alpha", "named twice")):
         with pytest.raises(SehdrError, match=words):
             render_views(run, tmp_path, passes=passes, overwrite=True)
