@@ -1,4 +1,5 @@
-"""Data passes of a view: depth, position, normals, coverage, confidence, clipped share, each a part of its own, tagged as data."""
+"""Data passes of a view, each a part of its own, tagged as data: depth, position, normals, coverage, confidence, and
+clipped share."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

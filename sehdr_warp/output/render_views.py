@@ -58,7 +58,8 @@ def render_views(
 
     cameras: "train", "test", "all", "orbit", "interpolate", or a file (see load_cameras). count: views of an orbit or
     interpolation. size: width and height in pixels, or "1920x1080", in place of the cameras' own: the vertical field of
-    view stays. passes: of depth, position, normals, alpha, confidence and clipped, each a part of `hdr/<view>.exr` of its own.
+    view stays. passes: of depth, position, normals, alpha, confidence and clipped, each a part of its own of
+    `hdr/<view>.exr`.
     overwrite: replaces the folders hdr, preview and brackets of an earlier render; other files in `out` stay.
     Cameras that see nothing are named in a warning.
 

@@ -72,7 +72,6 @@ class _Rendered:
         """[H, W] in [0, 1]: how far the photos vouch for what a camera sees; None where that was not measured."""
         return self.model.render_confidence(camera)
 
-
     def clipped_share(self) -> Tensor | None:
         """[N] in [0, 1]: which share of the values that show a Gaussian were clipped; None where not measured."""
         return None
