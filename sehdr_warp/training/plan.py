@@ -264,7 +264,8 @@ def _densification(facts: SceneFacts, config: Config, device: torch.device) -> C
 def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     preset = config.schedule.iterations
     wanted = min(preset, math.ceil(max(FEWEST_ITERATIONS, PASSES * facts.photos) / 100) * 100)
-    reason = f"{PASSES} steps on each of {facts.photos} photos, at least {FEWEST_ITERATIONS}, at most {preset}"
+    bounds = f"at least {FEWEST_ITERATIONS}, at most {preset}" if preset > FEWEST_ITERATIONS else f"at most {preset}"
+    reason = f"{PASSES} steps on each of {facts.photos} photos, {bounds}"
     if device.type == "cpu":
         step = cpu_step_seconds(facts, config)
         most = max(CPU_FEWEST, math.ceil(CPU_SECONDS / step / 100) * 100)
