@@ -30,6 +30,7 @@ _WRITE_ERRORS = {getattr(errno, name) for name in _REFUSALS.split() if hasattr(e
 # The largest file that is read whole: the biggest COLMAP models in use (Mip-NeRF 360, city captures) are well under it.
 MAX_FILE_BYTES = 4 << 30
 MAX_JSON_BYTES = 256 << 20
+_MAX_LINE = 16 << 20
 LIST = ".sehdr-warp"
 """The list of a folder: a line `SHA-256  name` for each file that this program has written there."""
 
@@ -191,6 +192,23 @@ def read_text(path: Path, limit: int = MAX_FILE_BYTES) -> str:
         return read_bytes(path, limit).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(path, f"is not UTF-8 text (byte {error.start})", "export the file again") from None
+
+
+def read_lines(path: Path) -> Iterator[str]:
+    """The lines of a file of UTF-8 text, one by one; raises InputError as read_text does, and for a line too long."""
+    try:
+        if path.stat().st_size == 0:
+            read_bytes(path)
+        with open(path, encoding="utf-8-sig") as file:
+            while line := file.readline(_MAX_LINE):
+                if len(line) == _MAX_LINE:
+                    raise InputError(path, f"has a line of over {_MAX_LINE} characters", "check that this is the file")
+                yield line.rstrip("\n")
+    except UnicodeDecodeError as error:
+        raise InputError(path, f"is not UTF-8 text ({error.reason})", "export the file again") from None
+    except OSError as error:
+        problem = "file not found" if isinstance(error, FileNotFoundError) else f"cannot be read ({error.strerror})"
+        raise InputError(path, problem, "check the data folder") from None
 
 
 def read_json(path: Path) -> dict:

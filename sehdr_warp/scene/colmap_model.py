@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from ..files import read_bytes, read_text
+from ..files import read_bytes, read_lines
 from .capture import NO_POINTS, Cloud, pose_from_quaternion
 from .lens import CAMERA_MODELS, Lens
 
@@ -169,7 +169,7 @@ def _points_binary(path: Path) -> Cloud:
 
 def _records(path: Path, what: str, parse: Callable[[str], tuple], lines_each: int = 1) -> Iterator[tuple]:
     """parse(line) of a text file's lines but empty ones and comments; ValueError becomes an InputError."""
-    lines = enumerate(read_text(path).splitlines(), start=1)
+    lines = enumerate(read_lines(path), start=1)
     for number, line in lines:
         if not line.strip() or line.startswith("#"):
             continue

@@ -68,7 +68,7 @@ def test_lossless_packing_costs_half_precision_alone(truth, tmp_path, compressio
     for a, b in zip(scene.views, before.views, strict=True):
         np.testing.assert_allclose(a.hdr, b.hdr * scale, rtol=6e-4)
         assert np.abs(a.image - b.image).max() <= 1.001 / 255
-    size = sum(path.stat().st_size for path in (tmp_path / "small").rglob("*.*") if path.name != "synth.json")
+    size = sum(path.stat().st_size for path in (tmp_path / "small").rglob("[!.]*.*") if path.name != "synth.json")
     assert packing["bytes"] == size
     assert json.loads((tmp_path / "small" / "synth.json").read_text())["packing"]["compression"] == compression
 
@@ -126,7 +126,7 @@ def test_embedded_scenes_have_truth_and_a_well_exposed_photo(name):
         assert np.isfinite(view.hdr).all() and view.hdr.min() >= 0
     making = json.loads((SCENES / name / "synth.json").read_text())
     assert making["scene"] == name and making["denoise"] == "oidn" and making["seed"] == 0
-    size = sum(p.stat().st_size for p in (SCENES / name).rglob("*.*") if p.name != "synth.json")
+    size = sum(p.stat().st_size for p in (SCENES / name).rglob("[!.]*.*") if p.name != "synth.json")
     assert size == making["packing"]["bytes"] < 2e6
     median = np.median([view.image for view in scene.train_views])
     assert 0.2 < median < 0.8

@@ -1,0 +1,101 @@
+"""Standard streams that fail, signals that end, and what the system refuses: one line, and the work is not lost."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from sehdr_warp.errors import SehdrError, UsageError, surroundings_told
+from sehdr_warp.process import _Stream
+from sehdr_warp.training.machine import interruptible
+
+
+@pytest.mark.parametrize(
+    "line, code, told",
+    [
+        ("presets --json > /dev/full", 1, "sehdr-warp: standard output cannot be written (No space left on device)"),
+        ("presets --json >&-", 1, "sehdr-warp: standard output cannot be written (Bad file descriptor)"),
+        ("presets --json 2>&- | grep -q purpose", 0, ""),
+        ("presets 2> /dev/full <&-", 0, ""),
+        ("frobnicate 2> /dev/full", 2, ""),
+    ],
+)
+def test_streams(line, code, told):
+    call = f"{sys.executable} -m sehdr_warp {line}"
+    ended = subprocess.run(["bash", "-c", call], capture_output=True, text=True, check=False)
+    assert ended.returncode == code and ended.stderr.startswith(told) and ended.stderr.count("\n") == bool(told)
+
+
+def test_what_is_said_of_the_work_never_ends_it():
+    class Full:
+        def write(self, text):
+            raise OSError(28, "No space left on device")
+
+    read, written = os.pipe()
+    stream = _Stream(Full(), written, asked=False)
+    assert stream.write("loss 0.1") == 8
+    os.write(written, b"to nowhere")
+    with pytest.raises(SehdrError, match="standard output cannot be written"):
+        _Stream(Full(), written, asked=True).write("{}")
+    os.close(written)
+    assert os.read(read, 99) == b""
+    os.close(read)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_the_first_signal_waits_for_the_end_of_the_block_and_the_second_does_not(number):
+    class Ended(BaseException):
+        pass
+
+    def end(*_):
+        raise Ended
+
+    before, reached = signal.signal(number, end), []
+    try:
+        with pytest.raises(Ended), interruptible() as interrupted:
+            signal.raise_signal(number)
+            reached.append(interrupted.is_set())
+        with pytest.raises(Ended), interruptible():
+            signal.raise_signal(number)
+            signal.raise_signal(number)
+            reached.append("never")
+        with pytest.raises(ValueError), interruptible():
+            signal.raise_signal(number)
+            raise ValueError
+        signal.signal(number, signal.SIG_IGN)
+        with interruptible() as interrupted:
+            signal.raise_signal(number)
+            reached.append(interrupted.is_set())
+    finally:
+        signal.signal(number, before)
+    assert reached == [True, False]
+
+
+@pytest.mark.parametrize(
+    "error, told",
+    [
+        (OSError(36, "File name too long", "nnn"), "nnn: cannot be used (File name too long); check"),
+        (OSError(5, "Input/output error"), "a file: cannot be used (Input/output error)"),
+        (MemoryError(), "out of memory (no more)"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: 8 bytes"), "out of memory (Default"),
+        (ImportError("libx.so: failed to map segment from shared object"), "out of memory (libx.so"),
+        (UnicodeEncodeError("utf-8", "\udcff", 0, 1, "surrogates"), r"'\udcff': is a name that is not UTF-8"),
+        (UsageError("train needs --out"), "train needs --out"),
+        (ZeroDivisionError(), None),
+        (RuntimeError("shapes differ"), None),
+    ],
+)
+def test_what_the_surroundings_refuse_is_one_line(error, told):
+    found = surroundings_told(error)
+    assert found is None if told is None else str(found).startswith(told)
+
+
+@pytest.mark.parametrize("columns", [1, 5])
+def test_narrow_terminals_get_help(columns):
+    call = [sys.executable, "-m", "sehdr_warp", "train", "--help"]
+    ended = subprocess.run(
+        call, env=os.environ | {"COLUMNS": str(columns)}, capture_output=True, timeout=60, check=False
+    )
+    assert ended.returncode == 0 and b"--iterations" in ended.stdout
