@@ -1,0 +1,171 @@
+"""Command lines in children of a process that has loaded everything, so that hundreds take minutes: each is watched for
+what it says, how long it takes, how much memory, and which programs it starts."""
+
+import importlib
+import os
+import resource
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from contextlib import chdir, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from sehdr_warp import cli
+from sehdr_warp.synth.expose import RadianceView
+from tests.make_scenes import write_blender, write_reinhard
+from tests.training.toy import toy_scene
+
+COMMANDS = {
+    "train": "train photos --out run --preset demo --response hdr-nerf --iterations 24 --device cpu --seed 3",
+    "render": "render run --out made --cameras all --evs=-2,0 --device cpu --overwrite",
+    "export": "export run --out made/scene.ply --kind hdr --overwrite",
+    "export usd": "export run --out made/scene.usda --overwrite",
+    "report": "report run --out made --device cpu --overwrite",
+    "panorama": "panorama run --out made/light.exr --size 32 --device cpu --overwrite",
+    "eval": "eval run --json made/figures.json --device cpu --overwrite",
+    "synth": "synth truth --out set --overwrite",
+    "quality": "bench quality --scenes truth --methods demo --iterations 4 --out made --device cpu",
+}
+COMMANDS = {name: line.split() for name, line in COMMANDS.items()}
+TRAIN = COMMANDS.pop("train")
+STARTED = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.spawn")
+CHANGES = ("rename", "replace", "unlink", "rmdir", "mkdir", "fsync", "open", "write")
+"""Functions of os at which a child may be killed."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command line ended. code: as of subprocess; memory: MiB, at most; changes: calls of CHANGES."""
+
+    code: int
+    out: str
+    err: str
+    seconds: float
+    memory: int
+    changes: int
+
+
+def load(folder: Path) -> None:
+    """Loads what commands need, and their kernels by using them once, all on one thread: others do not survive a fork.
+    Leaves photos, a run `run` and what commands make of it in `folder`."""
+    os.environ |= {"SEHDR_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "MPLBACKEND": "agg"}
+    write_blender(folder / "photos", 6, size=(24, 16))
+    views = [RadianceView(view.name, view.camera, view.hdr, view.split) for view in toy_scene(6, 16).views]
+    write_reinhard(folder / "truth", views, [0.5, 2.0])
+    importlib.import_module("torch").set_num_threads(1)
+    for words in (TRAIN, *COMMANDS.values()):
+        with chdir(folder), suppress(SystemExit):
+            cli.main([*words, "-q"])
+
+
+def call(
+    *words: object,
+    folder: Path,
+    kill_after: float | None = None,
+    kill_at: int | None = None,
+    seconds: float = 60.0,
+    prepare: Callable[[], None] = lambda: None,
+) -> Ended:
+    """Runs a command line in a child, in `folder`. kill_after: seconds until SIGKILL; kill_at: the change of the disk
+    at which it comes. Raises AssertionError for what no command line may do: a traceback, a hang, a program started."""
+    said, started = [folder / f".{name}" for name in ("out", "err")], time.monotonic()
+    count = folder / ".count"
+    child = os.fork()
+    if child == 0:
+        _run([str(word) for word in words], folder, said, count, kill_at, prepare)
+    status, usage = 0, None
+    while usage is None:
+        done, status, used = os.wait4(child, os.WNOHANG)
+        usage = used if done else None
+        late = time.monotonic() - started
+        if usage is None and late > (kill_after if kill_after is not None else seconds):
+            os.kill(child, signal.SIGKILL)
+            _, status, usage = os.wait4(child, 0)
+            assert kill_after is not None, f"hangs for {seconds} s: {words}"
+        time.sleep(0.005)
+    out, err = (path.read_text(errors="replace") for path in said)
+    changes = int(count.read_text() or 0) if count.exists() else 0
+    for path in (*said, count):
+        path.unlink(missing_ok=True)
+    code = os.waitstatus_to_exitcode(status)
+    assert "Traceback" not in err and "STARTED" not in err, f"{words}: {err[-2000:]}"
+    assert code in (0, 1, 2, 129, 130, 141, 143, -signal.SIGKILL), f"{words}: ended with {code}: {err[-500:]}"
+    lines = err.splitlines()
+    assert code not in (1, 2) or (lines and lines[-1].startswith("sehdr-warp: ")), f"{words}: {err[-500:]}"
+    return Ended(code, out, err, time.monotonic() - started, usage.ru_maxrss // 1024, changes)
+
+
+def _run(words, folder, said, count, kill_at, prepare) -> None:
+    code = 70
+    try:
+        os.chdir(folder)
+        for number, path in enumerate((Path(os.devnull), *said)):
+            handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o600)
+            os.dup2(handle, number)
+            os.close(handle)
+        sys.stdin, sys.stdout, sys.stderr = (os.fdopen(n, m, closefd=False) for n, m in enumerate("rww"))
+        for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(each, signal.default_int_handler if each == signal.SIGINT else signal.SIG_DFL)
+        sys.argv = ["sehdr-warp", *words]
+        sys.addaudithook(_watch)
+        prepare()
+        made = _count(kill_at)
+        from sehdr_warp.__main__ import run
+
+        try:
+            run()
+        finally:
+            sys.stdout.flush()
+            count.write_text(str(made[0]))
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except BaseException:  # noqa: BLE001
+        traceback.print_exc()
+    finally:
+        os._exit(code)
+
+
+def _watch(event: str, arguments) -> None:
+    if event.startswith(STARTED) and str(arguments[0]) != sys.executable:
+        os.write(2, f"STARTED {event} {arguments[:2]}\n".encode())
+
+
+def _count(kill_at: int | None) -> list[int]:
+    """Counts the changes of the disk, and kills the process before the one of that number."""
+    made = [0]
+
+    def counted(function):
+        def call(*arguments, **options):
+            made[0] += 1
+            if made[0] == kill_at:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return function(*arguments, **options)
+
+        return call
+
+    for name in CHANGES:
+        setattr(os, name, counted(getattr(os, name)))
+    return made
+
+
+def limit_memory(mebibytes: int) -> Callable[[], None]:
+    """Leaves a child so much address space beyond what it has."""
+
+    def prepare() -> None:
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        most = pages * resource.getpagesize() + (mebibytes << 20)
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+
+    return prepare
+
+
+def files_in(folder: Path) -> dict[str, bytes | str]:
+    """Content of every file, and where links lead; leftovers have hidden names."""
+    return {
+        str(path.relative_to(folder)): os.readlink(path) if path.is_symlink() else path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_symlink() or path.is_file()
+    }

@@ -1,0 +1,78 @@
+"""SIGKILL at any moment: what was whole stays whole, what was begun can be finished, to the same bits."""
+
+import json
+import random
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from sehdr_warp.files import LIST, foreign
+from sehdr_warp.training.run_folder import RunFolder
+
+from .harness import COMMANDS, TRAIN, call
+
+pytestmark = pytest.mark.trial
+SEED, KILLS, KILLS_EACH = 19, 50, 20
+ANEW = [word if word != "run" else "new" for word in TRAIN] + ["-q"]
+
+
+def result(run: Path):
+    """What a training made, without its times."""
+    folder = RunFolder(run)
+    checkpoint = folder.newest_checkpoint()
+    metrics = [{name: value for name, value in line.items() if name != "seconds"} for line in folder.read_metrics()]
+    values = {name: checkpoint.values[name] for name in ("iteration", "order", "skipped_steps", "run")}
+    return checkpoint.tensors, values, metrics
+
+
+def left_over(folder: Path) -> list[str]:
+    return [path.name for path in folder.rglob(".*") if path.name not in (LIST, ".lock")]
+
+
+def finish(space: Path) -> None:
+    """Goes on with the training in `new`, or begins it where nothing was; it must end as that in `run` did."""
+    out = space / "new"
+    ended = call("train", "--resume", "--out", "new", "--device", "cpu", "-q", folder=space)
+    if ended.code:
+        assert not out.exists() or not list(out.glob("[!.]*")), ended.err
+        assert call(*ANEW, folder=space).code == 0
+    for (tensors, *told), (expected, *stated) in [(result(out), result(space / "run"))]:
+        assert told == stated and tensors.keys() == expected.keys()
+        assert all(torch.equal(tensors[name], expected[name]) for name in expected)
+    assert left_over(space) == []
+
+
+@pytest.mark.parametrize("number", range(KILLS))
+def test_training_killed_at_random(space, number):
+    took = 1.3 * json.loads((space / "run" / "took.json").read_text())
+    call(*ANEW, folder=space, kill_after=random.Random(SEED * 1000 + number).uniform(0, took))
+    finish(space)
+
+
+@pytest.mark.parametrize("number", range(KILLS))
+def test_training_killed_at_a_change_of_the_disk(space, number):
+    changes = json.loads((space / "run" / "changes.json").read_text())["train"]
+    call(*ANEW, folder=space, kill_at=1 + number * changes // KILLS)
+    finish(space)
+
+
+@pytest.mark.parametrize("number", range(KILLS_EACH))
+@pytest.mark.parametrize("name", COMMANDS)
+def test_commands_killed_at_a_change_of_the_disk(space, name, number):
+    """What is replaced is whole, before or after; what a user keeps beside it stays; the next call ends the work."""
+    changes = json.loads((space / "run" / "changes.json").read_text())[name]
+    words = COMMANDS[name] + (["--seeds", "0,1"] if name == "quality" else [])
+    kept = {path: path.read_bytes() for path in space.rglob("result.json")}
+    (space / "made" / "notes.txt").write_text("mine")
+    run = shutil.copytree(space / "run", space / "copy")
+    assert call(*words, folder=space, kill_at=1 + number * changes // KILLS_EACH).code in (0, -9)
+    for path in (*(space / "made").glob("[!.]*"), space / "set"):
+        theirs = foreign(path) if path.exists() else None
+        assert theirs is None or theirs.name == "notes.txt" or path.name == "jobs", f"{theirs} is not whole"
+    assert call(*words, folder=space).code == 0
+    assert (space / "made" / "notes.txt").read_text() == "mine"
+    assert {path: path.read_bytes() for path in kept} == kept, "finished jobs were run again"
+    assert left_over(space) == []
+    assert sorted(path.name for path in run.rglob("*")) == sorted(path.name for path in (space / "run").rglob("*"))
