@@ -24,7 +24,7 @@ from ..errors import InputError, SehdrError
 from ..files import atomic_folder, is_sealed, usable, user_cache
 from .colmap_model import SparseModel, read_model
 from .develop import told
-from .images import EXIF_ERRORS, open_image, read_ldr
+from .images import EXIF_ERRORS, LDR_SUFFIXES, open_image, read_ldr
 
 _log = logging.getLogger("sehdr_warp.scene")
 
@@ -142,7 +142,10 @@ def _focal_prior(equivalent: str, width: int, height: int) -> float:
 
 
 def _device(photo: Path) -> tuple[str, ...]:
-    """EXIF's maker, model, focal length and its 35 mm equivalent, as text; "None" where EXIF does not say."""
+    """EXIF's maker, model, focal length and its 35 mm equivalent, as text; "None" where EXIF does not say, and of RAW
+    and float photos, which are of one camera anyhow."""
+    if photo.suffix.lower() not in LDR_SUFFIXES:
+        return ("None",) * 4
     with open_image(photo) as image:
         try:
             exif = image.getexif()

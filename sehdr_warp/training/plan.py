@@ -48,6 +48,7 @@ class SceneFacts:
     points: sparse points. seen: mean number of photos whose field of view holds a probe.
     overlap: part of the probes, or of places along the cameras' rays if that is more, that two photos show.
     clipped, black: part of the pixels with a channel at white, with all at 0. contrast: deviation of all codes.
+    light_known: the photos hold light itself: RAW, linear, float.
     drift: stops, about, between the darkest and the brightest photo's median where no exposure times are known; else 0.
     """
 
@@ -62,6 +63,7 @@ class SceneFacts:
     black: float
     contrast: float
     drift: float
+    light_known: bool = False
 
 
 @dataclass(frozen=True)
@@ -166,6 +168,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         black=black,
         contrast=float(np.sqrt(max(square - mean**2, 0.0))),
         drift=0.0 if scene.exposure_times_known else float(np.ptp(figures[:, -1])),
+        light_known=scene.light_known,
     )
 
 
@@ -216,6 +219,8 @@ def check_fields(scene: Scene, config: Config) -> None:
 
 def _response(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     name = config.response.name
+    if facts.light_known:
+        return {}, "no search", "the photos hold light itself"
     if name != "auto":
         return {}, "no search", "learned with the scene" if name == "learned" else f"{name} was named"
     made = "a camera made the files" if facts.from_camera else "nothing says what made the files"

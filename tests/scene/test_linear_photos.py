@@ -14,6 +14,7 @@ from sehdr_warp.output.images import write_picture
 from sehdr_warp.output.radiance_file import write_radiance
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.linear_photos import color_matrix, raw_codes, raw_exposure
+from sehdr_warp.scene.sfm import _device, _write_photos
 from sehdr_warp.training.run import Splats
 
 from ..output.helpers import camera
@@ -154,3 +155,12 @@ def test_a_scene_in_a_sensors_colors_is_rendered_in_rec709(tmp_path):
     options = {"focal_length": 50.0, "pixel_angle": 0.0}
     seen = scene.render_directions(np.zeros(3), np.array([[[0.0, 0, 1]]]), **options)
     assert seen.hdr.shape == (1, 1, 3)
+
+
+def test_structure_from_motion_asks_linear_photos_for_no_exif(tmp_path):
+    write_exr(tmp_path / "a.exr", rgb_channels(picture()))
+    sizes, small = _write_photos([tmp_path / "a.exr"], tmp_path / "copies")
+    assert _device(tmp_path / "a.exr") == ("None",) * 4
+    assert (sizes, small) == ([(32, 24)], [(32, 24)])
+    copy = np.asarray(Image.open(tmp_path / "copies" / "00000.png"))
+    assert copy.dtype == np.uint8 and 60 < copy.mean() < 180
