@@ -155,8 +155,8 @@ def test_a_training_ends_by_saying_what_to_type_next(run, capsys):
     assert call("train", "--resume", "--out", run, "--device", "cpu") == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith(f"{run}: 30 iterations, ") and "held-out PSNR" in lines[0]
-    assert len(lines) == 3 and all(
-        f"sehdr-warp {word} {run}" in "".join(lines) for word in ("render", "report", "export")
+    assert len(lines) == 4 and all(
+        f"sehdr-warp {word} {run}" in "".join(lines) for word in ("view", "render", "report", "export")
     )
 
 
