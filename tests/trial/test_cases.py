@@ -221,7 +221,7 @@ SURROUNDINGS = {
     "long photos": f"{S} train {LONG} --out new",
     "long run": f"{S} train photos --out {LONG} --iterations 2",
     "not UTF-8": f"{S} train $'/tmp/\\xff' --out new",
-    "not UTF-8 out": f"{S} export run --kind hdr --json --out $'n\\xff.ply'",
+    "not UTF-8 out": f"{S} export run --kind hdr --out $'n\\xff.ply'",
     "run not UTF-8": f"cp -r run $'r\\xff'; {S} render $'r\\xff' --out new --device cpu",
     "NUL and newline": f"{S} export run --kind hdr --out $'a\\nb.ply'",
     "a file for a run": f"{S} render photos/transforms.json --out new",
