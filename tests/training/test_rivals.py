@@ -48,7 +48,7 @@ def without_truth(scene, *names):
 
 @pytest.mark.parametrize("name", RIVALS)
 def test_every_rival_learns_and_loads_as_it_was_trained(scene, tmp_path, name):
-    config = quick(name, **RIVALS[name], **{"schedule.iterations": 100})
+    config = quick(name, **RIVALS[name], **{"schedule.iterations": 250})
     # What trains without truth trains without any there.
     given = scene if config.loss.uses_hdr else without_truth(scene)
     run = train(given, tmp_path / "run", config, device="cpu")
