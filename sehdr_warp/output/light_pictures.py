@@ -10,9 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from PIL import Image
 
-from .images import quantize
+from sehdr_warp.scene import View
+
+from .images import as_array, quantize
 from .tonemap import encode_srgb
 
 MIDDLE_GREY = 0.18
@@ -26,6 +29,19 @@ def display_gain(response: Any) -> float:
     for an sRGB or linear camera."""
     grey = float(response.decode(encode_srgb(np.array([MIDDLE_GREY])).astype(np.float64))[0])
     return MIDDLE_GREY / grey if grey > 0 else 1.0
+
+
+def photo_light(run: Any, view: View) -> np.ndarray:
+    """[H, W, 3] linear Rec.709 radiance that a photo alone tells: the run's response undone."""
+    light = np.asarray(run.response.decode(view.image), np.float32) / view.exposure_time
+    return light if run.color_matrix is None else as_array(run.in_rec709(torch.from_numpy(light)))
+
+
+def shown_photo(run: Any, view: View) -> np.ndarray:
+    """[H, W, 3] in [0, 1] as a photo is looked at: its encoded values, or of a RAW one its light as sRGB."""
+    if run.color_matrix is None:
+        return view.image
+    return encode_srgb(np.clip(photo_light(run, view) * view.exposure_time, 0, 1))
 
 
 @cache

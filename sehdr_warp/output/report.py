@@ -17,6 +17,7 @@ from ..files import atomic_path, check_absent
 from .camera_paths import interpolate
 from .charts import PANELS, QUIET, STYLE, training_chart, training_points
 from .images import as_array
+from .light_pictures import photo_light, shown_photo
 from .report_page import STOPS, report_page
 from .report_page import seconds as _seconds
 from .report_page import stops_text as _stops
@@ -155,9 +156,8 @@ def compare(run, view: View, views: Sequence[View]) -> Comparison:
     if others:
         nearest = min(others, key=lambda camera: float(np.linalg.norm(camera.position - view.camera.position)))
         new = as_array(run.render(interpolate([view.camera, nearest], 3)[1]).hdr)
-    from_photo = np.asarray(run.response.decode(view.image)) / view.exposure_time
     confidence = None if confidence is None else as_array(confidence)
-    return Comparison(view.name, view.image, from_photo, hdr, view.hdr, confidence, new)
+    return Comparison(view.name, shown_photo(run, view), photo_light(run, view), hdr, view.hdr, confidence, new)
 
 
 def _caption(views: Sequence[View], metrics: Sequence[dict], held_out: bool) -> str:

@@ -21,6 +21,7 @@ from .light_pictures import (
     img,
     jpeg,
     page_file,
+    shown_photo,
     side_choices,
     ultra_hdr,
 )
@@ -197,7 +198,7 @@ def _unexplained(run: Any, scene: Scene) -> str:
             photos.setdefault(region["photo"], []).append(region)
     figures = []
     for name, regions in list(photos.items())[:_MOST_PHOTOS]:
-        image = views[name].image
+        image = shown_photo(run, views[name])
         (height, width), size = image.shape[:2], _size(image, _PICTURE)
         # Lines and letters that look the same on any size of photo.
         unit, boxes = width / 420, []

@@ -50,7 +50,7 @@ class _Rendered:
     def render(self, camera: Camera) -> RenderedView:
         """HDR radiance [H, W, 3], alpha [H, W] and depth [H, W] from a camera."""
         rendered = self.model.render(camera, degree=self.degree)
-        return replace(rendered, hdr=self._rec709(rendered.hdr))
+        return replace(rendered, hdr=self.in_rec709(rendered.hdr))
 
     def render_directions(
         self, position: np.ndarray, directions: np.ndarray, *, focal_length: float, pixel_angle: float
@@ -59,9 +59,10 @@ class _Rendered:
         given = (torch.tensor(values, dtype=torch.float32, device=self.device) for values in (position, directions))
         options = {"focal_length": focal_length, "pixel_angle": pixel_angle, "degree": self.degree}
         seen = self.model.render_directions(*given, **options)
-        return replace(seen, hdr=self._rec709(seen.hdr))
+        return replace(seen, hdr=self.in_rec709(seen.hdr))
 
-    def _rec709(self, hdr: Tensor) -> Tensor:
+    def in_rec709(self, hdr: Tensor) -> Tensor:
+        """[..., 3] radiance in linear Rec.709 of radiance in the colors that the scene was trained in."""
         return hdr if self.color_matrix is None else rec709_of(hdr, self.color_matrix, self.base_time)
 
     def render_ldr(self, camera: Camera, exposure_time: float | None = None) -> Tensor:

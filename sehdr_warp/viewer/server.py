@@ -23,7 +23,7 @@ from ..errors import SehdrError
 from ..output.camera_paths import interpolate
 from ..output.film import write_film
 from ..output.images import quantize
-from ..output.light_pictures import page_file
+from ..output.light_pictures import page_file, shown_photo
 from ..output.render_views import render_views
 from .frames import Rendering, camera_file, camera_of
 
@@ -123,7 +123,8 @@ class Viewer:
         if found is None:
             raise Refusal(404, "no such photo")
         buffer = io.BytesIO()
-        Image.fromarray(quantize(found.image)).save(buffer, "PNG", compress_level=1)
+        photo = shown_photo(self._run({"run": run}), found)
+        Image.fromarray(quantize(photo)).save(buffer, "PNG", compress_level=1)
         return buffer.getvalue()
 
     def _save(self, run: Rendering, cameras: Sequence, kind: str, asked: dict) -> tuple[str, bytes]:

@@ -50,7 +50,7 @@ class AnalyticRun:
     """Stands for a trained run: a sky whose radiance depends on the viewing direction, six decades of it."""
 
     response = GammaResponse()
-    base_time = 0.5
+    base_time, color_matrix = 0.5, None
     scene_name = "sky"
     iterations = 7
     path = "runs/sky"

@@ -4,7 +4,8 @@ from PIL import Image
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.output.charts import training_chart
-from sehdr_warp.output.report import Comparison, comparison_figure, stops_figure, write_report
+from sehdr_warp.output.report import Comparison, compare, comparison_figure, stops_figure, write_report
+from sehdr_warp.output.tonemap import encode_srgb
 from sehdr_warp.scene import Scene, View, codes_of
 
 from .helpers import AnalyticRun
@@ -79,6 +80,16 @@ def test_stops_show_what_the_photo_lost(tmp_path):
     assert np.ptp(photo[0][clipped]) < 1e-6
     assert np.ptp(hdr[0][clipped]) > 0.01
     np.testing.assert_array_equal(hdr, truth)
+
+
+def test_photos_in_a_sensors_colors_are_shown_as_the_scene_is(tmp_path):
+    run, scene = make(tmp_path)
+    view, plain = scene.views[0], compare(run, scene.views[0], scene.views)
+    run.color_matrix, run.in_rec709 = np.eye(3), lambda light: light[..., [2, 1, 0]]
+    shown = compare(run, view, scene.views)
+    np.testing.assert_allclose(shown.from_photo, plain.from_photo[..., ::-1], rtol=1e-6)
+    exposure = np.clip(shown.from_photo * view.exposure_time, 0, 1)
+    np.testing.assert_allclose(shown.photo, encode_srgb(exposure), atol=1e-6)
 
 
 def test_the_new_view_lies_halfway_to_the_nearest(tmp_path):
