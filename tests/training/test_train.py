@@ -307,7 +307,7 @@ def test_a_config_may_be_a_name_or_fields(scene, tmp_path, config):
             Training(scene, tmp_path / "run", config)
         return
     training = Training(scene, tmp_path / "run", config, device="cpu")
-    assert training.total == (1000 if config == "demo" else 3)
+    assert training.total == (700 if config == "demo" else 3)
 
 
 def test_held_out_photos_that_get_worse_are_told(scene, tmp_path, caplog):
