@@ -106,7 +106,7 @@ def projection_kernel(dtype, antialiased: bool):
 
 @cache
 def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
-    """count_tiles, emit_entries and blend for one scalar type and number of channels."""
+    """list_tiles and blend for one scalar type and number of channels."""
     g = geometry(dtype)
     real, vec3, vec4 = g.real, g.vec3, g.vec4
     features_type = vector(channels, dtype)
@@ -118,12 +118,16 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
         return one[0] * other[0] + one[1] * other[1] + one[2] * other[2] >= wp.cos(reach)
 
     @wp.kernel(module="unique", module_options=options)
-    def count_tiles(
+    def list_tiles(
         first: int, order: wp.array(dtype=wp.int32), caps: wp.array(dtype=vec4), tile_caps: wp.array(dtype=vec4),
-        block_caps: wp.array(dtype=vec4), columns: int, rows: int, counts: wp.array(dtype=wp.int32),
+        block_caps: wp.array(dtype=vec4), columns: int, rows: int, starts: wp.array(dtype=wp.int32),
+        counts: wp.array(dtype=wp.int32), tiles: wp.array(dtype=wp.int32), gaussians: wp.array(dtype=wp.int32),
     ):
+        """counts: the tiles that each Gaussian touches. Where tiles and gaussians have room, an entry for each of them
+        from starts[place] on."""
         place = first + wp.tid()
-        cap = caps[order[place]]
+        gaussian = order[place]
+        cap = caps[gaussian]
         count = int(0)
         if cap[3] > real(0.0):
             across = (columns + BLOCK_TILES - 1) // BLOCK_TILES
@@ -134,31 +138,11 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
                     for row in range(top, wp.min(top + BLOCK_TILES, rows)):
                         for column in range(left, wp.min(left + BLOCK_TILES, columns)):
                             if caps_meet(cap, tile_caps[row * columns + column]):
+                                if tiles.shape[0] > 0:
+                                    tiles[starts[place] + count] = row * columns + column
+                                    gaussians[starts[place] + count] = gaussian
                                 count += 1
         counts[place] = count
-
-    @wp.kernel(module="unique", module_options=options)
-    def emit_entries(
-        first: int, order: wp.array(dtype=wp.int32), caps: wp.array(dtype=vec4), tile_caps: wp.array(dtype=vec4),
-        block_caps: wp.array(dtype=vec4), columns: int, rows: int, counts: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32), tiles: wp.array(dtype=wp.int32), gaussians: wp.array(dtype=wp.int32),
-    ):
-        place = first + wp.tid()
-        gaussian = order[place]
-        cap = caps[gaussian]
-        entry = ends[place] - counts[place]
-        if counts[place] > 0:
-            across = (columns + BLOCK_TILES - 1) // BLOCK_TILES
-            for block in range(block_caps.shape[0]):
-                if caps_meet(cap, block_caps[block]):
-                    top = (block // across) * BLOCK_TILES
-                    left = (block % across) * BLOCK_TILES
-                    for row in range(top, wp.min(top + BLOCK_TILES, rows)):
-                        for column in range(left, wp.min(left + BLOCK_TILES, columns)):
-                            if caps_meet(cap, tile_caps[row * columns + column]):
-                                tiles[entry] = row * columns + column
-                                gaussians[entry] = gaussian
-                                entry += 1
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def blend(
@@ -206,4 +190,4 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
             image[pixel] = total
             transmittance[pixel] = left_over
 
-    return SimpleNamespace(count_tiles=count_tiles, emit_entries=emit_entries, blend=blend)
+    return SimpleNamespace(list_tiles=list_tiles, blend=blend)

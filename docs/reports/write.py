@@ -15,7 +15,6 @@ import plots
 from sehdr_warp.bench.quality import EXPOSURES, KNOWN, LEARNED, UPPER_BOUND
 from sehdr_warp.bench.results import COLUMNS, groups, machine_line, markdown_table, parted
 from sehdr_warp.errors import InputError
-from sehdr_warp.evaluation.protocols import PROTOCOLS
 from sehdr_warp.files import atomic_path, read_json
 
 HERE = Path(__file__).resolve().parent
@@ -148,18 +147,6 @@ def _quality_tables(result: dict) -> Iterable[str]:
         yield f"{shared} trainings shared a device: seconds and renders / s are those of a shared one."
 
 
-def _reading_tables(result: dict) -> Iterable[str]:
-    columns = {"reading=method": "", "response": "", "n": "d"}
-    columns |= {f"{name}={name.replace('-', '_')}": ".2f" for name in PROTOCOLS} | {"LDR dB=ldr": ".2f"}
-    table = []
-    for (truth, method, response), rows in groups(result["rows"], "sees_truth", "method", "response").items():
-        means = {field: fmean(row[field] for row in rows) for _, field, form in parted(columns) if form == ".2f"}
-        table.append({"truth": truth, "method": method, "response": response, "n": len(rows)} | means)
-    for truth in (False, True):
-        yield f"## With{'' if truth else 'out'} truth"
-        yield markdown_table([line for line in table if line["truth"] == truth], columns)
-
-
 def _captures_tables(result: dict) -> Iterable[str]:
     yield markdown_table(result["rows"], COLUMNS["captures"])
 
@@ -189,7 +176,6 @@ def _stability_tables(result: dict) -> Iterable[str]:
 TABLES: dict[str, Callable[[dict], Iterable[str]]] = {
     "quality": _quality_tables,
     "captures": _captures_tables,
-    "paper": _reading_tables,
     "kernels": _kernel_tables,
     "step": _step_tables,
     "scale": _scale_tables,

@@ -8,9 +8,8 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from ..errors import SehdrError
+from ..splats.arrays import HARMONIC_0
 from ..splatting.threads import thread_count
-
-HARMONIC_0 = 0.28209479177387814  # The value of the spherical harmonic of degree 0, 1 / (2 sqrt(pi))
 
 PARAMETER_NAMES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics_dc", "harmonics_rest")
 

@@ -7,12 +7,14 @@ from collections.abc import Mapping
 from functools import cache
 from html import escape
 from pathlib import Path
+from string import Template
 from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image
 
+from sehdr_warp import __version__
 from sehdr_warp.scene import View
 
 from .images import as_array, quantize
@@ -119,3 +121,10 @@ def side_choices(names: list[str], left: str, right: str) -> str:
 def page_file(name: str) -> str:
     """A file of the folder `page`."""
     return Path(__file__).parent.joinpath("page", name).read_text(encoding="utf-8")
+
+
+def whole_page(title: str, style: str, body: str) -> str:
+    """A page that needs no other file. title: plain text; style: a file of the folder `page`, after style.css; body:
+    HTML."""
+    filled = {"title": escape(title), "style": page_file("style.css") + page_file(style), "body": body}
+    return Template(page_file("page.html")).substitute(filled, version=__version__)

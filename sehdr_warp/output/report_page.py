@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from html import escape
-from string import Template
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from .light_pictures import (
     shown_photo,
     side_choices,
     ultra_hdr,
+    whole_page,
 )
 from .tonemap import expose, fit_tone_map
 
@@ -66,13 +66,9 @@ def report_page(
         _map(run, comparisons),
         _footer(run),
     ]
-    return Template(page_file("report.html")).substitute(
-        version=__version__,
-        title=f"{escape(scene.name)}: sehdr-warp report",
-        style=page_file("style.css") + page_file("report.css"),
-        script=page_file("light.js") + page_file("report.js"),
-        body="\n".join(filter(None, sections)),
-    )
+    main, script = "\n".join(filter(None, sections)), page_file("light.js") + page_file("report.js")
+    body = f"<main>\n{main}\n</main>\n<script>\n{script}</script>"
+    return whole_page(f"{scene.name}: sehdr-warp report", "report.css", body)
 
 
 def _section(title: str, lead: str, body: str) -> str:

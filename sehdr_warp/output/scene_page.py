@@ -14,14 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from sehdr_warp import __version__
 from sehdr_warp.errors import InputError
 
 from ..field.baking import gaussians_of
 from ..files import atomic_path, check_absent
 from ..splats.arrays import HARMONIC_0
 from .camera_paths import facts_of_cameras
-from .light_pictures import display_gain, page_file
+from .light_pictures import display_gain, page_file, whole_page
 
 _HALF = float(np.finfo(np.float16).max)
 
@@ -55,16 +54,15 @@ def write_scene_page(run: Any, path: Path | str, *, overwrite: bool = False) -> 
         "base_time": run.base_time,
         "grey": display_gain(run.response),
     }
-    page = Template(page_file("scene.html")).substitute(
-        version=__version__,
+    body = Template(page_file("scene.html")).substitute(
         title=escape(str(run.scene_name)),
-        style=page_file("style.css") + page_file("scene.css"),
         facts=json.dumps(facts).replace("<", "\\u003c"),
         means=_packed(values[:3].astype("<f4")),
         rest=_packed(values[3:].astype("<f2")),
         engine=page_file("playcanvas.min.js").replace("</script", "<\\/script"),
         script=page_file("light.js") + page_file("camera.js") + page_file("scene.js"),
     )
+    page = whole_page(str(run.scene_name), "scene.css", body)
     with atomic_path(path, overwrite) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return path

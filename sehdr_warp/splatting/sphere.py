@@ -8,7 +8,7 @@ from ..kernels.sphere import BLOCK_TILES, projection_kernel, sphere_kernels
 from .checks import check_opacities, check_tensors
 from .launching import launch, warp_scalar
 from .memory import memory_told
-from .tile_lists import depth_order, find_ranges, sort_by_tile
+from .tile_lists import checked_room, depth_order, find_ranges, sort_by_tile
 
 
 @torch.no_grad()
@@ -69,12 +69,12 @@ def rasterize_directions(
         kernels = sphere_kernels(scalar, channels)
         order = depth_order(distances, caps[:, 3:].expand(-1, 2).contiguous())
         frame = order, caps, tile_caps, block_caps, columns, rows
-        counts = torch.empty_like(order)
-        launch(kernels.count_tiles, count, *frame, counts, smallest=256)
-        ends = counts.cumsum(0, dtype=torch.int32)
-        room = int(counts.sum(dtype=torch.int64))
+        counts, none = torch.empty_like(order), order[:0]
+        launch(kernels.list_tiles, count, *frame, order, counts, none, none, smallest=256)
+        room = checked_room(int(counts.sum(dtype=torch.int64)), count, columns, rows)
+        starts = counts.cumsum(0, dtype=torch.int32) - counts
         tiles, gaussians = (torch.empty(2 * room, dtype=torch.int32, device=order.device) for _ in range(2))
-        launch(kernels.emit_entries, count * bool(room), *frame, counts, ends, tiles, gaussians, smallest=256)
+        launch(kernels.list_tiles, count * bool(room), *frame, starts, counts, tiles, gaussians, smallest=256)
         tiles, gaussians, _ = sort_by_tile(tiles, gaussians, room, columns * rows, False)
         ranges = find_ranges(tiles, columns * rows)
         image, transmittance = means.new_zeros(height, width, channels), means.new_ones(height, width)

@@ -90,11 +90,7 @@ def build_tile_lists(
     total = counts.sum(dtype=torch.int64)
     overflow = None if capacity is None else total > capacity
     room = int(total) if capacity is None else capacity
-    if room > LARGEST_CAPACITY:
-        raise SehdrError(
-            f"{len(order)} Gaussians touch {room} tiles of a {columns} x {rows} tile image, more than 2^31 - 1; "
-            "render fewer Gaussians or a smaller image"
-        )
+    checked_room(room, len(order), columns, rows)
     ends = counts.cumsum(0, dtype=torch.int32)
     tiles, gaussians = emit_entries(*touched, ends, room, capacity is not None)
     tiles, gaussians, places = sort_by_tile(tiles, gaussians, room, tile_count, emission)
@@ -142,6 +138,16 @@ def count_entries(order, shapes, ellipses, extents, columns: int, rows: int):
     kernel = tile_kernels(warp_scalar(shapes.dtype)).count_tiles
     launch(kernel, len(order), order, shapes, ellipses, extents, columns, rows, counts)
     return counts
+
+
+def checked_room(room: int, count: int, columns: int, rows: int) -> int:
+    """The entries to make room for. Raises SehdrError where they are too many to be counted."""
+    if room > LARGEST_CAPACITY:
+        raise SehdrError(
+            f"{count} Gaussians touch {room} tiles of a {columns} x {rows} tile image, more than 2^31 - 1; "
+            "render fewer Gaussians or a smaller image"
+        )
+    return room
 
 
 def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends, room: int, padded: bool):

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..field.gaussians import HARMONIC_0
 from ..field.radiance_field import RadianceField
+from ..splats.arrays import HARMONIC_0
 from .matching import Matcher
 from .targets import TrainingView
 
