@@ -42,21 +42,26 @@ def main(
     /,
     json: Path,
     max_size: int = 500,
+    iterations: int | None = None,
     seeds: tuple[int, ...] = (0,),
     lpips: Path | None = None,
 ) -> None:
-    """Compare on each folder of photos; lpips: a folder with LPIPS weights."""
+    """Compare on each folder of photos; iterations: of all, by default the plan's; lpips: a folder with LPIPS
+    weights."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     result = new_result("captures", torch.device("cuda"), {"max_size": max_size})
     for folder in folders:
         scene = load_scene(folder, max_size=max_size)
-        result["rows"] += [row for seed in seeds for row in compare(scene, seed, lpips)]
+        result["rows"] += [row for seed in seeds for row in compare(scene, seed, lpips, iterations)]
     finish(result, json, overwrite=True)
 
 
-def compare(scene: Scene, seed: int, lpips: Path | None, device: str = "cuda:0") -> list[dict]:
+def compare(
+    scene: Scene, seed: int, lpips: Path | None, iterations: int | None = None, device: str = "cuda:0"
+) -> list[dict]:
     """A row of held-out figures for each method."""
-    config = make_plan(scene, load_config("default", {"seed": seed})).config
+    named = {} if iterations is None else {"schedule.iterations": iterations, "plan.keep": ("schedule.iterations",)}
+    config = make_plan(scene, load_config("default", {"seed": seed, **named})).config
     stated = {"seed": seed, "schedule.iterations": config.schedule.iterations}
     config = load_config("default", stated | {"schedule.evaluate_at": (config.schedule.iterations,)})
     metric = load_lpips(lpips, torch.device(device))[0]

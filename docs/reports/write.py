@@ -7,7 +7,7 @@ import csv
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from statistics import fmean, median
+from statistics import fmean, median, stdev
 from typing import Any
 
 import plots
@@ -147,6 +147,31 @@ def _quality_tables(result: dict) -> Iterable[str]:
         yield f"{shared} trainings shared a device: seconds and renders / s are those of a shared one."
 
 
+def _seeds_tables(result: dict) -> Iterable[str]:
+    table = []
+    for (scene,), rows in groups(result["rows"], "scene").items():
+        values = [row["gt_max"] for row in rows]
+        line = {"scene": scene, "seeds": len(rows), "lights": rows[0]["lights_count"], "mean": fmean(values)}
+        line |= {"lost": sum(row["lights_lost"] for row in rows), "deviation": stdev(values), "worst": min(values)}
+        table.append(line | {"below": line["mean"] - line["worst"], "photos": fmean(row["ldr"] for row in rows)})
+    trained, lost = len(result["rows"]), sum(line["lost"] for line in table)
+    yield f"{trained} trainings lost {lost} of {sum(row['lights_count'] for row in result['rows'])} lights."
+    yield markdown_table(table, PAGES["seeds"]["columns"])
+
+
+def _readings_tables(result: dict) -> Iterable[str]:
+    columns = PAGES["readings"]["columns"]
+    for truth in (False, True):
+        rows = [row for row in result["rows"] if row["sees_truth"] is truth]
+        table = [
+            {"method": method, "n": len(mine)}
+            | {field: fmean(row[field] for row in mine) for _, field, form in parted(columns) if form == ".1f"}
+            for (method,), mine in groups(rows, "method").items()
+        ]
+        yield f"## {'With' if truth else 'Without'} truth"
+        yield markdown_table(sorted(table, key=lambda line: -line["gt_max"]), columns)
+
+
 def _captures_tables(result: dict) -> Iterable[str]:
     yield markdown_table(result["rows"], COLUMNS["captures"])
 
@@ -175,6 +200,8 @@ def _stability_tables(result: dict) -> Iterable[str]:
 
 TABLES: dict[str, Callable[[dict], Iterable[str]]] = {
     "quality": _quality_tables,
+    "seeds": _seeds_tables,
+    "readings": _readings_tables,
     "captures": _captures_tables,
     "kernels": _kernel_tables,
     "step": _step_tables,
