@@ -172,6 +172,18 @@ def _readings_tables(result: dict) -> Iterable[str]:
         yield markdown_table(sorted(table, key=lambda line: -line["gt_max"]), columns)
 
 
+def _bits_tables(result: dict) -> Iterable[str]:
+    rows, names = result["rows"], {"hdr": "HDR dB", "well_exposed": "well-exposed dB", "dark": "dark dB"}
+    table = []
+    for (exposure, kind, noise, bits), mine in groups(rows, "exposure", "kind", "noise", "bits").items():
+        line = {"exposure": exposure, "photos": f"{bits} bits, {kind}", "noise": noise}
+        table.append(line | {title: fmean(row[field] for row in mine) for field, title in names.items()})
+    yield markdown_table(table, {"exposure": "d", "photos": "", "noise": ""} | dict.fromkeys(names.values(), ".2f"))
+    yield "HDR dB of each scene:"
+    places = {"exposure": "d", "rounded as=kind": "", "noise": "", "bits": "d"}
+    yield _pivot(rows, places, "scene", "hdr", ".2f")
+
+
 def _captures_tables(result: dict) -> Iterable[str]:
     yield markdown_table(result["rows"], COLUMNS["captures"])
 
@@ -203,6 +215,7 @@ TABLES: dict[str, Callable[[dict], Iterable[str]]] = {
     "seeds": _seeds_tables,
     "readings": _readings_tables,
     "captures": _captures_tables,
+    "bits": _bits_tables,
     "kernels": _kernel_tables,
     "step": _step_tables,
     "scale": _scale_tables,

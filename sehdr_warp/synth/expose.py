@@ -64,7 +64,7 @@ def expose(scene: Scene, response, exposure_time: float, *, noise: SensorNoise |
         exposure = _truth(scene, view).astype(np.float64) * exposure_time
         if noise is not None:
             rng = np.random.default_rng([seed, zlib.crc32(view.name.encode())])
-            exposure = _noisy(exposure, response.clip_exposure if response.clips else response.white, noise, rng)
+            exposure = noisy(exposure, response.clip_exposure if response.clips else response.white, noise, rng)
         views.append(replace(view, codes=codes_of(response.encode(exposure), 8), exposure_time=float(exposure_time)))
     made = {"views": tuple(views), "point_colors": _recolored(scene, views), "exposure_times_known": True}
     return replace(scene, **made, response=None, chosen_by=None)
@@ -104,7 +104,7 @@ def _truth(scene: Scene, view: View) -> np.ndarray:
     return view.hdr
 
 
-def _noisy(exposure: np.ndarray, saturation: float, noise: SensorNoise, rng: np.random.Generator) -> np.ndarray:
+def noisy(exposure: np.ndarray, saturation: float, noise: SensorNoise, rng: np.random.Generator) -> np.ndarray:
     """The exposure that the sensor reports: photons counted up to the full well, then read out."""
     # Ten full wells saturate as surely as more, and Poisson's generator has a largest mean.
     photons = np.minimum(exposure / saturation, 10.0) * noise.full_well

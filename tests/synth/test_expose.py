@@ -8,7 +8,7 @@ import pytest
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
-from sehdr_warp.synth.expose import SensorNoise, _noisy, expose, exposure_ladder
+from sehdr_warp.synth.expose import SensorNoise, expose, exposure_ladder, noisy
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_the_same_photos_color_the_points_alike(room):
 
 def test_noise_has_the_variance_of_photons_and_read_out():
     noise, white = SensorNoise(full_well=1000.0, read_noise=3.0), 4.0
-    electrons = _noisy(np.full((300, 300, 3), 0.2 * white), white, noise, np.random.default_rng(0)) / white * 1000.0
+    electrons = noisy(np.full((300, 300, 3), 0.2 * white), white, noise, np.random.default_rng(0)) / white * 1000.0
     assert abs(electrons.mean() - 200) < 0.5
     assert abs(electrons.var() / (200 + 9) - 1) < 0.03
 
