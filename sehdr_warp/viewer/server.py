@@ -87,7 +87,7 @@ class Viewer:
             return "image/png", self._photo(path.removeprefix("/photo/"))
         raise Refusal(404, "no such page")
 
-    def post(self, path: str, asked: dict) -> tuple[str, bytes]:
+    def post(self, path: str, asked: dict) -> tuple[str, bytes | memoryview]:
         """Content type and content; raises Refusal, and what a bad question raises."""
         if path == "/training" and self.training is not None:
             self.training.control(str(asked["do"]))
@@ -222,7 +222,7 @@ class _Handler(BaseHTTPRequestHandler):
             raise Refusal(400, "a request is an object")
         return values
 
-    def _answer(self, find: Callable[[str], tuple[str, bytes]]) -> None:
+    def _answer(self, find: Callable[[str], tuple[str, bytes | memoryview]]) -> None:
         try:
             if not self.server.allowed(self.headers.get("Host", ""), self.headers.get("Origin")):
                 self.close_connection = True
