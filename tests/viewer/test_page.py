@@ -97,6 +97,26 @@ def test_looks_overlays_and_the_photo_beside(chromium, serve):
         page.check("#frusta")
 
 
+def test_the_table_is_the_shader(chromium, serve):
+    with page_of(chromium, serve().url) as page:
+        page.wait_for_selector(FULL)
+        for tone in ("none", "filmic", "response"):
+            page.select_option("#tone", tone)
+            slide(page, "#stops", 1.5)
+            looked_up = pixels(page, "#picture")
+            page.evaluate(
+                "const {width: w, height: h} = picture, c = light.gl.canvas; light.shade(w, h);"
+                "light.paper.drawImage(c, 0, c.height - h, w, h, 0, 0, w, h)"
+            )
+            np.testing.assert_allclose(looked_up, pixels(page, "#picture"), atol=1.5 / 255)
+        page.select_option("#tone", "aces")  # No table: coarser while it moves, then whole.
+        page.evaluate("light.drawn = performance.now(), light.scale = 0.25")
+        slide(page, "#stops", 0)
+        coarse = pixels(page, "#picture")
+        page.wait_for_timeout(800)
+        assert 1e-3 < np.abs(coarse - pixels(page, "#picture")).mean() < 0.1
+
+
 def test_moving_resizing_and_two_at_once(chromium, serve):
     server = serve()
     with page_of(chromium, server.url) as page, page_of(chromium, server.url) as other:

@@ -111,11 +111,30 @@ void main() {
   if (overlay == 6) color.rgb = mix(vec3(dot(color.rgb, LUMINANCE)) * 0.6, vec3(1.0, 0.25, 0.15), texture(clipped, uv).r);
 }`;
 
+// Of a half float's bits, its value.
+const HALVES = Float32Array.from({length: 65536}, (_, h) => {
+  const exponent = h >> 10 & 31, fraction = h & 1023, sign = h & 0x8000 ? -1 : 1;
+  if (exponent === 31) return fraction ? NaN : sign * Infinity;
+  return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : 2 ** -14 * fraction / 1024);
+});
+const fromHalf = h => HALVES[h];
+const srgb = x => x <= 0.0031308 ? 12.92 * x : 1.055 * x ** (1 / 2.4) - 0.055;
+const hable = x => (x * (0.15 * x + 0.05) + 0.004) / (x * (0.15 * x + 0.5) + 0.06) - 0.02 / 0.3;
+const QUICK = 12, PAUSE = 150;  // Milliseconds: of a draw while looks move, in software; and without one until they rest
+
+const software = gl => /swiftshader|llvmpipe|softpipe|software|basic render/i.test(
+  gl.getParameter((gl.getExtension("WEBGL_debug_renderer_info") || {UNMASKED_RENDERER_WEBGL: gl.RENDERER}).UNMASKED_RENDERER_WEBGL));
+
+// Where WebGL is software its canvas is not the one that is seen. Looks that treat channels alike and alone are then a
+// table of half floats, which takes a tenth of the time; all others are coarser while they move.
 class LightCanvas {
   constructor(canvas) {
-    const gl = canvas.getContext("webgl2", {antialias: false, preserveDrawingBuffer: true});
+    const made = document.createElement("canvas"), options = {antialias: false, preserveDrawingBuffer: true};
+    let gl = made.getContext("webgl2", options);
     if (!gl) throw new Error("this browser has no WebGL2");
-    this.canvas = canvas, this.gl = gl, this.textures = {}, this.frames = {}, this.programs = {};
+    if (software(gl)) this.paper = canvas.getContext("2d", {alpha: false});
+    else gl = canvas.getContext("webgl2", options);
+    this.canvas = canvas, this.gl = gl, this.textures = {}, this.frames = {}, this.programs = {}, this.stale = new Set();
     this.settings = {stops: 0, tone: "none", white: 4, overlay: "none", split: 0, left: 0, grey: 1, far: 1, middle: 1,
                      toPhoto: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], lens: [1, 1, .5, .5], photoLens: [1, 1, .5, .5]};
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
@@ -147,13 +166,17 @@ class LightCanvas {
 
   // Half floats (Uint16Array) of 1, 3 or 4 channels, top row first, for the texture of a name.
   put(name, width, height, half, channels) {
+    this.frames[name] = {width, height, half, channels};
+    this.stale.add(name);
+  }
+
+  upload(name, {width, height, half, channels}) {
     const gl = this.gl;
     const [inside, format] = {1: [gl.R16F, gl.RED], 3: [gl.RGB16F, gl.RGB], 4: [gl.RGBA16F, gl.RGBA]}[channels];
     gl.activeTexture(gl.TEXTURE0 + TEXTURES.indexOf(name));
     const filter = width === this.canvas.width && height === this.canvas.height ? gl.NEAREST : gl.LINEAR;
     for (const size of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, size, filter);
     gl.texImage2D(gl.TEXTURE_2D, 0, inside, width, height, 0, format, gl.HALF_FLOAT, half);
-    this.frames[name] = {width, height, half, channels};
   }
 
   putPhoto(image) {
@@ -163,17 +186,58 @@ class LightCanvas {
   }
 
   draw(changes = {}) {
-    const gl = this.gl, s = Object.assign(this.settings, changes);
-    const looks = {tone: TONES.indexOf(s.tone), overlay: OVERLAYS.indexOf(s.overlay), left: s.left};
-    const {program, places} = this.program(looks), at = name => places[name] ??= gl.getUniformLocation(program, name);
+    const s = Object.assign(this.settings, changes), {width, height} = this.canvas, fits = name => {
+      const f = this.frames[name];
+      return f && f.width === width && f.height === height;
+    };
+    clearTimeout(this.rest);
+    if (!this.paper) return this.shade(width, height);
+    if (["none", "filmic", "response"].includes(s.tone) && s.overlay === "none" && fits("scene") && (s.left === 0 || s.left === 1 && fits("other")))
+      return this.lookUp(width, height);
+    const before = performance.now(), moving = before - this.drawn < PAUSE, scale = moving ? this.scale : 1;
+    const [w, h] = [width, height].map(side => Math.max(1, Math.round(side * scale)));
+    this.shade(w, h);
+    this.paper.drawImage(this.gl.canvas, 0, this.gl.canvas.height - h, w, h, 0, 0, width, height);
+    this.drawn = performance.now();
+    this.scale = Math.min(1, Math.max(0.1, scale * Math.sqrt(QUICK / Math.max(1, this.drawn - before))));
+    if (scale < 1) this.rest = setTimeout(() => this.draw(), PAUSE);
+  }
+
+  // By the shader, into the lower left corner of WebGL's canvas.
+  shade(width, height) {
+    const gl = this.gl, s = this.settings, canvas = gl.canvas;
+    for (const name of this.stale) this.upload(name, this.frames[name]);
+    this.stale.clear();
+    if (this.paper && (canvas.width < width || canvas.height < height)) canvas.width = Math.max(width, canvas.width), canvas.height = Math.max(height, canvas.height);
+    const chosen = {tone: TONES.indexOf(s.tone), overlay: OVERLAYS.indexOf(s.overlay), left: s.left};
+    const {program, places} = this.program(chosen), at = name => places[name] ??= gl.getUniformLocation(program, name);
     gl.useProgram(program);
     for (const [name, value] of Object.entries({gain: 2 ** s.stops, grey: s.grey, white: s.white, split: s.split, far: s.far, middle: s.middle}))
       gl.uniform1f(at(name), value);
     gl.uniform4fv(at("lens"), s.lens);
     gl.uniform4fv(at("photoLens"), s.photoLens);
     gl.uniformMatrix4fv(at("toPhoto"), true, s.toPhoto);
-    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    gl.viewport(0, 0, width, height);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // By a table of what the looks make of each half float, over the frames in memory.
+  lookUp(width, height) {
+    const s = this.settings, gain = 2 ** s.stops, shown = gain * s.grey, white = hable(s.white);
+    const look = {none: x => srgb(shown * x), filmic: x => srgb(hable(2 * shown * x) / white), response: x => this.response(gain * x)}[s.tone];
+    const table = this.table ??= new Uint8Array(65536);  // Black for what is negative
+    for (let h = 0; h < 0x7c00; h++) table[h] = 255 * Math.min(1, look(HALVES[h])) + 0.5;
+    table[0x7c00] = table[0x7bff];
+    if (!this.image || this.image.width !== width || this.image.height !== height) this.image = new ImageData(width, height);
+    const pixels = new Uint32Array(this.image.data.buffer), edge = s.left === 1 ? Math.round(s.split * width) : 0;
+    if (edge > 0) exposeColumns(this.frames.other, table, pixels, 0, edge);
+    if (edge < width) exposeColumns(this.frames.scene, table, pixels, edge, width);
+    this.paper.putImageData(this.image, 0, 0);
+  }
+  response(x) {
+    const place = (Math.log2(Math.max(x, 1e-9)) - CURVE_LOW) / (CURVE_HIGH - CURVE_LOW) * (CURVE_SIZE - 1), {half} = this.frames.curve;
+    const at = Math.min(CURVE_SIZE - 1, Math.max(0, place)), low = Math.min(CURVE_SIZE - 2, Math.floor(at));
+    return HALVES[half[low]] + (at - low) * (HALVES[half[low + 1]] - HALVES[half[low]]);
   }
 
   // The channels of a texture at a place, 0 to 1 from the left and the top.
@@ -185,10 +249,11 @@ class LightCanvas {
   }
 }
 
-function fromHalf(h) {
-  const exponent = h >> 10 & 31, fraction = h & 1023, sign = h & 0x8000 ? -1 : 1;
-  if (exponent === 31) return fraction ? NaN : sign * Infinity;
-  return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : 2 ** -14 * fraction / 1024);
+// Columns from first to last of a frame through a table, as RGBA in bytes.
+function exposeColumns({width, height, half, channels}, table, pixels, first, last) {
+  for (let y = 0; y < height; y++)
+    for (let i = y * width + first, k = i * channels, end = y * width + last; i < end; i++, k += channels)
+      pixels[i] = 0xff000000 | table[half[k + 2]] << 16 | table[half[k + 1]] << 8 | table[half[k]];
 }
 
 const luminance = ([r, g, b]) => 0.2126 * r + 0.7152 * g + 0.0722 * b;

@@ -8,9 +8,9 @@ let app, eye, color, target, sorted = 0, wanted = null, busy = false, timer = 0,
 
 async function start() {
   const means = new Float32Array((await unpackLight($("means").textContent)).buffer), half = await unpackLight($("rest").textContent);
-  const table = Float32Array.from({length: 65536}, (_, i) => fromHalf(i)), count = means.length / 3;
+  const count = means.length / 3;
   const properties = facts.columns.map((name, k) => {
-    const storage = k < 3 ? means.subarray(k * count, (k + 1) * count) : Float32Array.from(half.subarray((k - 3) * count, (k - 2) * count), h => table[h]);
+    const storage = k < 3 ? means.subarray(k * count, (k + 1) * count) : Float32Array.from(half.subarray((k - 3) * count, (k - 2) * count), fromHalf);
     return {name, type: "float", storage, byteSize: 4};
   });
   const device = await pc.createGraphicsDevice($("engine"), {deviceTypes: ["webgl2"], antialias: false});

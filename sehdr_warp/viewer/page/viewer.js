@@ -113,7 +113,7 @@ async function load(draft) {
   if (second) light.put("other", width, height, second.subarray(0, 4 * n), 4);
   if (draft && $("training").hidden) draftScale = Math.min(1, Math.max(0.08, draftScale * Math.min(1.5, Math.max(0.5, Math.sqrt(DRAFT_TIME / took)))));
   drawn = {camera: seen, draft};
-  const depths = half.subarray(4 * n, 5 * n).filter((d, i) => d > 0 && i % 13 === 0).sort();  // Positive halves sort as integers.
+  const depths = Uint16Array.from({length: Math.floor(n / 13)}, (_, i) => half[4 * n + 13 * i]).filter(d => d > 0).sort();  // As integers
   Object.assign(light.settings, {far: fromHalf(depths.at(-1) || 0x3c00), middle: fromHalf(depths[depths.length >> 1] || 0x3c00)});
   tell(`${width} \u00d7 ${height} \u00b7 ${took.toFixed(0)} ms \u00b7 ${facts.gaussians.toLocaleString("en").replaceAll(",", "\u202f")} Gaussians`);
   if (!draft) nearestPhoto();
@@ -193,8 +193,8 @@ function probe() {
 const BINS = 96, LOWEST = -16, HIGHEST = 16;  // Stops from middle grey at 0 EV
 function histogram() {
   const {half, width, height} = light.frames.scene, step = Math.max(1, Math.floor(width * height / 40000)), bins = new Float32Array(BINS);
-  for (let i = 0; i < width * height; i += step) {
-    const l = luminance([half[4 * i], half[4 * i + 1], half[4 * i + 2]].map(fromHalf)) * facts.grey / 0.18;
+  for (let k = 0; k < half.length; k += 4 * step) {
+    const l = luminance([HALVES[half[k]], HALVES[half[k + 1]], HALVES[half[k + 2]]]) * facts.grey / 0.18;
     const bin = Math.floor((Math.log2(l) - LOWEST) / (HIGHEST - LOWEST) * BINS);
     if (bin >= 0 && bin < BINS) bins[bin]++;
   }
