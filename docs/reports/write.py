@@ -163,13 +163,8 @@ def _readings_tables(result: dict) -> Iterable[str]:
     columns = PAGES["readings"]["columns"]
     for truth in (False, True):
         rows = [row for row in result["rows"] if row["sees_truth"] is truth]
-        table = [
-            {"method": method, "n": len(mine)}
-            | {field: fmean(row[field] for row in mine) for _, field, form in parted(columns) if form == ".1f"}
-            for (method,), mine in groups(rows, "method").items()
-        ]
         yield f"## {'With' if truth else 'Without'} truth"
-        yield markdown_table(sorted(table, key=lambda line: -line["gt_max"]), columns)
+        yield markdown_table(sorted(rows, key=lambda row: (row["scene"], -row["gt_max"])), columns)
 
 
 def _bits_tables(result: dict) -> Iterable[str]:

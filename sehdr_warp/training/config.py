@@ -74,9 +74,8 @@ class FusionConfig(_Table):
     """fuse exposure brackets into the HDR colour; off, the base colour is the HDR colour"""
     exposures: Annotated[tuple[Name, ...], Many] = ("1/8x", "1/4x", "1x", "8x", "16x")
     """exposures of the brackets: multiples of the photos' own (1/8x), stops from it (-3ev) or seconds (1/125)"""
-    radiance_scale: Literal["unit", "base", "white"] = "unit"
-    """the radiance of a fused value of 1; unit: 1, as printed in the paper; base: 1 / dt_1, an exposure of 1; white:
-    that which photos show as white"""
+    radiance_scale: Literal["unit", "base"] = "unit"
+    """the radiance of a fused value of 1; unit: 1, as printed in the paper; base: 1 / dt_1, an exposure of 1"""
 
 
 class LossConfig(_Table):

@@ -170,9 +170,9 @@ def assemble_field(gaussians: Gaussians, config: Config, response: Response, bas
     """Gaussians, response and a freshly seeded fusion as the config says."""
     fusion, options = None, config.fusion
     if options.enabled:
-        exposure = {"unit": base_time, "base": 1.0, "white": response.white}[options.radiance_scale]
+        scale = 1.0 / base_time if options.radiance_scale == "base" else 1.0
         times = exposure_times(base_time, options.exposures)
-        fusion = NeuralExposureFusion(response, times, base_time, radiance_scale=exposure / base_time, seed=config.seed)
+        fusion = NeuralExposureFusion(response, times, base_time, radiance_scale=scale, seed=config.seed)
     return RadianceField(
         gaussians,
         response,
