@@ -54,28 +54,29 @@ def run_view(asked: View) -> None:
     from functools import cache
 
     from ..errors import InputError, UsageError
-    from .frames import Rendering
+    from ..training.run import Run
     from .server import Server, Viewer
+    from .watching import Watch
 
     if not asked.runs:
         raise UsageError("view needs RUN, the folder of a run; see sehdr-warp view --help")
     if not 0 <= asked.port < 65536:
         raise UsageError(f"--port {asked.port}: is no port; give 1 to 65535, or 0 for any")
-    runs: list[Any] = [open_scene(path, asked.device) for path in asked.runs]
-    clipped = [run.clipped_share() if path.is_dir() else None for run, path in zip(runs, asked.runs)]
-    shown = [Rendering(run, str(path), share) for run, path, share in zip(runs, asked.runs, clipped)]
+    watch = Watch(asked.runs, lambda path: open_scene(path, asked.device))
 
     @cache
     def photos(index: int) -> dict:
-        if not asked.runs[index].is_dir():
+        if not isinstance(watch.shown[index].run, Run):
             raise InputError(asked.runs[index], "is a file of Gaussians, without photos", "view the run it came from")
-        return {view.name: view for view in read_scene(runs[index], asked.data).views}
+        return {view.name: view for view in read_scene(watch.shown[index], asked.data).views}
 
-    with Server(Viewer(shown, photos), asked.host, asked.port) as server:
+    watch.start()
+    with Server(Viewer(watch.shown, photos), asked.host, asked.port) as server:
         print(f"{server.url}  (Ctrl-C ends it)", flush=True)
         try:
             server.serve_forever()
         except KeyboardInterrupt:
             log.info("the viewer has ended")
-        for run in shown:  # What is being rendered is waited for: kernels must not outlive Python.
+        watch.stop()
+        for run in watch.shown:  # What is being rendered is waited for: kernels must not outlive Python.
             run.lock.acquire(timeout=30)

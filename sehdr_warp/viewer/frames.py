@@ -28,7 +28,13 @@ class Rendering:
 
     def __init__(self, run: Any, name: str, clipped: Tensor | None = None):
         self.run, self.name, self.clipped = run, name, clipped
-        self.lock = threading.Lock()
+        self.lock, self.version = threading.Lock(), 0
+
+    def replace(self, run: Any, clipped: Tensor | None) -> None:
+        """Shows another run from now on."""
+        with self.lock:
+            self.run, self.clipped = run, clipped
+            self.version += 1
 
     def __getattr__(self, name: str):
         return getattr(self.run, name)
@@ -48,8 +54,8 @@ class Rendering:
             rendered = self.render(camera)
             light, size = torch.as_tensor(rendered.hdr), (camera.height, camera.width)
             planes = [torch.as_tensor(rendered.depth)]
-            if clipped and self.clipped is not None:
-                with self.lock:
+            with self.lock:
+                if clipped and self.clipped is not None:
                     planes.append(self.run.model.render_mean(camera, self.clipped))
             confidence = None if draft else self.render_confidence(camera)
             frame = torch.empty((4 + len(planes), *size), dtype=torch.float16, device=light.device)
@@ -66,6 +72,7 @@ class Rendering:
         """What the page knows of the run: plain values."""
         return {
             "name": self.name,
+            "version": self.version,
             "scene": self.scene_name,
             "gaussians": self.gaussian_count,
             "iterations": self.iterations,

@@ -81,6 +81,8 @@ class Viewer:
         if path == "/scene":
             told = {"runs": [run.facts() for run in self.runs], "training": self.training is not None}
             return "application/json", json.dumps(told).encode()
+        if path == "/versions":
+            return "application/json", json.dumps([run.version for run in self.runs]).encode()
         if path == "/training" and self.training is not None:
             return "application/json", json.dumps(self.training.told()).encode()
         if path.startswith("/photo/"):

@@ -5,6 +5,7 @@ import io
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -17,9 +18,13 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.scene import look_at
+from sehdr_warp.training.commands import open_scene
+from sehdr_warp.training.train import train
 from sehdr_warp.viewer.server import MOST_BODY, MOST_VIEWS, Server
+from sehdr_warp.viewer.watching import Watch
 
 from ..output.helpers import camera, read_exr
+from ..training.toy import toy_scene
 
 
 def ask(server, path, body=None, method=None, **headers):
@@ -183,12 +188,30 @@ def test_photos_that_are_gone_are_told(serve):
     assert ask(server, "/photo/0/0")[::2] == (409, b"photos: are no longer here; say where")
 
 
+def test_what_a_training_writes_meanwhile_is_shown(tmp_path, logged):
+    options = {"plan.enabled": False, "schedule.iterations": 2}
+    paths = [tmp_path / "run", tmp_path / "other"]
+    for path in paths:
+        train(toy_scene(), path, options, device="cpu")
+    watch = Watch(paths, lambda path: open_scene(path, "cpu"))
+    watch.look()
+    shown = watch.shown[0]
+    assert [run.version for run in watch.shown] == [0, 0] and shown.facts()["iterations"] == 2
+    train(toy_scene(), paths[0], options | {"schedule.iterations": 4}, device="cpu", overwrite=True)
+    watch.look()
+    assert [run.version for run in watch.shown] == [1, 0] and shown.facts()["iterations"] == 4
+    assert shown.clipped is not None
+    for damage in (lambda: (paths[0] / "scene.json").unlink(), lambda: shutil.rmtree(paths[0])):
+        damage()
+        for file in paths[0].glob("checkpoints/*/checkpoint.json"):
+            os.utime(file, (1, 1))
+        watch.look()
+        assert "keeps what it has read" in logged[-1] and shown.version == 1
+    assert shown.frame(camera(8, 8)).nbytes == 8 * 8 * 5 * 2
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="sends SIGINT")
 def test_the_command_serves_and_ends_cleanly(tmp_path):
-    from sehdr_warp.training.train import train
-
-    from ..training.toy import toy_scene
-
     train(toy_scene(), tmp_path / "run", {"schedule.iterations": 5, "plan.enabled": False}, device="cpu")
     command = [sys.executable, "-m", "sehdr_warp", "view", str(tmp_path / "run"), "--port", "18300", "--device", "cpu"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)

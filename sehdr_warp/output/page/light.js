@@ -197,9 +197,10 @@ class LightCanvas {
     const before = performance.now(), moving = before - this.drawn < PAUSE, scale = moving ? this.scale : 1;
     const [w, h] = [width, height].map(side => Math.max(1, Math.round(side * scale)));
     this.shade(w, h);
-    this.paper.drawImage(this.gl.canvas, 0, this.gl.canvas.height - h, w, h, 0, 0, width, height);
+    const inset = scale < 1 ? 0.5 : 0;  // Enlarging would take in what an earlier draw left beside it.
+    this.paper.drawImage(this.gl.canvas, inset, this.gl.canvas.height - h + inset, w - 2 * inset, h - 2 * inset, 0, 0, width, height);
     this.drawn = performance.now();
-    this.scale = Math.min(1, Math.max(0.1, scale * Math.sqrt(QUICK / Math.max(1, this.drawn - before))));
+    this.scale = Math.min(1, Math.max(0.25, scale * Math.sqrt(QUICK / Math.max(1, this.drawn - before))));
     if (scale < 1) this.rest = setTimeout(() => this.draw(), PAUSE);
   }
 

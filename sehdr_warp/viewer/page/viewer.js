@@ -25,11 +25,25 @@ async function start() {
     if (runs.length > 1) $("left").add(new Option(run.name, "run" + i));
   });
   $("runRow").hidden = runs.length < 2;
-  if (!facts.clipped) $("overlay").querySelector("[value=clipped]").disabled = true;
   if (told.training) startTraining();
+  else setInterval(renew, 2000);
   useRun(0);
   new ResizeObserver(resize).observe(stage);
   jump(0);
+}
+
+// Shows what a training of another process has written meanwhile.
+async function renew() {
+  if (document.hidden) return;
+  try {
+    const versions = await (await ask("/versions")).json();
+    if (versions.every((version, i) => version === runs[i].version)) return;
+    const told = await (await ask("/scene")).json(), views = all => JSON.stringify(all.map(run => run.views));
+    if (views(told.runs) !== views(runs)) return location.reload();  // Another scene
+    runs = told.runs;
+    useRun(state.run);
+    request(false);
+  } catch (error) { tell("the server is gone"); }
 }
 
 function useRun(index) {
@@ -37,6 +51,7 @@ function useRun(index) {
   const curve = Uint8Array.from(atob(facts.curve), c => c.charCodeAt(0));
   light.put("curve", CURVE_SIZE, 1, new Uint16Array(curve.buffer), 1);
   light.settings.grey = facts.grey;
+  $("overlay").querySelector("[value=clipped]").disabled = !facts.clipped;
   state.run = index;
   expose();
 }
@@ -115,7 +130,8 @@ async function load(draft) {
   drawn = {camera: seen, draft};
   const depths = Uint16Array.from({length: Math.floor(n / 13)}, (_, i) => half[4 * n + 13 * i]).filter(d => d > 0).sort();  // As integers
   Object.assign(light.settings, {far: fromHalf(depths.at(-1) || 0x3c00), middle: fromHalf(depths[depths.length >> 1] || 0x3c00)});
-  tell(`${width} \u00d7 ${height} \u00b7 ${took.toFixed(0)} ms \u00b7 ${facts.gaussians.toLocaleString("en").replaceAll(",", "\u202f")} Gaussians`);
+  tell(`${width} \u00d7 ${height} \u00b7 ${took.toFixed(0)} ms \u00b7 ${facts.gaussians.toLocaleString("en").replaceAll(",", "\u202f")} Gaussians`
+    + (facts.iterations && $("training").hidden ? ` \u00b7 ${facts.iterations} steps` : ""));
   if (!draft) nearestPhoto();
   histogram();
   paint();

@@ -1,0 +1,63 @@
+"""Runs that change while they are looked at: what is newer on disk is loaded and shown."""
+
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..errors import SehdrError
+from .frames import Rendering
+
+log = logging.getLogger(__name__)
+PATIENCE = 2.0  # Seconds between looks
+
+
+class Watch(threading.Thread):
+    """Scenes of paths as `shown`; once started, it looks every PATIENCE seconds whether they have changed.
+
+    load: gives the run, or the Gaussians, of a path; raises SehdrError. What cannot be read leaves the scene as it was,
+    and a line says why.
+    """
+
+    def __init__(self, paths: Sequence[Path], load: Callable[[Path], Any]):
+        super().__init__(daemon=True)
+        self._load, self._ended = load, threading.Event()
+        self._states = [_state(path) for path in paths]  # Before they are read: what comes between is not missed.
+        runs = [load(path) for path in paths]
+        self.shown = [Rendering(run, str(path), run.clipped_share()) for run, path in zip(runs, paths, strict=True)]
+
+    def run(self) -> None:
+        while not self._ended.wait(PATIENCE):
+            self.look()
+
+    def look(self) -> None:
+        """Loads again what has changed."""
+        for index, rendering in enumerate(self.shown):
+            path, known = Path(rendering.name), self._states[index]
+            self._states[index] = state = _state(path)
+            if state == known:
+                continue
+            try:
+                if not state:
+                    raise SehdrError(f"{path}: has vanished")
+                run = self._load(path)
+                rendering.replace(run, run.clipped_share())
+            except SehdrError as error:
+                log.warning("%s; the viewer keeps what it has read", error)
+            else:
+                log.debug("%s has changed and is shown as it is now", path)
+
+    def stop(self) -> None:
+        self._ended.set()
+        if self.is_alive():
+            self.join(30)
+
+
+def _state(path: Path) -> dict[Path, int]:
+    """The files that a scene is read from, and when each was written; none where it is gone."""
+    files = [path] if path.is_file() else [*path.glob("checkpoints/*/checkpoint.json"), path / "confidence.safetensors"]
+    try:
+        return {file: file.stat().st_mtime_ns for file in files if file.exists()}
+    except OSError:  # One has gone in between.
+        return {}
