@@ -1,26 +1,44 @@
 """Libraries that print past Python, kept silent where an exception or nothing at all says it better."""
 
 import atexit
+import ctypes
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 
 @contextmanager
 def silent_stderr() -> Iterator[None]:
     """Whatever is written to file descriptor 2 meanwhile is lost; exceptions pass."""
+    with _silent(2):
+        yield
+
+
+@contextmanager
+def silent_output() -> Iterator[None]:
+    """As silent_stderr, of descriptor 1 as well, and of what C's streams hold back until the end of the process."""
+    with _silent(1), _silent(2):
+        try:
+            yield
+        finally:
+            with suppress(Exception):  # Windows has no such library.
+                ctypes.CDLL(None).fflush(None)
+
+
+@contextmanager
+def _silent(number: int) -> Iterator[None]:
     try:
-        kept = os.dup(2)
-    except OSError:  # The program runs without a standard error: nothing to silence.
+        kept = os.dup(number)
+    except OSError:  # The program runs without it: nothing to silence.
         yield
         return
     with open(os.devnull, "wb") as nothing:
-        os.dup2(nothing.fileno(), 2)
+        os.dup2(nothing.fileno(), number)
     try:
         yield
     finally:
-        os.dup2(kept, 2)
+        os.dup2(kept, number)
         os.close(kept)
 
 

@@ -12,11 +12,12 @@ PACKAGE = ROOT / "sehdr_warp"
 
 # What each room may import of the others: training -> field -> response -> splatting -> kernels, and below them all
 # what any room may use. Rooms that read a trained scene take it as an object with named methods.
-ANY = {"errors", "quiet", "arguments", "files", "console"}
+ANY = {"errors", "quiet", "arguments", "files", "console", "apart"}
 ALLOWED = {
     "kernels": set(),
     "errors": set(),
     "quiet": set(),
+    "apart": {"errors"},
     "files": {"errors"},
     "arguments": {"errors"},
     "splats": ANY,

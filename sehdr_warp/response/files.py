@@ -1,15 +1,12 @@
 """Responses that are read: EMoR and DoRF files, a curve of one's own, and the camera encodings of colour-science."""
 
-import io
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..apart import mat_arrays, read_apart
 from ..errors import InputError, SehdrError, nearest
 from ..files import read_json, read_text
 from .curve import Response
@@ -106,34 +103,9 @@ def _select(path: Path, curves: list[Response], selector: str | None) -> Respons
     raise InputError(path, f"has no curve {selector!r}", f"give an index from 0 to {len(curves) - 1}, or a name")
 
 
-# SciPy believes the lengths in a .mat file: a damaged one ends the process that reads it, or fills its memory. With
-# several threads the child would reserve more memory than its limit.
-_READ_MAT = """
-import sys
-import numpy, scipy.io
-try:
-    import resource
-    resource.setrlimit(resource.RLIMIT_AS, (2**32, 2**32))
-except ImportError:
-    pass
-stored = scipy.io.loadmat(sys.argv[1], variable_names=["B", "I"])
-B, I = (stored[name] for name in "BI")
-assert B.dtype.kind + I.dtype.kind in ("ff", "fu", "fi", "uf", "if", "uu", "ii"), "no real numbers"
-numpy.savez(sys.stdout.buffer, B=B.astype(float), I=I.astype(float))
-"""
-_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-
-
 def _dorf_mat(path: Path) -> list[Response]:
-    command = [sys.executable, "-c", _READ_MAT, str(path)]
-    try:
-        done = subprocess.run(command, capture_output=True, timeout=120, check=True, env={**os.environ, **_ONE_THREAD})
-    except (OSError, subprocess.SubprocessError) as error:
-        said = (getattr(error, "stderr", None) or b"").decode(errors="replace").strip().splitlines()
-        reason = said[-1] if said else "its reader ended early"
-        raise InputError(path, f"is not a DoRF file ({reason:.120})", "give B and I of [curves, samples]") from None
-    with np.load(io.BytesIO(done.stdout)) as stored:
-        values, exposures = stored["B"], stored["I"]
+    stored = read_apart(mat_arrays, path, "DoRF's B and I", "give 201_CRF_data.mat")
+    values, exposures = stored["B"], stored["I"]
     if values.ndim != 2 or values.shape != exposures.shape:
         raise InputError(path, f"B is {values.shape} and I is {exposures.shape}", "give both as [curves, samples]")
     numbered = enumerate(zip(exposures, values, strict=True))

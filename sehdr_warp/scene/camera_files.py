@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..apart import read_apart
 from ..errors import InputError
 from ..files import read_json, read_text
 from ..splats.usd import open_stage, pxr
@@ -142,38 +143,46 @@ def _of_colmap(folder: Path) -> list[tuple[str, Camera]]:
 
 def _of_usd(path: Path) -> list[tuple[str, Camera]]:
     """Every UsdGeomCamera, at each frame of the stage where it moves; of 1920 pixels' width where it states no size."""
+    pxr("Usd")
+    stored = read_apart(usd_camera_arrays, path, "USD", "export it again")
+    read = lambda entry, _: (str(entry[0]), _usd_camera(entry[1], entry[2], path, str(entry[0])))  # noqa: E731
+    return _listed(path, list(zip(stored["names"], stored["lenses"], stored["matrices"], strict=True)), read)
+
+
+def usd_camera_arrays(path: Path) -> dict[str, Any]:
+    """names [n]; lenses [n, 7]: width and height in pixels (0: not stated), focal length, both apertures and both of
+    their offsets in one unit; matrices [n, 4, 4], which act on row vectors."""
     Usd, UsdGeom = pxr("Usd"), pxr("UsdGeom")
     stage = open_stage(path)
-    cameras = []
+    names, lenses, matrices = [], [], []
     for prim in stage.Traverse():
         if not prim.IsA(UsdGeom.Camera):
             continue
         camera, frames = UsdGeom.Camera(prim), [Usd.TimeCode.Default()]
-        if camera.TransformMightBeTimeVarying():
+        if moving := camera.TransformMightBeTimeVarying():
             first, last = int(stage.GetStartTimeCode()), int(stage.GetEndTimeCode())
-            frames = [Usd.TimeCode(frame) for frame in range(first, last + 1)]
-        name, moving = prim.GetName(), len(frames) > 1
+            frames = map(Usd.TimeCode, range(first, last + 1))
+        size = [(prim.GetAttribute(name).Get() if prim.HasAttribute(name) else 0) or 0 for name in USD_SIZE]
         for frame in frames:
-            label = f"{name}_{int(frame.GetValue()):04d}" if moving else name
-            cameras.append((label, _usd_camera(camera, frame, path)))
-    return cameras
+            seen = camera.GetCamera(frame)
+            names.append(f"{prim.GetName()}_{int(frame.GetValue()):04d}" if moving else prim.GetName())
+            offsets = seen.horizontalApertureOffset, seen.verticalApertureOffset
+            lenses.append([*size, seen.focalLength, seen.horizontalAperture, seen.verticalAperture, *offsets])
+            matrices.append(np.array(seen.transform, np.float64))
+    shapes = ("names", names, str, (-1,)), ("lenses", lenses, float, (-1, 7)), ("matrices", matrices, float, (-1, 4, 4))
+    return {name: np.array(values, kind).reshape(shape) for name, values, kind, shape in shapes}
 
 
-def _usd_camera(camera, frame, path: Path) -> Camera:
-    """USD's lens lengths share one unit; its axes are OpenGL's; matrices act on row vectors."""
-    seen, prim = camera.GetCamera(frame), camera.GetPrim()
-    aperture, vertical = seen.horizontalAperture, seen.verticalAperture
-    stated = [prim.GetAttribute(name).Get() if prim.HasAttribute(name) else None for name in USD_SIZE]
+def _usd_camera(lens: np.ndarray, matrix: np.ndarray, path: Path, name: str) -> Camera:
+    """USD's axes are OpenGL's."""
+    stated, (focal, aperture, vertical, right, up) = lens[:2], lens[2:].tolist()
     width = int(stated[0] or _USD_WIDTH)
     height = int(stated[1] or round(width * vertical / aperture))
-    fx, fy = seen.focalLength / aperture * width, seen.focalLength / vertical * height
-    cx = width / 2 - seen.horizontalApertureOffset / aperture * width
-    cy = height / 2 + seen.verticalApertureOffset / vertical * height
-    matrix = np.array(seen.transform, np.float64).T
+    fx, fy = focal / aperture * width, focal / vertical * height
+    matrix = matrix.T.copy()
     size = np.linalg.norm(matrix[:3, :3], axis=0)
     matrix[:3, :3] /= np.where(size > 0, size, 1)
-    pose = pose_from_opengl(matrix, path, prim.GetName())
-    try:
-        return Camera(width, height, fx, fy, cx, cy, pose)
-    except ValueError as error:
-        raise InputError(path, f"camera {prim.GetPath()} cannot be used ({error})", "correct the camera") from None
+    pose = pose_from_opengl(matrix, path, name)
+    return Camera(
+        width, height, fx, fy, width / 2 - right / aperture * width, height / 2 + up / vertical * height, pose
+    )

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import read_bytes
-from ..quiet import silent_stderr
+from ..quiet import silent_output
 from .images import DAMAGED, MAX_PIXELS, check_size, require_file
 
 # OpenEXR asks for the memory of all pixels before it reads one. Its ZIP of a single colour holds 500 pixels in a byte.
@@ -81,7 +81,7 @@ def _exr_file(path: Path, **options) -> Iterator:
 
     require_file(path)
     try:
-        with silent_stderr(), OpenEXR.File(str(path), **options) as file:
+        with silent_output(), OpenEXR.File(str(path), **options) as file:
             yield file
     except (RuntimeError, ValueError, KeyError, TypeError, MemoryError) as error:
         raise InputError(path, f"cannot be read as OpenEXR ({error})", DAMAGED) from None

@@ -154,7 +154,7 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
 
     def focal(key: str, angle_key: str, length: float) -> Any:
         angle = number(angle_key, 0.0)
-        return number(key, 0.5 * length / math.tan(0.5 * angle) if 0 < angle < math.pi else None)
+        return number(key, 0.5 * length / math.tan(0.5 * angle) if 1e-9 < angle < math.pi else None)
 
     width, height = number("w"), number("h")
     if width is None or height is None:

@@ -68,10 +68,17 @@ class GaussianArrays:
         return replace(self, **{name: getattr(self, name)[index] for name in _ARRAYS})
 
     def checked(self, path: Path | str) -> "GaussianArrays":
-        """Without Gaussians that are not finite; InputError where none is left."""
+        """Without Gaussians that are not finite; InputError where none is left, arrays differ in length, or the base
+        time is no time."""
+        if len(lengths := {len(getattr(self, name)) for name in _ARRAYS}) > 1:
+            raise InputError(path, f"its arrays are of {sorted(lengths)} Gaussians", "export it again")
+        if not 0 < self.base_time < math.inf:
+            problem = f"its base exposure time is {self.base_time} s"
+            raise InputError(path, problem, "state a positive number of seconds")
         logits = np.clip(self.opacity_logits, -_MOST_LOGIT, _MOST_LOGIT)
         given = replace(self, opacity_logits=logits)
-        finite = np.all([np.isfinite(getattr(given, name)).reshape(self.count, -1).all(1) for name in _ARRAYS], axis=0)
+        arrays = (getattr(given, name) for name in _ARRAYS)
+        finite = np.all([np.isfinite(each).all(tuple(range(1, each.ndim))) for each in arrays], axis=0)
         if not finite.any():
             found = "all of its Gaussians have values that are not finite" if self.count else "holds no Gaussian"
             raise InputError(path, found, "export it again")

@@ -100,7 +100,7 @@ def read_glb(path: Path) -> GaussianArrays:
         opacities = values(f"{EXTENSION}:OPACITY", 1)[:, 0]
         harmonics = np.stack([values(name, 3) for name in _harmonic_names(degree)], axis=1)
         base_time = float(mesh.get("extras", {}).get("base_exposure_time", 1.0))
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise InputError(path, f"is damaged glTF ({error!r:.120})", _DAMAGED) from None
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales, logits = np.log(scales), np.log(opacities) - np.log1p(-opacities)

@@ -59,10 +59,10 @@ def read_ply(path: Path) -> GaussianArrays:
         degree_of(1 + len(rest) / 3, path)
         groups = (*(group.split() for group in _GROUPS), rest)
         columns = [_columns([np.asarray(vertex[name], np.float32) for name in group]) for group in groups]
-    except (PlyParseError, KeyError, ValueError, OSError, MemoryError) as error:
+    except (PlyParseError, KeyError, ValueError, OverflowError, OSError, MemoryError) as error:
         raise InputError(path, f"cannot be read as PLY ({error!s:.120})", _DAMAGED) from None
-    means, log_scales, quaternions, opacity, constant, rest = columns
-    higher = rest.reshape(len(means), 3, -1).swapaxes(1, 2)
+    means, log_scales, quaternions, opacity, constant, higher = columns
+    higher = higher.reshape(len(means), 3, len(rest) // 3).swapaxes(1, 2)
     harmonics = np.concatenate([constant[:, None], higher], axis=1)
     return GaussianArrays(means, log_scales, quaternions, opacity[:, 0], harmonics, *_facts(read.comments, path))
 

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from ..apart import read_apart
 from ..errors import InputError, SehdrError
 from ..files import atomic_path
 from .arrays import HARMONIC_0, GaussianArrays, degree_of
 
 COLOR_SPACE = "lin_rec709_scene"
-_BASE_TIME = "sehdr:baseExposureTime"
+_BASE_TIME, _HARMONICS = "sehdr:baseExposureTime", "radiance:sphericalHarmonicsCoefficients"
 _BIAS = 0.5 / HARMONIC_0
 # The extent that viewers clip by: three standard deviations hold 99.7 % of a Gaussian.
 _DEVIATIONS = 3.0
@@ -31,15 +32,14 @@ def pxr(module: str) -> Any:
 
 
 def open_stage(path: Path) -> Any:
-    """A stage; InputError where the file is missing or damaged."""
-    Usd, Tf = pxr("Usd"), pxr("Tf")
-    if not path.is_file():
-        raise InputError(path, "file not found", "check the name")
-    try:
-        return Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        reason = str(error).strip().splitlines()[-1]
-        raise InputError(path, f"cannot be read as USD ({reason:.120})", "export it again") from None
+    """A stage, of files in the folder of `path` alone. To be called by what read_apart calls: OpenUSD is misled by a
+    damaged file to fill any memory."""
+    stage = pxr("Usd").Stage.Open(str(path))
+    folder = path.resolve().parent
+    for layer in stage.GetUsedLayers():
+        if not layer.anonymous and not Path(layer.realPath).resolve().is_relative_to(folder):
+            raise ValueError(f"leads outside of its folder, to {layer.identifier}")
+    return stage
 
 
 def write_usd(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
@@ -79,41 +79,53 @@ def write_usd(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
 
 def read_usd(path: Path) -> GaussianArrays:
     """The one ParticleField3DGaussianSplat of a stage, where it stands in the world."""
+    pxr("Usd")
+    stored = read_apart(usd_arrays, path, "USD", "export it again")
+    if stored["count"] != 1:
+        problem = f"has {stored['count']} prims of ParticleField3DGaussianSplat, not one"
+        raise InputError(path, problem, "export Gaussians by OpenUSD's schema")
+    if str(stored["space"]) not in ("", COLOR_SPACE, "lin_rec709"):
+        problem = f"its color space is {stored['space']!s:.60}, not {COLOR_SPACE}"
+        raise InputError(path, problem, "export it scene-linear in Rec.709")
+    if not np.allclose(stored["matrix"], np.eye(4)):
+        raise InputError(path, "its Gaussians are moved by a transform", "bake the transform into the Gaussians")
+
+    def values(name: str, columns: int) -> np.ndarray:
+        if name not in stored or stored[name].size % columns:
+            raise InputError(path, f"has no usable {name}", "export it again")
+        return stored[name].reshape(-1, columns)
+
+    means, scales = values("positions", 3), values("scales", 3)
+    quaternions, opacities = np.roll(values("orientations", 4), 1, axis=1), values("opacities", 1)[:, 0]
+    degree = int(stored["degree"])
+    coefficients = (degree + 1) ** 2
+    degree_of(coefficients, path)
+    harmonics = values(_HARMONICS, 3 * coefficients).reshape(-1, coefficients, 3)
+    harmonics[:, 0] += _BIAS
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_scales, logits = np.log(scales), np.log(opacities) - np.log1p(-opacities)
+    return GaussianArrays(means, log_scales, quaternions, logits, harmonics, "linear", float(stored["base_time"]))
+
+
+def usd_arrays(path: Path) -> dict[str, Any]:
+    """How many prims of Gaussians a stage has, and the attributes of the first."""
     Usd, UsdGeom, UsdVol = (pxr(name) for name in ("Usd", "UsdGeom", "UsdVol"))
     stage = open_stage(path)
     found = [prim for prim in stage.Traverse() if prim.IsA(UsdVol.ParticleField3DGaussianSplat)]
     if len(found) != 1:
-        problem = f"has {len(found)} prims of ParticleField3DGaussianSplat, not one"
-        raise InputError(path, problem, "export Gaussians by OpenUSD's schema")
+        return {"count": len(found)}
     prim, splat = found[0], UsdVol.ParticleField3DGaussianSplat(found[0])
-    space = Usd.ColorSpaceAPI.ComputeColorSpaceName(prim, None)
-    if space and str(space) not in (COLOR_SPACE, "lin_rec709"):
-        raise InputError(path, f"its color space is {space}, not {COLOR_SPACE}", "export it scene-linear in Rec.709")
-
-    def values(name: str, columns: int) -> np.ndarray:
-        stored = next((v for n in (name, f"{name}h") if (v := prim.GetAttribute(n).Get())), None)
-        if stored is None:
-            raise InputError(path, f"{prim.GetPath()} has no {name}", "export it again")
-        return np.array(stored, np.float32).reshape(-1, columns)
-
-    means, scales = values("positions", 3), values("scales", 3)
-    quaternions, opacities = np.roll(values("orientations", 4), 1, axis=1), values("opacities", 1)[:, 0]
-    degree = int(splat.GetRadianceSphericalHarmonicsDegreeAttr().Get())
-    coefficients = (degree + 1) ** 2
-    degree_of(coefficients, path)
-    harmonics = values("radiance:sphericalHarmonicsCoefficients", 3)
-    lengths = {len(means), len(scales), len(quaternions), len(opacities), len(harmonics) / coefficients}
-    if len(lengths) != 1:
-        raise InputError(path, f"its arrays are of {sorted(lengths)} Gaussians", "export it again")
-    harmonics = harmonics.reshape(-1, coefficients, 3)
-    harmonics[:, 0] += _BIAS
-    matrix = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default()))
-    if not np.allclose(matrix, np.eye(4)):
-        raise InputError(path, f"{prim.GetPath()} is moved by a transform", "bake the transform into the Gaussians")
-    stated = prim.GetAttribute(_BASE_TIME).Get() if prim.HasAttribute(_BASE_TIME) else 1.0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log_scales, logits = np.log(scales), np.log(opacities) - np.log1p(-opacities)
-    return GaussianArrays(means, log_scales, quaternions, logits, harmonics, "linear", float(stated))
+    told = {
+        "count": 1,
+        "space": str(Usd.ColorSpaceAPI.ComputeColorSpaceName(prim, None) or ""),
+        "matrix": np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())),
+        "degree": int(splat.GetRadianceSphericalHarmonicsDegreeAttr().Get()),
+        "base_time": float(prim.GetAttribute(_BASE_TIME).Get()) if prim.HasAttribute(_BASE_TIME) else 1.0,
+    }
+    for name in ("positions", "scales", "orientations", "opacities", _HARMONICS):
+        for value in filter(None, (prim.GetAttribute(each).Get() for each in (f"{name}h", name))):
+            told[name] = np.array(value, np.float32)
+    return told
 
 
 def _array(kind: str, values: np.ndarray):

@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import os
 import shutil
+import struct
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,16 +18,21 @@ from plyfile import PlyData, PlyElement
 from scipy.io import savemat
 
 from sehdr_warp.errors import SehdrError
+from sehdr_warp.field.confidence import Evidence
 from sehdr_warp.field.gaussians import Gaussians
+from sehdr_warp.files import LIST
 from sehdr_warp.output.exr import Part, write_exr, write_multipart_exr
+from sehdr_warp.output.usd_cameras import usd_cameras
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_cameras, load_scene
 from sehdr_warp.scene.colmap_model import read_ply_points
 from sehdr_warp.scene.exposure import exif_exposure
 from sehdr_warp.scene.hdr_files import hdr_size, read_exr_channels, read_hdr
 from sehdr_warp.scene.images import image_sizes, read_ldr, read_mask
-from sehdr_warp.scene.read_folders import read_colmap, read_llff
+from sehdr_warp.scene.linear_photos import color_matrix, raw_exposure
+from sehdr_warp.scene.read_folders import read_colmap, read_hdr_nerf_real, read_llff
 from sehdr_warp.scene.read_transforms import read_hdr_nerf, read_transforms
+from sehdr_warp.splats import USD_SUFFIXES, GaussianArrays, read_gaussians, write_gaussians
 from sehdr_warp.synth.expose import RadianceView
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.initialization import assemble_field
@@ -35,15 +42,17 @@ from sehdr_warp.training.train import Training
 from sehdr_warp.training.trainer import Trainer
 from tests.make_scenes import pattern, write_blender, write_colmap, write_llff, write_reinhard
 from tests.output.helpers import camera
+from tests.scene.raw_files import write_dng
 from tests.training.toy import orbit_camera, toy_scene
 
 
 @dataclass(frozen=True)
 class Reader:
-    """make: writes the files into an empty folder. files: globs of those that are mutated. read: what is tried.
+    """make: writes the files into an empty folder. files: globs of those that are mutated. read: what is tried, on the
+    folder; on the mutated file where it is of each().
 
     text: the files are text. repair: after a mutation, makes good what would otherwise hide the reader behind it (a
-    checksum).
+    checksum, a length). cost: milliseconds an input, by which inputs are shared out.
     """
 
     make: Callable[[Path], None]
@@ -51,22 +60,23 @@ class Reader:
     read: Callable[[Path], object]
     text: bool = False
     repair: Callable[[Path], None] | None = None
+    cost: float = 1.0
 
 
 def each(*readers: Callable[[Path], object]) -> Callable[[Path], None]:
-    """Tries every reader on every file, though some raise: the first error is raised at the end."""
+    """Tries every reader on a file, though some raise: the first error is raised at the end."""
 
-    def read_all(folder: Path) -> None:
+    def read_all(path: Path) -> None:
         problem = None
-        for path in sorted(folder.iterdir()):
-            for read in readers:
-                try:
-                    read(path)
-                except SehdrError as error:
-                    problem = problem or error
+        for read in readers:
+            try:
+                read(path)
+            except SehdrError as error:
+                problem = problem or error
         if problem:
             raise problem
 
+    read_all.alone = True
     return read_all
 
 
@@ -149,6 +159,16 @@ def _read_run(folder: Path):
     return run.metrics(), run.summary(), run.degree
 
 
+def _confidence(folder: Path) -> None:
+    _run(folder)
+    checkpoint = RunFolder(folder).newest_checkpoint()
+    RunFolder(folder).write_confidence(Evidence(*torch.rand(3, 4)), checkpoint.values["sha256"])
+
+
+def _read_confidence(folder: Path):
+    return load_run(folder).clipped_share()
+
+
 def _resume(folder: Path):
     return Training(toy_scene(2, 8), folder, device="cpu", resume=True)
 
@@ -176,6 +196,11 @@ def _responses(folder: Path) -> None:
     savemat(folder / "m.mat", {"B": np.stack([y, y]), "I": np.stack([x, x])})
 
 
+def _curves(folder: Path) -> None:
+    _responses(folder)
+    (folder / "m.mat").unlink()
+
+
 def _read_response(path: Path):
     selectors = {"dorf.txt": ":1", "emor.txt": ":0.1", "m.mat": ":0"}
     curve = response_by_name(f"{path}{selectors.get(path.name, '')}")
@@ -189,6 +214,48 @@ def _cameras(folder: Path) -> None:
     (folder / "studio.json").write_text(json.dumps({"render_width": 8, "render_height": 6, "camera_path": path}))
 
 
+def _cameras_of_others(folder: Path) -> None:
+    place = {"rotation": np.eye(3).tolist(), "position": [0, 0, 1]}
+    listed = [{"id": 0, "img_name": "a", "width": 16, "height": 12, "fx": 20.0, "fy": 20.0, **place}]
+    (folder / "inria.json").write_text(json.dumps(listed))
+    _transforms(folder)
+    _cameras(folder)
+    back = {"transform": np.eye(4)[:3].tolist(), "scale": 0.5}
+    (folder / "dataparser_transforms.json").write_text(json.dumps(back))
+    shutil.rmtree(folder / "images")
+
+
+def _splats(*suffixes: str) -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        arrays = [np.full((3, *shape), 0.25, np.float32) for shape in ((3,), (3,), (4,), (), (4, 3))]
+        for suffix in suffixes:
+            write_gaussians(
+                folder / f"a{suffix}", GaussianArrays(*arrays, {".glb": "display"}.get(suffix, "linear"), 0.5)
+            )
+        if ".usda" in suffixes:
+            (folder / "b.usda").write_text(usd_cameras([("a", camera(16, 12)), ("b", camera(8, 8))]))
+        (folder / LIST).unlink()
+
+    return make
+
+
+def _rechunk(folder: Path) -> None:
+    """Lengths of a GLB's chunks that fit again."""
+    data = (folder / "a.glb").read_bytes()
+    end = data.find(b"BIN\0") - 4
+    if end > 20:
+        data = data[:8] + struct.pack("<2I", len(data), end - 20) + data[16:]
+        (folder / "a.glb").write_bytes(data)
+
+
+def _read_usd(path: Path):
+    return (load_cameras if path.name == "b.usda" else read_gaussians)(path)
+
+
+def _raw(folder: Path) -> None:
+    write_dng(folder / "a.dng", np.linspace(0, 1, 32 * 24 * 3).reshape(24, 32, 3))
+
+
 def _load(folder: Path):
     return load_scene(folder, response="srgb")
 
@@ -197,29 +264,50 @@ def _read_photo(path: Path):
     return read_ldr(path, oriented=True)
 
 
+def _read_matrix(path: Path):
+    return color_matrix([path])
+
+
 def _llff(folder: Path) -> None:
     write_llff(folder, 4, size=(16, 12))
 
 
+def _llff_seconds(folder: Path) -> None:
+    _llff(folder)
+    (folder / "images").rename(folder / "input_images")
+    for number, path in enumerate(sorted((folder / "input_images").iterdir())):
+        path.rename(path.with_name(f"{number:03d}_0.png"))
+    rows = np.load(folder / "poses_bounds.npy")
+    np.save(folder / "poses_bounds_exps.npy", np.c_[rows, np.full(len(rows), 0.5)])
+
+
 _RUN_FILES = ("*.json", "metrics.jsonl")
 READERS = {
-    "colmap-binary": Reader(_colmap(True), ("sparse/0/*.bin",), read_colmap),
-    "colmap-text": Reader(_colmap(False), ("sparse/0/*.txt",), read_colmap, text=True),
-    "transforms": Reader(_transforms, ("transforms.json",), read_transforms, text=True),
-    "hdr-nerf": Reader(_hdr_nerf, ("*.json", "sparse/0/*"), read_hdr_nerf, text=True),
-    "exposures": Reader(_exposures, ("exposures.json",), _load, text=True),
-    "scene": Reader(_transforms, ("transforms.json", "images/*"), _load, text=True),
+    "colmap-binary": Reader(_colmap(True), ("sparse/0/*.bin",), read_colmap, cost=3),
+    "colmap-text": Reader(_colmap(False), ("sparse/0/*.txt",), read_colmap, text=True, cost=3),
+    "transforms": Reader(_transforms, ("transforms.json",), read_transforms, text=True, cost=1.2),
+    "hdr-nerf": Reader(_hdr_nerf, ("*.json", "sparse/0/*"), read_hdr_nerf, text=True, cost=2),
+    "exposures": Reader(_exposures, ("exposures.json",), _load, text=True, cost=5),
+    "scene": Reader(_transforms, ("transforms.json", "images/*"), _load, text=True, cost=7),
     "llff": Reader(_llff, ("poses_bounds.npy",), read_llff),
-    "ply-points": Reader(_points, ("*.ply",), each(read_ply_points), text=True),
+    "llff-seconds": Reader(_llff_seconds, ("poses_bounds_exps.npy",), read_hdr_nerf_real),
+    "ply-points": Reader(_points, ("*.ply",), each(read_ply_points), text=True, cost=0.5),
     "exr": Reader(_exr, ("*.exr",), each(hdr_size, read_hdr, read_exr_channels)),
-    "radiance": Reader(_radiance, ("*.hdr",), each(read_hdr)),
-    "photos": Reader(_photos, ("*",), each(image_sizes, read_mask, exif_exposure, _read_photo)),
-    "config": Reader(_config, ("*.toml",), each(load_config), text=True),
-    "run": Reader(_run, _RUN_FILES, _read_run, text=True, repair=_resign),
-    "checkpoint": Reader(_run, ("checkpoints/*/*",), _read_run, text=True, repair=_resign),
-    "resume": Reader(_run, (*_RUN_FILES, "checkpoints/*/*"), _resume, text=True, repair=_resign),
-    "responses": Reader(_responses, ("*",), each(_read_response), text=True),
-    "cameras": Reader(_cameras, ("*.json",), each(load_cameras), text=True),
+    "radiance": Reader(_radiance, ("*.hdr",), each(read_hdr), cost=0.5),
+    "photos": Reader(_photos, ("*",), each(image_sizes, read_mask, exif_exposure, _read_photo), cost=1.2),
+    "raw": Reader(_raw, ("*",), each(image_sizes, raw_exposure, _read_matrix, _read_photo), cost=2),
+    "config": Reader(_config, ("*.toml",), each(load_config), text=True, cost=0.6),
+    "run": Reader(_run, _RUN_FILES, _read_run, text=True, repair=_resign, cost=5),
+    "checkpoint": Reader(_run, ("checkpoints/*/*",), _read_run, text=True, repair=_resign, cost=4),
+    "confidence": Reader(_confidence, ("confidence.safetensors",), _read_confidence, cost=5),
+    "resume": Reader(_run, (*_RUN_FILES, "checkpoints/*/*"), _resume, text=True, repair=_resign, cost=20),
+    "responses": Reader(_responses, ("*",), each(_read_response), text=True, cost=30),
+    "curves": Reader(_curves, ("*",), each(_read_response), text=True),
+    "cameras": Reader(_cameras, ("*.json",), each(load_cameras), text=True, cost=0.5),
+    "cameras-of-others": Reader(_cameras_of_others, ("*.json",), each(load_cameras), text=True, cost=0.7),
+    "ply": Reader(_splats(".ply"), ("*",), each(read_gaussians), text=True, cost=0.7),
+    "glb": Reader(_splats(".glb"), ("*",), each(read_gaussians), text=True, repair=_rechunk, cost=0.5),
+    "usd": Reader(_splats(*USD_SUFFIXES), ("*",), each(_read_usd), text=True, cost=20),
 }
 
 
@@ -234,12 +322,18 @@ class Workspace:
         self.whole = {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
         targets = sorted({path for glob in reader.files for path in folder.glob(glob) if path.is_file()})
         self.targets = {path: self.whole[path] for path in targets}
+        self.changed = targets[0]
+        self.times = {path: path.stat().st_mtime_ns for path in self.whole}
+
+    def read(self) -> object:
+        return self.reader.read(self.changed if hasattr(self.reader.read, "alone") else self.folder)
 
     def restore(self) -> None:
-        for path in sorted(self.folder.rglob("*")):
-            if path.is_file() and path not in self.whole:
-                path.unlink()
+        found = [Path(place, name) for place, _, names in os.walk(self.folder) for name in names]
+        for path in {*found} - self.whole.keys():
+            path.unlink()
         for path, data in self.whole.items():
-            if not path.is_file() or path.stat().st_size != len(data) or path.read_bytes() != data:
+            if path == self.changed or not path.is_file() or path.stat().st_mtime_ns != self.times[path]:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes(data)
+                self.times[path] = path.stat().st_mtime_ns

@@ -5,6 +5,7 @@ that numbers were lost, more than --seconds of processor time, more than --memor
 """
 
 import argparse
+import json
 import os
 import random
 import resource
@@ -14,8 +15,11 @@ import time
 import traceback
 import warnings
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+
+from sehdr_warp import apart
 
 from .mutate import mutate
 from .readers import READERS, Workspace
@@ -27,6 +31,23 @@ class TooSlow(BaseException):
     """Raised by the timer within a reader; no reader's `except Exception` may swallow it."""
 
 
+def forked(words, seconds: float) -> tuple[int, bytes, bytes]:
+    """As apart.start, which takes half a second to load what this process has loaded."""
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as told:
+        child = os.fork()
+        if child == 0:
+            code = 1
+            try:
+                os.dup2(out.fileno(), 1), os.dup2(told.fileno(), 2)
+                signal.alarm(int(seconds) + 1)
+                code = apart.main(*words)
+            finally:
+                os._exit(code)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        out.seek(0), told.seek(0)
+        return code, out.read(), told.read()
+
+
 def seed_of(name: str, seed: int, index: int) -> int:
     """The random seed of one input: (reader, seed, index) makes it again."""
     return zlib.crc32(f"{name}/{seed}/{index}".encode())
@@ -35,7 +56,7 @@ def seed_of(name: str, seed: int, index: int) -> int:
 def make_input(space: Workspace, name: str, seed: int, index: int) -> Path:
     """Changes one of the workspace's files; returns which."""
     rng = random.Random(seed_of(name, seed, index))
-    path = rng.choice(list(space.targets))
+    path = space.changed = rng.choice(list(space.targets))
     others = [data for other, data in space.targets.items() if other.suffix == path.suffix]
     path.write_bytes(mutate(space.targets[path], others, space.reader.text, rng))
     if space.reader.repair is not None:
@@ -55,7 +76,7 @@ def try_input(space: Workspace, seconds: float) -> str | None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            space.reader.read(space.folder)
+            space.read()
     except SehdrError as error:
         text = str(error)
         if "\n" in text or not text or len(text) > LONGEST_MESSAGE:
@@ -72,39 +93,40 @@ def try_input(space: Workspace, seconds: float) -> str | None:
     return None
 
 
-def fuzz(name: str, folder: Path, seed: int, first: int, count: int, seconds: float, until: float, report) -> int:
-    """Tries up to `count` inputs of one reader; report(index, finding) of each; returns how many were tried."""
+def fuzz(name: str, folder: Path, seed: int, first: int, count: int, seconds: float):
+    """Tries `count` inputs of one reader; yields the index of each and "begun", then the index and what was found."""
     space = Workspace(READERS[name], folder)
-    done = 0
     for index in range(first, first + count):
-        if time.monotonic() > until:
-            break
-        report(index, "begun")
+        yield index, "begun"
         make_input(space, name, seed, index)
         finding = try_input(space, seconds)
         space.restore()
-        done += 1
-        report(index, finding)
-    return done
+        yield index, finding
 
 
-def _child(pipe, name: str, folder: Path, options, first: int) -> None:
+def _child(pipe, name: str, folder: Path, options, first: int, inputs: int) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # decoders print there
     import torch  # its address space is no reader's doing
 
     torch.set_num_threads(1)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + (options.memory << 20),) * 2)
-    count, until = options.inputs - first, time.monotonic() + options.budget
-    fuzz(name, folder, options.seed, first, count, options.seconds, until, lambda *message: pipe.send(message))
+    apart.start = forked
+    for message in fuzz(name, folder, options.seed, first, inputs - first, options.seconds):
+        pipe.send(message)
 
 
-def run_reader(name: str, folder: Path, options) -> tuple[int, dict[str, list[int]]]:
-    """How many inputs one reader was given, and the indices behind each finding; a new process after a death."""
-    tried, findings, started = 0, {}, time.monotonic()
-    while tried < options.inputs and time.monotonic() < started + options.budget:
+def run_reader(name: str, folder: Path, inputs: int, options) -> tuple[int, dict[str, list]]:
+    """How many inputs one reader was given, and of each kind of finding the first index, its words, and the number; a
+    new process after a death."""
+    tried, findings = 0, {}
+
+    def note(index: int, finding: str) -> None:
+        findings.setdefault(finding.partition(": ")[0], [index, finding, 0])[2] += 1
+
+    while tried < inputs:
         pipe, other = get_context("spawn").Pipe(False)
-        child = get_context("spawn").Process(target=_child, args=(other, name, folder, options, tried))
+        child = get_context("spawn").Process(target=_child, args=(other, name, folder, options, tried, inputs))
         child.start()
         other.close()
         begun, what = None, "the process died"
@@ -117,32 +139,47 @@ def run_reader(name: str, folder: Path, options) -> tuple[int, dict[str, list[in
             if begun is None:
                 tried = index + 1
                 if finding is not None:
-                    findings.setdefault(finding, []).append(index)
+                    note(index, finding)
         else:
             child.kill()
             what = "hang"
         child.join()
         if begun is None:
             break
-        findings.setdefault(what, []).append(begun)
+        note(begun, what)
         tried = begun + 1
     return tried, findings
+
+
+def share(name: str, inputs: int) -> int:
+    """How many of so many inputs a reader gets: all take about as long."""
+    return max(1, round(inputs / READERS[name].cost / sum(1 / reader.cost for reader in READERS.values())))
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--readers", default=",".join(READERS), help="names separated by commas")
-    parser.add_argument("--inputs", type=int, default=6000, help="of each reader")
+    parser.add_argument("--inputs", type=int, default=100_000, help="of all readers, more of those that are quick")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--budget", type=float, default=600.0, help="seconds for each reader")
+    parser.add_argument("--jobs", type=int, default=1, help="readers at once")
     parser.add_argument("--seconds", type=float, default=2.0, help="of processor time that one input may take")
     parser.add_argument("--memory", type=int, default=4096, help="MiB of address space that a reader may take")
-    options, bad = parser.parse_args(), 0
-    with tempfile.TemporaryDirectory() as folder:
-        for name in options.readers.split(","):
-            tried, findings = run_reader(name, Path(folder) / name, options)
-            print(f"{name:16} {tried:7} inputs, {len(findings)} kinds of findings", flush=True)
-            for what, indices in findings.items():
-                print(f"    {len(indices):6} x {what} (first: index {indices[0]})", flush=True)
-            bad += len(findings)
-    return min(bad, 1)
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    options, rows = parser.parse_args(), []
+    memory = "/dev/shm" if os.path.isdir("/dev/shm") else None
+    with tempfile.TemporaryDirectory(dir=memory) as folder, ThreadPoolExecutor(options.jobs) as pool:
+
+        def one(name: str) -> tuple[str, int, float, dict]:
+            started = time.monotonic()
+            found = run_reader(name, Path(folder) / name, share(name, options.inputs), options)
+            return name, found[0], time.monotonic() - started, found[1]
+
+        for name, tried, seconds, findings in pool.map(one, options.readers.split(",")):
+            print(f"{name:18}{tried:8} inputs{seconds:7.0f} s, {len(findings)} kinds of findings", flush=True)
+            for index, finding, count in findings.values():
+                print(f"    {count:6} x {finding} (first: index {index})", flush=True)
+            rows.append({"reader": name, "inputs": tried, "seed": options.seed, "findings": len(findings)})
+    print(f"{sum(row['inputs'] for row in rows)} inputs, {sum(row['findings'] for row in rows)} kinds of findings")
+    if options.json:
+        options.json.write_text(json.dumps(rows, indent=1))
+    return int(any(row["findings"] for row in rows))

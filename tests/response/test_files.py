@@ -133,7 +133,7 @@ def test_damaged_matlab_files_end_no_more_than_their_reader(tmp_path):
     cut = b"MATLAB 5.0 MAT-file" + b" " * 105 + b"\x00\x01IM\x0e\x00\x00\x00"
     for content in (path.read_bytes(), cut, b"\xff" * 300):
         path.write_bytes(content)
-        with pytest.raises(InputError, match="bad.mat: is not a DoRF file") as error:
+        with pytest.raises(InputError, match="bad.mat: cannot be read as DoRF") as error:
             response_by_name(f"{path}:0")
         assert "\n" not in str(error.value)
 

@@ -18,8 +18,6 @@ from PIL import Image
 from sehdr_warp.scene.hdr_files import read_hdr
 from sehdr_warp.training.run_folder import RunFolder
 from tests.fuzz.mutate import NUMBERS, VALUES
-from tests.fuzz.readers import READERS
-from tests.fuzz.run import fuzz
 
 from .harness import COMMANDS, TRAIN, call, files_in, limit_memory
 
@@ -266,12 +264,3 @@ def test_interrupts(space, number):
     assert "Traceback" not in told and child.returncode in (128 + kind, -kind), told
     if (space / "new" / "run.json").exists():
         assert RunFolder(space / "new").newest_checkpoint() is not None
-
-
-@pytest.mark.parametrize("name", READERS)
-def test_readers_refuse_damage(name, tmp_path):
-    """Each reader as long as 12 s last; more by `python -m tests.fuzz`."""
-    findings = []
-    found = lambda index, finding: findings.append((index, finding)) if finding not in (None, "begun") else None  # noqa: E731
-    fuzz(name, tmp_path / name, SEED, 0, 100_000, 10.0, time.monotonic() + 12, found)
-    assert findings == []

@@ -1,0 +1,88 @@
+"""Other people's readers of files, which believe the lengths that they find: a damaged file ends the process, takes
+minutes or fills the memory. They run in a process of their own, with bounds, and give plain arrays."""
+
+import io
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+
+from .errors import InputError
+
+_MEMORY, _MEMORY_PER_BYTE = 1 << 30, 16
+_SECONDS, _BYTES_PER_SECOND = 25, 10 << 20
+# Each thread reserves address space, of which there is a bound.
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "PXR_WORK_THREAD_LIMIT"), "1")
+
+
+def read_apart(read: Callable[[Path], dict[str, np.ndarray]], path: Path, kind: str, remedy: str) -> dict:
+    """What `read`, a function of a module that loads quickly, makes of a file.
+
+    Raises InputError where the file is missing, and, as "cannot be read as `kind`", for whatever ends the reader.
+    """
+    if not path.is_file():
+        raise InputError(path, "file not found", "check the name")
+    size = path.stat().st_size
+    words = (read.__module__, read.__name__, str(path), str(_MEMORY + _MEMORY_PER_BYTE * size))
+    seconds = _SECONDS + size / _BYTES_PER_SECOND
+    try:
+        code, out, told = start(words, seconds)
+    except OSError as error:
+        code, out, told = 1, b"", str(error).encode()
+    except subprocess.TimeoutExpired:
+        code, out, told = 1, b"", f"not read after {seconds:.0f} s".encode()
+    if code:
+        reason = told.decode(errors="replace").strip().splitlines()[-1:] or ["its reader ended early"]
+        raise InputError(path, f"cannot be read as {kind} ({reason[0]:.160})", remedy)
+    with np.load(io.BytesIO(out)) as stored:
+        return dict(stored)
+
+
+def start(words: Sequence[str], seconds: float) -> tuple[int, bytes, bytes]:
+    """Code, standard output and error of main(*words) in a process; subprocess.TimeoutExpired after so long."""
+    # The modules of this process, and none that lie where it was started.
+    environment = {**os.environ, **_ONE_THREAD, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-P", "-m", __name__, *words]
+    done = subprocess.run(
+        command, stdin=subprocess.DEVNULL, capture_output=True, timeout=seconds, env=environment, check=False
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+def main(module: str, name: str, path: str, memory: str) -> int:
+    """Writes the arrays to standard output; returns the code to exit with."""
+    try:
+        read = getattr(import_module(module), name)
+        with suppress(ImportError, OSError, ValueError):
+            import resource
+
+            used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+            resource.setrlimit(resource.RLIMIT_AS, (used + int(memory),) * 2)
+        packed = io.BytesIO()
+        np.savez(packed, **read(Path(path)))
+        with open(1, "wb", closefd=False) as out:
+            out.write(packed.getbuffer())
+    except Exception as error:  # noqa: BLE001 - whatever a reader raises says that it cannot read
+        os.write(2, f"\n{type(error).__name__}: {' '.join(str(error).split())[-140:]}\n".encode(errors="replace"))
+        return 1
+    return 0
+
+
+def mat_arrays(path: Path) -> dict[str, np.ndarray]:
+    """B and I of a MATLAB file."""
+    from scipy.io import loadmat
+
+    stored = loadmat(path, variable_names=["B", "I"])
+    for name in "BI":
+        if stored[name].dtype.kind not in "fui":
+            raise ValueError(f"{name} holds no real numbers")
+    return {name: stored[name].astype(float) for name in "BI"}
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -1,0 +1,43 @@
+"""Readers in a process of their own: what they give, and that they end where files mislead them."""
+
+import time
+
+import numpy as np
+import pytest
+
+from sehdr_warp import apart
+from sehdr_warp.errors import InputError
+from sehdr_warp.splats import read_gaussians
+
+
+def given(path):
+    return {"read": np.frombuffer(path.read_bytes(), np.uint8), "word": "é"}
+
+
+def fills_memory(path):
+    return {"read": np.ones(4 << 30, np.uint8)}
+
+
+def never_ends(path):
+    time.sleep(60)
+
+
+def test_bounds(tmp_path, monkeypatch):
+    (tmp_path / "a").write_bytes(b"abc")
+    (tmp_path / "numpy.py").write_text("raise SystemExit('a module of the folder was run')")
+    monkeypatch.chdir(tmp_path)
+    stored = apart.read_apart(given, tmp_path / "a", "x", "y")
+    assert bytes(stored["read"]) == b"abc" and str(stored["word"]) == "é"
+    monkeypatch.setattr(apart, "_SECONDS", 3)
+    for read, told in ((fills_memory, "a: cannot be read as x .*allocate"), (never_ends, "not read after 3 s")):
+        with pytest.raises(InputError, match=told):
+            apart.read_apart(read, tmp_path / "a", "x", "y")
+
+
+def test_a_stage_leads_to_no_other_folder(tmp_path):
+    pytest.importorskip("pxr")
+    (tmp_path / "in").mkdir()
+    (tmp_path / "secret.usda").write_text('#usda 1.0\ndef Sphere "a" {}\n')
+    (tmp_path / "in" / "a.usda").write_text("#usda 1.0\n(subLayers = [@../secret.usda@])\n")
+    with pytest.raises(InputError, match="leads outside of its folder"):
+        read_gaussians(tmp_path / "in" / "a.usda")
