@@ -65,6 +65,7 @@ def write_brackets(
     colorspace: str = "rec709",
     pixel: str = "half",
     multipart: bool = False,
+    by: str = "view",
     ldr: str | None = None,
     response: Any = None,
     overwrite: bool = False,
@@ -75,14 +76,15 @@ def write_brackets(
     exposures: see bracket_exposures. cameras: by name, for the EXR attributes. Other parameters: see Brackets.
 
     Every pixel is E dt, computed in float64 and rounded once. Files: `out/brackets/<view>/<view>_b<i>_ev<+x.x>.exr`
-    with i ascending by exposure, or `out/brackets/<view>.exr`; `out/brackets_ldr/<view>/...` where ldr is given; and
-    `out/brackets.json`. All appear together when the last one is written.
+    with i ascending by exposure, by="exposure" `out/brackets/b<i>_ev<+x.x>/<view>.exr`, or `out/brackets/<view>.exr`;
+    the like in `out/brackets_ldr` where ldr is given; and `out/brackets.json`. All appear together when the last one is
+    written.
 
     Raises SehdrError for unusable exposures or options, InputError where something would be replaced (unless
     overwrite) or a pixel is not finite.
     """
     made = bracket_exposures(base_time, evs=evs, exposures=exposures)
-    brackets = Brackets(made, base_time, colorspace, pixel, multipart, ldr, response)
+    brackets = Brackets(made, base_time, colorspace, pixel, multipart, ldr, response, by=by)
     radiances = dict(views)
     names = zip(safe_names(list(radiances)), radiances.items(), strict=True)
     given = ((safe, radiance, (cameras or {}).get(name)) for safe, (name, radiance) in names)
@@ -96,7 +98,7 @@ class Brackets:
     exposures: ascending, as from bracket_exposures. base_time: seconds at 0 EV. colorspace: of the EXR files. pixel:
     "half" (float where half would overflow) or "float". multipart: one EXR file with all exposures of a view. ldr: one
     of LDR_FORMATS adds simulated photos through response.encode. captured: local time. provenance: text by key, for the
-    EXR attributes.
+    EXR attributes. by: "view" or "exposure", what a folder is of; folders by exposure hold sequences.
     """
 
     exposures: tuple[Exposure, ...]
@@ -108,10 +110,15 @@ class Brackets:
     response: Any = None
     captured: datetime | None = None
     provenance: Mapping[str, str] | None = None
+    by: str = "view"
 
     def __post_init__(self):
         color_space(self.colorspace)
         stored_pixel_type((), self.pixel)
+        if self.by not in ("view", "exposure"):
+            raise SehdrError(f"folders by {self.by!r} are not one of view, exposure")
+        if self.multipart and self.by == "exposure":
+            raise SehdrError("a multi-part file holds all exposures of a view; leave out multipart, or by")
         if self.ldr is not None and self.ldr not in LDR_FORMATS:
             raise SehdrError(f"LDR brackets {self.ldr!r} are not one of {', '.join(LDR_FORMATS)}")
         if self.ldr is not None and self.response is None:
@@ -165,14 +172,15 @@ class Brackets:
         for index, (exposure, image) in enumerate(zip(self.exposures, pixels, strict=True)):
             label, header = f"b{index}_{exposure.label}", self.header(name, exposure.time, camera, ev=repr(exposure.ev))
             parts.append(Part(rgb_channels(image), header, label))
-            file = f"{name}.exr" if self.multipart else f"{name}/{name}_{label}.exr"
+            place = f"{name}/{name}_{label}" if self.by == "view" else f"{label}/{name}"
+            file = f"{name}.exr" if self.multipart else f"{place}.exr"
             entry = {"index": index, "exposure_time": exposure.time, "ev": exposure.ev, "file": f"brackets/{file}"}
             if self.multipart:
                 entry["part"] = index
             else:
                 write_exr(folder / file, parts[-1].channels, pixel=pixel, header=header)
             if self.ldr:
-                photo = f"{name}/{name}_{label}.{'jpg' if self.ldr == 'jpeg' else 'png'}"
+                photo = f"{place}.{'jpg' if self.ldr == 'jpeg' else 'png'}"
                 exif = exposure_exif(exposure.time, bias=exposure.ev, captured=self.captured)
                 codes = quantize(self.response.encode(radiance * exposure.time), 16 if self.ldr == "png16" else 8)
                 write_picture(photos / photo, codes, exif=exif)

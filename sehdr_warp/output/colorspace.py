@@ -48,17 +48,23 @@ def chromaticities(name: str) -> tuple[float, ...]:
     """CIE xy of red, green, blue and white: eight numbers in the order of OpenEXR's `chromaticities`."""
     if color_space(name).name == "rec709":
         return _REC709
-    space = _dataset(name)
+    space = _dataset(color_space(name).dataset)
     return tuple(map(float, (*space.primaries.ravel(), *space.whitepoint)))
 
 
 @cache
 def matrix_from_rec709(name: str) -> np.ndarray:
-    """[3, 3] float64: linear Rec.709 column vectors to the named space, white to white by Bradford's adaptation, as in
-    the ACES transforms and OpenColorIO's built-in ones."""
+    """[3, 3] float64: linear Rec.709 column vectors to the named space."""
+    return matrix_to(color_space(name).dataset)
+
+
+@cache
+def matrix_to(dataset: str) -> np.ndarray:
+    """[3, 3] float64: linear Rec.709 to a space of colour.RGB_COLOURSPACES, white to white by Bradford's adaptation, as
+    in the ACES transforms and OpenColorIO's built-in ones."""
     import colour
 
-    return colour.matrix_RGB_to_RGB(_dataset("rec709"), _dataset(name), "Bradford")
+    return colour.matrix_RGB_to_RGB(_dataset(color_space("rec709").dataset), _dataset(dataset), "Bradford")
 
 
 def from_rec709(rgb: np.ndarray, name: str) -> np.ndarray:
@@ -68,10 +74,10 @@ def from_rec709(rgb: np.ndarray, name: str) -> np.ndarray:
     return rgb if color_space(name).name == "rec709" else rgb @ matrix_from_rec709(name).T
 
 
-def _dataset(name: str):
+def _dataset(dataset: str):
     """colour-science's space, with matrices of its primaries: the published ones are rounded to four digits."""
     import colour
 
-    space = colour.RGB_COLOURSPACES[color_space(name).dataset].copy()
+    space = colour.RGB_COLOURSPACES[dataset].copy()
     space.use_derived_transformation_matrices(True)
     return space

@@ -54,18 +54,27 @@ class Render(_Rendered):
     """Brackets as seconds (1/125), multiples of the photos' exposure (1/8x) or stops from it (-2ev): 1/125,1/30,1x."""
     multipart: bool = False
     """One multi-part EXR file for all exposures of a view."""
+    by: Literal["view", "exposure"] = "view"
+    """What a folder of brackets holds: all exposures of a view, or the sequence of all views at an exposure."""
     ldr_brackets: Literal["jpeg", "png", "png16"] | None = None
     """Also write the brackets as simulated photos, through the camera response."""
     colorspace: str = "rec709"
     """Primaries of the EXR files, always scene-linear: rec709, acescg, aces2065-1, rec2020, display-p3 or dci-p3."""
+    white: float | None = None
+    """Value of the photos' white in hdr/, such as 1; without, the files hold radiance."""
     pixel: Literal["half", "float"] = "half"
     """Pixel type of the EXR files."""
+    ocio: str | None = None
+    """Config of OpenColorIO for the previews: a file, or ocio://default."""
+    view: str | None = None
+    """View of that config, or DISPLAY/VIEW."""
     video: Path | None = None
     """A film of the cameras, such as orbit.mp4; without --out no pictures are written."""
     fps: float = 24.0
     """Frames a second of the film."""
-    transfer: Literal["sdr", "hlg", "hdr10"] = "sdr"
-    """What the film is for: any display (H.264), or HDR displays (HEVC, 10 bits)."""
+    transfer: Literal["sdr", "hlg", "hdr10", "logc3", "slog3", "acescct"] = "sdr"
+    """What the film is for: any display (H.264), HDR displays (hlg, hdr10: HEVC, 10 bits), or grading (ProRes 4444 in a
+    camera's logarithm, .mov)."""
     ev_ramp: str | None = None
     """Exposure of the film from its first frame to its last, in stops from the photos': --ev-ramp=-4:4."""
     json: bool = False

@@ -1,4 +1,5 @@
-"""Films of camera paths: H.264 for any display, or HEVC with 10 bits as HLG or HDR10 for HDR displays."""
+"""Films of camera paths: H.264 for any display, HEVC with 10 bits as HLG or HDR10 for HDR displays, or ProRes 4444 in a
+camera's logarithm for grading."""
 
 import logging
 import time
@@ -15,7 +16,7 @@ from sehdr_warp.scene import Camera
 
 from ..console import format_seconds
 from ..files import atomic_path
-from .colorspace import matrix_from_rec709
+from .colorspace import matrix_from_rec709, matrix_to
 from .images import as_array
 from .light_pictures import display_gain
 from .tonemap import encode_srgb, fit_tone_map
@@ -49,6 +50,13 @@ TRANSFERS = {
     "hlg": Transfer("libx265", "yuv420p10le", {"crf": "18", "x265-params": _X265}, 9, 18, 9),
     "hdr10": Transfer("libx265", "yuv420p10le", {"crf": "18", "x265-params": f"{_X265}:{_MASTER}"}, 9, 16, 9),
 }
+LOGS = {
+    "logc3": ("ARRI LogC3", "ARRI Wide Gamut 3"),
+    "slog3": ("S-Log3", "S-Gamut3.Cine"),
+    "acescct": ("ACEScct", "ACEScg"),
+}
+"""Curve and primaries of each logarithm, as colour-science names them. H.273 has no code points for them."""
+TRANSFERS |= dict.fromkeys(LOGS, Transfer("prores_ks", "yuv444p10le", {"profile": "4444"}, 2, 2, 1))
 
 
 def write_film(
@@ -65,9 +73,10 @@ def write_film(
     """Renders a film of cameras, one each frame, at the size of the first; returns `out`, whose suffix says the format.
 
     transfer: "sdr": H.264, Rec.709, tone-mapped by one map for all frames; "hlg" or "hdr10": HEVC of 10 bits in
-    Rec.2020, in which a photo's white is 203 cd/m2 and light is kept up to 1000. ev_ramp: stops from the photos'
-    exposure at the first and the last frame, changing evenly. exposed: SDR is not tone-mapped but exposed and clipped,
-    as a camera does; so too where the ramp moves.
+    Rec.2020, in which a photo's white is 203 cd/m2 and light is kept up to 1000; "logc3", "slog3", "acescct": ProRes
+    4444 of 10 bits (.mov), in which a photo's white is a reflectance of 1. ev_ramp: stops from the photos' exposure
+    at the first and the last frame, changing evenly. exposed: SDR is not tone-mapped but exposed and clipped, as a
+    camera does; so too where the ramp moves.
 
     Raises SehdrError without PyAV (the extra `film`) or its encoder, InputError where `out` exists (unless overwrite).
     """
@@ -108,10 +117,17 @@ def encode(light: np.ndarray, transfer: str) -> np.ndarray:
     """[..., 3] linear Rec.709 display light, in which 1 is the photos' white, as R'G'B' in [0, 1] of a transfer.
 
     sdr: Rec.709's primaries, the sRGB curve. hdr10: Rec.2020, SMPTE ST 2084 of cd/m2. hlg: Rec.2020, BT.2100's OETF of
-    the scene light that its system gamma of 1.2 shows so on a display of 1000 cd/m2.
+    the scene light that its system gamma of 1.2 shows so on a display of 1000 cd/m2. logc3 (at EI 800), slog3, acescct:
+    in the primaries of LOGS.
     """
     if transfer == "sdr":
         return encode_srgb(light)
+    if transfer in LOGS:
+        import colour
+
+        curve, primaries = LOGS[transfer]
+        linear = np.maximum(np.asarray(light, np.float64) @ matrix_to(primaries).T, 1e-10)
+        return np.clip(colour.log_encoding(linear, curve), 0, 1)
     wide = np.maximum(np.asarray(light, np.float64) @ matrix_from_rec709("rec2020").T, 0) * REFERENCE_WHITE
     shown = np.minimum(wide, PEAK)
     if transfer == "hdr10":

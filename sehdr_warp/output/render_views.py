@@ -1,6 +1,7 @@
 """Pictures of a trained scene: HDR files, previews and exposure brackets, for any set of cameras."""
 
 import logging
+import math
 from collections import deque
 from collections.abc import Iterator, Sequence
 from datetime import datetime
@@ -20,7 +21,9 @@ from .camera_paths import interpolate, orbit
 from .colorspace import from_rec709
 from .exr import Part, rgb_channels, write_multipart_exr
 from .images import as_array, quantize, write_picture
+from .light_pictures import display_gain
 from .names import safe_names
+from .ocio import ocio_view
 from .passes import data_parts, read_passes
 from .tonemap import fit_tone_map
 from .usd_cameras import usd_cameras
@@ -43,12 +46,16 @@ def render_views(
     evs: Items | None = None,
     exposures: Items | None = None,
     multipart: bool = False,
+    by: str = "view",
     colorspace: str = "rec709",
+    white: float | None = None,
     pixel: str = "half",
     overwrite: bool = False,
     ldr_brackets: str | None = None,
     passes: str | Sequence[str] = (),
     size: str | tuple[int, int] | None = None,
+    ocio: str | None = None,
+    view: str | None = None,
 ) -> list[Path]:
     """Renders views of a run into `out`; returns the files written.
 
@@ -58,8 +65,9 @@ def render_views(
 
     cameras: "train", "test", "all", "orbit", "interpolate", or a file (see load_cameras). count: views of an orbit or
     interpolation. size: width and height in pixels, or "1920x1080", in place of the cameras' own: the vertical field of
-    view stays. passes: of depth, position, normals, alpha, confidence and clipped, each a part of its own of
-    `hdr/<view>.exr`.
+    view stays. white: what `hdr/` shows the photos' white as, by an exposure that its `expTime` states; None leaves
+    radiance. ocio, view: a config of OpenColorIO and a view in it, for the previews (see ocio_view). passes: of depth,
+    position, normals, alpha, confidence and clipped, each a part of its own of `hdr/<view>.exr`.
     overwrite: replaces the folders hdr, preview and brackets of an earlier render; other files in `out` stay.
     Cameras that see nothing are named in a warning.
 
@@ -72,7 +80,14 @@ def render_views(
         raise SehdrError("brackets were asked for without exposures; give evs (--evs=-2,0,2) or exposures")
     made = bracket_exposures(run.base_time, evs=evs, exposures=exposures) if wanted else ()
     form, now = (colorspace, pixel, multipart, ldr_brackets, run.response), datetime.now().replace(microsecond=0)
-    brackets = Brackets(made, run.base_time, *form, now, provenance(run))
+    brackets = Brackets(made, run.base_time, *form, now, provenance(run), by)
+    shown = run.base_time * display_gain(run.response)
+    exposure = 1.0 if white is None else white * shown
+    if not (math.isfinite(exposure) and exposure > 0):
+        raise SehdrError(f"white {white} is not a positive number; 1 shows the photos' white as 1")
+    if (ocio is None) != (view is None):
+        raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")
+    look = None if ocio is None or view is None else ocio_view(ocio, view, shown)
     passes = read_passes(passes) if passes else ()
     views = select_cameras(run, cameras, count=count)
     if size is not None:
@@ -83,17 +98,17 @@ def render_views(
     def write_pictures(hdr_folder: Path, preview_folder: Path) -> Iterator[tuple[str, np.ndarray, Camera]]:
         """Writes each view, and yields what its brackets are made of."""
         chosen = [views[i][1] for i in sorted({round(i) for i in np.linspace(0, len(views) - 1, _FIT_VIEWS)})]
-        tone_map = fit_tone_map([as_array(run.render(_small(camera)).hdr) for camera in chosen])
+        tone_map = look or fit_tone_map([as_array(run.render(_small(camera)).hdr) for camera in chosen])
         for index, (name, camera) in enumerate(views, start=1):
             rendered, confidence = run.render(camera), run.render_confidence(camera)
             hdr = as_array(rendered.hdr)
-            channels = rgb_channels(from_rec709(hdr, colorspace))
+            channels = rgb_channels(from_rec709(hdr, colorspace) * exposure)
             channels |= {"A": as_array(rendered.alpha), "Z": as_array(rendered.depth)}
             if confidence is not None:
                 channels["confidence"] = as_array(confidence)
             elif index == 1:
                 log.info("without a confidence channel: `sehdr-warp report` measures it, from the photos")
-            header = brackets.header(name, 1.0, camera)
+            header = brackets.header(name, exposure, camera)
             parts = [Part(channels, header, "rgba" if passes else "")]
             parts += data_parts(passes, run, rendered, camera, header)
             stored = write_multipart_exr(hdr_folder / f"{name}.exr", parts, pixel=pixel)

@@ -13,6 +13,7 @@ from ..errors import InputError
 from ..field.exposure import exposure_times, is_seconds
 from ..scene import Scene
 from ..scene.exposure import made_by_camera
+from ..scene.linear_photos import kind_of
 from ..splatting.threads import thread_count
 from .config import Config
 from .config_files import override_config
@@ -48,7 +49,7 @@ class SceneFacts:
     points: sparse points. seen: mean number of photos whose field of view holds a probe.
     overlap: part of the probes, or of places along the cameras' rays if that is more, that two photos show.
     clipped, black: part of the pixels with a channel at white, with all at 0. contrast: deviation of all codes.
-    light_known: the photos hold light itself: RAW, linear, float.
+    light_known: the photos hold light itself: RAW, linear, float. unclipped: they are float pictures, with all of it.
     drift: stops, about, between the darkest and the brightest photo's median where no exposure times are known; else 0.
     """
 
@@ -64,6 +65,7 @@ class SceneFacts:
     contrast: float
     drift: float
     light_known: bool = False
+    unclipped: bool = False
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         count = min(PROBES, len(scene.points))
         probes = np.asarray(scene.points)[rng.choice(len(scene.points), count, replace=False)]
     shown, drawn = (np.array([pixels_of(points, view)[2] for view in views]).sum(0) for points in (probes, drawn))
-    figures = np.array([_light(view.image) for view in views[:: -(-len(views) // MOST_VIEWS)]])
+    figures = np.array([_codes(view.image) for view in views[:: -(-len(views) // MOST_VIEWS)]])
     clipped, black, mean, square, _ = map(float, figures.mean(0))
     return SceneFacts(
         photos=len(views),
@@ -169,10 +171,11 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         contrast=float(np.sqrt(max(square - mean**2, 0.0))),
         drift=0.0 if scene.exposure_times_known else float(np.ptp(figures[:, -1])),
         light_known=scene.light_known,
+        unclipped=scene.light_known and all(view.source and kind_of(view.source) == "float" for view in views),
     )
 
 
-def _light(image: np.ndarray) -> tuple[float, float, float, float, float]:
+def _codes(image: np.ndarray) -> tuple[float, float, float, float, float]:
     """Parts of the pixels that are clipped and black, the means of the encoded values and of their squares, and the
     median's light in stops, by a gamma of 2.2."""
     clipped, black = (image >= 254.5 / 255).any(2).mean(), (image <= 0.5 / 255).all(2).mean()
@@ -225,6 +228,14 @@ def _response(facts: SceneFacts, config: Config, device: torch.device) -> Choice
         return {}, "no search", "learned with the scene" if name == "learned" else f"{name} was named"
     made = "a camera made the files" if facts.from_camera else "nothing says what made the files"
     return {}, "search", f"no curve was named, and {made}: it is chosen from {facts.photos} photos"
+
+
+def _light(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
+    if not (facts.unclipped and facts.truths == facts.photos and config.loss.ldr_weight):
+        return {}, "as photos show it", f"{facts.clipped:.1%} of the pixels are a bound alone"
+    fields: dict[str, object] = {"loss.ldr_weight": 0.0, "loss.hdr_weight": 1.0, "loss.form": "blend"}
+    reason = f"{facts.truths} float pictures hold all light: behind a photo's curve the brightest would hardly count"
+    return fields, "in the mu-law", reason
 
 
 def _brackets(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
@@ -292,6 +303,7 @@ def _confidence(facts: SceneFacts, config: Config, device: torch.device) -> Choi
 
 RULES: dict[str, Callable[[SceneFacts, Config, torch.device], Choice]] = {
     "response": _response,
+    "light": _light,
     "brackets": _brackets,
     "linear-loss": _linear_loss,
     "densification": _densification,

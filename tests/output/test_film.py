@@ -29,12 +29,18 @@ def smooth_run():
 
 
 @pytest.mark.parametrize(
-    "transfer, codec, tags", [("sdr", "h264", (1, 1, 1)), ("hlg", "hevc", (9, 18, 9)), ("hdr10", "hevc", (9, 16, 9))]
+    "transfer, codec, tags",
+    [
+        ("sdr", "h264", (1, 1, 1)),
+        ("hlg", "hevc", (9, 18, 9)),
+        ("hdr10", "hevc", (9, 16, 9)),
+        ("logc3", "prores", (2, 2, 1)),
+    ],
 )
 def test_a_film_holds_the_light_and_says_how(tmp_path, transfer, codec, tags):
     run, cameras = smooth_run()
     shown, context = frames(
-        write_film(run, tmp_path / "f.mp4", cameras, transfer=transfer, exposed=True, fps=24000 / 1001)
+        write_film(run, tmp_path / "f.mov", cameras, transfer=transfer, exposed=True, fps=24000 / 1001)
     )
     assert shown.shape == (5, 64, 96, 3) and context.name == codec
     assert (context.color_primaries, context.color_trc, context.colorspace) == tags
@@ -51,6 +57,10 @@ def test_references_of_the_curves():
     assert encode(np.full(3, 1.0), "hlg") == pytest.approx(0.75, abs=3e-3)
     assert encode(np.full(3, 1e3), "hlg") == pytest.approx(1, abs=1e-3)
     assert encode(np.full(3, 1e3), "hdr10") == pytest.approx(0.7518, abs=1e-3)
+    # ARRI (2017), Sony (2016) and S-2016-001: 18 % grey at 400, 420 and 423 of 1023.
+    for transfer, code in (("logc3", 400), ("slog3", 420), ("acescct", 423)):
+        np.testing.assert_allclose(encode(np.full(3, 0.18), transfer) * 1023, code, atol=0.6)
+        assert encode(np.full(3, 30.0), transfer).max() < 1 and (encode(np.zeros(3), transfer) >= 0).all()
     assert encode(np.zeros(3), "hlg") == pytest.approx(0) and encode(np.zeros(3), "hdr10") == pytest.approx(0, abs=1e-5)
 
 

@@ -8,6 +8,7 @@ from PIL import Image
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.files import LIST
 from sehdr_warp.output.camera_paths import common_focus, interpolate, orbit
+from sehdr_warp.output.light_pictures import display_gain
 from sehdr_warp.output.names import safe_names
 from sehdr_warp.output.render_views import render_views, select_cameras
 from sehdr_warp.scene import Camera, load_cameras
@@ -70,6 +71,34 @@ def test_brackets_are_the_hdr_file_times_the_exposure(tmp_path):
         np.testing.assert_array_equal(
             read_exr(tmp_path / "brackets" / "t_1" / f"{name}.exr")[0], (hdr * time).astype(np.float32)
         )
+
+
+def test_white_is_an_exposure_that_the_file_states(tmp_path):
+    run = AnalyticRun()
+    render_views(run, tmp_path / "a", pixel="float", white=1.0)
+    render_views(run, tmp_path / "b", pixel="float")
+    exposed, _, header = read_exr(tmp_path / "a" / "hdr" / "t_0.exr")
+    plain = read_exr(tmp_path / "b" / "hdr" / "t_0.exr")[0]
+    time = run.base_time * display_gain(run.response)
+    assert header["expTime"] == pytest.approx(time)
+    np.testing.assert_allclose(exposed[..., :3], plain[..., :3] * time, rtol=1e-6)
+    np.testing.assert_array_equal(exposed[..., 3:], plain[..., 3:])
+    for white in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(SehdrError, match="white"):
+            render_views(run, tmp_path / "c", white=white)
+
+
+def test_folders_by_exposure_hold_sequences(tmp_path):
+    render_views(AnalyticRun(), tmp_path, cameras="orbit", count=3, evs=[-2, 0], by="exposure", ldr_brackets="png")
+    names = [f"orbit_{i:03d}" for i in range(3)]
+    for folder, suffix in (("brackets", "exr"), ("brackets_ldr", "png")):
+        wanted = [f"{label}/{name}.{suffix}" for label in ("b0_ev-2.0", "b1_ev+0.0") for name in names]
+        assert tree(tmp_path / folder) == wanted
+    manifest = json.loads((tmp_path / "brackets.json").read_text())
+    files = [each["file"] for view in manifest["views"] for each in view["exposures"]]
+    assert len(files) == 6 and all((tmp_path / file).is_file() for file in files)
+    with pytest.raises(SehdrError, match="multi-part"):
+        render_views(AnalyticRun(), tmp_path / "b", evs=[0], by="exposure", multipart=True)
 
 
 def test_nothing_is_replaced_unless_asked_and_rendering_does_not_start(tmp_path):

@@ -15,6 +15,8 @@ from sehdr_warp.output.radiance_file import write_radiance
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.linear_photos import color_matrix, raw_codes, raw_exposure
 from sehdr_warp.scene.sfm import _device, _write_photos
+from sehdr_warp.training.config_files import load_config
+from sehdr_warp.training.plan import make_plan
 from sehdr_warp.training.run import Splats
 
 from ..output.helpers import camera
@@ -63,6 +65,8 @@ def test_float_pictures_are_photos_whose_light_is_known(tmp_path, suffix, tolera
         np.testing.assert_allclose(view.hdr, picture(i), rtol=tolerance)
     with pytest.raises(InputError, match="its photos are float: their light is known, and response srgb"):
         load_scene(tmp_path, response="srgb")
+    config = make_plan(scene, load_config("default", {}), "cpu").config
+    assert (config.loss.hdr_weight, config.loss.ldr_weight, config.loss.form) == (1, 0, "blend")
 
 
 def test_linear_16_bit_photos(tmp_path):
