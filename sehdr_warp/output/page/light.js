@@ -263,7 +263,8 @@ const secondsText = time => time < 0.3 ? `1/${(1 / time).toFixed(time < 0.05 ? 0
 
 // Deflated half floats in base64, as the report and notebooks carry them.
 async function unpackLight(text) {
-  const bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
+  const raw = atob(text), bytes = new Uint8Array(raw.length);
+  for (let i = 0; i < raw.length; i++) bytes[i] = raw.charCodeAt(i);
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
   return new Uint16Array(await new Response(stream).arrayBuffer());
 }

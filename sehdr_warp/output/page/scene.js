@@ -32,7 +32,7 @@ async function start() {
   eye.addComponent("camera", {clearColor: new pc.Color(0, 0, 0, 1), toneMapping: pc.TONEMAP_NONE, gammaCorrection: pc.GAMMA_SRGB});
   app.root.addChild(eye);
   app.start();
-  splat.gsplat.instance.sorter.on("updated", () => { sorted++; request(wanted ?? false); });
+  splat.gsplat.instance.sorter.on("updated", () => { sorted++; request(timer !== 0); });
   facts.views.forEach((view, i) => $("view").add(new Option(view.name, i)));
   new ResizeObserver(moved).observe(stage);
   jump(0);
@@ -60,7 +60,7 @@ function place(c) {  // The engine's camera: OpenGL axes, +y up and +z back
 function moved() {
   delete stage.dataset.frame;
   clearTimeout(timer);
-  timer = setTimeout(() => request(false), STILL_AFTER);
+  timer = setTimeout(() => { timer = 0, request(false); }, STILL_AFTER);
   request(true);
 }
 async function request(draft) {
@@ -71,6 +71,7 @@ async function request(draft) {
   while (wanted !== null) {
     const isDraft = wanted, started = performance.now();
     wanted = null;
+    if (!isDraft && !sorted) break;  // A full picture waits for the first order of its Gaussians, which asks for it.
     await render(isDraft ? scale : 1);
     if (isDraft) scale = Math.min(1, Math.max(0.15, scale * Math.min(1.5, Math.max(0.5, Math.sqrt(DRAFT_TIME / (performance.now() - started))))));
     else if (wanted === null && sorted) stage.dataset.frame = "full";
