@@ -25,6 +25,7 @@ from sehdr_warp.evaluation.evaluate import evaluate
 from sehdr_warp.files import write_json
 from sehdr_warp.response import Response, response_by_name
 from sehdr_warp.scene import Scene, codes_of, load_scene
+from sehdr_warp.scene.linear_photos import linear_codes
 from sehdr_warp.synth.expose import SensorNoise, exposure_ladder, noisy
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.train import train
@@ -76,18 +77,18 @@ def row(asked: tuple[str, int, int, str, str], *, iterations: int, max_size: int
 
 
 def photographed(truth: Scene, curve: Response, time: float, bits: int, kind: str, noise: SensorNoise | None) -> Scene:
-    """The scene in photos of so many bits, rounded before ("linear") or behind ("curve") the curve. Their codes are the
-    curve's with 16 bits, as RAW files become."""
+    """The scene in photos of so many bits, rounded before ("linear", read as RAW files are) or behind ("curve") the
+    curve."""
     levels, views, random = 2**bits - 1, [], np.random.default_rng(0)
     for view in truth.views:
         assert view.hdr is not None
         light = view.hdr.astype(np.float64) * time
         light = light if noise is None else noisy(light, 1.0, noise, random)
         if kind == "linear":
-            light = np.rint(np.clip(light, 0, 1) * levels) / levels
-        encoded = np.asarray(curve.encode(light))
-        encoded = encoded if kind == "linear" else np.rint(encoded * levels) / levels
-        views.append(replace(view, codes=codes_of(encoded, 16), exposure_time=time))
+            codes = linear_codes(np.rint(np.clip(light, 0, 1) * levels) / levels)
+        else:
+            codes = codes_of(np.rint(np.asarray(curve.encode(light)) * levels) / levels, 16)
+        views.append(replace(view, codes=codes, exposure_time=time))
     return replace(truth, views=tuple(views), response=curve, light_known=True)
 
 

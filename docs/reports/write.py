@@ -179,6 +179,10 @@ def _bits_tables(result: dict) -> Iterable[str]:
     yield _pivot(rows, places, "scene", "hdr", ".2f")
 
 
+def _panorama_tables(result: dict) -> Iterable[str]:
+    yield markdown_table(result["rows"], COLUMNS["panorama"])
+
+
 def _captures_tables(result: dict) -> Iterable[str]:
     yield markdown_table(result["rows"], COLUMNS["captures"])
 
@@ -211,6 +215,7 @@ TABLES: dict[str, Callable[[dict], Iterable[str]]] = {
     "readings": _readings_tables,
     "captures": _captures_tables,
     "bits": _bits_tables,
+    "panorama": _panorama_tables,
     "kernels": _kernel_tables,
     "step": _step_tables,
     "scale": _scale_tables,

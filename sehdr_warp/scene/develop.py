@@ -14,7 +14,7 @@ from .capture import Capture, Shot, reinhard_gamma
 from .hdr_files import hdr_size, read_hdr
 from .images import EncodedImage, image_sizes, read_ldr, read_mask
 from .lens import Lens, Undistortion, area_average, limited_size
-from .linear_photos import float_codes, kind_of, srgb_codes
+from .linear_photos import float_codes, kind_of, linear_codes
 from .names import unique_names
 from .types import Scene, View, codes_of
 
@@ -75,7 +75,7 @@ def as_photographed(shot: Shot, *, oriented: bool = False) -> EncodedImage:
         return EncodedImage(float_codes(read_hdr(shot.image), shot.seconds), None)
     if not shot.derived:
         read = read_ldr(shot.image, oriented=oriented)
-        return EncodedImage(srgb_codes(read.pixels / read.levels), read.alpha) if shot.linear else read
+        return EncodedImage(linear_codes(read.pixels / read.levels), read.alpha) if shot.linear else read
     return EncodedImage(codes_of(reinhard_gamma(read_hdr(shot.image) * shot.seconds), 8), None)
 
 

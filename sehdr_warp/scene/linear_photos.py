@@ -23,7 +23,7 @@ CURVES = {"raw": "srgb", "linear": "srgb", "float": "hdr-nerf"}
 _XYZ_FROM_REC709 = np.array(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
 )
-# Near the white level demosaicing mixes clipped values with others.
+# What clips is not at white to the last bit: a sensor reads it out with noise, and demosaicing mixes it with others.
 _CLIPPED = 0.99
 _MIDDLE_GREY = 0.18
 _MOST_JUDGED = 24
@@ -80,11 +80,13 @@ def raw_codes(path: Path, *, oriented: bool) -> np.ndarray:
         options: dict[str, Any] = {"output_color": rawpy.ColorSpace.raw, "gamma": (1, 1), "output_bps": 16}
         options |= {"no_auto_bright": True, "user_wb": [1, 1, 1, 1], "adjust_maximum_thr": 0.0}
         linear = raw.postprocess(**options, user_flip=None if oriented else 0).astype(np.float32) / 65535
-    return srgb_codes(np.where(linear >= _CLIPPED, 1, linear))
+    return linear_codes(linear)
 
 
-def srgb_codes(linear: np.ndarray) -> np.ndarray:
-    """[H, W, 3] uint16 sRGB codes of light, 1 at white: of 16 linear bits, what the dark keeps is what matters."""
+def linear_codes(linear: np.ndarray) -> np.ndarray:
+    """[H, W, 3] uint16 sRGB codes of a sensor's light, 1 at white: of 16 linear bits, what the dark keeps is what
+    matters. From 0.99 on it counts as white."""
+    linear = np.where(linear >= _CLIPPED, 1, linear)
     bright = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
     return codes_of(np.where(linear <= 0.0031308, 12.92 * linear, bright), 16)
 

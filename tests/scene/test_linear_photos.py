@@ -13,8 +13,9 @@ from sehdr_warp.output.exr import rgb_channels, write_exr
 from sehdr_warp.output.images import write_picture
 from sehdr_warp.output.radiance_file import write_radiance
 from sehdr_warp.scene import load_scene
-from sehdr_warp.scene.linear_photos import color_matrix, raw_codes, raw_exposure
+from sehdr_warp.scene.linear_photos import color_matrix, linear_codes, raw_codes, raw_exposure
 from sehdr_warp.scene.sfm import _device, _write_photos
+from sehdr_warp.synth.expose import SensorNoise, noisy
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.plan import make_plan
 from sehdr_warp.training.run import Splats
@@ -77,8 +78,16 @@ def test_linear_16_bit_photos(tmp_path):
     assert scene.response.name == "srgb"
     for i, view in enumerate(scene.views):
         expected = np.clip(picture(i) / 20, 0, 1)
+        expected = np.where(expected >= 0.99, 1, expected)
         np.testing.assert_allclose(light_of(view, scene), expected, atol=2e-5, rtol=1e-4)
-        np.testing.assert_array_equal(view.codes == 65535, expected >= 1 - 1e-5)
+        np.testing.assert_array_equal(view.codes == 65535, expected == 1)
+
+
+def test_what_clips_in_a_noisy_sensor_is_clipped():
+    random = np.random.default_rng(0)
+    seen = np.array(noisy(np.full((64, 64, 3), 3.0), 1.0, SensorNoise(), random))
+    codes = linear_codes(np.rint(seen * 16383) / 16383)
+    assert (seen < 1).mean() > 0.3 and (codes == 65535).all()
 
 
 def test_raw_files_clip_by_channel_in_the_sensors_colors(tmp_path):
