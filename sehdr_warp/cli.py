@@ -43,6 +43,8 @@ COMMANDS = {
     },
 }
 """Every command, under the headings of the help: its module, dataclass of options, and the function that runs them."""
+words_given: list[str] = []
+"""The words of the command line that is run."""
 _MODULES = {name: command for group in COMMANDS.values() for name, command in group.items()}
 
 
@@ -50,6 +52,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Runs a command line and exits: 0 done, 1 an error the user can act on, 2 wrong usage, 130 interrupted, 141 nobody
     reads its output any more."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    words_given[:] = words
     try:
         try:
             _run([word for word in words if word != "--debug"])

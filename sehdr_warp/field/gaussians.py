@@ -98,6 +98,14 @@ class Gaussians(nn.Module):
             nothing = torch.zeros_like(rows[name])
             self._exchange(name, torch.cat([old, rows[name]]), optimizer, lambda m, new=nothing: torch.cat([m, new]))
 
+    def resize(self, count: int, optimizer: torch.optim.Optimizer | None = None) -> None:
+        """Makes them so many, the last of them arbitrary: for values that are written next."""
+        if count < self.count:
+            self.keep(torch.arange(count, device=self.means.device), optimizer)
+        elif count > self.count:
+            more = count - self.count
+            self.append({name: old.new_zeros(more, *old.shape[1:]) for name, old in self.tensors().items()}, optimizer)
+
     def overwrite(
         self, rows: dict[str, Tensor], index: Tensor | None = None, optimizer: torch.optim.Optimizer | None = None
     ) -> None:

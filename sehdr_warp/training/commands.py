@@ -73,6 +73,8 @@ class MachineOptions:
 
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
+    gpus: int = 1
+    """GPUs of this machine to train on."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,41 @@ class ShowConfig:
 
 def run_train(asked: Train) -> None:
     """Trains, or prints the plan, and says what was made and what to do next."""
+    from .ranks import device_of_rank, joined, stated
+
+    gpus, place = asked.machine.gpus, stated()
+    if gpus < 1:
+        raise UsageError(f"--gpus {gpus} is not 1 or more")
+    if place is None and gpus > 1 and not asked.training.plan_only:
+        from ..cli import words_given
+        from .launch import launch
+
+        device_of_rank(gpus - 1, asked.machine.device)
+        launch(gpus, _run_as_rank, list(words_given))
+    elif place is None or asked.training.plan_only:
+        _train(asked)
+    elif gpus not in (1, place[1]):
+        raise UsageError(f"--gpus {gpus}, but {place[1]} ranks were started; leave it out")
+    else:
+        with joined(*place, device_of_rank(place[0], asked.machine.device)) as ranks:
+            if ranks.leads:
+                _train(asked, ranks)
+            else:
+                from .following import follow_leader
+
+                follow_leader(ranks)
+
+
+def _run_as_rank(words: list[str]) -> None:
+    """The command line of these words, as any process of it begins."""
+    from ..cli import main
+    from ..process import prepare
+
+    prepare()
+    main(words)
+
+
+def _train(asked: Train, ranks=None) -> None:
     from .machine import pick_device
     from .run_folder import RunFolder
 
@@ -129,7 +166,8 @@ def run_train(asked: Train) -> None:
     elif (folder := RunFolder(out)).check(**how):
         resumed = folder
     data = _data(asked, resumed)
-    config, device = _config(asked, resumed), pick_device(asked.machine.device)
+    config = _config(asked, resumed)
+    device = pick_device(asked.machine.device) if ranks is None else ranks.device
     options = config.response
     scene = _load(data, response=options.name, method=options.method, candidates=options.candidates)
     if out is None:
@@ -142,7 +180,9 @@ def run_train(asked: Train) -> None:
     from ..viewer.commands import viewed
     from .train import Training
 
-    training = Training(scene, out, config, device=device, tensorboard=output.tensorboard, data=data, **how)
+    training = Training(
+        scene, out, config, device=device, tensorboard=output.tensorboard, data=data, ranks=ranks, **how
+    )
     with viewed(training, str(out)) if output.view else nullcontext(training) as steps:
         follow(steps, training.total)
     run = training.run

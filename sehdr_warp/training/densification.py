@@ -44,6 +44,8 @@ class Densification:
             config.scaled(getattr(self.options, name)) for name in ("start", "stop", "every", "reset_every")
         )
         self.every = max(self.every, SHORTEST_INTERVAL)
+        self.photos = 1
+        """Iterations that the step makes at once: where several ranks train, each takes a photo."""
 
     def needs_gradients(self, iteration: int) -> bool:
         """Whether observe() wants the gradients of the projected means at this iteration."""
@@ -54,6 +56,10 @@ class Densification:
 
     def observe(self, rendering: Rendering, width: int, height: int, usable: Tensor) -> None:
         """Takes note of a step's image gradients. usable: scalar tensor, 0 where the step is to be ignored."""
+
+    def changes_at(self, iteration: int) -> bool:
+        """Whether change() does anything at this iteration."""
+        return self._is_due(iteration)
 
     def change(self, iteration: int, gaussians: Gaussians, optimizer, generator, births: Births | None = None) -> bool:
         """Changes the Gaussians where this iteration is one for it; True if any tensor was replaced by another."""
@@ -70,7 +76,8 @@ class Densification:
         """Takes up the statistics of state()."""
 
     def _is_due(self, iteration: int) -> bool:
-        return self.start < iteration < self.stop and iteration % self.every == 0
+        past = iteration % self.every
+        return past < self.photos and self.start < iteration - past < self.stop
 
 
 class GradientDensification(Densification):
@@ -99,11 +106,18 @@ class GradientDensification(Densification):
             self._grow(gaussians, self.gradient_sum / self.seen.clamp_min(1), optimizer, generator)
             self._prune(gaussians, optimizer, oversized=iteration > self.reset_every)
             self.gradient_sum = self.seen = None
-        if iteration < self.stop and iteration % self.reset_every == 0 and self.reset_every >= SHORTEST_RESET:
+        if self._resets(iteration):
             opacity = 2 * self.options.prune_opacity
             logits = gaussians.opacity_logits.clamp_max(math.log(opacity / (1 - opacity)))
             gaussians.overwrite({"opacity_logits": logits}, optimizer=optimizer)
         return changed
+
+    def changes_at(self, iteration: int) -> bool:
+        return self._is_due(iteration) or self._resets(iteration)
+
+    def _resets(self, iteration: int) -> bool:
+        past = iteration % self.reset_every
+        return past < self.photos and iteration - past < self.stop and self.reset_every >= SHORTEST_RESET
 
     def _grow(self, gaussians: Gaussians, gradient: Tensor, optimizer, generator) -> None:
         wanted = gradient > self.options.grow_gradient

@@ -1,6 +1,12 @@
-"""Adam over the Gaussians and the fusion, with 3DGS's learning rates."""
+"""Adam over the Gaussians and the fusion, with 3DGS's learning rates.
 
-from collections.abc import Iterator
+Where a step is made of a batch of B photos, rates are multiplied by the square root of B, and the moments' decays
+raised to the power of B: gradients of photos are taken as independent, so that B photos move a parameter about as far,
+and with the same variance, as B steps of one do (the rule of Grendel-GS, ICLR 2025, for 3D Gaussians).
+"""
+
+import math
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -10,6 +16,7 @@ from ..field.radiance_field import RadianceField
 from ..splatting.training_step import adam_step, judge_step
 from .config import Config
 
+BETAS = 0.9, 0.999
 EPSILON = 1e-15  # 3DGS: gradients of a single Gaussian are tiny, and must not drown in Adam's usual 1e-8
 
 
@@ -35,9 +42,9 @@ class Adam(torch.optim.Adam):
             adam_step(*given, *state, skipped, rate=group["lr"], betas=group["betas"], epsilon=group["eps"])
 
 
-def make_optimizer(field: RadianceField, config: Config, extent: float) -> Adam:
+def make_optimizer(field: RadianceField, config: Config, extent: float, batch: int = 1) -> Adam:
     """One named group for each parameter of the Gaussians, one for the fusion, one for a learned response. On a GPU
-    counters and rates live on the device, so that steps can be recorded in a CUDA graph."""
+    counters and rates live on the device, so that steps can be recorded in a CUDA graph. batch: photos in a step."""
     device = field.gaussians.means.device
     rates = {name: getattr(config.optimizer, name) for name in PARAMETER_NAMES}
     rates["means"] *= extent
@@ -47,16 +54,18 @@ def make_optimizer(field: RadianceField, config: Config, extent: float) -> Adam:
     if field.response.learnable:
         learned = list(field.response.parameters())
         groups.append({"name": "response", "params": learned, "lr": config.optimizer.response})
-    for group in groups if device.type == "cuda" else ():
-        group["lr"] = torch.tensor(group["lr"], device=device)
-    return Adam(groups, eps=EPSILON, fused=True, capturable=device.type == "cuda")
+    for group in groups:
+        rate = group["lr"] * math.sqrt(batch)
+        group["lr"] = torch.tensor(rate, device=device) if device.type == "cuda" else rate
+    betas = tuple(beta**batch for beta in BETAS)
+    return Adam(groups, betas=betas, eps=EPSILON, fused=True, capturable=device.type == "cuda")
 
 
-def means_rate(config: Config, extent: float, iteration: int) -> float:
+def means_rate(config: Config, extent: float, iteration: int, batch: int = 1) -> float:
     """The learning rate of the positions at an iteration: exponential from `means` to `means_final`, times extent."""
     rates = config.optimizer
     part = min(iteration / config.schedule.iterations, 1.0)
-    return extent * rates.means * (rates.means_final / rates.means) ** part
+    return math.sqrt(batch) * extent * rates.means * (rates.means_final / rates.means) ** part
 
 
 def set_means_rate(optimizer: torch.optim.Adam, rate: float) -> None:
@@ -78,13 +87,57 @@ def guarded_step(optimizer: Adam, loss: Tensor, incomplete: Tensor | None = None
     return nonfinite, made
 
 
-def optimizer_tensors(optimizer: torch.optim.Adam) -> dict[str, Tensor]:
-    """Adam's state as named tensors, `<group>.<index>.<key>`, for a checkpoint."""
+class FlatGradients:
+    """The gradients of all parameters of an optimizer in one buffer, behind them two numbers of the step: its loss, and
+    whether its rendering was incomplete."""
+
+    def __init__(self, optimizer: torch.optim.Adam):
+        self.parameters = [p for group in optimizer.param_groups for p in group["params"]]
+        sizes = [parameter.numel() for parameter in self.parameters]
+        self.buffer = torch.zeros(sum(sizes) + 2, device=self.parameters[0].device)
+        *parts, self.numbers = self.buffer.split([*sizes, 2])
+        self._views = [part.view(p.shape) for part, p in zip(parts, self.parameters, strict=True)]
+        self._given: Sequence[int] = ()
+
+    def fits(self, optimizer: torch.optim.Adam) -> bool:
+        """Whether these are still the optimizer's parameters."""
+        return all(
+            ours is theirs
+            for ours, theirs in zip(
+                self.parameters, (p for g in optimizer.param_groups for p in g["params"]), strict=True
+            )
+        )
+
+    @torch.no_grad()
+    def take(self, loss: Tensor, incomplete: Tensor | None) -> None:
+        """Moves the parameters' gradients into the buffer, with a step's numbers."""
+        self._given = [k for k, parameter in enumerate(self.parameters) if parameter.grad is not None]
+        given = [self.parameters[k].grad for k in self._given]
+        torch._foreach_copy_([self._views[k] for k in self._given], given)
+        self.numbers[0] = loss.detach()
+        self.numbers[1] = torch.zeros_like(loss) if incomplete is None else incomplete.to(loss.dtype)
+        for k in self._given:
+            self.parameters[k].grad = None
+
+    def give(self) -> tuple[Tensor, Tensor]:
+        """The buffer's parts as the gradients of the parameters that had one; loss and incomplete [] bool."""
+        for k in self._given:
+            self.parameters[k].grad = self._views[k]
+        return self.numbers[0], self.numbers[1] > 0
+
+
+def optimizer_tensors(optimizer: torch.optim.Adam, batch: int = 1) -> dict[str, Tensor]:
+    """Adam's state as named tensors, `<group>.<index>.<key>`, for a checkpoint. Steps count photos there, of which one
+    makes `batch`: a training may go on with another."""
     states = {prefix: optimizer.state.get(parameter, {}) for prefix, parameter in _named(optimizer)}
-    return {f"{prefix}{key}": value for prefix, state in states.items() for key, value in state.items()}
+    return {
+        f"{prefix}{key}": value * batch if key == "step" and batch > 1 else value
+        for prefix, state in states.items()
+        for key, value in state.items()
+    }
 
 
-def load_optimizer_tensors(optimizer: torch.optim.Adam, tensors: dict[str, Tensor]) -> None:
+def load_optimizer_tensors(optimizer: torch.optim.Adam, tensors: dict[str, Tensor], batch: int = 1) -> None:
     """Takes up what optimizer_tensors gave."""
     for prefix, parameter in _named(optimizer):
         if state := under(tensors, prefix):
@@ -92,6 +145,7 @@ def load_optimizer_tensors(optimizer: torch.optim.Adam, tensors: dict[str, Tenso
                 key: value.to(parameter.device, copy=True).reshape(() if key == "step" else parameter.shape)
                 for key, value in state.items()
             }
+            optimizer.state[parameter]["step"] /= batch
 
 
 def under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -14,25 +14,25 @@ from typing import Any
 import torch
 
 from ..errors import InputError, SehdrError
-from ..evaluation.metrics import psnr
-from ..evaluation.protocols import normalise, tone_map
-from ..field.radiance_field import RadianceField, RenderedView
+from ..field.radiance_field import RenderedView
 from ..field.unexplained import MOST_NAMED, told, unexplained_regions
-from ..scene import Camera, Scene, View
+from ..scene import Camera, Scene
 from ..splatting.memory import memory_told
 from .checkpoint import first_not_finite
 from .config import Config
 from .config_files import config_fields, load_config, override_config
+from .following import hand_on, told_of_ranks
+from .held_out import evaluate_views
 from .initialization import choose_response, make_field, make_matcher
 from .machine import interruptible, machine_figures, pick_device, torch_settings
 from .plan import apply_plan
+from .ranks import END, GO, WAIT, Ranks
 from .run import Run, field_from_checkpoint, load_run
 from .run_folder import RunFolder
-from .trainer import Trainer
+from .trainer import Trainer, sizes_of
 
 log = logging.getLogger(__name__)
 
-BEST = 100.0  # Identical images count this many dB, so that a mean over views stays a number
 FALL = 0.2  # Decibels by which the last held-out figure may be below the best before it is told
 
 
@@ -85,6 +85,7 @@ class Training:
         overwrite: replace the run in `out`, once there is a checkpoint of the new one's start.
         tensorboard: event files in out/tensorboard (needs the extra `tensorboard`).
         data: how load_scene made the scene ("path", "exposure_index", "max_size" ...), saved to load it again.
+        ranks: the processes that train together, of which this one leads.
 
     Raises:
         InputError: for a scene, folder or config that cannot be used.
@@ -102,13 +103,14 @@ class Training:
         overwrite: bool = False,
         tensorboard: bool = False,
         data: dict[str, Any] | None = None,
+        ranks: Ranks | None = None,
     ):
-        self.folder = RunFolder(out)
+        self.folder, self.ranks = RunFolder(out), ranks
         self.device = pick_device(device)
         make_writer = _summary_writer() if tensorboard else None
         config = as_config(config)
         self.seconds = 0.0
-        with memory_told(self.device, lambda: _sizes(scene)):
+        with memory_told(self.device, lambda: sizes_of(scene)):
             self.scene = scene
             resumed = self.folder.check(resume=resume, overwrite=overwrite)
             try:
@@ -116,6 +118,8 @@ class Training:
                     self.trainer = self._continue(config)
                 else:
                     self.trainer = self._begin(scene, config or Config(), data or {}, overwrite)
+                if ranks is not None:
+                    hand_on(ranks, scene, self.trainer)
             except BaseException:
                 self.folder.unlock()
                 raise
@@ -128,7 +132,7 @@ class Training:
         self._checkpoint_every = self.config.scaled(self.config.schedule.checkpoint_every)
         response, count = self.trainer.field.response, self.trainer.field.gaussians.count
         log.info("response %s, %d Gaussians on %s", response.name, count, self.device)
-        for line in (*response.notes, *self._crowded()):
+        for line in (*response.notes, *self._crowded(), *told_of_ranks(scene, self.trainer)):
             log.info("%s", line)
 
     @property
@@ -165,7 +169,7 @@ class Training:
 
     def __iter__(self) -> Iterator[Step]:
         with (
-            memory_told(self.device, lambda: _sizes(self.scene, self.trainer)),
+            memory_told(self.device, lambda: sizes_of(self.scene, self.trainer)),
             torch_settings(self.config.deterministic),
             interruptible() as interrupted,
             ExitStack() as leaving,
@@ -174,9 +178,11 @@ class Training:
             leaving.callback(self.folder.unlock)
             self._interrupted = interrupted
             try:
-                while self.iteration < self.total and not self.ending:
+                while self._goes_on():
                     yield self._step()
             except GeneratorExit:
+                self.stop()
+                self._goes_on()
                 self._save()
                 raise
             self._save()
@@ -188,24 +194,41 @@ class Training:
             self.folder.write_confidence(run.measure_confidence(self.scene), run.checkpoint_hash)
             self._tell_unexplained(run)
 
+    def pause(self) -> None:
+        """Between steps: keeps other ranks waiting for a next one. To be called now and then."""
+        if self.ranks is not None and self.ranks.agree(WAIT) == END:
+            self.stop()
+
+    def _goes_on(self) -> bool:
+        """Whether there is a next step; of several ranks any may end the training."""
+        wanted = self.iteration < self.total and not self.ending
+        if self.ranks is None:
+            return wanted
+        while (agreed := self.ranks.agree(GO if wanted else END)) == WAIT:
+            pass
+        return agreed == GO
+
     def _step(self) -> Step:
-        before = self.seconds
+        before, first = self.seconds, self.iteration + 1
         self.timed(self.trainer.step)
-        iteration = self.iteration
-        evaluate, save = iteration in self._evaluate_at, iteration % self._checkpoint_every == 0
+        iteration, photos = self.iteration, self.trainer.photos
+        evaluate = not self._evaluate_at.isdisjoint(range(first, iteration + 1))
+        save = self.trainer.came_to(self._checkpoint_every)
         if evaluate or save:
             self._wait()
         if evaluate and self.scene.test_views:
             self._evaluate()
+        if save:
+            self.trainer.settle()
         if save and iteration < self.total:
             self._checkpoint()
         step = Step(self)
-        if self._writer is not None and iteration % max(1, self.total // 200) == 0:
+        if self._writer is not None and self.trainer.came_to(max(1, self.total // 200)):
             self._log("train", {name: getattr(step, name) for name in ("loss", "psnr", "gaussians")})
-        done = iteration - self._first - 1
+        done = iteration - self._first - photos
         if done == 0:  # It compiled kernels, which says nothing of the pace.
             return step
-        self._pace += (self.seconds - before - self._pace) / min(done, 100)
+        self._pace += ((self.seconds - before) / photos - self._pace) / min(done, 100)
         # With all the Gaussians that it may have, a step takes about twice as long as at the start.
         strategy = self.trainer.densification
         growing = self.trainer.field.gaussians.count < strategy.most
@@ -221,8 +244,11 @@ class Training:
     def _save(self) -> None:
         """The end of this process's part: a checkpoint, a summary, and what the held-out photos say of the whole."""
         self._wait()
+        self.trainer.settle()
         self.trainer.check()
         self._checkpoint()
+        if self.ranks is not None:
+            self.ranks.part()
         trainer, decisions = self.trainer, self.folder.read_decisions()
         summary = {
             "iteration": trainer.iteration,
@@ -288,7 +314,7 @@ class Training:
         response = choose_response(scene, config)
         matcher = cache(partial(make_matcher, scene, response, self.device))
         field = self.timed(partial(make_field, scene, config, response, self.device, matcher))
-        trainer = Trainer(scene, config, field, matcher)
+        trainer = Trainer(scene, config, field, matcher, self.ranks)
         # Nothing is made or removed before the scene is known to be good.
         tensors, values = trainer.state()
         state = tensors, values | {"seconds": self.seconds}
@@ -315,7 +341,9 @@ class Training:
         checkpoint = folder.newest_checkpoint()
         if checkpoint is None:
             raise InputError(folder.checkpoints, "holds no complete checkpoint", "train again, with --overwrite")
-        trainer = Trainer(scene, saved, field_from_checkpoint(checkpoint, saved, info).to(self.device))
+        trainer = Trainer(
+            scene, saved, field_from_checkpoint(checkpoint, saved, info).to(self.device), ranks=self.ranks
+        )
         try:
             trainer.load_state(checkpoint.tensors, checkpoint.values)
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
@@ -358,30 +386,6 @@ def as_config(config: object) -> Config | None:
     if isinstance(config, Mapping):
         return override_config(Config(), dict(config), "overrides")
     raise InputError("config", f"is {type(config).__name__}", "give a preset's name, a dict of fields or a Config")
-
-
-@torch.no_grad()
-def evaluate_views(field: RadianceField, views: tuple[View, ...], degree: int) -> dict[str, float]:
-    """Means over views, in dB, of psnr_ldr (simulated photo against photo, where the mask counts) and, over the views
-    with HDR truth, of psnr_mu (mu-law, protocol "gt-max"). Empty without views."""
-    device = field.gaussians.means.device
-    scores: dict[str, list[float]] = {}
-    for view in views:
-        mask = None if view.mask is None else torch.tensor(view.mask, device=device)
-        photo = torch.tensor(view.image, device=device)
-        predicted = field.render_ldr(view.camera, view.exposure_time, degree=degree)
-        scores.setdefault("psnr_ldr", []).append(min(psnr(predicted, photo, mask), BEST))
-        if view.hdr is not None:
-            hdr = field.render(view.camera, degree=degree).hdr
-            images = normalise("gt-max", hdr, torch.tensor(view.hdr, device=device), mask)
-            scores.setdefault("psnr_mu", []).append(min(psnr(*tone_map("gt-max", *images), mask), BEST))
-    return {name: sum(values) / len(values) for name, values in scores.items()}
-
-
-def _sizes(scene: Scene, trainer: Trainer | None = None) -> tuple[int, int, int]:
-    """Gaussians, and width and height of the largest photo."""
-    camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
-    return len(scene.points) if trainer is None else trainer.field.gaussians.count, camera.width, camera.height
 
 
 def _summary_writer() -> type:

@@ -3,7 +3,7 @@
 import operator
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import torch
@@ -13,7 +13,7 @@ from ..errors import SehdrError
 from ..field.radiance_field import RadianceField, RenderedView
 from ..response.learned import EXACT_BELOW
 from ..scene import Camera, Scene
-from ..splatting import GraphRecorder
+from ..splatting import GraphRecorder, Rendering
 from ..splatting.memory import bytes_asked_for
 from . import optimizer as adam
 from .births import born_rows
@@ -23,9 +23,11 @@ from .graph_capacity import GraphCapacity
 from .initialization import make_matcher, scene_extent
 from .losses import compares_light, data_loss, needed_colours, regularised
 from .matching import Matcher
+from .ranks import Ranks
 from .targets import TrainingView, ViewStack, largest_truth, training_views
 
 CHECK_EVERY = 20  # Iterations between looks at the count of skipped steps, each of which waits for the device
+COMPARE_EVERY = 500  # Iterations between looks at whether all ranks still have the same Gaussians
 MOST_SKIPPED = 20  # Steps with a loss or gradient that is not finite are skipped; more than so many end the training
 
 
@@ -34,16 +36,26 @@ class Trainer:
 
     Everything that decides the next step is in state(): a trainer that load_state()s it continues bit for bit on the
     CPU. No global random state is used.
+
+    ranks: the processes that train together. A step is then one photo on each of them and as many iterations; what is
+    to happen at an iteration does at the step that comes to or past it.
     """
 
     def __init__(
-        self, scene: Scene, config: Config, field: RadianceField, matcher: Callable[[], Matcher] | None = None
+        self,
+        scene: Scene,
+        config: Config,
+        field: RadianceField,
+        matcher: Callable[[], Matcher] | None = None,
+        ranks: Ranks | None = None,
     ):
+        self.ranks, self.batch = ranks, 1 if ranks is None else ranks.count
+        self.photos = 1  # Of the last step, which it made iterations
         self.config, self.field = config, field
         self.iteration = 0  # Steps done
         self.device = field.gaussians.means.device
         self.extent = scene_extent(scene)
-        self.optimizer = adam.make_optimizer(field, config, self.extent)
+        self.optimizer = adam.make_optimizer(field, config, self.extent, self.batch)
         pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
         self.densification = make_densification(config, self.extent, pixels)
         self._views = scene.train_views
@@ -59,6 +71,9 @@ class Trainer:
         self._index = torch.zeros(1, dtype=torch.int64, device=self.device)
         recorded = self.device.type == "cuda" and config.schedule.recorded
         self._recorder = GraphRecorder(self.device) if recorded else None
+        # What follows the exchange of gradients is a recording of its own.
+        self._follower = GraphRecorder(self.device, self._recorder.stream) if self._recorder and ranks else None
+        self._flat: adam.FlatGradients | None = None
         self._launched: set = set()
         self._capacity = GraphCapacity(self.device)
         self._loss: Tensor | None = None
@@ -98,15 +113,18 @@ class Trainer:
         return self._capacity.lacked
 
     def step(self) -> None:
-        """One photo, one step. Raises SehdrError if more than MOST_SKIPPED steps had to be skipped."""
-        self.iteration += 1
+        """One photo on each rank, one step. Raises SehdrError if more than MOST_SKIPPED steps had to be skipped."""
+        # The last step may be more photos than iterations are left.
+        self.photos = min(self.batch, max(1, self.config.schedule.iterations - self.iteration))
+        self.densification.photos = self.photos
+        self.iteration += self.photos
         views = self._training_views()
         index = self._next_index(len(views))
         gaussians = self.field.gaussians
         watched = self.densification.needs_gradients(self.iteration)
         if watched:
             self.densification.prepare(gaussians.count, self.device)
-        rate = adam.means_rate(self.config, self.extent, self.iteration)
+        rate = adam.means_rate(self.config, self.extent, self.iteration, self.batch)
         adam.set_means_rate(self.optimizer, rate)
         # The last: a learned response encodes few exposures otherwise, by kernels of its own.
         kind = (self.degree, watched, gaussians.count < EXACT_BELOW)
@@ -115,15 +133,58 @@ class Trainer:
             self._loss = self._replay(views, index, watched, kind)
         else:
             with self._launching():
-                self._loss = self._optimise(views[index], watched)
+                self._loss = self._step(lambda: self._gradients(views[index], watched), self._apply)
         self.densification.perturb(self.iteration, gaussians, rate)
-        changed = self.densification.change(self.iteration, gaussians, self.optimizer, self._generator, self._births)
-        if changed and self._recorder is not None:
+        if self._change() and self._recorder is not None:
             # Other Gaussians need about so many times the room.
-            self._recorder.invalidate()
+            self._invalidate()
             self._capacity.change(gaussians.count / max(1, count))
-        if self.iteration % CHECK_EVERY == 0:
+        if self.came_to(CHECK_EVERY):
             self.check()
+        if self.came_to(COMPARE_EVERY):
+            self.settle()
+
+    def came_to(self, every: int) -> bool:
+        """Whether the last step came to or past a multiple of a number of iterations."""
+        return self.iteration % every < self.photos
+
+    def settle(self) -> None:
+        """Gathers on rank 0 what belongs to a checkpoint. Raises SehdrError where the ranks are no longer alike."""
+        if self.ranks is not None:
+            self.ranks.collect(list(self.densification.state().values()))
+            self.ranks.compare(self.field.gaussians.tensors(), self.iteration)
+
+    def _change(self) -> bool:
+        """Changes the Gaussians where the iteration is one for it: rank 0 does, for all; whether their tensors are
+        others now."""
+        gaussians, strategy, ranks = self.field.gaussians, self.densification, self.ranks
+        given = self.iteration, gaussians, self.optimizer, self._generator, self._births
+        if ranks is None:
+            return strategy.change(*given)
+        if not strategy.changes_at(self.iteration):
+            return False
+        ranks.collect(list(strategy.state().values()))
+        changed = ranks.leads and strategy.change(*given)
+        told = torch.tensor([changed, gaussians.count, bool(strategy.state())], dtype=torch.int64, device=self.device)
+        ranks.spread([told])
+        changed, count, watching = told.tolist()
+        gaussians.resize(count, self.optimizer)
+        if not watching:
+            strategy.load_state({})
+        parameters = list(gaussians.tensors().values())
+        moments = [
+            self.optimizer.state[parameter][key]
+            for parameter in gaussians.parameters()
+            for key in ("exp_avg", "exp_avg_sq")
+            if parameter in self.optimizer.state
+        ]
+        ranks.spread([*parameters, *moments])
+        return bool(changed)
+
+    def _invalidate(self) -> None:
+        for recorder in (self._recorder, self._follower):
+            if recorder is not None:
+                recorder.invalidate()
 
     def _births(self, count: int) -> dict[str, Tensor]:
         """New Gaussians where the photos are explained worst; of the iteration alone, so that a resumed training has
@@ -132,9 +193,17 @@ class Trainer:
         with self._launching():
             return born_rows(self.field, self._matcher(), self._training_views(), count, self.degree, seed)
 
-    def _optimise(self, view: TrainingView, watched: bool, capacity: int | None = None) -> Tensor:
-        """Photograph, compare, differentiate, step; the loss. With a capacity all of it works on fixed memory and
-        nothing waits for the device."""
+    def _step(self, gradients: Callable[[], "_Seen"], apply: Callable[["_Seen"], Tensor]) -> Tensor:
+        """Gradients, of all ranks, and the step that they make; its loss."""
+        seen = gradients()
+        if self.ranks is not None:
+            assert self._flat is not None
+            self.ranks.mean(self._flat.buffer)
+        return apply(seen)
+
+    def _gradients(self, view: TrainingView, watched: bool, capacity: int | None = None) -> "_Seen":
+        """Photograph, compare, differentiate. With a capacity all of it works on fixed memory and nothing waits for the
+        device."""
         target, camera, time = view.target, view.camera, view.exposure_time
         also = needed_colours(self.config.loss, target.exposure_truth is not None)
         options = {"degree": self.degree, "also": also, "capacity": capacity, "encode": self._encoded}
@@ -149,16 +218,32 @@ class Trainer:
         del photo, target, view
         loss = regularised(loss, self.field, self.config.loss)
         loss.backward()
-        nonfinite, made = adam.guarded_step(self.optimizer, loss, rendering.overflow)
-        if watched:
-            self.densification.observe(rendering, camera.width, camera.height, made)
+        if self.ranks is not None:
+            self._flattened().take(loss, rendering.overflow)
+        return _Seen(loss.detach(), rendering, camera.width, camera.height, watched, capacity)
+
+    def _apply(self, seen: "_Seen") -> Tensor:
+        """The step that gradients make; its loss. Nothing waits for the device."""
+        rendering, loss, incomplete = seen.rendering, seen.loss, seen.rendering.overflow
+        if self._flat is not None:
+            loss, incomplete = self._flat.give()
+        nonfinite, made = adam.guarded_step(self.optimizer, loss, incomplete)
+        if seen.watched:
+            self.densification.observe(rendering, seen.width, seen.height, made)
         self.optimizer.zero_grad(set_to_none=True)
         self._skipped += nonfinite
-        if capacity is None:
+        if seen.capacity is None:
             self._capacity.launched(rendering.entry_count)
         else:
-            self._capacity.note(rendering.pair_count, rendering.overflow)
-        return loss.detach()
+            self._capacity.note(rendering.pair_count, incomplete)
+        return loss
+
+    def _flattened(self) -> adam.FlatGradients:
+        """The buffer for the gradients of the parameters as they are."""
+        if self._flat is None or not self._flat.fits(self.optimizer):
+            self._flat = None  # Before there is another: they are large.
+            self._flat = adam.FlatGradients(self.optimizer)
+        return self._flat
 
     def _can_record(self, views, kind) -> bool:
         """Whether this step can be a recorded one: on a GPU, photos of one size, after a step like it was launched."""
@@ -177,8 +262,19 @@ class Trainer:
     def _replay(self, views: ViewStack, index: int, watched: bool, kind) -> Tensor:
         capacity = self._capacity.capacity()
         self._index.fill_(index)
+
+        def gradients() -> _Seen:
+            return self._gradients(views.at(self._index), watched, capacity)
+
         try:
-            return self._recorder.run(kind, lambda: self._optimise(views.at(self._index), watched, capacity))
+            if self._follower is None:
+                return self._recorder.run(kind, lambda: self._step(gradients, self._apply))
+            self._flattened()  # Not in the recording's own memory.
+            follower = self._follower
+            return self._step(
+                lambda: self._recorder.run(kind, gradients),
+                lambda seen: follower.run(kind, lambda: self._apply(seen)),
+            )
         except RuntimeError as error:
             if bytes_asked_for(error):
                 raise
@@ -197,7 +293,7 @@ class Trainer:
             )
         if self._recorder is not None and self._capacity.look():
             # Steps without room for all pairs changed nothing; record again with what they needed.
-            self._recorder.invalidate()
+            self._invalidate()
 
     def state(self) -> tuple[dict[str, Tensor], dict]:
         """Named tensors and plain values that together are the whole state."""
@@ -205,7 +301,7 @@ class Trainer:
             "gaussians": self.field.gaussians.tensors(),
             "fusion": {} if self.field.fusion is None else self.field.fusion.state_dict(),
             "response": self.field.response.state_dict() if self.field.response.learnable else {},
-            "optimizer": adam.optimizer_tensors(self.optimizer),
+            "optimizer": adam.optimizer_tensors(self.optimizer, self.batch),
             "densification": self.densification.state(),
             "generators": {"order": self._order_generator.get_state(), "device": self._generator.get_state()},
         }
@@ -215,9 +311,12 @@ class Trainer:
 
     def load_state(self, tensors: dict[str, Tensor], values: dict) -> None:
         """Takes up what state() gave; the field's Gaussians must already be those of the state."""
-        adam.load_optimizer_tensors(self.optimizer, adam.under(tensors, "optimizer."))
+        adam.load_optimizer_tensors(self.optimizer, adam.under(tensors, "optimizer."), self.batch)
         statistics = {name: value.to(self.device) for name, value in adam.under(tensors, "densification.").items()}
         self.densification.load_state(statistics)
+        if self.ranks is not None and not self.ranks.leads:  # The sum over the ranks counts them once.
+            for total in statistics.values():
+                total.zero_()
         generators = adam.under(tensors, "generators.")
         self._order_generator.set_state(generators["order"].cpu())
         if self._generator.get_state().numel() == generators["device"].numel():
@@ -239,7 +338,29 @@ class Trainer:
         return self._stack
 
     def _next_index(self, count: int) -> int:
-        """Every photo once in random order, then again in another."""
-        if not self._order:
-            self._order = torch.randperm(count, generator=self._order_generator).tolist()
-        return self._order.pop()
+        """Every photo once in random order, then again in another; one for each rank, of which this one's is given."""
+        chosen = []
+        for _ in range(self.batch):
+            if not self._order:
+                self._order = torch.randperm(count, generator=self._order_generator).tolist()
+            chosen.append(self._order.pop())
+        return chosen[0 if self.ranks is None else self.ranks.rank]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What the second half of a step knows of the first: its own loss, what was rendered and at what size, whether the
+    densification watches, and the room for pairs."""
+
+    loss: Tensor
+    rendering: Rendering
+    width: int
+    height: int
+    watched: bool
+    capacity: int | None
+
+
+def sizes_of(scene: Scene, trainer: Trainer | None = None) -> tuple[int, int, int]:
+    """Gaussians, and width and height of the largest photo."""
+    camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
+    return len(scene.points) if trainer is None else trainer.field.gaussians.count, camera.width, camera.height

@@ -96,6 +96,7 @@ class LiveTraining(Rendering):
             if self._steps:
                 self._steps -= 1
                 return
+            self.run.pause()
             try:
                 self._make(self._asked.get(timeout=_WAIT))
             except queue.Empty:

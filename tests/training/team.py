@@ -1,0 +1,73 @@
+"""A training on two ranks of the CPU, as processes that keep what each of them ends with."""
+
+import os
+import sys
+from pathlib import Path
+
+import torch
+import torch.multiprocessing as processes
+
+RANKS = 2
+
+
+def run_team(work, folder: Path, *arguments) -> None:
+    """work(ranks, folder, *arguments) on each of RANKS ranks. Raises what ends one of them."""
+    processes.start_processes(_rank, (work, folder, arguments), RANKS, start_method="spawn")
+
+
+def _rank(rank: int, work, folder: Path, arguments: tuple) -> None:
+    from sehdr_warp.training.ranks import joined
+
+    os.environ |= {"WORLD_SIZE": str(RANKS), "SEHDR_RANKS": str(folder / "meeting"), "SEHDR_RANK_TIMEOUT": "60"}
+    with joined(rank, RANKS, torch.device("cpu")) as ranks:
+        work(ranks, folder, *arguments)
+
+
+def train_together(ranks, folder: Path, strategies: list[str], iterations: int) -> None:
+    """Trains the toy scene with each strategy; each rank saves its state as <strategy>.<rank>."""
+    from sehdr_warp.training.following import follow_leader
+    from sehdr_warp.training.train import Training
+
+    from .test_resume import configuration
+    from .toy import toy_scene
+
+    for strategy in strategies:
+        if ranks.leads:
+            training = Training(toy_scene(), folder / strategy, configuration(strategy), device="cpu", ranks=ranks)
+            for step in training:
+                if step.iteration >= iterations:
+                    training.stop()
+            trainer = training.trainer
+            ranks.store.delete_key("shared")
+        else:
+            trainer = follow_leader(ranks)
+        ranks.agree(2)
+        torch.save(trainer.state(), folder / f"{strategy}.{ranks.rank}")
+
+
+def differ(ranks, folder: Path) -> None:
+    """Ranks whose tensors differ by a bit say so, all of them."""
+    from sehdr_warp.errors import SehdrError
+
+    ranks.compare({"means": torch.ones(3)}, 5)
+    try:
+        ranks.compare({"scales": torch.ones(3), "means": torch.tensor([1.0, 1.0 + ranks.rank * 2**-23])}, 5)
+    except SehdrError as error:
+        (folder / f"differ.{ranks.rank}").write_text(str(error))
+
+
+def mixed(rank: int, folder: Path) -> None:
+    """Two ranks of different versions."""
+    import sehdr_warp
+    from sehdr_warp.errors import SehdrError
+    from sehdr_warp.training.ranks import joined
+
+    os.environ |= {"WORLD_SIZE": str(RANKS), "SEHDR_RANKS": str(folder / "meeting")}
+    sehdr_warp.__version__ = f"1.{rank}"
+    try:
+        with joined(rank, RANKS, torch.device("cpu")):
+            pass
+    except (SehdrError, SystemExit) as error:
+        (folder / f"mixed.{rank}").write_text(str(error))
+        sys.stdout.flush()
+        os._exit(0)

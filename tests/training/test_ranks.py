@@ -1,0 +1,163 @@
+"""Trainings on two ranks: alike in every bit, about as good as one, and ended together whatever happens to one."""
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+import torch.multiprocessing as processes
+
+from sehdr_warp.training.densification import make_densification
+from sehdr_warp.training.optimizer import FlatGradients, load_optimizer_tensors, make_optimizer, optimizer_tensors
+from sehdr_warp.training.plan import gain_of_ranks
+from sehdr_warp.training.run import load_run
+from sehdr_warp.training.run_folder import RunFolder
+from sehdr_warp.training.train import train
+
+from . import team
+from .test_resume import configuration
+from .toy import toy_field
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="ranks share photos through Linux's /proc")
+
+
+@pytest.fixture(scope="module")
+def together(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("together")
+    team.run_team(_all, folder)
+    return folder
+
+
+def _all(ranks, folder):
+    team.train_together(ranks, folder, ["gradient", "relocation"], 90)
+    team.differ(ranks, folder)
+
+
+@pytest.mark.parametrize("strategy", ["gradient", "relocation"])
+def test_ranks_stay_alike_and_one_can_go_on(scene, together, tmp_path, strategy):
+    """Counts change at 25, 50 and 75, in steps of two photos; at 90 they stop, and one rank goes on to 120."""
+    (tensors, values), (others, their_values) = (
+        torch.load(together / f"{strategy}.{rank}", weights_only=False) for rank in (0, 1)
+    )
+    assert values == their_values and values["iteration"] == 90
+    for name, value in tensors.items():
+        # Statistics stand on rank 0 alone, whose draws decide for all.
+        assert name.startswith(("densification.", "generators.device")) or torch.equal(value, others[name]), name
+    assert tensors["optimizer.means.0.step"] == 90, "counted in photos"
+    alone = train(scene, tmp_path / "alone", configuration(strategy), device="cpu")
+    run = train(scene, together / strategy, device="cpu", resume=True)
+    assert run.iterations == alone.iterations == 120
+    ours, theirs = (each.metrics()[-1]["psnr_ldr"] for each in (run, alone))
+    assert ours == pytest.approx(theirs, abs=1.0)
+    assert run.gaussian_count == pytest.approx(alone.gaussian_count, rel=0.2)
+
+
+def test_ranks_that_differ_say_where(together):
+    for rank in (0, 1):
+        assert (together / f"differ.{rank}").read_text().startswith("iteration 5: means is no longer the same on all")
+
+
+def test_other_versions_are_refused(tmp_path):
+    processes.start_processes(team.mixed, (tmp_path,), 2, start_method="spawn")
+    told = {(tmp_path / f"mixed.{rank}").read_text() for rank in (0, 1)}
+    assert len(told) == 2 and "1" in told, "one tells, the other ends quietly"
+    line = (told - {"1"}).pop()
+    assert line.startswith("rank 1 runs sehdr-warp 1.1") and "rank 0 sehdr-warp 1.0" in line
+
+
+def command(out, *words, patience="60"):
+    call = [sys.executable, "-m", "sehdr_warp", "train", "embedded", "--out", str(out), "--device", "cpu"]
+    call += ["--gpus", "2", "--max-size", "24", "--preset", "fast", "--response", "srgb", "--iterations", "20000"]
+    call += ["--schedule.checkpoint-every", "60", *words]
+    environment = os.environ | {"SEHDR_RANK_TIMEOUT": patience}
+    return subprocess.Popen(call, stderr=subprocess.PIPE, text=True, env=environment)
+
+
+@pytest.mark.parametrize(
+    "number,told",
+    [
+        (signal.SIGKILL, "rank 1 of 2 was killed (SIGKILL)"),
+        (signal.SIGSTOP, "another rank did not answer rank 0 of 2 for 10 s"),
+    ],
+)
+def test_the_end_of_one_rank_ends_all_with_a_line(tmp_path, number, told):
+    process = command(tmp_path / "run", "-q", patience="10")
+    deadline = time.monotonic() + 120
+    while not any((tmp_path / "run" / "checkpoints").glob("iteration_*[1-9]*")):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.1)
+    os.kill(_ranks_of(process)[1], number)
+    _, lines = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert told in lines and len(lines.splitlines()) == 1 and "Traceback" not in lines
+    assert RunFolder(tmp_path / "run").newest_checkpoint().values["iteration"] > 0
+
+
+def test_a_signal_saves_and_ends_all(tmp_path):
+    process = command(tmp_path / "run")
+    for line in process.stderr:
+        if line.startswith("iteration"):
+            break
+    process.send_signal(signal.SIGTERM)
+    _, lines = process.communicate(timeout=120)
+    assert process.returncode == 143 and "stopped at iteration" in lines, lines
+    assert load_run(tmp_path / "run").iterations > 0
+
+
+def _ranks_of(process) -> list[int]:
+    """The process ids of its ranks, in their order."""
+    found = subprocess.run(
+        ["ps", "-o", "pid=,args=", "--ppid", str(process.pid)], capture_output=True, text=True, check=True
+    )
+    return [int(line.split()[0]) for line in found.stdout.splitlines() if "spawn_main" in line]
+
+
+def test_rates_and_decays_follow_the_batch():
+    config, field = configuration("gradient"), toy_field()
+    one, four = (make_optimizer(field, config, 2.0, batch) for batch in (1, 4))
+    for a, b in zip(one.param_groups, four.param_groups, strict=True):
+        assert b["lr"] == pytest.approx(2 * a["lr"]) and b["betas"] == pytest.approx([beta**4 for beta in a["betas"]])
+    field.gaussians.means.grad = torch.ones_like(field.gaussians.means)
+    four.step()
+    saved = optimizer_tensors(four, 4)
+    assert saved["means.0.step"] == 4
+    load_optimizer_tensors(one, saved, 1)
+    assert one.state[field.gaussians.means]["step"] == 4
+
+
+def test_gradients_go_through_one_buffer():
+    field = toy_field()
+    optimizer = make_optimizer(field, configuration("gradient"), 1.0)
+    flat, given = FlatGradients(optimizer), {}
+    for name in ("means", "opacity_logits"):
+        parameter = getattr(field.gaussians, name)
+        given[name] = parameter.grad = torch.randn_like(parameter)
+    flat.take(torch.tensor(2.0), torch.tensor(True))
+    assert flat.fits(optimizer) and field.gaussians.means.grad is None
+    flat.buffer.mul_(0.5)
+    loss, incomplete = flat.give()
+    assert loss == 1 and bool(incomplete) and field.gaussians.quaternions.grad is None
+    for name, gradient in given.items():
+        assert torch.equal(getattr(field.gaussians, name).grad, gradient / 2)
+    field.gaussians.resize(70, optimizer)
+    assert not flat.fits(optimizer) and field.gaussians.count == 70
+
+
+@pytest.mark.parametrize("photos", [1, 2, 3, 8])
+def test_each_change_happens_once_whatever_the_stride(photos):
+    strategy = make_densification(configuration("relocation"), 1.0, 1000)
+    strategy.photos = photos
+    due = [n for n in range(photos, 121, photos) if strategy.changes_at(n)]
+    assert [n // 25 for n in due] == [1, 2, 3] and strategy.start == 20 and strategy.stop == 100
+
+
+def test_small_scenes_are_told_that_they_gain_nothing():
+    gpu = torch.device("cuda", 0)
+    assert "too short to gain much" in gain_of_ranks(2, 2_000, 10_000, gpu)
+    assert "about 1." in gain_of_ranks(2, 1_000_000, 2_000_000, gpu)
+    assert "no faster than one" in gain_of_ranks(2, 1_000_000, 2_000_000, torch.device("cpu"))
+    assert math.isfinite(float(gain_of_ranks(8, 10**6, 10**6, gpu).split("about ")[1].split()[0]))
