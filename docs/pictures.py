@@ -29,7 +29,7 @@ def main(name: str = "embedded:lamps", folder: str = "runs/hero", view: str = ""
     with Image.open(drawn) as picture:
         picture = picture.convert("RGB")
         content = ImageChops.difference(picture, Image.new("RGB", picture.size, "white")).getbbox()
-        picture = picture.crop((0, 0, picture.width, content[3] + 8))
+        picture = picture.crop((0, max(0, content[1] - 8), picture.width, min(picture.height, content[3] + 8)))
         picture.thumbnail((WIDTH, WIDTH))
         picture.save(PICTURE, quality=88, optimize=True)
 

@@ -141,7 +141,7 @@ def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, ce
             places = [column for column, picture in enumerate(pictures) if picture is not None]
             for column in places:
                 axes = figure.add_subplot(grid[row, column])
-                axes.imshow(np.clip(pictures[column], 0, 1), aspect="auto", interpolation="lanczos")
+                axes.imshow(np.clip(pictures[column], 0, 1), interpolation="lanczos")
                 axes.set(xticks=[], yticks=[], frame_on=False)
                 axes.set_title(untitled.pop(column, ""), fontsize=9.5, fontweight="bold")
                 axes.set_ylabel(name if column == places[0] else "", fontsize=8.5)

@@ -117,3 +117,11 @@ def test_confidence_stands_beside_the_scene(tmp_path):
     np.testing.assert_array_equal(axes[11].get_images()[0].get_array()[..., 0], confidence)
     assert axes[11].get_position().x0 > axes[5].get_position().x1
     assert axes[11].get_position().y0 == pytest.approx(axes[6].get_position().y0)
+
+
+@pytest.mark.parametrize("caption", ["", "Several lines of text. " * 20])
+def test_pictures_keep_their_shape(caption):
+    figure = comparison_figure([Comparison("v", *[np.ones((20, 30, 3), np.float32)] * 4)], 0.5, caption)
+    figure.draw_without_rendering()
+    boxes = [axes.get_window_extent() for axes in figure.axes]
+    assert len(boxes) == 4 and all(box.width / box.height == pytest.approx(1.5, rel=0.02) for box in boxes)
