@@ -4,6 +4,7 @@ import runpy
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
@@ -37,6 +38,12 @@ def test_own_loop():
 
 def test_own_kernel():
     assert abs(example("own_kernel")["main"]() - 0.35) < 0.005
+
+
+def test_relighting(tmp_path):
+    pytest.importorskip("mitsuba")
+    error = example("relighting")["main"](tmp_path, views=12, size=24, samples=8, iterations=60)
+    assert 0 < error < 1 and (tmp_path / "relighting.png").is_file()
 
 
 def test_every_example_is_run_here():

@@ -90,6 +90,10 @@ def main(
     for name, (squared, share) in parts.items():
         psnr = -10 * np.log10((squared * share).sum() / share.sum())
         result["rows"].append({"what": name, "psnr": float(psnr)})
+    given, wanted_light = (_irradiance(image, directions, weight) for image in (read_hdr(map_file), panorama))
+    off = np.abs(given / wanted_light - 1)
+    told = f"{off.mean():.1%} off in the mean, {off.max():.1%} at most"
+    result["notes"].append(f"Irradiance of surfaces that face {len(off)} directions: {told}.")
     result["notes"].append(f"{run.gaussian_count:,} Gaussians; the truth's peak is {peak:.3g}.")
     finish(result, json, overwrite=True)
 
@@ -161,6 +165,12 @@ def _panorama(mi: Any, scene: Any, tracer: Any, width: int, samples: int) -> np.
         light = np.array(tracer.sample(scene, sampler, ray)[0]).reshape(3, launch, -1)
         total += light.sum(1).T / (launch * -(-samples // launch))
     return total.reshape(height, width, 3).astype(np.float32)
+
+
+def _irradiance(image: np.ndarray, directions: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """[200] up to scale, mean over channels."""
+    light = image.mean(axis=2) * weight
+    return np.array([(light * np.maximum(directions @ normal, 0)).sum() for normal in sphere_directions(200)])
 
 
 def _even(image: np.ndarray) -> np.ndarray:

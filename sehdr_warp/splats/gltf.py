@@ -18,7 +18,7 @@ from .arrays import HARMONIC_0, GaussianArrays, degree_of
 EXTENSION = "KHR_gaussian_splatting"
 _SPACE = "srgb_rec709_display"
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
-_FLOAT, _POINTS = 5126, 0
+_FLOAT, _POINTS, _VERTICES = 5126, 0, 34962
 # Components, and for each their type and the value of 1 where they are normalized integers.
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _TYPES = {5120: ("<i1", 127), 5121: ("<u1", 255), 5122: ("<i2", 32767), 5123: ("<u2", 65535), _FLOAT: ("<f4", 1)}
@@ -38,7 +38,7 @@ def write_glb(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
     blobs = [np.ascontiguousarray(values, "<f4").tobytes() for values in attributes.values()]
     views, accessors, offset = [], [], 0
     for index, (values, blob) in enumerate(zip(attributes.values(), blobs, strict=True)):
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(blob)})
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(blob), "target": _VERTICES})
         kind = next(name for name, width in _WIDTHS.items() if width == values.shape[1])
         accessors.append({"bufferView": index, "componentType": _FLOAT, "count": len(values), "type": kind})
         offset += len(blob)

@@ -12,6 +12,7 @@ from sehdr_warp.field.sensor_colors import rec709_of
 from sehdr_warp.output.exr import rgb_channels, write_exr
 from sehdr_warp.output.images import write_picture
 from sehdr_warp.output.radiance_file import write_radiance
+from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.linear_photos import color_matrix, linear_codes, raw_codes, raw_exposure
 from sehdr_warp.scene.sfm import _device, _write_photos
@@ -147,6 +148,25 @@ def test_files_that_are_no_photos_of_a_camera(tmp_path, shared):
         color_matrix([tmp_path / "d.dng"])
     matrix = color_matrix([folder / "Blackmagic.dng"])
     np.testing.assert_allclose(matrix @ (1 / np.array([2.2060447, 1.0, 1.8867925])), 1, atol=0.02)
+
+
+def test_raw_and_its_developed_jpeg_show_the_same_light(tmp_path, shared):
+    """To 2 % after one matrix, in means over 32 x 32 pixels that the JPEG exposes well: pixel by pixel two demosaicings
+    and 8 bits differ by more."""
+    rawpy = pytest.importorskip("rawpy")
+    file = shared / "data" / "raw" / "Blackmagic.dng"
+    with rawpy.imread(str(file)) as raw:
+        options = {"gamma": (2.4, 12.92), "no_auto_bright": True, "use_camera_wb": True, "user_flip": 0}
+        Image.fromarray(raw.postprocess(**options)).save(tmp_path / "a.jpg", quality=95, subsampling=0)
+    codes = [raw_codes(file, oriented=False) / 65535, np.asarray(Image.open(tmp_path / "a.jpg")) / 255]
+    blocks = [c[:2176, :4128].reshape(68, 32, 129, 32, 3).swapaxes(1, 2) for c in codes]
+    well = (blocks[1].min((2, 3, 4)) > 0.1) & (blocks[1].max((2, 3, 4)) < 0.92)
+    ours, theirs = (response_by_name("srgb").decode(block[well]).mean((1, 2)) for block in blocks)
+    ours = ours @ color_matrix([file]).T
+    level = theirs.mean(1, keepdims=True)
+    matrix = np.linalg.lstsq(ours / level, theirs / level, rcond=None)[0]
+    error = np.abs(ours @ matrix / theirs - 1)
+    assert well.sum() > 5000 and np.percentile(error, 95) < 0.02 and np.median(error) < 0.005
 
 
 def test_what_is_clipped_in_a_sensor_is_neutral_or_keeps_the_color_it_shows():
