@@ -11,7 +11,7 @@ from collections.abc import Callable
 from importlib import import_module
 
 from . import __version__
-from .errors import UsageError, did_you_mean, surroundings_told
+from .errors import SehdrError, UsageError, did_you_mean, surroundings_told
 
 PROGRAM = "sehdr-warp"
 LEAST_COLUMNS = 40
@@ -45,6 +45,9 @@ COMMANDS = {
 """Every command, under the headings of the help: its module, dataclass of options, and the function that runs them."""
 words_given: list[str] = []
 """The words of the command line that is run."""
+_LIGHT = {"presets", "config", "scenes", "completion"}
+"""Commands that load no torch."""
+_LEAST_ADDRESS_SPACE = 1536 << 20
 _MODULES = {name: command for group in COMMANDS.values() for name, command in group.items()}
 
 
@@ -103,7 +106,24 @@ def _run(words: list[str]) -> None:
         print(f"{PROGRAM} {__version__}")
         return
     run, options = parse_command(words)
+    if words[0] not in _LIGHT:
+        _check_address_space()
     run(options)
+
+
+def _check_address_space() -> None:
+    """Where libraries may not reserve what they ask for, they crash, or end the process with words of their own."""
+    try:
+        import resource
+    except ImportError:
+        return
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit == resource.RLIM_INFINITY:
+        return
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # It reserves for each.
+    if limit < _LEAST_ADDRESS_SPACE:
+        told = f"{limit >> 20} MiB of address space, and {_LEAST_ADDRESS_SPACE >> 20} are the least"
+        raise SehdrError(f"out of memory: this process is limited to {told}; raise the limit (ulimit -v)")
 
 
 def parse_command(words: list[str]) -> tuple[Callable, object]:

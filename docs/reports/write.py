@@ -209,6 +209,34 @@ def _stability_tables(result: dict) -> Iterable[str]:
     yield f"Failed: {', '.join(failed)}." if failed else "All bounds hold."
 
 
+def trial_table(rows: Iterable[Mapping]) -> tuple[list[dict], dict[str, str]]:
+    """The families of the trial and their sum, and the columns that they have."""
+    found = sorted((dict(row) for row in rows), key=lambda row: row["family"])
+    counts = ("cases", "tracebacks", "hangs", "programs", "lost")
+    total = {name: sum(row[name] for row in found) for name in (*counts, "seconds")}
+    total |= {"family": "all", "longest": max(row["longest"] for row in found)}
+    columns = {"family": "", **dict.fromkeys(counts, "d"), "seconds": ".0f", "longest": ".1f", "MiB=memory": ""}
+    return [*found, total], columns
+
+
+def _trust_tables(result: dict) -> Iterable[str]:
+    yield f"## The trial, seed {result['seed']}"
+    yield markdown_table(*trial_table(result["rows"]))
+    if "fuzz" in result:
+        rows = []
+        for (reader,), each in groups(result["fuzz"], "reader").items():
+            seeds = ", ".join(str(seed) for seed in sorted({row["seed"] for row in each}))
+            rows.append(
+                {"reader": reader, "seeds": seeds} | {n: sum(r[n] for r in each) for n in ("inputs", "findings")}
+            )
+        sums = {name: sum(row[name] for row in rows) for name in ("inputs", "findings")}
+        yield "## Damaged files"
+        yield "Made by `python -m tests.fuzz`. A finding is anything but a refusal in one line."
+        yield markdown_table(
+            [*rows, {"reader": "all"} | sums], {"reader": "", "inputs": ",d", "seeds": "", "findings": "d"}
+        )
+
+
 TABLES: dict[str, Callable[[dict], Iterable[str]]] = {
     "quality": _quality_tables,
     "seeds": _seeds_tables,
@@ -221,6 +249,7 @@ TABLES: dict[str, Callable[[dict], Iterable[str]]] = {
     "scale": _scale_tables,
     "response": _response_tables,
     "stability": _stability_tables,
+    "trust": _trust_tables,
 }
 PLOTS: dict[str, Callable[[dict, Path], None]] = {
     "quality": plots.plot_quality,

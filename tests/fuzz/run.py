@@ -151,6 +151,25 @@ def run_reader(name: str, folder: Path, inputs: int, options) -> tuple[int, dict
     return tried, findings
 
 
+def told(command: str) -> dict:
+    """How a report's result says where figures are from."""
+    import torch
+
+    from sehdr_warp.bench.results import new_result
+
+    result = new_result("trust", torch.device("cpu"), {})
+    return {"command": command} | {name: result[name] for name in ("date", "machine", "notes")}
+
+
+def keep(path: Path, **values) -> None:
+    """Puts values into a JSON file beside those that are there."""
+    path.write_text(json.dumps(kept(path) | values, indent=1) + "\n")
+
+
+def kept(path: Path) -> dict:
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
 def share(name: str, inputs: int) -> int:
     """How many of so many inputs a reader gets: all take about as long."""
     return max(1, round(inputs / READERS[name].cost / sum(1 / reader.cost for reader in READERS.values())))
@@ -164,7 +183,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=1, help="readers at once")
     parser.add_argument("--seconds", type=float, default=2.0, help="of processor time that one input may take")
     parser.add_argument("--memory", type=int, default=4096, help="MiB of address space that a reader may take")
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--json", type=Path, help="file to which the figures are added")
     options, rows = parser.parse_args(), []
     memory = "/dev/shm" if os.path.isdir("/dev/shm") else None
     with tempfile.TemporaryDirectory(dir=memory) as folder, ThreadPoolExecutor(options.jobs) as pool:
@@ -179,7 +198,7 @@ def main() -> int:
             for index, finding, count in findings.values():
                 print(f"    {count:6} x {finding} (first: index {index})", flush=True)
             rows.append({"reader": name, "inputs": tried, "seed": options.seed, "findings": len(findings)})
+            if options.json:
+                keep(options.json, fuzz=kept(options.json).get("fuzz", []) + rows[-1:])
     print(f"{sum(row['inputs'] for row in rows)} inputs, {sum(row['findings'] for row in rows)} kinds of findings")
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=1))
     return int(any(row["findings"] for row in rows))

@@ -1,13 +1,18 @@
 """A prepared folder for each case, and the table of the trial."""
 
+import importlib
 import json
+import os
 import shutil
-from collections import defaultdict
+import sys
 from pathlib import Path
 
 import pytest
 
-from .harness import COMMANDS, TRAIN, call, load
+from sehdr_warp.bench.results import markdown_table
+from tests.fuzz.run import keep, kept, told
+
+from .harness import COMMANDS, SEED, TRAIN, VIEW, browse, call, load
 
 
 @pytest.fixture(scope="session")
@@ -18,8 +23,13 @@ def prepared(tmp_path_factory) -> Path:
     load(folder)
     changes = {name: call(*words, folder=folder).changes for name, words in COMMANDS.items()}
     again = call(*TRAIN, "--overwrite", "-q", folder=folder)
+    anew = call(*[word if word != "run" else "new" for word in TRAIN], "-q", folder=folder)
+    shutil.rmtree(folder / "new")
+    seen = call(*VIEW, folder=folder, prepare=browse(folder, ever=False))
+    changes |= {"train": again.changes, "train anew": anew.changes, "view": seen.changes}
+    shutil.rmtree(folder / "tmp")
     (folder / "run" / "took.json").write_text(json.dumps(again.seconds))
-    (folder / "run" / "changes.json").write_text(json.dumps(changes | {"train": again.changes}))
+    (folder / "run" / "changes.json").write_text(json.dumps(changes))
     return folder
 
 
@@ -29,20 +39,31 @@ def space(prepared, tmp_path) -> Path:
     return shutil.copytree(prepared, tmp_path / "space", symlinks=True)
 
 
+sys.path.append(str(Path(__file__).resolve().parents[2] / "docs" / "reports"))
+trial_table = importlib.import_module("write").trial_table
+KINDS = {"tracebacks": "Traceback", "hangs": "hangs for", "programs": "STARTED"}
+"""What a failed case did, by words of its report; any other lost something, or did not say what it should."""
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_terminal_summary(terminalreporter):
-    """Cases, failures and seconds of each family."""
-    rows = defaultdict(lambda: [0, 0, 0.0, 0.0])
+    """A line for each family, and the file that SEHDR_TRIAL_JSON names, where other families stay."""
+    rows = {}
     for outcome in ("passed", "failed", "error"):
         for report in terminalreporter.stats.get(outcome, ()):
             if "tests/trial/" in report.nodeid and (report.when == "call" or outcome == "error"):
-                row = rows[report.nodeid.partition("::")[2].partition("[")[0].removeprefix("test_").replace("_", " ")]
-                row[0] += 1
-                row[1] += outcome != "passed"
-                row[2], row[3] = row[2] + report.duration, max(row[3], report.duration)
+                name = report.nodeid.partition("::")[2].partition("[")[0].removeprefix("test_").replace("_", " ")
+                row = rows.setdefault(
+                    name, dict.fromkeys(("cases", *KINDS, "lost", "seconds", "longest"), 0) | {"family": name}
+                )
+                row["cases"] += 1
+                row["seconds"], row["longest"] = row["seconds"] + report.duration, max(row["longest"], report.duration)
+                if outcome != "passed":
+                    row[next((kind for kind, word in KINDS.items() if word in report.longreprtext), "lost")] += 1
+                row |= dict(report.user_properties)
     if rows:
-        terminalreporter.write_sep("=", "the trial")
-        terminalreporter.write_line(f"{'family':<64}{'cases':>6}{'failed':>8}{'seconds':>9}{'longest':>9}")
-        total = [sum(row[i] for row in rows.values()) for i in range(3)]
-        for name, row in (*sorted(rows.items()), ("all", [*total, max(row[3] for row in rows.values())])):
-            terminalreporter.write_line(f"{name:<64}{row[0]:>6}{row[1]:>8}{row[2]:>9.1f}{row[3]:>9.1f}")
+        terminalreporter.write_sep("=", f"the trial, seed {SEED}")
+        terminalreporter.write_line(markdown_table(*trial_table(rows.values())))
+        if path := os.environ.get("SEHDR_TRIAL_JSON"):
+            known = {row["family"]: row for row in kept(Path(path)).get("rows", [])}
+            keep(Path(path), rows=[*(known | rows).values()], seed=SEED, **told("pytest -m trial"))

@@ -4,22 +4,27 @@ what it says, how long it takes, how much memory, and which programs it starts."
 import builtins
 import importlib
 import io
+import json
 import os
 import resource
 import signal
 import sys
+import tempfile
+import threading
 import time
 import traceback
 from collections.abc import Callable
 from contextlib import chdir, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.request import Request, urlopen
 
 from sehdr_warp import cli
 from sehdr_warp.synth.expose import RadianceView
 from tests.make_scenes import write_blender, write_reinhard
 from tests.training.toy import toy_scene
 
+SEED = 19
 COMMANDS = {
     "train": "train photos --out run --preset demo --response hdr-nerf --iterations 24 --device cpu --seed 3",
     "render": "render run --out made --cameras all --evs=-2,0 --device cpu --overwrite",
@@ -31,6 +36,7 @@ COMMANDS = {
     "synth": "synth truth --out set --overwrite",
     "quality": "bench quality --scenes truth --methods demo --iterations 4 --out made --device cpu",
 }
+VIEW = ["view", "run", "--port", "0", "--device", "cpu"]
 COMMANDS = {name: line.split() for name, line in COMMANDS.items()}
 TRAIN = COMMANDS.pop("train")
 STARTED = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.spawn")
@@ -68,7 +74,7 @@ def call(
     folder: Path,
     kill_after: float | None = None,
     kill_at: int | None = None,
-    seconds: float = 60.0,
+    seconds: float = 120.0,
     prepare: Callable[[], None] = lambda: None,
 ) -> Ended:
     """Runs a command line in a child, in `folder`. kill_after: seconds until SIGKILL; kill_at: the change of the disk
@@ -93,6 +99,7 @@ def call(
     for path in (*said, count):
         path.unlink(missing_ok=True)
     code = os.waitstatus_to_exitcode(status)
+    assert usage.ru_utime + usage.ru_stime < 30, f"hangs for 30 s of processor time: {words}"
     assert "Traceback" not in err and "STARTED" not in err, f"{words}: {err[-2000:]}"
     assert code in (0, 1, 2, 129, 130, 141, 143, -signal.SIGKILL), f"{words}: ended with {code}: {err[-500:]}"
     lines = err.splitlines()
@@ -167,6 +174,35 @@ def _count(kill_at: int | None) -> list[int]:
         setattr(os, name, counted(getattr(os, name), opens=False))
     builtins.open = io.open = counted(open, opens=True)
     return made
+
+
+def browse(folder: Path, ever: bool) -> Callable[[], None]:
+    """Starts, in a child that will be a viewer, a client that asks for all that it serves: for ever, or once."""
+
+    def ask(url: str, path: str, asked: dict | None = None) -> bytes:
+        data = None if asked is None else json.dumps(asked).encode()
+        with urlopen(Request(url + path, data, {"Content-Type": "application/json"}), timeout=60) as answer:
+            return answer.read()
+
+    def client() -> None:
+        while "http" not in (said := (folder / ".out").read_text()):
+            time.sleep(0.01)
+        url = said.split()[0]
+        while True:
+            camera = {"camera": json.loads((folder / "run" / "scene.json").read_text())["views"][0]["camera"]}
+            made = [ask(url, "scene"), ask(url, "photo/0/0"), ask(url, "frame", camera)]
+            made += [ask(url, "save", {"cameras": list(camera.values()), "kind": kind}) for kind in ("exr", "brackets")]
+            if not ever:
+                (folder / "tmp" / "asked").write_text(str(sum(map(len, made))))
+                os.kill(os.getpid(), signal.SIGINT)
+                return
+
+    def prepare() -> None:
+        (folder / "tmp").mkdir(exist_ok=True)
+        tempfile.tempdir = str(folder / "tmp")
+        threading.Thread(target=client, daemon=True).start()
+
+    return prepare
 
 
 def limit_memory(mebibytes: int) -> Callable[[], None]:

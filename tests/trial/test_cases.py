@@ -18,11 +18,11 @@ from PIL import Image
 from sehdr_warp.scene.hdr_files import read_hdr
 from sehdr_warp.training.run_folder import RunFolder
 from tests.fuzz.mutate import NUMBERS, VALUES
+from tests.make_scenes import write_colmap
 
-from .harness import COMMANDS, TRAIN, call, files_in, limit_memory
+from .harness import COMMANDS, SEED, TRAIN, call, files_in, limit_memory
 
 pytestmark = pytest.mark.trial
-SEED = 19
 TARGETS = {
     "render": "made/hdr", "export": "made/scene.ply", "export usd": "made/scene.usda", "report": "made/stops.png",
     "panorama": "made/light.exr", "eval": "made/figures.json", "synth": "set", "train": "run",
@@ -114,24 +114,9 @@ def test_tampered_runs(space, prepared, number):
 
 
 FORMATS = (
-    "EPS",
-    "GIF",
-    "PPM",
-    "PDF",
-    "ICO",
-    "TGA",
-    "PCX",
-    "SGI",
-    "DDS",
-    "JPEG2000",
-    "CMYK",
-    "LAB",
-    "1",
-    "F",
-    "YCbCr",
-    "APNG",
+    "EPS", "GIF", "PPM", "PDF", "ICO", "TGA", "PCX", "SGI", "DDS", "JPEG2000", "CMYK", "LAB", "1", "F", "YCbCr", "APNG",
     "pages",
-)
+)  # fmt: skip
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 24 16\n%%EndComments\n"
 
 
@@ -166,14 +151,12 @@ def test_little_memory(space, name, mebibytes):
     assert ended.code == 0 or files_in(space) == before
 
 
-def test_a_sparse_file_of_points_is_not_read_whole(space):
-    (space / "photos" / "points.ply").write_bytes(b"ply\n")
-    model = space / "photos" / "sparse" / "0"
-    model.mkdir(parents=True)
-    for name in ("cameras.txt", "images.txt", "points3D.txt"):
-        with open(model / name, "wb") as file:
-            file.truncate(4 << 30)
-    ended = call("train", "photos", "--out", "new", "--iterations", "2", folder=space)
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_sparse_files_of_4_gib_are_not_read_whole(space, name):
+    write_colmap(space / "model", 4, binary=False, size=(24, 16), params=(20.0, 21.0, 12.0, 8.0))
+    os.truncate(space / "model" / "sparse" / "0" / f"{name}.txt", 4 << 30)
+    ended = call("train", "model", "--out", "new", "--iterations", "2", "--device", "cpu", folder=space)
+    assert ended.code == 1 and f"{name}.txt" in ended.err.splitlines()[-1]
     assert ended.memory < 1500, f"{ended.memory} MiB"
 
 
@@ -224,10 +207,9 @@ SURROUNDINGS = {
     "NUL and newline": f"{S} export run --kind hdr --out $'a\\nb.ply'",
     "a file for a run": f"{S} render photos/transforms.json --out new",
     "no locale": f"LC_ALL=C PYTHONIOENCODING=ascii {S} train --help",
-    "little space": f"ulimit -v 700000; {S} export run --kind hdr --out new.ply",
-    "less space": f"ulimit -v 300000; {S} export run --kind hdr --out new.ply",
     "few files": f"ulimit -n 16; {S} export run --kind hdr --out new.ply",
     "full disk": f"ulimit -f 2; {S} render run --out new --device cpu",
+    **{f"{k} kB of space": f"ulimit -v {k}; {S} export run --out new.ply" for k in (300000, 500000, 600000, 1200000)},
 } | {f"{columns} columns": f"COLUMNS={columns} {S} {words}" for columns in (1, 3, 5) for words in ("train --help",)}
 
 

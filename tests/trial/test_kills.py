@@ -11,10 +11,10 @@ import torch
 from sehdr_warp.files import LIST, foreign
 from sehdr_warp.training.run_folder import RunFolder
 
-from .harness import COMMANDS, TRAIN, call
+from .harness import COMMANDS, SEED, TRAIN, VIEW, browse, call, files_in
 
 pytestmark = pytest.mark.trial
-SEED, KILLS, KILLS_EACH = 19, 50, 20
+KILLS, KILLS_EACH = 50, 20
 ANEW = [word if word != "run" else "new" for word in TRAIN] + ["-q"]
 
 
@@ -53,9 +53,32 @@ def test_training_killed_at_random(space, number):
 
 @pytest.mark.parametrize("number", range(KILLS))
 def test_training_killed_at_a_change_of_the_disk(space, number):
-    changes = json.loads((space / "run" / "changes.json").read_text())["train"]
-    call(*ANEW, folder=space, kill_at=1 + number * changes // KILLS)
+    """Of a new run, or of one that takes the place of another, beside a file of the user's."""
+    kind, words = ("train anew", ANEW) if number % 2 else ("train", [*ANEW, "--overwrite"])
+    changes = json.loads((space / "run" / "changes.json").read_text())[kind]
+    if number % 2 == 0:
+        shutil.copytree(space / "run", space / "new")
+        (space / "new" / "notes.txt").write_text("mine")
+    photos = files_in(space / "photos")
+    assert call(*words, folder=space, kill_at=1 + number * changes // KILLS).code == -9
     finish(space)
+    assert files_in(space / "photos") == photos
+    assert number % 2 or (space / "new" / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("number", range(KILLS_EACH))
+def test_viewer_killed(space, number):
+    """At a change of the disk or at random, while it is asked for all that it serves; the next one serves."""
+    changes = json.loads((space / "run" / "changes.json").read_text())["view"]
+    kill = {"kill_at": 1 + number * changes // KILLS_EACH}
+    if number % 2:
+        kill = {"kill_after": random.Random(SEED * 1000 + number).uniform(0, 2)}
+    before = files_in(space)
+    assert call(*VIEW, folder=space, prepare=browse(space, ever=True), **kill).code == -9
+    shutil.rmtree(space / "tmp", ignore_errors=True)
+    assert files_in(space) == before
+    assert call(*VIEW, folder=space, prepare=browse(space, ever=False)).code == 0
+    assert int((space / "tmp" / "asked").read_text()) > 1000
 
 
 @pytest.mark.parametrize("number", range(KILLS_EACH))

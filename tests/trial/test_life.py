@@ -1,0 +1,74 @@
+"""Long life: what a process does many times takes no more memory in the end than at a fifth of it."""
+
+import gc
+import http.client
+import json
+import resource
+import threading
+from contextlib import chdir
+from pathlib import Path
+
+import pytest
+
+from sehdr_warp import cli
+from sehdr_warp.training.run import load_run
+from sehdr_warp.viewer.frames import Rendering
+from sehdr_warp.viewer.server import Server, Viewer
+
+from .harness import COMMANDS, TRAIN
+
+pytestmark = pytest.mark.trial
+FRAMES, FRAMES_EACH = 5 * 3600, 90
+"""An hour at five frames a second, of clients that come, look for so many, and go."""
+
+
+@pytest.fixture
+def live(record_property):
+    """live(act, count): does act(number) so often."""
+
+    def run(act, count: int) -> None:
+        early = 0.0
+        for number in range(count):
+            act(number)
+            if number in (count // 5, count - 1):
+                gc.collect()
+                pages = int(Path("/proc/self/statm").read_text().split()[1])
+                early, late = early or pages, pages
+        memory = [round(each * resource.getpagesize() / 2**20, 1) for each in (early, late)]
+        record_property("memory", "{} to {}".format(*memory))
+        assert memory[1] <= 1.05 * memory[0], memory
+
+    return run
+
+
+def command(folder: Path, *words: str) -> None:
+    with chdir(folder), pytest.raises(SystemExit) as end:
+        cli.main([*words, "-q"])
+    assert end.value.code == 0
+
+
+def test_200_renders(space, live):
+    live(lambda number: command(space, *COMMANDS["render"]), 200)
+
+
+def test_50_trainings(space, live):
+    live(lambda number: command(space, *TRAIN, "--overwrite"), 50)
+
+
+def test_an_hour_of_the_viewer(space, live):
+    run = load_run(space / "run")
+    asked = json.dumps({"camera": run.cameras[0].camera.to_dict()})
+
+    def look(number: int) -> None:
+        client = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=60)
+        for _ in range(FRAMES_EACH):
+            client.request("POST", "/frame", asked, {"Content-Type": "application/json"})
+            assert len(client.getresponse().read()) > 1000
+        if number % 2:  # Goes before the answer.
+            client.request("POST", "/frame", asked, {"Content-Type": "application/json"})
+        client.close()
+
+    with Server(Viewer([Rendering(run, "run", None)]), port=0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        live(look, FRAMES // FRAMES_EACH)
+        server.shutdown()
