@@ -16,6 +16,7 @@ from .images import EncodedImage, image_sizes, read_ldr, read_mask
 from .lens import Lens, Undistortion, area_average, limited_size
 from .linear_photos import float_codes, kind_of, linear_codes
 from .names import unique_names
+from .photo_file import PhotoKeeper
 from .types import Scene, View, codes_of
 
 if TYPE_CHECKING:
@@ -24,17 +25,18 @@ if TYPE_CHECKING:
 _log = logging.getLogger("sehdr_warp.scene")
 
 
-def develop(capture: Capture, response: "Response", max_size: int | None = None) -> Scene:
+def develop(capture: Capture, response: "Response", max_size: int | None = None, photos: str = "auto") -> Scene:
     """The scene of a capture: each photo undistorted and averaged to size, in the light that `response` decodes.
 
     max_size: longest side of the views in pixels, None keeps the photos'. A photo that is neither bent nor averaged
-    keeps its codes; others become uint16.
+    keeps its codes; others become uint16. photos: where views stay, see PhotoKeeper.
     Raises InputError where a file is damaged, sizes disagree, or the photos show nothing but black or white.
     """
     developer, names = _Developer(max_size, response, capture.alpha), unique_names(capture.shots)
-    views = [developer.view(shot, names[i]) for i, shot in told("reading views", capture.shots)]
+    keeper = PhotoKeeper(photos, len(names), sum(shot.lens.width * shot.lens.height for shot in capture.shots))
+    views = [keeper.kept(developer.view(shot, names[i])) for i, shot in told("reading views", capture.shots)]
     deque(with_content(((view.codes, view.mask) for view in views if view.split == "train"), capture.folder), maxlen=0)
-    stated = *capture.cloud, capture.times_known, capture.notes
+    stated = *capture.cloud, capture.times_known, (*capture.notes, *([keeper.note] if keeper.note else []))
     return Scene(capture.name, capture.format, tuple(views), *stated, response=response)
 
 

@@ -49,6 +49,7 @@ def load_scene(
     max_size: int | None = None,
     holdout: int | None = None,
     cache: Path | str | None = None,
+    photos: str = "auto",
 ) -> Scene:
     """Read a folder of posed or bare photos, whatever its layout, and develop it.
 
@@ -64,6 +65,9 @@ def load_scene(
     holdout: every so many views is held out, 0 for none, whatever the set states; None keeps the set's split, or the
         protocol of its layout, or takes the middle of every eight. Sets of fewer than 5 views have no test view.
     cache: a folder where structure from motion keeps its results; None is the user's ($SEHDR_CACHE).
+
+    photos: where they stay: "memory", "disk" (in a nameless file beside the cache, which goes with the process), or
+        "auto": the disk if they would take more than half of the memory that is free.
 
     Returns a Scene in the set's own world coordinates, with the points that the set has.
     Raises InputError where a file is missing, damaged or hostile, sizes disagree, an exposure is impossible, fewer
@@ -84,12 +88,12 @@ def load_scene(
             problem = f"its photos are {capture.kind}: their light is known, and response {response} is not theirs"
             raise InputError(path, problem, "leave the response out")
         matrix = color_matrix([shot.image for shot in capture.shots]) if capture.kind == "raw" else None
-        return replace(develop(capture, chosen, max_size), color_matrix=matrix, light_known=True)
+        return replace(develop(capture, chosen, max_size, photos), color_matrix=matrix, light_known=True)
     if isinstance(response, str) and response == "auto":
         response, chosen_by = choose_response(capture, method, candidates), (method, tuple(map(str, candidates)))
     elif isinstance(response, str | Path):
         response = response_by_name("srgb" if response == "learned" else response)
-    return replace(develop(capture, response, max_size), chosen_by=chosen_by)
+    return replace(develop(capture, response, max_size, photos), chosen_by=chosen_by)
 
 
 def read_capture(

@@ -9,28 +9,41 @@ import math
 import mmap
 import os
 import pickle
+import shutil
 import sys
 import tempfile
+import weakref
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import InputError
+from ..files import usable, user_cache
+from .types import View
 
 _LARGE = 1 << 14  # Arrays of fewer bytes are pickled
 _ALIGNED = 64
+_ARRAYS = "codes", "mask", "hdr"
+_LEAST, _MOST_BYTES = 1 << 30, 22  # Of a file, and of a pixel in it: 16-bit codes, a mask, truth
+SHARE = 0.5
+"""Of the free memory, photos of a scene stay in it up to so much."""
+
+
+class _Map(mmap.mmap):
+    owner: Any = None
 
 
 class PhotoFile:
-    """Room for `most` bytes of arrays in a nameless file in a folder, by default the system's for temporary files.
+    """Room for `most` bytes of arrays in a nameless file in a folder, by default the user's cache.
 
     Raises InputError where the folder cannot be written to, and, from keep(), where the disk is full.
     """
 
     def __init__(self, most: int, folder: Path | str | None = None):
-        self.folder = Path(folder or tempfile.gettempdir())
+        self.folder = Path(folder or _folder())
         try:
             # Sparse: what is not written takes no room. Only its end is known, so that it is mapped once.
             self._file = tempfile.TemporaryFile(dir=self.folder, buffering=0)  # noqa: SIM115
@@ -38,12 +51,16 @@ class PhotoFile:
         except OSError as error:
             raise self._refused(error) from None
         self.most, self.used = most, 0
-        self._map = mmap.mmap(self._file.fileno(), most, access=mmap.ACCESS_COPY)
-        self._bytes = np.frombuffer(self._map, np.uint8)
+        # Shared, though nobody writes to it: a private mapping that could be written would count as memory.
+        self._map = _Map(self._file.fileno(), most, access=mmap.ACCESS_WRITE)
+        self._map.owner = self  # The file stays open for as long as any array lies in it.
+        self._start = np.frombuffer(self._map, np.uint8, 1).ctypes.data
+        self.path = f"/proc/{os.getpid()}/fd/{self._file.fileno()}"
+        _files.add(self)
 
     def keep(self, array: np.ndarray) -> np.ndarray:
         """The same array in the file. One that is there already stays where it is."""
-        if self._place(array) is not None:
+        if self.place(array) is not None:
             return array
         offset, data = self.used, np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
         if offset + len(data) > self.most:
@@ -58,19 +75,20 @@ class PhotoFile:
         self.used = -(-(offset + len(data)) // _ALIGNED) * _ALIGNED
         return self._array(offset, array.dtype, array.shape)
 
-    def share(self, value: Any) -> tuple[str, int, int, int]:
+    def share(self, value: Any) -> tuple:
         """Puts any value into the file, large arrays as they are; what taken() gives back in another process, as
         long as this one lives."""
         told = io.BytesIO()
         _Pickler(told, self).dump(value)
-        kept = self.keep(np.frombuffer(told.getvalue(), np.uint8))
-        place = self._place(kept)
-        assert place is not None
-        return f"/proc/{os.getpid()}/fd/{self._file.fileno()}", self.most, place, kept.nbytes
+        return self.told(self.keep(np.frombuffer(told.getvalue(), np.uint8)))
 
-    def _place(self, array: np.ndarray) -> int | None:
+    def told(self, kept: np.ndarray) -> tuple:
+        """What another process needs to find an array of this file."""
+        return self.path, self.most, self.place(kept), kept.dtype.str, kept.shape
+
+    def place(self, array: np.ndarray) -> int | None:
         """Where in the file an array lies, None for one that is elsewhere."""
-        offset = array.ctypes.data - self._bytes.ctypes.data
+        offset = array.ctypes.data - self._start
         inside = 0 <= offset <= self.most - array.nbytes and array.flags.c_contiguous
         return offset if inside else None
 
@@ -82,12 +100,13 @@ class PhotoFile:
         return InputError(self.folder, f"the photos cannot be kept there ({error.strerror or error})", remedy)
 
 
-def taken(told: tuple[str, int, int, int]) -> Any:
+_files: weakref.WeakSet[PhotoFile] = weakref.WeakSet()
+
+
+def taken(told: tuple) -> Any:
     """What another process of this user put into its file by share(); arrays stay in the file."""
-    path, most, offset, size = told
-    with open(path, "rb") as file:
-        mapped = mmap.mmap(file.fileno(), most, access=mmap.ACCESS_COPY)
-    return _Unpickler(io.BytesIO(mapped[offset : offset + size]), mapped).load()
+    finder = _Unpickler(io.BytesIO())
+    return _Unpickler(io.BytesIO(finder.persistent_load(told).tobytes())).load()
 
 
 def can_share() -> bool:
@@ -103,23 +122,83 @@ class _Pickler(pickle.Pickler):
     def persistent_id(self, obj: Any) -> Any:
         if type(obj) is not np.ndarray or obj.nbytes < _LARGE or obj.dtype.hasobject:
             return None
-        kept = self.photos.keep(obj)
-        return self.photos._place(kept), kept.dtype.str, kept.shape
+        file = next((file for file in _files if file.place(obj) is not None), self.photos)
+        return file.told(file.keep(obj))
 
 
 class _Unpickler(pickle.Unpickler):
-    def __init__(self, file: io.BytesIO, mapped: mmap.mmap):
+    def __init__(self, file: io.BytesIO):
         super().__init__(file)
-        self.mapped = mapped
+        self._maps: dict[str, mmap.mmap] = {}
 
     def persistent_load(self, pid: Any) -> np.ndarray:
-        offset, dtype, shape = pid
-        return np.ndarray(shape, dtype, self.mapped, offset)
+        path, most, offset, dtype, shape = pid
+        if path not in self._maps:
+            with open(path, "r+b") as file:
+                self._maps[path] = mmap.mmap(file.fileno(), most, access=mmap.ACCESS_WRITE)
+        return np.frombuffer(self._maps[path], dtype, math.prod(shape), offset).reshape(shape)
 
 
-def free_bytes(folder: Path | str) -> int:
-    """Bytes that the disk of a folder has left for this user; 0 where that cannot be told."""
-    with suppress(OSError):
-        found = os.statvfs(folder)
-        return found.f_bavail * found.f_frsize
-    return 0
+class PhotoKeeper:
+    """Where the photos of a scene stay while it is read: in memory, or in a file of the disk that the system reads from
+    as they are looked at.
+
+    where: "memory", "disk", or "auto": the disk if they would take more than SHARE of the memory that is free. count:
+    of the photos; pixels: of all together, as photographed.
+    """
+
+    def __init__(self, where: str, count: int, pixels: int):
+        self.where, self.count, self.pixels = where, count, pixels
+        self.file: PhotoFile | None = None
+        self.note: str | None = None
+
+    def kept(self, view: View) -> View:
+        """The view with its arrays where they are to stay; the first one decides. Raises InputError where neither
+        memory nor disk have room."""
+        arrays = {name: array for name in _ARRAYS if (array := getattr(view, name)) is not None}
+        if self.note is None:
+            self._decide(self.count * sum(array.nbytes for array in arrays.values()))
+        if self.file is None:
+            return view
+        return replace(view, **{name: self.file.keep(array) for name, array in arrays.items()})
+
+    def _decide(self, size: int) -> None:
+        free, self.note = available_memory(), ""
+        if self.where == "memory" or (self.where == "auto" and size <= SHARE * free):
+            return
+        folder = _folder()
+        disk = shutil.disk_usage(folder).free
+        told = f"the photos take {_gigabytes(size)}; {_gigabytes(free)} of memory are free"
+        if size > disk:
+            remedy = "use smaller photos (--max-size), free some of it, or name a folder of another disk in SEHDR_CACHE"
+            raise InputError(folder, f"{told}, and {_gigabytes(disk)} of this disk", remedy)
+        # Views are at most as large as their photos; masks and truth are floats.
+        self.file = PhotoFile(max(_LEAST, 2 * size, self.pixels * _MOST_BYTES), folder)
+        self.note = f"photos: {told}: they are read from a nameless file in {folder}, which goes with this process"
+
+
+def available_memory() -> int:
+    """Bytes of memory that this process may still take without swapping, as far as the system tells."""
+    found = [1 << 62]
+    with suppress(OSError, ValueError, AttributeError):
+        found.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    with suppress(OSError, StopIteration, ValueError):
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        found.append(1024 * int(next(line for line in lines if line.startswith("MemAvailable")).split()[1]))
+    with suppress(OSError, ValueError):  # Of a container.
+        most, used = (int(Path(f"/sys/fs/cgroup/memory.{name}").read_text()) for name in ("max", "current"))
+        found.append(max(0, most - used))
+    return min(found)
+
+
+def _folder() -> Path:
+    stated = os.environ.get("SEHDR_CACHE")
+    folder = user_cache("sehdr-warp") if stated is None else Path(stated)
+    if folder is None or not usable(folder):
+        return Path(tempfile.gettempdir())
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _gigabytes(size: int) -> str:
+    return f"{size / 1e9:.3g} GB"

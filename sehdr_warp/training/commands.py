@@ -169,7 +169,9 @@ def _train(asked: Train, ranks=None) -> None:
     config = _config(asked, resumed)
     device = pick_device(asked.machine.device) if ranks is None else ranks.device
     options = config.response
-    scene = _load(data, response=options.name, method=options.method, candidates=options.candidates)
+    photos = {"device": "memory"}.get(config.schedule.photos, config.schedule.photos)
+    given = {"method": options.method, "candidates": options.candidates, "photos": photos}
+    scene = _load(data, response=options.name, **given)
     if out is None:
         from .plan import make_plan
 

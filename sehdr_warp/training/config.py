@@ -179,6 +179,9 @@ class ScheduleConfig(_Table):
     """iterations between checkpoints; one is always written at the end"""
     checkpoints_kept: Annotated[int, Field(ge=1, le=1000)] = 1
     """older checkpoints are deleted"""
+    photos: Literal["auto", "device", "memory", "disk"] = "auto"
+    """where photos are kept: on the device, in memory and copied to the device a step ahead, on the disk and read from
+    there, or as far down as they must be to fit; on a CPU device and memory are one"""
     recorded: bool = True
     """on a GPU, replay training steps as CUDA graphs; off, launch each: much slower"""
 

@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..field.radiance_field import CameraTensors
 from ..response import Response
 from ..scene import Scene, View
-from ..splatting.clipped_residual import code_tensor
+from ..splatting.clipped_residual import CodeScale, code_tensor
 from .config import LossConfig
 from .losses import Target, code_scale, one_of
 
@@ -108,17 +108,49 @@ def training_views(
     views: Sequence[View], base_time: float, device, *, truth: bool, clipping=True, light: Response | None = None
 ) -> list[TrainingView]:
     """The views on a device. truth: also upload HDR truth; light: the response by which exposures are compared."""
+    return list(photo_source(views, base_time, device, truth=truth, clipping=clipping, light=light))
+
+
+def photo_source(views, base_time: float, device, *, truth: bool, clipping=True, light=None) -> "PhotoSource":
+    """training_views() that are made one by one, whenever one is asked for."""
     deep = any(view.codes.dtype == np.uint16 for view in views)
-    scale = code_scale(65535 if deep else 255, light, device, clipping=clipping)
-    made = []
-    for view in views:
-        # 257 takes white to white and each value to itself.
-        codes = view.codes.astype(np.uint16) * np.uint16(257) if deep and view.codes.dtype == np.uint8 else view.codes
-        given = (None if view.mask is None else view.mask[..., None]), (view.hdr if truth else None)
+    return PhotoSource(
+        views, base_time, device, truth, deep, code_scale(65535 if deep else 255, light, device, clipping=clipping)
+    )
+
+
+class PhotoSource(Sequence[TrainingView]):
+    """Training views whose photos stay where they are, in memory or in a file, until one is asked for."""
+
+    def __init__(self, views: Sequence[View], base_time: float, device, truth: bool, deep: bool, scale: CodeScale):
+        self.views, self.base_time, self.device = views, base_time, device
+        self.truth, self._deep, self._scale = truth, deep, scale
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __getitem__(self, index: int) -> TrainingView:
+        view = self.views[index]
         mask, radiance = (
-            None if array is None else torch.tensor(np.ascontiguousarray(array), dtype=torch.float32, device=device)
-            for array in given
+            None
+            if array is None
+            else torch.tensor(np.ascontiguousarray(array), dtype=torch.float32, device=self.device)
+            for array in ((None if view.mask is None else view.mask[..., None]), (view.hdr if self.truth else None))
         )
-        target = Target(code_tensor(codes, device), scale, mask, None if radiance is None else radiance * base_time)
-        made.append(TrainingView(CameraTensors.of(view.camera, device), view.exposure_time, target))
-    return made
+        truth = None if radiance is None else radiance * self.base_time
+        target = Target(code_tensor(self.codes(index), self.device), self._scale, mask, truth)
+        return TrainingView(CameraTensors.of(view.camera, self.device), view.exposure_time, target)
+
+    def codes(self, index: int) -> np.ndarray:
+        """The codes of a photo, all of one type."""
+        codes = self.views[index].codes
+        # 257 takes white to white and each value to itself.
+        return codes.astype(np.uint16) * np.uint16(257) if self._deep and codes.dtype == np.uint8 else codes
+
+    @property
+    def bytes(self) -> int:
+        """What all of them would take on the device."""
+        parts = (
+            (v.camera.width * v.camera.height, v.mask is not None, self.truth and v.hdr is not None) for v in self.views
+        )
+        return sum(pixels * ((6 if self._deep else 3) + 4 * masked + 12 * true) for pixels, masked, true in parts)

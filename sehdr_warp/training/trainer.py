@@ -1,7 +1,8 @@
 """The training loop's state and its single step. What happens around steps is train.py's business."""
 
+import logging
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -23,8 +24,11 @@ from .graph_capacity import GraphCapacity
 from .initialization import make_matcher, scene_extent
 from .losses import compares_light, data_loss, needed_colours, regularised
 from .matching import Matcher
+from .photo_stream import PhotoStream, fits_device
 from .ranks import Ranks
-from .targets import TrainingView, ViewStack, largest_truth, training_views
+from .targets import PhotoSource, TrainingView, ViewStack, largest_truth, photo_source
+
+log = logging.getLogger(__name__)
 
 CHECK_EVERY = 20  # Iterations between looks at the count of skipped steps, each of which waits for the device
 COMPARE_EVERY = 500  # Iterations between looks at whether all ranks still have the same Gaussians
@@ -63,7 +67,7 @@ class Trainer:
         # Where light is compared, nothing needs the photo encoded.
         self._encoded = not compares_light(config.loss, field)
         self._largest_truth = largest_truth(scene, config.loss) * field.base_time
-        self._stack: ViewStack | list[TrainingView] | None = None
+        self._stack: ViewStack | PhotoStream | Sequence[TrainingView] | None = None
         self._order: list[int] = []
         self._order_generator = torch.Generator().manual_seed(config.seed)
         self._generator = torch.Generator(device=self.device).manual_seed(config.seed)
@@ -131,6 +135,8 @@ class Trainer:
         self._last_index, count = index, gaussians.count
         if self._can_record(views, kind):
             self._loss = self._replay(views, index, watched, kind)
+            if isinstance(views, PhotoStream):
+                views.used(self._following())
         else:
             with self._launching():
                 self._loss = self._step(lambda: self._gradients(views[index], watched), self._apply)
@@ -247,7 +253,7 @@ class Trainer:
 
     def _can_record(self, views, kind) -> bool:
         """Whether this step can be a recorded one: on a GPU, photos of one size, after a step like it was launched."""
-        if self._recorder is None or not isinstance(views, ViewStack):
+        if self._recorder is None or not isinstance(views, ViewStack | PhotoStream):
             return False
         if self.field.color_model.encoded and not isinstance(views.times, float):
             return False
@@ -259,9 +265,11 @@ class Trainer:
         """Launched work shares stream and memory with recorded steps."""
         return nullcontext() if self._recorder is None else self._recorder.launching()
 
-    def _replay(self, views: ViewStack, index: int, watched: bool, kind) -> Tensor:
+    def _replay(self, views: ViewStack | PhotoStream, index: int, watched: bool, kind) -> Tensor:
         capacity = self._capacity.capacity()
         self._index.fill_(index)
+        if isinstance(views, PhotoStream):
+            views.bring(index)
 
         def gradients() -> _Seen:
             return self._gradients(views.at(self._index), watched, capacity)
@@ -327,15 +335,32 @@ class Trainer:
             raise ValueError(f"the order of the photos names others than the {len(self._views)} there are")
         self._skipped.fill_(values["skipped_steps"])
 
-    def _training_views(self) -> ViewStack | list[TrainingView]:
+    def _training_views(self) -> ViewStack | PhotoStream | Sequence[TrainingView]:
         if self._stack is None:
-            loss = self.config.loss
-            light = self.field.response if compares_light(loss, self.field) else None
-            given = self._views, self.field.base_time, self.device
-            views = training_views(*given, truth=loss.uses_hdr, clipping=loss.clipping, light=light)
-            # Only recorded steps need what they read in one place.
-            self._stack = (None if self._recorder is None else ViewStack.of(views)) or views
+            source, wanted = self._source(), self.config.schedule.photos
+            if self.device.type == "cpu":  # Memory is the device's, or a file is mapped into it.
+                self._stack = source
+            elif wanted in ("memory", "disk") or (wanted == "auto" and not fits_device(source, self.device)):
+                log.info("plan: photos: %.3g GB go to %s one by one, a step ahead", source.bytes / 1e9, self.device)
+                self._stack = self._streamed(source) if self._recorder else source
+            else:
+                views = list(source)
+                # Only recorded steps need what they read in one place.
+                self._stack = (None if self._recorder is None else ViewStack.of(views)) or views
         return self._stack
+
+    def _streamed(self, source: PhotoSource) -> PhotoStream | PhotoSource:
+        try:
+            return PhotoStream(source)
+        except ValueError as error:
+            log.info("%s: they are copied one by one, and steps are not recorded", error)
+            return source
+
+    def _source(self) -> PhotoSource:
+        loss = self.config.loss
+        light = self.field.response if compares_light(loss, self.field) else None
+        given = self._views, self.field.base_time, self.device
+        return photo_source(*given, truth=loss.uses_hdr, clipping=loss.clipping, light=light)
 
     def _next_index(self, count: int) -> int:
         """Every photo once in random order, then again in another; one for each rank, of which this one's is given."""
@@ -345,6 +370,11 @@ class Trainer:
                 self._order = torch.randperm(count, generator=self._order_generator).tolist()
             chosen.append(self._order.pop())
         return chosen[0 if self.ranks is None else self.ranks.rank]
+
+    def _following(self) -> int | None:
+        """The photo of the next step; None where the order is not drawn yet."""
+        place = 1 if self.ranks is None else self.ranks.rank + 1
+        return self._order[-place] if place <= len(self._order) else None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,78 @@
+"""Photos in a nameless file: the same, out of memory, gone with the process, refused where there is no room."""
+
+import gc
+import os
+import subprocess
+import sys
+from collections import namedtuple
+
+import numpy as np
+import pytest
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.scene import load_scene
+from sehdr_warp.scene.photo_file import PhotoFile, taken
+from tests.make_scenes import write_blender, write_ply
+
+LOAD = """
+import re, sys
+from pathlib import Path
+import torch
+from sehdr_warp.scene import load_scene
+# Pages of files can be dropped at any time; what cannot is anonymous.
+held = lambda: 1024 * int(re.search(r"RssAnon:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
+before = held()
+scene = load_scene(sys.argv[1], response="srgb", photos=sys.argv[2])
+codes = [view.codes for view in scene.views]
+print(held() - before, sum(photo.nbytes for photo in codes), sum(int(photo[::7].sum()) for photo in codes))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
+def test_photos_on_the_disk_take_no_memory(tmp_path):
+    write_blender(tmp_path, 12, size=(1600, 1200), ply_file_path="p.ply")
+    write_ply(tmp_path / "p.ply", [(0, 0, 0)])
+    given = [sys.executable, "-c", LOAD, str(tmp_path)]
+    told = [
+        list(map(int, subprocess.run([*given, where], capture_output=True, text=True, check=True).stdout.split()))
+        for where in ("memory", "disk")
+    ]
+    (memory, codes, total), (disk, same_codes, same_total) = told
+    assert (codes, total) == (same_codes, same_total)
+    assert memory > 0.9 * codes and disk < memory - 0.7 * codes
+
+
+def test_arrays_are_kept_shared_and_gone(tmp_path):
+    photos = PhotoFile(1 << 20, tmp_path)
+    given = np.arange(30_000, dtype=np.uint16).reshape(100, 100, 3)
+    kept = photos.keep(given)
+    assert photos.keep(kept) is kept and photos.used < 2 * given.nbytes
+    assert list(tmp_path.iterdir()) == [], "no name"
+    if sys.platform == "linux":
+        value = taken(
+            photos.share({"photo": kept, "mask": np.ones((80, 80), np.float32), "name": "a", "small": given[:1]})
+        )
+        np.testing.assert_array_equal(value["photo"], given)
+        assert value["mask"].sum() == 6400 and value["name"] == "a" and value["small"].shape == (1, 100, 3)
+        assert photos.used < given.nbytes + 6400 * 4 + 4096, "what lies there is not copied"
+    handle = photos._file.fileno()
+    del photos
+    gc.collect()
+    os.fstat(handle)  # An array still lies in it.
+    np.testing.assert_array_equal(kept, given)
+
+
+def test_too_large_for_the_disk_is_one_line(tmp_path, monkeypatch):
+    write_blender(tmp_path, 6, ply_file_path="p.ply")
+    write_ply(tmp_path / "p.ply", [(0, 0, 0)])
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr("shutil.disk_usage", lambda folder: usage(10, 10, 0))
+    assert load_scene(tmp_path, response="srgb").notes is not None
+    with pytest.raises(InputError, match="the photos take .* of this disk; use smaller photos"):
+        load_scene(tmp_path, response="srgb", photos="disk")
+    monkeypatch.setattr("sehdr_warp.scene.photo_file.available_memory", lambda: 0)
+    with pytest.raises(InputError, match="of this disk"):
+        load_scene(tmp_path, response="srgb")
+    monkeypatch.undo()
+    monkeypatch.setattr("sehdr_warp.scene.photo_file.available_memory", lambda: 0)
+    assert any("nameless file" in note for note in load_scene(tmp_path, response="srgb").notes)
