@@ -27,9 +27,8 @@ def attenuate_kernel(
 @sw.differentiable
 def attenuate(program: Program, radiance: torch.Tensor, distance: torch.Tensor, density: torch.Tensor):
     """radiance: [N, 3], distance: [N], density: [1] -> [N, 3]."""
-    seen = program.write(radiance.shape, wp.vec3)
-    inputs = [program.read(radiance, wp.vec3), program.read(distance), program.read(density)]
-    program.launch(attenuate_kernel, len(radiance), inputs, [seen])
+    seen = program.write(radiance.shape)
+    program.launch(attenuate_kernel, len(radiance), [radiance, distance, density], [seen])
     return seen
 
 

@@ -22,7 +22,7 @@ ROWS = 4  # of pixels of one warp
 def backward_kernel(dtype, channels: int, ordered: bool):
     """blend_backward over tiles x BLOCKS_PER_TILE x 32 threads.
 
-    As blend_cuda.forward_kernel, and image_gradient: [H W] vectors of C; transmittance_gradient: [H W];
+    As blend_cuda.forward_kernel, and image_gradient: [H W] vectors of C; transmittance_gradient: [H W], or [0] for 0;
     rows: ROWS and gradient_count: C + 6, as arguments so that their loops stay loops;
     gradients: [N (C + 6)], flat rows (features, conic a b c, x, y, opacity), added to
 
@@ -80,7 +80,9 @@ def backward_kernel(dtype, channels: int, ordered: bool):
         count = most_drawn[0]
         t = transmittance[pixel]
         pixel_gradient = image_gradient[pixel]
-        behind = t * transmittance_gradient[pixel]
+        behind = real(0.0)
+        if transmittance_gradient.shape[0] > 0:
+            behind = t * transmittance_gradient[pixel]
         incoming = vec_padded()
         for channel in range(wp.static(channels)):
             incoming[channel] = pixel_gradient[channel]

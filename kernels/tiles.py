@@ -1,10 +1,12 @@
 """Which Gaussian touches which tile, front to back.
 
-Gaussians come in depth order. `count_tiles` counts the tiles that each one's ellipse really touches (not its bounding
-box), a prefix sum over the counts gives every Gaussian its range of entries, and `emit_entries` fills them. A stable
-sort of the entries by tile then leaves each tile's list in depth order, because the entries were emitted in it.
-`mark_ranges` finds where each tile's list begins and ends. Adjoints sum what they write for each entry by Gaussian in
-one order, whatever runs when: `gather_entries`.
+`pack_records` counts the tiles that each Gaussian's ellipse really touches (not its bounding box), and a prefix sum
+over the counts gives every Gaussian its range of entries. Two ways lead to lists in depth order, by stable sorts:
+Gaussians are put in it, `emit_entries` fills their ranges, and a sort of the entries by tile leaves each tile's list in
+the order in which they were emitted (the GPU has least to do); or `emit_keys` fills the ranges of the Gaussians as they
+come, and the entries are sorted once by tile and depth (the host has). `find_ranges` finds where each tile's list
+begins and ends. Adjoints sum what they write for each entry by Gaussian in one order, whatever runs when:
+`gather_entries`.
 """
 
 from functools import cache
@@ -18,13 +20,14 @@ from .geometry import geometry
 
 @cache
 def tile_kernels(dtype) -> SimpleNamespace:
-    """pack_records, key_by_depth, count_tiles, emit_entries and gather_entries for one scalar type."""
+    """pack_records, key_by_depth, emit_entries, emit_keys and gather_entries for one scalar type."""
     g = geometry(dtype)
     real, vec2, vec3, vec4 = g.real, g.vec2, g.vec3, g.vec4
-    reals, reals2d, ints = wp.array(dtype=real), wp.array2d(dtype=real), wp.array(dtype=wp.int32)
+    reals, reals2d = wp.array(dtype=real), wp.array2d(dtype=real)
+    ints, int64s = wp.array(dtype=wp.int32), wp.array(dtype=wp.int64)
     vec2s, vec4s = wp.array(dtype=vec2), wp.array(dtype=vec4)
     size = float(TILE_SIZE)
-    # Without fused multiply-adds: count_tiles and emit_entries must decide alike; a compiler fuses each its own way.
+    # Without fused multiply-adds: who counts and who emits must decide alike; a compiler fuses each its own way.
     options = {"enable_backward": False, "fuse_fp": False}
 
     @wp.func
@@ -45,10 +48,11 @@ def tile_kernels(dtype) -> SimpleNamespace:
     def pack_records(
         first: int,
         means2d: vec2s, conics: wp.array(dtype=vec3), opacities: reals, features: reals2d,
-        channels: int, alpha_threshold: real,
-        extents: vec2s, shapes: vec4s, ellipses: vec4s,
+        channels: int, alpha_threshold: real, columns: int, rows: int,
+        extents: vec2s, shapes: vec4s, ellipses: vec4s, counts: ints,
     ):
-        """shapes: (x, y, opacity, half-height); ellipses: (conic a, b, c, level at which alpha meets the threshold).
+        """shapes: (x, y, opacity, half-height); ellipses: (conic a, b, c, level at which alpha meets the threshold);
+        counts: of the tiles that it touches, of columns x rows.
         extents: changed to 0 for a Gaussian with a feature that is not finite: the CPU blend multiplies what a pixel
         does not see by 0, and 0 times NaN would show beside it."""
         i = first + wp.tid()
@@ -62,8 +66,19 @@ def tile_kernels(dtype) -> SimpleNamespace:
         level = real(-1.0)
         if extent[0] > real(0.0):
             level = real(2.0) * wp.log(wp.max(opacity / alpha_threshold, real(1.0)))
-        shapes[i] = vec4(mean[0], mean[1], opacity, extent[1])
-        ellipses[i] = vec4(conic[0], conic[1], conic[2], level)
+        shape = vec4(mean[0], mean[1], opacity, extent[1])
+        ellipse = vec4(conic[0], conic[1], conic[2], level)
+        shapes[i] = shape
+        ellipses[i] = ellipse
+        touched = int(0)
+        if extent[0] > real(0.0):
+            across = tile_span(shape[0], extent[0], columns)
+            down = tile_span(shape[1], extent[1], rows)
+            for row in range(down[0], down[1]):
+                for column in range(across[0], across[1]):
+                    if tile_is_touched(shape, ellipse, column, row):
+                        touched += 1
+        counts[i] = touched
 
     @wp.kernel(module="unique", module_options=options)
     def key_by_depth(
@@ -79,33 +94,11 @@ def tile_kernels(dtype) -> SimpleNamespace:
         places[i] = i
 
     @wp.kernel(module="unique", module_options=options)
-    def count_tiles(
-        first: int,
-        order: ints, shapes: vec4s, ellipses: vec4s, extents: vec2s,
-        columns: int, rows: int,
-        counts: ints,
-    ):
-        place = first + wp.tid()
-        i = order[place]
-        extent = extents[i]
-        touched = int(0)
-        if extent[0] > real(0.0):
-            shape = shapes[i]
-            ellipse = ellipses[i]
-            across = tile_span(shape[0], extent[0], columns)
-            down = tile_span(shape[1], extent[1], rows)
-            for row in range(down[0], down[1]):
-                for column in range(across[0], across[1]):
-                    if tile_is_touched(shape, ellipse, column, row):
-                        touched += 1
-        counts[place] = touched
-
-    @wp.kernel(module="unique", module_options=options)
     def emit_entries(
         first: int,
         order: ints, shapes: vec4s, ellipses: vec4s, extents: vec2s,
         columns: int, rows: int,
-        ends: ints,
+        ends: int64s,
         capacity: int,
         tiles: ints, gaussians: ints,
     ):
@@ -116,8 +109,8 @@ def tile_kernels(dtype) -> SimpleNamespace:
         extent = extents[i]
         entry = int(0)
         if place > 0:
-            entry = ends[place - 1]
-        end = wp.min(ends[place], capacity)
+            entry = int(wp.min(ends[place - 1], wp.int64(capacity)))
+        end = int(wp.min(ends[place], wp.int64(capacity)))
         if extent[0] > real(0.0) and end > entry:
             shape = shapes[i]
             ellipse = ellipses[i]
@@ -135,9 +128,43 @@ def tile_kernels(dtype) -> SimpleNamespace:
             entry += 1
 
     @wp.kernel(module="unique", module_options=options)
+    def emit_keys(
+        first: int,
+        shapes: vec4s, ellipses: vec4s, extents: vec2s, depths: wp.array(dtype=wp.float32),
+        columns: int, rows: int,
+        ends: int64s,
+        capacity: int,
+        keys: int64s, gaussians: ints,
+    ):
+        """As emit_entries, of Gaussians as they come. keys: the tile above the bits of the depth, which order positive
+        numbers as the numbers are."""
+        i = first + wp.tid()
+        extent = extents[i]
+        entry = int(0)
+        if i > 0:
+            entry = int(wp.min(ends[i - 1], wp.int64(capacity)))
+        end = int(wp.min(ends[i], wp.int64(capacity)))
+        depth = wp.int64(wp.cast(depths[i], wp.int32))
+        if extent[0] > real(0.0) and end > entry:
+            shape = shapes[i]
+            ellipse = ellipses[i]
+            across = tile_span(shape[0], extent[0], columns)
+            down = tile_span(shape[1], extent[1], rows)
+            for row in range(down[0], down[1]):
+                for column in range(across[0], across[1]):
+                    if entry < end and tile_is_touched(shape, ellipse, column, row):
+                        keys[entry] = (wp.int64(row * columns + column) << wp.int64(32)) | depth
+                        gaussians[entry] = i
+                        entry += 1
+        while entry < end:
+            keys[entry] = wp.int64(columns * rows) << wp.int64(32)
+            gaussians[entry] = i
+            entry += 1
+
+    @wp.kernel(module="unique", module_options=options)
     def gather_entries(
         first: int,
-        order: ints, ends: ints, entry_gradients: reals2d,
+        order: ints, ends: int64s, entry_gradients: reals2d,
         columns: int,
         rows: reals2d,
     ):
@@ -146,29 +173,37 @@ def tile_kernels(dtype) -> SimpleNamespace:
         place = first + wp.tid()
         begin = int(0)
         if place > 0:
-            begin = ends[place - 1]
+            begin = int(ends[place - 1])
         i = order[place]
         for column in range(columns):
             total = real(0.0)
-            for entry in range(begin, ends[place]):
+            for entry in range(begin, int(ends[place])):
                 total += entry_gradients[entry, column]
             rows[i, column] = total
 
     return SimpleNamespace(
-        pack_records=pack_records, key_by_depth=key_by_depth, count_tiles=count_tiles, emit_entries=emit_entries,
+        pack_records=pack_records, key_by_depth=key_by_depth, emit_entries=emit_entries, emit_keys=emit_keys,
         gather_entries=gather_entries,
     )
 
 
+@wp.func
+def first_of(tiles: wp.array(dtype=wp.int32), tile: int) -> int:
+    """The place of the first entry of this tile or a later one."""
+    low = int(0)
+    high = tiles.shape[0]
+    while low < high:
+        middle = low + (high - low) // 2
+        if tiles[middle] < tile:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
 @wp.kernel(module="unique", module_options={"enable_backward": False})
-def mark_ranges(tiles: wp.array(dtype=wp.int32), entry_count: int, tile_count: int, ranges: wp.array(dtype=wp.vec2i)):
-    """ranges[t] = (first, one past the last) entry of tile t in the sorted list; untouched tiles keep what they had.
-    Unused entries carry the tile number tile_count, and belong to no list."""
-    entry = wp.tid()
-    tile = tiles[entry]
-    if tile == tile_count:
-        return
-    if entry == 0 or tiles[entry - 1] != tile:
-        ranges[tile][0] = entry
-    if entry == entry_count - 1 or tiles[entry + 1] != tile:
-        ranges[tile][1] = entry + 1
+def find_ranges(tiles: wp.array(dtype=wp.int32), ranges: wp.array(dtype=wp.vec2i)):
+    """ranges[t]: the first and one past the last entry of tile t in the sorted list. Unused entries carry a tile number
+    beyond all, and belong to no list."""
+    tile = wp.tid()
+    ranges[tile] = wp.vec2i(first_of(tiles, tile), first_of(tiles, tile + 1))

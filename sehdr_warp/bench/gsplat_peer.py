@@ -40,10 +40,10 @@ def rasterize_with_gsplat(
         packed=False, rasterize_mode="antialiased" if antialiased else "classic", eps2d=low_pass,
     )  # fmt: skip
     # gsplat 1.5 gives two radii, its forerunners one.
-    radii = info["radii"][0]
-    radii = radii.amax(-1) if radii.ndim == 2 else radii
+    radii = info["radii"][0].float()
+    extents = radii if radii.ndim == 2 else radii[:, None].expand(-1, 2)
     unknown: Any = None
-    return Rendering(image[0], unknown, info["means2d"][0], info["depths"][0], radii, 0)
+    return Rendering(image[0], unknown, info["means2d"][0], info["depths"][0], extents, 0)
 
 
 def _matrix(intrinsics: torch.Tensor) -> torch.Tensor:

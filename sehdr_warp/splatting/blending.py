@@ -12,10 +12,10 @@ from ..kernels.constants import TILE_SIZE
 from ..kernels.tiles import tile_kernels
 from . import threads
 from .launching import launch, warp_scalar
-from .tile_lists import Emission, TileLists, pack_records
+from .tile_lists import ONE_SORT, Emission, TileLists
 
-Adjoint = Callable[[tuple[Tensor, Tensor], Tensor, Tensor], Tensor]
-"""The backward pass: from the records made again, and the gradients by image and transmittance, to those by Gaussian,
+Adjoint = Callable[[tuple[Tensor, Tensor], Tensor, Tensor | None], Tensor]
+"""The backward pass: from the records, and the gradients by image and transmittance (None for 0), to those by Gaussian,
 [N, C + 6]: features, conic a b c, x, y, opacity."""
 
 
@@ -24,7 +24,6 @@ def blend(
     conics: Tensor,
     opacities: Tensor,
     features: Tensor,
-    extents: Tensor,
     lists: TileLists,
     records: tuple[Tensor, Tensor],
     alpha_threshold: float,
@@ -35,48 +34,43 @@ def blend(
     Differentiable once with respect to means2d [N, 2], conics [N, 3], opacities [N] and features. Which entries count
     is decided by the lists and by alpha_threshold, and taken as given in the derivative.
 
-    records: pack_records()'s of these means2d, conics, opacities and extents, and of alpha_threshold. They are as large
-    as what they are made of, so the backward pass makes them again instead of keeping them.
+    records: pack_records()'s of these means2d, conics and opacities, and of alpha_threshold.
     deterministic: on a GPU gradients are summed in a fixed order, as the CPU always does: slower, and the gradients of
     every (Gaussian, tile) pair take memory.
     """
-    options = lists, records, alpha_threshold, deterministic
-    return _Blend.apply(means2d, conics, opacities, features, extents, *options)
+    return _Blend.apply(means2d, conics, opacities, features, lists, records, alpha_threshold, deterministic)
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means2d, conics, opacities, features, extents, lists, records, threshold, ordered):
+    def forward(ctx, means2d, conics, opacities, features, lists, records, threshold, ordered):
         features = features.detach()
-        ctx.sizes, ctx.threshold = (lists.height, lists.width, features.shape[1]), threshold
+        ctx.sizes = lists.height, lists.width, features.shape[1]
         image, transmittance = features.new_empty(ctx.sizes), features.new_empty(ctx.sizes[:2])
         backend = blend_on_cuda if features.device.type == "cuda" else blend_on_cpu
         # Not the tensors that torch makes results of: the adjoint keeps one, and with it would keep itself.
         results = image.detach(), transmittance.detach()
         ctx.adjoint = backend(features, lists, records, *results, threshold, ordered)
-        ctx.save_for_backward(means2d, conics, opacities, extents)
+        ctx.records = records
         ctx.set_materialize_grads(False)
         return image, transmittance
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, by_image, by_transmittance):
-        adjoint, ctx.adjoint = ctx.adjoint, None
+        adjoint, records = ctx.adjoint, ctx.records
+        ctx.adjoint = ctx.records = None
         if adjoint is None:
             raise RuntimeError("this blend was already differentiated once; run its forward pass again")
-        means2d, conics, opacities, extents = ctx.saved_tensors
-        height, width, channels = ctx.sizes
-        by_image = means2d.new_zeros(ctx.sizes) if by_image is None else by_image.contiguous()
+        _, width, channels = ctx.sizes
+        by_image = records[0].new_zeros(ctx.sizes) if by_image is None else by_image.contiguous()
         # Of an axis of length 1 torch calls any stride contiguous, and kernels do not.
         by_image = by_image.as_strided(ctx.sizes, (width * channels, channels, 1))
-        if by_transmittance is None:
-            by_transmittance = means2d.new_zeros(height, width)
-        records = pack_records(means2d, conics, opacities, extents, ctx.threshold)
-        gathered = adjoint(records, by_image, by_transmittance.contiguous())
+        gathered = adjoint(records, by_image, None if by_transmittance is None else by_transmittance.contiguous())
         by_features, by_conics, by_means2d, by_opacities = gathered.split((channels, 3, 2, 1), dim=1)
         gradients = by_means2d, by_conics, by_opacities[:, 0], by_features
         wanted = (part if needed else None for part, needed in zip(gradients, ctx.needs_input_grad, strict=False))
-        return *wanted, *(None,) * 5
+        return *wanted, *(None,) * 4
 
 
 def blend_on_cpu(
@@ -104,7 +98,9 @@ def blend_on_cpu(
         ranges=pieces,
     )
 
-    def backward(records, image_gradient: Tensor, left_over_gradient: Tensor) -> Tensor:
+    def backward(records, image_gradient: Tensor, left_over_gradient: Tensor | None) -> Tensor:
+        if left_over_gradient is None:
+            left_over_gradient = torch.zeros_like(left_over)
         scratch = rows(TILE_SIZE), rows(channels, TILE_SIZE), rows(TILE_SIZE), rows(TILE_SIZE)
         entry_gradients = features.new_empty(lists.entry_count, channels + 6)
         launch(
@@ -135,32 +131,42 @@ def blend_on_cuda(
     """Fill image [H, W, C] and transmittance [H, W] by block kernels (also on CPU fibers, where tests ask for them)."""
     scalar = warp_scalar(features.dtype)
     height, width, channels = image.shape
-    padding = blend_cuda.padded_channels(channels) - channels
+    padded_channels = blend_cuda.padded_channels(channels)
     last = torch.empty(height * width, dtype=torch.int32, device=features.device)
     tile_count = lists.columns * lists.rows
     frame = lists.columns, width, height, alpha_threshold
 
-    # The backward pass takes the features from here and lets them go once they are padded again, which is larger.
-    count, kept = len(features), [features]
+    def padded(features):
+        padding = padded_channels - features.shape[1]
+        return torch.nn.functional.pad(features, (0, padding)) if padding else features
 
     def by_gaussian(features, records):
-        padded = torch.nn.functional.pad(features, (0, padding)) if padding else features
-        return lists.ranges, lists.gaussians, *records, padded.reshape(-1, 4), *frame
+        return lists.ranges, lists.gaussians, *records, features.reshape(-1, 4), *frame
 
     def launch_blocks(kernel, blocks_per_tile, *arguments):
         block = blend_cuda.BLOCK_DIM
         launch(kernel, tile_count * blocks_per_tile * block, *arguments, block_dim=block)
 
-    launch_blocks(
-        blend_cuda.forward_kernel(scalar, channels),
-        blend_cuda.BLOCKS_PER_TILE,
-        *(*by_gaussian(features, records), image, transmittance, last),
-    )
+    rows = padded(features)
+    given = *by_gaussian(rows, records), image, transmittance, last
+    launch_blocks(blend_cuda.forward_kernel(scalar, channels), blend_cuda.BLOCKS_PER_TILE, *given)
+    # The backward pass takes them from here and lets them go. Padded they are larger, and few are not padded again.
+    count, kept = len(features), [rows if len(features) <= ONE_SORT else features]
+    del rows, given
 
-    def backward(records, image_gradient: Tensor, transmittance_gradient: Tensor) -> Tensor:
+    def backward(records, image_gradient: Tensor, transmittance_gradient: Tensor | None) -> Tensor:
+        if transmittance_gradient is None:
+            transmittance_gradient = transmittance.view(-1)[:0]
         kernel = blend_cuda_adjoint.backward_kernel(scalar, channels, deterministic)
         corners, sizes = blend_cuda_adjoint.BLOCKS_PER_TILE, (blend_cuda_adjoint.ROWS, channels + 6)
-        given = *by_gaussian(kept.pop(), records), transmittance, last, image_gradient, transmittance_gradient, *sizes
+        given = (
+            *by_gaussian(padded(kept.pop()), records),
+            transmittance,
+            last,
+            image_gradient,
+            transmittance_gradient,
+            *sizes,
+        )
         if not deterministic:
             gathered = transmittance.new_zeros(count, channels + 6)
             launch_blocks(kernel, corners, *given, 0, lists.gaussians, gathered)

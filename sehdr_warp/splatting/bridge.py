@@ -1,20 +1,19 @@
 """Warp programs as differentiable torch operations: the one place where tapes meet autograd.
 
-A *program* is a function that reads torch tensors as Warp arrays, launches kernels on a tape and returns the arrays
-it wrote. `@differentiable` turns it into a torch operation: data is shared, never copied; launches go to torch's
-current stream; the tape is replayed when torch asks for gradients, and not recorded when nobody will.
+A *program* is a function that launches kernels on torch tensors, on a tape, and returns the tensors it wrote.
+`@differentiable` turns it into a torch operation: data is shared, never copied; launches go to torch's current stream;
+the tape is replayed when torch asks for gradients, and not recorded when nobody will.
 
     @differentiable
     def scaled(program, values, *, gain):
-        result = program.write(values.shape, wp.vec3)
-        program.launch(scale, len(values), [program.read(values, wp.vec3), gain], [result])
+        result = program.write(values.shape)
+        program.launch(scale, len(values), [values, gain], [result])
         return result
 
 Positional arguments are tensors and take part in autograd; keyword arguments are passed on as they are.
 """
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec, overload
 
@@ -22,81 +21,65 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from . import threads
-from .launching import launch_ranges, parameters, torch_stream
+from .launching import launch
 
 P = ParamSpec("P")
 
 
 class Program:
-    """What a program sees while it runs: arrays over torch memory, and a tape that takes its launches."""
+    """What a program sees while it runs: memory to write to, and a tape that takes its launches."""
 
-    def __init__(self, device: torch.device, recording: bool):
-        self.device = wp.device_from_torch(device)
-        self.torch_device = device
+    def __init__(self, tensors: Sequence[Tensor], recording: bool):
+        self.device = tensors[0].device
         self.tape = wp.Tape() if recording else None
-        self.inputs: list[tuple[Tensor, wp.array]] = []
-        self.outputs: dict[int, tuple[Tensor, wp.array, bool]] = {}
+        self.constant: set[int] = set()
+        self.gradients: dict[int, Tensor] = {}
+        """By place in `known`: the arguments, then what was written."""
+        self.known: list[Tensor] = []
+        self._places: dict[int, int] = {}
+        for tensor in tensors:
+            self._know(tensor)
 
-    def read(self, tensor: Tensor, dtype: Any = None) -> wp.array:
-        """The tensor's memory as a Warp array; a vector or matrix dtype takes up the last one or two dimensions."""
-        array = _array(tensor, dtype)
-        self.inputs.append((tensor, array))
-        return array
+    def write(self, shape: Sequence[int], dtype: torch.dtype = torch.float32, *, differentiable: bool = True) -> Tensor:
+        """A new tensor for one launch to write to. A vector type's components are its last dimension."""
+        tensor = torch.empty(tuple(shape), dtype=dtype, device=self.device)
+        if not differentiable:
+            self.constant.add(len(self.known))
+        self._know(tensor)
+        return tensor
 
-    def write(self, shape: Sequence[int], dtype: Any, *, differentiable: bool = True) -> wp.array:
-        """A new array over torch memory. `shape` is the tensor's, with the components of a vector dtype last."""
-        tensor = torch.empty(tuple(shape), dtype=_scalar(dtype), device=self.torch_device)
-        array = _array(tensor, dtype)
-        self.outputs[id(array)] = (tensor, array, differentiable)
-        return array
+    def _know(self, tensor: Tensor) -> None:
+        self._places[id(tensor)] = len(self.known)
+        self.known.append(tensor)
 
     def launch(self, kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], outputs: Sequence[Any] = ()) -> None:
-        """Launch a kernel; its generated adjoint runs in the backward pass.
+        """Launch a kernel, tensors in the place of its arrays; its generated adjoint runs in the backward pass.
 
+        inputs: kept until then. outputs: what the kernel writes and does not read; the adjoint does without.
+        A vector or matrix type takes up a tensor's last one or two dimensions. Gradients reach the program's arguments
+        and what it wrote; other tensors are constants.
         A kernel whose first parameter is an integer `first` adds it to its thread's index and writes only what belongs
         to that item: it is given the start of a range, and on the CPU ranges run side by side, adjoint too, but for an
         adjoint that adds to an input which items share.
         """
-        ranged, _ = parameters(kernel)
-        if ranged and self.device.is_cpu and isinstance(dim, int):
-            self._launch_ranges(kernel, dim, [*inputs], [*outputs])
-            return
-        inputs = [0, *inputs] if ranged else [*inputs]
-        with nullcontext() if self.tape is None else self.tape:
-            wp.launch(kernel, dim, inputs, [*outputs], device=self.device)
-
-    def _launch_ranges(self, kernel, count: int, inputs: list, outputs: list) -> None:
-        arguments = [*inputs, *outputs]
-        launch_ranges(kernel, threads.even_ranges(count), arguments)
+        launch(kernel, dim, *inputs, *outputs)
         if self.tape is None:
             return
+        gradients, places = self.gradients, [self.place(argument) for argument in (*inputs, *outputs)]
+        kept = [*inputs, *(None,) * len(outputs)]
 
-        # The tape holds the adjoint. If that held the program or the tape, memory would wait for the garbage collector.
+        # The tape holds this. If it held the program or the tape, memory would wait for the garbage collector.
         def adjoint() -> None:
-            tape = wp.Tape()
-            gradients = [tape.get_adjoint(argument) for argument in arguments]
-            arrays = [argument for argument in inputs if isinstance(argument, wp.array) and argument.grad is not None]
-            shared = any(array.shape[0] != count for array in arrays)
-            ranges = [(0, count)] if shared or count == 0 else threads.even_ranges(count)
-            by_inputs, by_outputs = [None, *gradients[: len(inputs)]], gradients[len(inputs) :]
-            options = {"outputs": outputs, "adj_inputs": by_inputs, "adj_outputs": by_outputs, "adjoint": True}
-            launch_ranges(kernel, ranges, inputs, **options)
+            given = [gradients.get(place) for place in places]
+            read = zip(inputs, given, strict=False)
+            shared = any(gradient is not None and len(tensor) != dim for tensor, gradient in read)
+            launch(kernel, dim, *kept, gradients=given, ranges=[(0, dim)] if shared and isinstance(dim, int) else None)
 
         self.tape.record_func(adjoint, arrays=[])
 
-
-def _scalar(dtype) -> torch.dtype:
-    return dtype if isinstance(dtype, torch.dtype) else wp.dtype_to_torch(getattr(dtype, "_wp_scalar_type_", dtype))
-
-
-def _array(tensor: Tensor, dtype=None) -> wp.array:
-    dtype = None if isinstance(dtype, torch.dtype) else dtype
-    tensor = tensor.detach()
-    if tensor.is_contiguous():
-        # torch leaves the stride of an axis of length 1 as it was; Warp wants an array's and its gradient's alike.
-        tensor = tensor.view(-1).view(tensor.shape)
-    return wp.from_torch(tensor, dtype=dtype, requires_grad=False)
+    def place(self, tensor: Any) -> int:
+        """Under which the gradient of an argument or of what was written is found; -1 for anything else."""
+        return self._places.get(id(tensor), -1)
 
 
 def _zeros_like(tensors: list[Tensor]) -> list[Tensor]:
@@ -113,84 +96,65 @@ def _zeros_like(tensors: list[Tensor]) -> list[Tensor]:
 class _ProgramFunction(torch.autograd.Function):
     @staticmethod
     def forward(ctx, body, options, *tensors):
-        device = tensors[0].device
-        recording = any(ctx.needs_input_grad[2:])
-        program = Program(device, recording)
         plain = tuple(tensor.detach() for tensor in tensors)
-        with torch_stream(device):
-            result = body(program, *plain, **options)
-        arrays = result if isinstance(result, tuple) else (result,)
-        outputs = tuple(program.outputs[id(array)][0] for array in arrays)
-        ctx.mark_non_differentiable(
-            *(tensor for tensor, array in zip(outputs, arrays, strict=True) if not program.outputs[id(array)][2])
-        )
-        # torch makes this node the outputs' origin: held here as well, neither would ever be freed.
-        program.outputs = {key: (t.detach(), array, smooth) for key, (t, array, smooth) in program.outputs.items()}
+        program = Program(plain, True)
+        result = body(program, *plain, **options)
+        outputs = result if isinstance(result, tuple) else (result,)
+        places = [program.place(tensor) for tensor in outputs]
+        # torch makes this node the origin of what it is given: held by the tape as well, neither would ever be freed.
+        given = tuple(tensor.detach() for tensor in outputs)
+        ctx.mark_non_differentiable(*(t for t, place in zip(given, places, strict=True) if place in program.constant))
         ctx.set_materialize_grads(False)
-        if recording:
-            # The tape holds the arrays, hence the memory, until torch frees this node.
-            ctx.program, ctx.arrays, ctx.plain = program, arrays, plain
-            ctx.leaves = [tensor.is_leaf for tensor in tensors]
-        return outputs if isinstance(result, tuple) else outputs[0]
+        ctx.tape, ctx.gradients, ctx.plain, ctx.places = program.tape, program.gradients, plain, places
+        ctx.leaves = [tensor.is_leaf for tensor in tensors]
+        passed = {*range(len(plain)), *places, *program.constant}
+        ctx.between = {place: t for place, t in enumerate(program.known) if place not in passed}
+        return given if isinstance(result, tuple) else given[0]
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, *gradients):
-        program = ctx.program
-        if program is None:
+    def backward(ctx, *upstream):
+        tape, plain, gradients = ctx.tape, ctx.plain, ctx.gradients
+        if tape is None:
             raise RuntimeError("this Warp operation was already differentiated once; run its forward pass again")
-        arrays, plain = ctx.arrays, ctx.plain
-        ctx.program = ctx.arrays = ctx.plain = None
-        with torch_stream(program.torch_device):
-            for array, gradient in zip(arrays, gradients, strict=True):
-                if not program.outputs[id(array)][2]:
-                    continue
-                tensor = program.outputs[id(array)][0]
-                if gradient is None:
-                    gradient = torch.zeros_like(tensor)
-                elif gradient.stride() != tensor.stride():
-                    gradient = torch.empty_like(tensor).copy_(gradient)
-                array.grad = _array(gradient, array.dtype)
-                array.retain_grad = True  # the gradient is torch's: adjoint kernels must not clear it
-            results: list[Tensor | None] = [None] * len(plain)
-            by_memory = {}
-            wanted = [position for position, needed in enumerate(ctx.needs_input_grad[2:]) if needed]
-            # On a GPU leaves, whose gradients stay, have them in one memory; others' are soon let go, each by itself.
-            together = [p for p in wanted if ctx.leaves[p] and program.torch_device.type != "cpu"]
-            for group in (together, *([p] for p in wanted if p not in together)):
-                for position, zeros in zip(group, _zeros_like([plain[p] for p in group]), strict=True):
-                    results[position] = zeros
-                    by_memory[id(plain[position])] = zeros
-            for tensor, array in program.inputs:
-                if id(tensor) in by_memory:
-                    gradient = by_memory[id(tensor)]
-                    if tensor.is_contiguous() and gradient.stride() != tensor.stride():
-                        # A dimension of one element may have any stride, and Warp wants the gradient's to be the same.
-                        gradient = gradient.as_strided(tensor.shape, tensor.stride())
-                    array.grad = _array(gradient, array.dtype)
-            program.tape.backward()
+        ctx.tape = ctx.plain = ctx.gradients = None
+        for place, gradient in zip(ctx.places, upstream, strict=True):
+            if gradient is not None:
+                # Kernels read any rows, but a vector in one piece.
+                whole = gradient.is_contiguous() or gradient.ndim < 2 or gradient[0].is_contiguous()
+                gradients[place] = gradient if whole else gradient.contiguous()
+        for place, tensor in ctx.between.items():
+            gradients[place] = torch.zeros_like(tensor)
+        results: list[Tensor | None] = [None] * len(plain)
+        wanted = [place for place, needed in enumerate(ctx.needs_input_grad[2:]) if needed]
+        # On a GPU leaves, whose gradients stay, have them in one memory; others' are soon let go, each by itself.
+        together = [p for p in wanted if ctx.leaves[p] and plain[p].device.type != "cpu"]
+        for group in (together, *([p] for p in wanted if p not in together)):
+            for place, zeros in zip(group, _zeros_like([plain[p] for p in group]), strict=True):
+                results[place] = gradients[place] = zeros
+        tape.backward()
         return (None, None, *results)
 
 
 @overload
-def differentiable(
-    body: Callable[Concatenate[Program, P], tuple["wp.array[Any, Any]", ...]],
-) -> Callable[P, tuple[Tensor, ...]]: ...
+def differentiable(body: Callable[Concatenate[Program, P], tuple[Tensor, ...]]) -> Callable[P, tuple[Tensor, ...]]: ...
 
 
 @overload
-def differentiable(body: Callable[Concatenate[Program, P], "wp.array[Any, Any]"]) -> Callable[P, Tensor]: ...
+def differentiable(body: Callable[Concatenate[Program, P], Tensor]) -> Callable[P, Tensor]: ...
 
 
 def differentiable(body: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a torch operation of a program: body(program, *tensors, **options) -> Warp arrays made by program.write().
+    """Make a torch operation of a program: body(program, *tensors, **options) -> tensors made by program.write().
 
     The operation takes the tensors positionally (on one device) and the options by keyword, returns the tensors
-    behind the arrays, and can be differentiated once with respect to every tensor that body passed to program.read().
+    that body returns, and can be differentiated once with respect to every positional tensor.
     """
 
     @wraps(body)
     def operation(*tensors: Tensor, **options: Any) -> Any:
-        return _ProgramFunction.apply(body, options, *tensors)
+        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
+            return _ProgramFunction.apply(body, options, *tensors)
+        return body(Program(tensors, False), *tensors, **options)
 
     return operation

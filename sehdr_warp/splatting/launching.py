@@ -1,8 +1,10 @@
 """The one way kernels are launched: torch tensors in, on torch's device and stream, on the CPU spread over threads."""
 
+import math
+import threading
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from functools import cache, lru_cache
+from functools import cache
 from typing import Any
 
 import torch
@@ -34,6 +36,7 @@ def launch(
     kernel: Any,
     dim: int | Sequence[int],
     *arguments: Any,
+    gradients: Sequence[Tensor | None] | None = None,
     ranges: list[tuple[int, int]] | None = None,
     smallest: int = 1024,
     block_dim: int | None = None,
@@ -42,63 +45,121 @@ def launch(
 
     arguments: the kernel's, tensors (of one device) in the place of arrays. A vector or matrix type takes up the last
         one or two dimensions, and a tensor with more dimensions than the kernel's array is handed over flat.
+    gradients: for each argument its gradient, or None: launches the adjoint, which reads the gradients of what the
+        kernel wrote and adds to those of what it read. None as an argument is an array that it does without.
     A kernel whose first parameter is `first` adds it to its thread's index and writes nothing that another index
     writes: on the CPU it runs side by side over [first, last) ranges, by default even ones of `smallest` items or more.
     """
     if dim == 0 or (not isinstance(dim, int) and 0 in dim):
         return
-    ranged, types = parameters(kernel)
+    ranged = starts_at_first(kernel)
     device = next(argument.device for argument in arguments if isinstance(argument, Tensor))
-    inputs = [
-        _descriptor(argument, kind) if isinstance(argument, Tensor) else argument
-        for argument, kind in zip(arguments, types, strict=True)
-    ]
+    values = list(arguments)
+    if gradients is not None:
+        values += [None, *gradients] if ranged else gradients
+    adjoint = gradients is not None
     if ranged and device.type == "cpu" and isinstance(dim, int):
-        launch_ranges(kernel, threads.even_ranges(dim, smallest) if ranges is None else ranges, inputs)
+        ranges = threads.even_ranges(dim, smallest) if ranges is None else ranges
+        if len(ranges) > 1:
+            wp.load_module(kernel.module, device="cpu")  # compiling is not safe from two threads at once
+
+        def task(bounds: tuple[int, int]) -> None:
+            _launch(kernel, device, block_dim, adjoint, bounds[1] - bounds[0], [bounds[0], *values], None)
+
+        threads.run_parallel(task, ranges)
         return
-    dim = dim if isinstance(dim, int) else tuple(dim)
-    inputs, where = [0, *inputs] if ranged else inputs, wp.device_from_torch(device)
-    wp.launch(kernel, dim, inputs, stream=_stream(device), device=where, block_dim=block_dim, record_tape=False)
-
-
-def launch_ranges(kernel: Any, ranges: list[tuple[int, int]], inputs: list, **options: Any) -> None:
-    """Launch `kernel(first, *inputs)` over each [first, last) range, side by side on the CPU."""
-    if len(ranges) > 1:
-        wp.load_module(kernel.module, device="cpu")  # compiling is not safe from two threads at once
-
-    def task(bounds: tuple[int, int]) -> None:
-        given = [bounds[0], *inputs]
-        wp.launch(kernel, dim=bounds[1] - bounds[0], inputs=given, device="cpu", record_tape=False, **options)
-
-    threads.run_parallel(task, ranges)
+    _launch(kernel, device, block_dim, adjoint, dim, [0, *values] if ranged else values, _stream(device))
 
 
 @cache
-def parameters(kernel: Any) -> tuple[bool, list]:
-    """Whether the kernel takes the start of a range, `first`, and the types of its other parameters."""
-    arguments = kernel.adj.args
-    ranged = arguments[0].label == "first"
-    return ranged, [argument.type for argument in arguments[ranged:]]
+def starts_at_first(kernel: Any) -> bool:
+    """Whether the kernel takes the start of a range, `first`."""
+    return kernel.adj.args[0].label == "first"
 
 
-def _descriptor(tensor: Tensor, kind: wp.array) -> Any:
-    """The tensor's memory for one launch: a tenth of what a wp.array costs the host. It keeps the tensor alive."""
-    blank = _blank(tensor.shape, tensor.stride(), tensor.dtype, kind.ndim, kind.dtype)
-    descriptor = type(blank).from_buffer_copy(blank)
-    descriptor.data, descriptor._ref = tensor.data_ptr(), tensor
-    return descriptor
+class _Packed:
+    """A launch whose parameters stay packed: of the next one only what differs is packed, mostly places in memory.
+    A tenth of what wp.launch() costs the host."""
+
+    def __init__(
+        self, kernel: Any, device: torch.device, block_dim: int | None, adjoint: bool, dim: Any, values: list
+    ) -> None:
+        self.arguments = kernel.adj.args
+        self.kinds = [argument.type for argument in self.arguments] * (1 + adjoint)
+        self.seen: list[Any] = [None] * len(self.kinds)
+        count = len(self.arguments)
+        given = [
+            type(kind.__ctype__())() if hasattr(kind, "__ctype__") else values[place % count]
+            for place, kind in enumerate(self.kinds)
+        ]
+        self.recorded: Any = wp.launch(
+            kernel, dim, given[:count], adj_inputs=given[count:], adjoint=adjoint,
+            device=wp.device_from_torch(device), block_dim=block_dim, record_tape=False, record_cmd=True,
+        )  # fmt: skip
+        self.dim: int | Sequence[int] | None = None
+
+    def launch(self, dim: int | Sequence[int], values: list, stream: wp.Stream | None) -> None:
+        packed, seen = self.recorded.params, self.seen
+        for index, value in enumerate(values):
+            if isinstance(value, Tensor):
+                array, layout = packed[index + 1], (value.shape, value.stride(), value.dtype)
+                if layout != seen[index]:
+                    _lay_out(array, value, self.kinds[index])
+                    seen[index] = layout
+                array.data = value.data_ptr()
+            elif value is None:
+                if hasattr(packed[index + 1], "data"):
+                    packed[index + 1].data = 0
+            elif value != seen[index]:
+                self.recorded.set_param_at_index(index, value)
+                seen[index] = value
+        if dim != self.dim:
+            self.recorded.set_dim(dim)
+            self.dim = dim
+        self.recorded.launch(stream)
 
 
-@lru_cache(maxsize=4096)
-def _blank(shape: torch.Size, stride: tuple[int, ...], kind: torch.dtype, dimensions: int, dtype: Any) -> Any:
-    """The descriptor of such a tensor as an array of so many dimensions, without its place in memory."""
-    tensor = torch.empty_strided(shape, stride, dtype=kind, device="meta")
-    surplus = tensor.ndim - dimensions - len(getattr(dtype, "_shape_", ()))
+_of_thread = threading.local()
+
+
+def _launch(
+    kernel: Any, device: torch.device, block_dim: int | None, adjoint: bool, dim: Any, values: list, stream: Any
+) -> None:
+    """By this thread's packed launch of the kernel: another thread's may be at work."""
+    if not hasattr(_of_thread, "launches"):
+        _of_thread.launches = {}
+    key = kernel, device, block_dim, adjoint
+    if key not in _of_thread.launches:
+        _of_thread.launches[key] = _Packed(*key, dim, values)
+    _of_thread.launches[key].launch(dim, values, stream)
+
+
+def _lay_out(array: Any, tensor: Tensor, kind: wp.array) -> None:
+    """Give an array's descriptor the tensor's shape and strides. Raises TypeError where the kernel takes others."""
+    inner, scalar = getattr(kind.dtype, "_shape_", ()), getattr(kind.dtype, "_wp_scalar_type_", kind.dtype)
+    size, outer = tensor.element_size(), tensor.ndim - len(inner)
+    shape, steps = list(tensor.shape), [size * stride for stride in tensor.stride()]
+    if tensor.is_contiguous():
+        # torch leaves the stride of an axis of length 1 as it was.
+        steps = [size * math.prod(shape[axis + 1 :]) for axis in range(tensor.ndim)]
+    whole = [size * math.prod(inner[axis + 1 :]) for axis in range(len(inner))]
+    surplus = outer - kind.ndim
+    expected, given = wp.dtype_to_torch(scalar), tensor.dtype
+    whole_numbers = not (expected.is_floating_point or given.is_floating_point)
+    alike = given == expected or (whole_numbers and given.itemsize == expected.itemsize)
+    if not alike or tuple(shape[outer:]) != tuple(inner) or steps[outer:] != whole or surplus < -1:
+        told = f"{given} of shape {shape} and strides {list(tensor.stride())}"
+        raise TypeError(f"the kernel takes {kind.ndim} dimensions of {kind.dtype.__name__}, given is {told}")
+    shape, steps = shape[:outer], steps[:outer]
     if surplus > 0:
-        tensor = tensor.view(-1, *tensor.shape[surplus + 1 :])
+        if not tensor.is_contiguous():
+            raise TypeError(f"a tensor of shape {list(tensor.shape)} that is not contiguous cannot be handed over flat")
+        shape, steps = [math.prod(shape[: surplus + 1]), *shape[surplus + 1 :]], steps[surplus:]
     elif surplus < 0:
-        tensor = tensor[None]
-    return wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
+        shape, steps = [1, *shape], [size * tensor.numel(), *steps]
+    array.ndim = kind.ndim
+    for axis, (length, step) in enumerate(zip(shape, steps, strict=True)):
+        array.shape[axis], array.strides[axis] = length, step
 
 
 def sums_are_ordered(device: torch.device) -> bool:
@@ -109,15 +170,16 @@ def sums_are_ordered(device: torch.device) -> bool:
 def torch_stream(device: torch.device) -> AbstractContextManager:
     """Whatever Warp does goes to torch's current stream for as long as this context lasts."""
     stream = _stream(device)
-    return nullcontext() if stream is None else wp.ScopedStream(stream, sync_enter=False, sync_exit=False)
+    if stream is None or stream.device.stream is stream:
+        return nullcontext()
+    return wp.ScopedStream(stream, sync_enter=False, sync_exit=False)
 
 
 def _stream(device: torch.device) -> wp.Stream | None:
     if device.type == "cpu":
         return None
-    current = torch.cuda.current_stream(device)
     # One Warp object a stream, for good: when a second one dies, Warp forgets the stream, in mid-capture too.
-    key = current.device_index, current.cuda_stream
+    key = device.index, torch._C._cuda_getCurrentRawStream(device.index)
     if key not in _streams:
-        _streams[key] = wp.Stream(wp.device_from_torch(device), cuda_stream=current.cuda_stream)
+        _streams[key] = wp.Stream(wp.device_from_torch(device), cuda_stream=key[1])
     return _streams[key]

@@ -1,9 +1,7 @@
 """Stage one of a render: 3D Gaussians to 2D Gaussians."""
 
-import warp as wp
 from torch import Tensor
 
-from ..kernels.geometry import matrix, vector
 from ..kernels.project import projection_kernel
 from .bridge import Program, differentiable
 from .launching import warp_scalar
@@ -25,7 +23,7 @@ def project(
     low_pass: float,
     alpha_threshold: float,
     antialiased: bool,
-) -> tuple[wp.array, wp.array, wp.array, wp.array, wp.array]:
+) -> tuple[Tensor, ...]:
     """The 2D Gaussians of one camera.
 
     means, log_scales [N, 3]; quaternions [N, 4] (w, x, y, z), any length; opacities [N] in [0, 1];
@@ -35,15 +33,10 @@ def project(
     extents [N, 2], the half-width and half-height in pixels within which alpha reaches alpha_threshold. A culled
     Gaussian has extents 0. All but the extents are differentiable.
     """
-    scalar = warp_scalar(means.dtype)
-    vec2, vec3, vec4 = vector(2, scalar), vector(3, scalar), vector(4, scalar)
-    count = means.shape[0]
-    gaussians = (means, vec3), (log_scales, vec3), (quaternions, vec4), (opacities, scalar)
-    camera = (world_to_camera, matrix(4, 4, scalar)), (intrinsics, vec4)
-    read = [program.read(tensor, kind) for tensor, kind in (*gaussians, *camera)]
-    means2d, conics = program.write((count, 2), vec2), program.write((count, 3), vec3)
-    depths, opacities2d = program.write((count,), scalar), program.write((count,), scalar)
-    results = means2d, conics, depths, opacities2d, program.write((count, 2), vec2, differentiable=False)
-    kernel = projection_kernel(scalar, antialiased)
-    program.launch(kernel, count, [*read, width, height, near, low_pass, alpha_threshold], results)
+    count, dtype = len(means), means.dtype
+    extents = program.write((count, 2), dtype, differentiable=False)
+    results = *(program.write((count, *shape), dtype) for shape in ((2,), (3,), (), ())), extents
+    given = means, log_scales, quaternions, opacities, world_to_camera, intrinsics, width, height
+    kernel = projection_kernel(warp_scalar(dtype), antialiased)
+    program.launch(kernel, count, [*given, near, low_pass, alpha_threshold], results)
     return results

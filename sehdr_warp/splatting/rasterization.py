@@ -1,8 +1,10 @@
 """Differentiable splatting of 3D Gaussians: project, order, bin, blend."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
+import torch
 from torch import Tensor
 
 from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR
@@ -17,32 +19,40 @@ LARGEST_SIDE = 1 << 20  # of an image, in pixels
 
 @dataclass(frozen=True)
 class Rendering:
-    """One rendered view of N Gaussians.
+    """One rendered view of N Gaussians; of B cameras in one call all but the last three begin with an axis of B.
 
-    image: [H, W, C] blended features over zero; add transmittance * background for another background.
+    image: [H, W, C] blended features over the background, or over zero.
     transmittance: [H, W] in [0, 1], how much of each pixel's background is seen. The backward pass reads it: do not
         write to it.
     means2d: [N, 2] centres in pixels; part of the graph, so means2d.retain_grad() gives densification its signal.
     depths: [N] along the camera's axis, in scene units; 0 where culled.
-    radii: [N] the longer half-extent in pixels within which a Gaussian counts; 0 where culled.
+    extents: [N, 2] half-width and half-height in pixels within which a Gaussian counts; 0 where culled.
     entry_count: (Gaussian, tile) pairs that there was room for.
     overflow: scalar bool tensor, whether the given capacity left some of them out; None without a capacity.
     pair_count: scalar int64 tensor, how many there are; None from rasterizers that do not count them.
+    depth: [H, W] blended depths along the camera's axis over zero, where they were asked for; over alpha they are the
+        expected depth.
     """
 
     image: Tensor
     transmittance: Tensor
     means2d: Tensor
     depths: Tensor
-    radii: Tensor
+    extents: Tensor
     entry_count: int
     overflow: Tensor | None = None
     pair_count: Tensor | None = None
+    depth: Tensor | None = None
 
     @property
     def alpha(self) -> Tensor:
         """[H, W] in [0, 1], how much of each pixel the Gaussians cover; made anew whenever it is asked for."""
         return 1.0 - self.transmittance
+
+    @property
+    def radii(self) -> Tensor:
+        """[N] the longer of the two half-extents; made anew whenever it is asked for."""
+        return self.extents.amax(dim=-1)
 
     @property
     def visible(self) -> Tensor:
@@ -65,10 +75,12 @@ def rasterize(
     low_pass: float = LOW_PASS,
     alpha_threshold: float = ALPHA_THRESHOLD,
     antialiased: bool = False,
+    background: Tensor | None = None,
+    depth: bool = False,
     capacity: int | None = None,
     deterministic: bool = False,
 ) -> Rendering:
-    """Splat Gaussians with any number of feature channels onto one camera's image plane (3DGS, Kerbl et al. 2023).
+    """Splat Gaussians with any number of feature channels onto cameras' image planes (3DGS, Kerbl et al. 2023).
 
     means: [N, 3] world coordinates.
     log_scales: [N, 3] natural logarithm of the standard deviations along the local axes, in scene units.
@@ -76,12 +88,16 @@ def rasterize(
     opacities: [N] in [0, 1].
     features: [N, C], any C >= 1 and any finite range; several colour sets go side by side in one pass.
     world_to_camera: [4, 4], OpenCV convention. intrinsics: [4] fx, fy, cx, cy in pixels. width, height: in pixels.
+    B cameras in one call: world_to_camera [B, 4, 4], intrinsics [B, 4]; features may then be [B, N, C], opacities
+        [B, N].
     near: points nearer to the camera plane are culled; > 0. low_pass: variance in square pixels added to each splat;
         >= 0.
     alpha_threshold: contributions below it are left out, in (0, 1).
     antialiased: keep a Gaussian's energy under the low pass by lowering its opacity.
-    capacity: room for this many (Gaussian, tile) pairs, from 1. On a GPU nothing then waits for the device, so that the
-        call can be part of a CUDA graph; Rendering.overflow says whether the room was enough.
+    background: [C] what shows through, or with B cameras [B, C].
+    depth: also blend depths, Rendering.depth.
+    capacity: room for this many (Gaussian, tile) pairs of a camera, from 1. On a GPU nothing then waits for the device,
+        so that the call can be part of a CUDA graph; Rendering.overflow says whether the room was enough.
     deterministic: on a GPU, sum gradients in a fixed order, so that the same input gives the same bits; slower, and the
         gradients of every (Gaussian, tile) pair take memory.
 
@@ -93,16 +109,21 @@ def rasterize(
     not fit, and on the CPU for opacities outside of [0, 1]; OutOfMemory (an SehdrError), with the sizes, if memory does
     not suffice. Warns on the CPU of log_scales that look like sizes.
     """
+    cameras: tuple[str, ...] = ("B",) if isinstance(world_to_camera, Tensor) and world_to_camera.ndim == 3 else ()
+    by_camera = [bool(cameras) and isinstance(t, Tensor) and t.ndim == n for t, n in ((opacities, 2), (features, 3))]
+    backgrounds = {} if background is None else {"background": (background, (*cameras[: background.ndim - 1], "C"))}
     check_tensors(
         means=(means, ("N", 3)),
         log_scales=(log_scales, ("N", 3)),
         quaternions=(quaternions, ("N", 4)),
-        opacities=(opacities, ("N",)),
-        features=(features, ("N", "C")),
-        world_to_camera=(world_to_camera, (4, 4)),
-        intrinsics=(intrinsics, (4,)),
+        opacities=(opacities, (*cameras[: by_camera[0]], "N")),
+        features=(features, (*cameras[: by_camera[1]], "N", "C")),
+        world_to_camera=(world_to_camera, (*cameras, 4, 4)),
+        intrinsics=(intrinsics, (*cameras, 4)),
+        **backgrounds,
     )
-    if not features.shape[1]:
+    channels = features.shape[-1]
+    if not channels:
         raise ValueError(f"features has shape {list(features.shape)}, expected [N, C] with C >= 1")
     check_opacities(opacities)
     width = whole_number("width", width, 1, LARGEST_SIDE)
@@ -115,18 +136,57 @@ def rasterize(
         raise ValueError(f"low_pass {low_pass} is not a number from 0")
     if not 0.0 < alpha_threshold < 1.0:
         raise ValueError(f"alpha_threshold {alpha_threshold} is not between 0 and 1")
-    tensors = (means, log_scales, quaternions, opacities, world_to_camera, intrinsics)
-    with memory_told(means.device, lambda: (len(means), width, height, features.shape[1])):
+
+    def projected(opacities: Tensor, pose: Tensor, lens: Tensor) -> tuple[Tensor, ...]:
+        tensors = (tensor.contiguous() for tensor in (means, log_scales, quaternions, opacities, pose, lens))
         options = {"near": near, "low_pass": low_pass, "alpha_threshold": alpha_threshold, "antialiased": antialiased}
-        means2d, conics, depths, opacities2d, extents = project(
-            *(tensor.contiguous() for tensor in tensors), width=width, height=height, **options
-        )
-        features = features.contiguous()
-        means_, conics_, opacities_ = (tensor.detach() for tensor in (means2d, conics, opacities2d))
-        records = pack_records(means_, conics_, opacities_, extents, alpha_threshold, features.detach())
-        emission = means.device.type == "cpu" or deterministic
-        lists = build_tile_lists(records, depths.detach(), extents, width, height, capacity, emission=emission)
-        given = means2d, conics, opacities2d, features, extents
+        return project(*tensors, width=width, height=height, **options)
+
+    def drawn(features: Tensor, means2d, conics, depths, opacities, extents) -> Rendering:
+        features = (torch.cat([features, depths[:, None]], 1) if depth else features).contiguous()
+        given = means2d.detach(), conics.detach(), opacities.detach(), extents, alpha_threshold, width, height
+        records, counts = pack_records(*given, features.detach())
+        emission = features.device.type == "cpu" or deterministic
+        lists = build_tile_lists(records, counts, depths.detach(), extents, width, height, capacity, emission=emission)
+        given = means2d, conics, opacities, features
         image, transmittance = blend(*given, lists, records, alpha_threshold, deterministic)
-        radii = extents.amax(dim=1)
-    return Rendering(image, transmittance, means2d, depths, radii, lists.entry_count, lists.overflow, lists.total)
+        last = image[..., -1] if depth else None
+        image = image[..., :-1] if depth else image
+        numbers = lists.entry_count, lists.overflow, lists.total
+        return Rendering(image, transmittance, means2d, depths, extents, *numbers, last)
+
+    with memory_told(means.device, lambda: (len(means), width, height, channels)):
+        if cameras:
+            count = len(world_to_camera)
+            if not count:
+                raise ValueError("world_to_camera has no camera, expected [B, 4, 4] with B >= 1")
+            opacities, features = (
+                tensor if own else tensor.expand(count, *tensor.shape)
+                for tensor, own in zip((opacities, features), by_camera, strict=True)
+            )
+            seen = [projected(*each) for each in zip(opacities, world_to_camera, intrinsics, strict=True)]
+            # One tensor that every picture is drawn from, so that its gradient holds every camera's.
+            means2d = torch.stack([each[0] for each in seen])
+            each_seen = zip(features, means2d, seen, strict=True)
+            rendering = joined(means2d, [drawn(mine, own, *each[1:]) for mine, own, each in each_seen])
+        else:
+            rendering = drawn(features, *projected(opacities, world_to_camera, intrinsics))
+        if background is None:
+            return rendering
+        shown = background[:, None, None] if background.ndim == 2 else background
+        return replace(rendering, image=rendering.image + rendering.transmittance[..., None] * shown)
+
+
+def joined(means2d: Tensor, renderings: list[Rendering]) -> Rendering:
+    """One rendering of the cameras' own, drawn from means2d [B, N, 2]."""
+
+    def stacked(name: str) -> Any:
+        values = [getattr(rendering, name) for rendering in renderings]
+        return None if values[0] is None else torch.stack(values)
+
+    overflow, pairs = stacked("overflow"), stacked("pair_count")
+    return Rendering(
+        stacked("image"), stacked("transmittance"), means2d, stacked("depths"), stacked("extents"),
+        sum(rendering.entry_count for rendering in renderings), None if overflow is None else overflow.any(),
+        None if pairs is None else pairs.sum(), stacked("depth"),
+    )  # fmt: skip

@@ -116,4 +116,4 @@ def rasterize_reference(
     image, transmittance = blend_reference(
         means2d, conics, opacities, features, depths, extents, width, height, alpha_threshold, transmittance_min
     )
-    return Rendering(image, transmittance, means2d, depths, extents.amax(1), 0)
+    return Rendering(image, transmittance, means2d, depths, extents, 0)

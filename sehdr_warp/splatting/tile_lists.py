@@ -8,11 +8,14 @@ import warp as wp
 from torch import Tensor
 
 from ..errors import SehdrError
+from ..kernels import tiles as kernels
 from ..kernels.constants import TILE_SIZE
-from ..kernels.tiles import mark_ranges, tile_kernels
+from ..kernels.tiles import tile_kernels
 from .launching import launch, torch_stream, warp_scalar
 
 LARGEST_CAPACITY = 2**31 - 1  # Entries are counted in int32
+ONE_SORT = 1 << 18
+"""Up to so many Gaussians lists are made by one sort on a GPU, which then waits for the host rather than for memory."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +23,7 @@ class Emission:
     """Where entries stood before the sort by tile, those of one Gaussian side by side. All indices int32.
 
     order: [N] Gaussians by depth, nearest first (ties by index; culled ones last).
-    ends: [N] running number of entries, by place in `order`.
+    ends: [N] int64 running number of entries, by place in `order`.
     places: [M] each entry's place then.
     """
 
@@ -66,6 +69,7 @@ class TileLists:
 @torch.no_grad()
 def build_tile_lists(
     records: tuple[Tensor, Tensor],
+    counts: Tensor,
     depths: Tensor,
     extents: Tensor,
     width: int,
@@ -76,27 +80,33 @@ def build_tile_lists(
 ) -> TileLists:
     """Order the projected Gaussians by depth and list, for each tile, those whose ellipse touches it.
 
-    records: pack_records()'s; depths, extents: project()'s. Nothing here is differentiable.
+    records, counts: pack_records()'s for an image of this size; depths, extents: project()'s. Nothing here is
+    differentiable.
     capacity: room for this many entries; those beyond it are left out, which TileLists.overflow tells. The host then
     never waits for the device to learn how many there are.
     emission: also tell where entries came from, which adjoints need that sum by Gaussian in a fixed order.
     Raises SehdrError if the lists would need more than 2^31 - 1 entries.
     """
     columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
-    tile_count = columns * rows
-    order = depth_order(depths, extents)
-    touched = order, *records, extents, columns, rows
-    counts = count_entries(*touched)
-    total = counts.sum(dtype=torch.int64)
+    tile_count, count = columns * rows, len(depths)
+    one_sort = count <= ONE_SORT and not emission and depths.dtype == torch.float32
+    order = None if one_sort else depth_order(depths, extents)
+    ends = (counts if order is None else counts[order]).cumsum(0)
+    total = ends[-1] if count else ends.new_zeros(())
     overflow = None if capacity is None else total > capacity
-    room = int(total) if capacity is None else capacity
-    checked_room(room, len(order), columns, rows)
-    ends = counts.cumsum(0, dtype=torch.int32)
-    tiles, gaussians = emit_entries(*touched, ends, room, capacity is not None)
-    tiles, gaussians, places = sort_by_tile(tiles, gaussians, room, tile_count, emission)
-    ranges = find_ranges(tiles, tile_count)
-    by_gaussian = None if places is None else Emission(order, ends, places)
-    return TileLists(ranges, gaussians, by_gaussian, width, height, overflow, total)
+    room = checked_room(int(total) if capacity is None else capacity, count, columns, rows)
+    by_gaussian = None
+    padded = capacity is not None
+    if order is None:
+        touched = *records, extents, depths, columns, rows
+        tiles, gaussians = sort_keys(*emit_keys(*touched, ends, room, padded), room, tile_count)
+    else:
+        touched = order, *records, extents, columns, rows
+        tiles, gaussians = emit_entries(*touched, ends, room, padded)
+        tiles, gaussians, places = sort_by_tile(tiles, gaussians, room, tile_count, emission)
+        by_gaussian = None if places is None else Emission(order.clone(), ends, places)
+        total = total.clone()
+    return TileLists(find_ranges(tiles, tile_count), gaussians, by_gaussian, width, height, overflow, total)
 
 
 def pack_records(
@@ -105,39 +115,36 @@ def pack_records(
     opacities: Tensor,
     extents: Tensor,
     alpha_threshold: float,
+    width: int,
+    height: int,
     features: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """What is drawn of each projected Gaussian, in rows of four: shapes and ellipses.
+) -> tuple[tuple[Tensor, Tensor], Tensor]:
+    """What is drawn of each projected Gaussian, in rows of four, shapes and ellipses; and the tiles that it touches.
 
     shapes: [N, 4] x, y, opacity, half-height; ellipses: [N, 4] conic a, b, c and the level where alpha meets the
-    threshold, -1 where culled.
-    features: [N, C]; a Gaussian with one that is not finite is culled: its extents are set to 0. Packed again from the
-    same extents, with or without the features, the records are the same bits.
+    threshold, -1 where culled. counts: [N] int32.
+    features: [N, C]; a Gaussian with one that is not finite is culled: its extents are set to 0.
     """
-    shapes, ellipses = means2d.new_empty(len(means2d), 4), means2d.new_empty(len(means2d), 4)
+    count = len(means2d)
+    shapes, ellipses = means2d.new_empty(count, 4), means2d.new_empty(count, 4)
+    counts = torch.empty(count, dtype=torch.int32, device=means2d.device)
     given = (means2d, 0) if features is None else (features, features.shape[1])
+    tiles = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
     kernel = tile_kernels(warp_scalar(means2d.dtype)).pack_records
-    launch(kernel, len(means2d), means2d, conics, opacities, *given, alpha_threshold, extents, shapes, ellipses)
-    return shapes, ellipses
+    arguments = means2d, conics, opacities, *given, alpha_threshold, *tiles, extents
+    launch(kernel, count, *arguments, shapes, ellipses, counts)
+    return (shapes, ellipses), counts
 
 
 def depth_order(depths: Tensor, extents: Tensor) -> Tensor:
-    """[N] int32: Gaussians nearest first, culled ones last; equal depths keep the order of their indices."""
+    """[N] int32: Gaussians nearest first, culled ones last; equal depths keep the order of their indices. The first
+    half of memory that the sort needs."""
     count = depths.shape[0]
-    # The sort needs room for twice as many; what is returned does not hold on to it.
     keys = depths.new_empty(2 * count)
     places = torch.empty(2 * count, dtype=torch.int32, device=depths.device)
     launch(tile_kernels(warp_scalar(depths.dtype)).key_by_depth, count, depths, extents, keys, places)
     _sort_pairs(keys, places, count, None)
-    return places[:count].clone()
-
-
-def count_entries(order, shapes, ellipses, extents, columns: int, rows: int):
-    """[N] int32: how many tiles each Gaussian touches, by place in `order`."""
-    counts = torch.empty_like(order)
-    kernel = tile_kernels(warp_scalar(shapes.dtype)).count_tiles
-    launch(kernel, len(order), order, shapes, ellipses, extents, columns, rows, counts)
-    return counts
+    return places[:count]
 
 
 def checked_room(room: int, count: int, columns: int, rows: int) -> int:
@@ -165,6 +172,19 @@ def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends
     return tiles, gaussians
 
 
+def emit_keys(shapes, ellipses, extents, depths, columns: int, rows: int, ends, room: int, padded: bool):
+    """As emit_entries, of Gaussians as they come: int64 keys, the tile above the bits of the depth, and Gaussians."""
+    keys = torch.empty(2 * room, dtype=torch.int64, device=ends.device)
+    gaussians = torch.empty(2 * room, dtype=torch.int32, device=ends.device)
+    if padded:
+        keys[:room] = columns * rows << 32
+        gaussians[:room] = 0
+    if room:
+        touched = shapes, ellipses, extents, depths, columns, rows
+        launch(tile_kernels(wp.float32).emit_keys, len(depths), *touched, ends, room, keys, gaussians)
+    return keys, gaussians
+
+
 def sort_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: bool):
     """Stable sort of emit_entries()'s by tile: tiles [M], in the same memory, and copied out of it, which is kept,
     Gaussians [M] and where each entry stood before [M] or None."""
@@ -179,15 +199,32 @@ def sort_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: 
     return tiles[:entry_count], gaussians[:entry_count][places] if entry_count else gaussians, places
 
 
+def sort_keys(keys, gaussians, entry_count: int, tile_count: int):
+    """Stable sort of emit_keys()'s by tile and depth: tiles [M] and Gaussians [M], in the same memory."""
+    _sort_pairs(keys, gaussians, entry_count, 32 + tile_count.bit_length())
+    # The upper half of each key, on the machines that CUDA runs on.
+    return keys[:entry_count].view(torch.int32)[1::2], gaussians[:entry_count]
+
+
 def find_ranges(tiles, tile_count: int):
-    """[tiles, 2] int32: first and one past the last entry of each tile, (0, 0) for an untouched one."""
-    ranges = torch.zeros(tile_count, 2, dtype=torch.int32, device=tiles.device)
-    launch(mark_ranges, len(tiles), tiles, len(tiles), tile_count, ranges)
+    """[tiles, 2] int32: first and one past the last entry of each tile in the sorted list; alike for none."""
+    ranges = torch.empty(tile_count, 2, dtype=torch.int32, device=tiles.device)
+    launch(kernels.find_ranges, tile_count, tiles, ranges)
     return ranges
+
+
+class _Memory:
+    """What radix_sort_pairs() reads of an array; a tenth of what a wp.array costs the host."""
+
+    is_contiguous = True
+
+    def __init__(self, tensor: Tensor) -> None:
+        self.ptr, self.size = tensor.data_ptr(), tensor.numel()
+        self.dtype, self.device = wp.dtype_from_torch(tensor.dtype), wp.device_from_torch(tensor.device)
 
 
 def _sort_pairs(keys, values, count: int, bits: int | None) -> None:
     """Sorts keys[:count] and values[:count] by the keys' lowest bits (stable); both have room for 2 count."""
     if count:
         with torch_stream(keys.device):
-            wp.utils.radix_sort_pairs(wp.from_torch(keys), wp.from_torch(values), count, end_bit=bits)
+            wp.utils.radix_sort_pairs(_Memory(keys), _Memory(values), count, end_bit=bits)  # pyright: ignore[reportArgumentType]

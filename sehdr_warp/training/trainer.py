@@ -16,6 +16,7 @@ from ..response.learned import EXACT_BELOW
 from ..scene import Camera, Scene
 from ..splatting import GraphRecorder, Rendering
 from ..splatting.memory import bytes_asked_for
+from ..splatting.tile_lists import ONE_SORT
 from . import optimizer as adam
 from .births import born_rows
 from .config import Config
@@ -130,8 +131,8 @@ class Trainer:
             self.densification.prepare(gaussians.count, self.device)
         rate = adam.means_rate(self.config, self.extent, self.iteration, self.batch)
         adam.set_means_rate(self.optimizer, rate)
-        # The last: a learned response encodes few exposures otherwise, by kernels of its own.
-        kind = (self.degree, watched, gaussians.count < EXACT_BELOW)
+        # The last: few are ordered otherwise, and a learned response encodes few otherwise, by kernels of their own.
+        kind = (self.degree, watched, gaussians.count < EXACT_BELOW, gaussians.count <= ONE_SORT)
         self._last_index, count = index, gaussians.count
         if self._can_record(views, kind):
             self._loss = self._replay(views, index, watched, kind)
@@ -215,8 +216,8 @@ class Trainer:
         options = {"degree": self.degree, "also": also, "capacity": capacity, "encode": self._encoded}
         photo = self.field.photograph(camera, time, **options)
         # What the backward pass does not read, or only its first part does, must not stay until the end of the step.
-        kept = {"means2d", "radii"} if watched else set()
-        unread = {"image", "transmittance", "depths", "means2d", "radii"} - kept
+        kept = {"means2d", "extents"} if watched else set()
+        unread = {"image", "transmittance", "depths", "means2d", "extents"} - kept
         rendering = replace(photo.rendering, **dict.fromkeys(unread))
         if watched:
             rendering.means2d.retain_grad()

@@ -63,9 +63,9 @@ def projected(scene: SplatInputs, threshold: float = 1 / 255) -> tuple[torch.Ten
 
 
 def packed(scene: SplatInputs, threshold: float = 1 / 255):
-    """Records, depths and extents of a scene, as build_tile_lists() takes them."""
+    """Records, counts, depths and extents of a scene, as build_tile_lists() takes them."""
     means2d, conics, depths, opacities, extents = projected(scene, threshold)
-    return pack_records(means2d, conics, opacities, extents, threshold), depths, extents
+    return *pack_records(means2d, conics, opacities, extents, threshold, scene.width, scene.height), depths, extents
 
 
 def relative_error(value: torch.Tensor, truth: torch.Tensor) -> float:

@@ -25,16 +25,16 @@ def scale_kernel(
 
 
 ALIVE: list[weakref.ref] = []
-"""The programs that have run."""
+"""The tapes of the programs that have run."""
 
 
 @differentiable
 def scale_and_square(program, values, gain):
-    scaled = program.write(values.shape, wp.vec3)
-    squared = program.write(values.shape, wp.vec3)
-    program.launch(scale_kernel, len(values), [program.read(values, wp.vec3), program.read(gain)], [scaled])
+    scaled = program.write(values.shape)
+    squared = program.write(values.shape)
+    program.launch(scale_kernel, len(values), [values, gain], [scaled])
     program.launch(square_kernel, len(values), [scaled], [squared])
-    ALIVE.append(weakref.ref(program))
+    ALIVE.append(weakref.ref(program.tape))
     return scaled, squared
 
 
@@ -58,8 +58,8 @@ def test_memory_is_shared_not_copied(device):
 
     @differentiable
     def look(program, tensor):
-        seen.append(program.read(tensor).ptr)
-        return program.write(tensor.shape, wp.vec3)
+        seen.append(tensor.data_ptr())
+        return program.write(tensor.shape)
 
     result = look(values)
     assert seen == [values.data_ptr()]
@@ -100,7 +100,7 @@ def test_memory_goes_with_the_result_without_the_garbage_collector(device, diffe
             if differentiated:
                 result[0].sum().backward()
             del result
-        assert [program() for program in ALIVE] == [None] * 3
+        assert [tape() for tape in ALIVE] == [None] * 3
     finally:
         gc.enable()
 

@@ -5,7 +5,14 @@ from dataclasses import fields
 import pytest
 import torch
 
-from sehdr_warp.splatting.tile_lists import build_tile_lists, count_entries, depth_order, emit_entries, find_ranges
+from sehdr_warp.splatting.tile_lists import (
+    build_tile_lists,
+    depth_order,
+    emit_entries,
+    emit_keys,
+    find_ranges,
+    sort_keys,
+)
 
 from .scenes import packed, random_scene
 
@@ -13,15 +20,15 @@ COLUMNS, ROWS, UNWRITTEN = 20, 15, -7
 
 
 def dense(device, count=20000):
-    """Records, depths and extents of a scene dense enough that many ellipses end just at a tile's border."""
+    """Records, counts, depths and extents of a scene dense enough that many ellipses end just at a tile's border."""
     return packed(random_scene(count=count, width=16 * COLUMNS, height=16 * ROWS).to(torch.float32, device))
 
 
 def counted(*scene):
-    """What emit_entries() reads, and the counts."""
-    records, depths, extents = dense(*scene)
-    listed = depth_order(depths, extents), *records, extents, COLUMNS, ROWS
-    return listed, count_entries(*listed)
+    """What emit_entries() reads, and the counts in that order."""
+    records, counts, depths, extents = dense(*scene)
+    order = depth_order(depths, extents)
+    return (order, *records, extents, COLUMNS, ROWS), counts[order]
 
 
 def emit(records, counts, monkeypatch):
@@ -29,7 +36,7 @@ def emit(records, counts, monkeypatch):
     empty = torch.empty
     monkeypatch.setattr(torch, "empty", lambda *a, **k: empty(*a, **k).fill_(UNWRITTEN))
     room = int(counts.sum())
-    tiles, gaussians = emit_entries(*records, counts.cumsum(0, dtype=torch.int32), room, False)
+    tiles, gaussians = emit_entries(*records, counts.cumsum(0), room, False)
     monkeypatch.undo()
     return tiles[:room], gaussians[:room]
 
@@ -62,6 +69,23 @@ def test_an_entry_counted_too_much_is_no_tiles_and_one_too_few_costs_its_own_gau
     assert int((ranges[:, 1] - ranges[:, 0]).sum()) == len(tiles) - 2
 
 
+@pytest.mark.parametrize("spare", [0, 7, -1000])
+def test_one_sort_makes_the_lists_of_two(device, spare):
+    records, counts, depths, extents = dense(device)
+    # Many at one depth: ties keep the order of indices.
+    depths = (depths * 4).round().clamp_min(1) / 4
+    lists = build_tile_lists(records, counts, depths, extents, 16 * COLUMNS, 16 * ROWS)
+    room = lists.entry_count + spare
+    given = *records, extents, depths, COLUMNS, ROWS, counts.cumsum(0), room, spare != 0
+    tiles, gaussians = sort_keys(*emit_keys(*given), room, COLUMNS * ROWS)
+    ranges = find_ranges(tiles, COLUMNS * ROWS)
+    if spare < 0:
+        assert int(ranges[-1, 1]) == room and int(tiles.max()) < COLUMNS * ROWS
+        return
+    assert torch.equal(gaussians[: lists.entry_count], lists.gaussians)
+    assert torch.equal(ranges, lists.ranges)
+
+
 def kept_bytes(holder):
     """Of the memory behind a dataclass's tensors, and of the dataclasses in it."""
     values = [getattr(holder, field.name) for field in fields(holder)]
@@ -80,5 +104,6 @@ def test_lists_keep_no_more_memory_than_they_use(device, emission, spare):
     entries = exact.entry_count + (spare or 0)
     assert torch.equal(lists.gaussians[: exact.entry_count], exact.gaussians)
     total_and_overflow = 8 + (spare is not None)
-    by_gaussian = entries + 2 * 500 if emission else 0
-    assert kept_bytes(lists) == 4 * (2 * COLUMNS * ROWS + entries + by_gaussian) + total_and_overflow
+    by_gaussian = entries + 3 * 500 if emission else 0
+    one_sort = 0 if emission else 4 * entries + 8 * 500 - 8
+    assert kept_bytes(lists) == 4 * (2 * COLUMNS * ROWS + entries + by_gaussian) + total_and_overflow + one_sort
