@@ -22,6 +22,7 @@ ALLOWED = {
     "arguments": {"errors"},
     "splats": ANY,
     "splatting": ANY | {"kernels"},
+    "compat": {"splatting"},
     "response": ANY | {"splatting"},
     "scene": ANY | {"response", "splats"},
     "field": ANY | {"scene", "response", "splatting", "splats"},
@@ -48,7 +49,18 @@ ALLOWED = {
 }
 # Packages that only some rooms may import.
 ONLY_IN = {
-    "torch": {"response", "field", "splatting", "training", "output", "evaluation", "viewer", "bench", "check"},
+    "torch": {
+        "compat",
+        "response",
+        "field",
+        "splatting",
+        "training",
+        "output",
+        "evaluation",
+        "viewer",
+        "bench",
+        "check",
+    },
     "warp": {"kernels", "splatting"},
 }
 LARGEST_FILE = 400

@@ -1,0 +1,1 @@
+"""Other rasterizers' functions, made of ours."""
