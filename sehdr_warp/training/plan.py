@@ -28,10 +28,10 @@ CPU_SECONDS = 240.0  # What a training on a CPU may take, as far as CPU_FEWEST a
 CPU_FEWEST = 1000
 CPU_PIXEL, CPU_GAUSSIAN = 1.5e-6, 2.3e-6  # Seconds of one core for each in a step, measured on two of an AMD EPYC
 STEP_SECONDS, PIXEL_SECONDS, GAUSSIAN_SECONDS = 6e-4, 1e-9, 3e-9
-"""About what a recorded step takes on a GPU of a data center: for itself, for each pixel, for each Gaussian."""
+"""Estimates of what a recorded step takes on a GPU of a data center: for itself, each pixel, each Gaussian."""
 NUMBERS = 59  # Of a Gaussian with harmonics of degree 3
 EXCHANGE_SECONDS, NUMBER_SECONDS = 3e-4, 2.5e-11
-"""About what ranks take to agree and to begin an exchange, and for each number of the gradients."""
+"""Estimates of what ranks take to agree and to begin an exchange, and for each number of the gradients."""
 LEAST_GAIN = 0.7  # Of the number of ranks, from which they are worth it
 REACH = 2.0**16  # Brackets farther from the photos' exposure are black or white in all pixels of 8 bits
 
@@ -197,7 +197,7 @@ def gain_of_ranks(count: int, gaussians: int, pixels: int, device: torch.device)
     step = STEP_SECONDS + PIXEL_SECONDS * pixels + GAUSSIAN_SECONDS * gaussians
     exchange = EXCHANGE_SECONDS + 2 * (1 - 1 / count) * NUMBER_SECONDS * NUMBERS * gaussians
     gain = count * step / (step + exchange)
-    told = f"about {gain:.1f} times one for {gaussians} Gaussians and {pixels / 1e6:.2g} megapixels"
+    told = f"an estimated {gain:.1f} times one for {gaussians} Gaussians and {pixels / 1e6:.2g} megapixels"
     if gain < LEAST_GAIN * count:
         told = f"a step of about {1e3 * step:.1g} ms is too short to gain much ({told})"
     return f"plan: ranks: {count} GPUs, a photo each in a step: {told}"
