@@ -63,6 +63,7 @@ class Scene:
     response: the curve the photos were averaged by; None for a scene made by hand.
     chosen_by: the method and the candidates that chose the response; None where it was named.
     light_known: the photos' codes were made of light by `response`, of no camera's choice: RAW, linear, float.
+    evened: what the camera changed between photos unsaid is taken out of them; see photo_gains.
     color_matrix: [3, 3] from the colors of the codes' light to linear Rec.709; None where these are Rec.709 themselves.
     """
 
@@ -77,6 +78,7 @@ class Scene:
     chosen_by: tuple[str, tuple[str, ...]] | None = None
     color_matrix: np.ndarray | None = None
     light_known: bool = False
+    evened: bool = False
 
     @property
     def train_views(self) -> tuple[View, ...]:

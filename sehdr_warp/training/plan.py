@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from operator import attrgetter
 
 import numpy as np
@@ -76,12 +76,13 @@ class SceneFacts:
 
 @dataclass(frozen=True)
 class Decision:
-    """name: of RULES; the rest: see Choice."""
+    """name: of RULES; the rest: see Choice. told: it gets a line though it changes no field."""
 
     name: str
     fields: dict[str, object]
     choice: str
     reason: str
+    told: bool = False
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,10 @@ class Plan:
     facts: SceneFacts
     decisions: tuple[Decision, ...]
     kept: dict[str, object]
+
+    def with_decision(self, decision: Decision) -> "Plan":
+        """The plan with one more decision, made after it."""
+        return replace(self, decisions=(*self.decisions, decision))
 
     def to_dict(self) -> dict:
         """Plain values, for plan.json and --json."""
@@ -111,7 +116,7 @@ class Plan:
 
     def lines(self) -> list[str]:
         """One line for each decision that changes something, and for each field that stays."""
-        made = [f"plan: {row.name}: {row.choice} ({row.reason})" for row in self.decisions if row.fields]
+        made = [f"plan: {row.name}: {row.choice} ({row.reason})" for row in self.decisions if row.fields or row.told]
         if self.facts.drift >= DRIFT:
             spread = f"the photos' brightness differs by {self.facts.drift:.1f} stops and no exposure times are known"
             made.append(f"plan: {spread}: if exposure changed between them, give their times in exposures.json")

@@ -17,6 +17,7 @@ from ..field.radiance_field import RadianceField, RenderedView, Surroundings
 from ..field.sensor_colors import rec709_of
 from ..response import Response
 from ..scene import Camera, Scene, load_cameras
+from ..scene.photo_gains import PhotoGains
 from ..splats import read_gaussians
 from .checkpoint import Checkpoint
 from .config import Config
@@ -38,10 +39,15 @@ class _Rendered:
     degree: int
     base_time: float
     color_matrix: np.ndarray | None = None
+    photo_gains: PhotoGains | None = None
 
     @property
     def device(self) -> torch.device:
         return self.model.gaussians.means.device
+
+    def even(self, scene: Scene) -> Scene:
+        """The scene as it was trained on: without what the camera changed between its photos, if that was found."""
+        return scene if self.photo_gains is None else self.photo_gains.even(scene, self.model.response)
 
     @property
     def gaussian_count(self) -> int:
@@ -136,6 +142,7 @@ class Run(_Rendered):
         self.scene_name: str = info["scene"]
         if info.get("color_matrix"):
             self.color_matrix = np.array(info["color_matrix"], np.float64)
+        self.photo_gains = photo_gains(info)
 
     def _repr_html_(self) -> str:
         # By name: no room below output may know it, but a notebook asks the run itself.
@@ -163,7 +170,7 @@ class Run(_Rendered):
         """What the training photos of a scene say of the Gaussians; the model has their confidence from then on. Their
         HDR truth counts only if it was trained on."""
         truth = self.config.loss.uses_hdr
-        evidence = gather_evidence(self.model, scene.train_views, degree=self.degree, truth=truth)
+        evidence = gather_evidence(self.model, self.even(scene).train_views, degree=self.degree, truth=truth)
         self.model.confidence = evidence.confidence()
         return evidence
 
@@ -182,6 +189,11 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
     model = field_from_checkpoint(checkpoint, config, info)
     model.confidence = folder.read_confidence(checkpoint)
     return Run(folder, config, model.to(device).requires_grad_(False), info, checkpoint.values)
+
+
+def photo_gains(info: dict) -> PhotoGains | None:
+    """What run.json says of the photos' gains."""
+    return PhotoGains(**found) if (found := info.get("photo_gains")) else None
 
 
 def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) -> RadianceField:

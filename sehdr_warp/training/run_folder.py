@@ -21,7 +21,7 @@ import os
 import re
 import shutil
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -37,6 +37,7 @@ from ..response import Response
 from ..scene import Camera, Scene
 from ..scene.exposure import LONGEST, SHORTEST
 from ..scene.images import MAX_PIXELS
+from ..scene.photo_gains import PhotoGains
 from .checkpoint import (
     FORMAT,
     REMEDY,
@@ -55,7 +56,9 @@ from .config_files import config_from_dict
 _LOCK, _NEW, _READY = ".lock", ".new", ".ready"
 _OWN = "choose another folder, or remove this one yourself"
 _Count = Annotated[int, Field(ge=0, le=1_000_000)]
-_Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+_Gain = Annotated[float, Field(ge=1e-6, le=1e6)]
+_Three = Field(min_length=3, max_length=3)
+_Row = Annotated[list[FiniteFloat], _Three]
 
 
 class _DataValues(Values):
@@ -65,12 +68,18 @@ class _DataValues(Values):
     holdout: _Count | None = None
 
 
+class _GainValues(Values):
+    gains: dict[str, Annotated[list[_Gain], _Three]]
+    falloff: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
+
+
 class _RunValues(Values):
     scene: str
     data: _DataValues
     base_time: Annotated[float, Field(ge=SHORTEST, le=LONGEST)]
     response: dict
-    color_matrix: tuple[_Row, _Row, _Row] | None = None
+    color_matrix: Annotated[list[_Row], _Three] | None = None
+    photo_gains: _GainValues | None = None
 
 
 @dataclass(frozen=True)
@@ -166,6 +175,7 @@ class RunFolder:
         plan: dict | None,
         state: tuple[dict[str, Tensor], dict],
         *,
+        gains: PhotoGains | None = None,
         overwrite: bool = False,
     ) -> None:
         """Makes the folder, locked, with all that does not change and a checkpoint of the start. All of it is there
@@ -178,6 +188,8 @@ class RunFolder:
         info |= {"base_time": field.base_time, "response": field.response.to_dict()}
         if scene.color_matrix is not None:
             info["color_matrix"] = scene.color_matrix.tolist()
+        if gains is not None:
+            info["photo_gains"] = asdict(gains)
         with atomic_folder(self.path / _NEW, ours=True) as beside:
             new = RunFolder(beside)
             if plan is not None:

@@ -16,7 +16,9 @@ import torch
 from ..errors import InputError, SehdrError
 from ..field.radiance_field import RenderedView
 from ..field.unexplained import MOST_NAMED, told, unexplained_regions
+from ..response import Response
 from ..scene import Camera, Scene
+from ..scene.photo_gains import PhotoGains
 from ..splatting.memory import memory_told
 from .checkpoint import first_not_finite
 from .config import Config
@@ -25,9 +27,10 @@ from .following import hand_on, told_of_ranks
 from .held_out import evaluate_views
 from .initialization import choose_response, make_field, make_matcher
 from .machine import interruptible, machine_figures, pick_device, torch_settings
+from .photo_gains import decided, evens, find_gains
 from .plan import apply_plan
 from .ranks import END, GO, WAIT, Ranks
-from .run import Run, field_from_checkpoint, load_run
+from .run import Run, field_from_checkpoint, load_run, photo_gains
 from .run_folder import RunFolder
 from .trainer import Trainer, sizes_of
 
@@ -119,7 +122,7 @@ class Training:
                 else:
                     self.trainer = self._begin(scene, config or Config(), data or {}, overwrite)
                 if ranks is not None:
-                    hand_on(ranks, scene, self.trainer)
+                    hand_on(ranks, self.scene, self.trainer)
             except BaseException:
                 self.folder.unlock()
                 raise
@@ -312,16 +315,26 @@ class Training:
     def _begin(self, scene: Scene, config: Config, data: dict, overwrite: bool) -> Trainer:
         config, plan = apply_plan(scene, config, self.device)
         response = choose_response(scene, config)
-        matcher = cache(partial(make_matcher, scene, response, self.device))
-        field = self.timed(partial(make_field, scene, config, response, self.device, matcher))
-        trainer = Trainer(scene, config, field, matcher, self.ranks)
+        matcher, gains = cache(partial(make_matcher, scene, response, self.device)), None
+        if plan is not None and evens(config, response):
+            gains, found = self.timed(partial(find_gains, scene, response, self.device))
+            matcher, plan = (lambda: found), plan.with_decision(decided(gains))
+        evened = self._even(scene, gains, response)
+        field = self.timed(partial(make_field, evened, config, response, self.device, matcher))
+        trainer = Trainer(evened, config, field, matcher, self.ranks)
         # Nothing is made or removed before the scene is known to be good.
         tensors, values = trainer.state()
         state = tensors, values | {"seconds": self.seconds}
-        self.folder.begin(scene, config, trainer.field, data, plan and plan.to_dict(), state, overwrite=overwrite)
+        made = plan and plan.to_dict()
+        self.folder.begin(scene, config, trainer.field, data, made, state, gains=gains, overwrite=overwrite)
         for line in plan.lines() if plan is not None else ():
             log.info("%s", line)
         return trainer
+
+    def _even(self, scene: Scene, gains: PhotoGains | None, response: Response) -> Scene:
+        """The scene that is trained on from here."""
+        self.scene = scene if gains is None else gains.even(scene, response)
+        return self.scene
 
     def _continue(self, config: Config | None) -> Trainer:
         """The trainer as the newest checkpoint has it."""
@@ -341,9 +354,9 @@ class Training:
         checkpoint = folder.newest_checkpoint()
         if checkpoint is None:
             raise InputError(folder.checkpoints, "holds no complete checkpoint", "train again, with --overwrite")
-        trainer = Trainer(
-            scene, saved, field_from_checkpoint(checkpoint, saved, info).to(self.device), ranks=self.ranks
-        )
+        field = field_from_checkpoint(checkpoint, saved, info).to(self.device)
+        scene = self._even(scene, photo_gains(info), field.response)
+        trainer = Trainer(scene, saved, field, ranks=self.ranks)
         try:
             trainer.load_state(checkpoint.tensors, checkpoint.values)
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:

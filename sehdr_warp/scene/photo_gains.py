@@ -1,0 +1,136 @@
+"""What a camera changed between photos and no file states: exposure, white balance, and falloff towards the corners."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import lsmr
+
+from ..response import Response
+from .types import Scene, View, codes_of, encoded_values
+
+FAINT, BRIGHT = 10 / 255, 245 / 255  # Encoded values within tell light; beyond, noise or less than all of it
+TIGHT = 1.0, 0.5, 0.25, 0.1, 0.05, 0.05
+"""Differences of log light that count half, round by round: what is hidden, or shines, is to count nothing."""
+NEGLIGIBLE = 0.01  # Of light: what differs by less is left as it is
+
+
+@dataclass(frozen=True)
+class PhotoGains:
+    """gains: by photo, what its light was multiplied by in each channel, beyond the exposure that is stated; of
+    geometric mean 1 over the training photos. falloff: (a, b) >= 0 in all; light at r half diagonals from the middle is
+    exp(-(a r^2 + b r^4)) of what it would be there."""
+
+    gains: dict[str, tuple[float, float, float]]
+    falloff: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def stops(self) -> float:
+        """Deviation of the photos' gains, of the channel that varies most."""
+        return float(np.log2(list(self.gains.values())).std(0).max()) if self.gains else 0.0
+
+    @property
+    def corners(self) -> float:
+        """Part of the light that the corners lack."""
+        return 1 - float(np.exp(-sum(self.falloff)))
+
+    def even(self, scene: Scene, response: Response) -> Scene:
+        """The scene as if its camera had changed nothing: a photo's largest gain is part of its exposure time, the rest
+        and the falloff are taken from its codes, which have 16 bits then. White stays `at least white`."""
+        if scene.evened:
+            return scene
+        return replace(scene, views=tuple(self._view(view, response) for view in scene.views), evened=True)
+
+    def _view(self, view: View, response: Response) -> View:
+        gain = np.array(self.gains.get(view.name, (1.0, 1.0, 1.0)))
+        time = view.exposure_time * gain.max()
+        light = np.exp(-_power(_radius(view), *self.falloff)) * (gain / gain.max())
+        if light.min() > 1 - NEGLIGIBLE:
+            return replace(view, exposure_time=time)
+        decoded = response.decode(np.arange(view.levels + 1) / view.levels)[view.codes]
+        codes = codes_of(response.encode(decoded / np.maximum(light, 0.05)), 16)
+        codes[view.codes == view.levels] = 65535
+        return replace(view, exposure_time=time, codes=codes)
+
+
+def start_gains(views: Sequence[View], response: Response) -> PhotoGains:
+    """Gains by the photos' medians alone: as far off as what they show differs."""
+    found = []
+    for view in views:
+        encoded = encoded_values(view.codes[::4, ::4]).reshape(-1, 3)
+        told = encoded[((encoded > FAINT) & (encoded < BRIGHT)).all(1)]
+        light = response.decode(np.median(told if len(told) else encoded, 0)) / view.exposure_time
+        found.append(np.log(np.maximum(light, 1e-6)))
+    return _of([view.name for view in views], np.array(found) - np.mean(found, 0))
+
+
+def fit_gains(views: Sequence[View], others: Sequence[View], points: np.ndarray, response: Response) -> PhotoGains:
+    """Gains and falloff by which photos show points [P, 3] of surfaces in one light: least squares of logarithms, in
+    which what disagrees counts ever less (Cauchy's weights). others: photos that take no part, and get their median."""
+    names = [view.name for view in (*views, *others)]
+    light, radius = zip(*(_light(view, points, response) for view in (*views, *others)), strict=True)
+    light, radius = np.stack(light), np.stack(radius)  # [V, P, 3], nan where unknown; [V, P]
+    trained, count, most = light[: len(views)], len(points), len(views)
+    view, point, channel = np.nonzero(np.isfinite(trained))
+    values, r = trained[view, point, channel], radius[view, point]
+    one = np.ones(len(values))
+    rows = np.arange(len(values))
+    columns = 3 * point + channel, 3 * (count + view) + channel
+    first = 3 * (count + most)
+    system = sparse.csr_matrix(
+        (
+            np.concatenate([one, one, -(r**2), -(r**4)]),
+            (np.tile(rows, 4), np.concatenate([*columns, np.full_like(rows, first), np.full_like(rows, first + 1)])),
+        ),
+        shape=(len(rows), first + 2),
+    )
+    found = np.zeros(first + 2)
+    for width in TIGHT:
+        off = (values - system @ found) / width if found.any() else np.zeros_like(values)
+        weight = 1 / (1 + off**2)
+        found = lsmr(sparse.diags(weight) @ system, weight * values, damp=1e-3, x0=found, maxiter=80)[0]
+    a, b = found[first:]
+    falloff = (float(a), float(b)) if _power(np.linspace(0, 1, 20), a, b).min() > -NEGLIGIBLE else (0.0, 0.0)
+    surfaces = found[: 3 * count].reshape(count, 3)
+    gains = list(found[3 * count : first].reshape(most, 3))
+    mean = np.mean(gains, 0)
+    for index in range(most, len(names)):
+        differences = light[index] - surfaces + _power(radius[index], *falloff)[:, None]
+        told = np.isfinite(differences).sum(0).min() > 0
+        gains.append(np.nanmedian(differences, 0) if told else mean)
+    return _of(names, np.array(gains) - mean, falloff)
+
+
+def _of(names: Sequence[str], logarithms: np.ndarray, falloff=(0.0, 0.0)) -> PhotoGains:
+    gains = np.exp(logarithms).tolist()
+    return PhotoGains({name: tuple(gain) for name, gain in zip(names, gains, strict=True)}, falloff)
+
+
+def _power(r: np.ndarray, a: float, b: float) -> np.ndarray:
+    return a * r**2 + b * r**4
+
+
+def _radius(view: View) -> np.ndarray:
+    """[H, W, 1] distance of pixels from the middle of the picture, in half diagonals."""
+    height, width = view.codes.shape[:2]
+    row, column = np.mgrid[:height, :width] + 0.5
+    return (np.hypot(column - width / 2, row - height / 2) / np.hypot(width / 2, height / 2))[..., None]
+
+
+def _light(view: View, points: np.ndarray, response: Response) -> tuple[np.ndarray, np.ndarray]:
+    """[P, 3] log radiance of the pixels that points fall on, by the stated exposure, nan where they tell none; and
+    their radii [P]."""
+    camera = view.camera
+    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    depth = np.where(local[:, 2] > 1e-9, local[:, 2], np.inf)
+    column = np.floor(camera.fx * local[:, 0] / depth + camera.cx)
+    row = np.floor(camera.fy * local[:, 1] / depth + camera.cy)
+    inside = (depth < np.inf) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    place = np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)
+    if view.mask is not None:
+        inside &= view.mask[place] > 0.5
+    encoded = encoded_values(view.codes[place])
+    told = inside[:, None] & (encoded > FAINT) & (encoded < BRIGHT)
+    light = np.log(np.maximum(response.decode(encoded), 1e-9) / view.exposure_time)
+    return np.where(told, light, np.nan), _radius(view)[place][:, 0]

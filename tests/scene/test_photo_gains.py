@@ -1,0 +1,92 @@
+"""Gains of photos and falloff: fitted to points in view of cameras, and taken out of codes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sehdr_warp.response import response_by_name
+from sehdr_warp.scene import Camera, Scene, View, codes_of
+from sehdr_warp.scene.camera import look_at
+from sehdr_warp.scene.photo_gains import PhotoGains, fit_gains, start_gains
+
+SIZE, PHOTOS = 48, 6
+SRGB = response_by_name("srgb")
+FALLOFF = (0.25, 0.1)
+
+
+@pytest.fixture(scope="module")
+def gains():
+    rng = np.random.default_rng(3)
+    values = 2 ** rng.uniform(-1, 1, (PHOTOS, 1)) * (1 + rng.uniform(-0.15, 0.15, (PHOTOS, 3)))
+    values[:-1] /= np.exp(np.log(values[:-1]).mean(0))
+    return {f"p_{k}": tuple(row) for k, row in enumerate(values.tolist())}
+
+
+@pytest.fixture(scope="module")
+def points():
+    """Of a wall at z = 4."""
+    return np.c_[np.random.default_rng(1).uniform(-1.5, 1.5, (400, 2)), np.full(400, 4.0)]
+
+
+def photographed(gains, falloff) -> Scene:
+    """A wall of smooth colors, its photos taken by a camera of such gains; the last photo is held out."""
+    views = []
+    for index in range(PHOTOS):
+        place = (0.25 * index - 0.6, 0.1 * (index % 3), 0.0)
+        camera = Camera(SIZE, SIZE, 60.0, 60.0, SIZE / 2, SIZE / 2, look_at(place, (place[0], place[1], 1), (0, -1, 0)))
+        row, column = np.mgrid[:SIZE, :SIZE] + 0.5
+        rays = np.stack([(column - 24) / 60, (row - 24) / 60, np.ones_like(row)], -1) @ camera.world_to_camera[:3, :3]
+        wall = place[0] + 4 * rays[..., :1], place[1] + 4 * rays[..., 1:2]
+        light = 0.12 + 0.05 * np.sin(np.concatenate([wall[0] + wall[1], 2 * wall[0], 1 - wall[1]], 2))
+        r = np.hypot(column - 24, row - 24)[..., None] / np.hypot(24, 24)
+        name = f"p_{index}"
+        light = light * np.array(gains.get(name, (1, 1, 1))) * np.exp(-falloff[0] * r**2 - falloff[1] * r**4)
+        split = "test" if index == PHOTOS - 1 else "train"
+        views.append(View(name, codes_of(SRGB.encode(light), 8), camera, 1.0, split))
+    return Scene("wall", "hand-made", tuple(views), np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+
+
+def test_gains_and_falloff_are_found(gains, points):
+    scene = photographed(gains, FALLOFF)
+    hidden = points.copy()
+    hidden[::10, 2] = 2.0  # points that are none
+    found = fit_gains(scene.train_views, scene.test_views, hidden, SRGB)
+    for name, gain in gains.items():
+        np.testing.assert_allclose(found.gains[name], gain, rtol=0.02)
+    assert found.corners == pytest.approx(1 - np.exp(-sum(FALLOFF)), abs=0.03)
+    assert found.stops > 0.3
+    rough = start_gains(scene.train_views, SRGB)
+    np.testing.assert_allclose([rough.gains[v.name] for v in scene.train_views], list(gains.values())[:-1], rtol=0.25)
+
+
+def test_photos_that_do_not_drift_have_no_gains(points):
+    scene = photographed({}, (0.0, 0.0))
+    found = fit_gains(scene.train_views, scene.test_views, points, SRGB)
+    assert found.stops < 0.02 and abs(found.corners) < 0.02
+
+
+def test_evened_photos_hold_the_light_without_gains(gains):
+    plain, scene = photographed({}, (0.0, 0.0)), photographed(gains, FALLOFF)
+    evened = PhotoGains(gains, FALLOFF).even(scene, SRGB)
+    assert PhotoGains(gains, FALLOFF).even(evened, SRGB) is evened
+    for ours, truth in zip(evened.views, plain.views, strict=True):
+        told = (truth.image > 0.1) & (ours.image < 0.95)
+        light = SRGB.decode(ours.image) / ours.exposure_time
+        np.testing.assert_allclose(light[told], SRGB.decode(truth.image)[told], rtol=0.04)
+        assert ours.exposure_time == pytest.approx(max(gains[ours.name]))
+
+
+def test_an_exposure_alone_leaves_the_codes(gains):
+    scene = photographed({}, (0.0, 0.0))
+    twice = PhotoGains({"p_0": (2.0, 2.0, 2.0)}).even(scene, SRGB)
+    assert twice.views[0].exposure_time == 2.0 and twice.views[0].codes is scene.views[0].codes
+
+
+def test_white_stays_white_and_black_black(gains):
+    scene = photographed({}, (0.0, 0.0))
+    codes = scene.views[0].codes.copy()
+    codes[:8], codes[-8:] = 255, 0
+    scene = replace(scene, views=(replace(scene.views[0], codes=codes), *scene.views[1:]))
+    (first, *_) = PhotoGains(gains, FALLOFF).even(scene, SRGB).views
+    assert first.codes.dtype == np.uint16 and (first.codes[:8] == 65535).all() and (first.codes[-8:] == 0).all()

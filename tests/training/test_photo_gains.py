@@ -1,0 +1,63 @@
+"""Trainings on photos whose exposure drifts unsaid."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sehdr_warp.response import response_by_name
+from sehdr_warp.training.photo_gains import find_gains
+from sehdr_warp.training.run import load_run
+from sehdr_warp.training.train import Training, train
+
+from .wall_and_lamp import wall_and_lamp
+
+LINEAR = response_by_name("linear")
+TIMES = (1.0, 0.5, 1.4)
+SHORT = {"response.name": "linear", "schedule.iterations": 30, "plan.keep": ("schedule.iterations",)}
+
+
+def drifting():
+    """Photos of differing exposure that say nothing of it."""
+    scene = wall_and_lamp(TIMES)
+    views = tuple(replace(view, exposure_time=1.0) for view in scene.views)
+    return replace(scene, views=views, exposure_times_known=False), [view.exposure_time for view in scene.views]
+
+
+def test_drift_is_found_where_there_is_some(device):
+    scene, times = drifting()
+    gains, matcher = find_gains(scene, LINEAR, device)
+    found = np.array([gains.gains[view.name] for view in scene.views])
+    np.testing.assert_allclose(
+        found, np.repeat(np.array(times)[:, None], 3, 1) / np.exp(np.log(times).mean()), rtol=0.03
+    )
+    assert len(matcher.match(matcher.pixels(400, np.random.default_rng(0))).points) > 200
+    assert find_gains(wall_and_lamp(TIMES), LINEAR, device)[0] is None
+
+
+def test_a_run_keeps_the_gains(tmp_path):
+    scene, times = drifting()
+    scene = replace(scene, color_matrix=2 * np.eye(3))
+    run = train(scene, tmp_path / "run", SHORT, device="cpu")
+    decision = next(made for made in run.decisions() if made["name"] == "photo-gains")
+    assert "out of the photos" in decision["choice"] and "stops" in decision["reason"]
+    loaded = load_run(tmp_path / "run")
+    evened = loaded.even(scene)
+    assert (loaded.color_matrix == scene.color_matrix).all()
+    ratios = [view.exposure_time / time for view, time in zip(evened.views, times, strict=True)]
+    assert np.ptp(ratios) / np.mean(ratios) < 0.05
+    unevened = train(scene, tmp_path / "off", {**SHORT, "model.photo_gains": False}, device="cpu")
+    assert unevened.even(scene) is scene
+
+
+def test_a_training_resumes_on_evened_photos(tmp_path):
+    scene, _ = drifting()
+    training = Training(scene, tmp_path / "run", SHORT, device="cpu")
+    for step in training:
+        if step.iteration == 10:
+            training.stop()
+    resumed = Training(scene, tmp_path / "run", resume=True, device="cpu")
+    assert [v.exposure_time for v in resumed.scene.views] == pytest.approx(
+        [v.exposure_time for v in training.scene.views]
+    )
+    assert np.ptp([view.exposure_time for view in resumed.scene.views]) > 0.3
