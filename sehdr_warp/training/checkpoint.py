@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 from torch import Tensor
 
 from ..errors import InputError
 from ..files import read_json
+from ..scene.exposure import LONGEST, SHORTEST
 from .config_files import field_and_problem
 
 FORMAT = 2  # Version of what a run holds; a reader refuses others
@@ -19,8 +20,37 @@ REMEDY = "the run is damaged: train again"
 _OLDER = "remove this folder to use an older checkpoint, or train again"
 
 
+_Count = Annotated[int, Field(ge=0, le=1_000_000)]
+_Gain = Annotated[float, Field(ge=1e-6, le=1e6)]
+_Three = Field(min_length=3, max_length=3)
+_Row = Annotated[list[FiniteFloat], _Three]
+
+
 class Values(BaseModel):
     model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
+
+
+class _DataValues(Values):
+    path: Annotated[str, Field(max_length=4096)] | None = None
+    exposure_index: _Count | None = None
+    max_size: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
+    holdout: _Count | None = None
+
+
+class _GainValues(Values):
+    gains: dict[str, Annotated[list[_Gain], _Three]]
+    falloff: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
+
+
+class RunValues(Values):
+    """What run.json holds."""
+
+    scene: str
+    data: _DataValues
+    base_time: Annotated[float, Field(ge=SHORTEST, le=LONGEST)]
+    response: dict
+    color_matrix: Annotated[list[_Row], _Three] | None = None
+    photo_gains: _GainValues | None = None
 
 
 class _CheckpointValues(Values):

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from ..errors import InputError
+from ..errors import InputError, SehdrError
 from ..splatting.threads import thread_count
 
 
@@ -97,3 +97,12 @@ def interruptible() -> Iterator[threading.Event]:
         restore()
         if caught:
             signal.raise_signal(caught[0])
+
+
+def summary_writer() -> type:
+    """TensorBoard's; SehdrError where it is not installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        raise SehdrError("TensorBoard is not installed; run `pip install sehdr-warp[tensorboard]`") from None
+    return SummaryWriter

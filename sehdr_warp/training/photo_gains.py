@@ -19,9 +19,10 @@ ENOUGH = 0.4  # Part of the pixels that are matched from which photos are alike 
 FEWEST = 100  # Points that a fit needs
 
 
-def evens(config: Config, response: Response) -> bool:
-    """Whether a training looks for drift: where it matches points, and knows light."""
-    return config.model.photo_gains and config.model.initial_density > 0 and not response.learnable
+def evens(scene: Scene, config: Config, response: Response) -> bool:
+    """Whether a training looks for drift: where it may, matches points, and knows light."""
+    wanted = {"unstated": not scene.exposure_times_known, "always": True, "never": False}[config.model.photo_gains]
+    return wanted and config.model.initial_density > 0 and not response.learnable
 
 
 def decided(gains: PhotoGains | None) -> Decision:

@@ -23,10 +23,8 @@ import shutil
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
 
 from filelock import FileLock, Timeout
-from pydantic import Field, FiniteFloat
 from torch import Tensor
 
 from ..errors import InputError, SehdrError
@@ -35,7 +33,6 @@ from ..field.radiance_field import RadianceField
 from ..files import atomic_folder, atomic_path, make_parents, remove_stale, write_json, writing
 from ..response import Response
 from ..scene import Camera, Scene
-from ..scene.exposure import LONGEST, SHORTEST
 from ..scene.images import MAX_PIXELS
 from ..scene.photo_gains import PhotoGains
 from .checkpoint import (
@@ -44,7 +41,7 @@ from .checkpoint import (
     TENSORS,
     VALUES,
     Checkpoint,
-    Values,
+    RunValues,
     read_checkpoint,
     read_run_json,
     read_values,
@@ -55,31 +52,6 @@ from .config_files import config_from_dict
 
 _LOCK, _NEW, _READY = ".lock", ".new", ".ready"
 _OWN = "choose another folder, or remove this one yourself"
-_Count = Annotated[int, Field(ge=0, le=1_000_000)]
-_Gain = Annotated[float, Field(ge=1e-6, le=1e6)]
-_Three = Field(min_length=3, max_length=3)
-_Row = Annotated[list[FiniteFloat], _Three]
-
-
-class _DataValues(Values):
-    path: Annotated[str, Field(max_length=4096)] | None = None
-    exposure_index: _Count | None = None
-    max_size: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
-    holdout: _Count | None = None
-
-
-class _GainValues(Values):
-    gains: dict[str, Annotated[list[_Gain], _Three]]
-    falloff: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
-
-
-class _RunValues(Values):
-    scene: str
-    data: _DataValues
-    base_time: Annotated[float, Field(ge=SHORTEST, le=LONGEST)]
-    response: dict
-    color_matrix: Annotated[list[_Row], _Three] | None = None
-    photo_gains: _GainValues | None = None
 
 
 @dataclass(frozen=True)
@@ -245,7 +217,7 @@ class RunFolder:
 
     def read_info(self) -> dict:
         """What run.json holds; InputError also for a run of another version's format."""
-        info = read_values(self.info, _RunValues)
+        info = read_values(self.info, RunValues)
         try:
             Response.from_dict(info["response"])
         except SehdrError as error:

@@ -26,7 +26,7 @@ from .config_files import config_fields, load_config, override_config
 from .following import hand_on, told_of_ranks
 from .held_out import evaluate_views
 from .initialization import choose_response, make_field, make_matcher
-from .machine import interruptible, machine_figures, pick_device, torch_settings
+from .machine import interruptible, machine_figures, pick_device, summary_writer, torch_settings
 from .photo_gains import decided, evens, find_gains
 from .plan import apply_plan
 from .ranks import END, GO, WAIT, Ranks
@@ -110,7 +110,7 @@ class Training:
     ):
         self.folder, self.ranks = RunFolder(out), ranks
         self.device = pick_device(device)
-        make_writer = _summary_writer() if tensorboard else None
+        make_writer = summary_writer() if tensorboard else None
         config = as_config(config)
         self.seconds = 0.0
         with memory_told(self.device, lambda: sizes_of(scene)):
@@ -316,7 +316,7 @@ class Training:
         config, plan = apply_plan(scene, config, self.device)
         response = choose_response(scene, config)
         matcher, gains = cache(partial(make_matcher, scene, response, self.device)), None
-        if plan is not None and evens(config, response):
+        if plan is not None and evens(scene, config, response):
             gains, found = self.timed(partial(find_gains, scene, response, self.device))
             matcher, plan = (lambda: found), plan.with_decision(decided(gains))
         evened = self._even(scene, gains, response)
@@ -399,11 +399,3 @@ def as_config(config: object) -> Config | None:
     if isinstance(config, Mapping):
         return override_config(Config(), dict(config), "overrides")
     raise InputError("config", f"is {type(config).__name__}", "give a preset's name, a dict of fields or a Config")
-
-
-def _summary_writer() -> type:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        raise SehdrError("TensorBoard is not installed; run `pip install sehdr-warp[tensorboard]`") from None
-    return SummaryWriter
