@@ -325,8 +325,8 @@ class Training:
         # Nothing is made or removed before the scene is known to be good.
         tensors, values = trainer.state()
         state = tensors, values | {"seconds": self.seconds}
-        made = plan and plan.to_dict()
-        self.folder.begin(scene, config, trainer.field, data, made, state, gains=gains, overwrite=overwrite)
+        given = scene, config, trainer.field, data, plan and plan.to_dict(), state
+        self.folder.begin(*given, gains=gains, overwrite=overwrite)
         for line in plan.lines() if plan is not None else ():
             log.info("%s", line)
         return trainer
@@ -355,8 +355,7 @@ class Training:
         if checkpoint is None:
             raise InputError(folder.checkpoints, "holds no complete checkpoint", "train again, with --overwrite")
         field = field_from_checkpoint(checkpoint, saved, info).to(self.device)
-        scene = self._even(scene, photo_gains(info), field.response)
-        trainer = Trainer(scene, saved, field, ranks=self.ranks)
+        trainer = Trainer(self._even(scene, photo_gains(info), field.response), saved, field, ranks=self.ranks)
         try:
             trainer.load_state(checkpoint.tensors, checkpoint.values)
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:

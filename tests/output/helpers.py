@@ -64,6 +64,9 @@ class AnalyticRun:
         self.gain, self.confident = 1.0, True
         self.rendered = 0
 
+    def even(self, scene):
+        return scene
+
     def summary(self):
         return {"device": "abacus"}
 
