@@ -1,5 +1,5 @@
 """gsplat's rasterization() (Ye et al. 2025, version 1.5), made of rasterize(): a trainer that imports it from here runs
-on any device that Warp does."""
+on the CPU, too."""
 
 from typing import Any, Literal
 
