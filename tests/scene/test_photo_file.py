@@ -30,7 +30,7 @@ print(held() - before, sum(photo.nbytes for photo in codes), sum(int(photo[::7].
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
 def test_photos_on_the_disk_take_no_memory(tmp_path):
-    write_blender(tmp_path, 12, size=(1600, 1200), ply_file_path="p.ply")
+    write_blender(tmp_path, 8, size=(1200, 900), ply_file_path="p.ply")
     write_ply(tmp_path / "p.ply", [(0, 0, 0)])
     given = [sys.executable, "-c", LOAD, str(tmp_path)]
     told = [
