@@ -15,6 +15,7 @@ from ..errors import InputError
 
 MAX_PIXELS = 160_000_000
 """Above any camera's frame (the largest backs give 151 megapixels), far below what would exhaust memory."""
+MAX_SIDE = 65_536  # Of no photo; a damaged width that passes for few pixels in all takes long to decode
 LDR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 HDR_SUFFIXES = (".exr", ".hdr")
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw")
@@ -134,9 +135,11 @@ def require_file(path: Path) -> None:
 
 
 def check_size(path: Path, width: int, height: int, most: int = MAX_PIXELS) -> None:
-    """Raises InputError for a size of no pixels or of more than `most`."""
+    """Raises InputError for a size of no pixels, of more than `most`, or with a side of more than MAX_SIDE."""
     if width < 1 or height < 1 or width * height > most:
         raise InputError(path, f"size {width} x {height} is not between 1 and {most} pixels", "scale the image down")
+    if max(width, height) > MAX_SIDE:
+        raise InputError(path, f"size {width} x {height} has a side of more than {MAX_SIDE}", "scale the image down")
 
 
 def _decode(image: ImageFile.ImageFile, path: Path) -> tuple[np.ndarray, np.ndarray | None]:
