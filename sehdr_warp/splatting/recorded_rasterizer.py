@@ -18,7 +18,7 @@ LEAST_ROOM = 1 << 12
 
 
 class Options(TypedDict, total=False):
-    """rasterize()'s options, but for the capacity."""
+    """rasterize()'s options, but for capacity, background and depth."""
 
     near: float
     low_pass: float
@@ -64,7 +64,9 @@ class RecordedRasterizer:
         height: int,
         **options: Unpack[Options],
     ) -> Rendering:
-        """Arguments and result are rasterize()'s; `capacity` is not among them."""
+        """Arguments and result are rasterize()'s; `capacity`, `background`, `depth` are not among them: TypeError."""
+        if unknown := options.keys() - Options.__annotations__.keys():
+            raise TypeError(f"a RecordedRasterizer does not take {', '.join(sorted(unknown))}; use rasterize()")
         tensors = means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics
         size = width, height
         wanted = tuple(torch.is_grad_enabled() and tensor.requires_grad for tensor in tensors)
