@@ -3,7 +3,6 @@
 from .bridge import Program, differentiable
 from .harmonics import spherical_harmonics
 from .rasterization import Rendering, rasterize
-from .recorded_rasterizer import RecordedRasterizer
 from .recording import GraphRecorder
 from .sphere import rasterize_directions
 from .ssim import ssim, ssim_map
@@ -11,7 +10,6 @@ from .ssim import ssim, ssim_map
 __all__ = [
     "GraphRecorder",
     "Program",
-    "RecordedRasterizer",
     "Rendering",
     "differentiable",
     "rasterize",

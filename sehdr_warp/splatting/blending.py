@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,9 +15,17 @@ from . import threads
 from .launching import launch, warp_scalar
 from .tile_lists import ONE_SORT, Emission, TileLists
 
-Adjoint = Callable[[tuple[Tensor, Tensor], Tensor, Tensor | None], Tensor]
-"""The backward pass: from the records, and the gradients by image and transmittance (None for 0), to those by Gaussian,
-[N, C + 6]: features, conic a b c, x, y, opacity."""
+Adjoint = Callable[[Tensor, Tensor | None], Tensor]
+"""The backward pass: from the gradients by image and transmittance (None for 0) to those by Gaussian, [N, C + 6]:
+features, conic a b c, x, y, opacity."""
+
+
+class Picture(NamedTuple):
+    """image [H, W, C], transmittance [H, W], and how to differentiate them; with no graph behind them."""
+
+    image: Tensor
+    transmittance: Tensor
+    adjoint: Adjoint
 
 
 def blend(
@@ -38,39 +47,43 @@ def blend(
     deterministic: on a GPU gradients are summed in a fixed order, as the CPU always does: slower, and the gradients of
     every (Gaussian, tile) pair take memory.
     """
-    return _Blend.apply(means2d, conics, opacities, features, lists, records, alpha_threshold, deterministic)
+    rows = features.detach()
+    image = rows.new_empty(lists.height, lists.width, rows.shape[1])
+    transmittance = rows.new_empty(image.shape[:2])
+    backend = blend_on_cuda if rows.device.type == "cuda" else blend_on_cpu
+    # The adjoint keeps one of them, and must not keep what torch makes a result of: it would keep itself.
+    given = rows, lists, records, image.detach(), transmittance.detach(), alpha_threshold, deterministic
+    return differentiated(means2d, conics, opacities, features, Picture(image, transmittance, backend(*given)))
+
+
+def differentiated(means2d, conics, opacities, features, picture: Picture) -> tuple[Tensor, Tensor]:
+    """A picture's image and transmittance, as functions of what it was drawn from."""
+    return _Blend.apply(means2d, conics, opacities, features, picture)
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means2d, conics, opacities, features, lists, records, threshold, ordered):
-        features = features.detach()
-        ctx.sizes = lists.height, lists.width, features.shape[1]
-        image, transmittance = features.new_empty(ctx.sizes), features.new_empty(ctx.sizes[:2])
-        backend = blend_on_cuda if features.device.type == "cuda" else blend_on_cpu
-        # Not the tensors that torch makes results of: the adjoint keeps one, and with it would keep itself.
-        results = image.detach(), transmittance.detach()
-        ctx.adjoint = backend(features, lists, records, *results, threshold, ordered)
-        ctx.records = records
+    def forward(ctx, means2d, conics, opacities, features, picture: Picture):
+        ctx.sizes, ctx.adjoint = picture.image.shape, picture.adjoint
         ctx.set_materialize_grads(False)
-        return image, transmittance
+        return picture.image, picture.transmittance
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, by_image, by_transmittance):
-        adjoint, records = ctx.adjoint, ctx.records
-        ctx.adjoint = ctx.records = None
+        adjoint, ctx.adjoint = ctx.adjoint, None
         if adjoint is None:
             raise RuntimeError("this blend was already differentiated once; run its forward pass again")
+        if by_image is None and by_transmittance is None:
+            return (None,) * 5
         _, width, channels = ctx.sizes
-        by_image = records[0].new_zeros(ctx.sizes) if by_image is None else by_image.contiguous()
+        by_image = by_transmittance.new_zeros(ctx.sizes) if by_image is None else by_image.contiguous()
         # Of an axis of length 1 torch calls any stride contiguous, and kernels do not.
         by_image = by_image.as_strided(ctx.sizes, (width * channels, channels, 1))
-        gathered = adjoint(records, by_image, None if by_transmittance is None else by_transmittance.contiguous())
+        gathered = adjoint(by_image, None if by_transmittance is None else by_transmittance.contiguous())
         by_features, by_conics, by_means2d, by_opacities = gathered.split((channels, 3, 2, 1), dim=1)
         gradients = by_means2d, by_conics, by_opacities[:, 0], by_features
-        wanted = (part if needed else None for part, needed in zip(gradients, ctx.needs_input_grad, strict=False))
-        return *wanted, *(None,) * 4
+        return *(part if needed else None for part, needed in zip(gradients, ctx.needs_input_grad, strict=False)), None
 
 
 def blend_on_cpu(
@@ -98,7 +111,7 @@ def blend_on_cpu(
         ranges=pieces,
     )
 
-    def backward(records, image_gradient: Tensor, left_over_gradient: Tensor | None) -> Tensor:
+    def backward(image_gradient: Tensor, left_over_gradient: Tensor | None) -> Tensor:
         if left_over_gradient is None:
             left_over_gradient = torch.zeros_like(left_over)
         scratch = rows(TILE_SIZE), rows(channels, TILE_SIZE), rows(TILE_SIZE), rows(TILE_SIZE)
@@ -140,7 +153,7 @@ def blend_on_cuda(
         padding = padded_channels - features.shape[1]
         return torch.nn.functional.pad(features, (0, padding)) if padding else features
 
-    def by_gaussian(features, records):
+    def by_gaussian(features):
         return lists.ranges, lists.gaussians, *records, features.reshape(-1, 4), *frame
 
     def launch_blocks(kernel, blocks_per_tile, *arguments):
@@ -148,25 +161,19 @@ def blend_on_cuda(
         launch(kernel, tile_count * blocks_per_tile * block, *arguments, block_dim=block)
 
     rows = padded(features)
-    given = *by_gaussian(rows, records), image, transmittance, last
+    given = *by_gaussian(rows), image, transmittance, last
     launch_blocks(blend_cuda.forward_kernel(scalar, channels), blend_cuda.BLOCKS_PER_TILE, *given)
-    # The backward pass takes them from here and lets them go. Padded they are larger, and few are not padded again.
-    count, kept = len(features), [rows if len(features) <= ONE_SORT else features]
+    # Padded they are larger, and few are not padded again.
+    count, kept = len(features), rows if len(features) <= ONE_SORT else features
     del rows, given
 
-    def backward(records, image_gradient: Tensor, transmittance_gradient: Tensor | None) -> Tensor:
+    def backward(image_gradient: Tensor, transmittance_gradient: Tensor | None) -> Tensor:
         if transmittance_gradient is None:
             transmittance_gradient = transmittance.view(-1)[:0]
         kernel = blend_cuda_adjoint.backward_kernel(scalar, channels, deterministic)
         corners, sizes = blend_cuda_adjoint.BLOCKS_PER_TILE, (blend_cuda_adjoint.ROWS, channels + 6)
-        given = (
-            *by_gaussian(padded(kept.pop()), records),
-            transmittance,
-            last,
-            image_gradient,
-            transmittance_gradient,
-            *sizes,
-        )
+        gradients = image_gradient, transmittance_gradient
+        given = *by_gaussian(padded(kept)), transmittance, last, *gradients, *sizes
         if not deterministic:
             gathered = transmittance.new_zeros(count, channels + 6)
             launch_blocks(kernel, corners, *given, 0, lists.gaussians, gathered)

@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR
-from .blending import blend
+from .blending import blend, differentiated
 from .checks import check_opacities, check_tensors, whole_number
 from .memory import memory_told
 from .projection import project
-from .tile_lists import LARGEST_CAPACITY, build_tile_lists, pack_records
+from .replays import Frame, Given, replayed
+from .tile_lists import LARGEST_CAPACITY, build_tile_lists, number_entries, pack_records
 
 LARGEST_SIDE = 1 << 20  # of an image, in pixels
 
@@ -29,7 +30,7 @@ class Rendering:
     extents: [N, 2] half-width and half-height in pixels within which a Gaussian counts; 0 where culled.
     entry_count: (Gaussian, tile) pairs that there was room for.
     overflow: scalar bool tensor, whether the given capacity left some of them out; None without a capacity.
-    pair_count: scalar int64 tensor, how many there are; None from rasterizers that do not count them.
+    pair_count: scalar int64 tensor, how many there are; None without a capacity.
     depth: [H, W] blended depths along the camera's axis over zero, where they were asked for; over alpha they are the
         expected depth.
     """
@@ -137,6 +138,8 @@ def rasterize(
     if not 0.0 < alpha_threshold < 1.0:
         raise ValueError(f"alpha_threshold {alpha_threshold} is not between 0 and 1")
 
+    launched = capacity is not None or deterministic  # and never replayed
+
     def projected(opacities: Tensor, pose: Tensor, lens: Tensor) -> tuple[Tensor, ...]:
         tensors = (tensor.contiguous() for tensor in (means, log_scales, quaternions, opacities, pose, lens))
         options = {"near": near, "low_pass": low_pass, "alpha_threshold": alpha_threshold, "antialiased": antialiased}
@@ -144,15 +147,26 @@ def rasterize(
 
     def drawn(features: Tensor, means2d, conics, depths, opacities, extents) -> Rendering:
         features = (torch.cat([features, depths[:, None]], 1) if depth else features).contiguous()
-        given = means2d.detach(), conics.detach(), opacities.detach(), extents, alpha_threshold, width, height
-        records, counts = pack_records(*given, features.detach())
-        emission = features.device.type == "cpu" or deterministic
-        lists = build_tile_lists(records, counts, depths.detach(), extents, width, height, capacity, emission=emission)
-        given = means2d, conics, opacities, features
-        image, transmittance = blend(*given, lists, records, alpha_threshold, deterministic)
+        leaves = means2d, conics, opacities, features
+        given = Given(
+            means2d.detach(), conics.detach(), opacities.detach(), features.detach(), depths.detach(), extents
+        )
+        differentiable = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in leaves)
+        again = None if launched else replayed(given, Frame(width, height, alpha_threshold), differentiable)
+        if again:
+            picture, pairs = again
+            image, transmittance = differentiated(*leaves, picture)
+            numbers = pairs, None, None
+        else:
+            records, counts = pack_records(*given[:3], extents, alpha_threshold, width, height, given.features)
+            emission = features.device.type == "cpu" or deterministic
+            numbered = number_entries(counts, given.depths, extents, emission=emission)
+            seen = records, *numbered, given.depths, extents, width, height
+            lists = build_tile_lists(*seen, capacity, emission=emission)
+            image, transmittance = blend(*leaves, lists, records, alpha_threshold, deterministic)
+            numbers = lists.entry_count, lists.overflow, None if capacity is None else lists.total
         last = image[..., -1] if depth else None
         image = image[..., :-1] if depth else image
-        numbers = lists.entry_count, lists.overflow, lists.total
         return Rendering(image, transmittance, means2d, depths, extents, *numbers, last)
 
     with memory_told(means.device, lambda: (len(means), width, height, channels)):

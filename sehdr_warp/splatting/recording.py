@@ -5,6 +5,7 @@ long as the GPU. Recorded once and replayed, the GPU sets the pace.
 """
 
 import gc
+import threading
 import weakref
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager, suppress
@@ -20,6 +21,9 @@ T = TypeVar("T")
 IDLE_BYTES = 1 << 30
 """If more of torch's memory than this lies idle, it is given back before a recording is made: a recording has memory of
 its own, and while it is made torch can give nothing back."""
+
+_one_at_a_time = threading.RLock()
+"""Recordings of several threads: the garbage collector that one switches off is everyone's."""
 
 
 @contextmanager
@@ -124,6 +128,10 @@ class GraphRecorder:
         return self._result
 
     def _record(self, function: Callable):
+        with _one_at_a_time:
+            return self._record_alone(function)
+
+    def _record_alone(self, function: Callable):
         if self._idle() > self._kept + IDLE_BYTES:
             with suppress(RuntimeError):  # some versions of torch refuse while another thread records
                 torch.cuda.empty_cache()

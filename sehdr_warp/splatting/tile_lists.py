@@ -67,9 +67,24 @@ class TileLists:
 
 
 @torch.no_grad()
+def number_entries(
+    counts: Tensor, depths: Tensor, extents: Tensor, *, emission: bool = True
+) -> tuple[Tensor | None, Tensor]:
+    """The order in which Gaussians are entered, by depth, or None where they are as they come; and by place in it the
+    running number of entries, [N] int64.
+
+    counts: pack_records()'s; depths, extents: project()'s. emission: as build_tile_lists() is asked for it.
+    """
+    one_sort = len(depths) <= ONE_SORT and not emission and depths.dtype == torch.float32
+    order = None if one_sort else depth_order(depths, extents)
+    return order, (counts if order is None else counts[order]).cumsum(0)
+
+
+@torch.no_grad()
 def build_tile_lists(
     records: tuple[Tensor, Tensor],
-    counts: Tensor,
+    order: Tensor | None,
+    ends: Tensor,
     depths: Tensor,
     extents: Tensor,
     width: int,
@@ -80,8 +95,8 @@ def build_tile_lists(
 ) -> TileLists:
     """Order the projected Gaussians by depth and list, for each tile, those whose ellipse touches it.
 
-    records, counts: pack_records()'s for an image of this size; depths, extents: project()'s. Nothing here is
-    differentiable.
+    records: pack_records()'s for an image of this size; order, ends: number_entries()'s; depths, extents: project()'s.
+    Nothing here is differentiable.
     capacity: room for this many entries; those beyond it are left out, which TileLists.overflow tells. The host then
     never waits for the device to learn how many there are.
     emission: also tell where entries came from, which adjoints need that sum by Gaussian in a fixed order.
@@ -89,9 +104,6 @@ def build_tile_lists(
     """
     columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
     tile_count, count = columns * rows, len(depths)
-    one_sort = count <= ONE_SORT and not emission and depths.dtype == torch.float32
-    order = None if one_sort else depth_order(depths, extents)
-    ends = (counts if order is None else counts[order]).cumsum(0)
     total = ends[-1] if count else ends.new_zeros(())
     overflow = None if capacity is None else total > capacity
     room = checked_room(int(total) if capacity is None else capacity, count, columns, rows)

@@ -11,6 +11,7 @@ from sehdr_warp.splatting.tile_lists import (
     emit_entries,
     emit_keys,
     find_ranges,
+    number_entries,
     sort_keys,
 )
 
@@ -29,6 +30,12 @@ def counted(*scene):
     records, counts, depths, extents = dense(*scene)
     order = depth_order(depths, extents)
     return (order, *records, extents, COLUMNS, ROWS), counts[order]
+
+
+def built(records, counts, depths, extents, capacity=None, *, emission=True):
+    numbered = number_entries(counts, depths, extents, emission=emission)
+    size = 16 * COLUMNS, 16 * ROWS
+    return build_tile_lists(records, *numbered, depths, extents, *size, capacity, emission=emission)
 
 
 def emit(records, counts, monkeypatch):
@@ -74,7 +81,7 @@ def test_one_sort_makes_the_lists_of_two(device, spare):
     records, counts, depths, extents = dense(device)
     # Many at one depth: ties keep the order of indices.
     depths = (depths * 4).round().clamp_min(1) / 4
-    lists = build_tile_lists(records, counts, depths, extents, 16 * COLUMNS, 16 * ROWS)
+    lists = built(records, counts, depths, extents)
     room = lists.entry_count + spare
     given = *records, extents, depths, COLUMNS, ROWS, counts.cumsum(0), room, spare != 0
     tiles, gaussians = sort_keys(*emit_keys(*given), room, COLUMNS * ROWS)
@@ -98,9 +105,8 @@ def kept_bytes(holder):
 @pytest.mark.parametrize("emission", [False, True])
 def test_lists_keep_no_more_memory_than_they_use(device, emission, spare):
     scene = dense(device, 500)
-    size = 16 * COLUMNS, 16 * ROWS
-    exact = build_tile_lists(*scene, *size, emission=emission)
-    lists = exact if spare is None else build_tile_lists(*scene, *size, exact.entry_count + spare, emission=emission)
+    exact = built(*scene, emission=emission)
+    lists = exact if spare is None else built(*scene, exact.entry_count + spare, emission=emission)
     entries = exact.entry_count + (spare or 0)
     assert torch.equal(lists.gaussians[: exact.entry_count], exact.gaussians)
     total_and_overflow = 8 + (spare is not None)
