@@ -1,4 +1,4 @@
-"""Splats seen in all directions from one point, for environment maps: forward only, since nothing is trained on them.
+"""Splats seen in all directions from one point: environment maps, and panoramas as photos.
 
 A picture is any set of directions. One thread takes one Gaussian to the plane that touches the unit sphere in its own
 direction n, where its perspective is a 2D Gaussian (Huang et al. 2024, On the Error Analysis of 3D Gaussian Splatting
@@ -9,7 +9,7 @@ its poles. The inverse covariance is kept as two vectors a and b across n, such 
 
 Within a cap around n a Gaussian counts. Directions come in tiles of 16 x 16, and these in blocks; each has a cap as
 well, and two caps that do not meet share no pixel. A tile's list is ordered by distance and blended by one thread a
-pixel, front to back.
+pixel, front to back. The adjoint walks it back to front as blend_cpu.py's does; that of the projection is Warp's own.
 """
 
 from functools import cache
@@ -34,7 +34,7 @@ def projection_kernel(dtype, antialiased: bool):
     g = geometry(dtype)
     real, vec3, vec4 = g.real, g.vec3, g.vec4
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.kernel(module="unique", module_options={"enable_backward": True})
     def project_to_sphere(
         first: int,
         means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quaternions: wp.array(dtype=vec4),
@@ -43,6 +43,8 @@ def projection_kernel(dtype, antialiased: bool):
         caps: wp.array(dtype=vec4), across: wp.array(dtype=vec3), along: wp.array(dtype=vec3),
         opacities2d: wp.array(dtype=real), distances: wp.array(dtype=real),
     ):
+        # The limits below that nothing usable reaches keep the adjoint of a square root from dividing by 0.
+        tiny = real(1.0e-30)
         i = first + wp.tid()
         offset = means[i] - position[0]
         distance = wp.length(offset)
@@ -74,17 +76,17 @@ def projection_kernel(dtype, antialiased: bool):
         blurred = bare + low_pass * energy + low_pass * low_pass
         opacity = opacities[i]
         if wp.static(antialiased):
-            opacity = opacity * wp.sqrt(wp.max(bare / blurred, real(0.0)))
+            opacity = opacity * wp.sqrt(wp.max(bare / blurred, tiny))
         else:
             opacity = opacity * wp.sqrt(trained / blurred)
         v00 = wp.dot(m0, m0) + low_pass
         v11 = wp.dot(m1, m1) + low_pass
         v01 = wp.dot(m0, m1)
-        usable = usable and blurred > real(1.0e-30) and wp.isfinite(blurred) and opacity > alpha_threshold
+        usable = usable and blurred > tiny and wp.isfinite(blurred) and opacity > alpha_threshold
         if usable:
             level = real(2.0) * wp.log(opacity / alpha_threshold)
             half = real(0.5) * (v00 + v11)
-            widest = half + wp.sqrt(real(0.25) * (v00 - v11) * (v00 - v11) + v01 * v01)
+            widest = half + wp.sqrt(wp.max(real(0.25) * (v00 - v11) * (v00 - v11) + v01 * v01, tiny))
             # The inverse covariance's root: rows of a triangular matrix.
             r00 = wp.sqrt(v11 / blurred)
             r01 = -v01 / (blurred * r00)
@@ -106,7 +108,7 @@ def projection_kernel(dtype, antialiased: bool):
 
 @cache
 def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
-    """list_tiles and blend for one scalar type and number of channels."""
+    """list_tiles, blend and blend_adjoint for one scalar type and number of channels."""
     g = geometry(dtype)
     real, vec3, vec4 = g.real, g.vec3, g.vec4
     features_type = vector(channels, dtype)
@@ -116,6 +118,22 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
     def caps_meet(one: vec4, other: vec4) -> bool:
         reach = wp.min(one[3] + other[3] + real(1.0e-6), real(3.1415926))
         return one[0] * other[0] + one[1] * other[1] + one[2] * other[2] >= wp.cos(reach)
+
+    @wp.func
+    def falloff(squared: real, forward: real) -> real:
+        """Of a Gaussian's opacity; 0 behind the viewer, and where exp(-18) would be below every threshold in use."""
+        value = real(0.0)
+        if forward > real(0.0) and squared < real(36.0) * forward * forward:
+            value = wp.exp(real(-0.5) * squared / (forward * forward))
+        return value
+
+    @wp.func
+    def pixel_of(thread: int, columns: int) -> wp.vec3i:
+        """Tile, x and y of a thread: pixels go tile by tile, so that neighbors read the same list."""
+        tile = thread // (TILE_SIZE * TILE_SIZE)
+        place = thread - tile * (TILE_SIZE * TILE_SIZE)
+        x = (tile % columns) * TILE_SIZE + place % TILE_SIZE
+        return wp.vec3i(tile, x, (tile // columns) * TILE_SIZE + place // TILE_SIZE)
 
     @wp.kernel(module="unique", module_options=options)
     def list_tiles(
@@ -144,50 +162,94 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
                                 count += 1
         counts[place] = count
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.kernel(module="unique", module_options=options)
     def blend(
         first: int,
         ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), directions: wp.array(dtype=vec3),
         caps: wp.array(dtype=vec4), across: wp.array(dtype=vec3), along: wp.array(dtype=vec3),
         opacities: wp.array(dtype=real), features: wp.array(dtype=features_type),
         columns: int, width: int, height: int, alpha_threshold: real,
-        image: wp.array(dtype=features_type), transmittance: wp.array(dtype=real),
+        image: wp.array(dtype=features_type), transmittance: wp.array(dtype=real), ends: wp.array(dtype=wp.int32),
     ):
-        # Pixels tile by tile, so that neighbors read the same list.
-        thread = first + wp.tid()
-        tile = thread // (TILE_SIZE * TILE_SIZE)
-        place = thread - tile * (TILE_SIZE * TILE_SIZE)
-        x = (tile % columns) * TILE_SIZE + place % TILE_SIZE
-        y = (tile // columns) * TILE_SIZE + place // TILE_SIZE
-        if x < width and y < height:
-            pixel = y * width + x
+        """ends: one past the last entry that a pixel shows."""
+        found = pixel_of(first + wp.tid(), columns)
+        if found[1] < width and found[2] < height:
+            pixel = found[2] * width + found[1]
             d = directions[pixel]
-            bounds = ranges[tile]
+            bounds = ranges[found[0]]
             left_over = real(1.0)
             total = features_type()
+            end = bounds[0]
             k = bounds[0]
             while k < bounds[1]:
                 i = entries[k]
                 k += 1
                 cap = caps[i]
+                a = wp.dot(across[i], d)
+                b = wp.dot(along[i], d)
+                value = falloff(a * a + b * b, cap[0] * d[0] + cap[1] * d[1] + cap[2] * d[2])
+                alpha = wp.min(real(ALPHA_MAX), opacities[i] * value)
+                if alpha > alpha_threshold:
+                    remaining = left_over - left_over * alpha
+                    if remaining <= real(TRANSMITTANCE_MIN):
+                        k = bounds[1]
+                    else:
+                        total += features[i] * (alpha * left_over)
+                        left_over = remaining
+                        end = k
+            image[pixel] = total
+            transmittance[pixel] = left_over
+            ends[pixel] = end
+
+    @wp.kernel(module="unique", module_options=options)
+    def blend_adjoint(
+        first: int,
+        ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), directions: wp.array(dtype=vec3),
+        caps: wp.array(dtype=vec4), across: wp.array(dtype=vec3), along: wp.array(dtype=vec3),
+        opacities: wp.array(dtype=real), features: wp.array(dtype=features_type),
+        columns: int, width: int, height: int, alpha_threshold: real,
+        transmittance: wp.array(dtype=real), ends: wp.array(dtype=wp.int32), places: wp.array(dtype=wp.int32),
+        by_image: wp.array(dtype=features_type), by_transmittance: wp.array(dtype=real), rows: wp.array2d(dtype=real),
+    ):
+        """rows: added to at places[entry]: gradients by the direction of the cap, across, along (3 each), the opacity,
+        and features."""
+        found = pixel_of(first + wp.tid(), columns)
+        if found[1] < width and found[2] < height:
+            pixel = found[2] * width + found[1]
+            d = directions[pixel]
+            incoming = by_image[pixel]
+            left_over = transmittance[pixel]
+            behind = left_over * by_transmittance[pixel]
+            begin = ranges[found[0]][0]
+            k = ends[pixel]
+            while k > begin:
+                k -= 1
+                i = entries[k]
+                cap = caps[i]
                 forward = cap[0] * d[0] + cap[1] * d[1] + cap[2] * d[2]
                 a = wp.dot(across[i], d)
                 b = wp.dot(along[i], d)
-                squared = a * a + b * b
-                opacity = opacities[i]
-                # exp(-18) of anything is below every threshold that is used.
-                if forward > real(0.0) and squared < real(36.0) * forward * forward:
-                    alpha = wp.min(
-                        real(ALPHA_MAX), opacity * wp.exp(real(-0.5) * squared / (forward * forward))
-                    )
-                    if alpha > alpha_threshold:
-                        remaining = left_over - left_over * alpha
-                        if remaining <= real(TRANSMITTANCE_MIN):
-                            k = bounds[1]
-                        else:
-                            total += features[i] * (alpha * left_over)
-                            left_over = remaining
-            image[pixel] = total
-            transmittance[pixel] = left_over
+                value = falloff(a * a + b * b, forward)
+                unclamped = opacities[i] * value
+                alpha = wp.min(real(ALPHA_MAX), unclamped)
+                if alpha > alpha_threshold:
+                    row = places[k]
+                    inverse = real(1.0) / (real(1.0) - alpha)
+                    # As an addition: left_over * inverse would round each of many faint factors the same way.
+                    left_over += left_over * (alpha * inverse)
+                    through = wp.dot(features[i], incoming)
+                    by_alpha = left_over * through - behind * inverse
+                    weight = alpha * left_over
+                    behind += weight * through
+                    for channel in range(wp.static(channels)):
+                        wp.atomic_add(rows, row, 10 + channel, weight * incoming[channel])
+                    if unclamped < real(ALPHA_MAX):
+                        slope = alpha * by_alpha / (forward * forward)
+                        by_forward = slope * (a * a + b * b) / forward
+                        for axis in range(3):
+                            wp.atomic_add(rows, row, axis, by_forward * d[axis])
+                            wp.atomic_add(rows, row, 3 + axis, -slope * a * d[axis])
+                            wp.atomic_add(rows, row, 6 + axis, -slope * b * d[axis])
+                        wp.atomic_add(rows, row, 9, value * by_alpha)
 
-    return SimpleNamespace(list_tiles=list_tiles, blend=blend)
+    return SimpleNamespace(list_tiles=list_tiles, blend=blend, blend_adjoint=blend_adjoint)

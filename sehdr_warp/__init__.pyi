@@ -12,7 +12,7 @@ from .output.report import write_report
 from .response import Response, response_by_name, response_names
 from .scene import Camera, Scene, View, embedded_scenes, load_cameras, load_scene
 from .scene.stack import calibrate
-from .splatting import Rendering, differentiable, rasterize, spherical_harmonics, ssim
+from .splatting import Rendering, differentiable, rasterize, rasterize_directions, spherical_harmonics, ssim
 from .training.config import Config
 from .training.config_files import load_config, preset_names
 from .training.initialization import match_points
@@ -49,6 +49,7 @@ __all__ = [
     "match_points",
     "preset_names",
     "rasterize",
+    "rasterize_directions",
     "render_views",
     "response_by_name",
     "response_names",

@@ -1,17 +1,23 @@
 """Splats seen in any directions from one point: environment maps, as latitude and longitude or the faces of a cube."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR, TILE_SIZE
 from ..kernels.sphere import BLOCK_TILES, projection_kernel, sphere_kernels
+from .blending import gather_by_gaussian
+from .bridge import Program, differentiable
 from .checks import check_opacities, check_tensors
 from .launching import launch, warp_scalar
 from .memory import memory_told
-from .tile_lists import checked_room, depth_order, find_ranges, sort_by_tile
+from .threads import even_ranges
+from .tile_lists import Emission, checked_room, depth_order, find_ranges, sort_by_tile
+
+_PIXELS = TILE_SIZE * TILE_SIZE
 
 
-@torch.no_grad()
 def rasterize_directions(
     means: Tensor,
     log_scales: Tensor,
@@ -32,8 +38,10 @@ def rasterize_directions(
     means, log_scales [N, 3]; quaternions [N, 4]; opacities [N]; features [N, C]: as rasterize() takes them.
     focal_length: of the cameras that the Gaussians were trained on, in pixels: their pixels' footprint belongs to what
         a Gaussian looks like. pixel_angle: of the picture's pixels, radians; where they are larger, Gaussians are
-        smoothed to them and keep their energy. Order is by distance from the position. Not differentiable.
-    Neighboring pixels should look in neighboring directions; blocks of 128 x 128 pixels are culled as one.
+        smoothed to them and keep their energy. Order is by distance from the position.
+    Differentiable with respect to every tensor but the directions. On the CPU gradients repeat bit for bit, whatever
+    the number of threads. Neighboring pixels should look in neighboring directions; blocks of 128 x 128 pixels are
+    culled as one.
 
     Raises TypeError and ValueError as rasterize() does, OutOfMemory if memory does not suffice.
     """
@@ -48,44 +56,102 @@ def rasterize_directions(
     )
     check_opacities(opacities)
     height, width = directions.shape[:2]
-    count, channels = features.shape
-    scalar = warp_scalar(means.dtype)
     footprint = LOW_PASS / focal_length**2
     smoothing = max(LOW_PASS * pixel_angle**2 - footprint, 0.0)
-    with memory_told(means.device, lambda: (count, width, height, channels)):
-        caps, across, along = means.new_empty(count, 4), torch.empty_like(means), torch.empty_like(means)
-        opacities2d, distances = torch.empty_like(opacities), torch.empty_like(opacities)
+    with memory_told(means.device, lambda: (len(means), width, height, features.shape[1])):
         given = (tensor.contiguous() for tensor in (means, log_scales, quaternions, opacities, position))
+        options = {"near": near, "footprint": footprint, "smoothing": smoothing, "alpha_threshold": alpha_threshold}
+        *shapes, opacities, distances = _project(*given, antialiased=antialiased, **options)
+        opacities = opacities.masked_fill(~features.isfinite().all(1), 0)
+        drawn = *shapes, opacities, features.contiguous()
+        recorded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in drawn)
+        lists = _list_tiles(shapes[0].detach(), distances, directions.contiguous(), means.is_cpu and recorded)
+        return _Blend.apply(*drawn, lists, alpha_threshold)
+
+
+@differentiable
+def _project(
+    program: Program, means: Tensor, *others: Tensor, antialiased: bool, near: float, footprint: float,
+    smoothing: float, alpha_threshold: float,
+) -> tuple[Tensor, ...]:  # fmt: skip
+    """Caps [N, 4] (direction, angle), across, along [N, 3], opacities, distances [N]; angle 0 where not drawn."""
+    count, dtype = len(means), means.dtype
+    results = [program.write((count, *shape), dtype) for shape in ((4,), (3,), (3,), ())]
+    results.append(program.write((count,), dtype, differentiable=False))
+    given = means, *others, near, footprint, smoothing, alpha_threshold
+    program.launch(projection_kernel(warp_scalar(dtype), antialiased), count, given, results)
+    return tuple(results)
+
+
+@dataclass(frozen=True)
+class _Lists:
+    """As TileLists, of directions [H, W, 3]."""
+
+    directions: Tensor
+    columns: int
+    ranges: Tensor
+    gaussians: Tensor
+    emission: Emission | None
+
+
+@torch.no_grad()
+def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, emission: bool) -> _Lists:
+    """For each tile the Gaussians whose cap meets its own, by distance."""
+    count, (height, width) = len(caps), directions.shape[:2]
+    columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
+    tile_caps, block_caps = (caps_of(directions, side * TILE_SIZE) for side in (1, BLOCK_TILES))
+    kernel = sphere_kernels(warp_scalar(caps.dtype), 1).list_tiles
+    order = depth_order(distances, caps[:, 3:].expand(-1, 2).contiguous())
+    frame = order, caps, tile_caps, block_caps, columns, rows
+    counts, none = torch.empty_like(order), order[:0]
+    launch(kernel, count, *frame, order, counts, none, none, smallest=256)
+    ends = counts.cumsum(0)
+    room = checked_room(int(ends[-1]) if count else 0, count, columns, rows)
+    starts = (ends - counts).int()
+    tiles, gaussians = (torch.empty(2 * room, dtype=torch.int32, device=order.device) for _ in range(2))
+    launch(kernel, count * bool(room), *frame, starts, counts, tiles, gaussians, smallest=256)
+    tiles, gaussians, places = sort_by_tile(tiles, gaussians, room, columns * rows, emission)
+    by_gaussian = None if places is None else Emission(order.clone(), ends, places)
+    return _Lists(directions, columns, find_ranges(tiles, columns * rows), gaussians, by_gaussian)
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, caps, across, along, opacities, features, lists: _Lists, alpha_threshold: float):
+        (height, width), (_, channels) = lists.directions.shape[:2], features.shape
+        drawn = tuple(tensor.detach() for tensor in (caps, across, along, opacities, features))
+        image, transmittance = features.new_empty(height, width, channels), features.new_empty(height, width)
+        ends = torch.empty(height, width, dtype=torch.int32, device=image.device)
+        ctx.frame = lists.columns, width, height, alpha_threshold
+        ctx.kernels, ctx.lists = sphere_kernels(warp_scalar(features.dtype), channels), lists
+        ctx.pixels = lists.ranges.shape[0] * _PIXELS
+        read = lists.ranges, lists.gaussians, lists.directions.view(-1, 3), *drawn
+        results = image.view(-1, channels), transmittance, ends
+        launch(ctx.kernels.blend, ctx.pixels, *read, *ctx.frame, *results, smallest=_PIXELS)
+        ctx.save_for_backward(*drawn, transmittance, ends)
+        return image, transmittance
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, by_image, by_transmittance):
+        *drawn, transmittance, ends = ctx.saved_tensors
+        lists, emission, (count, channels) = ctx.lists, ctx.lists.emission, drawn[-1].shape
+        # On the CPU each entry has a row, and whole tiles go to a thread: sums keep one order.
+        places = lists.gaussians if emission is None else emission.places
+        rows = by_image.new_zeros(count if emission is None else len(places), channels + 10)
         launch(
-            projection_kernel(scalar, antialiased),
-            count,
-            *(*given, near, footprint, smoothing, alpha_threshold),
-            *(caps, across, along, opacities2d, distances),
+            ctx.kernels.blend_adjoint,
+            ctx.pixels,
+            *(lists.ranges, lists.gaussians, lists.directions.view(-1, 3), *drawn, *ctx.frame),
+            *(transmittance, ends, places, by_image.contiguous().view(-1, channels), by_transmittance.contiguous()),
+            rows,
+            ranges=[(first * _PIXELS, last * _PIXELS) for first, last in even_ranges(ctx.pixels // _PIXELS, 1)],
         )
-        opacities2d[~features.isfinite().all(1)] = 0
-        columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
-        directions = directions.contiguous()
-        tile_caps, block_caps = (caps_of(directions, side * TILE_SIZE) for side in (1, BLOCK_TILES))
-        kernels = sphere_kernels(scalar, channels)
-        order = depth_order(distances, caps[:, 3:].expand(-1, 2).contiguous())
-        frame = order, caps, tile_caps, block_caps, columns, rows
-        counts, none = torch.empty_like(order), order[:0]
-        launch(kernels.list_tiles, count, *frame, order, counts, none, none, smallest=256)
-        room = checked_room(int(counts.sum(dtype=torch.int64)), count, columns, rows)
-        starts = counts.cumsum(0, dtype=torch.int32) - counts
-        tiles, gaussians = (torch.empty(2 * room, dtype=torch.int32, device=order.device) for _ in range(2))
-        launch(kernels.list_tiles, count * bool(room), *frame, starts, counts, tiles, gaussians, smallest=256)
-        tiles, gaussians, _ = sort_by_tile(tiles, gaussians, room, columns * rows, False)
-        ranges = find_ranges(tiles, columns * rows)
-        image, transmittance = means.new_zeros(height, width, channels), means.new_ones(height, width)
-        launch(
-            kernels.blend,
-            columns * rows * TILE_SIZE * TILE_SIZE,
-            *(ranges, gaussians, directions.view(-1, 3), caps, across, along, opacities2d, features.contiguous()),
-            *(columns, width, height, alpha_threshold, image.view(-1, channels), transmittance),
-            smallest=TILE_SIZE * TILE_SIZE,
-        )
-    return image, transmittance
+        if emission is not None:
+            rows = gather_by_gaussian(emission, rows)
+        by_axis, by_across, by_along, by_opacity, by_features = rows.split((3, 3, 3, 1, channels), dim=1)
+        by_caps = torch.nn.functional.pad(by_axis, (0, 1))
+        return by_caps, by_across, by_along, by_opacity[:, 0], by_features, None, None
 
 
 def caps_of(directions: Tensor, side: int) -> Tensor:

@@ -1,4 +1,6 @@
 import json
+import shutil
+import subprocess
 
 import numpy as np
 import pytest
@@ -103,6 +105,51 @@ def test_openimageio_and_opencv_read_it(tmp_path, run):
     np.testing.assert_allclose(
         cv2.imread(str(tmp_path / "env.hdr"), cv2.IMREAD_UNCHANGED)[..., ::-1], radiance, atol=0.05
     )
+
+
+def looked_at(oiio, file, directions):
+    textures, options, still = oiio.TextureSystem(), oiio.TextureOpt(), (0, 0, 0)
+    return np.array([textures.environment(str(file), options, ray, still, still, 3) for ray in directions.tolist()])
+
+
+def decibels(one, other):
+    return -10 * np.log10(np.mean(np.square(one - other)))
+
+
+def test_openexrs_reference_picture_lies_as_maps_do(shared):
+    """The one that names its axes, looked at by OpenImageIO in the directions of our maps, is itself and not turned or
+    mirrored. Both take the outermost pixels as the border: half a pixel beside ours."""
+    oiio = pytest.importorskip("OpenImageIO")
+    file = shared / "data" / "env_maps" / "OrientationLatLong.exr"
+    picture, directions = read_hdr(file)[4::16, 4::16], latlong(1024)[4::16, 4::16]
+    seen = looked_at(oiio, file, directions.reshape(-1, 3)).reshape(picture.shape)
+    turned = [seen[:, ::-1], seen[::-1], *(np.roll(seen, columns, axis=1) for columns in (16, 32, 48))]
+    assert decibels(seen, picture) > 22 > 17 > max(decibels(other, picture) for other in turned)
+
+
+def test_openexrs_converter_and_openimageio_see_the_same(tmp_path, run):
+    """Faces made of our lat-long by exrenvmap are our cube's, none turned or mirrored."""
+    random = np.random.default_rng(0)
+    places = random.normal(size=(60, 3)).astype(np.float32)
+    shape = np.full((60, 3), -1.0, np.float32), random.normal(size=(60, 4)).astype(np.float32)
+    colors = random.uniform(0, 3, (60, 1, 3)).astype(np.float32)
+    places *= 3 / np.linalg.norm(places, axis=1, keepdims=True)
+    run.model = field_of(GaussianArrays(places, *shape, np.ones(60, np.float32), colors, "linear", 0.5))
+    options = {"at": (0, 0, 0), "axes": "scene", "pixel": "float"}
+    write_panorama(run, tmp_path / "env.exr", size=512, **options)
+    write_panorama(run, tmp_path / "cube.exr", size=128, layout="cube", **options)
+    ours = read(tmp_path / "cube.exr")[0]
+    oiio = pytest.importorskip("OpenImageIO")
+    seen = looked_at(oiio, tmp_path / "env.exr", cube(128).reshape(-1, 3)[::17])
+    assert decibels(seen, ours.reshape(-1, 3)[::17]) > 40
+    if shutil.which("exrenvmap") is None:
+        pytest.skip("exrenvmap is not installed")
+    subprocess.run(["exrenvmap", "-c", "-w", "128", tmp_path / "env.exr", tmp_path / "theirs.exr"], check=True)
+    theirs = read(tmp_path / "theirs.exr")[0].reshape(6, 128, 128, 3)
+    for i, face in enumerate(ours.reshape(6, 128, 128, 3)):
+        turned = [other for k in range(4) for other in (np.rot90(face, k), np.rot90(face, k)[::-1])][1:]
+        others = [decibels(other, theirs[i]) for other in [*turned, *np.delete(theirs, i, axis=0)]]
+        assert decibels(face, theirs[i]) > 40 > 24 > max(others)
 
 
 def test_radiance_files_keep_seven_bits(tmp_path):

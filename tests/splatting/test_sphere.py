@@ -9,6 +9,8 @@ from sehdr_warp.kernels.constants import ALPHA_MAX, ALPHA_THRESHOLD, LOW_PASS
 from sehdr_warp.splatting import rasterize, rasterize_directions
 from sehdr_warp.splatting.sphere import caps_of
 
+from .scenes import finite_differences, random_like, relative_error
+
 FOCAL = 60.0
 
 
@@ -104,6 +106,83 @@ def test_agrees_with_perspective_views(device):
         flat = rasterize(*given, pose, lens, side, side, low_pass=1e-6)
         image, _ = rasterize_directions(*given, torch.zeros(3, device=device), directions, focal_length=1e6)
         assert float((image - flat.image).abs().mean()) < 0.05 * float(flat.image.mean())
+
+
+NAMES = ("means", "log_scales", "quaternions", "opacities", "features", "position")
+
+
+@pytest.mark.parametrize("antialiased", [False, True], ids=["plain", "antialiased"])
+@pytest.mark.parametrize("which", range(len(NAMES)), ids=NAMES)
+def test_gradients_match_finite_differences(device, which, antialiased):
+    """A map of several tiles; wide Gaussians of low opacity and a tiny threshold keep pixels from cut-offs."""
+    tensors = [*gaussians(12, size=-0.7), torch.tensor([0.1, -0.2, 0.15], dtype=torch.float64)]
+    tensors[3] = tensors[3] * 0.3
+    options = {"focal_length": FOCAL, "pixel_angle": 0.2, "antialiased": antialiased, "alpha_threshold": 1e-7}
+
+    def loss(*tensors, dtype=torch.float64):
+        moved = [tensor.to(device=device, dtype=dtype) for tensor in tensors]
+        image, left = rasterize_directions(*moved, latlong(40, dtype, device), **options)
+        return (image * random_like(image, 5)).sum() + left.square().sum()
+
+    numeric = finite_differences(loss, tensors, which)
+    for dtype, bound in ((torch.float64, 1e-6), (torch.float32, 1e-4)):
+        leaves = [tensor.clone().requires_grad_() for tensor in tensors]
+        loss(*leaves, dtype=dtype).backward()
+        assert relative_error(leaves[which].grad, numeric) < bound
+
+
+def gradients(given, directions, **options):
+    leaves = [tensor.clone().requires_grad_() for tensor in given]
+    image, left = rasterize_directions(*leaves, directions, focal_length=FOCAL, **options)
+    (image.square().sum() + left.sum()).backward()
+    return [leaf.grad for leaf in leaves]
+
+
+def test_gradients_of_many_hold_in_float32_and_over_threads(device, monkeypatch):
+    given = [*gaussians(2000, device=device), torch.zeros(3, dtype=torch.float64, device=device)]
+    truth = gradients(given, latlong(96, device=device))
+    floats, directions = [tensor.float() for tensor in given], latlong(96, torch.float32, device)
+    seen = []
+    for threads in ("1", "3"):
+        monkeypatch.setenv("SEHDR_THREADS", threads)
+        seen.append(gradients(floats, directions))
+    for name, one, other, expected in zip(NAMES, *seen, truth, strict=True):
+        assert relative_error(one, expected) < 1e-3, name
+        assert device != "cpu" or torch.equal(one, other), name
+
+
+def test_gradients_are_finite_where_nothing_has_a_slope(device):
+    """Balls, a point at the viewer, one of no size, and one that is not finite beside others."""
+    given = [*gaussians(6, dtype=torch.float32, device=device), torch.zeros(3, device=device)]
+    given[0][0] = 0
+    given[1][:3] = -1
+    given[1][3] = -50
+    given[4][4, 0] = torch.nan
+    for antialiased in (False, True):
+        found = gradients(given, latlong(dtype=torch.float32, device=device), antialiased=antialiased)
+        assert all(bool(gradient.isfinite().all()) for gradient in found)
+        assert all(float(found[3][i]) == 0 for i in (0, 4)) and float(found[3][1]) != 0
+
+
+def test_a_scene_is_found_from_a_latlong_picture(device):
+    """Colors, sizes and places that were disturbed."""
+    truth, directions = gaussians(40, dtype=torch.float32, device=device, size=-1), latlong(64, torch.float32, device)
+    position, generator = torch.zeros(3, device=device), torch.Generator().manual_seed(0)
+    options = {"focal_length": FOCAL, "pixel_angle": 0.1}
+    wanted, _ = rasterize_directions(*truth, position, directions, **options)
+    leaves = [
+        (part + 0.1 * torch.randn(part.shape, generator=generator).to(device)).requires_grad_()
+        for part in (*truth[:3], truth[4])
+    ]
+    optimizer, losses = torch.optim.Adam(leaves, lr=0.02), []
+    for _ in range(60):
+        image, _ = rasterize_directions(*leaves[:3], truth[3], leaves[3], position, directions, **options)
+        loss = (image - wanted).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        losses.append(float(loss.detach()))
+        optimizer.step()
+    assert losses[-1] < 0.05 * losses[0]
 
 
 def test_larger_pixels_keep_the_light(device):
