@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, SehdrError
+from ..quiet import silent_stderr
 from .capture import reinhard_gamma
 from .hdr_files import read_hdr
 from .images import HDR_SUFFIXES, RAW_SUFFIXES, check_size, require_file
@@ -129,7 +130,8 @@ def _opened(path: Path) -> Iterator[Any]:
     except ImportError:
         raise SehdrError(f"{path}: RAW files need rawpy; pip install 'sehdr-warp[raw]'") from None
     try:
-        with rawpy.imread(str(path)) as raw:
+        # LibRaw prints of damage, too.
+        with silent_stderr(), rawpy.imread(str(path)) as raw:
             if raw.raw_pattern is None or raw.num_colors != 3:
                 raise InputError(path, "is no photo through a filter of three colors", _REMEDY)
             yield raw

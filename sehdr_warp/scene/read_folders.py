@@ -12,7 +12,7 @@ from .colmap_model import SparseModel, find_model, read_model
 from .exposure import parse_seconds
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES, image_sizes
 from .lens import Lens
-from .linear_photos import one_kind
+from .linear_photos import color_matrix, one_kind
 from .names import list_images, mask_of, natural_key, sibling, view_and_exposure
 from .sfm import reconstruct
 
@@ -185,11 +185,13 @@ def read_photos(folder: Path, cache: Path | str | None = None) -> Capture:
     if not photos:
         remedy = "give photos (JPEG, PNG, TIFF, RAW, EXR), a COLMAP set or a transforms.json"
         raise InputError(folder, "has no photos and no known layout", remedy)
-    one_kind(photos)
+    kind = one_kind(photos)
     if len(photos) < 2:
         raise InputError(photos[0], "is the only photo; one view does not show depth", "add photos from other places")
     for photo in photos:
         image_sizes(photo)
+    if kind == "raw":
+        color_matrix(photos)  # Photos of several cameras are refused before minutes of matching.
     model, shots, lost = reconstruct(photos, cache), [], []
     placed = {int(Path(image.name).stem): image for image in model.images}
     for i, photo in enumerate(photos):

@@ -16,6 +16,8 @@ MAX_DEGREE = 3
 _NOT_FINITE = "it is not written; train again from an earlier checkpoint or with another seed"
 # A logit beyond this is an opacity of 0 or 1 in float32.
 _MOST_LOGIT = 20.0
+# Sizes are drawn within e^-20 to e^20 scene units; further ones would overflow where files hold sizes themselves.
+_MOST_LOG_SCALE = 20.0
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,8 @@ class GaussianArrays:
             problem = f"its base exposure time is {self.base_time} s"
             raise InputError(path, problem, "state a positive number of seconds")
         logits = np.clip(self.opacity_logits, -_MOST_LOGIT, _MOST_LOGIT)
-        given = replace(self, opacity_logits=logits)
+        log_scales = np.clip(self.log_scales, -_MOST_LOG_SCALE, _MOST_LOG_SCALE)
+        given = replace(self, opacity_logits=logits, log_scales=log_scales)
         arrays = (getattr(given, name) for name in _ARRAYS)
         finite = np.all([np.isfinite(each).all(tuple(range(1, each.ndim))) for each in arrays], axis=0)
         if not finite.any():

@@ -55,6 +55,9 @@ def read_ply(path: Path) -> GaussianArrays:
         missing = [name for group in _GROUPS for name in group.split() if name not in names]
         if missing:
             raise InputError(path, _without(missing, names), "export 3D Gaussians as an uncompressed PLY")
+        whole = [p.name for p in vertex.properties if p.name in " ".join(_GROUPS).split() and p.val_dtype[0] != "f"]
+        if whole:
+            raise InputError(path, f"its {whole[0]} is of whole numbers", "export 3D Gaussians as an uncompressed PLY")
         rest = sorted((n for n in names if re.fullmatch(r"f_rest_\d{1,4}", n)), key=lambda name: int(name[7:]))
         degree_of(1 + len(rest) / 3, path)
         groups = (*(group.split() for group in _GROUPS), rest)

@@ -10,10 +10,17 @@ TO_CAMERA = np.array([[0.9, -0.2, -0.1], [-0.4, 1.2, 0.2], [-0.1, 0.2, 0.6]])
 
 
 def write_dng(
-    path: Path, light: np.ndarray, *, black=512, white=15000, balance=(0.5, 1.0, 0.7), seconds=1 / 60
+    path: Path,
+    light: np.ndarray,
+    *,
+    black=512,
+    white=15000,
+    balance=(0.5, 1.0, 0.7),
+    seconds=1 / 60,
+    to_camera=TO_CAMERA,
 ) -> None:
     """light: [H, W, 3] of even size in the sensor's colors, 1 at the white level, mosaiced as RGGB. balance: what a
-    neutral surface gives in each channel."""
+    neutral surface gives in each channel. to_camera: as TO_CAMERA."""
     mosaic = np.empty(light.shape[:2])
     for (row, column), channel in {(0, 0): 0, (0, 1): 1, (1, 0): 1, (1, 1): 2}.items():
         mosaic[row::2, column::2] = light[row::2, column::2, channel]
@@ -39,7 +46,7 @@ def write_dng(
         279: longs(stored.nbytes), 33421: shorts(2, 2), 33422: (1, 4, bytes([0, 1, 1, 2])),
         33434: (5, 1, struct.pack("<II", round(seconds * 1e6), 10**6)), 34855: shorts(100),
         50706: (1, 4, bytes([1, 4, 0, 0])), 50708: text("Test Sensor"), 50714: longs(black), 50717: longs(white),
-        50721: rationals(TO_CAMERA, True), 50728: rationals(balance), 50778: shorts(21),
+        50721: rationals(to_camera, True), 50728: rationals(balance), 50778: shorts(21),
     }  # fmt: skip
     offset = 8 + 2 + 12 * len(tags) + 4
     entries, blobs = b"", b""

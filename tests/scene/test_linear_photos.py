@@ -132,7 +132,16 @@ def test_kinds_and_cameras_are_not_mixed(tmp_path):
         load_scene(tmp_path)
 
 
-def test_files_that_are_no_photos_of_a_camera(tmp_path, shared):
+def test_raw_photos_of_two_cameras_are_refused_before_they_are_matched(tmp_path, monkeypatch):
+    pytest.importorskip("rawpy")
+    monkeypatch.setattr("sehdr_warp.scene.read_folders.reconstruct", lambda *_: pytest.fail("matched"))
+    for i, matrix in enumerate((TO_CAMERA, TO_CAMERA, TO_CAMERA[::-1])):
+        write_dng(tmp_path / f"{i}.dng", np.ones((64, 64, 3)), to_camera=matrix)
+    with pytest.raises(InputError, match=r"2.dng: is of another camera than 0.dng"):
+        load_scene(tmp_path)
+
+
+def test_files_that_are_no_photos_of_a_camera(tmp_path, shared, capfd):
     pytest.importorskip("rawpy")
     (tmp_path / "a.nef").write_bytes(b"II*\0" + bytes(100))
     write_dng(tmp_path / "b.dng", np.ones((64, 64, 3)))
@@ -140,6 +149,7 @@ def test_files_that_are_no_photos_of_a_camera(tmp_path, shared):
     for name in ("a.nef", "c.dng"):
         with pytest.raises(InputError, match="cannot be read as RAW"):
             raw_codes(tmp_path / name, oriented=False)
+    assert capfd.readouterr().err == ""
     folder = shared / "data" / "raw"
     with pytest.raises(InputError, match="no photo through a filter of three colors"):
         raw_codes(folder / "Nikon_uncompressed.nef", oriented=False)

@@ -124,12 +124,15 @@ def ply(header: str, body: bytes = b"") -> bytes:
     return f"ply\nformat binary_little_endian 1.0\n{header}end_header\n".encode() + body
 
 
+COLUMNS = "x y z scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3 f_dc_0 f_dc_1 f_dc_2"
+NUMBERS = "".join(f"property float {name}\n" for name in COLUMNS.split())
 BAD = {
     "a.ply": (ply("element vertex 2147483648\nproperty float x\n"), "claims 2147483648 elements"),
     "b.ply": (b"ply\nformat ascii 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n1\n", "claims"),
     "c.ply": (b"no ply", "is not a PLY file"),
     "d.ply": (ply("element vertex 1\nproperty float x\nproperty uchar red\n", bytes(5)), "point cloud"),
     "e.ply": (ply("element vertex 3\nproperty float x\n", bytes(9)), "cannot be read as PLY"),
+    "f.ply": (ply(f"element vertex 1\n{NUMBERS}property uchar opacity\n", bytes(53)), "opacity is of whole numbers"),
     "a.glb": (b"glTF" + bytes(40), "is not binary glTF"),
     "b.glb": (struct.pack("<5I", 0x46546C67, 2, 22, 2, 0x4E4F534A) + b"{}", "is damaged glTF"),
     "a.spz": (b"x", "is no splat file"),
@@ -153,8 +156,10 @@ def test_what_is_not_finite_is_left_out_and_odd_harmonics_are_refused(tmp_path, 
     write_gaussians(tmp_path / "a.ply", given)
     data = PlyData.read(tmp_path / "a.ply", mmap=False)
     data["vertex"]["x"][3], data["vertex"]["opacity"][4] = np.nan, np.inf  # An opacity of 1.
+    data["vertex"]["scale_0"][5], data["vertex"]["scale_1"][5] = 300, -np.inf  # Drawn as the largest and smallest are.
     data.write(tmp_path / "b.ply")
-    assert read_gaussians(tmp_path / "b.ply").count == 49 and "1 of 50" in logged[0]
+    found = read_gaussians(tmp_path / "b.ply")
+    assert found.count == 49 and "1 of 50" in logged[0] and found.log_scales[4, :2].tolist() == [20, -20]
     data["vertex"]["y"][:] = np.inf
     data.write(tmp_path / "c.ply")
     with pytest.raises(InputError, match="all of its Gaussians"):
