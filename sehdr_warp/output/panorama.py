@@ -63,7 +63,7 @@ def write_panorama(
     layout: "latlong": size x size / 2, the left edge at longitude pi, its middle along +Z, +X at a quarter, +Y up.
         "cube": OpenEXR's six faces, one above the other. axes: "upright": +Y is up in the photos, +Z is ahead of the
         named camera or of the middle one; "scene": those of the scene's coordinates.
-    fill: directions that no photo saw get the light around them, smoothly; A tells them still.
+    fill: what no photo saw gets the light around it, smoothly, as far as A is below 1; A tells it still.
 
     Raises SehdrError for options that do not fit, or a point that sees next to nothing; InputError where the file
     exists (unless overwrite) or a pixel is not finite.
@@ -89,7 +89,7 @@ def write_panorama(
     weight = solid_angles(size, layout)
     _judge(run, position, seen, alpha, distance, weight)
     if fill:
-        hdr = hdr + np.maximum(1 - alpha[..., None] / _SEEN, 0) * filled(hdr, alpha, directions, weight)
+        hdr = hdr + (1 - alpha[..., None]) * filled(hdr, alpha, directions, weight)
     log.info("%s: %.0f %% of all directions seen", path.name, 100 * weight[alpha > _SEEN].sum() / weight.sum())
     hdr = from_rec709(hdr, colorspace)
     if path.suffix.lower() == ".hdr":

@@ -26,6 +26,8 @@ _XYZ_FROM_REC709 = np.array(
 )
 # What clips is not at white to the last bit: a sensor reads it out with noise, and demosaicing mixes it with others.
 _CLIPPED = 0.99
+# Sensors that clip below the white level that is stated do so above this part of it, and at so many pixels.
+_LEAST_WHITE, _PILE = 0.75, 64
 _MIDDLE_GREY = 0.18
 _MOST_JUDGED = 24
 _REMEDY = "develop the photos as JPEG, PNG or TIFF, or convert them to DNG"
@@ -81,7 +83,22 @@ def raw_codes(path: Path, *, oriented: bool) -> np.ndarray:
         options: dict[str, Any] = {"output_color": rawpy.ColorSpace.raw, "gamma": (1, 1), "output_bps": 16}
         options |= {"no_auto_bright": True, "user_wb": [1, 1, 1, 1], "adjust_maximum_thr": 0.0}
         linear = raw.postprocess(**options, user_flip=None if oriented else 0).astype(np.float32) / 65535
-    return linear_codes(linear)
+        clipped = linear >= _CLIPPED * _saturation(raw)
+    return linear_codes(np.where(clipped, 1, linear))
+
+
+def _saturation(raw: Any) -> np.ndarray:
+    """[3] where each channel of an opened RAW file clips, as a share of the white level that is known of its camera:
+    below 1 where pixels pile up at their largest value, and no other near it is as frequent by far."""
+    levels, values, colors = np.ones(3), raw.raw_image_visible, raw.raw_colors_visible
+    for channel, members in enumerate(((0,), (1, 3), (2,))):
+        black = raw.black_level_per_channel[channel]
+        shares = (values[np.isin(colors, members)].astype(np.float32) - black) / (raw.white_level - black)
+        top = shares.max(initial=0)
+        at_top, below = (shares > 0.995 * top).sum(), (shares > 0.95 * top).sum()
+        if _LEAST_WHITE < top < 1 and at_top > max(_PILE, below / 4):
+            levels[channel] = top
+    return levels
 
 
 def linear_codes(linear: np.ndarray) -> np.ndarray:

@@ -110,6 +110,38 @@ def test_raw_files_clip_by_channel_in_the_sensors_colors(tmp_path):
     assert np.sign(matrix).tolist() == np.sign(to_rec709 @ np.linalg.inv(TO_CAMERA)).tolist()
 
 
+@pytest.mark.parametrize("clips", [15892, 13000])
+def test_what_piles_up_below_the_stated_white_is_clipped(tmp_path, clips):
+    """As cameras do whose white level is known for their bits alone."""
+    pytest.importorskip("rawpy")
+    light = np.random.default_rng(0).uniform(0.02, 1, (128, 96, 1)) * [0.9, 1, 0.8]
+    light[:, 70:] *= 3
+    write_dng(tmp_path / "a.dng", light, white=clips, stated=16383)
+    clipped = raw_codes(tmp_path / "a.dng", oriented=False) == 65535
+    write_dng(tmp_path / "b.dng", light / 4, white=clips, stated=16383)
+    assert clipped[:, 74:].mean() > 0.4 and clipped[:, :66].mean() < 0.02
+    assert raw_codes(tmp_path / "b.dng", oriented=False).max() < 65535
+
+
+@pytest.mark.parametrize("suffix, maker, white", [
+    (".nef", ("NIKON CORPORATION", "NIKON D850"), 65535),
+    (".cr2", ("Canon", "Canon EOS 5D Mark IV"), 65535),
+    (".arw", ("SONY", "ILCE-7M3"), 16383),
+])  # fmt: skip
+def test_cameras_whose_colors_libraw_knows(tmp_path, suffix, maker, white):
+    """Bare files of these makers, without compression and notes, so without a matrix and white balance."""
+    rawpy = pytest.importorskip("rawpy")
+    file, light = tmp_path / f"a{suffix}", BALANCE * np.linspace(0.02, 0.9, 96)[None, :, None] * np.ones((64, 1, 1))
+    write_dng(file, light, black=0, white=white, maker=maker)
+    found = response_by_name("srgb").decode(raw_codes(file, oriented=False) / 65535)
+    np.testing.assert_allclose(found[4:-4, 4:-4], light[4:-4, 4:-4], rtol=0.03)
+    with rawpy.imread(str(file)) as raw:
+        daylight = np.array(raw.daylight_whitebalance[:3])
+    matrix = color_matrix([file])
+    np.testing.assert_allclose(matrix @ (1 / daylight) * daylight.min(), 1, atol=2e-3)
+    assert (np.diag(matrix) > 0.5).all()
+
+
 def test_a_set_of_raw_files_becomes_a_scene(tmp_path):
     pytest.importorskip("rawpy")
 
