@@ -28,7 +28,7 @@ ALLOWED = {
     "field": ANY | {"scene", "response", "splatting", "splats"},
     "output": ANY | {"scene", "response", "splats", "field.exposure", "field.baking"},
     "viewer": ANY | {"scene", "output"},
-    "evaluation": ANY | {"scene", "splatting.ssim", "output.names", "output.charts"},
+    "evaluation": ANY | {"scene", "splatting.ssim", "field.baking", "output.names", "output.charts", "output.panorama"},
     "training": ANY
     | {"scene", "response", "field", "splatting", "splats", "evaluation.metrics", "evaluation.protocols"},
     "synth": ANY | {"scene", "response", "output.exr", "output.images", "field.exposure"},

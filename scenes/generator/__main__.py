@@ -11,6 +11,7 @@ import tyro
 from sehdr_warp.arguments import numbers, parse
 from sehdr_warp.errors import SehdrError
 
+from .light import render_light
 from .recipes import recipes_named
 from .render import Settings, load_mitsuba, render_scene
 from .truth_set import pack_truth
@@ -60,10 +61,28 @@ class Pack:
 
 
 @dataclass(frozen=True)
+class Light:
+    """Add maps of the light at four places to a set, rendered or packed: what `bench quality` judges irradiance by."""
+
+    name: Positional[str]
+    """Of the scene, or all."""
+    folder: Path
+    """The folder that holds the set's folder."""
+    samples: int = 256
+    """Light paths of a pixel in an easy scene."""
+    variant: Literal["auto", "cuda_ad_rgb", "llvm_ad_rgb"] = "auto"
+    """Mitsuba's."""
+
+
+@dataclass(frozen=True)
 class Generator:
     """Render HDR scenes with truth, and pack them."""
 
-    action: Annotated[Render, tyro.conf.subcommand("render")] | Annotated[Pack, tyro.conf.subcommand("pack")]
+    action: (
+        Annotated[Render, tyro.conf.subcommand("render")]
+        | Annotated[Pack, tyro.conf.subcommand("pack")]
+        | Annotated[Light, tyro.conf.subcommand("light")]
+    )
 
 
 def main(words: list[str] | None = None) -> None:
@@ -71,7 +90,7 @@ def main(words: list[str] | None = None) -> None:
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
         action = parse(Generator, sys.argv[1:] if words is None else words, PROGRAM).action
-        render(action) if isinstance(action, Render) else pack(action)
+        {Render: render, Pack: pack, Light: light}[type(action)](action)
     except SehdrError as error:
         sys.exit(f"{PROGRAM}: {str(error).removeprefix(PROGRAM + ' ')}")
     except KeyboardInterrupt:
@@ -97,6 +116,13 @@ def pack(asked: Pack) -> None:
         f"{asked.out}: {packing['bytes'] / 1e6:.2f} MB, relative error {100 * packing['relative_error']:.2f} %, "
         f"{packing['mu_law_psnr']:.1f} dB (mu-law)"
     )
+
+
+def light(asked: Light) -> None:
+    recipes = recipes_named(asked.name)
+    mi = load_mitsuba(asked.variant)
+    for recipe in recipes:
+        print(*render_light(mi, recipe, asked.folder / recipe.name, asked.samples), sep="\n")
 
 
 if __name__ == "__main__":

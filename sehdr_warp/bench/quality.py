@@ -19,6 +19,7 @@ from filelock import FileLock, Timeout
 
 from ..errors import InputError, SehdrError
 from ..evaluation.evaluate import evaluate
+from ..evaluation.irradiance import irradiance_errors, read_light_maps
 from ..evaluation.metrics import REGIONS
 from ..evaluation.protocols import PROTOCOLS
 from ..files import read_json, write_json
@@ -32,7 +33,7 @@ from .timing import Variant, forget_peaks, time_variants
 
 LOG = logging.getLogger(__name__)
 MONTH = 30 * 24 * 60  # Minutes, the longest that a worker may take
-FORMAT = 4  # Of a job and of its result; others are run again.
+FORMAT = 5  # Of a job and of its result; others are run again.
 RESULT, FAILURE = "result.json", "failure.json"
 TESTS, FIRST_TEST = 16, 100
 """A training tests its held-out views this often, at iterations spaced evenly on a log scale from 1/100 of all."""
@@ -162,9 +163,13 @@ def _read(path: Path) -> dict:
     return {}
 
 
+def _folder(place: str) -> Path:
+    return embedded_folder(place) if is_embedded(place) else Path(place)
+
+
 def _digest(place: str) -> str:
     """A hash of a file, or of all files of a folder or embedded scene with their names."""
-    folder = embedded_folder(place) if is_embedded(place) else Path(place)
+    folder = _folder(place)
     if not folder.exists():
         raise InputError(place, "no such folder", "give folders with HDR truth, or embedded")
     digest = hashlib.sha256()
@@ -222,6 +227,7 @@ def row_of(result: dict) -> dict:
         "ldr": figures["ldr"]["psnr"],
         **{region.replace("-", "_"): regions[region]["psnr_mu"]["aligned"] for region in REGIONS},
         **{f"lights_{name}": figures["lights"][name] for name in ("count", "lost")},
+        "irradiance": figures["irradiance"]["median"],
         "clipped_share": regions["clipped"]["fraction"],
         "confidence": figures["confidence"]["spearman_log2"],
         "chosen": figures["response"],
@@ -312,6 +318,8 @@ def run_job(job: Job, folder: Path, device: str, lpips: str | None) -> dict:
     peak = torch.cuda.max_memory_allocated(device) if device.startswith("cuda") else None
     figures = evaluate(run, scene, lpips_weights=lpips if config["lpips"] else None)
     figures.pop("views")
+    given = read_light_maps(_folder(job.place)), [view.camera for view in scene.train_views]
+    figures["irradiance"] = irradiance_errors(run, *given, figures["protocol"]["aligned"]["scale"] or 1.0)
     figures |= {"response": run.response.name, "peak_memory_bytes": peak}
     figures["renders_per_second"] = _render_rate(run, scene)
     curve = run.metrics()

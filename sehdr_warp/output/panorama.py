@@ -100,7 +100,7 @@ def write_panorama(
         data["confidence"] = as_array(found.confidence)
     facts = {**provenance(run), "position": json.dumps(position.tolist()), "axes": axes}
     header = exr_header(colorspace, 1.0, None, datetime.now().replace(microsecond=0), facts)
-    header |= {"sehdr:mapToWorld": json.dumps(to_world.tolist()), "envmap": _envmap(layout)}
+    header |= {"sehdr:mapToWorld": json.dumps(to_world.tolist()), "envmap": envmap(layout)}
     # In a part of their own: Mitsuba takes a map with a fifth channel for no map at all.
     parts = [Part(rgb_channels(hdr) | {"A": alpha}, header, "rgba"), Part(data, as_data(header), "data")]
     stored = write_multipart_exr(path, parts, pixel=pixel, overwrite=overwrite)
@@ -109,7 +109,7 @@ def write_panorama(
     return path
 
 
-def _envmap(layout: str) -> Any:
+def envmap(layout: str) -> Any:
     """The value of OpenEXR's attribute."""
     import OpenEXR
 
