@@ -31,7 +31,8 @@ def run_html(run: Any) -> str:
         light = as_array(run.render(camera).hdr) * np.float32(run.base_time)
         body += dial({"scene": light}, run.base_time, display_gain(run.response), "scene")
         height += 50 + round(_LONGEST * camera.height / camera.width)
-    script = f"<script>{page_file('light.js')}document.querySelectorAll('.dial').forEach(startDial);</script>"
+    script = "".join(map(page_file, ("tables.js", "light.js")))
+    script = f"<script>{script}document.querySelectorAll('.dial').forEach(startDial);</script>"
     style = f"<style>{page_file('style.css')}{_STYLE}</style>"
     head = f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>run</title>{style}</head>'
     page = f"{head}<body>{body}{script}</body></html>"

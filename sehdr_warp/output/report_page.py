@@ -66,7 +66,7 @@ def report_page(
         _map(run, comparisons),
         _footer(run),
     ]
-    main, script = "\n".join(filter(None, sections)), page_file("light.js") + page_file("report.js")
+    main, script = "\n".join(filter(None, sections)), "".join(map(page_file, ("tables.js", "light.js", "report.js")))
     body = f"<main>\n{main}\n</main>\n<script>\n{script}</script>"
     return whole_page(f"{scene.name}: sehdr-warp report", "report.css", body)
 

@@ -1,7 +1,7 @@
 """A scene as one HTML file that opens from disk: its Gaussians as linear light, and an engine that blends them so.
 
-The engine is PlayCanvas 2.23.3 (MIT, page/playcanvas.LICENSE), unchanged. It blends into half floats, which light.js
-exposes: light above white stays.
+The engine is PlayCanvas 2.23.3 (MIT, page/playcanvas.LICENSE), unchanged; scene.js has it draw whole Gaussians, as ours
+are. It blends into half floats, which light.js exposes: light above white stays.
 """
 
 import base64
@@ -60,7 +60,7 @@ def write_scene_page(run: Any, path: Path | str, *, overwrite: bool = False) -> 
         means=_packed(values[:3].astype("<f4")),
         rest=_packed(values[3:].astype("<f2")),
         engine=page_file("playcanvas.min.js").replace("</script", "<\\/script"),
-        script=page_file("light.js") + page_file("camera.js") + page_file("scene.js"),
+        script="".join(map(page_file, ("tables.js", "light.js", "camera.js", "scene.js"))),
     )
     page = whole_page(str(run.scene_name), "scene.css", body)
     with atomic_path(path, overwrite) as temporary:

@@ -32,6 +32,7 @@ class LiveTraining(Rendering):
     def __init__(self, training: Any, name: str):
         super().__init__(training, name)
         self.paused = self.ended = False
+        self._thread: threading.Thread | None = None
         self._steps = 0
         self._asked: queue.Queue[_Picture] = queue.Queue()
         self._credit = self._spent = 0.0
@@ -47,8 +48,16 @@ class LiveTraining(Rendering):
         return known[name]
 
     def render(self, camera: Camera):
-        """Of the thread of a browser: waits until the training has made the picture."""
-        picture = _Picture(lambda: self.run.render(camera))
+        return self._between_steps(lambda: self.run.render(camera))
+
+    def frame(self, camera: Camera, *, draft: bool = False, clipped: bool = False) -> memoryview:
+        return self._between_steps(lambda: super(LiveTraining, self).frame(camera, draft=draft, clipped=clipped))
+
+    def _between_steps(self, make: Callable[[], Any]) -> Any:
+        """What `make` gives. A browser's thread waits until the training has made it, in the time for pictures."""
+        if threading.current_thread() is self._thread:
+            return make()
+        picture = _Picture(make)
         self._asked.put(picture)
         while not picture.made.wait(_WAIT):
             if self.ended:
@@ -74,6 +83,7 @@ class LiveTraining(Rendering):
     def attend(self) -> Iterator[Any]:
         """The steps of the training, with pictures made in between."""
         started, last = time.perf_counter(), 0.0
+        self._thread = threading.current_thread()
         try:
             before = time.perf_counter()
             for step in self.run:
@@ -87,7 +97,7 @@ class LiveTraining(Rendering):
                 self._serve()
                 before = time.perf_counter()
         finally:
-            self.ended = True
+            self.ended, self._thread = True, None
 
     def _serve(self) -> None:
         while self._credit > 0 and not self._asked.empty():

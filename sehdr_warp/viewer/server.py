@@ -68,8 +68,7 @@ class Viewer:
                 "text/css",
                 page_file("style.css") + page.joinpath("viewer.css").read_text(encoding="utf-8"),
             ),
-            "/light.js": ("text/javascript", page_file("light.js")),
-            "/camera.js": ("text/javascript", page_file("camera.js")),
+            **{f"/{name}": ("text/javascript", page_file(name)) for name in ("tables.js", "light.js", "camera.js")},
             "/viewer.js": ("text/javascript", page.joinpath("viewer.js").read_text(encoding="utf-8")),
         }
 

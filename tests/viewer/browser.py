@@ -46,9 +46,10 @@ def page_of(made, url, width=700, height=420):
 
 
 def pixels(page, selector):
-    """What a canvas of the page shows: [H, W, 3] in [0, 1], at its own size."""
+    """What a canvas of the page shows: [H, W, 3] in [0, 1], at its own size, once looks rest."""
     import base64
     import io
 
-    data = page.locator(selector).evaluate("canvas => canvas.toDataURL('image/png')")
+    rested = "while (typeof light !== 'undefined' && light.coarse) await new Promise(done => setTimeout(done, 50));"
+    data = page.locator(selector).evaluate(f"async canvas => {{ {rested} return canvas.toDataURL('image/png'); }}")
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2]))).convert("RGB")) / 255

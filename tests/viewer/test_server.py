@@ -63,7 +63,7 @@ def test_a_frame_is_the_render(serve):
 
 def test_the_page_its_facts_and_photos(serve):
     server = serve(count=2)
-    for path in ("/", "/viewer.css", "/light.js", "/camera.js", "/viewer.js"):
+    for path in ("/", "/viewer.css", "/tables.js", "/light.js", "/camera.js", "/viewer.js"):
         status, kind, content = ask(server, path)
         assert status == 200 and kind.startswith("text/")
         assert not re.findall(rb"(?:src|href)=\"(?:https?:)?//|@import|url\(", content)

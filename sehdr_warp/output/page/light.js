@@ -118,15 +118,13 @@ const HALVES = Float32Array.from({length: 65536}, (_, h) => {
   return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : 2 ** -14 * fraction / 1024);
 });
 const fromHalf = h => HALVES[h];
-const srgb = x => x <= 0.0031308 ? 12.92 * x : 1.055 * x ** (1 / 2.4) - 0.055;
-const hable = x => (x * (0.15 * x + 0.05) + 0.004) / (x * (0.15 * x + 0.5) + 0.06) - 0.02 / 0.3;
 const QUICK = 12, PAUSE = 150;  // Milliseconds: of a draw while looks move, in software; and without one until they rest
 
 const software = gl => /swiftshader|llvmpipe|softpipe|software|basic render/i.test(
   gl.getParameter((gl.getExtension("WEBGL_debug_renderer_info") || {UNMASKED_RENDERER_WEBGL: gl.RENDERER}).UNMASKED_RENDERER_WEBGL));
 
-// Where WebGL is software its canvas is not the one that is seen. Looks that treat channels alike and alone are then a
-// table of half floats, which takes a tenth of the time; all others are coarser while they move.
+// Where WebGL is software its canvas is not the one that is seen, and tone maps are tables (tables.js), which take a tenth
+// of the time. What takes longer than QUICK is coarser while it moves.
 class LightCanvas {
   constructor(canvas) {
     const made = document.createElement("canvas"), options = {antialias: false, preserveDrawingBuffer: true};
@@ -135,6 +133,7 @@ class LightCanvas {
     if (software(gl)) this.paper = canvas.getContext("2d", {alpha: false});
     else gl = canvas.getContext("webgl2", options);
     this.canvas = canvas, this.gl = gl, this.textures = {}, this.frames = {}, this.programs = {}, this.stale = new Set();
+    this.drawn = -Infinity, this.scale = this.wide = 1;
     this.settings = {stops: 0, tone: "none", white: 4, overlay: "none", split: 0, left: 0, grey: 1, far: 1, middle: 1,
                      toPhoto: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], lens: [1, 1, .5, .5], photoLens: [1, 1, .5, .5]};
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
@@ -192,16 +191,22 @@ class LightCanvas {
     };
     clearTimeout(this.rest);
     if (!this.paper) return this.shade(width, height);
-    if (["none", "filmic", "response"].includes(s.tone) && s.overlay === "none" && fits("scene") && (s.left === 0 || s.left === 1 && fits("other")))
-      return this.lookUp(width, height);
-    const before = performance.now(), moving = before - this.drawn < PAUSE, scale = moving ? this.scale : 1;
+    const before = performance.now(), moving = before - this.drawn < PAUSE;
+    const tables = s.overlay === "none" && fits("scene") && (s.left === 0 || s.left === 1 && fits("other"));
+    this.coarse = tables ? this.lookUp(width, height, moving) : this.shadeSmaller(width, height, moving);
+    this.drawn = performance.now();
+    if (this.coarse) this.rest = setTimeout(() => this.draw(), PAUSE);
+  }
+
+  // By the shader, in fewer pixels while looks move; returns whether they are fewer.
+  shadeSmaller(width, height, moving) {
+    const before = performance.now(), scale = moving ? this.scale : 1;
     const [w, h] = [width, height].map(side => Math.max(1, Math.round(side * scale)));
     this.shade(w, h);
     const inset = scale < 1 ? 0.5 : 0;  // Enlarging would take in what an earlier draw left beside it.
     this.paper.drawImage(this.gl.canvas, inset, this.gl.canvas.height - h + inset, w - 2 * inset, h - 2 * inset, 0, 0, width, height);
-    this.drawn = performance.now();
-    this.scale = Math.min(1, Math.max(0.25, scale * Math.sqrt(QUICK / Math.max(1, this.drawn - before))));
-    if (scale < 1) this.rest = setTimeout(() => this.draw(), PAUSE);
+    this.scale = Math.min(1, Math.max(0.25, scale * Math.sqrt(QUICK / Math.max(1, performance.now() - before))));
+    return scale < 1;
   }
 
   // By the shader, into the lower left corner of WebGL's canvas.
@@ -222,23 +227,18 @@ class LightCanvas {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // By a table of what the looks make of each half float, over the frames in memory.
-  lookUp(width, height) {
-    const s = this.settings, gain = 2 ** s.stops, shown = gain * s.grey, white = hable(s.white);
-    const look = {none: x => srgb(shown * x), filmic: x => srgb(hable(2 * shown * x) / white), response: x => this.response(gain * x)}[s.tone];
-    const table = this.table ??= new Uint8Array(65536);  // Black for what is negative
-    for (let h = 0; h < 0x7c00; h++) table[h] = 255 * Math.min(1, look(HALVES[h])) + 0.5;
-    table[0x7c00] = table[0x7bff];
+  // By tables, over the frames in memory: every pixel, or while looks move one of so many that are wide alike.
+  lookUp(width, height, moving) {
+    const s = this.settings, before = performance.now(), edge = s.left === 1 ? Math.round(s.split * width) : 0;
+    this.tables ??= new LookTables();
+    this.tables.set(s, this.frames.curve);
     if (!this.image || this.image.width !== width || this.image.height !== height) this.image = new ImageData(width, height);
-    const pixels = new Uint32Array(this.image.data.buffer), edge = s.left === 1 ? Math.round(s.split * width) : 0;
-    if (edge > 0) exposeColumns(this.frames.other, table, pixels, 0, edge);
-    if (edge < width) exposeColumns(this.frames.scene, table, pixels, edge, width);
+    const pixels = new Uint32Array(this.image.data.buffer), wide = moving ? this.wide : 1;
+    const prepared = [["other", 0, edge], ["scene", edge, width]].filter(([, first, last]) => first < last)
+      .map(([name, first, last]) => this.tables.fill(this.frames[name], pixels, first, last, wide)).some(Boolean);
     this.paper.putImageData(this.image, 0, 0);
-  }
-  response(x) {
-    const place = (Math.log2(Math.max(x, 1e-9)) - CURVE_LOW) / (CURVE_HIGH - CURVE_LOW) * (CURVE_SIZE - 1), {half} = this.frames.curve;
-    const at = Math.min(CURVE_SIZE - 1, Math.max(0, place)), low = Math.min(CURVE_SIZE - 2, Math.floor(at));
-    return HALVES[half[low]] + (at - low) * (HALVES[half[low + 1]] - HALVES[half[low]]);
+    if (!prepared) this.wide = Math.min(4, Math.ceil(0.8 * wide * (performance.now() - before) / QUICK));
+    return wide > 1;
   }
 
   // The channels of a texture at a place, 0 to 1 from the left and the top.
@@ -248,13 +248,6 @@ class LightCanvas {
     const first = (Math.floor(y * f.height) * f.width + Math.floor(x * f.width)) * f.channels;
     return Array.from(f.half.subarray(first, first + f.channels), fromHalf);
   }
-}
-
-// Columns from first to last of a frame through a table, as RGBA in bytes.
-function exposeColumns({width, height, half, channels}, table, pixels, first, last) {
-  for (let y = 0; y < height; y++)
-    for (let i = y * width + first, k = i * channels, end = y * width + last; i < end; i++, k += channels)
-      pixels[i] = 0xff000000 | table[half[k + 2]] << 16 | table[half[k + 1]] << 8 | table[half[k]];
 }
 
 const luminance = ([r, g, b]) => 0.2126 * r + 0.7152 * g + 0.0722 * b;

@@ -27,6 +27,7 @@ async function start() {
   splat.addComponent("gsplat", {unified: false});
   splat.gsplat.resource = new pc.GSplatResource(device, new pc.GSplatData([{name: "vertex", count, properties}]));
   app.root.addChild(splat);
+  asOurs(splat.gsplat.instance.material, pc.ShaderChunks.get(device, pc.SHADERLANGUAGE_GLSL));
   eye = new pc.Entity();
   // As far as the engine knows its colors are encoded, and it leaves them as they are.
   eye.addComponent("camera", {clearColor: new pc.Color(0, 0, 0, 1), toneMapping: pc.TONEMAP_NONE, gammaCorrection: pc.GAMMA_SRGB});
@@ -36,6 +37,18 @@ async function start() {
   facts.views.forEach((view, i) => $("view").add(new Option(view.name, i)));
   new ResizeObserver(moved).observe(stage);
   jump(0);
+}
+
+// The engine's Gaussians end early, are lifted to make up for it, and left out where small; ours end at the same opacity alone.
+function asOurs(material, chunks) {
+  const change = (name, from, to) => {
+    if (chunks.get(name).search(from) < 0) throw new Error(`the engine has another ${name}`);
+    material.getShaderChunks(pc.SHADERLANGUAGE_GLSL).set(name, chunks.get(name).replace(from, to));
+  };
+  change("gsplatCommonVS", /min\(1.0, (sqrt\(max\(0.0, log\(alpha \/ alphaClipValue\)\)\) \* 0.5)\)/, "$1");
+  change("gsplatPS", /if \(A > 1.0\) \{\s*discard;\s*\}\s*mediump float alpha = normExp\(A\)/, "mediump float alpha = exp(A * -4.0)");
+  material.setParameter("minPixelSize", 0);
+  material.update();
 }
 
 function resize(width, height) {
