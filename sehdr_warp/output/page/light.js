@@ -22,7 +22,7 @@ precision highp sampler2D;
 in vec2 at;
 out vec4 color;
 uniform sampler2D scene, other, depth, clipped, photo, curve;
-uniform float gain, grey, white, split, far, middle;
+uniform float gain, grey, white, split, near, far;
 uniform mat4 toPhoto;                        // camera of the view to camera of the photo
 uniform vec4 lens, photoLens;                // fx, fy, cx, cy over width and height
 
@@ -97,9 +97,9 @@ void main() {
   }
   if (overlay == 1) color.rgb = stops(log2(max(dot(light.rgb, LUMINANCE) * gain * grey, 1e-9) / 0.18));
   if (overlay == 2) color.rgb = ramp(light.a);
-  if (overlay == 3) color.rgb = texture(depth, uv).r > 0.0 ? ramp(middle / (middle + texture(depth, uv).r)) : vec3(0.0);
+  if (overlay == 3) color.rgb = texture(depth, uv).r > 0.0 ? ramp((near * far / texture(depth, uv).r - near) / max(far - near, 1e-9)) : vec3(0.0);
   if (overlay == 4) {
-    vec2 e = 1.0 / vec2(textureSize(depth, 0));
+    vec2 size = vec2(textureSize(depth, 0)), e = ceil(size.y / 400.0) / size;  // Finer is the Gaussians' own relief.
     vec3 n = cross(place(uv + vec2(0, e.y)) - place(uv - vec2(0, e.y)), place(uv + vec2(e.x, 0)) - place(uv - vec2(e.x, 0)));
     color.rgb = 0.5 + 0.5 * n * vec3(1, -1, -1) / max(length(n), 1e-12);
   }
@@ -134,7 +134,7 @@ class LightCanvas {
     else gl = canvas.getContext("webgl2", options);
     this.canvas = canvas, this.gl = gl, this.textures = {}, this.frames = {}, this.programs = {}, this.stale = new Set();
     this.drawn = -Infinity, this.scale = this.wide = 1;
-    this.settings = {stops: 0, tone: "none", white: 4, overlay: "none", split: 0, left: 0, grey: 1, far: 1, middle: 1,
+    this.settings = {stops: 0, tone: "none", white: 4, overlay: "none", split: 0, left: 0, grey: 1, near: 1, far: 1,
                      toPhoto: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], lens: [1, 1, .5, .5], photoLens: [1, 1, .5, .5]};
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     TEXTURES.forEach((name, unit) => {
@@ -218,7 +218,7 @@ class LightCanvas {
     const chosen = {tone: TONES.indexOf(s.tone), overlay: OVERLAYS.indexOf(s.overlay), left: s.left};
     const {program, places} = this.program(chosen), at = name => places[name] ??= gl.getUniformLocation(program, name);
     gl.useProgram(program);
-    for (const [name, value] of Object.entries({gain: 2 ** s.stops, grey: s.grey, white: s.white, split: s.split, far: s.far, middle: s.middle}))
+    for (const [name, value] of Object.entries({gain: 2 ** s.stops, grey: s.grey, white: s.white, split: s.split, near: s.near, far: s.far}))
       gl.uniform1f(at(name), value);
     gl.uniform4fv(at("lens"), s.lens);
     gl.uniform4fv(at("photoLens"), s.photoLens);

@@ -77,12 +77,14 @@ function jump(index) {
 async function loadPhoto(index) {
   state.photo = index, state.photoReady = null;
   if (!usesPhoto()) return;
+  tell("the photo is being read \u2026");
   try {
     const blob = await (await ask(`/photo/${state.run}/${index}`)).blob();
     const image = await createImageBitmap(blob, {colorSpaceConversion: "none"});
     if (state.photo !== index) return;
     light.putPhoto(image);
     state.photoReady = index;
+    tell(state.told);
     paint();
   } catch (error) { tell(error.message); }
 }
@@ -129,8 +131,10 @@ async function load(draft) {
   if (draft && $("training").hidden) draftScale = Math.min(1, Math.max(0.08, draftScale * Math.min(1.5, Math.max(0.5, Math.sqrt(DRAFT_TIME / took)))));
   drawn = {camera: seen, draft};
   const depths = Uint16Array.from({length: Math.floor(n / 13)}, (_, i) => half[4 * n + 13 * i]).filter(d => d > 0).sort();  // As integers
-  Object.assign(light.settings, {far: fromHalf(depths.at(-1) || 0x3c00), middle: fromHalf(depths[depths.length >> 1] || 0x3c00)});
-  tell(`${width} \u00d7 ${height} \u00b7 ${took.toFixed(0)} ms \u00b7 ${facts.gaussians.toLocaleString("en").replaceAll(",", "\u202f")} Gaussians`
+  const [near, far] = [0.02, 0.98].map(part => fromHalf(depths[Math.floor(part * depths.length)] || 0x3c00));
+  Object.assign(light.settings, {near, far});
+  legend();
+  tell(state.told = `${width} \u00d7 ${height} \u00b7 ${took.toFixed(0)} ms \u00b7 ${facts.gaussians.toLocaleString("en").replaceAll(",", "\u202f")} Gaussians`
     + (facts.iterations && $("training").hidden ? ` \u00b7 ${facts.iterations} steps` : ""));
   if (!draft) nearestPhoto();
   histogram();
@@ -142,9 +146,10 @@ const zoom = () => 2 ** Number($("zoom").value);
 
 function paint() {
   if (!drawn || !facts) return;
-  const left = $("left").value, split = left === "0" ? 0 : state.split, view = facts.views[state.photo];
+  // A photo that is still being read is not compared with.
+  const ready = state.photoReady === state.photo, left = $("left").value === "photo" && !ready ? "0" : $("left").value, split = left === "0" ? 0 : state.split, view = facts.views[state.photo];
   const photo = view ? {toPhoto: between(drawn.camera, view.camera), photoLens: lensOf(view.camera)} : {};
-  light.draw({stops: state.stops, tone: $("tone").value, white: 2 ** Number($("white").value), overlay: $("overlay").value,
+  light.draw({stops: state.stops, tone: $("tone").value, white: 2 ** Number($("white").value), overlay: $("overlay").value === "error" && !ready ? "none" : $("overlay").value,
               split, left: left === "photo" ? 2 : left === "0" ? 0 : 1, lens: lensOf(drawn.camera), ...photo});
   $("handle").hidden = left === "0";
   $("handle").style.left = 100 * state.split + "%";
@@ -191,18 +196,18 @@ function frusta() {
   });
 }
 
+const figure = x => x === 0 ? "0" : Math.abs(x) < 1e-3 || x >= 1e5 ? x.toExponential(1) : x.toPrecision(3);
 function probe() {
   const at = state.pointer, side = at && $("left").value.startsWith("run") && at[0] < state.split ? "other" : "scene";
   const value = at && light.value(side, ...at), rows = [];
   if (value) {
     const [r, g, b, sure] = value, time = facts.base_time, l = luminance(value) * facts.grey * 2 ** state.stops;
-    const figure = x => x === 0 ? "0" : Math.abs(x) < 1e-3 || x >= 1e5 ? x.toExponential(1) : x.toPrecision(3);
     rows.push(["radiance", [r, g, b].map(x => figure(x / time)).join("&ensp;")]);
-    rows.push(["from middle grey", l > 0 ? stopsText(Math.log2(l / 0.18)) : "\u2013"]);
+    rows.push(["from grey", l > 0 ? stopsText(Math.log2(l / 0.18)) : "\u2013"]);
     rows.push(["confidence", drawn.draft || side === "other" ? "\u2013" : `${Math.round(100 * sure)} %`]);
     rows.push(["depth", figure(light.value("depth", ...at)[0])]);
     state.probed = [r, g, b].map(x => x / time);
-  }
+  } else for (const name of ["radiance", "from grey", "confidence", "depth"]) rows.push([name, "\u2013"]);
   $("probe").innerHTML = rows.map(([name, text]) => `<dt>${name}</dt><dd>${text}</dd>`).join("");
 }
 
@@ -237,7 +242,7 @@ function bars() {
 
 function legend() {
   const ramp = ["#1a1738", "#1b3f5f", "#216b8c", "#8da973", "#fae059"], kind = $("overlay").value;
-  const ends = {confidence: ["unknown", "known"], depth: ["far", "near"], error: ["0", "\u00bc"]}[kind];
+  const ends = {confidence: ["unknown", "known"], depth: [`far ${figure(light.settings.far)}`, `near ${figure(light.settings.near)}`], error: ["0", "\u00bc"]}[kind];
   if (kind === "stops") {
     const color = s => s === 0 ? "#808080" : s < 0 ? mix([64, 158, 184], [41, 10, 82], -s / 8)
       : s < 4 ? mix([115, 179, 89], [242, 217, 64], s / 3) : mix([242, 140, 38], [217, 20, 31], (s - 4) / 4);
