@@ -10,7 +10,7 @@ from .light_pictures import dial, display_gain, page_file
 from .report_page import duration
 
 _LONGEST = 420  # Pixels of a side of the picture, which the notebook keeps
-_STYLE = "body { padding: 2px; background: none; } canvas { display: block; width: 100%; border-radius: 3px; }"
+_STYLE = "body { padding: 12px; font-size: 13px; } canvas { display: block; width: 100%; border-radius: 3px; }"
 _STYLE += " p { margin: 0 0 8px; color: #8a8783; } label { display: grid; grid-template-columns: auto 1fr 9.5em;"
 _STYLE += " gap: 14px; align-items: center; margin-top: 8px; color: #8a8783; } output { text-align: right; }"
 
@@ -23,18 +23,18 @@ def run_html(run: Any) -> str:
     scores = [line["psnr_ldr"] for line in run.metrics() if "psnr_ldr" in line]
     figures += [f"held-out PSNR {score:.1f} dB" for score in scores[-1:]]
     figures += [f"view {shown.name}"] if shown else []
-    body, height = f"<p><b>{escape(run.scene_name)}</b> &middot; {escape(' · '.join(figures))}</p>", 40
+    body, height = f"<p><b>{escape(run.scene_name)}</b> &middot; {escape(' · '.join(figures))}</p>", 72
     if shown is not None:
         camera = shown.camera
         factor = min(1.0, _LONGEST / max(camera.width, camera.height))
         camera = camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
         light = as_array(run.render(camera).hdr) * np.float32(run.base_time)
         body += dial({"scene": light}, run.base_time, display_gain(run.response), "scene")
-        height += 50 + round(_LONGEST * camera.height / camera.width)
+        height += 34 + round(_LONGEST * camera.height / camera.width)
     script = "".join(map(page_file, ("tables.js", "light.js")))
     script = f"<script>{script}document.querySelectorAll('.dial').forEach(startDial);</script>"
     style = f"<style>{page_file('style.css')}{_STYLE}</style>"
     head = f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>run</title>{style}</head>'
     page = f"{head}<body>{body}{script}</body></html>"
-    frame = f'width="{_LONGEST + 8}" height="{height}" style="border: 0; max-width: 100%"'
+    frame = f'width="{_LONGEST + 24}" height="{height}" style="border: 0; border-radius: 6px; max-width: 100%"'
     return f'<iframe srcdoc="{escape(page)}" {frame}></iframe>'

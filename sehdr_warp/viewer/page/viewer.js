@@ -134,13 +134,14 @@ async function load(draft) {
   const [near, far] = [0.02, 0.98].map(part => fromHalf(depths[Math.floor(part * depths.length)] || 0x3c00));
   Object.assign(light.settings, {near, far});
   legend();
-  tell(state.told = `${width} \u00d7 ${height} \u00b7 ${took.toFixed(0)} ms \u00b7 ${facts.gaussians.toLocaleString("en").replaceAll(",", "\u202f")} Gaussians`
+  tell(state.told = `${width} \u00d7 ${height} \u00b7 ${took.toFixed(0)} ms \u00b7 ${counts(facts.gaussians)} Gaussians`
     + (facts.iterations && $("training").hidden ? ` \u00b7 ${facts.iterations} steps` : ""));
   if (!draft) nearestPhoto();
   histogram();
   paint();
   if (!draft && wanted === null) stage.dataset.frame = "full";  // Nothing better is to come
 }
+const counts = number => number.toLocaleString("en").replaceAll(",", "\u202f");
 const tell = text => { $("told").textContent = text; };
 const zoom = () => 2 ** Number($("zoom").value);
 
@@ -151,8 +152,10 @@ function paint() {
   const photo = view ? {toPhoto: between(drawn.camera, view.camera), photoLens: lensOf(view.camera)} : {};
   light.draw({stops: state.stops, tone: $("tone").value, white: 2 ** Number($("white").value), overlay: $("overlay").value === "error" && !ready ? "none" : $("overlay").value,
               split, left: left === "photo" ? 2 : left === "0" ? 0 : 1, lens: lensOf(drawn.camera), ...photo});
-  $("handle").hidden = left === "0";
+  $("handle").hidden = $("left").value === "0";
   $("handle").style.left = 100 * state.split + "%";
+  [left === "photo" ? view.name : left.startsWith("run") ? runs[Number(left.slice(3))].name : "", runs.length > 1 ? facts.name : "scene"]
+    .forEach((name, i) => { $("handle").children[i].textContent = name; });
   frusta();
   probe();
 }
@@ -381,14 +384,17 @@ async function startTraining() {
     try {
       const t = await (await ask("/training")).json();
       if (t.iteration === undefined) throw new Error("not yet");
-      $("progress").textContent = `${t.iteration} of ${t.total} \u00b7 loss ${t.loss.toFixed(4)} \u00b7 ${t.psnr.toFixed(1)} dB \u00b7 ${t.gaussians} Gaussians`
+      $("progress").textContent = `${t.iteration} of ${t.total} \u00b7 loss ${t.loss.toFixed(4)} \u00b7 ${t.psnr.toFixed(1)} dB \u00b7 ${counts(t.gaussians)} Gaussians`
         + (t.ended ? " \u00b7 ended" : t.left === null ? "" : ` \u00b7 ${t.left} left`) + ` \u00b7 ${(100 * t.share).toFixed(0)} % for pictures`;
       $("pause").textContent = t.paused ? "Resume" : "Pause";
       facts.gaussians = t.gaussians;
       curve(t.curve);
       if (t.iteration !== last && !document.hidden) request(false);
       last = t.iteration;
-    } catch (error) { $("progress").textContent = error.message === "not yet" ? "kernels are being compiled" : "the training has ended"; }
+    } catch (error) {
+      $("progress").textContent = error.message === "not yet" ? "kernels are being compiled" : "the training has ended";
+      if (error.message !== "not yet") return void ($("pause").disabled = $("step").disabled = true);
+    }
     await new Promise(done => setTimeout(done, 1000));
   }
 }
