@@ -152,7 +152,7 @@ function paint() {
   const photo = view ? {toPhoto: between(drawn.camera, view.camera), photoLens: lensOf(view.camera)} : {};
   light.draw({stops: state.stops, tone: $("tone").value, white: 2 ** Number($("white").value), overlay: $("overlay").value === "error" && !ready ? "none" : $("overlay").value,
               split, left: left === "photo" ? 2 : left === "0" ? 0 : 1, lens: lensOf(drawn.camera), ...photo});
-  $("handle").hidden = $("left").value === "0";
+  $("handle").hidden = left === "0";
   $("handle").style.left = 100 * state.split + "%";
   [left === "photo" ? view.name : left.startsWith("run") ? runs[Number(left.slice(3))].name : "", runs.length > 1 ? facts.name : "scene"]
     .forEach((name, i) => { $("handle").children[i].textContent = name; });
