@@ -76,7 +76,7 @@ def sweep(
             )
             for slot in range(neighbors.shape[1]):
                 other = neighbors[view, slot]
-                if other >= 0:
+                if other >= 0 and hidden[slot] == 0.0:
                     there = wp.transform_point(between[view, slot], here)
                     lens = intrinsics[other]
                     u = lens[0] * there[0] / there[2] + lens[2] - 0.5

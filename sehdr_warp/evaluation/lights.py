@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
 
 from ..scene import Camera
 
@@ -32,6 +31,8 @@ def light_regions(truth: np.ndarray, render: np.ndarray, camera: Camera) -> list
 
     truth, render: [H, W] radiance in one unit.
     """
+    from scipy import ndimage
+
     found = []
     labels = np.empty(truth.shape, np.int32)
     ndimage.label(truth > BRIGHT * truth.mean(), np.ones((3, 3)), output=labels)

@@ -1,10 +1,10 @@
 """The 3D Gaussians of a scene: their parameters, their start values, and changes of their number during training."""
 
 import math
+from typing import Any, Protocol
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from ..errors import SehdrError
@@ -12,6 +12,13 @@ from ..splats.arrays import HARMONIC_0
 from ..splatting.threads import thread_count
 
 PARAMETER_NAMES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics_dc", "harmonics_rest")
+
+
+class Optimizer(Protocol):
+    """What steps parameters and keeps tensors for each of them, laid out as torch.optim does."""
+
+    param_groups: list[dict[str, Any]]
+    state: Any
 
 
 class Gaussians(nn.Module):
@@ -85,20 +92,20 @@ class Gaussians(nn.Module):
         """Copies of the parameters at an index or mask [N]."""
         return {name: value[index].clone() for name, value in self.tensors().items()}
 
-    def keep(self, index: Tensor, optimizer: torch.optim.Optimizer | None = None) -> None:
+    def keep(self, index: Tensor, optimizer: Optimizer | None = None) -> None:
         """Keeps only the Gaussians at an index or mask [N], with their optimizer state."""
         if index.dtype == torch.bool:
             index = index.nonzero()[:, 0]  # once: each tensor indexed by a mask would wait for the device
         for name in PARAMETER_NAMES:
             self._exchange(name, getattr(self, name).detach()[index], optimizer, lambda state: state[index])
 
-    def append(self, rows: dict[str, Tensor], optimizer: torch.optim.Optimizer | None = None) -> None:
+    def append(self, rows: dict[str, Tensor], optimizer: Optimizer | None = None) -> None:
         """Adds M Gaussians, given as by rows(); their optimizer state starts at zero."""
         for name, old in self.tensors().items():
             nothing = torch.zeros_like(rows[name])
             self._exchange(name, torch.cat([old, rows[name]]), optimizer, lambda m, new=nothing: torch.cat([m, new]))
 
-    def resize(self, count: int, optimizer: torch.optim.Optimizer | None = None) -> None:
+    def resize(self, count: int, optimizer: Optimizer | None = None) -> None:
         """Makes them so many, the last of them arbitrary: for values that are written next."""
         if count < self.count:
             self.keep(torch.arange(count, device=self.means.device), optimizer)
@@ -107,7 +114,7 @@ class Gaussians(nn.Module):
             self.append({name: old.new_zeros(more, *old.shape[1:]) for name, old in self.tensors().items()}, optimizer)
 
     def overwrite(
-        self, rows: dict[str, Tensor], index: Tensor | None = None, optimizer: torch.optim.Optimizer | None = None
+        self, rows: dict[str, Tensor], index: Tensor | None = None, optimizer: Optimizer | None = None
     ) -> None:
         """Writes values of some parameters in place, at an index or mask [N] or everywhere, and zeroes the optimizer
         state there."""
@@ -116,7 +123,7 @@ class Gaussians(nn.Module):
             getattr(self, name).detach()[where] = values
             self.forget(name, where, optimizer)
 
-    def forget(self, name: str, where, optimizer: torch.optim.Optimizer | None) -> None:
+    def forget(self, name: str, where, optimizer: Optimizer | None) -> None:
         """Zeroes a parameter's optimizer state at an index, mask or slice."""
         for state in _moments(optimizer, getattr(self, name)).values():
             state[where] = 0
@@ -147,6 +154,8 @@ def neighbour_distances(points: Tensor) -> Tensor:
     if len(broken):
         problem = f"point {broken[0]} of {len(points)} is {positions[broken[0]].tolist()}"
         raise SehdrError(f"{problem}: a point cloud needs finite coordinates; remove such points")
+    from scipy.spatial import KDTree
+
     tree = KDTree(positions, balanced_tree=False, compact_nodes=False)
     distances = np.empty((len(positions), 4))
     # In the tree's own order, in which queries that follow each other read the same nodes.

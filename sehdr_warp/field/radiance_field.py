@@ -223,7 +223,8 @@ class RadianceField(nn.Module):
         with torch.enable_grad():
             features = images.new_zeros(self.gaussians.count, images.shape[2]).requires_grad_()
             blended = self._rasterize(camera, features).image
-            return torch.autograd.grad(blended, features, images)[0]
+            # Of one number: to check given gradients torch loads its compiler, two seconds.
+            return torch.autograd.grad((blended * images).sum(), features)[0]
 
     def _colors(self, position: Tensor, degree: int | None) -> tuple[Tensor, Tensor | None]:
         gaussians = self.gaussians

@@ -5,7 +5,6 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch
-from scipy import ndimage
 
 from ..response import Response
 from ..scene import View
@@ -35,6 +34,8 @@ class Region:
 def unexplained_regions(field: RadianceField, views: Sequence[View], *, degree: int | None = None) -> list[Region]:
     """Of up to 200 photos, evenly chosen, the regions of LEAST_PIXELS and more that a field shows otherwise, the worst
     first: by area times stops. Lines a pixel wide, as edges leave them, are none."""
+    from scipy import ndimage
+
     found = []
     for view in views[:: -(-len(views) // MOST_VIEWS) or 1]:
         exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time

@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import lsmr
 
 from ..response import Response
 from .types import Scene, View, codes_of, encoded_values
@@ -68,6 +66,9 @@ def start_gains(views: Sequence[View], response: Response) -> PhotoGains:
 def fit_gains(views: Sequence[View], others: Sequence[View], points: np.ndarray, response: Response) -> PhotoGains:
     """Gains and falloff by which photos show points [P, 3] of surfaces in one light: least squares of logarithms, in
     which what disagrees counts ever less (Cauchy's weights). others: photos that take no part, and get their median."""
+    from scipy import sparse
+    from scipy.sparse.linalg import lsmr
+
     names = [view.name for view in (*views, *others)]
     light, radius = zip(*(_light(view, points, response) for view in (*views, *others)), strict=True)
     light, radius = np.stack(light), np.stack(radius)  # [V, P, 3], nan where unknown; [V, P]

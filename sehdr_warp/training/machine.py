@@ -60,7 +60,8 @@ def torch_settings(deterministic: bool) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
-        torch.use_deterministic_algorithms(ordered)
+        if deterministic:  # The call alone loads torch's compiler, two seconds.
+            torch.use_deterministic_algorithms(ordered)
         memory.fill_uninitialized_memory = filled
 
 

@@ -6,6 +6,7 @@ and with the same variance, as B steps of one do (the rule of Grendel-GS, ICLR 2
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 
 import torch
@@ -20,9 +21,21 @@ BETAS = 0.9, 0.999
 EPSILON = 1e-15  # 3DGS: gradients of a single Gaussian are tiny, and must not drown in Adam's usual 1e-8
 
 
-class Adam(torch.optim.Adam):
-    """torch's Adam with its state, its steps made by splatting.training_step."""
+class Adam:
+    """Adam by splatting.training_step. Groups and state are laid out as torch.optim.Adam's, whose making loads torch's
+    compiler: two seconds of every start."""
 
+    def __init__(self, groups: list[dict], betas: tuple[float, float]):
+        self.param_groups = [{"betas": betas, "eps": EPSILON} | group for group in groups]
+        self.state: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict)
+
+    def zero_grad(self) -> None:
+        """Forgets the gradients of all parameters."""
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = None
+
+    @torch.no_grad()
     def step(self, skipped: Tensor | None = None, made: Tensor | None = None) -> None:
         """skipped: scalar, 1 where parameters, moments and step count stay as they are. made: 1 - skipped."""
         grouped = [(group, p) for group in self.param_groups for p in group["params"] if p.grad is not None]
@@ -57,8 +70,7 @@ def make_optimizer(field: RadianceField, config: Config, extent: float, batch: i
     for group in groups:
         rate = group["lr"] * math.sqrt(batch)
         group["lr"] = torch.tensor(rate, device=device) if device.type == "cuda" else rate
-    betas = tuple(beta**batch for beta in BETAS)
-    return Adam(groups, betas=betas, eps=EPSILON, fused=True, capturable=device.type == "cuda")
+    return Adam(groups, betas=(BETAS[0] ** batch, BETAS[1] ** batch))
 
 
 def means_rate(config: Config, extent: float, iteration: int, batch: int = 1) -> float:
@@ -68,7 +80,7 @@ def means_rate(config: Config, extent: float, iteration: int, batch: int = 1) ->
     return math.sqrt(batch) * extent * rates.means * (rates.means_final / rates.means) ** part
 
 
-def set_means_rate(optimizer: torch.optim.Adam, rate: float) -> None:
+def set_means_rate(optimizer: Adam, rate: float) -> None:
     """Sets the learning rate of the positions for the next step."""
     group = optimizer.param_groups[PARAMETER_NAMES.index("means")]
     if isinstance(group["lr"], Tensor):
@@ -91,7 +103,7 @@ class FlatGradients:
     """The gradients of all parameters of an optimizer in one buffer, behind them two numbers of the step: its loss, and
     whether its rendering was incomplete."""
 
-    def __init__(self, optimizer: torch.optim.Adam):
+    def __init__(self, optimizer: Adam):
         self.parameters = [p for group in optimizer.param_groups for p in group["params"]]
         sizes = [parameter.numel() for parameter in self.parameters]
         self.buffer = torch.zeros(sum(sizes) + 2, device=self.parameters[0].device)
@@ -99,7 +111,7 @@ class FlatGradients:
         self._views = [part.view(p.shape) for part, p in zip(parts, self.parameters, strict=True)]
         self._given: Sequence[int] = ()
 
-    def fits(self, optimizer: torch.optim.Adam) -> bool:
+    def fits(self, optimizer: Adam) -> bool:
         """Whether these are still the optimizer's parameters."""
         return all(
             ours is theirs
@@ -126,7 +138,7 @@ class FlatGradients:
         return self.numbers[0], self.numbers[1] > 0
 
 
-def optimizer_tensors(optimizer: torch.optim.Adam, batch: int = 1) -> dict[str, Tensor]:
+def optimizer_tensors(optimizer: Adam, batch: int = 1) -> dict[str, Tensor]:
     """Adam's state as named tensors, `<group>.<index>.<key>`, for a checkpoint. Steps count photos there, of which one
     makes `batch`: a training may go on with another."""
     states = {prefix: optimizer.state.get(parameter, {}) for prefix, parameter in _named(optimizer)}
@@ -137,7 +149,7 @@ def optimizer_tensors(optimizer: torch.optim.Adam, batch: int = 1) -> dict[str, 
     }
 
 
-def load_optimizer_tensors(optimizer: torch.optim.Adam, tensors: dict[str, Tensor], batch: int = 1) -> None:
+def load_optimizer_tensors(optimizer: Adam, tensors: dict[str, Tensor], batch: int = 1) -> None:
     """Takes up what optimizer_tensors gave."""
     for prefix, parameter in _named(optimizer):
         if state := under(tensors, prefix):
@@ -153,7 +165,7 @@ def under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
 
 
-def _named(optimizer: torch.optim.Adam) -> Iterator[tuple[str, Tensor]]:
+def _named(optimizer: Adam) -> Iterator[tuple[str, Tensor]]:
     for group in optimizer.param_groups:
         for index, parameter in enumerate(group["params"]):
             yield f"{group['name']}.{index}.", parameter

@@ -237,7 +237,7 @@ class Trainer:
         nonfinite, made = adam.guarded_step(self.optimizer, loss, incomplete)
         if seen.watched:
             self.densification.observe(rendering, seen.width, seen.height, made)
-        self.optimizer.zero_grad(set_to_none=True)
+        self.optimizer.zero_grad()
         self._skipped += nonfinite
         if seen.capacity is None:
             self._capacity.launched(rendering.entry_count)
@@ -290,7 +290,7 @@ class Trainer:
             # What a broken recording leaves behind on the device is no ground to go on from.
             raise SehdrError(
                 f"iteration {self.iteration}: the step could not be recorded as a CUDA graph "
-                f"({str(error).splitlines()[0]}); train with --set schedule.recorded=false, which is slower"
+                f"({str(error).splitlines()[0]}); train with --schedule.recorded=false, which is slower"
             ) from error
 
     def check(self) -> None:
