@@ -8,12 +8,12 @@ from sehdr_warp.training.train import train
 from .toy import load_unscaled
 
 SHORT = {
-    "schedule.iterations": 120,
+    "schedule.iterations": 60,
     "schedule.harmonics_every": 20,
-    "densification.start": 20,
-    "densification.stop": 90,
-    "densification.every": 15,
-    "densification.reset_every": 60,
+    "densification.start": 10,
+    "densification.stop": 50,
+    "densification.every": 10,
+    "densification.reset_every": 30,
     "deterministic": True,
 }
 
