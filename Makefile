@@ -10,10 +10,11 @@
 PYTHON ?= python3
 VENV ?= .venv
 DEMO ?= runs/demo
-PYTEST ?= -q -n auto
+PYTEST ?= -q -n auto --dist worksteal
 
 BIN = $(VENV)/bin
-PIP = $(BIN)/python -m pip --disable-pip-version-check install -qq --constraint constraints.txt
+# Python compiles what is imported when it is; pip would compile all of it, most of which nothing imports.
+PIP = $(BIN)/python -m pip --disable-pip-version-check install -qq --no-compile --constraint constraints.txt
 
 # Editable as one plain line in site-packages, which editors and type checkers can follow; setuptools' default is an import
 # hook, which they cannot. The links sehdr_warp/kernels and sehdr_warp/configs complete the package in a checkout.
@@ -24,17 +25,24 @@ EDITABLE = $(PIP) --no-build-isolation --config-settings editable_mode=compat --
 TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
-.PHONY: demo test lint docs pictures reports
+.PHONY: demo demo-eval demo-render demo-report test lint docs pictures reports
 
 demo: $(VENV)/installed
 	$(BIN)/sehdr-warp train embedded --out $(DEMO)/run --preset demo --response hdr-nerf --device cpu --overwrite
-	$(BIN)/sehdr-warp eval $(DEMO)/run --json $(DEMO)/eval.json --device cpu --overwrite
-	$(BIN)/sehdr-warp render $(DEMO)/run --out $(DEMO)/views --evs=-4,-2,0,2,4 --device cpu --overwrite
-	$(BIN)/sehdr-warp report $(DEMO)/run --out $(DEMO)/report --device cpu --overwrite
+	@$(MAKE) --no-print-directory --jobs=2 demo-eval demo-render demo-report
 	@echo
 	@echo "Made: a trained HDR scene in $(DEMO)/run, its figures in $(DEMO)/eval.json."
 	@echo "Next: source $(BIN)/activate, then sehdr-warp --help. Brackets as OpenEXR: $(DEMO)/views/brackets"
 	@echo "Open in a browser: $(DEMO)/report/report.html"
+
+demo-eval:
+	$(BIN)/sehdr-warp eval $(DEMO)/run --json $(DEMO)/eval.json --device cpu --overwrite
+
+demo-render:
+	$(BIN)/sehdr-warp render $(DEMO)/run --out $(DEMO)/views --evs=-4,-2,0,2,4 --device cpu --overwrite
+
+demo-report:
+	$(BIN)/sehdr-warp report $(DEMO)/run --out $(DEMO)/report --device cpu --overwrite
 
 test: $(VENV)/installed-test
 	$(BIN)/python -m pytest $(PYTEST)
@@ -57,8 +65,8 @@ pictures: $(VENV)/installed
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(PIP) torch==$(TORCH)+cpu 2>/dev/null || $(PIP) torch==$(TORCH) --extra-index-url $(TORCH_INDEX)
-	$(PIP) setuptools wheel
+	$(PIP) torch==$(TORCH)+cpu setuptools wheel 2>/dev/null || \
+		$(PIP) torch==$(TORCH) setuptools wheel --extra-index-url $(TORCH_INDEX)
 	$(EDITABLE) '.[hdr]'
 	touch $@
 

@@ -8,6 +8,8 @@ import pytest
 
 # As the command line does, and for its reason; before anything loads torch.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# Tests run side by side: threads of linear algebra would wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -36,6 +38,17 @@ def plain_logs():
 def own_cache(tmp_path_factory):
     """Structure from motion keeps its results for the session, not in the user's cache."""
     os.environ["SEHDR_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture(scope="session")
+def embedded_run(own_cache, tmp_path_factory) -> Path:
+    """A very short training of the embedded scene, made through the command line; not to be changed."""
+    from .refusals import call
+
+    out = tmp_path_factory.mktemp("embedded") / "run"
+    flags = "--preset demo --iterations 30 --max-size 48 --response hdr-nerf --device cpu --seed 3"
+    assert call("train", "embedded", "--out", out, *flags.split()) == 0
+    return out
 
 
 @pytest.fixture(scope="session")

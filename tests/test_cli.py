@@ -17,13 +17,9 @@ from sehdr_warp.training.config_files import config_fields, flag_of, load_config
 from .refusals import call
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A very short training of the embedded scene, made through the command line."""
-    out = tmp_path_factory.mktemp("cli") / "run"
-    arguments = ["train", "embedded", "--out", str(out), "--preset", "demo", "--iterations", "30", "--max-size", "48"]
-    assert call(*arguments, "--response", "hdr-nerf", "--device", "cpu", "--seed", "3") == 0
-    return out
+@pytest.fixture
+def run(embedded_run):
+    return embedded_run
 
 
 @pytest.mark.parametrize("command", [["check", "--cases", "needle"], ["train", "--help"], ["--help"], ["presets"]])
@@ -75,18 +71,18 @@ def test_every_command_explains_itself(name, capsys):
     assert f"sehdr-warp {name}" in text and "None" not in text
 
 
-def test_help_is_quick_and_needs_no_torch():
-    """Under a second of processor time: how long that takes is a matter of what else runs."""
-    call = "try: cli.main(['{}', '--help'])\nexcept SystemExit: print('torch' in sys.modules, time.process_time())"
-    for words in ("train", "--help"):
-        code = f"import sys, time; from sehdr_warp import cli\n{call.format(words)}"
-        times = []
-        for _ in range(3):
-            out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-            torch, seconds = out.split()[-2:]
-            assert torch == "False"
-            times.append(float(seconds))
-        assert min(times) < 1.0
+@pytest.mark.parametrize("words", ["train", "--help"])
+def test_help_is_quick_and_needs_no_torch(words):
+    """Under a second of processor time, in one of three tries: how long that takes is a matter of what else runs."""
+    code = f"import sys, time; from sehdr_warp import cli\ntry: cli.main(['{words}', '--help'])\n"
+    code += "except SystemExit: print('torch' in sys.modules, time.process_time())"
+    for _ in range(3):
+        out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+        torch, seconds = out.split()[-2:]
+        assert torch == "False"
+        if float(seconds) < 1.0:
+            return
+    pytest.fail(f"{seconds} s")
 
 
 @pytest.mark.parametrize(

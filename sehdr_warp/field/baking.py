@@ -16,6 +16,7 @@ from torch import Tensor
 from ..response import response_by_name
 from ..scene import Camera
 from ..splats.arrays import HARMONIC_0, GaussianArrays, evaluate_colors, harmonic_basis
+from .adam import Adam
 from .gaussians import Gaussians
 from .radiance_field import CameraTensors, RadianceField
 from .sensor_colors import rec709_of
@@ -159,15 +160,16 @@ def refine(
     device = next(iter(wanted.values())).device
     field = field_of(gaussians).to(device)
     changed = {name: getattr(field.gaussians, name).requires_grad_() for name in RATES}
-    optimizer = torch.optim.Adam([{"params": [value], "lr": RATES[name]} for name, value in changed.items()], eps=1e-15)
-    fading = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, len(order))
-    for index in order:
+    optimizer = Adam([{"params": [value]} for value in changed.values()])
+    for step, index in enumerate(order):
+        fading = 0.5 * (1 + math.cos(math.pi * step / len(order)))
+        for group, rate in zip(optimizer.param_groups, RATES.values(), strict=True):
+            group["lr"] = rate * fading
         shown = field.photograph(CameraTensors.of(cameras[index], device), field.base_time).encoded
         assert shown is not None
         optimizer.zero_grad()
         (shown.clamp(0, 1) - wanted[index]).square().mean().backward()
         optimizer.step()
-        fading.step()
     return _stored(field)[0]
 
 

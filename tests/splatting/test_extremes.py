@@ -71,7 +71,7 @@ def test_one_gaussian_over_a_whole_8k_image(device):
 
 def test_very_many_gaussians_in_one_tile(device):
     """All in one tile: as many entries as Gaussians, the front ones hide the rest."""
-    count = 1_000_000
+    count = 1_000_000 if device.startswith("cuda") else 300_000  # More than one sort takes
     generator = torch.Generator().manual_seed(0)
     depth = 2.0 + torch.arange(count) / count
     spread = (torch.rand(count, 2, generator=generator) - 0.5) * 16 / 64 * depth[:, None]

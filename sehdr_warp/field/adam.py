@@ -1,0 +1,44 @@
+"""Adam without torch.optim, whose making loads torch's compiler: two seconds of every start."""
+
+from collections import defaultdict
+
+import torch
+from torch import Tensor
+
+from ..splatting.training_step import adam_step
+
+BETAS = 0.9, 0.999
+EPSILON = 1e-15  # 3DGS: gradients of a single Gaussian are tiny, and must not drown in Adam's usual 1e-8
+
+
+class Adam:
+    """Steps of splatting.training_step; groups, of `params` and `lr`, and state are laid out as torch.optim.Adam's."""
+
+    def __init__(self, groups: list[dict], betas: tuple[float, float] = BETAS):
+        self.param_groups = [{"betas": betas, "eps": EPSILON} | group for group in groups]
+        self.state: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict)
+
+    def zero_grad(self) -> None:
+        """Forgets the gradients of all parameters."""
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = None
+
+    @torch.no_grad()
+    def step(self, skipped: Tensor | None = None, made: Tensor | None = None) -> None:
+        """skipped: scalar, 1 where parameters, moments and step count stay as they are. made: 1 - skipped."""
+        grouped = [(group, p) for group in self.param_groups for p in group["params"] if p.grad is not None]
+        parameters = [parameter for _, parameter in grouped]
+        skipped = parameters[0].new_zeros(()) if skipped is None else skipped
+        made = 1 - skipped if made is None else made
+        for parameter in parameters:
+            if not self.state[parameter]:
+                moments = (torch.zeros_like(parameter, memory_format=torch.contiguous_format) for _ in range(2))
+                self.state[parameter] = {"step": torch.zeros((), device=parameter.device)}
+                self.state[parameter] |= zip(("exp_avg", "exp_avg_sq"), moments, strict=True)
+        # With lists on both sides: to add one tensor to many, torch reads it on the host, which no recording allows.
+        torch._foreach_add_([self.state[p]["step"] for p in parameters], [made] * len(parameters))
+        for group, parameter in grouped:
+            given = parameter.detach(), parameter.grad.contiguous()
+            state = (self.state[parameter][key] for key in ("exp_avg", "exp_avg_sq", "step"))
+            adam_step(*given, *state, skipped, rate=group["lr"], betas=group["betas"], epsilon=group["eps"])
