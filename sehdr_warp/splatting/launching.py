@@ -179,7 +179,12 @@ def _stream(device: torch.device) -> wp.Stream | None:
     if device.type == "cpu":
         return None
     # One Warp object a stream, for good: when a second one dies, Warp forgets the stream, in mid-capture too.
-    key = device.index, torch._C._cuda_getCurrentRawStream(device.index)
+    key = device.index, stream_handle(device)
     if key not in _streams:
         _streams[key] = wp.Stream(wp.device_from_torch(device), cuda_stream=key[1])
     return _streams[key]
+
+
+def stream_handle(device: torch.device) -> int:
+    """CUDA's handle of torch's current stream, in a tenth of the time that torch.cuda.current_stream() takes."""
+    return torch._C._cuda_getCurrentRawStream(device.index)

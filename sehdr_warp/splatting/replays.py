@@ -17,7 +17,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .blending import Picture, blend_on_cuda
+from .blending import Adjoint, Picture, blend_on_cuda
+from .launching import stream_handle
 from .recording import GraphRecorder, is_recording
 from .tile_lists import ONE_SORT, build_tile_lists, number_entries, pack_records
 
@@ -27,6 +28,7 @@ LAUNCHED_FIRST = 4  # Calls of a kind before it is recorded: a recording costs a
 KINDS = 3  # Kinds of calls that are remembered, the latest
 TOGETHER = 4  # Calls of a kind whose backward passes are still to come: each has a recording of its own
 LARGEST_IMAGE = 1 << 21  # In pixels; larger ones wait for the GPU as it is
+LARGEST_COUNT = 1 << 21  # Of Gaussians, without a backward pass; with one the host is behind only up to ONE_SORT
 ROOM = 1.25  # For this many times the (Gaussian, tile) pairs of the call that is recorded
 LEAST_ROOM = 1 << 12
 
@@ -58,12 +60,12 @@ def replayed(given: Given, frame: Frame, differentiable: bool) -> tuple[Picture,
     given: its extents become 0 where a feature is not finite.
     differentiable: whether the picture's adjoint may be asked for.
     """
-    features = given.features
-    small = 0 < len(features) <= ONE_SORT and frame.width * frame.height <= LARGEST_IMAGE
-    if features.device.type != "cuda" or features.dtype != torch.float32 or not small or is_recording(features.device):
+    features, device = given.features, given.features.device
+    small = 0 < len(features) <= (ONE_SORT if differentiable else LARGEST_COUNT)
+    small &= frame.width * frame.height <= LARGEST_IMAGE
+    if device.type != "cuda" or features.dtype != torch.float32 or not small or is_recording(device):
         return None
-    stream = torch.cuda.current_stream(features.device).cuda_stream
-    kind = _kind((features.device, stream, *features.shape, frame, differentiable))
+    kind = _kind((device, stream_handle(device), *features.shape, frame, differentiable))
     recording = kind.take(lambda pairs: _Recording(given, frame, differentiable, pairs))
     if recording is None:
         return None
@@ -89,41 +91,41 @@ class _Recording:
         means2d, conics, opacities, features, depths, extents = self._given
         self._image = features.new_empty(height, width, features.shape[1])
         self._transmittance = features.new_empty(height, width)
-        self._by_image = torch.zeros_like(self._image) if differentiable else None
+        self._by_image = by_image = torch.zeros_like(self._image) if differentiable else None
         self._pairs = torch.empty(1, dtype=torch.int64, pin_memory=True)
-        self._counted = torch.cuda.Event()
+        self._counted, self._stream = torch.cuda.Event(), torch.cuda.current_stream(features.device)
         self._counter = GraphRecorder(features.device)
         self._drawer, self._differentiator = (GraphRecorder(features.device, self._counter.stream) for _ in range(2))
 
-        def count() -> tuple[tuple[Tensor, Tensor], Tensor]:
+        def count():
             records, counts = pack_records(means2d, conics, opacities, extents, threshold, width, height, features)
-            return records, number_entries(counts, depths, extents, emission=False)[1]
+            return records, number_entries(counts, depths, extents, emission=False)
 
-        def draw(records: tuple[Tensor, Tensor], ends: Tensor, room: int) -> Callable[..., Tensor]:
-            lists = build_tile_lists(records, None, ends, depths, extents, width, height, room, emission=False)
-            picture = self._image, self._transmittance
-            return blend_on_cuda(features, lists, records, *picture, threshold, False)
+        def draw(records, numbered, room: int) -> Adjoint:
+            lists = build_tile_lists(records, *numbered, depths, extents, width, height, room, emission=False)
+            return blend_on_cuda(features, lists, records, self._image, self._transmittance, threshold, False)
 
         # Launched once: nothing may be compiled or loaded during a recording, and it tells how much room is needed.
         with self._counter.launching():
-            records, ends = count()
-            self.room = max(LEAST_ROOM, int(ROOM * max(pairs, int(ends[-1]))))
-            adjoint = draw(records, ends, self.room)
-            if self._by_image is not None:
-                adjoint(self._by_image, None)
-            del records, ends, adjoint
-        records, self._ends = self._counter.record(None, count)
-        self._adjoint = self._drawer.record(None, lambda: draw(records, self._ends, self.room))
+            records, numbered = count()
+            self.room = max(LEAST_ROOM, int(ROOM * max(pairs, int(numbered[1][-1]))))
+            adjoint = draw(records, numbered, self.room)
+            if by_image is not None:
+                adjoint(by_image, None)
+            del records, numbered, adjoint
+        records, numbered = self._counter.record(None, count)
+        self._ends = numbered[1]
+        self._adjoint = self._drawer.record(None, lambda: draw(records, numbered, self.room))
         self._gathered = None
-        if self._by_image is not None:
-            self._gathered = self._differentiator.record(None, lambda: self._adjoint(self._by_image, None))
+        if by_image is not None:
+            self._gathered = self._differentiator.record(None, lambda: self._adjoint(by_image, None))
 
     def play(self, given: Given) -> tuple[Tensor, Tensor, int]:
         """Image, transmittance and the number of pairs, of which those beyond the room are not drawn."""
         torch._foreach_copy_(list(self._given), list(given))  # pyright: ignore[reportPrivateImportUsage]
         self._counter.replay()
         self._pairs.copy_(self._ends[-1:], non_blocking=True)
-        self._counted.record()
+        self._counted.record(self._stream)
         self._drawer.replay()
         picture = self._image.clone(), self._transmittance.clone()
         given.extents.copy_(self._given.extents)

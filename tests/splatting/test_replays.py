@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sehdr_warp.splatting import rasterize, replays
+from sehdr_warp.splatting import rasterize, replays, tile_lists
 
 from .scenes import random_like, random_scene, relative_error
 
@@ -88,7 +88,9 @@ def test_pictures_stay_and_backward_passes_come_in_any_order():
 
 
 @needs_gpu
-def test_without_gradients_pictures_stay_too():
+@pytest.mark.parametrize("one_sort", [1 << 18, 0])
+def test_without_gradients_pictures_stay_too(one_sort, monkeypatch):
+    monkeypatch.setattr(tile_lists, "ONE_SORT", one_sort)
     scene = scene_of()
     with torch.no_grad():
         images = [
