@@ -34,7 +34,7 @@ def told_of_ranks(scene: Scene, trainer: Trainer) -> Iterator[str]:
         return
     views, most = scene.train_views, max(trainer.field.gaussians.count, trainer.densification.most)
     pixels = sum(view.camera.width * view.camera.height for view in views) // len(views)
-    yield gain_of_ranks(trainer.ranks.count, most, pixels, trainer.device)
+    yield gain_of_ranks(trainer.ranks.count, most, pixels, trainer.config.schedule.iterations, trainer.device)
     yield from trainer.ranks.notes()
 
 

@@ -27,12 +27,12 @@ FEWEST_ITERATIONS = 4000
 CPU_SECONDS = 240.0  # What a training on a CPU may take, as far as CPU_FEWEST allows
 CPU_FEWEST = 1000
 CPU_PIXEL, CPU_GAUSSIAN = 1.5e-6, 2.3e-6  # Seconds of one core for each in a step, measured on two of an AMD EPYC
-STEP_SECONDS, PIXEL_SECONDS, GAUSSIAN_SECONDS = 6e-4, 1e-9, 3e-9
-"""Estimates of what a recorded step takes on a GPU of a data center: for itself, each pixel, each Gaussian."""
+STEP_SECONDS, PIXEL_SECONDS, GAUSSIAN_SECONDS = 4.6e-4, 3e-11, 3.9e-9
+"""What a recorded step takes on one H200: for itself, each pixel, each Gaussian."""
 NUMBERS = 59  # Of a Gaussian with harmonics of degree 3
-EXCHANGE_SECONDS, NUMBER_SECONDS = 3e-4, 2.5e-11
-"""Estimates of what ranks take to agree and to begin an exchange, and for each number of the gradients."""
-LEAST_GAIN = 0.7  # Of the number of ranks, from which they are worth it
+EXCHANGE_SECONDS, NUMBER_SECONDS = 1.1e-4, 1.66e-11
+"""What two H200 take beyond that to agree and to begin an exchange, and for each number of the gradients."""
+START_SECONDS = 10.0  # What more processes take to start, about
 REACH = 2.0**16  # Brackets farther from the photos' exposure are black or white in all pixels of 8 bits
 
 PROBES = 2000  # Places at which overlap and visibility are measured
@@ -194,17 +194,18 @@ def _codes(image: np.ndarray) -> tuple[float, float, float, float, float]:
     return clipped, black, image.mean(dtype=np.float64), np.square(image, dtype=np.float64).mean(), median
 
 
-def gain_of_ranks(count: int, gaussians: int, pixels: int, device: torch.device) -> str:
-    """What to expect of a training of so many Gaussians, on photos of so many pixels each, on `count` ranks."""
+def gain_of_ranks(count: int, gaussians: int, pixels: int, photos: int, device: torch.device) -> str:
+    """What to expect of a training of so many Gaussians, on so many photos one by one, each of so many pixels, on
+    `count` ranks."""
     if device.type == "cpu":
         shared = f"{count} processes share this machine's {thread_count() * count} threads"
         return f"plan: ranks: {shared}: no faster than one"
     step = STEP_SECONDS + PIXEL_SECONDS * pixels + GAUSSIAN_SECONDS * gaussians
     exchange = EXCHANGE_SECONDS + 2 * (1 - 1 / count) * NUMBER_SECONDS * NUMBERS * gaussians
-    gain = count * step / (step + exchange)
-    told = f"an estimated {gain:.1f} times one for {gaussians} Gaussians and {pixels / 1e6:.2g} megapixels"
-    if gain < LEAST_GAIN * count:
-        told = f"a step of about {1e3 * step:.1g} ms is too short to gain much ({told})"
+    alone, together = photos * step, photos / count * (step + exchange)
+    told = f"an estimated {alone / together:.1f} times one for {gaussians} Gaussians and {pixels / 1e6:.2g} megapixels"
+    if alone < together + START_SECONDS:
+        told = f"about {alone:.1g} s of steps are too few to gain by more processes ({told})"
     return f"plan: ranks: {count} GPUs, a photo each in a step: {told}"
 
 
