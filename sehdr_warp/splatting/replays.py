@@ -102,7 +102,8 @@ class _Recording:
             return records, number_entries(counts, depths, extents, emission=False)
 
         def draw(records, numbered, room: int) -> Adjoint:
-            lists = build_tile_lists(records, *numbered, depths, extents, width, height, room, emission=False)
+            order, ends = numbered
+            lists = build_tile_lists(records, order, ends, depths, extents, width, height, room, emission=False)
             return blend_on_cuda(features, lists, records, self._image, self._transmittance, threshold, False)
 
         # Launched once: nothing may be compiled or loaded during a recording, and it tells how much room is needed.
