@@ -37,8 +37,9 @@ class Adam:
                 self.state[parameter] = {"step": torch.zeros((), device=parameter.device)}
                 self.state[parameter] |= zip(("exp_avg", "exp_avg_sq"), moments, strict=True)
         # With lists on both sides: to add one tensor to many, torch reads it on the host, which no recording allows.
-        torch._foreach_add_([self.state[p]["step"] for p in parameters], [made] * len(parameters))
+        steps = [self.state[p]["step"] for p in parameters]
+        torch._foreach_add_(steps, [made] * len(steps))  # pyright: ignore[reportPrivateImportUsage]
         for group, parameter in grouped:
-            given = parameter.detach(), parameter.grad.contiguous()
-            state = (self.state[parameter][key] for key in ("exp_avg", "exp_avg_sq", "step"))
-            adam_step(*given, *state, skipped, rate=group["lr"], betas=group["betas"], epsilon=group["eps"])
+            first, second, step = (self.state[parameter][key] for key in ("exp_avg", "exp_avg_sq", "step"))
+            options = {"rate": group["lr"], "betas": group["betas"], "epsilon": group["eps"]}
+            adam_step(parameter.detach(), parameter.grad.contiguous(), first, second, step, skipped, **options)
