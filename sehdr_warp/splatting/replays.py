@@ -20,7 +20,7 @@ from torch import Tensor
 from .blending import Adjoint, Picture, blend_on_cuda
 from .launching import stream_handle
 from .recording import GraphRecorder, is_recording
-from .tile_lists import ONE_SORT, build_tile_lists, number_entries, pack_records
+from .tile_lists import LARGEST_CAPACITY, ONE_SORT, build_tile_lists, number_entries, pack_records
 
 LOG = logging.getLogger(__name__)
 
@@ -109,7 +109,8 @@ class _Recording:
         # Launched once: nothing may be compiled or loaded during a recording, and it tells how much room is needed.
         with self._counter.launching():
             records, numbered = count()
-            self.room = max(LEAST_ROOM, int(ROOM * max(pairs, int(numbered[1][-1]))))
+            room = int(ROOM * max(pairs, int(numbered[1][-1])))
+            self.room = min(max(LEAST_ROOM, room), LARGEST_CAPACITY)
             adjoint = draw(records, numbered, self.room)
             if by_image is not None:
                 adjoint(by_image, None)
@@ -186,7 +187,14 @@ class _Lease:
 
 _lock = threading.Lock()
 _kinds: OrderedDict[tuple, _Kind] = OrderedDict()
-atexit.register(_kinds.clear)  # Recordings must go before CUDA does.
+
+
+def forget() -> None:
+    """Lets go of all recordings and of their memory."""
+    _kinds.clear()
+
+
+atexit.register(forget)  # Recordings must go before CUDA does.
 
 
 def _kind(key: tuple) -> _Kind:

@@ -13,7 +13,7 @@ CALLS = replays.LAUNCHED_FIRST + 3
 
 @pytest.fixture(autouse=True)
 def nothing_is_recorded():
-    replays._kinds.clear()
+    replays.forget()
 
 
 def launched(*arguments, **options):
