@@ -12,7 +12,8 @@ from sehdr_warp.training.train import train
 
 from ..training.wall_and_lamp import HALF, LAMP, wall_and_lamp
 
-CONFIG = load_config("fast", {"schedule.iterations": 250, "response.name": "linear", "plan.enabled": False})
+FIELDS = {"schedule.iterations": 250, "response.name": "linear", "plan.enabled": False, "densification.budget": 25.0}
+CONFIG = load_config("fast", FIELDS)
 
 
 def without_lamp(scene):
