@@ -1,6 +1,7 @@
 """The package as installed: public names, version, data, and how fast it is there."""
 
 import ast
+import json
 import subprocess
 import sys
 import time
@@ -62,3 +63,19 @@ def _seconds(code):
     started = time.perf_counter()
     subprocess.run([sys.executable, "-c", code], check=True)
     return time.perf_counter() - started
+
+
+def test_pins_with_known_holes_are_told(tmp_path):
+    """Versions from the first with the hole to before the first without; another package's do not count."""
+    folder = tmp_path / "vulns" / "pillow"
+    folder.mkdir(parents=True)
+    for name, fixed in (("open", "999"), ("mended", "1.0")):
+        events = [{"introduced": "0"}, {"fixed": fixed}]
+        affected = {"package": {"name": "Pillow"}, "ranges": [{"type": "ECOSYSTEM", "events": events}]}
+        text = json.dumps({"id": name, "modified": "2026-01-02T00:00:00Z", "affected": [affected]})
+        (folder / f"{name}.yaml").write_text(text)
+    told = subprocess.run(
+        [sys.executable, ROOT / ".ci" / "audit.py", tmp_path], capture_output=True, text=True, check=False
+    )
+    assert told.returncode == 1 and told.stdout.startswith("pillow==") and "open" in told.stdout
+    assert told.stdout.endswith("2 advisories about them, the newest of 2026-01-02: 1 holes\n")

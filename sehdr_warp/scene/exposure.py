@@ -10,7 +10,7 @@ from typing import Any
 from ..errors import InputError
 from ..files import read_bytes
 from .capture import Shot
-from .images import EXIF_ERRORS, HDR_SUFFIXES, RAW_SUFFIXES, open_image
+from .images import HDR_SUFFIXES, PILLOW_ERRORS, RAW_SUFFIXES, open_image
 
 _EXIF_IFD = 0x8769
 _EXPOSURE_TIME, _F_NUMBER, _SPEED, _SHUTTER_APEX = 33434, 33437, 34855, 37377
@@ -132,7 +132,7 @@ def exif_exposure(path: Path) -> tuple[float | None, float | None, float | None]
             table = image.getexif().get_ifd(_EXIF_IFD)
             tags = (_EXPOSURE_TIME, _SHUTTER_APEX, _SPEED, _F_NUMBER)
             time, apex, speed, aperture = (_number(table.get(tag)) for tag in tags)
-    except EXIF_ERRORS:
+    except PILLOW_ERRORS:
         return None, None, None
     if time is None and apex is not None and math.isfinite(apex) and abs(apex) < 64:
         time = 2.0**-apex

@@ -30,9 +30,11 @@ _OTHER_MODES = {
     "F": "floating-point values, not encoded ones",
 }
 DAMAGED = "copy or export the image again"
-_PILLOW_ERRORS = (OSError, SyntaxError, ValueError, EOFError, MemoryError)
-EXIF_ERRORS = (*_PILLOW_ERRORS, KeyError, TypeError, struct.error)
-"""What Pillow raises for damaged EXIF; the pixels may still be good."""
+PILLOW_ERRORS = (
+    ArithmeticError, AttributeError, EOFError, Image.DecompressionBombError, LookupError, MemoryError, OSError,
+    RuntimeError, SyntaxError, TypeError, ValueError, struct.error,
+)  # fmt: skip
+"""What Pillow raises for damaged files. Where it does for EXIF, the pixels may still be good."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> Encod
         try:
             pixels, alpha = _decode(image, path)
             turn = _orientation(image) if oriented else 1
-        except (*_PILLOW_ERRORS, Image.DecompressionBombError) as error:
+        except PILLOW_ERRORS as error:
             raise InputError(path, f"cannot be decoded ({error})", DAMAGED) from None
     return EncodedImage(_upright(pixels, turn), None if alpha is None else _upright(alpha, turn))
 
@@ -108,14 +110,15 @@ def open_image(path: Path, *, mask: bool = False) -> ImageFile.ImageFile:
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
         image = Image.open(path, formats=_FORMATS)
-    except _PILLOW_ERRORS as error:
+        several = getattr(image, "is_animated", False) and image.format != "MPO"
+    except PILLOW_ERRORS as error:
         detail = f", which is one of {', '.join(_FORMATS)}" if "cannot identify" in str(error) else f" ({error})"
         raise InputError(path, f"is not a readable image{detail}", DAMAGED) from None
     finally:
         Image.MAX_IMAGE_PIXELS = limit
     try:
         check_size(path, *image.size)
-        if getattr(image, "is_animated", False) and image.format != "MPO":
+        if several:
             raise InputError(path, "holds several pictures, pages or an animation", "save the one that counts")
         if image.mode not in (*_MODES, *("1" * mask)):
             found = _OTHER_MODES.get(image.mode, f"{image.mode}, not RGB")
@@ -203,5 +206,5 @@ def _orientation(image: Image.Image) -> int:
     """EXIF's orientation, 1 (as stored) where there is none."""
     try:
         return image.getexif().get(0x0112, 1)
-    except EXIF_ERRORS:
+    except PILLOW_ERRORS:
         return 1

@@ -24,7 +24,7 @@ from ..errors import InputError, SehdrError
 from ..files import atomic_folder, is_sealed, usable, user_cache
 from .colmap_model import SparseModel, read_model
 from .develop import told
-from .images import EXIF_ERRORS, LDR_SUFFIXES, open_image, read_ldr
+from .images import LDR_SUFFIXES, PILLOW_ERRORS, open_image, read_ldr
 
 _log = logging.getLogger("sehdr_warp.scene")
 
@@ -151,7 +151,7 @@ def _device(photo: Path) -> tuple[str, ...]:
             exif = image.getexif()
             lens = exif.get_ifd(0x8769)
             return str(exif.get(0x010F)), str(exif.get(0x0110)), str(lens.get(0x920A)), str(lens.get(0xA405))
-        except EXIF_ERRORS:
+        except PILLOW_ERRORS:
             return ("None",) * 4
 
 

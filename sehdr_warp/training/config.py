@@ -17,7 +17,8 @@ REFERENCE_ITERATIONS = 30_000  # The length of training for which iteration numb
 Part = Annotated[float, Field(ge=0.0, le=1.0)]
 Weight = Annotated[float, Field(ge=0.0, le=100.0)]
 Rate = Annotated[float, Field(gt=0.0, le=1.0)]
-Iteration = Annotated[int, Field(ge=1)]
+Iteration = Annotated[int, Field(ge=1, le=10**12)]
+Positive = Annotated[float, Field(gt=0.0, le=1e6)]
 Name = Annotated[str, Field(min_length=1)]
 Many = Field(strict=False)  # Lists, as TOML and JSON have them, are tuples here
 
@@ -116,24 +117,24 @@ class DensificationConfig(_Table):
     strategy: Literal["gradient", "relocation"] = "relocation"
     """gradient: clone and split where image gradients are large (3DGS); relocation: move the dead to where the living
     are (3DGS-MCMC)"""
-    start: Annotated[int, Field(ge=0)] = 500
+    start: Annotated[int, Field(ge=0, le=10**12)] = 500
     """first iteration after which the count may change"""
-    stop: Annotated[int, Field(ge=0)] = 15_000
+    stop: Annotated[int, Field(ge=0, le=10**12)] = 15_000
     """the iteration from which it may no longer"""
     every: Iteration = 100
     """iterations between changes"""
-    max_gaussians: Annotated[int, Field(ge=1)] = 3_000_000
+    max_gaussians: Annotated[int, Field(ge=1, le=2**31 - 1)] = 3_000_000
     """the count never exceeds this"""
-    budget: Annotated[float, Field(ge=0.0)] = 120.0
+    budget: Annotated[float, Field(ge=0.0, le=1e6)] = 120.0
     """relocation: nor this many times the square root of the training photos' pixels, if they start with fewer; 0: no
     such bound"""
-    grow_gradient: Annotated[float, Field(gt=0.0)] = 0.0002
+    grow_gradient: Positive = 0.0002
     """gradient: mean gradient in normalised screen units that makes one grow"""
-    grow_scale: Annotated[float, Field(gt=0.0)] = 0.01
+    grow_scale: Positive = 0.01
     """gradient: larger than this part of the scene is split, smaller is cloned"""
     prune_opacity: Annotated[float, Field(gt=0.0, le=0.5)] = 0.005
     """fainter ones are taken away (relocation: are moved)"""
-    prune_scale: Annotated[float, Field(gt=0.0)] = 0.1
+    prune_scale: Positive = 0.1
     """gradient: larger than this part of the scene is taken away after the first reset"""
     reset_every: Iteration = 3000
     """gradient: iterations between resets of the opacities"""
@@ -143,7 +144,7 @@ class DensificationConfig(_Table):
     births: Part = 0.2
     """relocation: part of the moved and the new ones that is born where the photos are explained worst, at depths on
     which they agree"""
-    noise: Annotated[float, Field(ge=0.0)] = 5e5
+    noise: Annotated[float, Field(ge=0.0, le=1e12)] = 5e5
     """relocation: strength of the noise on the positions, in learning rates"""
 
 

@@ -86,6 +86,7 @@ def test_every_field_is_documented_and_read(path, item):
         ("[los]\nclipping = true", ["los.clipping = True", "did you mean loss.clipping?"]),
         ("[model]\nradiance2 = 1", ["model.radiance2 = 1", "did you mean model.radiance?"]),
         ("[schedule]\niterations = 0", ["schedule.iterations = 0", "greater than or equal to 1"]),
+        ("[schedule]\ncheckpoint_every = 1" + "0" * 400, ["schedule.checkpoint_every", "less than or equal"]),
         ("[schedule]\niterations = 1.5", ["schedule.iterations = 1.5", "int"]),
         ("[loss]\nssim_weight = nan", ["loss.ssim_weight = nan", "finite"]),
         ("[model]\nradiance = 'rgb'", ["model.radiance = 'rgb'", "log"]),
@@ -107,6 +108,17 @@ def test_bad_files_name_file_field_and_value(tmp_path, text, words):
     assert str(path) in message and "\n" not in message
     for word in words:
         assert word in message
+
+
+def test_every_number_has_a_smallest_and_a_largest_value():
+    """A file may hold any: 10^400 is no float, and none has so many Gaussians."""
+    schema = Config.model_json_schema()
+    for part in (schema, *schema["$defs"].values()):
+        for name, field in part["properties"].items():
+            field = field.get("items", field)
+            if field.get("type") in ("integer", "number"):
+                assert {"minimum", "exclusiveMinimum"} & field.keys(), name
+                assert {"maximum", "exclusiveMaximum"} & field.keys(), name
 
 
 def test_missing_preset_is_refused():
