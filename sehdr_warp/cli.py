@@ -48,6 +48,8 @@ words_given: list[str] = []
 _LIGHT = {"presets", "config", "scenes", "completion"}
 """Commands that load no torch."""
 _LEAST_ADDRESS_SPACE = 1536 << 20
+_reserve = [bytearray(4 << 20)]
+"""Memory for the last words of a command that finds no more."""
 _MODULES = {name: command for group in COMMANDS.values() for name, command in group.items()}
 
 
@@ -69,6 +71,7 @@ def main(arguments: list[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
     except Exception as error:
+        _reserve.clear()
         told = surroundings_told(error)
         if told is None:
             raise

@@ -169,18 +169,25 @@ def _list(temporary: Path, path: Path) -> None:
         os.close(handle)
 
 
+def plain_size(path: Path) -> int:
+    """Bytes of a file; raises InputError for a folder, and for pipes and devices, which may never end, and OSError."""
+    size = path.stat().st_size
+    if not path.is_file():
+        raise InputError(path, "is a folder, a pipe or a device, not a file", "name a file")
+    return size
+
+
 def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     """The whole file; raises InputError where it is missing, unreadable, empty or larger than `limit` bytes."""
     try:
-        size = path.stat().st_size
-        if size > limit:
-            problem = f"{size} bytes is more than the limit of {limit}"
-            raise InputError(path, problem, "check that this is the right file")
+        if (size := plain_size(path)) > limit:
+            raise InputError(
+                path, f"{size} bytes is more than the limit of {limit}", "check that this is the right file"
+            )
         data = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(path, "file not found", "check the data folder") from None
     except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror or error})", "check the file and its rights") from None
+        problem = "file not found" if isinstance(error, FileNotFoundError) else f"cannot be read ({error.strerror})"
+        raise InputError(path, problem, "check the name and its rights") from None
     if not data:
         raise InputError(path, "file is empty", "copy or export the file again")
     return data
@@ -197,7 +204,7 @@ def read_text(path: Path, limit: int = MAX_FILE_BYTES) -> str:
 def read_lines(path: Path) -> Iterator[str]:
     """The lines of a file of UTF-8 text, one by one; raises InputError as read_text does, and for a line too long."""
     try:
-        if path.stat().st_size == 0:
+        if plain_size(path) == 0:
             read_bytes(path)
         with open(path, encoding="utf-8-sig") as file:
             while line := file.readline(_MAX_LINE):

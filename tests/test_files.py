@@ -8,7 +8,18 @@ import sys
 import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.files import LIST, atomic_folder, atomic_path, is_sealed, read_json, seal, write_json
+from sehdr_warp.files import (
+    LIST,
+    atomic_folder,
+    atomic_path,
+    is_sealed,
+    read_bytes,
+    read_json,
+    read_lines,
+    seal,
+    write_json,
+)
+from sehdr_warp.splats import read_gaussians
 
 from .full_disk import full_disk
 
@@ -257,3 +268,12 @@ with files.atomic_path(Path("a.txt"), overwrite=True) as file:
         other.communicate(b"\n")
     assert other.returncode == 0 and (tmp_path / "a.txt").read_text() == "theirs"
     assert listing(tmp_path) == ["a.txt"]
+
+
+@pytest.mark.parametrize("read", [read_bytes, lambda path: list(read_lines(path)), read_gaussians])
+def test_devices_and_pipes_are_not_read(tmp_path, read):
+    """Such as a pipe that nobody writes to, or /dev/zero; /dev/null would end at once."""
+    path = tmp_path / "a.ply"
+    path.symlink_to(os.devnull)
+    with pytest.raises(InputError, match="is a folder, a pipe or a device"):
+        read(path)

@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.files import read_bytes
 
 from .colorspace import from_rec709
 
@@ -26,6 +28,8 @@ def ocio_view(config: str, view: str, gain: float = 1.0) -> Callable[[np.ndarray
         OCIO: Any = import_module("PyOpenColorIO")  # Its stubs lack what it loads from its library.
     except ImportError:
         raise SehdrError("--ocio needs OpenColorIO; run `pip install sehdr-warp[ocio]`") from None
+    if not config.startswith("ocio://"):
+        read_bytes(Path(config))
     try:
         read = OCIO.Config.CreateFromFile(config)
         read.validate()

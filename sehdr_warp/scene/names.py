@@ -1,6 +1,7 @@
 """The order of file names, files beside each other, and names of views."""
 
 import itertools
+import os
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -34,7 +35,7 @@ def mask_of(folder: Path, name: str, source: Path) -> Path | None:
     """The mask of the image called `name`: `masks/<name>.png` (COLMAP's habit) or `masks/<stem>.png`."""
     masks = (f"{name}.png", str(Path(name).with_suffix(".png")))
     places = (contained(folder / "masks", mask, source) for mask in masks)
-    return next((place for place in places if place.is_file()), None)
+    return next((place for place in places if os.path.isfile(place)), None)
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:

@@ -1,5 +1,6 @@
 """Readers of folders without transforms: COLMAP's sets and HDR-GS's, HDR-NeRF's real ones and LLFF's, bare photos."""
 
+import os
 import re
 from pathlib import Path
 
@@ -39,7 +40,7 @@ def read_colmap(folder: Path) -> Capture:
         image = contained(images, entry.name, source)
         if image.suffix.lower() in HDR_SUFFIXES and (photo := sibling(image, LDR_SUFFIXES)):
             hdr, image = image, photo
-        elif not image.is_file():
+        elif not os.path.isfile(image):  # As of a name that no file can have.
             absent.append(entry.name)
             continue
         else:

@@ -75,8 +75,9 @@ def calibrate(
         check_absent(path, overwrite)
     files, times = read_stack(folder, times)
     name = folder.name if out is None else Path(out).stem
+    photos = [read_ldr(file).pixels for file in files]
     try:
-        found = calibrate_codes([read_ldr(file).pixels for file in files], times, channel=channel, name=name)
+        found = calibrate_codes(photos, times, channel=channel, name=name)
     except InputError as error:
         raise InputError(folder, *error.args[0].split(": ", 1)[1].split("; ", 1)) from None
     _tell(found, files, channel)

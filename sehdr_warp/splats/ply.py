@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from ..files import atomic_path
+from ..files import atomic_path, plain_size
 from .arrays import GaussianArrays, degree_of
 
 _DAMAGED = "copy or export the file again"
@@ -91,6 +91,7 @@ def _check_header(path: Path) -> None:
 
 def _start(path: Path) -> bytes:
     try:
+        plain_size(path)
         with path.open("rb") as file:
             return file.read(_MOST_HEADER)
     except FileNotFoundError:

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 from torch import Tensor
 
 from ..errors import InputError
-from ..files import read_json
+from ..files import plain_size, read_json
 from ..scene.exposure import LONGEST, SHORTEST
 from .config_files import field_and_problem
 
@@ -75,6 +75,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
     values, file = read_values(path / VALUES, _CheckpointValues, _OLDER), path / TENSORS
     try:
+        plain_size(file)
         data = file.read_bytes()
         if hashlib.sha256(data).hexdigest() != values.get("sha256"):
             raise InputError(file, f"its SHA-256 is not the {values.get('sha256')} of {VALUES}", _OLDER)

@@ -30,7 +30,7 @@ from torch import Tensor
 from ..errors import InputError, SehdrError
 from ..field.confidence import Evidence
 from ..field.radiance_field import RadianceField
-from ..files import atomic_folder, atomic_path, make_parents, remove_stale, write_json, writing
+from ..files import atomic_folder, atomic_path, make_parents, read_json, remove_stale, write_json, writing
 from ..response import Response
 from ..scene import Camera, Scene
 from ..scene.images import MAX_PIXELS
@@ -242,10 +242,10 @@ class RunFolder:
     def read_decisions(self) -> list[dict]:
         """The decisions of the run's plan, as Plan.to_dict gave them; none without a plan, or where it is damaged."""
         try:
-            decisions = json.loads(self.plan.read_text(encoding="utf-8"))["decisions"]
+            decisions = read_json(self.plan)["decisions"]
             told = ("name", "choice", "reason")
             return [{name: d[name] for name in told} | {"fields": dict(d["fields"])} for d in decisions]
-        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        except (InputError, ValueError, KeyError, TypeError):
             return []
 
     def read_summary(self) -> dict:
@@ -262,7 +262,7 @@ class RunFolder:
     def read_metrics(self) -> list[dict]:
         """The lines of metrics.jsonl; what a killed process left half-written is passed over."""
         lines = []
-        text = self.metrics.read_text(encoding="utf-8", errors="replace") if self.metrics.exists() else ""
+        text = self.metrics.read_text(encoding="utf-8", errors="replace") if self.metrics.is_file() else ""
         for line in text.splitlines():
             with suppress(ValueError, RecursionError, TypeError, KeyError, AttributeError, OverflowError):
                 values = json.loads(line)

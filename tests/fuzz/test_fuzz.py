@@ -34,7 +34,7 @@ FOUND = (
     ("responses", 0, 534), ("responses", 0, 1409), ("responses", 0, 3020), ("cameras", 0, 5937), ("ply", 19, 3736),
     ("ply", 19, 5257), ("glb", 20, 400), ("glb", 19, 218), ("transforms", 20, 3719), ("usd", 20, 21), ("usd", 20, 27),
     ("usd", 20, 751), ("usd", 20, 1068), ("usd", 20, 4737), ("photos", 31, 9228), ("photos", 30, 2656),
-    ("resume", 30, 1091),
+    ("resume", 30, 1091), ("colmap-text", 33, 6037),
 )  # fmt: skip
 
 

@@ -35,8 +35,8 @@ def test_what_a_config_lacks_is_named(tmp_path):
     with pytest.raises(InputError, match="has no display 'x'"):
         ocio_view(CONFIG, "x/Raw")
     (tmp_path / "a.ocio").write_text("no config")
-    for name in ("a.ocio", "b.ocio"):
-        with pytest.raises(InputError, match="is no OpenColorIO config"):
+    for name, problem in (("a.ocio", "is no OpenColorIO config"), ("b.ocio", "file not found")):
+        with pytest.raises(InputError, match=problem):
             ocio_view(str(tmp_path / name), "Raw")
     (tmp_path / "raw.ocio").write_text(OCIO.Config.CreateRaw().serialize())
     with pytest.raises(InputError, match="has no role aces_interchange"):

@@ -105,6 +105,9 @@ def test_useless_stacks_get_one_line(tmp_path):
         sw.calibrate(tmp_path)
     with pytest.raises(InputError, match="2 times are given"):
         sw.calibrate(folder, times=(1, 2))
+    next(folder.glob("*.png")).write_bytes(b"cut")
+    with pytest.raises(InputError, match=r"\.png: is not a readable image"):
+        sw.calibrate(folder, times=times)
 
 
 @pytest.mark.parametrize("name", ["frobisher", "library_window_sonyA6000"])

@@ -40,6 +40,8 @@ VIEW = ["view", "run", "--port", "0", "--device", "cpu"]
 COMMANDS = {name: line.split() for name, line in COMMANDS.items()}
 TRAIN = COMMANDS.pop("train")
 STARTED = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.spawn")
+LATEST = 300.0
+"""Seconds after which a command hangs, on however busy a machine; of its processor's time it may take 30."""
 CHANGES = ("rename", "replace", "unlink", "rmdir", "mkdir", "fsync", "open", "write")
 """Functions of os at which a child may be killed."""
 
@@ -74,7 +76,7 @@ def call(
     folder: Path,
     kill_after: float | None = None,
     kill_at: int | None = None,
-    seconds: float = 120.0,
+    seconds: float = LATEST,
     prepare: Callable[[], None] = lambda: None,
 ) -> Ended:
     """Runs a command line in a child, in `folder`. kill_after: seconds until SIGKILL; kill_at: the change of the disk
@@ -128,7 +130,8 @@ def _run(words, folder, said, count, kill_at, prepare) -> None:
             run()
         finally:
             sys.stdout.flush()
-            count.write_text(str(made[0]))
+            with suppress(MemoryError):
+                count.write_text(str(made[0]))
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(end.code is not None)
     except BaseException:  # noqa: BLE001

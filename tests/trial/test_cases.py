@@ -20,7 +20,7 @@ from sehdr_warp.training.run_folder import RunFolder
 from tests.fuzz.mutate import NUMBERS, VALUES
 from tests.make_scenes import write_colmap
 
-from .harness import COMMANDS, SEED, TRAIN, call, files_in, limit_memory
+from .harness import COMMANDS, LATEST, SEED, TRAIN, call, files_in, limit_memory
 
 pytestmark = pytest.mark.trial
 TARGETS = {
@@ -143,6 +143,34 @@ def test_hostile_photos(space, name, format_):
     assert ended.code == 1 and name in ended.err.splitlines()[-1] and files_in(space) == before
 
 
+PHOTOS = "train photos --out new --iterations 2 --device cpu"
+INPUTS = {
+    "run/run.json": " ".join(COMMANDS["render"]),
+    "run/metrics.jsonl": " ".join(COMMANDS["report"]),
+    "run/plan.json": " ".join(COMMANDS["report"]),
+    "run/checkpoints/*/state.safetensors": " ".join(COMMANDS["eval"]),
+    "run/confidence.safetensors": " ".join(COMMANDS["panorama"]),
+    "made/scene.ply": "convert made/scene.ply other.ply",
+    "made/scene.usda": "convert made/scene.usda other.ply",
+    "made/light.exr": "score made --truth truth",
+    "own.json": "render run --out new --cameras own.json --device cpu",
+    "own.ocio": "render run --out new --ocio own.ocio --view Raw --device cpu",
+    "own.toml": "train photos --out new --preset own.toml",
+    "own.csv": "train photos --out new --iterations 2 --response own.csv --device cpu",
+    "photos/exposures.json": PHOTOS,
+    "photos/transforms.json": PHOTOS,
+    "photos/images/r_2.png": PHOTOS,
+}
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_inputs_that_are_pipes_are_not_waited_for(space, name):
+    path = next(space.glob(name), space / name)
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+    call(*INPUTS[name].split(), folder=space)
+
+
 @pytest.mark.parametrize("mebibytes", [1, 4, 16, 64, 256])
 @pytest.mark.parametrize("name", ["render", "report", "train", "export usd"])
 def test_little_memory(space, name, mebibytes):
@@ -175,7 +203,7 @@ def test_two_trainings_do_not_mix(space):
         assert call("render", "new", "--out", "seen", "--device", "cpu", folder=space).code == 0
     finally:
         first.send_signal(signal.SIGTERM)
-    assert b"Traceback" not in first.communicate(timeout=120)[1] and first.returncode == 143
+    assert b"Traceback" not in first.communicate(timeout=LATEST)[1] and first.returncode == 143
     assert call("train", "--resume", "--out", "new", "--iterations", "4000", "--help", folder=space).code == 0
 
 
@@ -193,7 +221,7 @@ SURROUNDINGS = {
     "reader gone": f"{S} train --help-all | head -1",
     "no HOME": f"unset HOME; {S} export run --out new.ply --kind hdr",
     "HOME missing": f"HOME=/dev/null/x {S} export run --out new.ply --kind hdr",
-    "HOME of none": f"HOME=/proc/x {S} report run --out new --device cpu",
+    "HOME of none": f"HOME=/proc/x {S} render run --out new --device cpu",
     "kernels' cache a file": f"WARP_CACHE_PATH=/dev/null {S} export run --out new.ply --kind hdr",
     "MPLBACKEND": f"MPLBACKEND=nonsense {S} report run --out new --device cpu",
     "long name": f"{S} render {LONG} --out new",
@@ -219,7 +247,7 @@ def test_surroundings(space, name):
     environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
     before = files_in(space / "run")
     ended = subprocess.run(
-        ["bash", "-c", SURROUNDINGS[name]], cwd=space, env=environment, capture_output=True, timeout=120, check=False
+        ["bash", "-c", SURROUNDINGS[name]], cwd=space, env=environment, capture_output=True, timeout=LATEST, check=False
     )
     told = ended.stderr.decode(errors="replace")
     assert "Traceback" not in told and "Error:" not in told and ended.returncode in (0, 1, 141), told
@@ -242,7 +270,7 @@ def test_interrupts(space, number):
     for _ in range(3 if number % 2 and kind == signal.SIGINT else 1):
         child.send_signal(kind)
         time.sleep(0.02)
-    told = child.communicate(timeout=60)[1].decode()
+    told = child.communicate(timeout=LATEST)[1].decode()
     assert "Traceback" not in told and child.returncode in (128 + kind, -kind), told
     if (space / "new" / "run.json").exists():
         assert RunFolder(space / "new").newest_checkpoint() is not None
