@@ -204,8 +204,7 @@ def read_text(path: Path, limit: int = MAX_FILE_BYTES) -> str:
 def read_lines(path: Path) -> Iterator[str]:
     """The lines of a file of UTF-8 text, one by one; raises InputError as read_text does, and for a line too long."""
     try:
-        if plain_size(path) == 0:
-            read_bytes(path)
+        plain_size(path) or read_bytes(path)  # Which refuses an empty one.
         with open(path, encoding="utf-8-sig") as file:
             while line := file.readline(_MAX_LINE):
                 if len(line) == _MAX_LINE:
@@ -257,8 +256,7 @@ def contained(folder: Path, name: str, source: Path) -> Path:
             return folder / name
     except (OSError, ValueError, RuntimeError) as error:
         problem = f"cannot be resolved ({error})"
-    short = repr(name if len(name) <= 80 else name[:77] + "...")
-    raise InputError(source, f"file name {short} {problem}", f"use a path relative to {folder} without '..'")
+    raise InputError(source, f"file name {name!r:.80} {problem}", f"use a path relative to {folder} without '..'")
 
 
 def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = False, ours: bool = False) -> None:

@@ -83,8 +83,8 @@ def render_views(
     brackets = Brackets(made, run.base_time, *form, now, provenance(run), by)
     shown = run.base_time * display_gain(run.response)
     exposure = 1.0 if white is None else white * shown
-    if not (math.isfinite(exposure) and exposure > 0):
-        raise SehdrError(f"white {white} is not a positive number; 1 shows the photos' white as 1")
+    if not (math.isfinite(exposure) and exposure > 0 and (white is None or 1e-3 <= white <= 1e4)):
+        raise SehdrError(f"white {white} is not between 0.001 and 10000; 1 shows the photos' white as 1")
     if (ocio is None) != (view is None):
         raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")
     look = None if ocio is None or view is None else ocio_view(ocio, view, shown)

@@ -230,6 +230,8 @@ def device_of_rank(rank: int, device: str | None) -> torch.device:
     if device not in (None, "cpu", "cuda"):
         raise InputError(f"device {device}", "is one, and each rank takes its own", "use cpu or cuda, or leave it out")
     if device == "cpu" or (device is None and not torch.cuda.is_available()):
+        if rank >= (most := max(2, os.cpu_count() or 1)):
+            raise SehdrError(f"{rank + 1} ranks on {os.cpu_count()} processors: start {most} at most")
         return torch.device("cpu")
     if (there := torch.cuda.device_count()) <= rank:
         raise SehdrError(f"rank {rank} finds {there} GPUs: start as many ranks as there are, or give --device cpu")

@@ -11,9 +11,11 @@ from contextlib import suppress
 import pytest
 import torch
 
+from sehdr_warp.errors import SehdrError
 from sehdr_warp.training.densification import make_densification
 from sehdr_warp.training.optimizer import FlatGradients, load_optimizer_tensors, make_optimizer, optimizer_tensors
 from sehdr_warp.training.plan import gain_of_ranks
+from sehdr_warp.training.ranks import device_of_rank
 from sehdr_warp.training.run import load_run
 from sehdr_warp.training.run_folder import RunFolder
 from sehdr_warp.training.train import train
@@ -176,3 +178,9 @@ def test_small_scenes_are_told_that_they_gain_nothing():
     assert "estimated 1." in large and "too few" not in large
     assert "no faster than one" in gain_of_ranks(2, 1_000_000, 2_000_000, 30_000, torch.device("cpu"))
     assert math.isfinite(float(gain_of_ranks(8, 10**6, 10**6, 10**4, gpu).split("estimated ")[1].split()[0]))
+
+
+def test_a_processor_takes_no_thousands_of_ranks():
+    assert device_of_rank(1, "cpu").type == "cpu"
+    with pytest.raises(SehdrError, match="100000 ranks on .* processors"):
+        device_of_rank(99_999, "cpu")
