@@ -98,6 +98,8 @@ class Viewer:
             return "application/octet-stream", self._run(asked).frame(camera_of(asked["camera"]), **options)
         if path in ("/path", "/save"):
             cameras = [camera_of(camera) for camera in asked["cameras"][:MOST_VIEWS]]
+            if not cameras:
+                raise Refusal(400, "no cameras are given")
             if asked.get("count"):
                 cameras = interpolate(cameras, min(int(asked["count"]), MOST_VIEWS))
             if path == "/path":
@@ -202,6 +204,7 @@ class Server(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version, timeout, disable_nagle_algorithm = "HTTP/1.1", PATIENCE, True
+    error_message_format, error_content_type = "%(message)s", "text/plain"
     server: Server  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def do_GET(self) -> None:

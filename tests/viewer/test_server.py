@@ -112,7 +112,7 @@ def test_what_is_saved_is_what_render_writes(serve, tmp_path):
         ("/frame", {"camera": camera().to_dict() | {"fx": float("nan")}}, 400),
         ("/frame", {"camera": camera().to_dict() | {"world_to_camera": [[0] * 4] * 4}}, 400),
         ("/save", {"cameras": [camera().to_dict()], "kind": "brackets", "evs": "x"}, 409),
-        ("/save", {"cameras": [], "kind": "exr"}, 409),
+        ("/save", {"cameras": [], "kind": "exr"}, 400),
         ("/path", {"cameras": [camera().to_dict()], "count": "many"}, 400),
         ("/training", {"do": "pause"}, 404),
     ],

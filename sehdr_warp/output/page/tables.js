@@ -26,7 +26,7 @@ class LookTables {
     this.tone = tone;
     if (tone === "aces") {
       this.codes ??= Uint8Array.from({length: 65536}, (_, i) => byte(srgb(i / CODES - LOW)));
-      this.fitted = Float64Array.from(MIDDLES, x => CODES * fitted(1.8 * shown * x));
+      this.fitted = Float32Array.from(MIDDLES, x => CODES * fitted(1.8 * shown * x));
     } else if (tone === "reinhard") {
       this.shift = Math.round(STEPS * (Math.log2(shown) - DARKEST));
       if (this.white !== white) this.reinhard = reinhardTable(this.white = white);
@@ -59,7 +59,8 @@ function respond({half}, x) {
 }
 
 function plainRow({plain}, {half, channels}, pixels, i, end, wide) {
-  for (let k = i * channels; i < end; i += wide, k += wide * channels)
+  const step = wide * channels;
+  for (let k = i * channels; i < end; i += wide, k += step)
     pixels[i] = 0xff000000 | plain[half[k + 2]] << 16 | plain[half[k + 1]] << 8 | plain[half[k]];
 }
 
@@ -75,10 +76,11 @@ function acesPlanes({width, height, half, channels}) {
   return planes;
 }
 function acesRow({fitted, codes}, {aces}, pixels, i, end, wide) {
-  for (let k = 3 * i; i < end; i += wide, k += 3 * wide) {
-    const x = fitted[aces[k]], y = fitted[aces[k + 1]], z = fitted[aces[k + 2]], low = LOW * CODES;
-    pixels[i] = 0xff000000 | codes[-0.00327 * x - 0.07276 * y + 1.07602 * z + low | 0] << 16
-      | codes[-0.10208 * x + 1.10813 * y - 0.00605 * z + low | 0] << 8 | codes[1.60475 * x - 0.53108 * y - 0.07367 * z + low | 0];
+  const low = LOW * CODES, step = 3 * wide;
+  for (let k = 3 * i; i < end; i += wide, k += step) {
+    const x = fitted[aces[k]], y = fitted[aces[k + 1]], z = fitted[aces[k + 2]];
+    pixels[i] = 0xff000000 | codes[low - 0.00327 * x - 0.07276 * y + 1.07602 * z | 0] << 16
+      | codes[low - 0.10208 * x + 1.10813 * y - 0.00605 * z | 0] << 8 | codes[low + 1.60475 * x - 0.53108 * y - 0.07367 * z | 0];
   }
 }
 
