@@ -18,6 +18,7 @@ from ..splatting import GraphRecorder, Rendering
 from ..splatting.memory import bytes_asked_for
 from ..splatting.tile_lists import ONE_SORT
 from . import optimizer as adam
+from .averaging import Averaging
 from .births import born_rows
 from .config import Config
 from .densification import SEED_STEP, make_densification
@@ -63,6 +64,7 @@ class Trainer:
         self.optimizer = adam.make_optimizer(field, config, self.extent, self.batch)
         pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
         self.densification = make_densification(config, self.extent, pixels)
+        self._averaging = Averaging(config, self.densification.stop)
         self._views = scene.train_views
         self._matcher = matcher or cache(partial(make_matcher, scene, field.response, self.device))
         # Where light is compared, nothing needs the photo encoded.
@@ -123,9 +125,8 @@ class Trainer:
         self.photos = min(self.batch, max(1, self.config.schedule.iterations - self.iteration))
         self.densification.photos = self.photos
         self.iteration += self.photos
-        views = self._training_views()
+        views, gaussians = self._training_views(), self.field.gaussians
         index = self._next_index(len(views))
-        gaussians = self.field.gaussians
         watched = self.densification.needs_gradients(self.iteration)
         if watched:
             self.densification.prepare(gaussians.count, self.device)
@@ -146,6 +147,7 @@ class Trainer:
             # Other Gaussians need about so many times the room.
             self._invalidate()
             self._capacity.change(gaussians.count / max(1, count))
+        self._averaging.follow(self.iteration, self.photos, gaussians)
         if self.came_to(CHECK_EVERY):
             self.check()
         if self.came_to(COMPARE_EVERY):
@@ -312,17 +314,19 @@ class Trainer:
             "response": self.field.response.state_dict() if self.field.response.learnable else {},
             "optimizer": adam.optimizer_tensors(self.optimizer, self.batch),
             "densification": self.densification.state(),
+            "average": self._averaging.state(),
             "generators": {"order": self._order_generator.get_state(), "device": self._generator.get_state()},
         }
         tensors = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
-        values = {"iteration": self.iteration, "order": list(self._order), "skipped_steps": self.skipped_steps}
-        return tensors, values
+        return tensors, {"iteration": self.iteration, "order": list(self._order), "skipped_steps": self.skipped_steps}
 
     def load_state(self, tensors: dict[str, Tensor], values: dict) -> None:
         """Takes up what state() gave; the field's Gaussians must already be those of the state."""
         adam.load_optimizer_tensors(self.optimizer, adam.under(tensors, "optimizer."), self.batch)
         statistics = {name: value.to(self.device) for name, value in adam.under(tensors, "densification.").items()}
         self.densification.load_state(statistics)
+        means = {name: value.to(self.device) for name, value in adam.under(tensors, "average.").items()}
+        self._averaging.load_state(means)
         if self.ranks is not None and not self.ranks.leads:  # The sum over the ranks counts them once.
             for total in statistics.values():
                 total.zero_()
@@ -358,9 +362,8 @@ class Trainer:
             return source
 
     def _source(self) -> PhotoSource:
-        loss = self.config.loss
+        given, loss = (self._views, self.field.base_time, self.device), self.config.loss
         light = self.field.response if compares_light(loss, self.field) else None
-        given = self._views, self.field.base_time, self.device
         return photo_source(*given, truth=loss.uses_hdr, clipping=loss.clipping, light=light)
 
     def _next_index(self, count: int) -> int:

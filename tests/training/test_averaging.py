@@ -1,0 +1,66 @@
+"""What a training ends with is the mean over its last steps."""
+
+import pytest
+import torch
+
+from sehdr_warp.training.averaging import SPANS, Averaging
+from sehdr_warp.training.checkpoint import Checkpoint
+from sehdr_warp.training.config_files import load_config
+from sehdr_warp.training.run_folder import RunFolder
+from sehdr_warp.training.train import Training, train
+
+from .test_train import QUICK
+from .toy import load_unscaled
+
+AVERAGED = QUICK | {"schedule.iterations": 80, "schedule.average": 4500, "densification.stop": 20}
+
+
+class Moving:
+    """Gaussians of one number, which is the iteration."""
+
+    def __init__(self):
+        self.value = torch.zeros(3)
+
+    def tensors(self):
+        return {"means": self.value}
+
+
+@pytest.mark.parametrize("average", [0, 100, 1000])
+def test_the_mean_is_as_old_as_its_span(average):
+    iterations = 6000
+    config = load_config("default", {"schedule.iterations": iterations, "schedule.average": 5 * average})
+    averaging, gaussians = Averaging(config, 500), Moving()
+    begin = max(iterations - SPANS * average, 500) + average // 10
+    for iteration in range(1, iterations + 1):
+        gaussians.value.fill_(iteration)
+        averaging.follow(iteration, 1, gaussians)
+        if iteration < iterations:
+            assert (gaussians.value == iteration).all()
+            assert bool(averaging.state()) == (average > 0 and iteration >= begin)
+    age = iterations - float(gaussians.value[0])
+    assert age == (0 if not average else pytest.approx(0.9 * average, rel=0.1)) and not averaging.state()
+
+
+def test_means_begin_when_the_count_stays():
+    config = load_config("default", {"schedule.iterations": 1000, "schedule.average": 15_000})
+    assert Averaging(config, 500).first == 500
+
+
+def test_a_training_that_stops_in_between_ends_in_the_same_bits(scene, tmp_path):
+    config = load_unscaled("default", AVERAGED)
+    whole = train(scene, tmp_path / "whole", config, device="cpu")
+    training = Training(scene, tmp_path / "parts", config, device="cpu")
+    for step in training:
+        if step.iteration == 60:
+            training.stop()
+    stopped = RunFolder(tmp_path / "parts").newest_checkpoint()
+    assert isinstance(stopped, Checkpoint) and any(name.startswith("average.") for name in stopped.tensors)
+    resumed = train(scene, tmp_path / "parts", device="cpu", resume=True)
+    last = load_unscaled("default", AVERAGED | {"schedule.average": 0})
+    plain = train(scene, tmp_path / "plain", last, device="cpu")
+    for name, values in whole.model.gaussians.tensors().items():
+        assert torch.equal(values, resumed.model.gaussians.tensors()[name]), name
+    differs = [
+        not torch.equal(a, b) for a, b in zip(whole.model.gaussians.parameters(), plain.model.gaussians.parameters())
+    ]
+    assert all(differs)
