@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..quiet import silent_stderr
 from . import kernel_cache, threads
+from .memory import check_room_to_compile
 
 # The start-up banner, and the warning where there is no GPU, are not for a library to print.
 wp.config.log_level = wp.LOG_WARNING
@@ -84,6 +85,7 @@ class _Packed:
     def __init__(
         self, kernel: Any, device: torch.device, block_dim: int | None, adjoint: bool, dim: Any, values: list
     ) -> None:
+        check_room_to_compile()
         self.arguments = kernel.adj.args
         self.kinds = [argument.type for argument in self.arguments] * (1 + adjoint)
         self.seen: list[Any] = [None] * len(self.kinds)

@@ -3,17 +3,38 @@
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import torch
 import warp as wp
 
 from ..errors import SehdrError
 
+try:
+    import resource
+except ImportError:  # Windows has no limits of this kind.
+    resource = None
+
 REMEDY = "use fewer Gaussians (densification.max_gaussians) or a smaller image (--max-size)"
+
+COMPILER_BYTES = 64 << 20  # Half of it is too little for a kernel of the CPU
 
 
 class OutOfMemory(SehdrError):
     """Not enough memory; the message gives the sizes and how much was asked for."""
+
+
+def check_room_to_compile() -> None:
+    """Raises MemoryError where the address space is limited and nearly used up: the compiler of kernels would end this
+    process, without a word."""
+    status = Path("/proc/self/statm")
+    if resource is None or not status.exists():
+        return
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit == resource.RLIM_INFINITY:
+        return
+    if limit - int(status.read_text().split()[0]) * resource.getpagesize() < COMPILER_BYTES:
+        raise MemoryError(f"the compiler of kernels cannot allocate {COMPILER_BYTES >> 20} MiB")
 
 
 def held_by_warp(device: torch.device) -> int:

@@ -173,3 +173,12 @@ def test_running_out_on_the_gpu_is_one_line_and_the_next_render_works():
         assert torch.isfinite(rasterize(*small.arguments).image).all()
     finally:
         torch.cuda.set_per_process_memory_fraction(1.0, 0)
+
+
+def test_no_kernel_is_compiled_where_its_compiler_would_end_the_process(monkeypatch):
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (1 << 20, limits[1]))
+    with pytest.raises(MemoryError, match="compiler of kernels"):
+        memory.check_room_to_compile()
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (1 << 50, limits[1]))
+    memory.check_room_to_compile()
