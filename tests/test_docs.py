@@ -86,7 +86,13 @@ def test_flags_and_fields_on_the_pages_exist(page):
     text = page.read_text()
     known = {flag for options in cli.command_options().values() for flag in flags_of(options)}
     others = {"--version", "--help", "--help-all", "--debug", "--set", "--plan", "--predict-hdr"}  # the last are gone
-    others |= {"--index-url", "--config-settings", "--clock-control", "--nproc-per-node"}  # of pip, Nsight and torchrun
+    others |= {
+        "--index-url",
+        "--config-settings",
+        "--no-deps",
+        "--clock-control",
+        "--nproc-per-node",
+    }  # of pip, Nsight and torchrun
     assert set(re.findall(r"(?<![\w-])(--[a-z][a-z-]*)(?![\w.])", text)) <= known | others
     fields = {path for path, _ in config_fields()}
     parts = "|".join({field.split(".")[0] for field in fields if "." in field})

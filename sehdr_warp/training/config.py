@@ -178,7 +178,7 @@ class ScheduleConfig(_Table):
     """training steps; one photo each"""
     harmonics_every: Iteration = 1000
     """iterations between degrees of the harmonics; degree 0 first"""
-    average: Annotated[int, Field(ge=0)] = 750
+    average: Annotated[int, Field(ge=0, le=10**12)] = 750
     """the scene is the mean over about so many of the last iterations, the later the more; 0: the last alone"""
     evaluate_at: Annotated[tuple[Iteration, ...], Many] = (500, 1000, 2000, 4000, 7000, 10_000, 14_000, 20_000, 30_000)
     """iterations that test the held-out views; the last always does"""
