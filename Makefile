@@ -13,7 +13,9 @@ DEMO ?= runs/demo
 PYTEST ?= -q -n auto --dist worksteal
 
 BIN = $(VENV)/bin
-# Python compiles what is imported when it is; pip would compile all of it, most of which nothing imports.
+# Python compiles what is imported when it is, and keeps it, whatever the surroundings say; pip would compile all of it,
+# most of which nothing imports.
+export PYTHONDONTWRITEBYTECODE =
 PIP = $(BIN)/python -m pip --disable-pip-version-check install -qq --no-compile --constraint constraints.txt
 
 # Editable as one plain line in site-packages, which editors and type checkers can follow; setuptools' default is an import
