@@ -13,10 +13,9 @@ DEMO ?= runs/demo
 PYTEST ?= -q -n auto --dist worksteal
 
 BIN = $(VENV)/bin
-# Python compiles what is imported when it is, and keeps it, whatever the surroundings say; pip would compile all of it,
-# most of which nothing imports.
-export PYTHONDONTWRITEBYTECODE =
 PIP = $(BIN)/python -m pip --disable-pip-version-check install -qq --no-compile --constraint constraints.txt
+# On all cores, which pip does not. Not left to the first import: that of a full disk would leave half a file.
+COMPILE = $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true
 
 # Editable as one plain line in site-packages, which editors and type checkers can follow; setuptools' default is an import
 # hook, which they cannot. The links sehdr_warp/kernels and sehdr_warp/configs complete the package in a checkout.
@@ -70,12 +69,15 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	$(PIP) torch==$(TORCH)+cpu setuptools wheel 2>/dev/null || \
 		$(PIP) torch==$(TORCH) setuptools wheel --extra-index-url $(TORCH_INDEX)
 	$(EDITABLE) '.[hdr]'
+	$(COMPILE)
 	touch $@
 
 $(VENV)/installed-test: $(VENV)/installed
 	$(EDITABLE) '.[test]'
+	$(COMPILE)
 	touch $@
 
 $(VENV)/installed-dev: $(VENV)/installed
 	$(EDITABLE) '.[dev]'
+	$(COMPILE)
 	touch $@
