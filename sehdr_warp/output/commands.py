@@ -169,6 +169,9 @@ def run_render(asked: Render) -> None:
         raise UsageError("--ev-ramp, --fps and --transfer are of a film; name it with --video")
     written, ramp = [], _ramp(asked.ev_ramp)
     if asked.video is not None:
+        from .film import film_library
+
+        film_library()
         check_absent(asked.video, asked.overwrite)
     run = open_scene(asked.run, asked.device)
     if asked.out is not None:

@@ -80,7 +80,7 @@ def write_film(
 
     Raises SehdrError without PyAV (the extra `film`) or its encoder, InputError where `out` exists (unless overwrite).
     """
-    av, kind = _library(), TRANSFERS[transfer]
+    av, kind = film_library(), TRANSFERS[transfer]
     out, first = Path(out), cameras[0]
     # Chroma of 4:2:0 covers two by two pixels.
     width, height = (max(2, side - side % 2) for side in (first.width, first.height))
@@ -161,7 +161,8 @@ def _told(cameras: Sequence[Camera], out: Path) -> Iterator[Camera]:
         yield camera
 
 
-def _library() -> Any:
+def film_library() -> Any:
+    """PyAV; raises SehdrError where it is not installed."""
     try:
         import av
     except ImportError:

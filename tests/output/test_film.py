@@ -92,6 +92,6 @@ def test_refusals(tmp_path, monkeypatch):
     def missing():
         raise SehdrError("films need PyAV; run `pip install sehdr-warp[film]`")
 
-    monkeypatch.setattr(film, "_library", missing)
+    monkeypatch.setattr(film, "film_library", missing)
     with pytest.raises(SehdrError, match="pip install"):
         write_film(run, tmp_path / "new.mp4", cameras)
