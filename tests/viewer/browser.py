@@ -10,7 +10,7 @@ from PIL import Image
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 # Software rendering, so that a test needs no GPU; Chromium as root has no sandbox.
-ARGUMENTS = ["--enable-unsafe-swiftshader", "--use-angle=swiftshader", *["--no-sandbox"] * (os.geteuid() == 0)]
+ARGUMENTS = ["--enable-unsafe-swiftshader", *["--no-sandbox"] * (os.geteuid() == 0)]
 
 
 @contextmanager

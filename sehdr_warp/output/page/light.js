@@ -4,6 +4,7 @@
 
 const TONES = ["none", "reinhard", "filmic", "aces", "response"];
 const OVERLAYS = ["none", "stops", "confidence", "depth", "normals", "error", "clipped"];
+const TABLED = ["none", "stops", "clipped"];  // Overlays that an exposure changes
 const TEXTURES = ["scene", "other", "depth", "clipped", "photo", "curve"];
 const CURVE_LOW = -20, CURVE_HIGH = 20, CURVE_SIZE = 1024;  // Stops that a response's table spans
 
@@ -123,8 +124,8 @@ const QUICK = 12, PAUSE = 150;  // Milliseconds: of a draw while looks move, in 
 const software = gl => /swiftshader|llvmpipe|softpipe|software|basic render/i.test(
   gl.getParameter((gl.getExtension("WEBGL_debug_renderer_info") || {UNMASKED_RENDERER_WEBGL: gl.RENDERER}).UNMASKED_RENDERER_WEBGL));
 
-// Where WebGL is software its canvas is not the one that is seen, and tone maps are tables (tables.js), which take a tenth
-// of the time. What takes longer than QUICK is coarser while it moves.
+// Where WebGL is software its canvas is not the one that is seen. What an exposure changes are tables there (tables.js),
+// which take a tenth of the time; the shader draws the rest once. What takes longer than QUICK is coarser while it moves.
 class LightCanvas {
   constructor(canvas) {
     const made = document.createElement("canvas"), options = {antialias: false, preserveDrawingBuffer: true};
@@ -133,7 +134,7 @@ class LightCanvas {
     if (software(gl)) this.paper = canvas.getContext("2d", {alpha: false});
     else gl = canvas.getContext("webgl2", options);
     this.canvas = canvas, this.gl = gl, this.textures = {}, this.frames = {}, this.programs = {}, this.stale = new Set();
-    this.drawn = -Infinity, this.scale = this.wide = 1;
+    this.drawn = -Infinity, this.scale = this.wide = 1, this.changes = 0;
     this.settings = {stops: 0, tone: "none", white: 4, overlay: "none", split: 0, left: 0, grey: 1, near: 1, far: 1,
                      toPhoto: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], lens: [1, 1, .5, .5], photoLens: [1, 1, .5, .5]};
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
@@ -167,6 +168,7 @@ class LightCanvas {
   put(name, width, height, half, channels) {
     this.frames[name] = {width, height, half, channels};
     this.stale.add(name);
+    this.changes++;
   }
 
   upload(name, {width, height, half, channels}) {
@@ -182,6 +184,7 @@ class LightCanvas {
     const gl = this.gl;
     gl.activeTexture(gl.TEXTURE0 + TEXTURES.indexOf("photo"));
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
+    this.changes++;
   }
 
   draw(changes = {}) {
@@ -190,28 +193,36 @@ class LightCanvas {
       return f && f.width === width && f.height === height;
     };
     clearTimeout(this.rest);
-    if (!this.paper) return this.shade(width, height);
-    const before = performance.now(), moving = before - this.drawn < PAUSE;
-    const tables = s.overlay === "none" && fits("scene") && (s.left === 0 || s.left === 1 && fits("other"));
-    this.coarse = tables ? this.lookUp(width, height, moving) : this.shadeSmaller(width, height, moving);
+    if (!this.paper) return this.shade(s, width, height);
+    const before = performance.now(), moving = before - this.drawn < PAUSE, exposed = TABLED.includes(s.overlay);
+    const tables = exposed && ["scene", ...s.left === 1 ? ["other"] : [], ...s.overlay === "clipped" ? ["clipped"] : []].every(fits);
+    const edge = s.left ? Math.round(s.split * width) : 0, unexposed = {stops: 0, tone: "none", white: 4};
+    // With tables the shader draws the photo alone, over all of the width, of which an edge shows its part.
+    const shaded = tables ? {...s, ...unexposed, overlay: "none", split: 1} : exposed ? s : {...s, ...unexposed};
+    this.coarse = this.shadeOnce(shaded, width, height, moving, !tables ? width : s.left === 2 ? edge : 0);
+    if (tables) this.coarse = this.lookUp(width, height, moving, edge) || this.coarse;
     this.drawn = performance.now();
     if (this.coarse) this.rest = setTimeout(() => this.draw(), PAUSE);
   }
 
-  // By the shader, in fewer pixels while looks move; returns whether they are fewer.
-  shadeSmaller(width, height, moving) {
-    const before = performance.now(), scale = moving ? this.scale : 1;
-    const [w, h] = [width, height].map(side => Math.max(1, Math.round(side * scale)));
-    this.shade(w, h);
-    const inset = scale < 1 ? 0.5 : 0;  // Enlarging would take in what an earlier draw left beside it.
-    this.paper.drawImage(this.gl.canvas, inset, this.gl.canvas.height - h + inset, w - 2 * inset, h - 2 * inset, 0, 0, width, height);
-    this.scale = Math.min(1, Math.max(0.25, scale * Math.sqrt(QUICK / Math.max(1, performance.now() - before))));
-    return scale < 1;
+  // By the shader, the columns to `edge` if they have changed, in fewer pixels while looks move; returns whether they are fewer.
+  shadeOnce(settings, width, height, moving, edge) {
+    const before = performance.now(), key = JSON.stringify([settings, width, height, this.changes]), scale = moving ? this.scale : 1;
+    const known = this.shaded && this.shaded.key === key && this.shaded.scale >= scale;
+    if (!edge || known && this.shaded.edge === edge) return edge && this.shaded.scale < 1;
+    if (!known) this.shaded = {key, scale};
+    this.shaded.edge = edge;
+    const [w, h] = [width, height].map(side => Math.max(1, Math.round(side * this.shaded.scale)));
+    if (!known) this.shade(settings, w, h);
+    const inset = this.shaded.scale < 1 ? 0.5 : 0, part = edge / width;  // Enlarging would take in what an earlier draw left beside it.
+    this.paper.drawImage(this.gl.canvas, inset, this.gl.canvas.height - h + inset, (w - 2 * inset) * part, h - 2 * inset, 0, 0, edge, height);
+    if (!known) this.scale = Math.min(1, Math.max(0.25, scale * Math.sqrt(QUICK / Math.max(1, performance.now() - before))));
+    return this.shaded.scale < 1;
   }
 
   // By the shader, into the lower left corner of WebGL's canvas.
-  shade(width, height) {
-    const gl = this.gl, s = this.settings, canvas = gl.canvas;
+  shade(s, width, height) {
+    const gl = this.gl, canvas = gl.canvas;
     for (const name of this.stale) this.upload(name, this.frames[name]);
     this.stale.clear();
     if (this.paper && (canvas.width < width || canvas.height < height)) canvas.width = Math.max(width, canvas.width), canvas.height = Math.max(height, canvas.height);
@@ -228,16 +239,16 @@ class LightCanvas {
   }
 
   // By tables, over the frames in memory: every pixel, or while looks move one of so many that are wide alike.
-  lookUp(width, height, moving) {
-    const s = this.settings, before = performance.now(), edge = s.left === 1 ? Math.round(s.split * width) : 0;
+  lookUp(width, height, moving, edge) {
+    const s = this.settings, before = performance.now(), first = s.left === 2 ? edge : 0;
     this.tables ??= new LookTables();
-    this.tables.set(s, this.frames.curve);
+    this.tables.set(s, this.frames);
     if (!this.image || this.image.width !== width || this.image.height !== height) this.image = new ImageData(width, height);
     const pixels = new Uint32Array(this.image.data.buffer), wide = moving ? this.wide : 1;
-    const prepared = [["other", 0, edge], ["scene", edge, width]].filter(([, first, last]) => first < last)
+    const prepared = [["other", first, edge], ["scene", edge, width]].filter(([, first, last]) => first < last)
       .map(([name, first, last]) => this.tables.fill(this.frames[name], pixels, first, last, wide)).some(Boolean);
-    this.paper.putImageData(this.image, 0, 0);
-    if (!prepared) this.wide = Math.min(4, Math.ceil(0.8 * wide * (performance.now() - before) / QUICK));
+    if (first < width) this.paper.putImageData(this.image, 0, 0, first, 0, width - first, height);
+    if (!prepared) this.wide = Math.min(4, wide + 1, Math.ceil(0.8 * wide * (performance.now() - before) / QUICK));
     return wide > 1;
   }
 
@@ -252,7 +263,7 @@ class LightCanvas {
 
 const luminance = ([r, g, b]) => 0.2126 * r + 0.7152 * g + 0.0722 * b;
 const stopsText = stops => (Math.abs(stops) < 0.05 ? "" : stops < 0 ? "\u2212" : "+") + Math.abs(stops).toFixed(1) + " EV";
-const secondsText = time => time < 0.3 ? `1/${(1 / time).toFixed(time < 0.05 ? 0 : 1)} s` : `${Number(time.toPrecision(3))} s`;
+const secondsText = time => time < 0.3 ? `1/${Number((1 / time).toPrecision(time < 0.01 ? 3 : 2))} s` : `${Number(time.toPrecision(3))} s`;
 
 // Deflated half floats in base64, as the report and notebooks carry them.
 async function unpackLight(text) {

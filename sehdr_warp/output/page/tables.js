@@ -1,4 +1,4 @@
-// Tone maps as tables, for a processor instead of WebGL. What costs much is done once for a frame or a white point, so
+// Looks that move with the exposure as tables, for a processor instead of WebGL. What costs much is done once for a frame or a white point, so
 // that an exposure costs a few look-ups a pixel.
 "use strict";
 
@@ -19,12 +19,24 @@ const PLACES = Int32Array.from(MIDDLES, x => Math.round(STEPS * Math.log2(x)));
 // sRGB of what ACES's last matrix gives, from -LOW to 2.6 - LOW.
 const LOW = 0.7, CODES = 65535 / 2.6;
 
+// Of so many stops from middle grey, the false color in bytes.
+function bandColor(stops) {
+  const between = (a, b, t) => a.map((x, i) => x + (b[i] - x) * Math.min(1, t));
+  return stops === 0 ? [128, 128, 128] : stops < 0 ? between([64, 158, 184], [41, 10, 82], -stops / 8)
+    : stops < 4 ? between([115, 179, 89], [242, 217, 64], stops / 3) : between([242, 140, 38], [217, 20, 31], (stops - 4) / 4);
+}
+const packed = ([r, g, b]) => 0xff000000 | b << 16 | g << 8 | r;
+const BANDS = Uint32Array.from({length: 81}, (_, i) => packed(bandColor(i - 40)));
+
 class LookTables {
-  // settings: of a LightCanvas; curve: of the response.
-  set({tone, stops, grey, white}, curve) {
+  // settings: of a LightCanvas; frames: of it.
+  set({tone, overlay, stops, grey, white}, {curve, clipped}) {
     const gain = 2 ** stops, shown = gain * grey;
-    this.tone = tone;
-    if (tone === "aces") {
+    this.look = overlay === "stops" ? "stops" : tone;
+    this.clipped = overlay === "clipped" ? clipped : null;
+    if (this.look === "stops") {
+      this.bands = Uint32Array.from(MIDDLES, x => BANDS[40 + Math.round(Math.max(-40, Math.min(40, Math.log2(shown * x / 0.18))))]);
+    } else if (tone === "aces") {
       this.codes ??= Uint8Array.from({length: 65536}, (_, i) => byte(srgb(i / CODES - LOW)));
       this.fitted = Float32Array.from(MIDDLES, x => CODES * fitted(1.8 * shown * x));
     } else if (tone === "reinhard") {
@@ -33,18 +45,19 @@ class LookTables {
     } else {
       const look = {none: x => srgb(shown * x), filmic: x => srgb(hable(2 * shown * x) / hable(white)), response: x => respond(curve, gain * x)}[tone];
       this.plain ??= new Uint8Array(65536);  // Black for what is negative
-      for (let h = 0; h < 0x7c00; h++) this.plain[h] = byte(look(HALVES[h]));
+      for (let h = 0; h < 0x7c00; h += h < 0x400 ? 1 : 8) this.plain.fill(byte(look(HALVES[h < 0x400 ? h : h + 4])), h, h + 8);
       this.plain[0x7c00] = this.plain[0x7bff];
     }
   }
 
   // RGBA in bytes of columns from first to last, so many of them wide alike; returns whether it had to prepare the frame.
   fill(frame, pixels, first, last, wide) {
-    const prepare = {aces: acesPlanes, reinhard: reinhardPlanes}[this.tone], missing = prepare && !(this.tone in frame);
-    if (missing) frame[this.tone] = prepare(frame);
-    const row = {aces: acesRow, reinhard: reinhardRow}[this.tone] || plainRow;
+    const [prepare, row] = {aces: [acesPlanes, acesRow], reinhard: [reinhardPlanes, reinhardRow], stops: [lightPlane, bandRow]}[this.look] || [null, plainRow];
+    const missing = prepare && !(this.look in frame);
+    if (missing) frame[this.look] = prepare(frame);
     for (let y = 0, start = 0; y < frame.height; y++, start += frame.width) {
       row(this, frame, pixels, start + first, start + last, wide);
+      if (this.clipped) clippedRow(this.clipped, pixels, start + first, start + last, wide);
       for (let beside = 1; beside < wide; beside++)
         for (let i = start + first; i + beside < start + last; i += wide) pixels[i + beside] = pixels[i];
     }
@@ -62,6 +75,26 @@ function plainRow({plain}, {half, channels}, pixels, i, end, wide) {
   const step = wide * channels;
   for (let k = i * channels; i < end; i += wide, k += step)
     pixels[i] = 0xff000000 | plain[half[k + 2]] << 16 | plain[half[k + 1]] << 8 | plain[half[k]];
+}
+
+// Grey, and red where photos were clipped.
+function clippedRow({half}, pixels, i, end, wide) {
+  for (; i < end; i += wide) {
+    const p = pixels[i], share = HALVES[half[i]], rest = 1 - share, red = 255 * share;
+    const grey = rest * 0.6 * (0.2126 * (p & 255) + 0.7152 * (p >> 8 & 255) + 0.0722 * (p >> 16 & 255)) + 0.5;
+    pixels[i] = 0xff000000 | grey + 0.15 * red << 16 | grey + 0.25 * red << 8 | grey + red;
+  }
+}
+
+// One a pixel: the place of its luminance in MIDDLES.
+function lightPlane({width, height, half, channels}) {
+  const plane = new Uint16Array(width * height);
+  for (let i = 0, k = 0; i < plane.length; i++, k += channels)
+    plane[i] = upper(0.2126 * HALVES[half[k]] + 0.7152 * HALVES[half[k + 1]] + 0.0722 * HALVES[half[k + 2]]);
+  return plane;
+}
+function bandRow({bands}, {stops}, pixels, i, end, wide) {
+  for (; i < end; i += wide) pixels[i] = bands[stops[i]];
 }
 
 // Three a pixel: what ACES's first matrix gives.

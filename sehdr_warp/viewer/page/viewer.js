@@ -138,6 +138,7 @@ async function load(draft) {
     + (facts.iterations && $("training").hidden ? ` \u00b7 ${facts.iterations} steps` : ""));
   if (!draft) nearestPhoto();
   histogram();
+  frusta();
   paint();
   if (!draft && wanted === null) stage.dataset.frame = "full";  // Nothing better is to come
 }
@@ -152,11 +153,11 @@ function paint() {
   const photo = view ? {toPhoto: between(drawn.camera, view.camera), photoLens: lensOf(view.camera)} : {};
   light.draw({stops: state.stops, tone: $("tone").value, white: 2 ** Number($("white").value), overlay: $("overlay").value === "error" && !ready ? "none" : $("overlay").value,
               split, left: left === "photo" ? 2 : left === "0" ? 0 : 1, lens: lensOf(drawn.camera), ...photo});
+  $("whiteTold").textContent = stopsText(Number($("white").value));
   $("handle").hidden = left === "0";
   $("handle").style.left = 100 * state.split + "%";
   [left === "photo" ? view.name : left.startsWith("run") ? runs[Number(left.slice(3))].name : "", runs.length > 1 ? facts.name : "scene"]
     .forEach((name, i) => { $("handle").children[i].textContent = name; });
-  frusta();
   probe();
 }
 
@@ -244,15 +245,13 @@ function bars() {
 }
 
 function legend() {
-  const ramp = ["#1a1738", "#1b3f5f", "#216b8c", "#8da973", "#fae059"], kind = $("overlay").value;
-  const ends = {confidence: ["unknown", "known"], depth: [`far ${figure(light.settings.far)}`, `near ${figure(light.settings.near)}`], error: ["0", "\u00bc"]}[kind];
+  const kind = $("overlay").value;
+  const ramp = kind === "clipped" ? ["#666", "#8c5d55", "#b35344", "#d94a33", "#ff4026"] : ["#1a1738", "#1b3f5f", "#216b8c", "#8da973", "#fae059"];
+  const ends = {confidence: ["unknown", "known"], clipped: ["never", "always"], depth: [`far ${figure(light.settings.far)}`, `near ${figure(light.settings.near)}`], error: ["0", "\u00bc"]}[kind];
   if (kind === "stops") {
-    const color = s => s === 0 ? "#808080" : s < 0 ? mix([64, 158, 184], [41, 10, 82], -s / 8)
-      : s < 4 ? mix([115, 179, 89], [242, 217, 64], s / 3) : mix([242, 140, 38], [217, 20, 31], (s - 4) / 4);
-    $("legend").innerHTML = Array.from({length: 17}, (_, i) => `<i style="background:${color(i - 8)}"><span>${i % 4 ? "" : i - 8}</span></i>`).join("");
+    $("legend").innerHTML = Array.from({length: 17}, (_, i) => `<i style="background:rgb(${bandColor(i - 8)})"><span>${i % 4 ? "" : i - 8}</span></i>`).join("");
   } else $("legend").innerHTML = ends ? ramp.map((c, i) => `<i style="background:${c}"><span>${i === 0 ? ends[0] : i === 4 ? ends[1] : ""}</span></i>`).join("") : "";
 }
-const mix = (a, b, t) => `rgb(${a.map((x, i) => Math.round(x + (b[i] - x) * Math.min(1, t)))})`;
 
 // Controls
 $("stops").addEventListener("input", () => { state.stops = Number($("stops").value); expose(); });
@@ -264,7 +263,7 @@ $("seconds").addEventListener("change", () => {
 });
 $("tone").addEventListener("change", () => { $("whiteRow").hidden = !["reinhard", "filmic"].includes($("tone").value); paint(); });
 $("white").addEventListener("input", paint);
-$("frusta").addEventListener("change", paint);
+$("frusta").addEventListener("change", () => drawn && frusta());
 $("overlay").addEventListener("change", () => { legend(); nearestPhoto(); $("overlay").value === "clipped" ? moved() : paint(); });
 $("left").addEventListener("change", () => { nearestPhoto(); $("left").value.startsWith("run") ? moved() : paint(); });
 $("run").addEventListener("change", () => { useRun(Number($("run").value)); moved(); });
@@ -341,32 +340,39 @@ function download(blob, name) {
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
 }
+const answer = text => { $("saved").textContent = text, $("saved").scrollIntoView({block: "nearest"}); };
 const counted = () => Math.max(2, Math.round(24 * (Number($("length").value) || 6)));
 for (const button of document.querySelectorAll("[data-save]")) button.addEventListener("click", async () => {
   const kind = button.dataset.save, film = kind === "film";
-  if (film && state.path.length < 2) return void ($("saved").textContent = "add two views or more first");
-  $("saved").textContent = "rendering \u2026";
+  if (film && state.path.length < 2) return answer("add two views or more first");
+  answer("rendering \u2026");
+  let watch = film && setInterval(async () => {
+    const told = await ask("/saving").then(said => said.text(), () => "");
+    if (told && watch) answer(told);
+  }, 1000);
   try {
     const body = {run: state.run, kind, evs: $("evs").value, cameras: film ? state.path : [now()], count: film ? counted() : null, stops: state.stops};
     download(await (await ask("/save", body)).blob(), facts.scene + {exr: ".exr", brackets: "_brackets.zip", film: ".mp4"}[kind]);
-    $("saved").textContent = "saved by your browser";
-  } catch (error) { $("saved").textContent = error.message; }
+    answer("saved by your browser");
+  } catch (error) { answer(error.message); }
+  watch = clearInterval(watch);
 });
-$("addView").addEventListener("click", () => { state.path.push(now()); $("saved").textContent = `${state.path.length} views in the path`; });
-$("clearPath").addEventListener("click", () => { state.path = []; playing = 0; $("saved").textContent = ""; });
+$("addView").addEventListener("click", () => { state.path.push(now()); answer(`${state.path.length} views in the path`); });
+$("clearPath").addEventListener("click", () => { state.path = []; playing = 0; answer(""); });
 const path = async () => (await (await ask("/path", {cameras: state.path, count: counted()})).json()).cameras;
 $("savePath").addEventListener("click", async () => {
-  if (!state.path.length) return void ($("saved").textContent = "add a view first");
+  if (!state.path.length) return answer("add a view first");
   download(new Blob([JSON.stringify({cameras: await path()})], {type: "application/json"}), "path.json");
-  $("saved").textContent = "render it: sehdr-warp render RUN --cameras path.json --video film.mp4";
+  answer("render it: sehdr-warp render RUN --cameras path.json --video film.mp4");
 });
 $("play").addEventListener("click", async () => {
-  if (state.path.length < 2) return void ($("saved").textContent = "add two views or more first");
+  if (state.path.length < 2) return answer("add two views or more first");
   const cameras = await path(), turn = ++playing, started = performance.now(), step = async () => {
     const index = Math.floor((performance.now() - started) / 1000 * 24);
-    if (turn !== playing || index >= cameras.length) return moved();
-    camera.jump(cameras[index], camera.ahead);
+    if (turn !== playing) return;
+    camera.jump(cameras[Math.min(index, cameras.length - 1)], camera.ahead);
     $("zoom").value = 0;
+    if (index >= cameras.length) return moved();
     await request(true);
     requestAnimationFrame(step);
   };
