@@ -3,7 +3,7 @@ camera's logarithm for grading."""
 
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -69,6 +69,7 @@ def write_film(
     ev_ramp: tuple[float, float] = (0.0, 0.0),
     exposed: bool = False,
     overwrite: bool = False,
+    tell: Callable[[str], None] | None = None,
 ) -> Path:
     """Renders a film of cameras, one each frame, at the size of the first; returns `out`, whose suffix says the format.
 
@@ -76,7 +77,8 @@ def write_film(
     Rec.2020, in which a photo's white is 203 cd/m2 and light is kept up to 1000; "logc3", "slog3", "acescct": ProRes
     4444 of 10 bits (.mov), in which a photo's white is a reflectance of 1. ev_ramp: stops from the photos' exposure
     at the first and the last frame, changing evenly. exposed: SDR is not tone-mapped but exposed and clipped, as a
-    camera does; so too where the ramp moves.
+    camera does; so too where the ramp moves. tell: takes a line at each frame that says how far the film is; by
+    default the log has one now and then.
 
     Raises SehdrError without PyAV (the extra `film`) or its encoder, InputError where `out` exists (unless overwrite).
     """
@@ -101,7 +103,7 @@ def write_film(
                 context = stream.codec_context
                 context.color_primaries, context.color_trc, context.colorspace = kind.primaries, kind.curve, kind.matrix
                 context.color_range = 1
-                for camera, ev in zip(_told(cameras, out), stops):
+                for camera, ev in zip(_told(cameras, out, tell), stops):
                     hdr = as_array(run.render(camera.resized(width, height)).hdr) * np.float32(2.0**ev)
                     shown = look(hdr) if look else encode(hdr * np.float32(gain), transfer)
                     for packet in stream.encode(_frame(av, shown, kind)):
@@ -150,14 +152,14 @@ def _frame(av: Any, encoded: np.ndarray, kind: Transfer) -> Any:
     return made
 
 
-def _told(cameras: Sequence[Camera], out: Path) -> Iterator[Camera]:
-    """The cameras; meanwhile the log says how far the film is."""
+def _told(cameras: Sequence[Camera], out: Path, tell: Callable[[str], None] | None) -> Iterator[Camera]:
+    """The cameras; meanwhile `tell`, or the log now and then, says how far the film is."""
     started = due = time.monotonic()
     for index, camera in enumerate(cameras):
-        if index and time.monotonic() > due + TELL_EVERY:
-            due = time.monotonic()
-            left = (due - started) / index * (len(cameras) - index)
-            log.info("%s: frame %d of %d, %s left", out.name, index, len(cameras), format_seconds(left))
+        now = time.monotonic()
+        if index and (tell or now > due + TELL_EVERY):
+            due, left = now, (now - started) / index * (len(cameras) - index)
+            (tell or log.info)(f"{out.name}: frame {index} of {len(cameras)}, {format_seconds(left)} left")
         yield camera
 
 

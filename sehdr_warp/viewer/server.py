@@ -59,7 +59,7 @@ class Viewer:
     def __init__(
         self, runs: Sequence[Rendering], photos: Callable[[int], dict[str, Any]] | None = None, training: Any = None
     ):
-        self.runs, self.training = list(runs), training
+        self.runs, self.training, self.saving = list(runs), training, ""
         self._photos, self._reading, self._saving = photos, threading.Lock(), threading.Lock()
         page = Path(__file__).parent / "page"
         self.files = {
@@ -84,6 +84,8 @@ class Viewer:
             return "application/json", json.dumps([run.version for run in self.runs]).encode()
         if path == "/training" and self.training is not None:
             return "application/json", json.dumps(self.training.told()).encode()
+        if path == "/saving":
+            return "text/plain", self.saving.encode()
         if path.startswith("/photo/"):
             return "image/png", self._photo(path.removeprefix("/photo/"))
         raise Refusal(404, "no such page")
@@ -138,8 +140,8 @@ class Viewer:
             with tempfile.TemporaryDirectory() as folder:
                 if kind == "film":
                     stops = float(asked.get("stops") or 0)
-                    film = write_film(run, Path(folder, "film.mp4"), cameras, ev_ramp=(stops, stops), exposed=True)
-                    return "video/mp4", film.read_bytes()
+                    options = {"ev_ramp": (stops, stops), "exposed": True, "tell": self._tell}
+                    return "video/mp4", write_film(run, Path(folder, "film.mp4"), cameras, **options).read_bytes()
                 given = Path(folder, "cameras.json")
                 given.write_text(camera_file(cameras), encoding="utf-8")
                 evs = str(asked.get("evs") or "-4,-2,0,2,4") if kind == "brackets" else None
@@ -152,7 +154,12 @@ class Viewer:
                         packed.write(file, file.relative_to(folder))
                 return "application/zip", buffer.getvalue()
         finally:
+            self.saving = ""
             self._saving.release()
+
+    def _tell(self, line: str) -> None:
+        """What a page shows meanwhile of a film that is made."""
+        self.saving = line
 
 
 class Server(ThreadingHTTPServer):
