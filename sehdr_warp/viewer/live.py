@@ -116,8 +116,8 @@ class LiveTraining(Rendering):
         started = time.perf_counter()
         picture.make()
         taken = time.perf_counter() - started
-        self._spent += taken
         if not self.paused:
+            self._spent += taken
             self._credit -= taken
 
     def _tell(self, step: Any, elapsed: float) -> None:

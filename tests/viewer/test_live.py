@@ -15,6 +15,7 @@ from sehdr_warp.viewer.commands import viewed
 from sehdr_warp.viewer.live import SHARE, LiveTraining
 
 from ..training.toy import toy_scene
+from .browser import browser
 
 CONFIG = {"schedule.iterations": 60, "plan.enabled": False}
 
@@ -129,3 +130,39 @@ def test_an_interrupt_ends_a_pause_and_errors_reach_who_asked():
         live.render(None)
     with pytest.raises(ValueError, match="none of pause"):
         live.control("explode")
+
+
+def test_the_page_pauses_steps_and_says_the_end(tmp_path, logged):
+    training = Training(toy_scene(), tmp_path / "run", CONFIG | {"schedule.iterations": 300}, device="cpu")
+    served = threading.Event()
+
+    def work():
+        with viewed(training, "toy") as steps:
+            served.set()
+            for _ in steps:
+                pass
+
+    with browser() as chromium:
+        page = chromium.new_page(viewport={"width": 440, "height": 300})
+        threading.Thread(target=work).start()
+        served.wait(60)
+        page.goto(re.search(r"http://\S*", logged[-1])[0])
+
+        def wait(text, place="#progress"):
+            page.locator(place, has_text=re.compile(text)).wait_for()
+
+        wait(" of 300 ")
+        page.click("#pause")
+        wait("Resume", "#pause")
+        page.wait_for_timeout(1200)
+        stopped = int(page.text_content("#progress").split()[0])
+        page.wait_for_timeout(1200)
+        assert page.text_content("#progress").startswith(f"{stopped} of 300 \N{MIDDLE DOT} loss 0.")
+        for _ in range(2):
+            page.click("#step")
+        wait(f"^{stopped + 2} of")
+        curves = "canvas => canvas.getContext('2d').getImageData(0, 0, 248, 70).data.some(value => value)"
+        assert page.locator("#curves").evaluate(curves)
+        page.click("#pause")
+        wait("the training has ended", "#told")
+        assert page.is_disabled("#pause") and page.is_disabled("#step")

@@ -217,7 +217,7 @@ def test_brackets_and_a_film_are_saved_and_what_is_wrong_is_told(chromium, serve
             with page.expect_download() as download:
                 page.click(f"[data-save={kind}]")
             assert download.value.path().read_bytes().startswith(start)
-            page.wait_for_function("document.getElementById('saved').textContent === 'saved by your browser'")
+            page.locator("#saved", has_text="saved by your browser").wait_for()
         page.click("#clearPath")
         assert page.evaluate("state.path.length") == 0
         box = page.locator("#saved").bounding_box()

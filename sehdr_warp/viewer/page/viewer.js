@@ -3,16 +3,18 @@
 
 const $ = id => document.getElementById(id);
 const stage = $("stage"), picture = $("picture"), drawing = $("drawing");
-const DRAFT_TIME = 90, STILL_AFTER = 140;  // Milliseconds that a picture may take while moving; then comes the full one
+const DRAFT_TIME = 90, STILL_AFTER = [140, 600];  // Milliseconds that a picture may take while moving; then comes the full one
 let runs, light, camera, facts, state = {stops: 0, photo: 0, split: 0.5, pointer: null, keys: new Set(), path: []};
-let draftScale = 0.5, busy = false, wanted = null, stillTimer = 0, drawn = null, playing = 0;
+let draftScale = 0.5, fullTime = 0, busy = false, wanted = null, stillTimer = 0, drawn = null, playing = 0;
 
 async function ask(path, body) {
   const given = body && {method: "POST", headers: {"Content-Type": "application/json"}, body: JSON.stringify(body)};
-  const answer = await fetch(path, given);
+  const answer = await fetch(path, given).catch(() => { throw new Error(over()); });
   if (!answer.ok) throw new Error(await answer.text());
   return answer;
 }
+
+const over = () => $("training").hidden ? "the server is gone" : "the training has ended; `sehdr-warp view` shows the run";
 
 async function start() {
   const told = await (await ask("/scene")).json();
@@ -43,7 +45,7 @@ async function renew() {
     runs = told.runs;
     useRun(state.run);
     request(false);
-  } catch (error) { tell("the server is gone"); }
+  } catch (error) { tell(error.message); }
 }
 
 function useRun(index) {
@@ -101,7 +103,8 @@ function nearestPhoto() {
 function moved() {
   delete stage.dataset.frame;
   clearTimeout(stillTimer);
-  stillTimer = setTimeout(() => request(false), STILL_AFTER);
+  // What takes seconds should not begin at a hand's short rest.
+  stillTimer = setTimeout(() => request(false), Math.min(STILL_AFTER[1], Math.max(STILL_AFTER[0], fullTime / 4)));
   request(true);
 }
 async function request(draft) {
@@ -112,7 +115,7 @@ async function request(draft) {
   while (wanted !== null) {
     const isDraft = wanted;
     wanted = null;
-    try { await load(isDraft); } catch (error) { tell(error.message || "the server is gone"); await new Promise(done => setTimeout(done, 500)); }
+    try { await load(isDraft); } catch (error) { tell(error.message); await new Promise(done => setTimeout(done, 500)); }
   }
   busy = false;
 }
@@ -129,6 +132,7 @@ async function load(draft) {
   if (half.length > 5 * n) light.put("clipped", width, height, half.subarray(5 * n), 1);
   if (second) light.put("other", width, height, second.subarray(0, 4 * n), 4);
   if (draft && $("training").hidden) draftScale = Math.min(1, Math.max(0.08, draftScale * Math.min(1.5, Math.max(0.5, Math.sqrt(DRAFT_TIME / took)))));
+  if (!draft) fullTime = took;
   drawn = {camera: seen, draft};
   const depths = Uint16Array.from({length: Math.floor(n / 13)}, (_, i) => half[4 * n + 13 * i]).filter(d => d > 0).sort();  // As integers
   const [near, far] = [0.02, 0.98].map(part => fromHalf(depths[Math.floor(part * depths.length)] || 0x3c00));
@@ -385,29 +389,32 @@ async function startTraining() {
   const control = name => ask("/training", {do: name}).catch(error => tell(error.message));
   $("pause").addEventListener("click", () => control($("pause").textContent === "Pause" ? "pause" : "resume"));
   $("step").addEventListener("click", () => control("step"));
-  let last = -1;
-  for (;;) {
+  let last = -1, ended = false;
+  while (!ended) {
     try {
       const t = await (await ask("/training")).json();
       if (t.iteration === undefined) throw new Error("not yet");
+      ended = t.ended;
       $("progress").textContent = `${t.iteration} of ${t.total} \u00b7 loss ${t.loss.toFixed(4)} \u00b7 ${t.psnr.toFixed(1)} dB \u00b7 ${counts(t.gaussians)} Gaussians`
-        + (t.ended ? " \u00b7 ended" : t.left === null ? "" : ` \u00b7 ${t.left} left`) + ` \u00b7 ${(100 * t.share).toFixed(0)} % for pictures`;
+        + (ended || t.left === null ? "" : ` \u00b7 ${t.left} left`) + ` \u00b7 ${(100 * t.share).toFixed(0)} % for pictures`;
       $("pause").textContent = t.paused ? "Resume" : "Pause";
       facts.gaussians = t.gaussians;
       curve(t.curve);
-      if (t.iteration !== last && !document.hidden) request(false);
+      if (t.iteration !== last && !document.hidden && !ended) request(false);
       last = t.iteration;
     } catch (error) {
-      $("progress").textContent = error.message === "not yet" ? "kernels are being compiled" : "the training has ended";
-      if (error.message !== "not yet") return void ($("pause").disabled = $("step").disabled = true);
+      ended = error.message !== "not yet";
+      if (!ended) $("progress").textContent = "kernels are being compiled";
     }
     await new Promise(done => setTimeout(done, 1000));
   }
+  $("pause").disabled = $("step").disabled = true;
+  tell(over());
 }
 function curve(points) {
   const context = $("curves").getContext("2d");
   context.clearRect(0, 0, 248, 86);
-  [["loss", "#e0a458"], ["psnr", "#7fb2c4"], ["gaussians", "#8a8783"]].forEach(([name, color], k) => {
+  [["loss", "#e0a458"], ["PSNR", "#7fb2c4"], ["Gaussians", "#8a8783"]].forEach(([name, color], k) => {
     const values = points.map(p => p[k + 1]).filter(Number.isFinite), low = Math.min(...values), high = Math.max(...values);
     context.strokeStyle = context.fillStyle = color;
     context.lineWidth = 1.5;
