@@ -15,7 +15,7 @@ from sehdr_warp.scene import Camera
 from .charts import PANELS, training_points
 from .images import as_array, quantize
 
-LINE, COLORS = "#363636", ("#e0a458", "#7fb2c4")
+LINE, COLORS = "var(--line)", ("var(--accent)", "var(--cool)")  # Of style.css
 _MAP_VIEWS, _MAP_SIZE, _SAMPLES = 12, 640, 200
 
 
@@ -90,7 +90,8 @@ def camera_map(run: Any, tone_map: Any, names: Sequence[str] = ()) -> str:
         drawn.append(f'<g fill="{color}" stroke="{color}">{title}<polygon points="{wedge}" fill-opacity="0.18"/>')
         drawn.append(f'<circle cx="{at[0]:.1f}" cy="{at[1]:.1f}" r="3"/></g>')
         if entry.name in names:
-            drawn.append(f'<text x="{at[0] + 7:.1f}" y="{at[1] - 6:.1f}" style="fill:#fff">{escape(entry.name)}</text>')
+            style = "fill:var(--ink);stroke:var(--ground);stroke-width:3px;paint-order:stroke"
+            drawn.append(f'<text x="{at[0] + 7:.1f}" y="{at[1] - 6:.1f}" style="{style}">{escape(entry.name)}</text>')
     return f'<div class="map">{_svg(round(width), round(height), "Cameras from above", drawn)}</div>'
 
 

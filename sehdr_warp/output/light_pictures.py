@@ -101,9 +101,10 @@ def dial(lights: Mapping[str, np.ndarray], base_time: float, gain: float, right:
     sides = side_choices(list(lights), next(iter(lights)), right) if len(lights) > 1 else ""
     facts = {"width": width, "height": height, "time": base_time, "grey": gain}
     data = " ".join(f'data-{name}="{value!r}"' for name, value in facts.items())
-    return f"""<div class="dial" {data}>
+    span = f'min="{-stops}" max="{stops}" step="0.05" value="0" aria-label="exposure in stops"'
+    return f"""<div class="dial" {data} style="--ratio: {width / height:.4f}">
 {scripts}{sides}<div class="stage"><canvas width="{width}" height="{height}"></canvas>{split}</div>
-<label>Exposure <input type="range" min="{-stops}" max="{stops}" step="0.05" value="0"><output>0 EV</output></label>
+<p class="exposure">Exposure <input type="range" {span}><output>0 EV</output></p>
 </div>"""
 
 

@@ -11,8 +11,8 @@ from .report_page import duration
 
 _LONGEST = 420  # Pixels of a side of the picture, which the notebook keeps
 _STYLE = "body { padding: 12px; font-size: 13px; } canvas { display: block; width: 100%; border-radius: 3px; }"
-_STYLE += " p { margin: 0 0 8px; color: #8a8783; } label { display: grid; grid-template-columns: auto 1fr 9.5em;"
-_STYLE += " gap: 14px; align-items: center; margin-top: 8px; color: #8a8783; } output { text-align: right; }"
+_STYLE += " p { margin: 0 0 8px; color: #8a8783; } .exposure { display: grid; grid-template-columns: auto 1fr 9.5em;"
+_STYLE += " gap: 14px; align-items: center; margin: 8px 0 0; } output { text-align: right; }"
 
 
 def run_html(run: Any) -> str:

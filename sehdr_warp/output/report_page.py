@@ -61,7 +61,9 @@ def report_page(
         _plan(run.decisions()),
         _table(evaluation, held_out),
         _section(
-            "Error against time", "Of all held-out photos, while it was trained.", _figure(training_svg(run.metrics()))
+            "Error against time",
+            "Of all held-out photos, while it was trained.",
+            _figure(_wide(training_svg(run.metrics()))),
         ),
         _map(run, comparisons),
         _footer(run),
@@ -79,6 +81,11 @@ def _section(title: str, lead: str, body: str) -> str:
 def _figure(body: str, caption: str = "") -> str:
     told = f"\n<figcaption>{caption}</figcaption>" if caption else ""
     return f"<figure>\n{body}{told}\n</figure>" if body else ""
+
+
+def _wide(body: str) -> str:
+    """What a narrow window scrolls sideways rather than shrinks."""
+    return f'<div class="wide">{body}</div>' if body else ""
 
 
 def _header(run: Any, scene: Scene) -> str:
@@ -157,7 +164,7 @@ def _brackets(shown: "Comparison", time: float, gain: float) -> str:
         f"View {escape(shown.name)}, re-exposed from {seconds(time)} (0 EV) and shown as a plain display does. "
         "What the photo clipped stays flat; the scene keeps its light."
     )
-    body = _figure(dial(lights, time, gain, "Scene")) + _figure(f'<div class="strip">{"".join(cells)}</div>')
+    body = _figure(dial(lights, time, gain, "Scene")) + _figure(_wide(f'<div class="strip">{"".join(cells)}</div>'))
     return _section("Brackets", lead, body)
 
 
@@ -212,9 +219,8 @@ def _unexplained(run: Any, scene: Scene) -> str:
             boxes.append(f'<rect {place} fill="none" stroke="{color}" stroke-width="{1.6 * unit:.2f}"/>')
             below = y < 16 * unit
             at = f'x="{min(x, width - 60 * unit):.1f}" y="{y + h + 14 * unit if below else y - 5 * unit:.1f}"'
-            shadow = (
-                f"fill:{color};font-size:{13 * unit:.1f}px;paint-order:stroke;stroke:#000;stroke-width:{3 * unit:.2f}px"
-            )
+            shadow = f"fill:{color};font-size:{15 * unit:.1f}px;"
+            shadow += f"paint-order:stroke;stroke:#000;stroke-width:{2.4 * unit:.2f}px"
             boxes.append(f'<text {at} style="{shadow}">{stops_text(region["stops"]).removesuffix(" EV")}</text>')
         picture = (
             img(jpeg(smaller(image, _PICTURE), 84), "", size)
@@ -270,8 +276,8 @@ def _table(evaluation: Mapping[str, Any] | None, held_out: bool) -> str:
 def _map(run: Any, comparisons: Sequence["Comparison"]) -> str:
     tone_map = fit_tone_map([each.hdr for each in comparisons])
     lead = (
-        'From above, as the photos see it. <span style="color: #e0a458">Amber</span>: trained on. '
-        '<span style="color: #7fb2c4">Blue</span>: held out.'
+        'From above, as the photos see it. <span style="color: var(--accent)">Amber</span>: trained on. '
+        '<span style="color: var(--cool)">Blue</span>: held out.'
     )
     drawn = camera_map(run, tone_map, [each.name for each in comparisons])
     return _section("Cameras", lead, _figure(drawn))
