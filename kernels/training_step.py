@@ -4,10 +4,13 @@ Adam (Kingma and Ba 2015) takes one thread a number. torch's fused Adam hands ea
 100,000 Gaussians then keeps 90 blocks busy on a GPU that has room for thousands.
 """
 
+from functools import cache
+
 import warp as wp
 
 from .constants import LOG_SCALE_MAX
 from .geometry import geometry, vector
+from .harmonics import harmonic_functions
 
 SHARPNESS, CENTRE = 100.0, 0.995  # 3DGS-MCMC, equation 8: noise is for Gaussians of opacity below 1 - 0.995
 
@@ -43,6 +46,16 @@ def bias_correction(decay_log: float, step: float) -> float:
     return correction
 
 
+@wp.func
+def change_by_adam(
+    mean: float, square: float, step: float, rate: float, first_decay_log: float, second_decay_log: float,
+    epsilon: float,
+) -> float:
+    """What a number loses in a step whose moments are `mean` and `square`, both not yet corrected."""
+    deviation = wp.sqrt(square / bias_correction(second_decay_log, step)) + epsilon
+    return rate / bias_correction(first_decay_log, step) * mean / deviation
+
+
 @wp.kernel(module="unique", module_options={"enable_backward": False})
 def update_by_adam(
     first: int,
@@ -61,8 +74,51 @@ def update_by_adam(
         square = second_moments[i] + second_gain * (gradient * gradient - second_moments[i])
         first_moments[i] = mean
         second_moments[i] = square
-        deviation = wp.sqrt(square / bias_correction(second_decay_log, step[0])) + epsilon
-        parameters[i] = parameters[i] - rate[0] / bias_correction(first_decay_log, step[0]) * mean / deviation
+        parameters[i] = parameters[i] - change_by_adam(
+            mean, square, step[0], rate[0], first_decay_log, second_decay_log, epsilon
+        )
+
+
+@cache
+def harmonics_adam_kernel(degree: int):
+    """update_by_adam of coefficients of harmonics, [N, K] vec3 from number `start` on, whose gradient nobody stored: it
+    is the sum over V views of Y_k towards means [N] from positions [V], times value_gradients [V, N]. Those of degrees
+    above `degree` have none. Covers [0, N K): neighbouring threads change neighbouring numbers."""
+    direction_of, harmonic = harmonic_functions(wp.float32)
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    def update_harmonics_by_adam(
+        first: int,
+        means: wp.array(dtype=_vec3), positions: wp.array(dtype=_vec3), value_gradients: wp.array2d(dtype=_vec3),
+        start: int,
+        step: wp.array(dtype=wp.float32), rate: wp.array(dtype=wp.float32), skipped: wp.array(dtype=wp.float32),
+        first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
+        parameters: wp.array2d(dtype=_vec3), first_moments: wp.array2d(dtype=_vec3),
+        second_moments: wp.array2d(dtype=_vec3),
+    ):
+        place = first + wp.tid()
+        i = place // parameters.shape[1]
+        k = place - i * parameters.shape[1]
+        if skipped[0] == 0.0:
+            gradient = _vec3()
+            if start + k < wp.static((degree + 1) * (degree + 1)):
+                for view in range(positions.shape[0]):
+                    d = direction_of(means[i], positions[view])
+                    gradient += harmonic(start + k, d[0], d[1], d[2]) * value_gradients[view, i]
+            mean = first_moments[i, k]
+            square = second_moments[i, k]
+            mean += first_gain * (gradient - mean)
+            square += second_gain * (wp.cw_mul(gradient, gradient) - square)
+            first_moments[i, k] = mean
+            second_moments[i, k] = square
+            change = _vec3()
+            for c in range(3):
+                change[c] = change_by_adam(
+                    mean[c], square[c], step[0], rate[0], first_decay_log, second_decay_log, epsilon
+                )
+            parameters[i, k] = parameters[i, k] - change
+
+    return update_harmonics_by_adam
 
 
 @wp.kernel(module="unique", module_options={"enable_backward": False})

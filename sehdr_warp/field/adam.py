@@ -5,8 +5,11 @@ from collections import defaultdict
 import torch
 from torch import Tensor
 
-from ..splatting.training_step import adam_step
+from ..splatting import HarmonicsGradients
+from ..splatting.training_step import adam_step, harmonics_adam_step
 
+FIRST_COEFFICIENT = {"harmonics_dc": 0, "harmonics_rest": 1}
+"""Of the groups that hold coefficients of harmonics."""
 BETAS = 0.9, 0.999
 EPSILON = 1e-15  # 3DGS: gradients of a single Gaussian are tiny, and must not drown in Adam's usual 1e-8
 
@@ -25,9 +28,23 @@ class Adam:
                 parameter.grad = None
 
     @torch.no_grad()
-    def step(self, skipped: Tensor | None = None, made: Tensor | None = None) -> None:
-        """skipped: scalar, 1 where parameters, moments and step count stay as they are. made: 1 - skipped."""
-        grouped = [(group, p) for group in self.param_groups for p in group["params"] if p.grad is not None]
+    def step(
+        self,
+        skipped: Tensor | None = None,
+        made: Tensor | None = None,
+        harmonics: HarmonicsGradients | None = None,
+    ) -> None:
+        """skipped: scalar, 1 where parameters, moments and step count stay as they are. made: 1 - skipped. harmonics:
+        the gradients of coefficients that have none of their own."""
+        factored = FIRST_COEFFICIENT if harmonics is not None else ()
+        grouped = [
+            (group, parameter)
+            for group in self.param_groups
+            for parameter in group["params"]
+            if parameter.grad is not None or group.get("name") in factored
+        ]
+        # Directions to centres are those of before the step.
+        grouped.sort(key=lambda pair: pair[1].grad is not None)
         parameters = [parameter for _, parameter in grouped]
         skipped = parameters[0].new_zeros(()) if skipped is None else skipped
         made = 1 - skipped if made is None else made
@@ -42,4 +59,8 @@ class Adam:
         for group, parameter in grouped:
             first, second, step = (self.state[parameter][key] for key in ("exp_avg", "exp_avg_sq", "step"))
             options = {"rate": group["lr"], "betas": group["betas"], "epsilon": group["eps"]}
-            adam_step(parameter.detach(), parameter.grad.contiguous(), first, second, step, skipped, **options)
+            state, values = (first, second, step, skipped), parameter.detach()
+            if parameter.grad is not None:
+                adam_step(values, parameter.grad.contiguous(), *state, **options)
+            else:
+                harmonics_adam_step(values, FIRST_COEFFICIENT[group["name"]], harmonics, *state, **options)

@@ -44,6 +44,7 @@ class Photograph:
     base: of the base color at the base time (I^b); the same tensor as `exposure` without fusion.
     rendering: what the rasterizer knows: alpha, projected means, radii.
     light: exposure of this photo, which the response encoded; None where colors are encoded before they are composited.
+    harmonics: [N, 3], what each Gaussian's harmonics are in this direction.
     """
 
     encoded: Tensor | None
@@ -51,6 +52,7 @@ class Photograph:
     base: Tensor | None
     rendering: Rendering
     light: Tensor | None = None
+    harmonics: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -121,17 +123,22 @@ class RadianceField(nn.Module):
         also: frozenset[str] = frozenset(),
         capacity: int | None = None,
         encode: bool = True,
+        factored: bool = False,
     ) -> Photograph:
         """A photo of exposure_time seconds, harmonics up to `degree`; also: which of "exposure" and "base" are wanted;
-        capacity: as rasterize() takes it; encode: False leaves a photo that has an exposure at that."""
+        capacity: as rasterize() takes it; encode: False leaves a photo that has an exposure at that; factored: the
+        harmonics' coefficients get no gradient, their values keep one."""
         ratio = exposure_time / self.base_time
+        values = self._values(camera.position, degree, factored)
+        if factored:
+            values.retain_grad()
         if self.color_model.encoded:
-            rendering = self._rasterize(camera, self._colors(camera.position, degree)[0], capacity)
+            rendering = self._rasterize(camera, self.color_model.colors(values)[0], capacity)
             image = rendering.image
             if ratio != 1.0:
                 image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
-            return Photograph(image, None, None, rendering)
-        base, fused = self._exposures(camera.position, degree)
+            return Photograph(image, None, None, rendering, None, values)
+        base, fused = self._exposures(values)
         sets = {"fused": fused}
         if self.tone_map == "gaussian":
             wanted = "exposure" in also or ("base" in also and self.fusion is None)
@@ -147,7 +154,7 @@ class RadianceField(nn.Module):
         if self.tone_map == "pixel":
             light = images["fused"] * ratio
             encoded = self.response.encode_extended(light) if encode else None
-        return Photograph(encoded, exposure, images.get("base", exposure), rendering, light)
+        return Photograph(encoded, exposure, images.get("base", exposure), rendering, light, values)
 
     @torch.no_grad()
     def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:
@@ -155,8 +162,8 @@ class RadianceField(nn.Module):
         tensors = CameraTensors.of(camera, self.gaussians.means.device)
         pose = tensors.world_to_camera
         depth = self.gaussians.means @ pose[2, :3, None] + pose[2, 3]
-        encoded = self.color_model.encoded
-        colors = self._colors(tensors.position, degree)[0] if encoded else self._exposures(tensors.position, degree)[1]
+        encoded, values = self.color_model.encoded, self._values(tensors.position, degree)
+        colors = self.color_model.colors(values)[0] if encoded else self._exposures(values)[1]
         rendering = self._rasterize(tensors, torch.cat([colors, depth], dim=1))
         colors, depth = rendering.image[..., :3], rendering.image[..., 3]
         if encoded:
@@ -176,8 +183,8 @@ class RadianceField(nn.Module):
         """What is seen along unit directions [H, W, 3] from a position [3], float32 on the field's device; focal_length
         (pixels) and pixel_angle (radians) as rasterize_directions() takes them."""
         gaussians = self.gaussians
-        encoded = self.color_model.encoded
-        colors = self._colors(position, degree)[0] if encoded else self._exposures(position, degree)[1]
+        encoded, values = self.color_model.encoded, self._values(position, degree)
+        colors = self.color_model.colors(values)[0] if encoded else self._exposures(values)[1]
         features = [colors, (gaussians.means - position).norm(dim=1, keepdim=True)]
         if self.confidence is not None:
             features.append(self.confidence[:, None])
@@ -226,15 +233,17 @@ class RadianceField(nn.Module):
             # Of one number: to check given gradients torch loads its compiler, two seconds.
             return torch.autograd.grad((blended * images).sum(), features)[0]
 
-    def _colors(self, position: Tensor, degree: int | None) -> tuple[Tensor, Tensor | None]:
+    def _values(self, position: Tensor, degree: int | None, factored: bool = False) -> Tensor:
+        """[N, 3], what the Gaussians' harmonics are towards a position [3]."""
         gaussians = self.gaussians
         used = gaussians.degree if degree is None else min(degree, gaussians.degree)
-        coefficients = gaussians.harmonics_dc, gaussians.harmonics_rest
-        return self.color_model.colors(spherical_harmonics(used, coefficients, gaussians.means, position))
+        constant, rest = gaussians.harmonics_dc, gaussians.harmonics_rest
+        coefficients = (constant.detach(), rest.detach()) if factored else (constant, rest)
+        return spherical_harmonics(used, coefficients, gaussians.means, position)
 
-    def _exposures(self, position: Tensor, degree: int | None) -> tuple[Tensor, Tensor]:
+    def _exposures(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Exposures at the base time of each Gaussian's base colour and of its HDR colour, [N, 3] each."""
-        base, logarithm = self._colors(position, degree)
+        base, logarithm = self.color_model.colors(values)
         if self.fusion is None:
             return base, base
         return base, self.fusion(base.log() if logarithm is None else logarithm) * self.base_time

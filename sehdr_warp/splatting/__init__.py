@@ -1,7 +1,7 @@
 """torch <-> Warp: differentiable splatting and the bridge that makes torch operations of Warp programs."""
 
 from .bridge import Program, differentiable
-from .harmonics import spherical_harmonics
+from .harmonics import HarmonicsGradients, spherical_harmonics
 from .rasterization import Rendering, rasterize
 from .recording import GraphRecorder
 from .sphere import rasterize_directions
@@ -9,6 +9,7 @@ from .ssim import ssim, ssim_map
 
 __all__ = [
     "GraphRecorder",
+    "HarmonicsGradients",
     "Program",
     "Rendering",
     "differentiable",

@@ -1,11 +1,12 @@
 """View-dependent values from spherical harmonics."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..kernels.harmonics import harmonics_adjoint_kernel, harmonics_kernel
+from ..kernels.harmonics import coefficient_adjoint_kernel, harmonics_adjoint_kernel, harmonics_kernel
 from .checks import check_tensors, whole_number
 from .launching import launch, warp_scalar
 
@@ -42,6 +43,22 @@ def spherical_harmonics(
     return _Evaluation.apply(degree, *(t.contiguous() for t in (constant, rest, means, camera_position)))
 
 
+@dataclass(frozen=True)
+class HarmonicsGradients:
+    """Gradients by the coefficients of harmonics as their factors, of which there are 3 numbers a Gaussian and view in
+    place of 48: the gradients by the values that views showed, and where these were seen from. The gradients are the
+    sums over the views.
+
+    by_values: [V, N, 3]; positions: [V, 3]; means: [N, 3], as the views saw them; world coordinates, float32.
+    degree: of the evaluation.
+    """
+
+    by_values: Tensor
+    positions: Tensor
+    means: Tensor
+    degree: int
+
+
 class _Evaluation(torch.autograd.Function):
     """The adjoint is by hand: the generated one adds to zeros, number by number, which for 48 numbers a Gaussian takes
     several times as long as to write them."""
@@ -58,10 +75,20 @@ class _Evaluation(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):
-        constant, *read = ctx.saved_tensors
-        made = [torch.empty_like(tensor) for tensor in (constant, *read[:2])]
-        kernel = harmonics_adjoint_kernel(warp_scalar(gradient.dtype), ctx.degree)
-        launch(kernel, len(gradient), *read, gradient.contiguous(), *made)
-        by_camera = -made[2].sum(0) if ctx.needs_input_grad[4] else None
-        wanted = (part if needed else None for part, needed in zip(made, ctx.needs_input_grad[1:], strict=False))
-        return None, *wanted, by_camera
+        constant, rest, means, position = ctx.saved_tensors
+        scalar, degree, gradient = warp_scalar(gradient.dtype), ctx.degree, gradient.contiguous()
+        by_constant, by_rest, turns, by_camera = ctx.needs_input_grad[1:]
+        made = [torch.empty_like(t) if by_constant or by_rest else None for t in (constant, rest)]
+        # On the CPU a thread takes a Gaussian with all of its coefficients.
+        together = gradient.device.type == "cpu" and made[0] is not None
+        mean_gradients = torch.empty_like(means)
+        if turns or by_camera or together:
+            kernel = harmonics_adjoint_kernel(scalar, degree, together)
+            launch(kernel, len(means), rest, means, position, gradient, mean_gradients, *made)
+        if not together:
+            kernel = coefficient_adjoint_kernel(scalar, degree)
+            for start, part in enumerate(made):
+                if part is not None:
+                    launch(kernel, part.shape[0] * part.shape[1], means, position, gradient, start, part)
+        by_position = -mean_gradients.sum(0) if by_camera else None
+        return None, *made, mean_gradients if turns else None, by_position

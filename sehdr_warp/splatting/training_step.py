@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import training_step as kernels
+from .harmonics import HarmonicsGradients
 from .launching import launch
 
 
@@ -55,15 +56,42 @@ def adam_step(
         numbers: Any = {"lr": float(rate), "beta1": betas[0], "beta2": betas[1], "weight_decay": 0.0, "eps": epsilon}
         torch._fused_adam_(*lists, **numbers, amsgrad=False, maximize=False, found_inf=skipped)  # pyright: ignore[reportPrivateImportUsage]
         return
-    rate = rate if isinstance(rate, Tensor) else torch.full_like(skipped, rate)
     _step_by_kernel(parameter, gradient, first_moment, second_moment, step, skipped, rate, betas, epsilon)
 
 
 def _step_by_kernel(parameter, gradient, first_moment, second_moment, step, skipped, rate, betas, epsilon) -> None:
-    gains, logs = [1 - beta for beta in betas], [math.log(beta) for beta in betas]
     changed = parameter.view(-1), first_moment.view(-1), second_moment.view(-1)
-    numbers = step, rate, skipped, *gains, *logs, epsilon
+    numbers = _numbers(step, rate, skipped, betas, epsilon)
     launch(kernels.update_by_adam, parameter.numel(), gradient.view(-1), *numbers, *changed)
+
+
+@torch.no_grad()
+def harmonics_adam_step(
+    parameter: Tensor,
+    start: int,
+    gradients: HarmonicsGradients,
+    first_moment: Tensor,
+    second_moment: Tensor,
+    step: Tensor,
+    skipped: Tensor,
+    *,
+    rate: Tensor | float,
+    betas: tuple[float, float],
+    epsilon: float,
+) -> None:
+    """adam_step() of coefficients of harmonics [N, K, 3] from number `start` on, whose gradients are multiplied out
+    where they are used."""
+    given = gradients.means.detach(), gradients.positions, gradients.by_values, start
+    kernel, threads = kernels.harmonics_adam_kernel(gradients.degree), parameter.shape[0] * parameter.shape[1]
+    numbers = _numbers(step, rate, skipped, betas, epsilon)
+    launch(kernel, threads, *given, *numbers, parameter, first_moment, second_moment)
+
+
+def _numbers(step: Tensor, rate: Tensor | float, skipped: Tensor, betas: tuple[float, float], epsilon: float) -> tuple:
+    """What Adam's kernels read beside gradient and state."""
+    rate = rate if isinstance(rate, Tensor) else torch.full_like(skipped, rate)
+    gains, logs = [1 - beta for beta in betas], [math.log(beta) for beta in betas]
+    return step, rate, skipped, *gains, *logs, epsilon
 
 
 @torch.no_grad()

@@ -11,9 +11,10 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
-from ..field.adam import BETAS, Adam
+from ..field.adam import BETAS, FIRST_COEFFICIENT, Adam
 from ..field.gaussians import PARAMETER_NAMES
 from ..field.radiance_field import RadianceField
+from ..splatting import HarmonicsGradients
 from ..splatting.training_step import judge_step
 from .config import Config
 
@@ -52,53 +53,80 @@ def set_means_rate(optimizer: Adam, rate: float) -> None:
         group["lr"] = rate
 
 
-def guarded_step(optimizer: Adam, loss: Tensor, incomplete: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def guarded_step(
+    optimizer: Adam, loss: Tensor, incomplete: Tensor | None = None, harmonics: HarmonicsGradients | None = None
+) -> tuple[Tensor, Tensor]:
     """One step of Adam, or none if the loss or a gradient is not finite or the rendering was incomplete; decided on the
     device, without waiting for it. Two scalar float tensors: 1 if something was not finite; 1 if the step was made."""
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
+    gradients += [] if harmonics is None else [harmonics.by_values]
     norms = torch.stack(torch._foreach_norm(gradients))
     nonfinite, skipped, made = judge_step(loss, norms, incomplete)
-    optimizer.step(skipped, made)
+    optimizer.step(skipped, made, harmonics)
     return nonfinite, made
 
 
 class FlatGradients:
-    """The gradients of all parameters of an optimizer in one buffer, behind them two numbers of the step: its loss, and
-    whether its rendering was incomplete."""
+    """The gradients of all parameters of an optimizer in one buffer, which ranks exchange; those of harmonics as their
+    factors where they come so. Behind them two numbers of the step: its loss, and whether its rendering was incomplete.
 
-    def __init__(self, optimizer: Adam):
-        self.parameters = [p for group in optimizer.param_groups for p in group["params"]]
-        sizes = [parameter.numel() for parameter in self.parameters]
-        self.buffer = torch.zeros(sum(sizes) + 2, device=self.parameters[0].device)
+    place: of this rank among `count`. factored: whether the gradients of harmonics come as their factors.
+    """
+
+    def __init__(self, optimizer: Adam, place: int, count: int, *, factored: bool):
+        groups = {group["name"]: group["params"] for group in optimizer.param_groups}
+        self.all = _parameters(optimizer)
+        self.parameters = [
+            parameter
+            for name, parameters in groups.items()
+            for parameter in parameters
+            if not (factored and name in FIRST_COEFFICIENT)
+        ]
+        self._means, self._place, self._count = groups["means"][0], place, count
+        shapes = [parameter.shape for parameter in self.parameters]
+        shapes += [(count, *self._means.shape), (count, 3)] if factored else []
+        sizes = [math.prod(shape) for shape in shapes]
+        self.buffer = torch.zeros(sum(sizes) + 2, device=self._means.device)
         *parts, self.numbers = self.buffer.split([*sizes, 2])
-        self._views = [part.view(p.shape) for part, p in zip(parts, self.parameters, strict=True)]
+        self._views = [part.view(shape) for part, shape in zip(parts, shapes, strict=True)]
         self._given: Sequence[int] = ()
+        self._degree: int | None = None
 
     def fits(self, optimizer: Adam) -> bool:
         """Whether these are still the optimizer's parameters."""
-        return all(
-            ours is theirs
-            for ours, theirs in zip(
-                self.parameters, (p for g in optimizer.param_groups for p in g["params"]), strict=True
-            )
-        )
+        return all(ours is theirs for ours, theirs in zip(self.all, _parameters(optimizer), strict=True))
 
     @torch.no_grad()
-    def take(self, loss: Tensor, incomplete: Tensor | None) -> None:
+    def take(self, loss: Tensor, incomplete: Tensor | None, harmonics: HarmonicsGradients | None = None) -> None:
         """Moves the parameters' gradients into the buffer, with a step's numbers."""
         self._given = [k for k, parameter in enumerate(self.parameters) if parameter.grad is not None]
         given = [self.parameters[k].grad for k in self._given]
         torch._foreach_copy_([self._views[k] for k in self._given], given)
+        self._degree = None
+        if harmonics is not None:
+            # The others' places are zero: the sum over the ranks gathers all.
+            by_values, positions = (part.zero_() for part in self._views[-2:])
+            by_values[self._place], positions[self._place] = harmonics.by_values[0], harmonics.positions[0]
+            self._degree = harmonics.degree
         self.numbers[0] = loss.detach()
         self.numbers[1] = torch.zeros_like(loss) if incomplete is None else incomplete.to(loss.dtype)
         for k in self._given:
             self.parameters[k].grad = None
 
-    def give(self) -> tuple[Tensor, Tensor]:
-        """The buffer's parts as the gradients of the parameters that had one; loss and incomplete [] bool."""
+    def give(self) -> tuple[Tensor, Tensor, HarmonicsGradients | None]:
+        """The buffer's parts as the gradients of the parameters that had one; loss, incomplete [] bool, and what the
+        harmonics' gradients are the product of. To be called on the mean over the ranks."""
         for k in self._given:
             self.parameters[k].grad = self._views[k]
-        return self.numbers[0], self.numbers[1] > 0
+        harmonics = None
+        if self._degree is not None:
+            by_values, positions = self._views[-2:]
+            harmonics = HarmonicsGradients(by_values, positions * self._count, self._means, self._degree)
+        return self.numbers[0], self.numbers[1] > 0, harmonics
+
+
+def _parameters(optimizer: Adam) -> list[Tensor]:
+    return [parameter for group in optimizer.param_groups for parameter in group["params"]]
 
 
 def optimizer_tensors(optimizer: Adam, batch: int = 1) -> dict[str, Tensor]:

@@ -14,7 +14,7 @@ from ..errors import SehdrError
 from ..field.radiance_field import RadianceField, RenderedView
 from ..response.learned import EXACT_BELOW
 from ..scene import Camera, Scene
-from ..splatting import GraphRecorder, Rendering
+from ..splatting import GraphRecorder, HarmonicsGradients, Rendering
 from ..splatting.memory import bytes_asked_for
 from ..splatting.tile_lists import ONE_SORT
 from . import optimizer as adam
@@ -80,6 +80,8 @@ class Trainer:
         self._recorder = GraphRecorder(self.device) if recorded else None
         # What follows the exchange of gradients is a recording of its own.
         self._follower = GraphRecorder(self.device, self._recorder.stream) if self._recorder and ranks else None
+        # A GPU waits for memory: the 48 numbers of each Gaussian's gradients by its harmonics are never written there.
+        self._factored = self.device.type == "cuda"
         self._flat: adam.FlatGradients | None = None
         self._launched: set = set()
         self._capacity = GraphCapacity(self.device)
@@ -216,7 +218,8 @@ class Trainer:
         target, camera, time = view.target, view.camera, view.exposure_time
         also = needed_colours(self.config.loss, target.exposure_truth is not None)
         options = {"degree": self.degree, "also": also, "capacity": capacity, "encode": self._encoded}
-        photo = self.field.photograph(camera, time, **options)
+        photo = self.field.photograph(camera, time, **options, factored=self._factored)
+        values = photo.harmonics
         # What the backward pass does not read, or only its first part does, must not stay until the end of the step.
         kept = {"means2d", "extents"} if watched else set()
         unread = {"image", "transmittance", "depths", "means2d", "extents"} - kept
@@ -227,16 +230,20 @@ class Trainer:
         del photo, target, view
         loss = regularised(loss, self.field, self.config.loss)
         loss.backward()
+        harmonics = None
+        if self._factored:
+            degree, means = min(self.degree, self.field.gaussians.degree), self.field.gaussians.means
+            harmonics = HarmonicsGradients(values.grad[None], camera.position[None], means, degree)
         if self.ranks is not None:
-            self._flattened().take(loss, rendering.overflow)
-        return _Seen(loss.detach(), rendering, camera.width, camera.height, watched, capacity)
+            self._flattened().take(loss, rendering.overflow, harmonics)
+        return _Seen(loss.detach(), rendering, camera.width, camera.height, watched, capacity, harmonics)
 
     def _apply(self, seen: "_Seen") -> Tensor:
         """The step that gradients make; its loss. Nothing waits for the device."""
-        rendering, loss, incomplete = seen.rendering, seen.loss, seen.rendering.overflow
+        rendering, loss, incomplete, harmonics = seen.rendering, seen.loss, seen.rendering.overflow, seen.harmonics
         if self._flat is not None:
-            loss, incomplete = self._flat.give()
-        nonfinite, made = adam.guarded_step(self.optimizer, loss, incomplete)
+            loss, incomplete, harmonics = self._flat.give()
+        nonfinite, made = adam.guarded_step(self.optimizer, loss, incomplete, harmonics)
         if seen.watched:
             self.densification.observe(rendering, seen.width, seen.height, made)
         self.optimizer.zero_grad()
@@ -251,7 +258,9 @@ class Trainer:
         """The buffer for the gradients of the parameters as they are."""
         if self._flat is None or not self._flat.fits(self.optimizer):
             self._flat = None  # Before there is another: they are large.
-            self._flat = adam.FlatGradients(self.optimizer)
+            assert self.ranks is not None
+            place = self.ranks.rank, self.ranks.count
+            self._flat = adam.FlatGradients(self.optimizer, *place, factored=self._factored)
         return self._flat
 
     def _can_record(self, views, kind) -> bool:
@@ -384,7 +393,7 @@ class Trainer:
 @dataclass(frozen=True)
 class _Seen:
     """What the second half of a step knows of the first: its own loss, what was rendered and at what size, whether the
-    densification watches, and the room for pairs."""
+    densification watches, the room for pairs, and the gradients by the harmonics where no parameter has them."""
 
     loss: Tensor
     rendering: Rendering
@@ -392,6 +401,7 @@ class _Seen:
     height: int
     watched: bool
     capacity: int | None
+    harmonics: HarmonicsGradients | None
 
 
 def sizes_of(scene: Scene, trainer: Trainer | None = None) -> tuple[int, int, int]:

@@ -5,7 +5,10 @@ import pytest
 import torch
 from scipy.special import sph_harm_y
 
-from sehdr_warp.splatting import spherical_harmonics
+from sehdr_warp.kernels.harmonics import coefficient_adjoint_kernel
+from sehdr_warp.splatting import HarmonicsGradients, spherical_harmonics
+from sehdr_warp.splatting.launching import launch, warp_scalar
+from sehdr_warp.splatting.training_step import adam_step, harmonics_adam_step
 
 from .scenes import finite_differences, relative_error
 
@@ -86,3 +89,40 @@ def test_one_gaussian_takes_joined_coefficients(device):
     means = torch.randn(1, 3, device=device, requires_grad=True)
     spherical_harmonics(3, coefficients, means, torch.zeros(3, device=device)).sum().backward()
     assert coefficients.grad.abs().sum() > 0 and means.grad.abs().sum() > 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_a_thread_for_each_coefficient_gives_the_same(device, degree, dtype):
+    leaves = [tensor.to(device, dtype).requires_grad_() for tensor in inputs()]
+    weights = torch.randn(20, 3, generator=torch.Generator().manual_seed(1), dtype=dtype).to(device)
+    spherical_harmonics(degree, *leaves).backward(weights)
+    means, position = (leaf.detach() for leaf in leaves[1:])
+    found = torch.full((20, 15, 3), torch.nan, dtype=dtype, device=device)
+    launch(coefficient_adjoint_kernel(warp_scalar(dtype), degree), 20 * 15, means, position, weights, 1, found)
+    assert torch.allclose(found, leaves[0].grad[:, 1:], rtol=1e-5, atol=1e-6)
+    assert not found[:, (degree + 1) ** 2 - 1 :].any()
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_adam_multiplies_the_factors_of_two_views_out(device, degree):
+    coefficients, means, camera = (tensor.float().to(device) for tensor in inputs())
+    positions = torch.stack([camera, -camera])
+    by_values = torch.randn(2, 20, 3, generator=torch.Generator().manual_seed(1)).to(device)
+    leaf = coefficients.clone().requires_grad_()
+    sum(
+        (spherical_harmonics(degree, leaf, means, p) * g).sum() for p, g in zip(positions, by_values, strict=True)
+    ).backward()
+    one, options = torch.ones((), device=device), {"rate": 0.01, "betas": (0.9, 0.999), "epsilon": 1e-15}
+    for start, part in ((0, slice(0, 1)), (1, slice(1, 16))):
+        plain, factored = (
+            [t[:, part].clone(), *(torch.zeros_like(t[:, part]) for _ in range(2))] for t in [coefficients] * 2
+        )
+        adam_step(plain[0], leaf.grad[:, part].contiguous(), *plain[1:], one, 0 * one, **options)
+        gradients = HarmonicsGradients(by_values, positions, means, degree)
+        harmonics_adam_step(factored[0], start, gradients, *factored[1:], one, 0 * one, **options)
+        for a, b in zip(plain, factored, strict=True):
+            assert torch.allclose(a, b, rtol=1e-4, atol=1e-6)
+        kept = factored[0].clone()
+        harmonics_adam_step(factored[0], start, gradients, *factored[1:], one, one, **options)
+        assert torch.equal(kept, factored[0])

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
+from sehdr_warp.splatting import HarmonicsGradients
 from sehdr_warp.training.densification import make_densification
 from sehdr_warp.training.optimizer import FlatGradients, load_optimizer_tensors, make_optimizer, optimizer_tensors
 from sehdr_warp.training.plan import gain_of_ranks
@@ -148,19 +149,34 @@ def test_rates_and_decays_follow_the_batch():
 def test_gradients_go_through_one_buffer():
     field = toy_field()
     optimizer = make_optimizer(field, configuration("gradient"), 1.0)
-    flat, given = FlatGradients(optimizer), {}
+    flat, given = FlatGradients(optimizer, 0, 1, factored=False), {}
     for name in ("means", "opacity_logits"):
         parameter = getattr(field.gaussians, name)
         given[name] = parameter.grad = torch.randn_like(parameter)
     flat.take(torch.tensor(2.0), torch.tensor(True))
     assert flat.fits(optimizer) and field.gaussians.means.grad is None
     flat.buffer.mul_(0.5)
-    loss, incomplete = flat.give()
-    assert loss == 1 and bool(incomplete) and field.gaussians.quaternions.grad is None
+    loss, incomplete, harmonics = flat.give()
+    assert harmonics is None and loss == 1 and bool(incomplete) and field.gaussians.quaternions.grad is None
     for name, gradient in given.items():
         assert torch.equal(getattr(field.gaussians, name).grad, gradient / 2)
     field.gaussians.resize(70, optimizer)
     assert not flat.fits(optimizer) and field.gaussians.count == 70
+
+
+def test_harmonics_go_as_their_factors():
+    field, count = toy_field(), 3
+    optimizer, means = make_optimizer(field, configuration("gradient"), 1.0), field.gaussians.means
+    ranks = [FlatGradients(optimizer, place, count, factored=True) for place in range(count)]
+    seen = [HarmonicsGradients(torch.randn(1, len(means), 3), torch.randn(1, 3), means, 1) for _ in ranks]
+    for flat, harmonics in zip(ranks, seen, strict=True):
+        means.grad = torch.ones_like(means)
+        flat.take(torch.tensor(2.0), None, harmonics)
+    ranks[1].buffer.copy_(torch.stack([flat.buffer for flat in ranks]).mean(0))
+    _, _, harmonics = ranks[1].give()
+    assert harmonics.degree == 1 and ranks[1].buffer.numel() < 4 * count * means.numel() + 11 * len(means)
+    assert torch.allclose(harmonics.by_values, torch.cat([one.by_values for one in seen]) / count)
+    assert torch.allclose(harmonics.positions, torch.cat([one.positions for one in seen]))
 
 
 @pytest.mark.parametrize("photos", [1, 2, 3, 8])

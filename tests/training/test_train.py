@@ -198,6 +198,19 @@ def test_steps_that_compare_light_do_not_encode_it_and_report_the_same(scene):
     assert trainers[0].psnr() == trainers[1].psnr() > 0
 
 
+@pytest.mark.parametrize("variant", ["default", "gradient"])
+def test_gradients_by_harmonics_as_factors_make_the_same_steps(scene, device, variant):
+    config = override_config(VARIANTS[variant], {"schedule.harmonics_every": 2})
+    fields = [make_field(scene, config, choose_response(scene, config), device) for _ in range(2)]
+    for field, factored in zip(fields, (True, False), strict=True):
+        trainer = Trainer(scene, config, field)
+        trainer._factored = factored
+        for _ in range(6):
+            trainer.step()
+    for name, ours in fields[0].gaussians.tensors().items():
+        torch.testing.assert_close(ours, fields[1].gaussians.tensors()[name], rtol=1e-3, atol=1e-4, msg=name)
+
+
 def test_non_finite_steps_are_skipped_and_then_stop(scene):
     config = quick(**{"densification.noise": 0.0})
     field = make_field(scene, config, choose_response(scene, config), "cpu")
