@@ -12,12 +12,13 @@ PACKAGE = ROOT / "sehdr_warp"
 
 # What each room may import of the others: training -> field -> response -> splatting -> kernels, and below them all
 # what any room may use. Rooms that read a trained scene take it as an object with named methods.
-ANY = {"errors", "quiet", "arguments", "files", "console", "apart"}
+ANY = {"errors", "quiet", "arguments", "files", "console", "apart", "parallel"}
 ALLOWED = {
     "kernels": set(),
     "errors": set(),
     "quiet": set(),
     "apart": {"errors"},
+    "parallel": set(),
     "files": {"errors"},
     "arguments": {"errors"},
     "splats": ANY,

@@ -1,6 +1,7 @@
 """Adam without torch.optim, whose making loads torch's compiler: two seconds of every start."""
 
 from collections import defaultdict
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
@@ -26,6 +27,11 @@ class Adam:
         for group in self.param_groups:
             for parameter in group["params"]:
                 parameter.grad = None
+
+    def moments(self, parameters: Iterable[Tensor]) -> list[Tensor]:
+        """First and second of those parameters that had a step."""
+        kept = (self.state[parameter] for parameter in parameters if parameter in self.state)
+        return [state[key] for state in kept for key in ("exp_avg", "exp_avg_sq")]
 
     @torch.no_grad()
     def step(

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import SehdrError
+from ..parallel import thread_count
 from ..splats.arrays import HARMONIC_0
-from ..splatting.threads import thread_count
 
 PARAMETER_NAMES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics_dc", "harmonics_rest")
 

@@ -1,6 +1,7 @@
 """From shots to views: decode, orient, undistort and scale, every average taken over light by one response."""
 
 import logging
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError
+from ..parallel import made_ahead
 from .camera import Camera
 from .capture import Capture, Shot, reinhard_gamma
 from .hdr_files import hdr_size, read_hdr
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     from ..response import Response
 
 _log = logging.getLogger("sehdr_warp.scene")
+_PIXELS_AT_ONCE = 64_000_000  # Of the photos that are read side by side
 
 
 def develop(capture: Capture, response: "Response", max_size: int | None = None, photos: str = "auto") -> Scene:
@@ -34,7 +37,10 @@ def develop(capture: Capture, response: "Response", max_size: int | None = None,
     """
     developer, names = _Developer(max_size, response, capture.alpha), unique_names(capture.shots)
     keeper = PhotoKeeper(photos, len(names), sum(shot.lens.width * shot.lens.height for shot in capture.shots))
-    views = [keeper.kept(developer.view(shot, names[i])) for i, shot in told("reading views", capture.shots)]
+    # Some copies of a photo are made on its way.
+    most = max(1, _PIXELS_AT_ONCE // max(shot.lens.width * shot.lens.height for shot in capture.shots))
+    shots = ((shot, names[i]) for i, shot in told("reading views", capture.shots))
+    views = [keeper.kept(view) for view in made_ahead(lambda given: developer.view(*given), shots, most)]
     deque(with_content(((view.codes, view.mask) for view in views if view.split == "train"), capture.folder), maxlen=0)
     stated = *capture.cloud, capture.times_known, (*capture.notes, *([keeper.note] if keeper.note else []))
     return Scene(capture.name, capture.format, tuple(views), *stated, response=response)
@@ -86,6 +92,7 @@ class _Developer:
         self.max_size, self.response, self.alpha = max_size, response, alpha
         self._tables: dict[int, np.ndarray] = {}
         self._last: tuple[Lens, Undistortion] | None = None
+        self._mapping = threading.Lock()
 
     def view(self, shot: Shot, name: str) -> View:
         lens, oriented = (shot.lens, False) if shot.derived else fitted_lens(shot)
@@ -96,9 +103,10 @@ class _Developer:
             if factor > 1:
                 working = lens.resized(round(lens.width / factor), round(lens.height / factor))
             # Sets mostly share one lens, whose map is as large as an image.
-            if self._last is None or self._last[0] != working:
-                self._last = working, Undistortion(working)
-            undistortion = self._last[1]
+            with self._mapping:
+                if self._last is None or self._last[0] != working:
+                    self._last = working, Undistortion(working)
+                undistortion = self._last[1]
             full = undistortion.camera(shot.world_to_camera)
         camera = full.resized(*limited_size(full.width, full.height, self.max_size))
 

@@ -10,7 +10,7 @@ from typing import Any
 from ..errors import InputError
 from ..files import read_bytes
 from .capture import Shot
-from .images import HDR_SUFFIXES, PILLOW_ERRORS, RAW_SUFFIXES, open_image
+from .images import HDR_SUFFIXES, PILLOW_ERRORS, RAW_SUFFIXES, exif_of, open_image
 
 _EXIF_IFD = 0x8769
 _EXPOSURE_TIME, _F_NUMBER, _SPEED, _SHUTTER_APEX = 33434, 33437, 34855, 37377
@@ -129,7 +129,7 @@ def exif_exposure(path: Path) -> tuple[float | None, float | None, float | None]
 
             return raw_exposure(path)
         with open_image(path) as image:
-            table = image.getexif().get_ifd(_EXIF_IFD)
+            table = exif_of(image).get_ifd(_EXIF_IFD)
             tags = (_EXPOSURE_TIME, _SHUTTER_APEX, _SPEED, _F_NUMBER)
             time, apex, speed, aperture = (_number(table.get(tag)) for tag in tags)
     except PILLOW_ERRORS:

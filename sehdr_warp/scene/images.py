@@ -5,6 +5,7 @@ decoded. Pillow knows many more, and hands some (EPS) to other programs.
 """
 
 import struct
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +22,7 @@ HDR_SUFFIXES = (".exr", ".hdr")
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw")
 PHOTO_SUFFIXES = (*LDR_SUFFIXES, *RAW_SUFFIXES, *HDR_SUFFIXES)
 _BAND_ROWS = 512
+_opening = threading.Lock()  # Pillow's limit of pixels, which is put aside, is one for all threads
 _FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP")
 _MODES = ("L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "I", "I;16", "I;16L", "I;16B", "I;16N")
 _OTHER_MODES = {
@@ -107,15 +109,16 @@ def open_image(path: Path, *, mask: bool = False) -> ImageFile.ImageFile:
     first."""
     require_file(path)
     # Pillow's own limit is global and lower for its warning; ours is checked below, before any pixel is decoded.
-    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-    try:
-        image = Image.open(path, formats=_FORMATS)
-        several = getattr(image, "is_animated", False) and image.format != "MPO"
-    except PILLOW_ERRORS as error:
-        detail = f", which is one of {', '.join(_FORMATS)}" if "cannot identify" in str(error) else f" ({error})"
-        raise InputError(path, f"is not a readable image{detail}", DAMAGED) from None
-    finally:
-        Image.MAX_IMAGE_PIXELS = limit
+    with _opening:
+        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            image = Image.open(path, formats=_FORMATS)
+            several = getattr(image, "is_animated", False) and image.format != "MPO"
+        except PILLOW_ERRORS as error:
+            detail = f", which is one of {', '.join(_FORMATS)}" if "cannot identify" in str(error) else f" ({error})"
+            raise InputError(path, f"is not a readable image{detail}", DAMAGED) from None
+        finally:
+            Image.MAX_IMAGE_PIXELS = limit
     try:
         check_size(path, *image.size)
         if several:
@@ -127,6 +130,28 @@ def open_image(path: Path, *, mask: bool = False) -> ImageFile.ImageFile:
         image.close()
         raise
     return image
+
+
+def exif_of(image: Image.Image) -> Image.Exif:
+    """EXIF as it is stored, without the pixels: to look for it behind those, Pillow decodes a whole PNG. Raises one of
+    PILLOW_ERRORS where it is damaged."""
+    if image.format == "PNG" and _has_text_behind_pixels(Path(image.filename)):  # pyright: ignore[reportAttributeAccessIssue]
+        return image.getexif()
+    return Image.Image.getexif(image)
+
+
+def _has_text_behind_pixels(png: Path) -> bool:
+    """Whether a PNG has a chunk that may hold EXIF behind its pixels."""
+    with png.open("rb") as file:
+        file.seek(8)
+        behind = False
+        while len(head := file.read(8)) == 8:
+            length, kind = struct.unpack(">I4s", head)
+            behind |= kind == b"IDAT"
+            if behind and kind in (b"eXIf", b"tEXt", b"zTXt", b"iTXt"):
+                return True
+            file.seek(length + 4, 1)
+    return False
 
 
 def require_file(path: Path) -> None:
@@ -205,6 +230,6 @@ def _upright(array: np.ndarray, orientation: int) -> np.ndarray:
 def _orientation(image: Image.Image) -> int:
     """EXIF's orientation, 1 (as stored) where there is none."""
     try:
-        return image.getexif().get(0x0112, 1)
+        return exif_of(image).get(0x0112, 1)
     except PILLOW_ERRORS:
         return 1

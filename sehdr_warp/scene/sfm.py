@@ -24,7 +24,7 @@ from ..errors import InputError, SehdrError
 from ..files import atomic_folder, is_sealed, usable, user_cache
 from .colmap_model import SparseModel, read_model
 from .develop import told
-from .images import LDR_SUFFIXES, PILLOW_ERRORS, open_image, read_ldr
+from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image, read_ldr
 
 _log = logging.getLogger("sehdr_warp.scene")
 
@@ -148,7 +148,7 @@ def _device(photo: Path) -> tuple[str, ...]:
         return ("None",) * 4
     with open_image(photo) as image:
         try:
-            exif = image.getexif()
+            exif = exif_of(image)
             lens = exif.get_ifd(0x8769)
             return str(exif.get(0x010F)), str(exif.get(0x0110)), str(lens.get(0x920A)), str(lens.get(0xA405))
         except PILLOW_ERRORS:

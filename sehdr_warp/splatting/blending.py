@@ -11,7 +11,7 @@ from torch import Tensor
 from ..kernels import blend_cpu, blend_cuda, blend_cuda_adjoint
 from ..kernels.constants import TILE_SIZE
 from ..kernels.tiles import tile_kernels
-from . import threads
+from ..parallel import thread_count
 from .launching import launch, warp_scalar
 from .tile_lists import ONE_SORT, Emission, TileLists
 
@@ -132,7 +132,7 @@ def balanced_pieces(lists: TileLists) -> list[tuple[int, int]]:
     """Ranges of tiles that hold about the same number of entries each, a few for every thread."""
     tile_count = lists.ranges.shape[0]
     work = (lists.ranges[:, 1] - lists.ranges[:, 0]).add(16).cumsum(0).double()  # 16: a tile costs something in itself
-    pieces = min(threads.thread_count() * 8, tile_count)
+    pieces = min(thread_count() * 8, tile_count)
     goals = torch.arange(1, pieces, dtype=torch.float64) * (float(work[-1]) / pieces)
     bounds = sorted({0, *torch.searchsorted(work, goals).tolist(), tile_count})
     return list(pairwise(bounds))

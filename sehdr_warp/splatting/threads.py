@@ -5,22 +5,15 @@ one launch run side by side from a thread pool (launching.py). No range writes w
 depend on the number of threads.
 """
 
-import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
 
+from ..parallel import thread_count
+
 _pool: ThreadPoolExecutor | None = None
 _pool_size = 0
-
-
-def thread_count() -> int:
-    """Threads used on the CPU: SEHDR_THREADS if set, else the processors this process may run on."""
-    requested = os.environ.get("SEHDR_THREADS", "")
-    if requested.isdigit() and int(requested) > 0:
-        return int(requested)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
 def run_parallel(task: Callable[[Any], object], items: Iterable[Any]) -> None:

@@ -10,11 +10,12 @@ from ..scene import Scene
 from ..splatting.memory import memory_told
 from .checkpoint import Checkpoint
 from .config import Config
+from .initialization import sizes_of
 from .machine import interruptible, torch_settings
 from .plan import gain_of_ranks
 from .ranks import END, GO, WAIT, Ranks
 from .run import field_from_checkpoint
-from .trainer import Trainer, sizes_of
+from .trainer import Trainer
 
 
 def hand_on(ranks: Ranks, scene: Scene, trainer: Trainer) -> None:
@@ -52,7 +53,7 @@ def follow_leader(ranks: Ranks) -> Trainer:
 
     every = config.scaled(config.schedule.checkpoint_every)
     with (
-        memory_told(ranks.device, lambda: sizes_of(scene, trainer)),
+        memory_told(ranks.device, lambda: sizes_of(scene, trainer.field.gaussians.count)),
         torch_settings(config.deterministic),
         interruptible() as interrupted,
     ):

@@ -264,3 +264,9 @@ def colors_in_views(points: np.ndarray, views: tuple[View, ...]) -> tuple[np.nda
         seen[inside] += 1
         total[inside] += view.image[row[inside].astype(int), column[inside].astype(int)]
     return seen, total / np.maximum(seen, 1)[:, None]
+
+
+def sizes_of(scene: Scene, gaussians: int | None = None) -> tuple[int, int, int]:
+    """Gaussians, by default as many as there are points, and width and height of the largest photo."""
+    camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
+    return len(scene.points) if gaussians is None else gaussians, camera.width, camera.height

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from ..errors import InputError, SehdrError
-from ..splatting.threads import thread_count
+from ..parallel import thread_count
 
 
 def pick_device(device: str | torch.device | None) -> torch.device:

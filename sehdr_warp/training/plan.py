@@ -11,10 +11,10 @@ import torch
 
 from ..errors import InputError
 from ..field.exposure import exposure_times, is_seconds
-from ..scene import Scene
+from ..parallel import thread_count
+from ..scene import Scene, View, encoded_values
 from ..scene.exposure import made_by_camera
 from ..scene.linear_photos import kind_of
-from ..splatting.threads import thread_count
 from .config import Config
 from .config_files import override_config
 from .densification import gaussian_budget
@@ -29,7 +29,7 @@ CPU_FEWEST = 1000
 CPU_PIXEL, CPU_GAUSSIAN = 1.5e-6, 2.3e-6  # Seconds of one core for each in a step, measured on two of an AMD EPYC
 STEP_SECONDS, PIXEL_SECONDS, GAUSSIAN_SECONDS = 4.6e-4, 3e-11, 3.9e-9
 """What a recorded step takes on one H200: for itself, each pixel, each Gaussian."""
-NUMBERS = 59  # Of a Gaussian with harmonics of degree 3
+NUMBERS, RANK_NUMBERS = 11, 3  # That ranks exchange of a Gaussian: its own, and for each of them what its light pulls
 EXCHANGE_SECONDS, NUMBER_SECONDS = 1.1e-4, 1.66e-11
 """What two H200 take beyond that to agree and to begin an exchange, and for each number of the gradients."""
 START_SECONDS = 10.0  # What more processes take to start, about
@@ -41,6 +41,7 @@ FEWEST_PHOTOS = 3
 LEAST_OVERLAP = 0.02
 LEAST_CONTRAST = 1 / 255
 DRIFT = 3.0  # Stops of brightness between photos from which exposure is taken to have changed unsaid
+MOST_PIXELS = 250_000  # Of a photo, looked at
 MOST_VIEWS = 64  # Photos that codes are read from, evenly spread; geometry is of all
 
 Choice = tuple[dict[str, object], str, str]
@@ -167,7 +168,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         count = min(PROBES, len(scene.points))
         probes = np.asarray(scene.points)[rng.choice(len(scene.points), count, replace=False)]
     shown, drawn = (np.array([pixels_of(points, view)[2] for view in views]).sum(0) for points in (probes, drawn))
-    figures = np.array([_codes(view.image) for view in views[:: -(-len(views) // MOST_VIEWS)]])
+    figures = np.array([_codes(view) for view in views[:: -(-len(views) // MOST_VIEWS)]])
     clipped, black, mean, square, _ = map(float, figures.mean(0))
     return SceneFacts(
         photos=len(views),
@@ -186,9 +187,11 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     )
 
 
-def _codes(image: np.ndarray) -> tuple[float, float, float, float, float]:
+def _codes(view: View) -> tuple[float, float, float, float, float]:
     """Parts of the pixels that are clipped and black, the means of the encoded values and of their squares, and the
-    median's light in stops, by a gamma of 2.2."""
+    median's light in stops, by a gamma of 2.2; of a photo of more than MOST_PIXELS, on a grid."""
+    step = max(1, round((view.camera.width * view.camera.height / MOST_PIXELS) ** 0.5))
+    image = encoded_values(view.codes[::step, ::step])
     clipped, black = (image >= 254.5 / 255).any(2).mean(), (image <= 0.5 / 255).all(2).mean()
     median = 2.2 * math.log2(max(float(np.median(image)), 0.5 / 255))
     return clipped, black, image.mean(dtype=np.float64), np.square(image, dtype=np.float64).mean(), median
@@ -201,7 +204,7 @@ def gain_of_ranks(count: int, gaussians: int, pixels: int, photos: int, device: 
         shared = f"{count} processes share this machine's {thread_count() * count} threads"
         return f"plan: ranks: {shared}: no faster than one"
     step = STEP_SECONDS + PIXEL_SECONDS * pixels + GAUSSIAN_SECONDS * gaussians
-    exchange = EXCHANGE_SECONDS + 2 * (1 - 1 / count) * NUMBER_SECONDS * NUMBERS * gaussians
+    exchange = EXCHANGE_SECONDS + 2 * (1 - 1 / count) * NUMBER_SECONDS * (NUMBERS + RANK_NUMBERS * count) * gaussians
     alone, together = photos * step, photos / count * (step + exchange)
     told = f"an estimated {alone / together:.1f} times one for {gaussians} Gaussians and {pixels / 1e6:.2g} megapixels"
     if alone < together + START_SECONDS:

@@ -25,14 +25,14 @@ from .config import Config
 from .config_files import config_fields, load_config, override_config
 from .following import hand_on, told_of_ranks
 from .held_out import evaluate_views
-from .initialization import choose_response, make_field, make_matcher
+from .initialization import choose_response, make_field, make_matcher, sizes_of
 from .machine import interruptible, machine_figures, pick_device, summary_writer, torch_settings
 from .photo_gains import decided, evens, find_gains
 from .plan import apply_plan
 from .ranks import END, GO, WAIT, Ranks
 from .run import Run, field_from_checkpoint, load_run, photo_gains
 from .run_folder import RunFolder
-from .trainer import Trainer, sizes_of
+from .trainer import Trainer
 
 log = logging.getLogger(__name__)
 
@@ -172,7 +172,7 @@ class Training:
 
     def __iter__(self) -> Iterator[Step]:
         with (
-            memory_told(self.device, lambda: sizes_of(self.scene, self.trainer)),
+            memory_told(self.device, lambda: sizes_of(self.scene, self.trainer.field.gaussians.count)),
             torch_settings(self.config.deterministic),
             interruptible() as interrupted,
             ExitStack() as leaving,

@@ -55,7 +55,8 @@ class Trainer:
         matcher: Callable[[], Matcher] | None = None,
         ranks: Ranks | None = None,
     ):
-        self.ranks, self.batch = ranks, 1 if ranks is None else ranks.count
+        self.ranks = ranks
+        self.rank, self.batch = (0, 1) if ranks is None else (ranks.rank, ranks.count)
         self.photos = 1  # Of the last step, which it made iterations
         self.config, self.field = config, field
         self.iteration = 0  # Steps done
@@ -182,14 +183,7 @@ class Trainer:
         gaussians.resize(count, self.optimizer)
         if not watching:
             strategy.load_state({})
-        parameters = list(gaussians.tensors().values())
-        moments = [
-            self.optimizer.state[parameter][key]
-            for parameter in gaussians.parameters()
-            for key in ("exp_avg", "exp_avg_sq")
-            if parameter in self.optimizer.state
-        ]
-        ranks.spread([*parameters, *moments])
+        ranks.spread([*gaussians.tensors().values(), *self.optimizer.moments(gaussians.parameters())])
         return bool(changed)
 
     def _invalidate(self) -> None:
@@ -207,8 +201,7 @@ class Trainer:
     def _step(self, gradients: Callable[[], "_Seen"], apply: Callable[["_Seen"], Tensor]) -> Tensor:
         """Gradients, of all ranks, and the step that they make; its loss."""
         seen = gradients()
-        if self.ranks is not None:
-            assert self._flat is not None
+        if self.ranks is not None and self._flat is not None:
             self.ranks.mean(self._flat.buffer)
         return apply(seen)
 
@@ -219,7 +212,7 @@ class Trainer:
         also = needed_colours(self.config.loss, target.exposure_truth is not None)
         options = {"degree": self.degree, "also": also, "capacity": capacity, "encode": self._encoded}
         photo = self.field.photograph(camera, time, **options, factored=self._factored)
-        values = photo.harmonics
+        shown = photo.harmonics
         # What the backward pass does not read, or only its first part does, must not stay until the end of the step.
         kept = {"means2d", "extents"} if watched else set()
         unread = {"image", "transmittance", "depths", "means2d", "extents"} - kept
@@ -232,8 +225,8 @@ class Trainer:
         loss.backward()
         harmonics = None
         if self._factored:
-            degree, means = min(self.degree, self.field.gaussians.degree), self.field.gaussians.means
-            harmonics = HarmonicsGradients(values.grad[None], camera.position[None], means, degree)
+            means = self.field.gaussians.means
+            harmonics = HarmonicsGradients(shown.grad[None], camera.position[None], means, self.degree)
         if self.ranks is not None:
             self._flattened().take(loss, rendering.overflow, harmonics)
         return _Seen(loss.detach(), rendering, camera.width, camera.height, watched, capacity, harmonics)
@@ -258,9 +251,7 @@ class Trainer:
         """The buffer for the gradients of the parameters as they are."""
         if self._flat is None or not self._flat.fits(self.optimizer):
             self._flat = None  # Before there is another: they are large.
-            assert self.ranks is not None
-            place = self.ranks.rank, self.ranks.count
-            self._flat = adam.FlatGradients(self.optimizer, *place, factored=self._factored)
+            self._flat = adam.FlatGradients(self.optimizer, self.rank, self.batch, factored=self._factored)
         return self._flat
 
     def _can_record(self, views, kind) -> bool:
@@ -382,12 +373,11 @@ class Trainer:
             if not self._order:
                 self._order = torch.randperm(count, generator=self._order_generator).tolist()
             chosen.append(self._order.pop())
-        return chosen[0 if self.ranks is None else self.ranks.rank]
+        return chosen[self.rank]
 
     def _following(self) -> int | None:
         """The photo of the next step; None where the order is not drawn yet."""
-        place = 1 if self.ranks is None else self.ranks.rank + 1
-        return self._order[-place] if place <= len(self._order) else None
+        return self._order[-1 - self.rank] if self.rank < len(self._order) else None
 
 
 @dataclass(frozen=True)
@@ -402,9 +392,3 @@ class _Seen:
     watched: bool
     capacity: int | None
     harmonics: HarmonicsGradients | None
-
-
-def sizes_of(scene: Scene, trainer: Trainer | None = None) -> tuple[int, int, int]:
-    """Gaussians, and width and height of the largest photo."""
-    camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
-    return len(scene.points) if trainer is None else trainer.field.gaussians.count, camera.width, camera.height

@@ -12,7 +12,7 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.hdr_files import hdr_size, read_hdr
-from sehdr_warp.scene.images import image_sizes, read_ldr, read_mask
+from sehdr_warp.scene.images import exif_of, image_sizes, open_image, read_ldr, read_mask
 from sehdr_warp.scene.lens import area_average, limited_size
 
 RNG = np.random.default_rng(1)
@@ -213,3 +213,20 @@ def test_photos_made_by_a_camera(tmp_path):
     assert made_by_camera([camera]) and made_by_camera([camera, camera, plain])
     for others in ([plain], [screen], [camera, plain], [None], [tmp_path / "gone.jpg"], []):
         assert not made_by_camera(others)
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_exif_of_a_png_is_found_without_its_pixels_or_behind_them(tmp_path, behind):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    path = tmp_path / "o.png"
+    Image.fromarray(RNG.integers(0, 256, (5, 7, 3), dtype=np.uint8)).save(path, exif=exif)
+    content = path.read_bytes()
+    start = content.index(b"eXIf") - 4
+    chunk = content[start : start + 12 + int.from_bytes(content[start : start + 4], "big")]
+    if behind:
+        path.write_bytes(content.replace(chunk, b"")[:-12] + chunk + content[-12:])
+    with open_image(path) as image:
+        assert exif_of(image)[0x0112] == 6
+        assert behind or image.tile, "the pixels were decoded"
+    assert image_sizes(path) == ((7, 5), (5, 7))
