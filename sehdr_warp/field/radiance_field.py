@@ -152,7 +152,8 @@ class RadianceField(nn.Module):
         images = dict(zip(sets, parts, strict=True))
         encoded, exposure, light = images.get("encoded"), images.get("fused"), None
         if self.tone_map == "pixel":
-            light = images["fused"] * ratio
+            # Most photos of a set have its base time.
+            light = exposure if isinstance(ratio, float) and ratio == 1 else images["fused"] * ratio
             encoded = self.response.encode_extended(light) if encode else None
         return Photograph(encoded, exposure, images.get("base", exposure), rendering, light, values)
 
