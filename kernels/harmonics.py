@@ -178,28 +178,29 @@ def harmonics_adjoint_kernel(dtype, degree: int, coefficients: bool):
 
 @cache
 def coefficient_adjoint_kernel(dtype, degree: int):
-    """The adjoint by coefficients with a thread for each: neighbouring threads write neighbouring numbers. A GPU takes
-    seven times as long where one thread writes the 45 numbers of a Gaussian.
+    """The adjoint by coefficients with a thread for each of their numbers: neighbouring threads write neighbouring
+    ones. A GPU takes seven times as long where one thread writes the 45 numbers of a Gaussian.
 
-    gradients: [N, K] vec3, of the coefficients from number `start` on. Covers [0, N K).
+    gradients: [N, K, 3], of the coefficients from number `start` on. Covers [0, 3 N K).
     """
-    vec3 = geometry(dtype).vec3
+    real, vec3 = dtype, geometry(dtype).vec3
     direction_of, harmonic = harmonic_functions(dtype)
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def coefficient_adjoint(
         first: int,
-        means: wp.array(dtype=vec3), camera_position: wp.array(dtype=vec3), value_gradients: wp.array(dtype=vec3),
+        means: wp.array(dtype=vec3), camera_position: wp.array(dtype=vec3), value_gradients: wp.array2d(dtype=real),
         start: int,
-        gradients: wp.array2d(dtype=vec3),
+        gradients: wp.array3d(dtype=real),
     ):
         place = first + wp.tid()
-        i = place // gradients.shape[1]
-        k = place - i * gradients.shape[1]
-        gradient = vec3()
+        i = place // (3 * gradients.shape[1])
+        k = place // 3 - i * gradients.shape[1]
+        c = place % 3
+        gradient = real(0.0)
         if start + k < wp.static((degree + 1) * (degree + 1)):
             d = direction_of(means[i], camera_position[0])
-            gradient = harmonic(start + k, d[0], d[1], d[2]) * value_gradients[i]
-        gradients[i, k] = gradient
+            gradient = harmonic(start + k, d[0], d[1], d[2]) * value_gradients[i, c]
+        gradients[i, k, c] = gradient
 
     return coefficient_adjoint

@@ -81,42 +81,40 @@ def update_by_adam(
 
 @cache
 def harmonics_adam_kernel(degree: int):
-    """update_by_adam of coefficients of harmonics, [N, K] vec3 from number `start` on, whose gradient nobody stored: it
-    is the sum over V views of Y_k towards means [N] from positions [V], times value_gradients [V, N]. Those of degrees
-    above `degree` have none. Covers [0, N K): neighbouring threads change neighbouring numbers."""
+    """update_by_adam of coefficients of harmonics, [N, K, 3] from number `start` on, whose gradient nobody stored: it
+    is the sum over V views of Y_k towards means [N] from positions [V], times value_gradients [V, N, 3]. Those of
+    degrees above `degree` have none. Covers [0, 3 N K): neighbouring threads change neighbouring numbers."""
     direction_of, harmonic = harmonic_functions(wp.float32)
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def update_harmonics_by_adam(
         first: int,
-        means: wp.array(dtype=_vec3), positions: wp.array(dtype=_vec3), value_gradients: wp.array2d(dtype=_vec3),
+        means: wp.array(dtype=_vec3), positions: wp.array(dtype=_vec3), value_gradients: wp.array3d(dtype=wp.float32),
         start: int,
         step: wp.array(dtype=wp.float32), rate: wp.array(dtype=wp.float32), skipped: wp.array(dtype=wp.float32),
         first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
-        parameters: wp.array2d(dtype=_vec3), first_moments: wp.array2d(dtype=_vec3),
-        second_moments: wp.array2d(dtype=_vec3),
+        parameters: wp.array3d(dtype=wp.float32), first_moments: wp.array3d(dtype=wp.float32),
+        second_moments: wp.array3d(dtype=wp.float32),
     ):
         place = first + wp.tid()
-        i = place // parameters.shape[1]
-        k = place - i * parameters.shape[1]
+        i = place // (3 * parameters.shape[1])
+        k = place // 3 - i * parameters.shape[1]
+        c = place % 3
         if skipped[0] == 0.0:
-            gradient = _vec3()
+            gradient = float(0.0)
             if start + k < wp.static((degree + 1) * (degree + 1)):
                 for view in range(positions.shape[0]):
                     d = direction_of(means[i], positions[view])
-                    gradient += harmonic(start + k, d[0], d[1], d[2]) * value_gradients[view, i]
-            mean = first_moments[i, k]
-            square = second_moments[i, k]
+                    gradient += harmonic(start + k, d[0], d[1], d[2]) * value_gradients[view, i, c]
+            mean = first_moments[i, k, c]
+            square = second_moments[i, k, c]
             mean += first_gain * (gradient - mean)
-            square += second_gain * (wp.cw_mul(gradient, gradient) - square)
-            first_moments[i, k] = mean
-            second_moments[i, k] = square
-            change = _vec3()
-            for c in range(3):
-                change[c] = change_by_adam(
-                    mean[c], square[c], step[0], rate[0], first_decay_log, second_decay_log, epsilon
-                )
-            parameters[i, k] = parameters[i, k] - change
+            square += second_gain * (gradient * gradient - square)
+            first_moments[i, k, c] = mean
+            second_moments[i, k, c] = square
+            parameters[i, k, c] = parameters[i, k, c] - change_by_adam(
+                mean, square, step[0], rate[0], first_decay_log, second_decay_log, epsilon
+            )
 
     return update_harmonics_by_adam
 

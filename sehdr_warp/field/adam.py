@@ -68,5 +68,5 @@ class Adam:
             state, values = (first, second, step, skipped), parameter.detach()
             if parameter.grad is not None:
                 adam_step(values, parameter.grad.contiguous(), *state, **options)
-            else:
+            elif harmonics is not None:
                 harmonics_adam_step(values, FIRST_COEFFICIENT[group["name"]], harmonics, *state, **options)

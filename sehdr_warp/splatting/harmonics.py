@@ -89,6 +89,6 @@ class _Evaluation(torch.autograd.Function):
             kernel = coefficient_adjoint_kernel(scalar, degree)
             for start, part in enumerate(made):
                 if part is not None:
-                    launch(kernel, part.shape[0] * part.shape[1], means, position, gradient, start, part)
+                    launch(kernel, part.numel(), means, position, gradient, start, part)
         by_position = -mean_gradients.sum(0) if by_camera else None
         return None, *made, mean_gradients if turns else None, by_position

@@ -82,9 +82,9 @@ def harmonics_adam_step(
     """adam_step() of coefficients of harmonics [N, K, 3] from number `start` on, whose gradients are multiplied out
     where they are used."""
     given = gradients.means.detach(), gradients.positions, gradients.by_values, start
-    kernel, threads = kernels.harmonics_adam_kernel(gradients.degree), parameter.shape[0] * parameter.shape[1]
     numbers = _numbers(step, rate, skipped, betas, epsilon)
-    launch(kernel, threads, *given, *numbers, parameter, first_moment, second_moment)
+    kernel = kernels.harmonics_adam_kernel(gradients.degree)
+    launch(kernel, parameter.numel(), *given, *numbers, parameter, first_moment, second_moment)
 
 
 def _numbers(step: Tensor, rate: Tensor | float, skipped: Tensor, betas: tuple[float, float], epsilon: float) -> tuple:

@@ -26,6 +26,7 @@ from .matching import Matcher
 
 _log = logging.getLogger(__name__)
 
+MOST_DEPTHS = 100_000  # Points that tell how far away things are
 FEWEST_POINTS = 20  # With fewer, points are drawn too, FEWEST_DRAWN or more
 FEWEST_DRAWN = 5000
 DEPTH_RANGE = (0.5, 3.0)
@@ -159,8 +160,9 @@ def start_count(config: Config, pixels: int) -> int:
 def make_matcher(scene: Scene, response: Response, device: torch.device | str) -> Matcher:
     """Of the training views, with depths around those of the scene's points or of where the cameras look."""
     views = scene.train_views
-    homogeneous = np.c_[scene.points, np.ones(len(scene.points))]
-    depths = [homogeneous[pixels_of(scene.points, view)[2]] @ view.camera.world_to_camera[2] for view in views]
+    points = scene.points[:: -(-len(scene.points) // MOST_DEPTHS) or 1]
+    homogeneous = np.c_[points, np.ones(len(points))]
+    depths = [homogeneous[pixels_of(points, view)[2]] @ view.camera.world_to_camera[2] for view in views]
     depths = np.concatenate(depths)
     focus = float(np.median(depths)) if len(depths) >= FEWEST_POINTS else focus_distance(views)
     return Matcher(views, response, focus, device)

@@ -2,12 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
 
+from ..parallel import made_ahead
 from ..response import Response
 from ..scene import Camera, View, codes_of
 from ..splatting.plane_sweep import BORDER, NEIGHBORS, PhotoSet, matching_costs
@@ -49,7 +51,8 @@ class Matcher:
 
     def __init__(self, views: Sequence[View], response: Response, focus: float, device: torch.device | str):
         base = float(np.median([view.exposure_time for view in views]))
-        self._images, cameras = zip(*(_matchable(view, response, base) for view in views), strict=True)
+        matchable = made_ahead(partial(_matchable, response=response, base_time=base), views, len(views))
+        self._images, cameras = zip(*matchable, strict=True)
         self._masks = [view.mask for view in views]
         self.device = torch.device(device)
         neighbors = _neighbors(cameras)
@@ -73,10 +76,9 @@ class Matcher:
         """[about count, 3] int32: view, column and row of pixels all over the photos, one for each square of equal
         size, drawn by their gradients and light: edges can be matched, and lamps are small."""
         side = max(1.0, (sum(image.shape[0] * image.shape[1] for image in self._images) / count) ** 0.5)
-        chosen = [
-            _one_for_each_square(_chances(image, mask), side, rng, index)
-            for index, (image, mask) in enumerate(zip(self._images, self._masks, strict=True))
-        ]
+        photos = zip(self._images, self._masks, strict=True)
+        chances = made_ahead(lambda photo: _chances(*photo), photos, len(self._images))
+        chosen = [_one_for_each_square(chance, side, rng, index) for index, chance in enumerate(chances)]
         return torch.from_numpy(np.concatenate(chosen).astype(np.int32)).to(self.device)
 
     def inside(self, pixels: Tensor) -> Tensor:
