@@ -93,8 +93,11 @@ def ladder_of(name: str, images: Sequence[np.ndarray], encode: Callable, count: 
         return float(np.exp(-0.5 * ((encode(radiance * 2.0**stop) - 0.5) / 0.2) ** 2).mean())
 
     low, high = (np.log2(np.percentile(lit, share)) for share in (1, 99))
-    # From the brightest parts at black to the darkest at white.
-    middle = 2.0 ** max(np.arange(-high - 12, -low + 12, 1 / _STEPS_PER_STOP), key=well_exposedness)
+    # From the brightest parts at black to the darkest at white; two stops of light are well exposed, so that no peak
+    # lies between every eighth step.
+    stops = np.arange(-high - 12, -low + 12, 1 / _STEPS_PER_STOP)
+    near = 8 * max(range(len(stops[::8])), key=lambda place: well_exposedness(stops[8 * place]))
+    middle = 2.0 ** max(stops[max(0, near - 8) : near + 9], key=well_exposedness)
     return tuple(float(middle * factor ** (k - (count - 1) / 2)) for k in range(count))
 
 
