@@ -51,6 +51,12 @@ def embedded_run(own_cache, tmp_path_factory) -> Path:
     return out
 
 
+@pytest.fixture
+def few_probes(monkeypatch):
+    """Photos of some 64 pixels tell by fewer of them how far away things are."""
+    monkeypatch.setattr("sehdr_warp.training.matching.PROBES", 300)
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """Larger real data (photos, rendered rooms, response curves), which the repository does not carry."""

@@ -132,8 +132,8 @@ def test_submitit_runs_several_at_once_and_outlives_one_that_dies(tmp_path, monk
     pytest.importorskip("submitit")
     work = quality.work
     monkeypatch.setattr(quality, "work", lambda *arguments: _run_stubbed(work, arguments))
-    rows = run_jobs(jobs(seeds=(DIES, 7, 8, 9)), tmp_path, device="cpu", at_once=2)
-    assert [row.get("error") for row in rows] == ["its process ended without a result", None, None, None]
+    rows = run_jobs(jobs(seeds=(DIES, 7, 8)), tmp_path, device="cpu", at_once=2)
+    assert [row.get("error") for row in rows] == ["its process ended without a result", None, None]
     assert ran(tmp_path).count(7) == ran(tmp_path).count(8) == 1
 
 
@@ -169,7 +169,7 @@ def test_exposures_are_four_times_apart_and_photos_follow():
     assert bright.views[0].image.mean() > 1.3 * dark.views[0].image.mean()
 
 
-def test_one_training_from_the_command_line(tmp_path, capsys):
+def test_one_training_from_the_command_line(tmp_path, capsys, few_probes):
     command = [*SMALL, "--methods", "default", "--out", tmp_path / "out", "--json"]
     assert call(*command, tmp_path / "a.json") == 0
     assert "gt-max dB" in capsys.readouterr().out

@@ -31,7 +31,7 @@ print(bytes_of("RssAnon") - held, grown, sum(photo.nbytes for photo in codes), s
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
 def test_a_photo_takes_three_bytes_a_pixel_and_none_on_the_disk(tmp_path):
-    write_blender(tmp_path, 12, size=(1600, 1200), ply_file_path="p.ply")
+    write_blender(tmp_path, 6, size=(1600, 1200), ply_file_path="p.ply")
     write_ply(tmp_path / "p.ply", [(0, 0, 0)])
     given = [sys.executable, "-c", LOAD, str(tmp_path)]
     told = [
@@ -40,7 +40,7 @@ def test_a_photo_takes_three_bytes_a_pixel_and_none_on_the_disk(tmp_path):
     ]
     (memory, grown, *photos), (disk, _, *same_photos) = told
     codes = photos[0]
-    assert photos == same_photos and codes == 12 * 1600 * 1200 * 3
+    assert photos == same_photos and codes == 6 * 1600 * 1200 * 3
     assert memory > 0.9 * codes and disk < memory - 0.7 * codes
     # What decoding a few photos takes besides; float32 copies of all would be four times the codes more.
     assert grown < codes + 200e6

@@ -1,10 +1,39 @@
-"""Scenes small enough to train on in seconds."""
+"""Scenes small enough to train on in seconds, and trainings of them that tests share."""
+
+import shutil
+from functools import cache
+from pathlib import Path
 
 import pytest
 
-from .toy import toy_scene
+from sehdr_warp.training.train import Training
+
+from .toy import VARIANTS, toy_scene, without_truth
+
+
+@pytest.fixture(autouse=True)
+def quickly(few_probes):
+    """Whatever is trained here is small."""
 
 
 @pytest.fixture(scope="session")
 def scene():
     return toy_scene()
+
+
+@pytest.fixture(scope="session")
+def trained(scene, tmp_path_factory):
+    """trained(variant): the folder of a finished run of VARIANTS; beside it lies `killed`, what a kill at iteration 66
+    would have left. Neither is to be changed."""
+
+    @cache
+    def train(variant: str) -> Path:
+        folder, config = tmp_path_factory.mktemp("trained"), VARIANTS[variant]
+        # What trains without truth trains without any there.
+        given = scene if config.loss.uses_hdr else without_truth(scene)
+        for step in Training(given, folder / "run", config, device="cpu", data={"path": "somewhere"}):
+            if step.iteration == 66:
+                shutil.copytree(folder / "run", folder / "killed")
+        return folder / "run"
+
+    return train

@@ -1,7 +1,9 @@
 """A training on two ranks of the CPU, as processes that keep what each of them ends with."""
 
+import logging
 import os
 import sys
+import time
 from pathlib import Path
 
 import torch
@@ -28,12 +30,11 @@ def train_together(ranks, folder: Path, strategies: list[str], iterations: int) 
     from sehdr_warp.training.following import follow_leader
     from sehdr_warp.training.train import Training
 
-    from .test_resume import configuration
-    from .toy import toy_scene
+    from .toy import VARIANTS, toy_scene
 
     for strategy in strategies:
         if ranks.leads:
-            training = Training(toy_scene(), folder / strategy, configuration(strategy), device="cpu", ranks=ranks)
+            training = Training(toy_scene(), folder / strategy, VARIANTS[strategy], device="cpu", ranks=ranks)
             for step in training:
                 if step.iteration >= iterations:
                     training.stop()
@@ -67,3 +68,12 @@ def mixed(ranks, folder: Path) -> None:
         ranks._check_versions()
     except SehdrError as error:
         (folder / f"mixed.{ranks.rank}").write_text(str(error))
+
+
+def fall_silent(ranks, folder: Path) -> None:
+    """Rank 1 no longer answers, and rank 0 ends; what it says is kept."""
+    ranks._patience = 2.0
+    if ranks.leads:
+        logging.getLogger("sehdr_warp").addHandler(logging.FileHandler(folder / "silent"))
+        ranks.agree(2)
+    time.sleep(60)

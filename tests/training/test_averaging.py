@@ -9,10 +9,9 @@ from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.run_folder import RunFolder
 from sehdr_warp.training.train import Training, train
 
-from .test_train import QUICK
-from .toy import load_unscaled
+from .toy import QUICK, load_unscaled
 
-AVERAGED = QUICK | {"schedule.iterations": 80, "schedule.average": 4500, "densification.stop": 20}
+AVERAGED = QUICK | {"schedule.iterations": 40, "schedule.average": 4500, "densification.stop": 20}
 
 
 class Moving:
@@ -51,7 +50,7 @@ def test_a_training_that_stops_in_between_ends_in_the_same_bits(scene, tmp_path)
     whole = train(scene, tmp_path / "whole", config, device="cpu")
     training = Training(scene, tmp_path / "parts", config, device="cpu")
     for step in training:
-        if step.iteration == 60:
+        if step.iteration == 30:
             training.stop()
     stopped = RunFolder(tmp_path / "parts").newest_checkpoint()
     assert isinstance(stopped, Checkpoint) and any(name.startswith("average.") for name in stopped.tensors)

@@ -10,7 +10,7 @@ from sehdr_warp.training.train import train
 
 from .wall_and_lamp import in_lamp, photographed, texture, wall_and_lamp
 
-SHORT = {"response.name": "linear", "schedule.iterations": 200, "densification.max_gaussians": 2500}
+SHORT = {"response.name": "linear", "schedule.iterations": 80, "densification.max_gaussians": 2500}
 SHORT |= {"plan.keep": tuple(name for name in SHORT if name != "response.name")}
 
 
@@ -41,7 +41,7 @@ def test_two_photos_are_refused(tmp_path):
 
 def test_a_lamp_in_the_dark(tmp_path, device):
     scene = photographed(lambda position, rays: 1e3 * in_lamp(position, rays)[..., None].repeat(3, -1))
-    run = train(scene, tmp_path / "run", SHORT, device=device)
+    run = train(scene, tmp_path / "run", SHORT | {"schedule.iterations": 200}, device=device)
     for view in scene.views:
         shown, lit = run.render_ldr(view.camera, 1.0).cpu().numpy(), view.codes.min(2) > 0
         assert shown[lit].mean() > 0.7 and shown[~lit].mean() < 0.02
@@ -51,7 +51,12 @@ def test_a_sky_that_fills_the_photo(tmp_path, device):
     """Light by direction alone, which hardly two photos agree on a depth of: few points to start from."""
     scene = photographed(lambda _, rays: texture(4 * rays[..., :2] / rays[..., 2:]), turn=0.2)
     flat = -10 * np.log10(np.mean([np.var(view.image, axis=(0, 1)) for view in scene.views]))
-    run = train(scene, tmp_path / "run", SHORT | {"schedule.iterations": 700}, device=device)
+    run = train(
+        scene,
+        tmp_path / "run",
+        SHORT | {"schedule.iterations": 700, "densification.max_gaussians": 1000},
+        device=device,
+    )
     assert decibels(run, scene) > flat + 2
 
 

@@ -8,12 +8,12 @@ from sehdr_warp.training.train import train
 from .toy import load_unscaled
 
 SHORT = {
-    "schedule.iterations": 60,
-    "schedule.harmonics_every": 20,
-    "densification.start": 10,
-    "densification.stop": 50,
-    "densification.every": 10,
-    "densification.reset_every": 30,
+    "schedule.iterations": 24,
+    "schedule.harmonics_every": 8,
+    "densification.start": 4,
+    "densification.stop": 20,
+    "densification.every": 4,
+    "densification.reset_every": 12,
     "deterministic": True,
 }
 

@@ -20,7 +20,7 @@ from .wall_and_lamp import LAMP, WALL, wall_and_lamp
 LINEAR = response_by_name("linear")
 
 
-def matched(scene, device, count=1500):
+def matched(scene, device, count=700):
     matcher = make_matcher(scene, LINEAR, device)
     return matcher.match(matcher.pixels(count, np.random.default_rng(0)))
 
@@ -29,10 +29,10 @@ def matched(scene, device, count=1500):
 def test_matched_points_lie_on_wall_and_lamp(device, times):
     found = matched(wall_and_lamp(times), device)
     depth, white = found.points[:, 2].cpu().numpy(), (found.colors > 0.99).all(1).cpu().numpy()
-    assert len(depth) > 600
+    assert len(depth) > 280
     assert (np.abs(depth[~white] - WALL) < 0.1 * WALL).mean() > 0.9
     if len(times) == 1:
-        assert white.sum() >= 5 and (np.abs(depth[white] - LAMP) < 0.1 * LAMP).mean() > 0.8
+        assert white.sum() >= 3 and (np.abs(depth[white] - LAMP) < 0.1 * LAMP).mean() > 0.8
     np.testing.assert_allclose(found.footprints.cpu(), depth / 70, rtol=1e-4)
 
 
@@ -43,7 +43,7 @@ def test_points_that_mislead_do_no_harm(device):
     for points in clouds:
         found = matched(replace(scene, points=points, point_colors=np.full(points.shape, 0.5, np.float32)), device)
         depth = found.points[:, 2]
-        assert len(depth) > 400 and ((depth - WALL).abs() < 0.1 * WALL).float().mean() > 0.8
+        assert len(depth) > 190 and ((depth - WALL).abs() < 0.1 * WALL).float().mean() > 0.8
 
 
 def test_pixels_repeat_and_avoid_borders_and_masks(device):

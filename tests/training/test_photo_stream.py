@@ -15,8 +15,7 @@ from sehdr_warp.training.targets import photo_source
 from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
 
-from .test_resume import configuration
-from .toy import EXPOSURE_TIME, toy_scene
+from .toy import EXPOSURE_TIME, VARIANTS, toy_scene
 
 
 @pytest.mark.parametrize("truth", [False, True])
@@ -46,20 +45,19 @@ def test_photos_of_several_sizes_have_no_common_place(device):
         PhotoStream(photo_source(views, EXPOSURE_TIME, device, truth=False))
 
 
-def test_a_training_on_a_file_is_the_same_bits(scene, tmp_path):
+def test_a_training_on_a_file_is_the_same_bits(scene, trained, tmp_path):
     keeper = PhotoKeeper("disk", len(scene.views), len(scene.views) * 32 * 32)
     kept = dataclasses.replace(scene, views=tuple(keeper.kept(view) for view in scene.views))
     assert "read from a nameless file" in keeper.note
-    for name, given in (("memory", scene), ("disk", kept)):
-        train(given, tmp_path / name, configuration("relocation"), device="cpu")
-    first, second = (RunFolder(tmp_path / name).newest_checkpoint().tensors for name in ("memory", "disk"))
+    train(kept, tmp_path / "disk", VARIANTS["default"], device="cpu")
+    first, second = (RunFolder(run).newest_checkpoint().tensors for run in (trained("default"), tmp_path / "disk"))
     for name, value in first.items():
         assert torch.equal(value, second[name]), name
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_streamed_steps_are_recorded_and_the_same_on_a_gpu(scene):
-    config, states = override_config(configuration("relocation"), {"deterministic": True}), []
+    config, states = override_config(VARIANTS["default"], {"deterministic": True}), []
     for photos in ("device", "memory"):
         chosen = override_config(config, {"schedule.photos": photos})
         trainer = Trainer(scene, chosen, make_field(scene, chosen, choose_response(scene, chosen), "cuda:0"))

@@ -3,13 +3,14 @@
 import math
 import os
 import signal
-import subprocess
 import sys
+import threading
 import time
-from contextlib import suppress
+from multiprocessing import active_children
 
 import pytest
 import torch
+from torch.multiprocessing import ProcessExitedException
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.splatting import HarmonicsGradients
@@ -21,9 +22,9 @@ from sehdr_warp.training.run import load_run
 from sehdr_warp.training.run_folder import RunFolder
 from sehdr_warp.training.train import train
 
+from ..refusals import call
 from . import team
-from .test_resume import configuration
-from .toy import toy_field
+from .toy import VARIANTS, toy_field
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="ranks share photos through Linux's /proc")
 
@@ -31,30 +32,32 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="ranks share pho
 @pytest.fixture(scope="module")
 def together(tmp_path_factory):
     folder = tmp_path_factory.mktemp("together")
-    team.run_team(_all, folder)
+    with pytest.raises(ProcessExitedException, match="process 0 terminated with exit code 1"):
+        team.run_team(_all, folder)
     return folder
 
 
 def _all(ranks, folder):
-    team.train_together(ranks, folder, ["gradient", "relocation"], 90)
+    team.train_together(ranks, folder, ["gradient", "default"], 60)
     team.differ(ranks, folder)
     team.mixed(ranks, folder)
+    team.fall_silent(ranks, folder)
 
 
-@pytest.mark.parametrize("strategy", ["gradient", "relocation"])
-def test_ranks_stay_alike_and_one_can_go_on(scene, together, tmp_path, strategy):
-    """Counts change at 25, 50 and 75, in steps of two photos; at 90 they stop, and one rank goes on to 120."""
+@pytest.mark.parametrize("strategy", ["gradient", "default"])
+def test_ranks_stay_alike_and_one_can_go_on(scene, trained, together, strategy):
+    """Counts change at 25 and 50, in steps of two photos; at 60 they stop, and one rank goes on to 90."""
     (tensors, values), (others, their_values) = (
         torch.load(together / f"{strategy}.{rank}", weights_only=False) for rank in (0, 1)
     )
-    assert values == their_values and values["iteration"] == 90
+    assert values == their_values and values["iteration"] == 60
     for name, value in tensors.items():
         # Statistics stand on rank 0 alone, whose draws decide for all.
         assert name.startswith(("densification.", "generators.device")) or torch.equal(value, others[name]), name
-    assert tensors["optimizer.means.0.step"] == 90, "counted in photos"
-    alone = train(scene, tmp_path / "alone", configuration(strategy), device="cpu")
+    assert tensors["optimizer.means.0.step"] == 60, "counted in photos"
+    alone = load_run(trained(strategy))
     run = train(scene, together / strategy, device="cpu", resume=True)
-    assert run.iterations == alone.iterations == 120
+    assert run.iterations == alone.iterations == 90
     ours, theirs = (each.metrics()[-1]["psnr_ldr"] for each in (run, alone))
     assert ours == pytest.approx(theirs, abs=1.0)
     assert run.gaussian_count == pytest.approx(alone.gaussian_count, rel=0.2)
@@ -71,70 +74,54 @@ def test_other_versions_are_refused(together):
         assert line.startswith("rank 1 runs sehdr-warp 1.1") and "rank 0 sehdr-warp 1.0" in line
 
 
+def test_a_rank_that_does_not_answer_ends_the_others(together):
+    assert (together / "silent").read_text().startswith("another rank did not answer rank 0 of 2 for 2 s")
+
+
 @pytest.fixture
-def command():
-    """Starts a training on two ranks; whatever is left of it at the end of the test is killed."""
-    started = []
+def command(tmp_path, monkeypatch, capfd):
+    """Trains on two ranks and does what is given to them once there is a checkpoint; exit status and lines."""
+    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    monkeypatch.setenv("SEHDR_RANK_TIMEOUT", "60")
 
-    def start(*given, **options):
-        started.append(_start(*given, **options))
-        return started[-1]
+    def train(disturb, *words):
+        flags = "--device cpu --gpus 2 --max-size 24 --preset fast --response srgb --iterations 20000"
+        flags += " --schedule.checkpoint-every 30 --model.initial-density 0 --densification.births 0"
+        seen = threading.Thread(target=once_saved, args=(tmp_path / "run", disturb))
+        seen.start()
+        status = call("train", "embedded", "--out", tmp_path / "run", *flags.split(), *words)
+        seen.join()
+        return status, capfd.readouterr().err
 
-    yield start
-    for process in started:
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-
-
-def _start(out, *words, patience="60"):
-    call = [sys.executable, "-m", "sehdr_warp", "train", "embedded", "--out", str(out), "--device", "cpu"]
-    call += ["--gpus", "2", "--max-size", "24", "--preset", "fast", "--response", "srgb", "--iterations", "20000"]
-    call += ["--schedule.checkpoint-every", "60", *words]
-    environment = os.environ | {"SEHDR_RANK_TIMEOUT": patience}
-    return subprocess.Popen(call, stderr=subprocess.PIPE, text=True, env=environment, start_new_session=True)
+    yield train
+    for number, handler in kept.items():
+        signal.signal(number, handler)
 
 
-@pytest.mark.parametrize(
-    "number,told",
-    [
-        (signal.SIGKILL, "rank 1 of 2 was killed (SIGKILL)"),
-        (signal.SIGSTOP, "another rank did not answer rank 0 of 2 for 10 s"),
-    ],
-)
-def test_the_end_of_one_rank_ends_all_with_a_line(command, tmp_path, number, told):
-    process = command(tmp_path / "run", "-q", patience="10")
+def once_saved(out, disturb):
+    """Calls disturb(ranks) when a run has been saved; ends the ranks if that never happens."""
     deadline = time.monotonic() + 120
-    while not any((tmp_path / "run" / "checkpoints").glob("iteration_*[1-9]*")):
-        assert process.poll() is None and time.monotonic() < deadline
+    while not any((out / "checkpoints").glob("iteration_*[1-9]*")):
+        if time.monotonic() > deadline:
+            return [rank.kill() for rank in active_children()]
         time.sleep(0.1)
-    os.kill(_ranks_of(process)[1], number)
-    _, lines = process.communicate(timeout=120)
-    assert process.returncode == 1
-    assert told in lines and len(lines.splitlines()) == 1 and "Traceback" not in lines
+    return disturb(sorted(active_children(), key=lambda rank: rank.pid))
+
+
+def test_the_end_of_one_rank_ends_all_with_a_line(command, tmp_path):
+    status, lines = command(lambda ranks: ranks[1].kill(), "-q")
+    assert status == 1 and len(lines.splitlines()) == 1 and "rank 1 of 2 was killed (SIGKILL)" in lines
     assert RunFolder(tmp_path / "run").newest_checkpoint().values["iteration"] > 0
 
 
 def test_a_signal_saves_and_ends_all(command, tmp_path):
-    process = command(tmp_path / "run")
-    for line in process.stderr:
-        if line.startswith("iteration"):
-            break
-    process.send_signal(signal.SIGTERM)
-    _, lines = process.communicate(timeout=120)
-    assert process.returncode == 143 and "stopped at iteration" in lines, lines
+    status, lines = command(lambda _: os.kill(os.getpid(), signal.SIGTERM))
+    assert status == 143 and "stopped at iteration" in lines, lines
     assert load_run(tmp_path / "run").iterations > 0
 
 
-def _ranks_of(process) -> list[int]:
-    """The process ids of its ranks, in their order."""
-    found = subprocess.run(
-        ["ps", "-ww", "-o", "pid=,args=", "--ppid", str(process.pid)], capture_output=True, text=True, check=True
-    )
-    return [int(line.split()[0]) for line in found.stdout.splitlines() if "spawn_main" in line]
-
-
 def test_rates_and_decays_follow_the_batch():
-    config, field = configuration("gradient"), toy_field()
+    config, field = VARIANTS["gradient"], toy_field()
     one, four = (make_optimizer(field, config, 2.0, batch) for batch in (1, 4))
     for a, b in zip(one.param_groups, four.param_groups, strict=True):
         assert b["lr"] == pytest.approx(2 * a["lr"]) and b["betas"] == pytest.approx([beta**4 for beta in a["betas"]])
@@ -148,7 +135,7 @@ def test_rates_and_decays_follow_the_batch():
 
 def test_gradients_go_through_one_buffer():
     field = toy_field()
-    optimizer = make_optimizer(field, configuration("gradient"), 1.0)
+    optimizer = make_optimizer(field, VARIANTS["gradient"], 1.0)
     flat, given = FlatGradients(optimizer, 0, 1, factored=False), {}
     for name in ("means", "opacity_logits"):
         parameter = getattr(field.gaussians, name)
@@ -166,7 +153,7 @@ def test_gradients_go_through_one_buffer():
 
 def test_harmonics_go_as_their_factors():
     field, count = toy_field(), 3
-    optimizer, means = make_optimizer(field, configuration("gradient"), 1.0), field.gaussians.means
+    optimizer, means = make_optimizer(field, VARIANTS["gradient"], 1.0), field.gaussians.means
     ranks = [FlatGradients(optimizer, place, count, factored=True) for place in range(count)]
     seen = [HarmonicsGradients(torch.randn(1, len(means), 3), torch.randn(1, 3), means, 1) for _ in ranks]
     for flat, harmonics in zip(ranks, seen, strict=True):
@@ -181,10 +168,10 @@ def test_harmonics_go_as_their_factors():
 
 @pytest.mark.parametrize("photos", [1, 2, 3, 8])
 def test_each_change_happens_once_whatever_the_stride(photos):
-    strategy = make_densification(configuration("relocation"), 1.0, 1000)
+    strategy = make_densification(VARIANTS["default"], 1.0, 1000)
     strategy.photos = photos
-    due = [n for n in range(photos, 121, photos) if strategy.changes_at(n)]
-    assert [n // 25 for n in due] == [1, 2, 3] and strategy.start == 20 and strategy.stop == 100
+    due = [n for n in range(photos, 91, photos) if strategy.changes_at(n)]
+    assert [n // 25 for n in due] == [1, 2, 3] and strategy.start == 20 and strategy.stop == 80
 
 
 def test_small_scenes_are_told_that_they_gain_nothing():

@@ -16,51 +16,16 @@ from sehdr_warp.training.config import Config, LossConfig, ResponseConfig
 from sehdr_warp.training.config_files import load_config, override_config, preset_names
 from sehdr_warp.training.initialization import choose_response, make_field
 from sehdr_warp.training.losses import Target, anchor_loss, code_scale, data_loss, hdr_loss
-from sehdr_warp.training.run import load_run
 from sehdr_warp.training.targets import largest_truth
 from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
 
 from .recorded import train_on_gpu
-from .test_train import PAPER, quick
-
-RIVALS = {
-    "paper-truth": PAPER,
-    "hdr-gs": {"optimizer.harmonics_dc": 0.02, "optimizer.response": 0.005},
-    "hdr-gs-truth": {"optimizer.harmonics_dc": 0.02, "optimizer.response": 0.005},
-    "gauss-hdr": {"optimizer.harmonics_dc": 0.02, "optimizer.response": 0.005},
-    "truth": {},
-}
+from .toy import VARIANTS, quick, without_truth
 
 
 def trainer_of(scene, config):
     return Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cpu"))
-
-
-def without_truth(scene, *names):
-    """The scene without the truth of the training views, or of those named alone."""
-    views = (
-        dataclasses.replace(view, hdr=None) if view.split == "train" and (not names or view.name in names) else view
-        for view in scene.views
-    )
-    return dataclasses.replace(scene, views=tuple(views))
-
-
-@pytest.mark.parametrize("name", RIVALS)
-def test_every_rival_learns_and_loads_as_it_was_trained(scene, tmp_path, name):
-    config = quick(name, **RIVALS[name], **{"schedule.iterations": 250})
-    # What trains without truth trains without any there.
-    given = scene if config.loss.uses_hdr else without_truth(scene)
-    run = train(given, tmp_path / "run", config, device="cpu")
-    first, last = run.metrics()
-    figure = "psnr_mu" if config.loss.hdr_weight > 0 else "psnr_ldr"
-    # Perceptrons take longer than this to find their weights.
-    gain = 0.5 if config.fusion.enabled or config.response.name == "learned" else 1.5
-    assert last[figure] > first[figure] + gain
-    assert run.summary()["skipped_steps"] == 0
-    again, camera = load_run(tmp_path / "run"), scene.test_views[0].camera
-    assert torch.equal(again.render(camera).hdr, run.render(camera).hdr)
-    assert torch.equal(again.render_ldr(camera), run.render_ldr(camera))
 
 
 def test_presets_are_what_their_methods_say():
@@ -180,5 +145,5 @@ def test_the_anchor_holds_the_unit_exposure_of_a_learned_tone_mapper():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
 @pytest.mark.parametrize("name", ["hdr-gs-truth", "gauss-hdr", "truth"])
 def test_rivals_are_recorded_on_a_gpu(scene, name):
-    _, replays = train_on_gpu(scene, quick(name, **RIVALS[name]), iterations=100)
+    _, replays = train_on_gpu(scene, VARIANTS[name], iterations=90)
     assert replays > 50

@@ -11,61 +11,31 @@ import torch
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.scene import codes_of
-from sehdr_warp.training.config_files import load_config, override_config
+from sehdr_warp.training.config_files import override_config
 from sehdr_warp.training.initialization import choose_response, make_field
 from sehdr_warp.training.run import load_run
-from sehdr_warp.training.train import Training, train
+from sehdr_warp.training.train import Training, evaluate_views, train
 from sehdr_warp.training.trainer import Trainer
 
 from .recorded import check_recorded_like_launched
-from .toy import EXPOSURE_TIME, load_unscaled, toy_scene
-
-QUICK = {
-    # That of the toy scene: what a training makes of a wrong one is not its fault.
-    "response.name": "srgb",
-    "schedule.iterations": 150,
-    "schedule.harmonics_every": 60,
-    "schedule.evaluate_at": [10, 150],
-    "schedule.checkpoint_every": 60,
-    "densification.start": 20,
-    "densification.stop": 100,
-    "densification.every": 20,
-    "densification.max_gaussians": 400,
-    "model.harmonics_degree": 1,
-    "optimizer.means": 1e-3,
-    "model.initial_density": 2.0,
-}
-
-
-def quick(preset="default", **options):
-    learned = {"response.name": "learned"} if load_config(preset).response.name == "learned" else {}
-    return load_unscaled(preset, QUICK | learned | options, length=150)
-
-
-PAPER = {"response.name": "srgb", "optimizer.harmonics_dc": 0.05, "optimizer.fusion": 0.01}
-VARIANTS = {
-    "default": quick(),
-    "gradient": quick(**{"densification.strategy": "gradient", "loss.opacity_weight": 0.0}),
-    "3dgs": quick("3dgs", **{"optimizer.harmonics_dc": 0.01}),
-    "paper": quick("paper", **PAPER),
-    "paper, pixel": quick("paper", **PAPER, **{"model.tone_map": "pixel"}),
-    "truth": quick(**{"loss.linear_weight": 0.5, "loss.hdr_truth": True}),
-    "gaussian tone map": quick(**{"model.tone_map": "gaussian"}),
-}
+from .toy import EXPOSURE_TIME, VARIANTS, quick, toy_scene
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_every_variant_learns(scene, tmp_path, variant):
-    run = train(scene, tmp_path / "run", VARIANTS[variant], device="cpu")
+def test_every_variant_learns_and_loads_as_it_was_trained(scene, trained, variant):
+    run = load_run(trained(variant))
     first, last = run.metrics()
-    assert first["iteration"] == 10 and last["iteration"] == 150 and last["split"] == "test"
-    # The perceptrons of the fusion take longer than this to find their weights.
-    gain = 0.8 if run.config.fusion.enabled else 3.0
-    assert last["psnr_ldr"] > first["psnr_ldr"] + gain
+    assert first["iteration"] == 10 and last["iteration"] == run.config.schedule.iterations and last["split"] == "test"
+    figure = "psnr_mu" if run.config.loss.hdr_weight > 0 else "psnr_ldr"
+    # Perceptrons take longer than this to find their weights.
+    gain = 0.5 if run.config.fusion.enabled or run.config.response.name == "learned" else 1.5
+    assert last[figure] > first[figure] + gain
     assert last["psnr_mu"] > 20 or variant != "default"
     assert last["seconds"] > first["seconds"] > 0
     assert run.base_time == EXPOSURE_TIME and run.gaussian_count == last["gaussians"]
     assert run.summary()["finished"] and run.summary()["skipped_steps"] == 0
+    again = evaluate_views(run.model, scene.test_views, run.config.model.harmonics_degree)
+    assert again["psnr_ldr"] == pytest.approx(last["psnr_ldr"], abs=1e-4)
     assert np.isfinite(run.render(run.cameras[0].camera).hdr.numpy()).all()
 
 
@@ -79,12 +49,13 @@ def test_a_scene_without_points_starts_from_drawn_ones(tmp_path):
 def test_more_start_points_than_the_budget_stay_as_many_and_are_told(scene, tmp_path, caplog, options):
     """60 points; 0.1 times the square root of six photos of 32 x 32 pixels is 7."""
     caplog.set_level("INFO")
-    config = quick(**{"schedule.iterations": 50, "densification.growth": 0.5, "model.initial_density": 0.0} | options)
+    config = quick(**{"schedule.iterations": 40, "densification.growth": 0.5, "model.initial_density": 0.0} | options)
     run = train(scene, tmp_path / "run", config, device="cpu")
     told = caplog.text
     assert ("60 Gaussians are more than relocation's budget of 7" in told) == ("densification.budget" in options)
     assert ("60 start points: drawn from" in told) == ("densification.max_gaussians" in options)
-    assert run.gaussian_count == options.get("densification.max_gaussians", 60 if options else 120)
+    count = run.gaussian_count
+    assert count == options.get("densification.max_gaussians", 60) if options else count > 60
 
 
 def test_what_was_repaired_in_a_response_file_is_told(scene, tmp_path, caplog):
@@ -98,23 +69,19 @@ def test_what_was_repaired_in_a_response_file_is_told(scene, tmp_path, caplog):
         caplog.clear()
 
 
-def test_run_folder_is_complete_and_loads_without_photos(scene, tmp_path):
-    out = tmp_path / "run"
-    run = train(scene, out, quick(), device="cpu", data={"path": "somewhere"})
-    names = {path.name for path in out.iterdir()}
+def test_run_folder_is_complete_and_loads_without_photos(scene, trained):
+    run = load_run(trained("default"))
+    names = {path.name for path in run.path.iterdir()}
     files = {"config.json", "scene.json", "run.json", "metrics.jsonl", "summary.json", "confidence.safetensors"}
     assert names == files | {"checkpoints", ".lock"}
-    again = load_run(out)
-    assert again.config == run.config == quick() and again.data == {"path": "somewhere"}
-    assert [entry.name for entry in again.cameras] == [view.name for view in scene.views]
-    assert [entry.split for entry in again.cameras] == [view.split for view in scene.views]
-    view = run.render(scene.test_views[0].camera)
-    assert torch.equal(view.hdr, again.render(scene.test_views[0].camera).hdr)
-    size = scene.views[0].camera.height
+    assert run.config == quick() and run.data == {"path": "somewhere"}
+    assert [entry.name for entry in run.cameras] == [view.name for view in scene.views]
+    assert [entry.split for entry in run.cameras] == [view.split for view in scene.views]
+    view, size = run.render(scene.test_views[0].camera), scene.views[0].camera.height
     assert view.hdr.shape == (size, size, 3) and view.alpha.shape == view.depth.shape == (size, size)
     solid = view.alpha > 0.9
     assert solid.any() and (view.depth[solid] > 2).all() and (view.depth[solid] < 6).all()
-    assert json.loads((out / "summary.json").read_text())["peak_memory_bytes"] > 1e7
+    assert run.summary()["peak_memory_bytes"] > 1e7
 
 
 def test_views_of_differing_exposure_agree(tmp_path):
@@ -173,7 +140,7 @@ def test_resume_refuses_another_config_or_scene(scene, tmp_path):
 
 
 def test_seeds_decide_and_global_state_does_not(scene, tmp_path):
-    config = quick(**{"schedule.iterations": 40})
+    config = quick(**{"schedule.iterations": 30})
     results = []
     for index, seed in enumerate((0, 0, 1)):
         torch.manual_seed(index)
@@ -203,6 +170,8 @@ def test_gradients_by_harmonics_as_factors_make_the_same_steps(scene, device, va
     config = override_config(VARIANTS[variant], {"schedule.harmonics_every": 2})
     fields = [make_field(scene, config, choose_response(scene, config), device) for _ in range(2)]
     for field, factored in zip(fields, (True, False), strict=True):
+        with torch.no_grad():  # How a ball is turned shows in no photo: its gradient would be rounding.
+            field.gaussians.log_scales += torch.tensor([-0.5, 0.0, 0.5], device=device)
         trainer = Trainer(scene, config, field)
         trainer._factored = factored
         for _ in range(6):
@@ -303,10 +272,10 @@ def test_a_training_is_driven_step_by_step_and_left_at_any_time(scene, tmp_path)
     for step in training:
         seen.append((step.iteration, step.seconds, step.seconds_left))
         if step.iteration == 12:
-            assert step.loss > 0 and step.psnr > 5 and step.gaussians >= 60 and step.total == 150
+            assert step.loss > 0 and step.psnr > 5 and step.gaussians >= 60 and step.total == 90
             break
     assert [iteration for iteration, *_ in seen] == list(range(1, 13))
-    assert seen[0][2] is None and 0 < seen[-1][2] < 138 * (seen[-1][1] - seen[0][1])
+    assert seen[0][2] is None and 0 < seen[-1][2] < 78 * (seen[-1][1] - seen[0][1])
     assert training.run.iterations == 12 and not training.run.summary()["finished"]
     training = Training(scene, tmp_path / "run", device="cpu", resume=True)
     for step in training:

@@ -1,5 +1,7 @@
 """A scene of a few small views of a coloured cloud, with HDR truth, made by the package's own renderer."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -66,3 +68,53 @@ def load_unscaled(preset: str = "default", overrides: dict | None = None, length
         many = isinstance(value, list | tuple)
         given[path] = [stated(n, iterations) for n in value] if many else stated(value, iterations)
     return load_config(preset, given)
+
+
+QUICK = {
+    # That of the toy scene: what a training makes of a wrong one is not its fault.
+    "response.name": "srgb",
+    "schedule.harmonics_every": 40,
+    "schedule.evaluate_at": [10],
+    "schedule.checkpoint_every": 60,
+    "densification.start": 20,
+    "densification.stop": 80,
+    "densification.every": 25,
+    "densification.max_gaussians": 400,
+    "model.harmonics_degree": 1,
+    "optimizer.means": 1e-3,
+    "model.initial_density": 2.0,
+}
+PAPER = {"optimizer.harmonics_dc": 0.05, "optimizer.fusion": 0.01}
+TONE = {"optimizer.harmonics_dc": 0.02, "optimizer.response": 0.005}
+
+
+def quick(preset: str = "default", length: int = 90, **options) -> Config:
+    """A training of `length` iterations: counts change at 25, 50 and 75, a checkpoint is at 60."""
+    learned = {"response.name": "learned"} if load_config(preset).response.name == "learned" else {}
+    fixed = {"schedule.iterations": length}
+    return load_unscaled(preset, QUICK | fixed | learned | options, length=length)
+
+
+VARIANTS = {
+    "default": quick(),
+    "gradient": quick(**{"densification.strategy": "gradient", "loss.opacity_weight": 0.0}),
+    "3dgs": quick("3dgs", **{"optimizer.harmonics_dc": 0.01}),
+    "paper": quick("paper", 130, **PAPER),
+    "paper-truth": quick("paper-truth", 150, **PAPER),
+    "linear truth": quick(**{"loss.linear_weight": 0.5, "loss.hdr_truth": True}),
+    "truth": quick("truth"),
+    "gaussian tone map": quick(**{"model.tone_map": "gaussian"}),
+    "hdr-gs": quick("hdr-gs", **TONE),
+    "hdr-gs-truth": quick("hdr-gs-truth", **TONE),
+    "gauss-hdr": quick("gauss-hdr", 220, **TONE),
+}
+"""Short trainings of all kinds, which the fixture `trained` makes."""
+
+
+def without_truth(scene: Scene, *names: str) -> Scene:
+    """The scene without the truth of the training views, or of those named alone."""
+    views = (
+        replace(view, hdr=None) if view.split == "train" and (not names or view.name in names) else view
+        for view in scene.views
+    )
+    return replace(scene, views=tuple(views))
