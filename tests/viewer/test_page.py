@@ -53,6 +53,10 @@ def test_exposure_probe_and_saved_exr_agree(chromium, serve, tmp_path):
         page.fill("#seconds", "1/16")
         page.press("#seconds", "Enter")
         assert page.text_content("#stopsTold") == "\N{MINUS SIGN}3.0 EV"
+        for bad in ("-3", "soon"):
+            page.fill("#seconds", bad)
+            page.press("#seconds", "Enter")
+            assert page.input_value("#seconds") == "1/16 s"
         assert run.rendered == rendered  # Exposure renders nothing.
         page.mouse.move(130, 90)
         probed, told = page.evaluate("window.viewer.probed()"), page.text_content("#probe")

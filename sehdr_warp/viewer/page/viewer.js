@@ -258,10 +258,11 @@ function legend() {
 }
 
 // Controls
+const bounded = stops => Math.max(-12, Math.min(12, stops));
 $("stops").addEventListener("input", () => { state.stops = Number($("stops").value); expose(); });
 $("seconds").addEventListener("change", () => {
   const time = secondsOf($("seconds").value);
-  if (time > 0) state.stops = Math.log2(time / facts.base_time);
+  if (time > 0) state.stops = bounded(Math.log2(time / facts.base_time));
   $("seconds").blur();
   expose();
 });
@@ -321,7 +322,7 @@ stage.addEventListener("keydown", event => {
   const key = event.key.toLowerCase(), count = facts.views.length;
   if (event.ctrlKey || event.metaKey) return;
   if ("wasdqe".includes(key)) { if (!state.keys.size) requestAnimationFrame(fly); state.keys.add(key); }
-  if (key === "[" || key === "]") { state.stops = Math.max(-12, Math.min(12, Math.round(3 * state.stops + (key === "]" ? 1 : -1)) / 3)); expose(); }
+  if (key === "[" || key === "]") { state.stops = bounded(Math.round(3 * state.stops + (key === "]" ? 1 : -1)) / 3); expose(); }
   if (count && (key === "arrowleft" || key === "arrowright")) jump((Number($("view").value) + (key === "arrowright" ? 1 : count - 1)) % count);
 });
 stage.addEventListener("keyup", event => state.keys.delete(event.key.toLowerCase()));
