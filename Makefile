@@ -68,7 +68,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(PIP) torch==$(TORCH)+cpu setuptools wheel 2>/dev/null || \
 		$(PIP) torch==$(TORCH) setuptools wheel --extra-index-url $(TORCH_INDEX)
-	$(EDITABLE) '.[hdr]'
+	$(EDITABLE) .
 	$(COMPILE)
 	touch $@
 

@@ -207,7 +207,6 @@ def _ramp(text: str | None) -> tuple[float, float]:
 
 def run_report(asked: Report) -> None:
     from ..evaluation.evaluate import evaluate
-    from .light_pictures import WITHOUT_GAIN_MAPS, gain_maps
     from .report import write_report
 
     run = open_run(asked.run, asked.device)
@@ -215,8 +214,6 @@ def run_report(asked: Report) -> None:
     check_absent(asked.out / "report.html", asked.overwrite)
     for path in write_report(run, scene, asked.out, overwrite=asked.overwrite, evaluation=evaluate(run, scene)):
         print(path)
-    if not gain_maps():
-        print(f"its pictures are plain JPEG; Ultra HDR needs imagecodecs: {WITHOUT_GAIN_MAPS}")
 
 
 def run_export(asked: Export) -> None:

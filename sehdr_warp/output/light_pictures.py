@@ -1,10 +1,9 @@
-"""Light inside pages: Ultra HDR JPEG, plain JPEG, and float pictures for a dial, as text that stands in the page."""
+"""Light inside pages: JPEG, and float pictures for a dial, as text that stands in the page."""
 
 import base64
 import io
 import zlib
 from collections.abc import Mapping
-from functools import cache
 from html import escape
 from pathlib import Path
 from string import Template
@@ -21,9 +20,6 @@ from .images import as_array, quantize
 from .tonemap import encode_srgb
 
 MIDDLE_GREY = 0.18
-MOST_STOPS = 5.5
-"""Stops over white that a gain map holds here; brighter light is shown at that."""
-WITHOUT_GAIN_MAPS = "pip install sehdr-warp[hdr]"
 
 
 def display_gain(response: Any) -> float:
@@ -46,25 +42,11 @@ def shown_photo(run: Any, view: View) -> np.ndarray:
     return encode_srgb(np.clip(photo_light(run, view) * view.exposure_time, 0, 1))
 
 
-@cache
-def gain_maps() -> bool:
-    """Whether pictures can be Ultra HDR, which imagecodecs writes."""
-    try:
-        import imagecodecs
-    except ImportError:
-        return False
-    return bool(imagecodecs.ULTRAHDR.available)
-
-
-def ultra_hdr(light: np.ndarray) -> bytes:
-    """A JPEG with a gain map (Ultra HDR 1.1, ISO 21496-1) of [H, W, 3] linear Rec.709 display light, in which 1 is
-    white: an HDR display shows up to MOST_STOPS more, any other the JPEG. Needs the extra `hdr`."""
-    import imagecodecs
-
-    kinds: Any = imagecodecs.ULTRAHDR
-    pixels = np.ones((*light.shape[:2], 4), np.float16)
-    pixels[..., :3] = np.clip(light, 0, 2**MOST_STOPS)
-    return bytes(imagecodecs.ultrahdr_encode(pixels, gamut=kinds.CG.BT_709, transfer=kinds.CT.LINEAR))
+def photographed(run: Any, exposure: np.ndarray) -> np.ndarray:
+    """[H, W, 3] in [0, 1]: exposures in Rec.709 as a photo of the run would show them; see shown_photo."""
+    if run.color_matrix is None:
+        return np.clip(run.response.encode(exposure), 0, 1)
+    return encode_srgb(np.clip(exposure, 0, 1))
 
 
 def jpeg(encoded: np.ndarray, quality: int = 88) -> bytes:

@@ -12,20 +12,18 @@ from sehdr_warp.scene import Scene
 
 from .diagrams import camera_map, training_svg
 from .light_pictures import (
-    MOST_STOPS,
-    WITHOUT_GAIN_MAPS,
     dial,
     display_gain,
-    gain_maps,
     img,
     jpeg,
     page_file,
+    photographed,
     shown_photo,
     side_choices,
-    ultra_hdr,
     whole_page,
 )
 from .tonemap import expose, fit_tone_map
+from .ultra_hdr import MOST_STOPS, ultra_hdr
 
 if TYPE_CHECKING:
     from .report import Comparison
@@ -54,7 +52,7 @@ def report_page(
     times = {view.name: view.exposure_time for view in scene.views}
     sections = [
         _header(run, scene),
-        _pictures(comparisons, times, gain, held_out),
+        _pictures(run, comparisons, times, held_out),
         _brackets(brightest, times[brightest.name], gain),
         _confidence(comparisons),
         _unexplained(run, scene),
@@ -96,7 +94,7 @@ def _header(run: Any, scene: Scene) -> str:
         "photos trained on": len(scene.train_views),
         "photos held out": len(scene.test_views),
         "pixels each": f"{camera.width} \N{MULTIPLICATION SIGN} {camera.height}",
-        "exposure": seconds(times[0]) if len(times) == 1 else f"{seconds(times[0])} to {seconds(times[-1])}",
+        "exposure": " to ".join(seconds(time) for time in sorted({times[0], times[-1]})).replace(" s to", " to"),
         "response": escape(str(run.response.name)),
         "Gaussians": f"{run.gaussian_count:,}".replace(",", SPACE),
         "steps": run.iterations,
@@ -114,10 +112,9 @@ def _header(run: Any, scene: Scene) -> str:
     )
 
 
-def _pictures(comparisons: Sequence["Comparison"], times: Mapping[str, float], gain: float, held_out: bool) -> str:
+def _pictures(run: Any, comparisons: Sequence["Comparison"], times: Mapping[str, float], held_out: bool) -> str:
     """Photo, scene and truth, two at a time with a slider between them."""
-    figures = []
-    plain = None if gain_maps() else fit_tone_map([each.hdr for each in comparisons])
+    figures, gain = [], display_gain(run.response)
     for each in comparisons:
         lights = {"Photo": None, "Scene": each.hdr, "Truth": each.truth}
         lights = {name: light for name, light in lights.items() if name == "Photo" or light is not None}
@@ -125,10 +122,9 @@ def _pictures(comparisons: Sequence["Comparison"], times: Mapping[str, float], g
         for name, light in lights.items():
             if light is None:
                 data = jpeg(smaller(each.photo, _PICTURE))
-            elif plain:
-                data = jpeg(plain(smaller(light, _PICTURE)))
             else:
-                data = ultra_hdr(smaller(light * (times[each.name] * gain), _PICTURE))
+                exposure = smaller(light * times[each.name], _PICTURE)
+                data = ultra_hdr(exposure * gain, photographed(run, exposure))
             tags.append(img(data, f"{name} of {each.name}", size, data_name=name))
         split = '<div class="split" style="left: 50%"></div>'
         ratio = f'style="aspect-ratio: {size[0]} / {size[1]}" tabindex="0" role="group"'
@@ -139,11 +135,10 @@ def _pictures(comparisons: Sequence["Comparison"], times: Mapping[str, float], g
     )
     lead = f"{what}. Drag across a picture; choose what stands on either side."
     known = any(each.truth is not None for each in comparisons)
-    if plain:
-        lead += f" Plain JPEG, tone-mapped; imagecodecs (<code>{WITHOUT_GAIN_MAPS}</code>) would make them Ultra HDR."
-    else:
-        lead += f" {'Scene and truth are' if known else 'The scene is'} Ultra HDR: "
-        lead += f"up to {MOST_STOPS:g} stops over white on an HDR display, plain on others."
+    lead += (
+        f" {'Scene and truth are' if known else 'The scene is'} Ultra HDR: light up to {MOST_STOPS:g} stops over white "
+    )
+    lead += "on an HDR display, on any other what the camera would have shown."
     return _section(
         "Photo, scene, truth" if known else "Photo and scene", lead, f'<div class="views">{"".join(figures)}</div>'
     )
