@@ -57,6 +57,17 @@ def few_probes(monkeypatch):
     monkeypatch.setattr("sehdr_warp.training.matching.PROBES", 300)
 
 
+@pytest.fixture
+def coarse_figures(monkeypatch):
+    """Figures of fewer pixels: drawing them is most of a report's time."""
+    from matplotlib.figure import Figure
+
+    save = Figure.savefig
+    monkeypatch.setattr(
+        Figure, "savefig", lambda figure, *given, **options: save(figure, *given, **options | {"dpi": 50})
+    )
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """Larger real data (photos, rendered rooms, response curves), which the repository does not carry."""

@@ -251,7 +251,7 @@ def test_nothing_is_replaced(trained, tmp_path, capfd):
 @pytest.mark.parametrize(
     "command", [("render",), ("render", "--evs=-2,0,2", "--multipart"), ("export",), ("report",)], ids=" ".join
 )
-def test_full_disk(trained, tmp_path, capfd, command):
+def test_full_disk(trained, tmp_path, capfd, command, coarse_figures):
     out = tmp_path / "out"
     out = out.with_suffix(".ply") if command[0] == "export" else out
     with full_disk():

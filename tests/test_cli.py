@@ -309,7 +309,7 @@ def test_export_writes_files_that_render_and_convert(run, tmp_path, capsys):
     assert "holds 8 bits" in capsys.readouterr().err and not (tmp_path / "scene.splat").exists()
 
 
-def test_report_writes_pictures(run, tmp_path, capsys):
+def test_report_writes_pictures(run, tmp_path, capsys, coarse_figures):
     assert call("report", run, "--out", tmp_path / "report", "--device", "cpu") == 0
     assert len(list((tmp_path / "report").iterdir())) >= 2
 

@@ -46,7 +46,7 @@ def command_lines():
 
 
 SMALL = (
-    ('"photos", max_size=800', '"embedded", max_size=32'),
+    ('"photos", max_size=800', '"embedded", max_size=32, response="srgb"'),
     ('"runs/castle")', '"runs/castle", load_config("demo", {"schedule.iterations": 10}))'),
     ('load_run("runs/castle", load_config("demo", {"schedule.iterations": 10}))', 'load_run("runs/castle")'),
     ('"schedule.iterations": 200', '"schedule.iterations": 20'),
@@ -55,7 +55,7 @@ SMALL = (
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/python.md", "docs/rasterizer.md"])
-def test_python_blocks_run(page, tmp_path, monkeypatch):
+def test_python_blocks_run(page, tmp_path, monkeypatch, few_probes, coarse_figures):
     """One after another in one folder, at small sizes."""
     monkeypatch.chdir(tmp_path)
     for code in blocks(page, "python"):

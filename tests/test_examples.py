@@ -14,7 +14,7 @@ def example(name):
     return runpy.run_path(str(EXAMPLES / f"{name}.py"))
 
 
-def test_quickstart_and_hand_off(tmp_path):
+def test_quickstart_and_hand_off(tmp_path, few_probes):
     import OpenEXR
 
     run = example("quickstart")["main"](tmp_path / "first", max_size=32, iterations=20)
@@ -31,8 +31,8 @@ def test_quickstart_and_hand_off(tmp_path):
     np.testing.assert_allclose(last, 64 * first, rtol=1e-6)
 
 
-def test_own_loop():
-    losses = example("own_loop")["main"](steps=60, max_size=48)
+def test_own_loop(few_probes):
+    losses = example("own_loop")["main"](steps=60, max_size=40)
     assert losses[-1] < 0.5 * losses[0]
 
 

@@ -10,6 +10,7 @@ from sehdr_warp.scene import Scene, View, codes_of
 
 from .helpers import AnalyticRun
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
 METRICS = [
     {"iteration": 100, "seconds": 1.5, "split": "test", "psnr_ldr": 20.0, "psnr_mu": 18.0},
     {"iteration": 200, "seconds": 3.0, "split": "test", "psnr_ldr": 26.0, "psnr_mu": 25.5},

@@ -22,6 +22,7 @@ from sehdr_warp.output.report_page import smaller
 from .helpers import AnalyticRun
 from .test_report import make
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
 PLAN = [{"name": "brackets", "choice": "plain <scaling>", "reason": "0.0% of the pixels clip"}]
 FIGURES = {"psnr": 31.4, "ssim": 0.9}, {"psnr_mu": 28.2, "ssim_mu": None}
 EVALUATION = {

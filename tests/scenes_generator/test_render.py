@@ -9,7 +9,7 @@ from scenes.generator import render, stage, textures
 from scenes.generator.recipes import RECIPES, VIEWS, Arc, Grid, make_cameras
 from scenes.generator.render import Settings, load_mitsuba
 from sehdr_warp.errors import InputError
-from sehdr_warp.scene import load_scene
+from tests.make_scenes import load
 
 TEXTURES = ("wood", "brick", "checker", "wallpaper", "plaster", "painting", "globe", "ground", "books")
 
@@ -81,7 +81,7 @@ def rendered(mitsuba, tmp_path_factory):
 
 def test_a_rendered_scene_loads(rendered):
     folder, _ = rendered
-    scene = load_scene(folder)
+    scene = load(folder)
     assert [view.name for view in scene.train_views] == ["r_0", "r_34"]
     assert [view.name for view in scene.test_views] == ["r_1"]
     for view in scene.views:
@@ -93,13 +93,13 @@ def test_a_rendered_scene_loads(rendered):
 def test_finished_views_are_not_rendered_again(rendered, mitsuba, monkeypatch, caplog):
     folder, settings = rendered
     path = folder / "train_hdr" / "hdr_001.exr"
-    kept, before = (folder / "train_hdr" / "hdr_000.exr").stat().st_mtime_ns, load_scene(folder).views
+    kept, before = (folder / "train_hdr" / "hdr_000.exr").stat().st_mtime_ns, load(folder).views
     path.unlink()
     with caplog.at_level("INFO", logger="scenes.generator"):
         render.render_scene(mitsuba, RECIPES["night"], folder.parent, settings)
     assert "view 34" in caplog.text and "view 0 of" not in caplog.text
     assert (folder / "train_hdr" / "hdr_000.exr").stat().st_mtime_ns == kept
-    again = {view.name: view.hdr for view in load_scene(folder).views}
+    again = {view.name: view.hdr for view in load(folder).views}
     for view in before:
         if view.name == "r_34":  # The same things, the same light; Mitsuba may number its lights in another order.
             assert 0.9 < np.median(again["r_34"] / view.hdr) < 1.1

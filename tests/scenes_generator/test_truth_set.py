@@ -9,8 +9,9 @@ import pytest
 from scenes.generator.recipes import RECIPES
 from scenes.generator.truth_set import pack_truth
 from sehdr_warp.errors import InputError
-from sehdr_warp.scene import embedded_scenes, load_scene
+from sehdr_warp.scene import embedded_scenes
 from sehdr_warp.scene.capture import reinhard_gamma
+from tests.make_scenes import load
 
 from .conftest import write_truth
 
@@ -20,7 +21,7 @@ SCENES = Path(__file__).resolve().parents[2] / "scenes"
 @pytest.mark.parametrize("index", [None, 0, 4])
 def test_photos_are_derived_at_the_chosen_exposure(truth, index):
     folder, views, times = truth
-    scene = load_scene(folder, exposure_index=index)
+    scene = load(folder, exposure_index=index)
     time = times[2 if index is None else index]
     assert [view.name for view in scene.train_views] == ["r_0", "r_2", "r_4"] and len(scene.test_views) == 3
     assert not len(scene.points) and scene.exposure_times_known
@@ -37,7 +38,7 @@ def test_photos_are_derived_at_the_chosen_exposure(truth, index):
 
 def test_a_derived_photo_is_scaled_in_light(truth):
     folder, _, times = truth
-    small = load_scene(folder, max_size=16)
+    small = load(folder, max_size=16)
     for view in small.views:
         assert view.image.shape == (16, 16, 3)
         assert np.abs(view.image - reinhard_gamma(view.hdr * times[2])).max() <= 0.5 / 255 + 1e-6
@@ -49,11 +50,11 @@ def test_truth_that_is_missing_or_of_another_curve_is_refused(truth):
     values = json.loads(path.read_text())
     path.write_text(json.dumps(values | {"photo_response": "kodak"}))
     with pytest.raises(InputError, match="kodak"):
-        load_scene(folder)
+        load(folder)
     path.write_text(json.dumps(values))
     (folder / "train_hdr" / "hdr_001.exr").unlink()
     with pytest.raises(InputError, match="hdr_001.exr: HDR truth not found"):
-        load_scene(folder)
+        load(folder)
 
 
 @pytest.mark.parametrize("compression", ["zip", "piz"])
@@ -61,10 +62,10 @@ def test_lossless_packing_costs_half_precision_alone(truth, tmp_path, compressio
     folder, _, times = truth
     packing = pack_truth(folder, tmp_path / "small", compression=compression)
     assert packing["relative_error"] < 3e-4 and packing["mu_law_psnr"] > 85
-    scene = load_scene(tmp_path / "small")
+    scene = load(tmp_path / "small")
     scale = times[2] / scene.views[0].exposure_time
     assert 0.7 <= 16 * scene.views[0].exposure_time <= 1.42 and np.log2(scale) == round(np.log2(scale))
-    before = load_scene(folder)
+    before = load(folder)
     for a, b in zip(scene.views, before.views, strict=True):
         np.testing.assert_allclose(a.hdr, b.hdr * scale, rtol=6e-4)
         assert np.abs(a.image - b.image).max() <= 1.001 / 255
@@ -79,7 +80,7 @@ def test_the_stated_error_is_the_packed_files(truth, tmp_path):
     for level in (20.0, 200.0):
         out = tmp_path / f"dwab{level}"
         packing = pack_truth(folder, out, compression="dwab", level=level)
-        packed, stored = load_scene(out), {view.name: view.radiance for view in views}
+        packed, stored = load(out), {view.name: view.radiance for view in views}
         scale = 2 ** np.round(np.log2(packed.views[0].hdr.max() / stored["r_0"].max()))
         squares = []
         for view in packed.views:
@@ -94,7 +95,7 @@ def test_the_stated_error_is_the_packed_files(truth, tmp_path):
 def test_no_half_overflows_when_one_light_is_bright(tmp_path):
     _, times = write_truth(tmp_path / "truth", peak=1e7)
     pack_truth(tmp_path / "truth", tmp_path / "small", compression="dwab")
-    packed = load_scene(tmp_path / "small")
+    packed = load(tmp_path / "small")
     largest = max(view.hdr.max() for view in packed.views)
     assert 2e4 * 0.9 <= largest <= 4e4 * 1.1
     assert largest * packed.views[0].exposure_time == pytest.approx(1e7 * times[2], rel=0.1), "photos are as before"
@@ -118,7 +119,7 @@ def test_the_scale_of_truth_only_moves_the_times(tmp_path):
 
 @pytest.mark.parametrize("name", RECIPES)
 def test_embedded_scenes_have_truth_and_a_well_exposed_photo(name):
-    scene = load_scene(f"embedded:{name}")
+    scene = load(f"embedded:{name}")
     assert scene.name == f"embedded:{name}"
     assert len(scene.train_views) == 18 and len(scene.test_views) == 17
     for view in scene.views:
@@ -138,15 +139,15 @@ def test_scenes_lie_in_the_package_beside_it_or_where_the_environment_says(tmp_p
     monkeypatch.setattr("sehdr_warp.scene.load.resources.files", lambda package: tmp_path / "site" / package)
     assert embedded_scenes() == ()
     with pytest.raises(InputError, match="embedded:study: is not here; .* get the repository's scenes/"):
-        load_scene("embedded:study")
+        load("embedded:study")
     monkeypatch.setenv("SEHDR_SCENES", str(SCENES))
     assert {*embedded_scenes()} == {*RECIPES}
-    assert load_scene("embedded:study", max_size=16, response="srgb").name == "embedded:study"
+    assert load("embedded:study", max_size=16).name == "embedded:study"
 
 
 def test_a_scene_that_is_not_embedded_is_refused_with_the_names():
     with pytest.raises(InputError, match="embedded:nowhere: is not here; present are .*embedded:room"):
-        load_scene("embedded:nowhere")
+        load("embedded:nowhere")
     with pytest.raises(InputError):
-        load_scene("embedded:../room")
-    assert load_scene("embedded:room", max_size=16).name == "embedded:room"
+        load("embedded:../room")
+    assert load("embedded:room", max_size=16).name == "embedded:room"

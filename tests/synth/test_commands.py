@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from sehdr_warp.response import response_by_name
-from sehdr_warp.scene import Camera, load_scene
+from sehdr_warp.scene import Camera
 from sehdr_warp.synth.expose import RadianceView, expose
 from tests import refusals
-from tests.make_scenes import arc_poses, write_reinhard
+from tests.make_scenes import arc_poses, load, write_reinhard
 from tests.refusals import call
 
 
@@ -37,9 +37,9 @@ def test_expose_writes_a_set_of_five_exposures(truth, tmp_path, capfd):
     out = tmp_path / "photos"
     assert call("synth", truth, "--out", out, "--response", "srgb") == 0
     assert "6 views" in capfd.readouterr().out
-    truths = load_scene(truth)
+    truths = load(truth)
     for index in range(5):
-        scene = load_scene(out, exposure_index=index)
+        scene = load(out, exposure_index=index)
         again = expose(truths, response_by_name("srgb"), scene.views[0].exposure_time)
         for a, b in zip(scene.views, again.views, strict=True):
             assert a.name == b.name and np.abs(a.image - b.image).max() <= 1.001 / 255
@@ -50,7 +50,7 @@ def test_expose_writes_a_set_of_five_exposures(truth, tmp_path, capfd):
 def test_expose_takes_times_and_noise(truth, tmp_path):
     call("synth", truth, "--out", tmp_path / "clean", "--exposures", "0.5,4")
     call("synth", truth, "--out", tmp_path / "noisy", "--exposures", "0.5,4", "--noise", "2000,5")
-    clean, noisy = (load_scene(tmp_path / name, exposure_index=1) for name in ("clean", "noisy"))
+    clean, noisy = (load(tmp_path / name, exposure_index=1) for name in ("clean", "noisy"))
     assert clean.views[0].exposure_time == noisy.views[0].exposure_time == 4
     assert 0.5 / 255 < np.abs(clean.views[0].image - noisy.views[0].image).mean() < 0.2
 
@@ -73,4 +73,4 @@ def test_expose_refuses_in_a_line(truth, tmp_path, capfd):
     assert call("synth", truth, "--out", out, "--exposures", "1") == 0
     assert "exists already" in refused(capfd, truth, "--out", out, "--exposures", "1")
     assert call("synth", truth, "--out", out, "--exposures", "2", "--overwrite") == 0
-    assert load_scene(out).views[0].exposure_time == 2
+    assert load(out).views[0].exposure_time == 2

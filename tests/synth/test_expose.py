@@ -7,13 +7,13 @@ import pytest
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
-from sehdr_warp.scene import load_scene
 from sehdr_warp.synth.expose import SensorNoise, expose, exposure_ladder, noisy
+from tests.make_scenes import load
 
 
 @pytest.fixture(scope="module")
 def room():
-    return load_scene("embedded", max_size=64)
+    return load("embedded", max_size=64)
 
 
 @pytest.mark.parametrize("name", ["hdr-nerf", "srgb", "filmic"])
@@ -29,7 +29,7 @@ def test_photos_are_the_rounded_response_of_the_exposure(room, name):
 
 
 def test_the_embedded_photos_come_back():
-    room = load_scene("embedded")
+    room = load("embedded")
     again = expose(room, response_by_name("hdr-nerf"), 0.5)
     off = np.concatenate([np.abs(a.image - b.image).ravel() for a, b in zip(room.views, again.views, strict=True)])
     # The stored truth has half the bits of the one that was photographed.
