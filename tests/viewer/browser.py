@@ -27,10 +27,11 @@ def browser():
 
 
 @contextmanager
-def page_of(made, url, width=700, height=420):
-    """A page that may reach nothing but its own server or file, and must not complain."""
+def page_of(made, url, width=700, height=420, script=""):
+    """A page that may reach nothing but its own server or file, and must not complain. script: runs before its own."""
     complaints = []
     context = made.new_context(viewport={"width": width, "height": height}, accept_downloads=True)
+    context.add_init_script(script)
     page = context.new_page()
     page.on("console", lambda line: complaints.append(line.text) if line.type in ("error", "warning") else None)
     page.on("pageerror", lambda error: complaints.append(str(error)))

@@ -149,9 +149,35 @@ def test_an_exposure_is_none_of_the_shader_s_work_in_software(chromium, serve):
                 slide(page, "#stops", -2)
                 shown.append(pixels(page, "#picture"))
                 assert page.evaluate("shaded") == 0, (left, overlay)
+                page.select_option("#overlay", "stops")
+                page.select_option("#overlay", overlay)
+                page.wait_for_timeout(300)
+                page.wait_for_selector(FULL)
+                np.testing.assert_array_equal(pixels(page, "#picture"), shown[1])
                 moves = overlay in ("none", "stops", "clipped")
                 assert (np.abs(shown[0] - shown[1]).max() > 0.02) == moves, (left, overlay)
                 slide(page, "#stops", 0)
+
+
+def test_without_webgl_the_light_is_shown_all_the_same(chromium, serve):
+    server, get = serve(count=2), "HTMLCanvasElement.prototype.getContext"
+    run = server.viewer.runs[0].run
+    script = f"const get = {get}; {get} = function (...how) {{ return how[0] === '2d' ? get.apply(this, how) : null; }}"
+    with page_of(chromium, server.url, script=script) as page:
+        page.wait_for_selector(FULL)
+        assert page.evaluate("light.gl") is None and page.is_disabled("#overlay [value=depth]")
+        slide(page, "#stops", -2)
+        light = light_of(page, run)
+        np.testing.assert_allclose(pixels(page, "#picture"), encode_srgb(light * 0.25), atol=2.5 / 255)
+        looks = [pixels(page, "#picture")]
+        for overlay in ("stops", "clipped"):
+            page.select_option("#overlay", overlay)
+            page.wait_for_timeout(300)
+            page.wait_for_selector(FULL)
+            looks.append(pixels(page, "#picture"))
+        assert all(np.abs(looks[0] - look).mean() > 0.01 for look in looks[1:])
+        page.select_option("#overlay", "none")
+        settle(page, lambda: page.select_option("#left", "run1"))
 
 
 def test_what_is_coarse_while_it_moves_is_whole_soon(chromium, serve):

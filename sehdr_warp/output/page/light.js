@@ -126,17 +126,18 @@ const software = gl => /swiftshader|llvmpipe|softpipe|software|basic render/i.te
 
 // Where WebGL is software its canvas is not the one that is seen. What an exposure changes are tables there (tables.js),
 // which take a tenth of the time; the shader draws the rest once. What takes longer than QUICK is coarser while it moves.
+// Without WebGL2 (`gl` is null) there are the tables alone.
 class LightCanvas {
   constructor(canvas) {
     const made = document.createElement("canvas"), options = {antialias: false, preserveDrawingBuffer: true};
     let gl = made.getContext("webgl2", options);
-    if (!gl) throw new Error("this browser has no WebGL2");
-    if (software(gl)) this.paper = canvas.getContext("2d", {alpha: false});
+    if (!gl || software(gl)) this.paper = canvas.getContext("2d", {alpha: false});
     else gl = canvas.getContext("webgl2", options);
     this.canvas = canvas, this.gl = gl, this.textures = {}, this.frames = {}, this.programs = {}, this.stale = new Set();
     this.drawn = -Infinity, this.scale = this.wide = 1, this.changes = 0;
     this.settings = {stops: 0, tone: "none", white: 4, overlay: "none", split: 0, left: 0, grey: 1, near: 1, far: 1,
                      toPhoto: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], lens: [1, 1, .5, .5], photoLens: [1, 1, .5, .5]};
+    if (!gl) return;
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     TEXTURES.forEach((name, unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
@@ -182,6 +183,7 @@ class LightCanvas {
 
   putPhoto(image) {
     const gl = this.gl;
+    if (!gl) return;
     gl.activeTexture(gl.TEXTURE0 + TEXTURES.indexOf("photo"));
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
     this.changes++;
@@ -196,6 +198,7 @@ class LightCanvas {
     if (!this.paper) return this.shade(s, width, height);
     const before = performance.now(), moving = before - this.drawn < PAUSE, exposed = TABLED.includes(s.overlay);
     const tables = exposed && ["scene", ...s.left === 1 ? ["other"] : [], ...s.overlay === "clipped" ? ["clipped"] : []].every(fits);
+    if (!tables && !this.gl) return;
     const edge = s.left ? Math.round(s.split * width) : 0, unexposed = {stops: 0, tone: "none", white: 4};
     // With tables the shader draws the photo alone, over all of the width, of which an edge shows its part.
     const shaded = tables ? {...s, ...unexposed, overlay: "none", split: 1} : exposed ? s : {...s, ...unexposed};
@@ -248,6 +251,7 @@ class LightCanvas {
     const prepared = [["other", first, edge], ["scene", edge, width]].filter(([, first, last]) => first < last)
       .map(([name, first, last]) => this.tables.fill(this.frames[name], pixels, first, last, wide)).some(Boolean);
     if (first < width) this.paper.putImageData(this.image, 0, 0, first, 0, width - first, height);
+    if (this.shaded) this.shaded.edge = Math.min(this.shaded.edge, first);  // What lay there is gone.
     if (!prepared) this.wide = Math.min(4, wide + 1, Math.ceil(0.8 * wide * (performance.now() - before) / QUICK));
     return wide > 1;
   }
@@ -278,8 +282,7 @@ async function startDial(dial) {
   const canvas = dial.querySelector("canvas"), range = dial.querySelector("input"), told = dial.querySelector("output");
   const set = dial.dataset, lights = {};
   for (const each of dial.querySelectorAll("script[data-light]")) lights[each.dataset.light] = await unpackLight(each.textContent);
-  let view;
-  try { view = new LightCanvas(canvas); } catch (error) { told.textContent = error.message; return; }
+  const view = new LightCanvas(canvas);
   const width = Number(set.width), height = Number(set.height), names = Object.keys(lights);
   const show = (texture, name) => view.put(texture, width, height, lights[name], 3);
   const draw = () => {

@@ -19,6 +19,10 @@ const over = () => $("training").hidden ? "the server is gone" : "the training h
 async function start() {
   const told = await (await ask("/scene")).json();
   runs = told.runs, facts = runs[0], light = new LightCanvas(picture);
+  for (const option of light.gl ? [] : document.querySelectorAll("[data-shaded]")) {
+    option.disabled = true;
+    option.textContent += " (needs WebGL2)";
+  }
   document.title = facts.scene + " \u00b7 sehdr-warp";
   camera = new FlyingCamera(facts.up);
   facts.views.forEach((view, i) => $("view").add(new Option(`${view.name} (${view.split})`, i)));
