@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch.profiler import ProfilerActivity, profile
 
+from ..quiet import silent_stderr
 from ..splatting.memory import held_by_warp
 
 LEAST_REPETITIONS = 3
@@ -113,7 +114,8 @@ def peak_memory(variant: Variant, device: torch.device) -> int:
         wait(device)
         return torch.cuda.max_memory_allocated(device) - before
     os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # the profiler's own messages are not the user's
-    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
+    # It warns of what was allocated before, which is none of this.
+    with silent_stderr(), profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
         variant.run()
     # In the order of time; events() of the profiler leaves out what is freed within the operation that allocated it.
     profiler: Any = recorded.profiler
