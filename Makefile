@@ -60,7 +60,8 @@ docs: $(VENV)/installed-dev
 reports: $(VENV)/installed
 	$(BIN)/python docs/reports/write.py
 
-# The README's picture: trains a scene that clips, a few minutes on two cores.
+# The pictures of README and guide: trains a scene that clips, a few minutes on two cores. That of the viewer needs
+# Chromium, and playwright, which `make test` installs.
 pictures: $(VENV)/installed
 	$(BIN)/python docs/pictures.py
 

@@ -1,11 +1,15 @@
-"""Makes the README's picture: trains a scene through a camera that clips, then shows what the photo lost.
+"""Makes the pictures of README and guide: trains a scene through a camera that clips, shows what the photo lost, and
+looks at it in the viewer.
 
 python docs/pictures.py [SCENE] [RUN]       minutes on two cores; a RUN that exists is not trained again
 """
 
+import importlib.util
 import io
+import shutil
 import sys
 from pathlib import Path
+from threading import Thread
 
 from PIL import Image, ImageChops
 
@@ -13,25 +17,74 @@ import sehdr_warp as sw
 from sehdr_warp.output.report import compare, comparison_figure
 from sehdr_warp.synth.expose import expose, exposure_ladder
 
-PICTURE = Path(__file__).parent / "images" / "hero.jpg"
+PICTURES = Path(__file__).parent / "images"
 WIDTH = 1500
+SOFTWARE = ["--no-sandbox", "--enable-unsafe-swiftshader", "--use-angle=swiftshader"]
+WINDOW = {"width": 1280, "height": 720}
+REST = 3000  # Milliseconds until a page in software WebGL is whole
 
 
 def main(name: str = "embedded:lamps", folder: str = "runs/hero", view: str = "") -> None:
-    """Writes docs/images/hero.jpg of one held-out view of an embedded scene."""
+    """Writes hero.jpg and viewer.jpg of one held-out view of an embedded scene."""
     truth, camera = sw.load_scene(name), sw.response_by_name("camera")
     scene = expose(truth, camera, exposure_ladder(truth, camera)[2])
     run = sw.load_run(folder) if Path(folder).exists() else sw.train(scene, folder, {"response.name": "camera"})
     shown = next(each for each in scene.test_views if each.name == (view or each.name))
+    _save(_beside(run, shown, scene), "hero.jpg")
+    if shutil.which("chromium") and importlib.util.find_spec("playwright"):
+        _save(_browsed(run, shown, scene), "viewer.jpg")
+    else:
+        print("viewer.jpg stays as it was: it needs Chromium and playwright (pip install 'sehdr-warp[test]')")
+
+
+def _beside(run: sw.Run, shown: sw.View, scene: sw.Scene) -> Image.Image:
+    """The photo, and the same view of photo, scene and truth at four stops less."""
     figure = comparison_figure([compare(run, shown, scene.views)], shown.exposure_time, "")
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=160, facecolor="white", format="png")
-    with Image.open(drawn) as picture:
-        picture = picture.convert("RGB")
-        content = ImageChops.difference(picture, Image.new("RGB", picture.size, "white")).getbbox()
-        picture = picture.crop((0, max(0, content[1] - 8), picture.width, min(picture.height, content[3] + 8)))
-        picture.thumbnail((WIDTH, WIDTH))
-        picture.save(PICTURE, quality=88, optimize=True)
+    picture = Image.open(drawn).convert("RGB")
+    content = ImageChops.difference(picture, Image.new("RGB", picture.size, "white")).getbbox()
+    assert content is not None
+    return picture.crop((0, max(0, content[1] - 8), picture.width, min(picture.height, content[3] + 8)))
+
+
+def _browsed(run: sw.Run, shown: sw.View, scene: sw.Scene) -> Image.Image:
+    """The page of `view`, two and a half stops down beside the photo, with the pointer on the brightest light."""
+    from playwright.sync_api import sync_playwright
+
+    from sehdr_warp.viewer.frames import Rendering
+    from sehdr_warp.viewer.server import Server, Viewer
+
+    photos = {view.name: view for view in scene.views}
+    viewer = Viewer([Rendering(run, run.scene_name)], lambda _: photos)
+    with Server(viewer, port=18080) as server, sync_playwright() as driver:
+        Thread(target=server.serve_forever, daemon=True).start()
+        chromium = driver.chromium.launch(executable_path=shutil.which("chromium"), args=SOFTWARE)
+        page = chromium.new_page(viewport=WINDOW)
+        page.goto(server.url)
+        page.select_option("#view", label=f"{shown.name} ({shown.split})")
+        page.select_option("#left", "photo")
+        page.locator("#stops").evaluate("range => { range.value = -2.5; range.dispatchEvent(new Event('input')); }")
+        page.wait_for_timeout(REST)
+        page.wait_for_selector("#stage[data-frame=full]")
+        box = page.locator("#picture").bounding_box()
+        assert box is not None
+        light = run.render(shown.camera).hdr.sum(2)
+        row, column = divmod(int(light[:, light.shape[1] // 2 :].argmax()), light.shape[1] // 2)
+        scale = box["height"] / light.shape[0]
+        # The photo has the left half.
+        page.mouse.move(box["x"] + box["width"] / 2 + (column + 0.5) * scale, box["y"] + (row + 0.5) * scale)
+        page.wait_for_timeout(REST)
+        picture = Image.open(io.BytesIO(page.screenshot()))
+        chromium.close()
+        server.shutdown()
+    return picture
+
+
+def _save(picture: Image.Image, name: str) -> None:
+    picture = picture.convert("RGB")
+    picture.thumbnail((WIDTH, WIDTH))
+    picture.save(PICTURES / name, quality=88, optimize=True)
 
 
 if __name__ == "__main__":
