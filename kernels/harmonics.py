@@ -177,30 +177,65 @@ def harmonics_adjoint_kernel(dtype, degree: int, coefficients: bool):
 
 
 @cache
-def coefficient_adjoint_kernel(dtype, degree: int):
+def basis_kernel(dtype, degree: int):
+    """basis[v, k, i] = Y_k of the direction from position v to mean i, for all k of degrees up to `degree`; [V, K, N].
+    Covers [0, V N)."""
+    vec3 = geometry(dtype).vec3
+    direction_of, harmonic = harmonic_functions(dtype)
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    def evaluate_basis(
+        first: int,
+        means: wp.array(dtype=vec3), positions: wp.array(dtype=vec3), basis: wp.array3d(dtype=dtype),
+    ):
+        place = first + wp.tid()
+        view = place // means.shape[0]
+        i = place - view * means.shape[0]
+        d = direction_of(means[i], positions[view])
+        for k in range(wp.static((degree + 1) * (degree + 1))):
+            basis[view, k, i] = harmonic(k, d[0], d[1], d[2])
+
+    return evaluate_basis
+
+
+@cache
+def coefficient_gradient(dtype, count: int):
+    """A function: the gradient by one number of coefficients [N, count, 3], counted through, of which the first is
+    number `start`; 0 for those whose basis [V, K, N] is not there. value_gradients: [V, N, 3]."""
+    real = dtype
+
+    @wp.func
+    def gradient_of(
+        place: int, start: int, basis: wp.array3d(dtype=real), value_gradients: wp.array3d(dtype=real)
+    ) -> real:
+        i = place // wp.static(3 * count)
+        rest = place - i * wp.static(3 * count)
+        k = start + rest // 3
+        gradient = real(0.0)
+        if k < basis.shape[1]:
+            for view in range(basis.shape[0]):
+                gradient += basis[view, k, i] * value_gradients[view, i, rest % 3]
+        return gradient
+
+    return gradient_of
+
+
+@cache
+def coefficient_adjoint_kernel(dtype, count: int):
     """The adjoint by coefficients with a thread for each of their numbers: neighbouring threads write neighbouring
     ones. A GPU takes seven times as long where one thread writes the 45 numbers of a Gaussian.
 
-    gradients: [N, K, 3], of the coefficients from number `start` on. Covers [0, 3 N K).
+    gradients: [3 N count], otherwise as coefficient_gradient() takes them. Covers [0, 3 N count).
     """
-    real, vec3 = dtype, geometry(dtype).vec3
-    direction_of, harmonic = harmonic_functions(dtype)
+    gradient_of = coefficient_gradient(dtype, count)
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def coefficient_adjoint(
         first: int,
-        means: wp.array(dtype=vec3), camera_position: wp.array(dtype=vec3), value_gradients: wp.array2d(dtype=real),
-        start: int,
-        gradients: wp.array3d(dtype=real),
+        basis: wp.array3d(dtype=dtype), value_gradients: wp.array3d(dtype=dtype), start: int,
+        gradients: wp.array(dtype=dtype),
     ):
         place = first + wp.tid()
-        i = place // (3 * gradients.shape[1])
-        k = place // 3 - i * gradients.shape[1]
-        c = place % 3
-        gradient = real(0.0)
-        if start + k < wp.static((degree + 1) * (degree + 1)):
-            d = direction_of(means[i], camera_position[0])
-            gradient = harmonic(start + k, d[0], d[1], d[2]) * value_gradients[i, c]
-        gradients[i, k, c] = gradient
+        gradients[place] = gradient_of(place, start, basis, value_gradients)
 
     return coefficient_adjoint

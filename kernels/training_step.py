@@ -10,7 +10,7 @@ import warp as wp
 
 from .constants import LOG_SCALE_MAX
 from .geometry import geometry, vector
-from .harmonics import harmonic_functions
+from .harmonics import coefficient_gradient
 
 SHARPNESS, CENTRE = 100.0, 0.995  # 3DGS-MCMC, equation 8: noise is for Gaussians of opacity below 1 - 0.995
 
@@ -47,13 +47,19 @@ def bias_correction(decay_log: float, step: float) -> float:
 
 
 @wp.func
-def change_by_adam(
-    mean: float, square: float, step: float, rate: float, first_decay_log: float, second_decay_log: float,
-    epsilon: float,
-) -> float:
-    """What a number loses in a step whose moments are `mean` and `square`, both not yet corrected."""
+def step_by_adam(
+    i: int, gradient: float, step: float, rate: float,
+    first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
+    parameters: wp.array(dtype=wp.float32), first_moments: wp.array(dtype=wp.float32),
+    second_moments: wp.array(dtype=wp.float32),
+):
+    """One step of number i, in place."""
+    mean = first_moments[i] + first_gain * (gradient - first_moments[i])
+    square = second_moments[i] + second_gain * (gradient * gradient - second_moments[i])
+    first_moments[i] = mean
+    second_moments[i] = square
     deviation = wp.sqrt(square / bias_correction(second_decay_log, step)) + epsilon
-    return rate / bias_correction(first_decay_log, step) * mean / deviation
+    parameters[i] = parameters[i] - rate / bias_correction(first_decay_log, step) * mean / deviation
 
 
 @wp.kernel(module="unique", module_options={"enable_backward": False})
@@ -69,52 +75,34 @@ def update_by_adam(
     *_decay_log: log of the decays; *_gain: 1 - decay, not as float32 would round it."""
     i = first + wp.tid()
     if skipped[0] == 0.0:
-        gradient = gradients[i]
-        mean = first_moments[i] + first_gain * (gradient - first_moments[i])
-        square = second_moments[i] + second_gain * (gradient * gradient - second_moments[i])
-        first_moments[i] = mean
-        second_moments[i] = square
-        parameters[i] = parameters[i] - change_by_adam(
-            mean, square, step[0], rate[0], first_decay_log, second_decay_log, epsilon
-        )
+        step_by_adam(
+            i, gradients[i], step[0], rate[0], first_gain, second_gain, first_decay_log, second_decay_log, epsilon,
+            parameters, first_moments, second_moments,
+        )  # fmt: skip
 
 
 @cache
-def harmonics_adam_kernel(degree: int):
-    """update_by_adam of coefficients of harmonics, [N, K, 3] from number `start` on, whose gradient nobody stored: it
-    is the sum over V views of Y_k towards means [N] from positions [V], times value_gradients [V, N, 3]. Those of
-    degrees above `degree` have none. Covers [0, 3 N K): neighbouring threads change neighbouring numbers."""
-    direction_of, harmonic = harmonic_functions(wp.float32)
+def harmonics_adam_kernel(count: int):
+    """update_by_adam of coefficients of harmonics, [3 N count], whose gradients nobody stored: they are as
+    coefficient_gradient() multiplies them out."""
+    gradient_of = coefficient_gradient(wp.float32, count)
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def update_harmonics_by_adam(
         first: int,
-        means: wp.array(dtype=_vec3), positions: wp.array(dtype=_vec3), value_gradients: wp.array3d(dtype=wp.float32),
-        start: int,
+        basis: wp.array3d(dtype=wp.float32), value_gradients: wp.array3d(dtype=wp.float32), start: int,
         step: wp.array(dtype=wp.float32), rate: wp.array(dtype=wp.float32), skipped: wp.array(dtype=wp.float32),
         first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
-        parameters: wp.array3d(dtype=wp.float32), first_moments: wp.array3d(dtype=wp.float32),
-        second_moments: wp.array3d(dtype=wp.float32),
+        parameters: wp.array(dtype=wp.float32), first_moments: wp.array(dtype=wp.float32),
+        second_moments: wp.array(dtype=wp.float32),
     ):
-        place = first + wp.tid()
-        i = place // (3 * parameters.shape[1])
-        k = place // 3 - i * parameters.shape[1]
-        c = place % 3
+        i = first + wp.tid()
         if skipped[0] == 0.0:
-            gradient = float(0.0)
-            if start + k < wp.static((degree + 1) * (degree + 1)):
-                for view in range(positions.shape[0]):
-                    d = direction_of(means[i], positions[view])
-                    gradient += harmonic(start + k, d[0], d[1], d[2]) * value_gradients[view, i, c]
-            mean = first_moments[i, k, c]
-            square = second_moments[i, k, c]
-            mean += first_gain * (gradient - mean)
-            square += second_gain * (gradient * gradient - square)
-            first_moments[i, k, c] = mean
-            second_moments[i, k, c] = square
-            parameters[i, k, c] = parameters[i, k, c] - change_by_adam(
-                mean, square, step[0], rate[0], first_decay_log, second_decay_log, epsilon
-            )
+            gradient = gradient_of(i, start, basis, value_gradients)
+            step_by_adam(
+                i, gradient, step[0], rate[0], first_gain, second_gain, first_decay_log, second_decay_log, epsilon,
+                parameters, first_moments, second_moments,
+            )  # fmt: skip
 
     return update_harmonics_by_adam
 

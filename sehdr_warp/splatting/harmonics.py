@@ -1,12 +1,13 @@
 """View-dependent values from spherical harmonics."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..kernels.harmonics import coefficient_adjoint_kernel, harmonics_adjoint_kernel, harmonics_kernel
+from ..kernels.harmonics import basis_kernel, coefficient_adjoint_kernel, harmonics_adjoint_kernel, harmonics_kernel
 from .checks import check_tensors, whole_number
 from .launching import launch, warp_scalar
 
@@ -49,14 +50,31 @@ class HarmonicsGradients:
     place of 48: the gradients by the values that views showed, and where these were seen from. The gradients are the
     sums over the views.
 
-    by_values: [V, N, 3]; positions: [V, 3]; means: [N, 3], as the views saw them; world coordinates, float32.
-    degree: of the evaluation.
+    by_values: [V, N, 3]; positions: [V, 3]; means: [N, 3], as the views saw them; world coordinates. degree: of the
+    evaluation.
     """
 
     by_values: Tensor
     positions: Tensor
     means: Tensor
     degree: int
+
+    @cached_property
+    def basis(self) -> Tensor:
+        """[V, (degree + 1)^2, N] the harmonics towards each mean, as the means are at the first call."""
+        means = self.means.detach()
+        basis = means.new_empty(len(self.positions), (self.degree + 1) ** 2, len(means))
+        kernel = basis_kernel(warp_scalar(means.dtype), self.degree)
+        launch(kernel, len(self.positions) * len(means), means, self.positions, basis)
+        return basis
+
+    def by_coefficients(self, like: Tensor, start: int) -> Tensor:
+        """The gradients [N, K, 3], like a tensor of that shape, by the coefficients from number `start` on."""
+        made = torch.empty_like(like)
+        if made.numel():
+            kernel = coefficient_adjoint_kernel(warp_scalar(made.dtype), made.shape[1])
+            launch(kernel, made.numel(), self.basis, self.by_values, start, made.view(-1))
+        return made
 
 
 class _Evaluation(torch.autograd.Function):
@@ -78,17 +96,15 @@ class _Evaluation(torch.autograd.Function):
         constant, rest, means, position = ctx.saved_tensors
         scalar, degree, gradient = warp_scalar(gradient.dtype), ctx.degree, gradient.contiguous()
         by_constant, by_rest, turns, by_camera = ctx.needs_input_grad[1:]
-        made = [torch.empty_like(t) if by_constant or by_rest else None for t in (constant, rest)]
         # On the CPU a thread takes a Gaussian with all of its coefficients.
-        together = gradient.device.type == "cpu" and made[0] is not None
+        together = gradient.device.type == "cpu" and (by_constant or by_rest)
+        made = [torch.empty_like(part) if together else None for part in (constant, rest)]
         mean_gradients = torch.empty_like(means)
         if turns or by_camera or together:
             kernel = harmonics_adjoint_kernel(scalar, degree, together)
             launch(kernel, len(means), rest, means, position, gradient, mean_gradients, *made)
-        if not together:
-            kernel = coefficient_adjoint_kernel(scalar, degree)
-            for start, part in enumerate(made):
-                if part is not None:
-                    launch(kernel, part.numel(), means, position, gradient, start, part)
+        if not together and (by_constant or by_rest):
+            factors = HarmonicsGradients(gradient[None], position[None], means, degree)
+            made = [factors.by_coefficients(part, start) for start, part in enumerate((constant, rest))]
         by_position = -mean_gradients.sum(0) if by_camera else None
         return None, *made, mean_gradients if turns else None, by_position

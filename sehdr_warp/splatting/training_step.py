@@ -81,10 +81,12 @@ def harmonics_adam_step(
 ) -> None:
     """adam_step() of coefficients of harmonics [N, K, 3] from number `start` on, whose gradients are multiplied out
     where they are used."""
-    given = gradients.means.detach(), gradients.positions, gradients.by_values, start
+    if not parameter.numel():
+        return
     numbers = _numbers(step, rate, skipped, betas, epsilon)
-    kernel = kernels.harmonics_adam_kernel(gradients.degree)
-    launch(kernel, parameter.numel(), *given, *numbers, parameter, first_moment, second_moment)
+    changed = parameter.view(-1), first_moment.view(-1), second_moment.view(-1)
+    kernel = kernels.harmonics_adam_kernel(parameter.shape[1])
+    launch(kernel, parameter.numel(), gradients.basis, gradients.by_values, start, *numbers, *changed)
 
 
 def _numbers(step: Tensor, rate: Tensor | float, skipped: Tensor, betas: tuple[float, float], epsilon: float) -> tuple:

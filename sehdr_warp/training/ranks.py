@@ -24,8 +24,8 @@ import torch.distributed as dist
 from torch import Tensor
 
 from ..errors import InputError, SehdrError, surroundings_told
-from ..parallel import thread_count
 from ..scene.photo_file import PhotoFile, can_share, taken
+from ..splatting.threads import thread_count
 
 log = logging.getLogger(__name__)
 
