@@ -4,8 +4,13 @@ import atexit
 import ctypes
 import os
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+
+_changing = threading.Lock()
+_silenced: dict[int, tuple[int, int | None]] = {}
+"""Descriptors, with how many silence each now and where it leads otherwise: the first redirects, the last restores."""
 
 
 @contextmanager
@@ -28,18 +33,23 @@ def silent_output() -> Iterator[None]:
 
 @contextmanager
 def _silent(number: int) -> Iterator[None]:
-    try:
-        kept = os.dup(number)
-    except OSError:  # The program runs without it: nothing to silence.
-        yield
-        return
-    with open(os.devnull, "wb") as nothing:
-        os.dup2(nothing.fileno(), number)
+    with _changing:
+        users, kept = _silenced.get(number, (0, None))
+        if not users:
+            with suppress(OSError):  # The program runs without it: nothing to silence.
+                kept = os.dup(number)
+                with open(os.devnull, "wb") as nothing:
+                    os.dup2(nothing.fileno(), number)
+        _silenced[number] = users + 1, kept
     try:
         yield
     finally:
-        os.dup2(kept, number)
-        os.close(kept)
+        with _changing:
+            users, kept = _silenced[number]
+            _silenced[number] = users - 1, kept
+            if users == 1 and kept is not None:
+                os.dup2(kept, number)
+                os.close(kept)
 
 
 def silence_exit() -> None:

@@ -88,7 +88,8 @@ def photographed(truth: Scene, curve: Response, time: float, bits: int, kind: st
             codes = linear_codes(np.rint(np.clip(light, 0, 1) * levels) / levels)
         else:
             codes = codes_of(np.rint(np.asarray(curve.encode(light)) * levels) / levels, 16)
-        views.append(replace(view, codes=codes, exposure_time=time))
+        # Of no file: a picture of light, as the truth is, would be learned from as it is.
+        views.append(replace(view, codes=codes, exposure_time=time, source=None))
     return replace(truth, views=tuple(views), response=curve, light_known=True)
 
 

@@ -37,8 +37,9 @@ def develop(capture: Capture, response: "Response", max_size: int | None = None,
     """
     developer, names = _Developer(max_size, response, capture.alpha), unique_names(capture.shots)
     keeper = PhotoKeeper(photos, len(names), sum(shot.lens.width * shot.lens.height for shot in capture.shots))
-    # Some copies of a photo are made on its way.
-    most = max(1, _PIXELS_AT_ONCE // max(shot.lens.width * shot.lens.height for shot in capture.shots))
+    # Some copies of a photo are made on its way. While OpenEXR and LibRaw read, nobody's words reach the terminal.
+    quiet = any(shot.hdr is not None or kind_of(shot.image) != "encoded" for shot in capture.shots)
+    most = 1 if quiet else _PIXELS_AT_ONCE // max(shot.lens.width * shot.lens.height for shot in capture.shots)
     shots = ((shot, names[i]) for i, shot in told("reading views", capture.shots))
     views = [keeper.kept(view) for view in made_ahead(lambda given: developer.view(*given), shots, most)]
     deque(with_content(((view.codes, view.mask) for view in views if view.split == "train"), capture.folder), maxlen=0)
