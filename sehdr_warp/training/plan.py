@@ -27,10 +27,10 @@ FEWEST_ITERATIONS = 4000
 CPU_SECONDS = 240.0  # What a training on a CPU may take, as far as CPU_FEWEST allows
 CPU_FEWEST = 1000
 CPU_PIXEL, CPU_GAUSSIAN = 1.5e-6, 2.3e-6  # Seconds of one core for each in a step, measured on two of an AMD EPYC
-STEP_SECONDS, PIXEL_SECONDS, GAUSSIAN_SECONDS = 4.6e-4, 3e-11, 3.9e-9
+STEP_SECONDS, PIXEL_SECONDS, GAUSSIAN_SECONDS = 4.7e-4, 1e-11, 3.2e-9
 """What a recorded step takes on one H200: for itself, each pixel, each Gaussian."""
 NUMBERS, RANK_NUMBERS = 11, 3  # That ranks exchange of a Gaussian: its own, and for each of them what its light pulls
-EXCHANGE_SECONDS, NUMBER_SECONDS = 1.1e-4, 1.66e-11
+EXCHANGE_SECONDS, NUMBER_SECONDS = 1.5e-4, 2.3e-11
 """What two H200 take beyond that to agree and to begin an exchange, and for each number of the gradients."""
 START_SECONDS = 10.0  # What more processes take to start, about
 REACH = 2.0**16  # Brackets farther from the photos' exposure are black or white in all pixels of 8 bits

@@ -24,8 +24,8 @@ import torch.distributed as dist
 from torch import Tensor
 
 from ..errors import InputError, SehdrError, surroundings_told
+from ..parallel import thread_count
 from ..scene.photo_file import PhotoFile, can_share, taken
-from ..splatting.threads import thread_count
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +35,7 @@ GO, WAIT, END = 2, 1, 0
 _EVER = timedelta(days=30)  # Of torch's own limits: they end a process with pages of its innards
 _POLL = 0.1
 ALL_END = "all end; the last checkpoint is whole, --resume goes on from it"
+_LONGEST_WORD = 5.0  # Seconds that the watch may take to say or ask something
 _GRACE = 1.0  # Seconds for whoever knows more about the end of a rank to tell it first
 
 
@@ -68,7 +69,8 @@ class Ranks:
             # What hosts say to each other must not wait for their devices.
             self._hosts = dist.new_group(backend="gloo", timeout=_EVER) if self._cuda else dist.group.WORLD
         self._check_versions()
-        threading.Thread(target=self._watch, name="sehdr-warp ranks", daemon=True).start()
+        self._watcher = threading.Thread(target=self._watch, name="sehdr-warp ranks", daemon=True)
+        self._watcher.start()
 
     def agree(self, wanted: int) -> int:
         """The least that any rank wants of GO, WAIT and END. Rank 0 may take its time before it asks; the others
@@ -157,6 +159,9 @@ class Ranks:
     def close(self) -> None:
         """The end of a training that all ranks came to."""
         self._over.set()
+        # What still talks to other ranks while the interpreter ends would abort the process.
+        self._watcher.join(_LONGEST_WORD)
+        self._hosts = None
         dist.destroy_process_group()
 
     def abandon(self) -> None:

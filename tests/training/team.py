@@ -72,8 +72,8 @@ def mixed(ranks, folder: Path) -> None:
 
 def fall_silent(ranks, folder: Path) -> None:
     """Rank 1 no longer answers, and rank 0 ends; what it says is kept."""
-    ranks._patience = 2.0
     if ranks.leads:
+        ranks._patience = 2.0
         logging.getLogger("sehdr_warp").addHandler(logging.FileHandler(folder / "silent"))
         ranks.agree(2)
     time.sleep(60)
