@@ -18,7 +18,7 @@ def test_error_ignores_scale_and_nothing_else():
 
 
 def test_a_scene_is_exposed_by_each_curve_and_judged():
-    result = bench_response(["embedded"], ["hdr-nerf", "srgb"], exposures=2, max_size=80)
+    result = bench_response(["embedded"], ["hdr-nerf", "srgb"], exposures=2, max_size=48)
     rows = {(row["curve"], row["method"]): row for row in result["rows"]}
     assert {method for _, method in rows} == {"always srgb", "always camera", "posterior", "paper"}
     assert rows["srgb", "always srgb"]["mean"] == 0 and rows["srgb", "always srgb"]["good"] == 2

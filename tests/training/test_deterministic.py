@@ -8,12 +8,12 @@ from sehdr_warp.training.train import train
 from .toy import load_unscaled
 
 SHORT = {
-    "schedule.iterations": 24,
-    "schedule.harmonics_every": 8,
+    "schedule.iterations": 14,
+    "schedule.harmonics_every": 4,
     "densification.start": 4,
-    "densification.stop": 20,
+    "densification.stop": 12,
     "densification.every": 4,
-    "densification.reset_every": 12,
+    "densification.reset_every": 8,
     "deterministic": True,
 }
 
