@@ -9,41 +9,64 @@ import warp as wp
 
 RADIUS = wp.constant(2)
 """Patches are 5 x 5 pixels."""
+WHITE = wp.constant(765.0)
+"""Codes of a white pixel, all channels together: in units of it differences are means of the channels in [0, 1]."""
 SIMILARITY = wp.constant(0.1)
 """A pixel whose color differs by so much, in the mean of the channels, counts 1 / e as much."""
 LARGEST = wp.constant(0.25)
 """Differences count up to here: what a photo does not see must not outweigh what others see."""
 MOST_NEIGHBORS = 8
 
+_SIDE = 2 * int(RADIUS) + 1
 _costs8 = wp.types.vector(length=8, dtype=wp.float32)
+_patch = wp.types.vector(length=_SIDE * _SIDE, dtype=wp.float32)
 
 
 @wp.func
-def color_at(photos: wp.array(dtype=wp.uint8), offset: wp.int64, width: int, column: int, row: int) -> wp.vec3:
-    place = offset + wp.int64(3) * (wp.int64(row) * wp.int64(width) + wp.int64(column))
-    return wp.vec3(float(photos[place]), float(photos[place + wp.int64(1)]), float(photos[place + wp.int64(2)])) / 255.0
+def color_at(photos: wp.array(dtype=wp.vec4ub), place: wp.int64) -> wp.vec4:
+    code = photos[place]
+    return wp.vec4(float(code[0]), float(code[1]), float(code[2]), float(code[3]))
 
 
 @wp.func
-def difference(a: wp.vec3, b: wp.vec3) -> float:
-    return (wp.abs(a[0] - b[0]) + wp.abs(a[1] - b[1]) + wp.abs(a[2] - b[2])) / 3.0
+def difference(a: wp.vec4, b: wp.vec4) -> float:
+    """Of the codes, all channels together."""
+    apart = a - b
+    return wp.abs(apart[0]) + wp.abs(apart[1]) + wp.abs(apart[2])
 
 
 @wp.func
-def color_between(photos: wp.array(dtype=wp.uint8), offset: wp.int64, width: int, u: float, v: float) -> wp.vec3:
-    """Bilinear, at u, v from the middle of the first pixel."""
-    left, top = int(u), int(v)
+def color_between(
+    photos: wp.array(dtype=wp.vec4ub), offset: wp.int64, width: int, height: int, u: float, v: float
+) -> wp.vec4:
+    """Bilinear, at u, v from the middle of the first pixel; within the photo but for rounding."""
+    left, top = wp.clamp(int(u), 0, width - 2), wp.clamp(int(v), 0, height - 2)
     a, b = u - float(left), v - float(top)
-    upper = color_at(photos, offset, width, left, top) * (1.0 - a) + color_at(photos, offset, width, left + 1, top) * a
-    lower = (color_at(photos, offset, width, left, top + 1) * (1.0 - a)
-             + color_at(photos, offset, width, left + 1, top + 1) * a)
+    above = offset + wp.int64(top * width + left)
+    below = above + wp.int64(width)
+    upper = color_at(photos, above) * (1.0 - a) + color_at(photos, above + wp.int64(1)) * a
+    lower = color_at(photos, below) * (1.0 - a) + color_at(photos, below + wp.int64(1)) * a
     return upper * (1.0 - b) + lower * b
+
+
+@wp.func
+def in_pixels(lens: wp.vec4, place: wp.vec3) -> wp.vec3:
+    """Column and row, from the middle of the first pixel, times the depth, and the depth."""
+    return wp.vec3(
+        lens[0] * place[0] + (lens[2] - 0.5) * place[2], lens[1] * place[1] + (lens[3] - 0.5) * place[2], place[2]
+    )
+
+
+@wp.func
+def is_inside(pixel: wp.vec3, nearest: float, right: float, bottom: float) -> bool:
+    u, v = pixel[0] / pixel[2], pixel[1] / pixel[2]
+    return pixel[2] > nearest and u >= 0.0 and v >= 0.0 and u < right and v < bottom
 
 
 @wp.kernel(module="unique", module_options={"enable_backward": False})
 def sweep(
     first: int,
-    photos: wp.array(dtype=wp.uint8), offsets: wp.array(dtype=wp.int64), sizes: wp.array2d(dtype=wp.int32),
+    photos: wp.array(dtype=wp.vec4ub), offsets: wp.array(dtype=wp.int64), sizes: wp.array2d(dtype=wp.int32),
     intrinsics: wp.array(dtype=wp.vec4), neighbors: wp.array2d(dtype=wp.int32), between: wp.array2d(dtype=wp.mat44),
     pixels: wp.array2d(dtype=wp.int32), depths: wp.array2d(dtype=wp.float32),
     costs: wp.array2d(dtype=wp.float32),
@@ -51,9 +74,10 @@ def sweep(
     """costs[n, d]: of pixel n at depths[n, d], the mean of the better half of its neighbors' mean differences, in
     [0, LARGEST]; 2 * LARGEST where fewer than two neighbors show it.
 
-    photos: all pixels, one photo after another from offsets [V]; sizes: [V, 2] width and height; intrinsics: fx, fy,
-    cx, cy; neighbors: [V, K <= 8], -1 for none; between: [V, K] from a view's axes to its neighbor's; pixels: [N, 3]
-    view, column, row, at least RADIUS from the border; depths: [N, D] along the view's axis.
+    photos: all pixels, RGB and a code that is not read, one photo after another from offsets [V]; sizes: [V, 2] width
+    and height; intrinsics: fx, fy, cx, cy; neighbors: [V, K <= 8], -1 for none; between: [V, K] from a view's axes to
+    its neighbor's; pixels: [N, 3] view, column, row, at least RADIUS from the border; depths: [N, D] along the view's
+    axis.
     """
     i = first + wp.tid()
     count = depths.shape[1]
@@ -61,45 +85,58 @@ def sweep(
     view, column, row = pixels[n, 0], pixels[n, 1], pixels[n, 2]
     width, own = sizes[view, 0], intrinsics[view]
     depth = depths[n, i - n * count]
-    middle = color_at(photos, offsets[view], width, column, row)
+    place = offsets[view] + wp.int64(row * width + column)
+    middle = color_at(photos, place)
 
-    sums = _costs8()
-    hidden = _costs8()
-    weights = float(0.0)
-    for y in range(-RADIUS, RADIUS + 1):
-        for x in range(-RADIUS, RADIUS + 1):
-            color = color_at(photos, offsets[view], width, column + x, row + y)
-            weight = wp.exp(-difference(color, middle) / SIMILARITY)
-            weights += weight
-            here = depth * wp.vec3(
-                (float(column + x) + 0.5 - own[2]) / own[0], (float(row + y) + 0.5 - own[3]) / own[1], 1.0
-            )
-            for slot in range(neighbors.shape[1]):
-                other = neighbors[view, slot]
-                if other >= 0 and hidden[slot] == 0.0:
-                    there = wp.transform_point(between[view, slot], here)
-                    lens = intrinsics[other]
-                    u = lens[0] * there[0] / there[2] + lens[2] - 0.5
-                    v = lens[1] * there[1] / there[2] + lens[3] - 0.5
-                    right, bottom = sizes[other, 0] - 1, sizes[other, 1] - 1
-                    if there[2] > 1.0e-6 * depth and u >= 0.0 and v >= 0.0 and u < float(right) and v < float(bottom):
-                        seen = color_between(photos, offsets[other], sizes[other, 0], u, v)
-                        sums[slot] = sums[slot] + weight * wp.min(difference(color, seen), LARGEST)
-                    else:
-                        hidden[slot] = 1.0
+    weights = _patch()
+    total = float(0.0)
+    for y in range(wp.static(_SIDE)):
+        for x in range(wp.static(_SIDE)):
+            color = color_at(photos, place + wp.int64((y - RADIUS) * width + x - RADIUS))
+            weight = wp.exp(difference(color, middle) * (-1.0 / (WHITE * SIMILARITY)))
+            weights[y * wp.static(_SIDE) + x] = weight
+            total += weight
+    total *= WHITE
 
     # In order, the best first.
     best = _costs8()
     counted = int(0)
+    here = depth * wp.vec3((float(column) + 0.5 - own[2]) / own[0], (float(row) + 0.5 - own[3]) / own[1], 1.0)
+    reach = float(RADIUS)
     for slot in range(neighbors.shape[1]):
-        if neighbors[view, slot] >= 0 and hidden[slot] == 0.0:
-            cost = sums[slot] / weights
-            place = int(counted)
-            while place > 0 and best[wp.max(place - 1, 0)] > cost:
-                best[place] = best[place - 1]
-                place -= 1
-            best[place] = cost
-            counted += 1
+        other = neighbors[view, slot]
+        if other >= 0:
+            to_other, lens = between[view, slot], intrinsics[other]
+            # A patch is flat: pixels times depths are sums of steps from its middle, and its corners tell of all.
+            center = in_pixels(lens, wp.transform_point(to_other, here))
+            across = in_pixels(lens, wp.transform_vector(to_other, wp.vec3(depth / own[0], 0.0, 0.0)))
+            down = in_pixels(lens, wp.transform_vector(to_other, wp.vec3(0.0, depth / own[1], 0.0)))
+            size = wp.vec2i(sizes[other, 0], sizes[other, 1])
+            right, bottom, nearest = float(size[0] - 1), float(size[1] - 1), 1.0e-6 * depth
+            if (
+                is_inside(center - reach * (across + down), nearest, right, bottom)
+                and is_inside(center + reach * (across - down), nearest, right, bottom)
+                and is_inside(center - reach * (across - down), nearest, right, bottom)
+                and is_inside(center + reach * (across + down), nearest, right, bottom)
+            ):
+                offset = offsets[other]
+                unlike = float(0.0)
+                for y in range(wp.static(_SIDE)):
+                    for x in range(wp.static(_SIDE)):
+                        pixel = center + float(x - RADIUS) * across + float(y - RADIUS) * down
+                        nearness = 1.0 / pixel[2]
+                        u, v = pixel[0] * nearness, pixel[1] * nearness
+                        seen = color_between(photos, offset, size[0], size[1], u, v)
+                        color = color_at(photos, place + wp.int64((y - RADIUS) * width + x - RADIUS))
+                        apart = wp.min(difference(color, seen), WHITE * LARGEST)
+                        unlike += weights[y * wp.static(_SIDE) + x] * apart
+                cost = unlike / total
+                rank = int(counted)
+                while rank > 0 and best[wp.max(rank - 1, 0)] > cost:
+                    best[rank] = best[rank - 1]
+                    rank -= 1
+                best[rank] = cost
+                counted += 1
     result = 2.0 * LARGEST
     if counted >= 2:
         half = wp.max(2, (counted + 1) / 2)

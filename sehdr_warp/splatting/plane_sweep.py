@@ -20,8 +20,8 @@ NEIGHBORS = plane_sweep.MOST_NEIGHBORS
 class PhotoSet:
     """Posed photos of any sizes, one after another on a device, each with the neighbors that it is compared with.
 
-    codes: all pixels, uint8. offsets: [V] int64; sizes: [V, 2] int32; intrinsics: [V, 4]; neighbors: [V, K] int32, -1
-    for none; between: [V, K, 4, 4], from a view's axes to a neighbor's.
+    codes: [P, 4] all pixels, uint8: RGB and a 0, so that one is read at once. offsets: [V] int64; sizes: [V, 2] int32;
+    intrinsics: [V, 4]; neighbors: [V, K] int32, -1 for none; between: [V, K, 4, 4], from a view's axes to a neighbor's.
     """
 
     codes: Tensor
@@ -36,10 +36,12 @@ class PhotoSet:
         """photos: uint8 [H, W, 3]; cameras: scene.Camera, of the photos' sizes; neighbors: [V, K] of -1 and indices."""
         poses = np.stack([camera.world_to_camera for camera in cameras])
         back = np.stack([camera.camera_to_world for camera in cameras])
-        offsets = np.cumsum([0, *(photo.size for photo in photos[:-1])])
+        starts = np.cumsum([0, *(photo.shape[0] * photo.shape[1] for photo in photos)])
+        codes = np.zeros((starts[-1], 4), np.uint8)
+        np.concatenate([photo.reshape(-1, 3) for photo in photos], out=codes[:, :3])
         given = {
-            "codes": np.concatenate([photo.ravel() for photo in photos]),
-            "offsets": offsets.astype(np.int64),
+            "codes": codes,
+            "offsets": starts[:-1].astype(np.int64),
             "sizes": np.array([[camera.width, camera.height] for camera in cameras], np.int32),
             "intrinsics": np.stack([camera.intrinsics for camera in cameras]).astype(np.float32),
             "neighbors": np.ascontiguousarray(neighbors, np.int32),

@@ -99,8 +99,8 @@ class Matcher:
         )
         pose = self._poses[view]
         points = (pose[:, :3, :3] @ local[:, :, None])[:, :, 0] + pose[:, :3, 3]
-        place = self._photos.offsets[view] + 3 * (row * self.sizes[view, 0] + column)
-        colors = self._photos.codes[place[:, None] + torch.arange(3, device=self.device)].float() / 255
+        place = self._photos.offsets[view] + row * self.sizes[view, 0] + column
+        colors = self._photos.codes[place, :3].float() / 255
         return Matches(points, colors, depth / fx)
 
     def _depth(self, pixels: Tensor) -> Tensor:
