@@ -13,6 +13,7 @@ from .geometry import geometry, vector
 from .harmonics import coefficient_gradient
 
 SHARPNESS, CENTRE = 100.0, 0.995  # 3DGS-MCMC, equation 8: noise is for Gaussians of opacity below 1 - 0.995
+NOTHING = 16.0  # The exponent from which on a Gaussian's noise is a ten-millionth, and is not drawn
 
 _g = geometry(wp.float32)
 _vec3, _vec4 = vector(3, wp.float32), vector(4, wp.float32)
@@ -140,7 +141,10 @@ def add_position_noise(
     """means += strength * sigmoid(100 (0.005 - opacity)) * R S S R^T * normal noise, of seed and index alone."""
     i = first + wp.tid()
     opacity = 1.0 / (1.0 + wp.exp(-opacity_logits[i]))
-    faintness = 1.0 / (1.0 + wp.exp(-SHARPNESS * (1.0 - opacity - CENTRE)))
+    above = SHARPNESS * (opacity - (1.0 - CENTRE))
+    if above > NOTHING:
+        return
+    faintness = 1.0 / (1.0 + wp.exp(above))
     state = wp.rand_init(seed, i)
     noise = _vec3(wp.randn(state), wp.randn(state), wp.randn(state)) * (strength * faintness)
     rotation = _g.rotation_from_quaternion(quaternions[i])
