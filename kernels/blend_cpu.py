@@ -1,9 +1,10 @@
-"""N-channel front-to-back blend and its adjoint for the CPU: rows of 16 pixels, branch-free.
+"""N-channel front-to-back blend and its adjoint for the CPU: rows of 8 pixels, branch-free.
 
-One kernel index is one tile of 16 x 16 pixels. For each Gaussian of the tile's list the kernel walks the pixel rows
-that the Gaussian reaches; a row is one vector of 16, and every decision (is alpha high enough, is the pixel finished)
-is a factor of 0 or 1, so that LLVM turns a row into a handful of AVX-512 or AVX2 instructions. The exponential is a
-polynomial for the same reason: a call of libm's expf would break the vectorisation.
+One kernel index is one tile of 16 x 16 pixels, in two halves side by side. For each Gaussian of the tile's list the
+kernel walks the pixel rows that the Gaussian reaches, of the halves that it reaches. A row is one vector of 8, and
+every decision (is alpha high enough, is the pixel finished) is a factor of 0 or 1, so that LLVM turns a row into a
+handful of AVX2 instructions. The exponential is a polynomial for the same reason: a call of libm's expf would break the
+vectorisation.
 
 Forward, per pixel, with T the transmittance so far:
 
@@ -31,6 +32,9 @@ import warp as wp
 from .constants import ALPHA_MAX, TILE_SIZE, TRANSMITTANCE_MIN
 from .geometry import vector
 
+LANES = 8  # Pixels in a row: a register of AVX2. Rows of 16 are wider than most Gaussians
+HALVES = TILE_SIZE // LANES
+
 # Inlining everything and fusing multiply-adds is worth 1.3-1.6x here. The flags go to Warp's own LLVM.
 COMPILER_FLAGS = "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 "
 COMPILER_FLAGS += "-ffp-contract=fast"
@@ -44,12 +48,12 @@ EXP_COEFFICIENTS = (
 
 @cache
 def row_functions(dtype, halvings: int):
-    """The type of a row of 16, and on rows: broadcast, comparison with zero, exp. float64, the reference, uses the
-    library's exponential.
+    """The type of a row, and on rows: broadcast, comparison with zero, exp; and the halves of a tile that a Gaussian
+    reaches. float64, the reference, uses the library's exponential.
 
     halvings: the polynomial is taken at p / 2^halvings and squared as often, so that p may go down to -0.7 2^halvings.
     """
-    row, real = vector(TILE_SIZE, dtype), dtype
+    row, vec4, real = vector(LANES, dtype), vector(4, dtype), dtype
     lowest = -0.7 * 2.0**halvings
     highest, *others = EXP_COEFFICIENTS
     degree = len(others)
@@ -68,7 +72,7 @@ def row_functions(dtype, halvings: int):
         @wp.func
         def exponential(p: row) -> row:
             e = row()
-            for i in range(wp.static(TILE_SIZE)):
+            for i in range(wp.static(LANES)):
                 e[i] = wp.exp(p[i])
             return e
 
@@ -84,7 +88,20 @@ def row_functions(dtype, halvings: int):
                 e = wp.cw_mul(e, e)
             return e
 
-    return row, spread, step, exponential
+    @wp.func
+    def halves(x: real, ellipse: vec4) -> wp.vec2i:
+        """First and one past the last; x: of the Gaussian's centre from the tile's first pixel."""
+        determinant = ellipse[0] * ellipse[2] - ellipse[1] * ellipse[1]
+        reached = wp.vec2i(0, wp.static(HALVES))
+        # For needles rounding leaves nothing of the determinant.
+        if determinant > real(1.0e-4) * ellipse[0] * ellipse[2]:
+            extent = wp.sqrt(ellipse[3] * ellipse[2] / determinant) * real(1.01) + real(0.01)
+            first = wp.clamp((x - extent) * real(wp.static(1.0 / LANES)), real(0.0), real(wp.static(HALVES)))
+            last = wp.clamp((x + extent) * real(wp.static(1.0 / LANES)), real(-1.0), real(wp.static(HALVES - 1)))
+            reached = wp.vec2i(int(first), int(wp.floor(last)) + 1)
+        return reached
+
+    return row, spread, step, exponential, halves
 
 
 def _options(dtype) -> dict:
@@ -99,12 +116,12 @@ def forward_kernel(dtype, channels: int, halvings: int):
     halvings: see row_functions
     ranges: [tiles] first and one past the last entry; entries: [M] Gaussians
     shapes: [N] (x, y, opacity, half-height); ellipses: [N] (conic a, b, c, level); features: [N, C]
-    columns: tiles across; width, height: of the image; iota: one row, 0 to 15
-    transmittance, accumulated, last: scratch of [tiles, 16] rows, [tiles, C, 16] rows and [tiles, 16] rows
+    columns: tiles across; width, height: of the image; iota: one row, 0 to 7
+    transmittance, accumulated, last: scratch of [tiles, 32] rows, [tiles, C, 32] rows and [tiles, 32] rows, 16 a half
     image: [H W, C]; left_over: [H W], the transmittance behind everything
     """
-    row, spread, step, exponential = row_functions(dtype, halvings)
-    real, vec4, size = dtype, vector(4, dtype), TILE_SIZE
+    row, spread, step, exponential, halves = row_functions(dtype, halvings)
+    real, vec4, size, lanes, rows = dtype, vector(4, dtype), TILE_SIZE, LANES, TILE_SIZE * HALVES
 
     @wp.kernel(module="unique", module_options=_options(dtype))
     def blend_forward(
@@ -120,7 +137,7 @@ def forward_kernel(dtype, channels: int, halvings: int):
         x0 = (tile % columns) * size
         y0 = (tile // columns) * size
         offsets = iota[0]
-        for j in range(size):
+        for j in range(rows):
             transmittance[tile, j] = spread(real(1.0))
             last[tile, j] = spread(real(0.0))
             for channel in range(wp.static(channels)):
@@ -132,42 +149,47 @@ def forward_kernel(dtype, channels: int, halvings: int):
             i = entries[k]
             shape = shapes[i]
             ellipse = ellipses[i]
-            dx = spread(shape[0] - real(x0) - real(0.5)) - offsets
-            in_x = wp.cw_mul(dx, dx) * (real(-0.5) * ellipse[0])
+            x = shape[0] - real(x0) - real(0.5)
             y = shape[1] - real(y0) - real(0.5)
             top = wp.max(int(wp.ceil(y - shape[3])), 0)
             bottom = wp.min(int(wp.floor(y + shape[3])) + 1, size)
-            for j in range(top, bottom):
-                dy = y - real(j)
-                p = in_x + dx * (-ellipse[1] * dy) + spread(real(-0.5) * ellipse[2] * dy * dy)
-                a = wp.min(exponential(wp.min(p, spread(real(0.0)))) * shape[2], spread(real(ALPHA_MAX)))
-                t = transmittance[tile, j]
-                counted = wp.cw_mul(step(a - spread(alpha_threshold)), step(t))
-                weight = wp.cw_mul(wp.cw_mul(a, t), counted)
-                goes_on = step(t - weight - spread(real(TRANSMITTANCE_MIN)))
-                weight = wp.cw_mul(weight, goes_on)
-                # The pixel that this Gaussian finishes keeps its T, negated; finished ones have counted = 0.
-                finished = counted - wp.cw_mul(counted, goes_on)
-                transmittance[tile, j] = t - weight - wp.cw_mul(t, finished) * real(2.0)
-                drawn = wp.cw_mul(counted, goes_on)
-                previous = last[tile, j]
-                last[tile, j] = previous + wp.cw_mul(drawn, spread(real(k - bounds[0] + 1)) - previous)
-                for channel in range(wp.static(channels)):
-                    accumulated[tile, channel, j] = accumulated[tile, channel, j] + weight * features[i, channel]
+            reached = halves(x, ellipse)
+            for half in range(reached[0], reached[1]):
+                dx = spread(x - real(half * lanes)) - offsets
+                in_x = wp.cw_mul(dx, dx) * (real(-0.5) * ellipse[0])
+                for j in range(top, bottom):
+                    at = half * size + j
+                    dy = y - real(j)
+                    p = in_x + dx * (-ellipse[1] * dy) + spread(real(-0.5) * ellipse[2] * dy * dy)
+                    a = wp.min(exponential(wp.min(p, spread(real(0.0)))) * shape[2], spread(real(ALPHA_MAX)))
+                    t = transmittance[tile, at]
+                    counted = wp.cw_mul(step(a - spread(alpha_threshold)), step(t))
+                    weight = wp.cw_mul(wp.cw_mul(a, t), counted)
+                    goes_on = step(t - weight - spread(real(TRANSMITTANCE_MIN)))
+                    weight = wp.cw_mul(weight, goes_on)
+                    # The pixel that this Gaussian finishes keeps its T, negated; finished ones have counted = 0.
+                    finished = counted - wp.cw_mul(counted, goes_on)
+                    transmittance[tile, at] = t - weight - wp.cw_mul(t, finished) * real(2.0)
+                    drawn = wp.cw_mul(counted, goes_on)
+                    previous = last[tile, at]
+                    last[tile, at] = previous + wp.cw_mul(drawn, spread(real(k - bounds[0] + 1)) - previous)
+                    for channel in range(wp.static(channels)):
+                        accumulated[tile, channel, at] = accumulated[tile, channel, at] + weight * features[i, channel]
             k += 1
             if (k - bounds[0]) % 32 == 0:
-                most = transmittance[tile, 0]
-                for j in range(1, size):
-                    most = wp.max(most, transmittance[tile, j])
-                alive = wp.max(most) > real(0.0)
+                most = spread(real(0.0))
+                for j in range(rows):
+                    most += wp.max(transmittance[tile, j], spread(real(0.0)))
+                alive = wp.dot(most, spread(real(1.0))) > real(0.0)
 
         for j in range(wp.min(size, height - y0)):
-            t = transmittance[tile, j]
             for i in range(wp.min(size, width - x0)):
                 pixel = (y0 + j) * width + x0 + i
-                left_over[pixel] = wp.abs(t[i])
+                half = i // lanes
+                at = half * size + j
+                left_over[pixel] = wp.abs(transmittance[tile, at][i - half * lanes])
                 for channel in range(wp.static(channels)):
-                    image[pixel, channel] = accumulated[tile, channel, j][i]
+                    image[pixel, channel] = accumulated[tile, channel, at][i - half * lanes]
 
     return blend_forward
 
@@ -179,11 +201,12 @@ def backward_kernel(dtype, channels: int, halvings: int):
     emission: [M] each entry's row in entry_gradients
     last: as the forward left it; image_gradient: [H W, C]; left_over_gradient: [H W]
     transmittance: as the forward left it, and used up
-    behind, weights, slopes: scratch of [tiles, 16] rows; incoming: scratch of [tiles, C, 16] rows
+    behind: scratch of [tiles, 32] rows; incoming: of [tiles, C, 32]; weights, slopes: of [tiles, 16]; sums: of
+        [tiles, C + 6]
     entry_gradients: [M, C + 6], in the order of emission: features, conic a b c, x, y, opacity
     """
-    row, spread, step, exponential = row_functions(dtype, halvings)
-    real, vec4, size = dtype, vector(4, dtype), TILE_SIZE
+    row, spread, step, exponential, halves = row_functions(dtype, halvings)
+    real, vec4, size, lanes, rows = dtype, vector(4, dtype), TILE_SIZE, LANES, TILE_SIZE * HALVES
 
     @wp.kernel(module="unique", module_options=_options(dtype))
     def blend_backward(
@@ -194,7 +217,7 @@ def backward_kernel(dtype, channels: int, halvings: int):
         iota: wp.array(dtype=row), last: wp.array2d(dtype=row), image_gradient: wp.array2d(dtype=real),
         left_over_gradient: wp.array(dtype=real), transmittance: wp.array2d(dtype=row),
         behind: wp.array2d(dtype=row), incoming: wp.array3d(dtype=row), weights: wp.array2d(dtype=row),
-        slopes: wp.array2d(dtype=row), entry_gradients: wp.array2d(dtype=real),
+        slopes: wp.array2d(dtype=row), sums: wp.array2d(dtype=row), entry_gradients: wp.array2d(dtype=real),
     ):
         tile = first + wp.tid()
         bounds = ranges[tile]
@@ -203,20 +226,23 @@ def backward_kernel(dtype, channels: int, halvings: int):
         offsets = iota[0]
         ones = spread(real(1.0))
         furthest = spread(real(0.0))
-        for j in range(size):
-            t = wp.max(transmittance[tile, j], transmittance[tile, j] * real(-1.0))
-            transmittance[tile, j] = t
-            furthest = wp.max(furthest, last[tile, j])
+        for at in range(rows):
+            t = wp.max(transmittance[tile, at], transmittance[tile, at] * real(-1.0))
+            transmittance[tile, at] = t
+            furthest = wp.max(furthest, last[tile, at])
             from_left_over = spread(real(0.0))
             for channel in range(wp.static(channels)):
-                incoming[tile, channel, j] = spread(real(0.0))
+                incoming[tile, channel, at] = spread(real(0.0))
+            half = at // size
+            j = at - half * size
             if y0 + j < height:
-                for i in range(wp.min(size, width - x0)):
-                    pixel = (y0 + j) * width + x0 + i
+                left = x0 + half * lanes
+                for i in range(wp.min(lanes, width - left)):
+                    pixel = (y0 + j) * width + left + i
                     from_left_over[i] = left_over_gradient[pixel]
                     for channel in range(wp.static(channels)):
-                        incoming[tile, channel, j][i] = image_gradient[pixel, channel]
-            behind[tile, j] = wp.cw_mul(t, from_left_over)
+                        incoming[tile, channel, at][i] = image_gradient[pixel, channel]
+            behind[tile, at] = wp.cw_mul(t, from_left_over)
 
         drawn = int(wp.max(furthest))
         for k in range(bounds[0] + drawn, bounds[1]):
@@ -228,56 +254,75 @@ def backward_kernel(dtype, channels: int, halvings: int):
             i = entries[k]
             shape = shapes[i]
             ellipse = ellipses[i]
-            dx = spread(shape[0] - real(x0) - real(0.5)) - offsets
-            dx2 = wp.cw_mul(dx, dx)
-            in_x = dx2 * (real(-0.5) * ellipse[0])
+            x = shape[0] - real(x0) - real(0.5)
             y = shape[1] - real(y0) - real(0.5)
             top = wp.max(int(wp.ceil(y - shape[3])), 0)
             bottom = wp.min(int(wp.floor(y + shape[3])) + 1, size)
             place = spread(real(k - bounds[0]) + real(0.5))
-            for j in range(top, bottom):
-                dy = y - real(j)
-                p = in_x + dx * (-ellipse[1] * dy) + spread(real(-0.5) * ellipse[2] * dy * dy)
-                unclamped = exponential(wp.min(p, spread(real(0.0)))) * shape[2]
-                a = wp.min(unclamped, spread(real(ALPHA_MAX)))
-                counted = wp.cw_mul(step(a - spread(alpha_threshold)), step(last[tile, j] - place))
-                inverse = wp.cw_div(ones, ones - a)
-                t = transmittance[tile, j]
-                # As an addition: t * inverse would round each of many faint factors the same way.
-                t = t + wp.cw_mul(wp.cw_mul(t, wp.cw_mul(a, inverse)), counted)
-                transmittance[tile, j] = t
-                q = incoming[tile, 0, j] * features[i, 0]
-                for channel in range(1, wp.static(channels)):
-                    q += incoming[tile, channel, j] * features[i, channel]
-                r = behind[tile, j]
-                weight = wp.cw_mul(wp.cw_mul(a, t), counted)
-                from_a = wp.cw_mul(wp.cw_mul(t, q) - wp.cw_mul(r, inverse), counted)
-                behind[tile, j] = r + wp.cw_mul(weight, q)
-                weights[tile, j] = weight
-                # alpha = opacity exp(p): the derivative by p is alpha's own, and none where alpha is held at its limit
-                slopes[tile, j] = wp.cw_mul(wp.cw_mul(a, from_a), step(spread(real(ALPHA_MAX)) - unclamped))
-
-            s0 = spread(real(0.0))
-            sy = spread(real(0.0))
-            syy = spread(real(0.0))
-            for j in range(top, bottom):
-                dy = y - real(j)
-                slope = slopes[tile, j]
-                s0 += slope
-                sy += slope * dy
-                syy += slope * (dy * dy)
             target = emission[k]
-            for channel in range(wp.static(channels)):
-                total = spread(real(0.0))
+            for column in range(wp.static(channels + 6)):
+                sums[tile, column] = spread(real(0.0))
+            reached = halves(x, ellipse)
+            for half in range(reached[0], reached[1]):
+                dx = spread(x - real(half * lanes)) - offsets
+                in_x = wp.cw_mul(dx, dx) * (real(-0.5) * ellipse[0])
                 for j in range(top, bottom):
-                    total += wp.cw_mul(weights[tile, j], incoming[tile, channel, j])
-                entry_gradients[target, channel] = wp.dot(total, ones)
-            sum_0 = wp.dot(s0, ones)
-            sum_x = wp.dot(s0, dx)
-            sum_y = wp.dot(sy, ones)
-            entry_gradients[target, wp.static(channels)] = real(-0.5) * wp.dot(s0, dx2)
-            entry_gradients[target, wp.static(channels + 1)] = -wp.dot(sy, dx)
-            entry_gradients[target, wp.static(channels + 2)] = real(-0.5) * wp.dot(syy, ones)
+                    at = half * size + j
+                    dy = y - real(j)
+                    p = in_x + dx * (-ellipse[1] * dy) + spread(real(-0.5) * ellipse[2] * dy * dy)
+                    unclamped = exponential(wp.min(p, spread(real(0.0)))) * shape[2]
+                    a = wp.min(unclamped, spread(real(ALPHA_MAX)))
+                    counted = wp.cw_mul(step(a - spread(alpha_threshold)), step(last[tile, at] - place))
+                    inverse = wp.cw_div(ones, ones - a)
+                    t = transmittance[tile, at]
+                    # As an addition: t * inverse would round each of many faint factors the same way.
+                    t = t + wp.cw_mul(wp.cw_mul(t, wp.cw_mul(a, inverse)), counted)
+                    transmittance[tile, at] = t
+                    q = incoming[tile, 0, at] * features[i, 0]
+                    for channel in range(1, wp.static(channels)):
+                        q += incoming[tile, channel, at] * features[i, channel]
+                    r = behind[tile, at]
+                    weight = wp.cw_mul(wp.cw_mul(a, t), counted)
+                    from_a = wp.cw_mul(wp.cw_mul(t, q) - wp.cw_mul(r, inverse), counted)
+                    behind[tile, at] = r + wp.cw_mul(weight, q)
+                    weights[tile, j] = weight
+                    # alpha = opacity exp(p): the derivative by p is alpha's own, and none where alpha is held at its
+                    # limit
+                    slopes[tile, j] = wp.cw_mul(wp.cw_mul(a, from_a), step(spread(real(ALPHA_MAX)) - unclamped))
+
+                s0 = spread(real(0.0))
+                sy = spread(real(0.0))
+                syy = spread(real(0.0))
+                for j in range(top, bottom):
+                    dy = y - real(j)
+                    slope = slopes[tile, j]
+                    s0 += slope
+                    sy += slope * dy
+                    syy += slope * (dy * dy)
+                # Through memory: a sum over a row in the same breath would keep LLVM from taking rows at once.
+                for channel in range(wp.static(channels)):
+                    total = sums[tile, channel]
+                    for j in range(top, bottom):
+                        total += wp.cw_mul(weights[tile, j], incoming[tile, channel, half * size + j])
+                    sums[tile, channel] = total
+                sx = wp.cw_mul(s0, dx)
+                sums[tile, wp.static(channels)] = sums[tile, wp.static(channels)] + s0
+                sums[tile, wp.static(channels + 1)] = sums[tile, wp.static(channels + 1)] + sx
+                sums[tile, wp.static(channels + 2)] = sums[tile, wp.static(channels + 2)] + sy
+                sums[tile, wp.static(channels + 3)] = sums[tile, wp.static(channels + 3)] + wp.cw_mul(sx, dx)
+                sums[tile, wp.static(channels + 4)] = sums[tile, wp.static(channels + 4)] + wp.cw_mul(sy, dx)
+                sums[tile, wp.static(channels + 5)] = sums[tile, wp.static(channels + 5)] + syy
+            for channel in range(wp.static(channels)):
+                entry_gradients[target, channel] = wp.dot(sums[tile, channel], ones)
+            sum_0 = wp.dot(sums[tile, wp.static(channels)], ones)
+            sum_x = wp.dot(sums[tile, wp.static(channels + 1)], ones)
+            sum_y = wp.dot(sums[tile, wp.static(channels + 2)], ones)
+            sum_xx = wp.dot(sums[tile, wp.static(channels + 3)], ones)
+            sum_xy = wp.dot(sums[tile, wp.static(channels + 4)], ones)
+            sum_yy = wp.dot(sums[tile, wp.static(channels + 5)], ones)
+            entry_gradients[target, wp.static(channels)] = real(-0.5) * sum_xx
+            entry_gradients[target, wp.static(channels + 1)] = -sum_xy
+            entry_gradients[target, wp.static(channels + 2)] = real(-0.5) * sum_yy
             entry_gradients[target, wp.static(channels + 3)] = -(ellipse[0] * sum_x + ellipse[1] * sum_y)
             entry_gradients[target, wp.static(channels + 4)] = -(ellipse[1] * sum_x + ellipse[2] * sum_y)
             entry_gradients[target, wp.static(channels + 5)] = sum_0 / shape[2]

@@ -98,23 +98,23 @@ def blend_on_cpu(
     tile_count, pieces = lists.columns * lists.rows, balanced_pieces(lists)
 
     def rows(*shape):
-        return features.new_empty(tile_count, *shape, TILE_SIZE)
+        return features.new_empty(tile_count, *shape, blend_cpu.LANES)
 
-    iota = torch.arange(TILE_SIZE, dtype=features.dtype)
+    iota, count = torch.arange(blend_cpu.LANES, dtype=features.dtype), blend_cpu.HALVES * TILE_SIZE
     frame = features, lists.columns, width, height, alpha_threshold, iota
-    transmittance, last = rows(TILE_SIZE), rows(TILE_SIZE)
+    transmittance, last = rows(count), rows(count)
     launch(
         blend_cpu.forward_kernel(scalar, channels, halvings),
         tile_count,
         *(lists.ranges, lists.gaussians, *records, *frame),
-        *(transmittance, rows(channels, TILE_SIZE), last, image.view(-1, channels), left_over),
+        *(transmittance, rows(channels, count), last, image.view(-1, channels), left_over),
         ranges=pieces,
     )
 
     def backward(image_gradient: Tensor, left_over_gradient: Tensor | None) -> Tensor:
         if left_over_gradient is None:
             left_over_gradient = torch.zeros_like(left_over)
-        scratch = rows(TILE_SIZE), rows(channels, TILE_SIZE), rows(TILE_SIZE), rows(TILE_SIZE)
+        scratch = rows(count), rows(channels, count), rows(TILE_SIZE), rows(TILE_SIZE), rows(channels + 6)
         entry_gradients = features.new_empty(lists.entry_count, channels + 6)
         launch(
             blend_cpu.backward_kernel(scalar, channels, halvings),
