@@ -15,7 +15,7 @@ from ..parallel import thread_count
 from ..scene import Scene, View, encoded_values
 from ..scene.exposure import made_by_camera
 from ..scene.linear_photos import kind_of
-from .config import Config
+from .config import Config, OptimizerConfig
 from .config_files import override_config
 from .densification import gaussian_budget
 from .initialization import base_time, focus_distance, pixels_of, points_on_rays, start_count
@@ -24,9 +24,11 @@ from .targets import largest_truth
 
 PASSES = 300  # Steps on each photo. A second look at the same photos teaches less and less, and in the end their noise
 FEWEST_ITERATIONS = 4000
-CPU_SECONDS = 240.0  # What a training on a CPU may take, as far as CPU_FEWEST allows
+CPU_SECONDS = 120.0  # What a training on a CPU may take, as far as CPU_FEWEST allows
 CPU_FEWEST = 1000
-CPU_PIXEL, CPU_GAUSSIAN = 1.5e-6, 2.3e-6  # Seconds of one core for each in a step, measured on two of an AMD EPYC
+MOST_HASTE = 2.5  # By which learning rates of a short training are raised at most
+HASTY = "means", "means_final", "log_scales", "opacity_logits", "harmonics_rest"
+CPU_PIXEL, CPU_GAUSSIAN = 1.0e-6, 1.5e-6  # Seconds of one core for each in a step, measured on two of an AMD EPYC
 STEP_SECONDS, PIXEL_SECONDS, GAUSSIAN_SECONDS = 4.7e-4, 1e-11, 3.2e-9
 """What a recorded step takes on one H200: for itself, each pixel, each Gaussian."""
 NUMBERS, RANK_NUMBERS = 11, 3  # That ranks exchange of a Gaussian: its own, and for each of them what its light pulls
@@ -324,6 +326,18 @@ def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Choi
     return {"schedule.iterations": wanted}, f"{wanted}", reason
 
 
+def _rates(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
+    # Adam moves a parameter by its rate at most: of fewer steps each is to go farther.
+    steps = config.schedule.iterations
+    haste = round(min(MOST_HASTE, max(1.0, math.sqrt(FEWEST_ITERATIONS / steps))), 2)
+    usual = OptimizerConfig()
+    as_usual = [name for name in HASTY if getattr(config.optimizer, name) == getattr(usual, name)]
+    if haste == 1 or not as_usual:
+        return {}, "as they are", f"{steps} steps"
+    fields: dict[str, object] = {f"optimizer.{name}": getattr(usual, name) * haste for name in as_usual}
+    return fields, f"{haste:g} times", f"{steps} steps are fewer than {FEWEST_ITERATIONS}"
+
+
 def _confidence(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     unsure = facts.clipped + facts.black
     reason = f"{unsure:.1%} of the pixels state a bound alone, and a place is seen by {facts.seen:.1f} photos"
@@ -337,6 +351,7 @@ RULES: dict[str, Callable[[SceneFacts, Config, torch.device], Choice]] = {
     "linear-loss": _linear_loss,
     "densification": _densification,
     "iterations": _iterations,
+    "rates": _rates,
     "confidence": _confidence,
 }
 """What a plan decides, in this order."""

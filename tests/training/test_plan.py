@@ -94,13 +94,23 @@ def test_photos_whose_exposure_drifts_unsaid_get_a_line(scene):
     assert not any("exposure times" in line for line in plain.lines())
 
 
+def test_rates_of_a_short_training_are_raised_once_and_those_given_stay(scene):
+    short = {"schedule__iterations": 1000, "plan__keep": ["schedule.iterations", "optimizer.means"]}
+    plan = make_plan(scene, config_of(**short))
+    rates, usual = plan.config.optimizer, config_of().optimizer
+    assert rates.log_scales == 2 * usual.log_scales and rates.opacity_logits == 2 * usual.opacity_logits
+    assert (rates.means, rates.harmonics_dc) == (usual.means, usual.harmonics_dc)
+    enough = make_plan(scene, config_of(schedule__iterations=4000, plan__keep=["schedule.iterations"]))
+    assert enough.config.optimizer == usual
+
+
 def test_a_cpu_gets_the_iterations_that_fit_into_minutes(facts, monkeypatch):
     monkeypatch.setattr("sehdr_warp.training.plan.thread_count", lambda: 2)
     config, rule = config_of(), RULES["iterations"]
     small, large = (replace(facts, photos=200, pixels=200 * side * side) for side in (32, 2000))
     some, few, all_of_them = rule(small, config, CPU), rule(large, config, CPU), rule(small, config, GPU)
     assert all_of_them[0] == {"schedule.iterations": 30_000} and few[0] == {"schedule.iterations": 1000}
-    assert "--max-size" in few[2] and "88 min on a CPU" in few[2]
+    assert "--max-size" in few[2] and "58 min on a CPU" in few[2]
     assert 1000 < some[0]["schedule.iterations"] <= 30_000
     assert cpu_step_seconds(large, config) > 50 * cpu_step_seconds(small, config)
 
