@@ -24,8 +24,9 @@ from .targets import largest_truth
 
 PASSES = 300  # Steps on each photo. A second look at the same photos teaches less and less, and in the end their noise
 FEWEST_ITERATIONS = 4000
-CPU_SECONDS = 120.0  # What a training on a CPU may take, as far as CPU_FEWEST allows
+CPU_SECONDS = 60.0  # What a training on a CPU may take, as far as CPU_FEWEST allows
 CPU_FEWEST = 1000
+CPU_BUDGET = 60.0  # Of densification, where time is short: twice as many Gaussians gain less than twice the steps
 MOST_HASTE = 2.5  # By which learning rates of a short training are raised at most
 HASTY = "means", "means_final", "log_scales", "opacity_logits", "harmonics_rest"
 CPU_PIXEL, CPU_GAUSSIAN = 1.0e-6, 1.5e-6  # Seconds of one core for each in a step, measured on two of an AMD EPYC
@@ -293,6 +294,10 @@ def _linear_loss(facts: SceneFacts, config: Config, device: torch.device) -> Cho
 
 
 def _densification(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
+    fields: dict[str, object] = {}
+    if _is_short_of_time(facts, config, device) and "densification.budget" not in config.plan.keep:
+        fields = {"densification.budget": CPU_BUDGET}
+        config = override_config(config, fields, "plan")
     options = config.densification
     most = gaussian_budget(options, facts.pixels)
     reason = f"densification.max_gaussians = {options.max_gaussians}"
@@ -301,11 +306,21 @@ def _densification(facts: SceneFacts, config: Config, device: torch.device) -> C
     if options.strategy == "relocation":
         start = max(facts.points, start_count(config, facts.pixels))
         choice = f"relocation grows to at most {most}" if start < most else "relocation without growth"
-        return {}, choice, f"{reason}; {start} to start with"
+        return fields, choice, f"{reason}; {start} to start with"
     # Relocation has this budget by itself; densification by gradients stops nowhere.
     most = min(options.max_gaussians, max(most, 2 * facts.points))
     reason += f"; {facts.points} points to start from"
     return {"densification.max_gaussians": most}, f"{most} Gaussians", reason
+
+
+def _is_short_of_time(facts: SceneFacts, config: Config, device: torch.device) -> bool:
+    """Whether a CPU lacks time for the fewest steps of a GPU, by relocation to more than CPU_BUDGET, and nobody asked
+    for as many."""
+    options, steps = config.densification, config.schedule.iterations
+    if device.type != "cpu" or options.strategy != "relocation" or options.budget <= CPU_BUDGET:
+        return False
+    asked = "schedule.iterations" in config.plan.keep and steps >= FEWEST_ITERATIONS
+    return not asked and FEWEST_ITERATIONS * cpu_step_seconds(facts, config) > CPU_SECONDS
 
 
 def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Choice:

@@ -115,6 +115,16 @@ def test_a_cpu_gets_the_iterations_that_fit_into_minutes(facts, monkeypatch):
     assert cpu_step_seconds(large, config) > 50 * cpu_step_seconds(small, config)
 
 
+def test_a_cpu_short_of_time_gets_half_the_gaussians_unless_steps_are_asked_for(facts, monkeypatch):
+    monkeypatch.setattr("sehdr_warp.training.plan.thread_count", lambda: 2)
+    large, rule = replace(facts, photos=18, pixels=18 * 200 * 200), RULES["densification"]
+    asked = config_of(schedule__iterations=4000, plan__keep=["schedule.iterations"])
+    assert rule(large, config_of(), CPU)[0] == {"densification.budget": 60.0}
+    assert "at most 50911" in rule(large, config_of(), CPU)[1]
+    for given, config, device in ((facts, config_of(), CPU), (large, config_of(), GPU), (large, asked, CPU)):
+        assert rule(given, config, device)[0] == {}
+
+
 def test_brackets_of_one_base_become_a_scaling(scene):
     untrue = replace(scene, views=tuple(replace(view, hdr=None) for view in scene.views))
     plan = make_plan(untrue, load_config("paper", {"response.name": "srgb", "plan.enabled": True}))
