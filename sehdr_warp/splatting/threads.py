@@ -50,8 +50,9 @@ def run_parallel(task: Callable[[Any], object], items: Iterable[Any]) -> None:
         future.result()
 
 
-def even_ranges(count: int, smallest: int = 1024) -> list[tuple[int, int]]:
-    """[first, last) ranges that cover `count` items, a few for each thread; one, or each of at least `smallest`."""
-    pieces = max(1, min(thread_count() * 4, count // smallest))
+def even_ranges(count: int, smallest: int = 4096) -> list[tuple[int, int]]:
+    """[first, last) ranges that cover `count` items, two for each thread; one, or each of at least `smallest`: to begin
+    one takes the interpreter's lock, for which all threads wait."""
+    pieces = max(1, min(thread_count() * 2, count // smallest))
     bounds = [count * k // pieces for k in range(pieces + 1)]
     return [(a, b) for a, b in pairwise(bounds) if b > a]

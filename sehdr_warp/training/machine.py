@@ -13,6 +13,10 @@ import torch
 from ..errors import InputError, SehdrError
 from ..parallel import thread_count
 
+SWITCH_SECONDS = (
+    2e-4  # A thread that waits for the interpreter asks for it after so long, where Python's 5 ms are a kernel
+)
+
 
 def pick_device(device: str | torch.device | None) -> torch.device:
     """The device a user named, by default the first GPU or else the CPU; raises InputError if it is not there."""
@@ -46,11 +50,14 @@ def machine_figures(device: torch.device) -> dict:
 @contextmanager
 def torch_settings(deterministic: bool) -> Iterator[None]:
     """torch on one thread, so that its sums do not depend on the machine's cores, which costs nothing: the kernels have
-    threads of their own. deterministic: also its sums on a GPU in a fixed order."""
+    threads of their own, which hand on the interpreter's lock sooner. deterministic: also its sums on a GPU in a fixed
+    order."""
     threads, ordered = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     memory: Any = torch.utils.deterministic
     filled = memory.fill_uninitialized_memory
+    interval = sys.getswitchinterval()
     torch.set_num_threads(1)
+    sys.setswitchinterval(SWITCH_SECONDS)
     if deterministic:
         # cuBLAS repeats itself only with a workspace of its own; it reads this when it is first used.
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
@@ -60,6 +67,7 @@ def torch_settings(deterministic: bool) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+        sys.setswitchinterval(interval)
         if deterministic:  # The call alone loads torch's compiler, two seconds.
             torch.use_deterministic_algorithms(ordered)
         memory.fill_uninitialized_memory = filled
