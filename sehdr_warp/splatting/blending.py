@@ -132,7 +132,7 @@ def balanced_pieces(lists: TileLists) -> list[tuple[int, int]]:
     """Ranges of tiles that hold about the same number of entries each, a few for every thread."""
     tile_count = lists.ranges.shape[0]
     work = (lists.ranges[:, 1] - lists.ranges[:, 0]).add(16).cumsum(0).double()  # 16: a tile costs something in itself
-    pieces = min(thread_count() * 8, tile_count)
+    pieces = min(thread_count() * 4, tile_count)
     goals = torch.arange(1, pieces, dtype=torch.float64) * (float(work[-1]) / pieces)
     bounds = sorted({0, *torch.searchsorted(work, goals).tolist(), tile_count})
     return list(pairwise(bounds))
