@@ -349,7 +349,7 @@ def _rates(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     as_usual = [name for name in HASTY if getattr(config.optimizer, name) == getattr(usual, name)]
     if haste == 1 or not as_usual:
         return {}, "as they are", f"{steps} steps"
-    fields: dict[str, object] = {f"optimizer.{name}": getattr(usual, name) * haste for name in as_usual}
+    fields: dict[str, object] = {f"optimizer.{name}": float(f"{getattr(usual, name) * haste:.3g}") for name in as_usual}
     return fields, f"{haste:g} times", f"{steps} steps are fewer than {FEWEST_ITERATIONS}"
 
 
