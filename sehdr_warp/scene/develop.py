@@ -93,7 +93,7 @@ class _Developer:
         self.max_size, self.response, self.alpha = max_size, response, alpha
         self._tables: dict[int, np.ndarray] = {}
         self._last: tuple[Lens, Undistortion] | None = None
-        self._mapping = threading.Lock()
+        self._alone = threading.Lock()  # For what photos share; responses work on all cores by themselves
 
     def view(self, shot: Shot, name: str) -> View:
         lens, oriented = (shot.lens, False) if shot.derived else fitted_lens(shot)
@@ -104,7 +104,7 @@ class _Developer:
             if factor > 1:
                 working = lens.resized(round(lens.width / factor), round(lens.height / factor))
             # Sets mostly share one lens, whose map is as large as an image.
-            with self._mapping:
+            with self._alone:
                 if self._last is None or self._last[0] != working:
                     self._last = working, Undistortion(working)
                 undistortion = self._last[1]
@@ -137,9 +137,10 @@ class _Developer:
 
     def _averaged(self, codes: np.ndarray, alpha: np.ndarray | None, warped: Callable) -> np.ndarray:
         levels = int(np.iinfo(codes.dtype).max)
-        if levels not in self._tables:
-            light = self.response.decode(np.arange(levels + 1, dtype=np.float64) / levels)
-            self._tables[levels] = np.maximum(light, 0.0).astype(np.float32)
+        with self._alone:
+            if levels not in self._tables:
+                light = self.response.decode(np.arange(levels + 1, dtype=np.float64) / levels)
+                self._tables[levels] = np.maximum(light, 0.0).astype(np.float32)
 
         def seen(values: np.ndarray, rows: slice) -> np.ndarray:
             return values if alpha is None else values * alpha[rows, :, None]
@@ -147,7 +148,9 @@ class _Developer:
         light = warped(codes, lambda rows: seen(self._tables[levels][codes[rows]], rows))
         clipped = warped(codes, lambda rows: seen((codes[rows] == levels).astype(np.float32), rows))
         # A mean over clipped samples is a lower bound: with half of the area clipped, white is the honest value.
-        return codes_of(np.where(clipped >= 0.5, np.float32(1.0), self.response.encode(light)), 16)
+        with self._alone:
+            encoded = self.response.encode(light)
+        return codes_of(np.where(clipped >= 0.5, np.float32(1.0), encoded), 16)
 
 
 def _shrunk(image: np.ndarray, to: Lens | Camera, values: Callable[[slice], np.ndarray] | None = None) -> np.ndarray:

@@ -24,6 +24,7 @@ kernel_cache.check()
 
 _SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 _streams: dict[tuple[int, int], wp.Stream] = {}
+_loading = threading.Lock()  # Kernels are neither made, compiled nor loaded by two threads at once
 
 
 def warp_scalar(dtype: torch.dtype) -> Any:
@@ -62,7 +63,8 @@ def launch(
     if ranged and device.type == "cpu" and isinstance(dim, int):
         ranges = threads.even_ranges(dim, smallest) if ranges is None else ranges
         if len(ranges) > 1:
-            wp.load_module(kernel.module, device="cpu")  # compiling is not safe from two threads at once
+            with _loading:
+                wp.load_module(kernel.module, device="cpu")
 
         def task(bounds: tuple[int, int]) -> None:
             _launch(kernel, device, block_dim, adjoint, bounds[1] - bounds[0], [bounds[0], *values], None)
@@ -132,7 +134,8 @@ def _launch(
         _of_thread.launches = {}
     key = kernel, device, block_dim, adjoint
     if key not in _of_thread.launches:
-        _of_thread.launches[key] = _Packed(*key, dim, values)
+        with _loading:
+            _of_thread.launches[key] = _Packed(*key, dim, values)
     _of_thread.launches[key].launch(dim, values, stream)
 
 

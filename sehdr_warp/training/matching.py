@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
@@ -51,7 +50,8 @@ class Matcher:
 
     def __init__(self, views: Sequence[View], response: Response, focus: float, device: torch.device | str):
         base = float(np.median([view.exposure_time for view in views]))
-        matchable = made_ahead(partial(_matchable, response=response, base_time=base), views, len(views))
+        tables = [_as_if(view.exposure_time / base, response) for view in views]
+        matchable = made_ahead(lambda given: _matchable(*given), zip(views, tables, strict=True), len(views))
         self._images, cameras = zip(*matchable, strict=True)
         self._masks = [view.mask for view in views]
         self.device = torch.device(device)
@@ -122,14 +122,19 @@ class Matcher:
         return torch.where((least.values < WORST_COST) & narrow, 1 / inverse, 0.0)
 
 
-def _matchable(view: View, response: Response, base_time: float) -> tuple[np.ndarray, Camera]:
-    """A photo of 8 bits at the size for matching, as if exposed for base_time seconds, and its camera."""
+def _as_if(ratio: float, response: Response) -> np.ndarray | None:
+    """[256] what the codes of a photo that was exposed `ratio` times as long would else have been; None: the same."""
+    if response.learnable or abs(np.log2(ratio)) <= ALIKE:
+        return None
+    return codes_of(response.encode(response.decode(np.linspace(0, 1, 256)) / ratio), 8)
+
+
+def _matchable(view: View, table: np.ndarray | None) -> tuple[np.ndarray, Camera]:
+    """A photo of 8 bits at the size for matching, its codes looked up in a table, and its camera."""
     codes, camera = view.codes, view.camera
     if codes.dtype != np.uint8:
         codes = codes_of(view.image, 8)
-    if abs(np.log2(view.exposure_time / base_time)) > ALIKE and not response.learnable:
-        light = response.decode(np.linspace(0, 1, 256)) * (base_time / view.exposure_time)
-        codes = codes_of(response.encode(light), 8)[codes]
+    codes = codes if table is None else table[codes]
     scale = min(1.0, LARGEST_SIDE / max(camera.width, camera.height))
     if scale < 1:
         size = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))

@@ -1,6 +1,7 @@
 """What load_scene does with exposures, splits, names, bare photos, the embedded scene and unusable folders."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -204,3 +205,11 @@ def test_a_damaged_result_of_structure_from_motion_is_made_again(tmp_path, caplo
         with sfm._cached(tmp_path, "sfm-key", solve) as place:
             assert len(solved) == 2 and (place / "cameras.bin").read_bytes() == b"cameras"
     assert caplog.text.count("is damaged and is made again") == 1
+
+
+def test_photos_are_averaged_side_by_side(tmp_path):
+    """In a new process, whose kernels are not loaded yet: eight threads that load one at once end it."""
+    write_colmap(tmp_path, count=16)
+    code = f"from sehdr_warp.scene import load_scene; load_scene({str(tmp_path)!r}, max_size=24, response='hdr-nerf')"
+    environment = os.environ | {"SEHDR_THREADS": "8"}
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=120)
