@@ -223,7 +223,7 @@ def coefficient_gradient(dtype, count: int):
 @cache
 def coefficient_adjoint_kernel(dtype, count: int):
     """The adjoint by coefficients with a thread for each of their numbers: neighbouring threads write neighbouring
-    ones. A GPU takes seven times as long where one thread writes the 45 numbers of a Gaussian.
+    ones. A GPU takes several times as long where one thread writes all of a Gaussian.
 
     gradients: [3 N count], otherwise as coefficient_gradient() takes them. Covers [0, 3 N count).
     """

@@ -56,7 +56,7 @@ def write_report(
     """Renders some held-out views of a trained run and writes the report; returns the paths of its files.
 
     `report.html`: one page without a network: figures (of evaluation, which evaluate() gives), what was left out and
-    why, photo, scene and truth as Ultra HDR (the extra `hdr`; else plain), brackets with an exposure dial, confidence,
+    why, photo, scene and truth as Ultra HDR, brackets with an exposure dial, confidence,
     unexplained regions, error against time, cameras. For papers:
     `comparison.png`: photo; photo, HDR scene and truth (where there is some) at -4 EV; a new view; one row for each of
     view_count views, evenly chosen. `stops.png`: the view of most clipped light from -4 to +4 stops: the photo alone,
