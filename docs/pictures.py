@@ -1,7 +1,8 @@
 """Makes the pictures of README and guide: trains a scene through a camera that clips, shows what the photo lost, and
 looks at it in the viewer.
 
-python docs/pictures.py [SCENE] [RUN]       minutes on two cores; a RUN that exists is not trained again
+python docs/pictures.py [SCENE] [RUN] [VIEW]            minutes on two cores; a RUN that exists is not trained again
+python docs/pictures.py --photos FOLDER RUN VIEW        drone.jpg, of github.com/pierotofy/drone_dataset_brighton_beach
 """
 
 import importlib.util
@@ -11,9 +12,12 @@ import sys
 from pathlib import Path
 from threading import Thread
 
+import numpy as np
 from PIL import Image, ImageChops
 
 import sehdr_warp as sw
+from sehdr_warp.output.camera_paths import interpolate
+from sehdr_warp.output.images import as_array, quantize
 from sehdr_warp.output.report import compare, comparison_figure
 from sehdr_warp.synth.expose import expose, exposure_ladder
 
@@ -35,6 +39,27 @@ def main(name: str = "embedded:lamps", folder: str = "runs/hero", view: str = ""
         _save(_browsed(run, shown, scene), "viewer.jpg")
     else:
         print("viewer.jpg stays as it was: it needs Chromium and playwright (pip install 'sehdr-warp[test]')")
+
+
+def photographed(photos: str, folder: str, view: str) -> None:
+    """Writes drone.jpg: a photo and the scene there; that a stop and a half darker, and half-way to the next photo."""
+    if not Path(folder).exists():
+        sw.train(sw.load_scene(photos, max_size=360), folder)
+    run = sw.load_run(folder)
+    scene = run.even(sw.load_scene(photos, max_size=360, response=run.response))
+    shown = next(each for each in scene.views if each.name == view)
+    others = (each.camera for each in scene.views if each is not shown)
+    near = min(others, key=lambda camera: float(np.linalg.norm(camera.position - shown.camera.position)))
+
+    def rendered(camera: sw.Camera, stops: float = 0.0) -> np.ndarray:
+        return as_array(run.render_ldr(camera, shown.exposure_time * 2.0**stops))
+
+    between = interpolate([shown.camera, near], 3)[1]
+    rows = [[shown.image, rendered(shown.camera)], [rendered(shown.camera, -1.5), rendered(between)]]
+    gap = np.ones((shown.camera.height, 6, 3))
+    lines = [np.concatenate([left, gap, right], axis=1) for left, right in rows]
+    picture = np.concatenate([lines[0], np.ones((6, lines[0].shape[1], 3)), lines[1]])
+    _save(Image.fromarray(quantize(picture)), "drone.jpg")
 
 
 def _beside(run: sw.Run, shown: sw.View, scene: sw.Scene) -> Image.Image:
@@ -88,4 +113,4 @@ def _save(picture: Image.Image, name: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    photographed(*sys.argv[2:]) if sys.argv[1:2] == ["--photos"] else main(*sys.argv[1:])
