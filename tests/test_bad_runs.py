@@ -274,7 +274,7 @@ def test_full_disk_while_training_keeps_the_last_checkpoint(trained, tmp_path, c
     assert call("train", "embedded", "--out", out, *flags) == 0, "and goes on once there is room"
 
 
-def test_read_only_place(trained, tmp_path, capfd):
+def test_read_only_place(trained, tmp_path, capfd, coarse_figures):
     """/proc takes no new files, not even root's."""
     for command in ("render", "export", "report"):
         line = refused(capfd, command, trained, "--out", "/proc/sehdr/out.ply")

@@ -47,9 +47,9 @@ def command_lines():
 
 SMALL = (
     ('"photos", max_size=800', '"embedded", max_size=32, response="srgb"'),
-    ('"runs/castle")', '"runs/castle", load_config("demo", {"schedule.iterations": 10}))'),
-    ('load_run("runs/castle", load_config("demo", {"schedule.iterations": 10}))', 'load_run("runs/castle")'),
-    ('"schedule.iterations": 200', '"schedule.iterations": 20'),
+    ('"runs/castle")', '"runs/castle", load_config("demo", {"schedule.iterations": 5}))'),
+    ('load_run("runs/castle", load_config("demo", {"schedule.iterations": 5}))', 'load_run("runs/castle")'),
+    ('"schedule.iterations": 200', '"schedule.iterations": 5'),
     ("resized(1920, 1080)", "resized(48, 27)"),
 )
 

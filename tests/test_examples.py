@@ -17,8 +17,8 @@ def example(name):
 def test_quickstart_and_hand_off(tmp_path, few_probes):
     import OpenEXR
 
-    run = example("quickstart")["main"](tmp_path / "first", max_size=32, iterations=20)
-    assert run.iterations == 20
+    run = example("quickstart")["main"](tmp_path / "first", max_size=32, iterations=8)
+    assert run.iterations == 8
     assert len(list((tmp_path / "first" / "views" / "brackets").rglob("*.exr"))) == 5 * len(
         [entry for entry in run.cameras if entry.split == "test"]
     )
@@ -32,8 +32,8 @@ def test_quickstart_and_hand_off(tmp_path, few_probes):
 
 
 def test_own_loop(few_probes):
-    losses = example("own_loop")["main"](steps=60, max_size=40)
-    assert losses[-1] < 0.5 * losses[0]
+    losses = example("own_loop")["main"](steps=25, max_size=32)
+    assert losses[-1] < 0.6 * losses[0]
 
 
 def test_own_kernel():

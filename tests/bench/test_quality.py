@@ -133,9 +133,9 @@ def test_submitit_runs_several_at_once_and_outlives_one_that_dies(tmp_path, monk
     monkeypatch.setattr(pytest.importorskip("submitit").LocalJob, "_results_timeout_s", 1)
     work = quality.work
     monkeypatch.setattr(quality, "work", lambda *arguments: _run_stubbed(work, arguments))
-    rows = run_jobs(jobs(seeds=(DIES, 7, 8)), tmp_path, device="cpu", at_once=2)
-    assert [row.get("error") for row in rows] == ["its process ended without a result", None, None]
-    assert ran(tmp_path).count(7) == ran(tmp_path).count(8) == 1
+    rows = run_jobs(jobs(seeds=(DIES, 7)), tmp_path, device="cpu", at_once=2)
+    assert [row.get("error") for row in rows] == ["its process ended without a result", None]
+    assert ran(tmp_path).count(7) == 1
 
 
 def _run_stubbed(work, arguments):
@@ -170,7 +170,8 @@ def test_exposures_are_four_times_apart_and_photos_follow():
     assert bright.views[0].image.mean() > 1.3 * dark.views[0].image.mean()
 
 
-def test_one_training_from_the_command_line(tmp_path, capsys, few_probes):
+def test_one_training_from_the_command_line(tmp_path, capsys, few_probes, monkeypatch):
+    monkeypatch.setattr(quality, "WARM_UP_ITERATIONS", 2)
     command = [*SMALL, "--methods", "default", "--out", tmp_path / "out", "--json"]
     assert call(*command, tmp_path / "a.json") == 0
     assert "gt-max dB" in capsys.readouterr().out

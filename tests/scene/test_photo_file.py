@@ -35,7 +35,7 @@ for where in ("disk", "memory", "disk"):  # The first loads libraries, too.
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
 def test_a_photo_takes_three_bytes_a_pixel_and_none_on_the_disk(tmp_path):
-    write_blender(tmp_path, 6, size=(1600, 1200), ply_file_path="p.ply")
+    write_blender(tmp_path, 3, size=(1600, 1200), ply_file_path="p.ply")
     write_ply(tmp_path / "p.ply", [(0, 0, 0)])
     # What is freed is to be given back at once, so that what is counted is held.
     environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_ARENA_MAX": "1"}
@@ -44,7 +44,7 @@ def test_a_photo_takes_three_bytes_a_pixel_and_none_on_the_disk(tmp_path):
     told = [list(map(int, line.split())) for line in ended.stdout.splitlines()]
     (_, grown, *_), (memory, more, *photos), (disk, _, *same_photos) = told
     codes = photos[0]
-    assert photos == same_photos and codes == 6 * 1600 * 1200 * 3
+    assert photos == same_photos and codes == 3 * 1600 * 1200 * 3
     assert 0.9 * codes < memory < 1.1 * codes and disk < 0.1 * codes
     # What decoding a few photos takes besides; float32 copies of all would be four times the codes more.
     assert grown < codes + 200e6 and more < codes

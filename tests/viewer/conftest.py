@@ -26,7 +26,7 @@ def serve(tmp_path):
         viewer = Viewer(shown, lambda index: {view.name: view for view in scene.views}, **options)
         server = Server(viewer, port=18080)
         servers.append(server)
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
         return server
 
     yield start

@@ -133,7 +133,7 @@ def test_an_interrupt_ends_a_pause_and_errors_reach_who_asked():
 
 
 def test_the_page_pauses_steps_and_says_the_end(tmp_path, logged):
-    training = Training(toy_scene(), tmp_path / "run", CONFIG | {"schedule.iterations": 300}, device="cpu")
+    training = Training(toy_scene(), tmp_path / "run", CONFIG | {"schedule.iterations": 150}, device="cpu")
     served = threading.Event()
 
     def work():
@@ -151,13 +151,13 @@ def test_the_page_pauses_steps_and_says_the_end(tmp_path, logged):
         def wait(text, place="#progress"):
             page.locator(place, has_text=re.compile(text)).wait_for()
 
-        wait(" of 300 ")
+        wait(" of 150 ")
         page.click("#pause")
         wait("Resume", "#pause")
-        page.wait_for_timeout(1200)
+        page.wait_for_timeout(1100)  # It asks once a second.
         stopped = int(page.text_content("#progress").split()[0])
-        page.wait_for_timeout(1200)
-        assert page.text_content("#progress").startswith(f"{stopped} of 300 \N{MIDDLE DOT} loss 0.")
+        page.wait_for_timeout(1100)
+        assert page.text_content("#progress").startswith(f"{stopped} of 150 \N{MIDDLE DOT} loss 0.")
         for _ in range(2):
             page.click("#step")
         wait(f"^{stopped + 2} of")

@@ -28,6 +28,15 @@ def settle(page, action=lambda: None):
     page.wait_for_selector(FULL)
 
 
+def until(page, condition):
+    page.evaluate(f"async () => {{ while (!({condition})) await new Promise(done => setTimeout(done, 20)); }}")
+
+
+def rest(page):
+    """Waits until nothing is asked for any more, nor the photo that is compared with still read."""
+    until(page, "stage.dataset.frame === 'full' && !busy && (!usesPhoto() || state.photoReady === state.photo)")
+
+
 def light_of(page, run):
     """What the page shows now, rendered here: exposures at 0 EV [H, W, 3], as display light."""
     camera = Camera.from_dict(page.evaluate("window.viewer.camera()"))
@@ -81,7 +90,7 @@ def test_looks_overlays_and_the_photo_beside(chromium, serve):
         light = light_of(page, run) / display_gain(run.response)
         np.testing.assert_allclose(looks[4], run.response.encode(light), atol=2.5 / 255)
         page.select_option("#left", "photo")
-        page.wait_for_timeout(1500)
+        rest(page)
         half = pixels(page, "#picture").shape[1] // 2
         beside = pixels(page, "#picture")
         # The photo is of this camera, and what the camera would see is what the scene shows.
@@ -91,8 +100,7 @@ def test_looks_overlays_and_the_photo_beside(chromium, serve):
         assert np.abs(beside[:, left] - looks[4][:, left])[inside].mean() < 0.02
         for overlay in ("stops", "confidence", "depth", "normals", "error", "clipped"):
             page.select_option("#overlay", overlay)
-            page.wait_for_timeout(300)
-            page.wait_for_selector(FULL)
+            rest(page)
             looks.append(pixels(page, "#picture"))
         for first in range(len(looks)):
             for second in range(first):
@@ -116,8 +124,7 @@ def test_the_tables_are_the_shader(chromium, serve):
             page.select_option("#tone", tone)
             page.select_option("#left", left)
             page.select_option("#overlay", overlay)
-            page.wait_for_timeout(300)
-            page.wait_for_selector(FULL)
+            rest(page)
             slide(page, "#stops", 1.5)
             looked_up = pixels(page, "#picture")
             page.evaluate(
@@ -142,8 +149,7 @@ def test_an_exposure_is_none_of_the_shader_s_work_in_software(chromium, serve):
             page.select_option("#left", left)
             for overlay in ("none", "stops", "depth", "error", "clipped"):
                 page.select_option("#overlay", overlay)
-                page.wait_for_timeout(300)
-                page.wait_for_selector(FULL)
+                rest(page)
                 shown = [pixels(page, "#picture")]
                 page.evaluate("window.shaded = 0")
                 slide(page, "#stops", -2)
@@ -151,8 +157,7 @@ def test_an_exposure_is_none_of_the_shader_s_work_in_software(chromium, serve):
                 assert page.evaluate("shaded") == 0, (left, overlay)
                 page.select_option("#overlay", "stops")
                 page.select_option("#overlay", overlay)
-                page.wait_for_timeout(300)
-                page.wait_for_selector(FULL)
+                rest(page)
                 np.testing.assert_array_equal(pixels(page, "#picture"), shown[1])
                 moves = overlay in ("none", "stops", "clipped")
                 assert (np.abs(shown[0] - shown[1]).max() > 0.02) == moves, (left, overlay)
@@ -172,8 +177,7 @@ def test_without_webgl_the_light_is_shown_all_the_same(chromium, serve):
         looks = [pixels(page, "#picture")]
         for overlay in ("stops", "clipped"):
             page.select_option("#overlay", overlay)
-            page.wait_for_timeout(300)
-            page.wait_for_selector(FULL)
+            rest(page)
             looks.append(pixels(page, "#picture"))
         assert all(np.abs(looks[0] - look).mean() > 0.01 for look in looks[1:])
         page.select_option("#overlay", "none")
@@ -188,7 +192,7 @@ def test_what_is_coarse_while_it_moves_is_whole_soon(chromium, serve):
             "light.settings.overlay = 'depth', light.scale = 0.25",
         ):  # While it moves; then whole.
             coarse = page.evaluate(f"light.drawn = performance.now(), {coarser}, light.draw(), picture.toDataURL()")
-            page.wait_for_timeout(1000)
+            until(page, "!light.coarse")
             whole = page.evaluate("picture.toDataURL()")
             assert whole != coarse
             page.evaluate("light.draw()")
@@ -237,11 +241,9 @@ def test_brackets_and_a_film_are_saved_and_what_is_wrong_is_told(chromium, serve
         page.click("#addView")
         page.fill("#length", "0.2")
         page.click("#play")
-        page.wait_for_timeout(1000)
-        page.wait_for_selector(FULL)
-        assert page.evaluate("window.viewer.camera().world_to_camera[0]") == pytest.approx(
-            page.evaluate("state.path[1].world_to_camera[0]"), abs=1e-6
-        )
+        there = "(a, b) => a.world_to_camera[0].every((x, i) => Math.abs(x - b.world_to_camera[0][i]) < 1e-6)"
+        until(page, f"({there})(window.viewer.camera(), state.path[1])")
+        rest(page)
         starts = {"brackets": b"PK", "film": b"\0\0\0"}
         for kind, start in starts.items():
             with page.expect_download() as download:
