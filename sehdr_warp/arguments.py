@@ -15,7 +15,12 @@ import tyro
 from .errors import InputError, UsageError, did_you_mean
 
 Options = typing.TypeVar("Options")
-MARKERS = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone)
+MARKERS = (
+    tyro.conf.FlagCreatePairsOff,
+    tyro.conf.OmitArgPrefixes,
+    tyro.conf.DisallowNone,
+    tyro.conf.PositionalMetavarFromFieldName,
+)
 
 
 def parse(options: type[Options], words: list[str], program: str) -> Options:
@@ -107,15 +112,20 @@ def _hide_empty_defaults(options: type) -> None:
             if dataclasses.is_dataclass(_plain(part)):
                 _hide_empty_defaults(_plain(part))
         marks = getattr(hint, "__metadata__", ())
-        if field.default in (None, False, ()) and not any(hasattr(mark, "help_behavior_hint") for mark in marks):
+        if field.default in (None, False, (), "") and not any(hasattr(mark, "help_behavior_hint") for mark in marks):
             quiet = tyro.conf.arg(help_behavior_hint="")
             owner.__annotations__[field.name] = typing.Annotated[hint, quiet]
+
+
+def _sorted_choices(match: re.Match) -> str:
+    """A refused choice; of a flag that need not be given, tyro lists them in any order, with a None that none types."""
+    return f"{match[2]} {match[1]}: is none of {', '.join(sorted({*match[3].split(', ')} - {repr('None')}))}"
 
 
 # What tyro says, and the same in fewer words; a text in none of these forms is passed on as it is.
 _SHORTER = (
     (r"Missing value for argument '(\S+)'.*", r"\1 needs a value"),
-    (r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*?),?\) ?\.", r"\2 \1: is none of \3"),
+    (r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*?),?\) ?\.", _sorted_choices),
     (r"Error parsing (\S+): no type matching (.+) could be instantiated from \['(.*?)'\].*", r"\1 \3: is no \2"),
     (r"Error parsing (\S+): .*: '(.*)'", r"\1 \2: is no number"),
     (r"Expected one of \{(.*)\} ?\.", r"needs one of \1"),
@@ -135,9 +145,8 @@ def _one_line(told: str) -> str:
         names = [line.strip() for line in lines if re.match(r" {4}\S", line)]
         return f"{lines[0].strip(' :').replace('Missing from ', '')} needs {', '.join(names)}"
     text = " ".join(" ".join(lines).split())
-    return next(
-        (match.expand(shorter) for pattern, shorter in _SHORTER if (match := re.fullmatch(pattern, text))), text
-    )
+    shorter = (re.sub(pattern, said, text) for pattern, said in _SHORTER if re.fullmatch(pattern, text))
+    return next(shorter, text)
 
 
 def numbers(flag: str, text: str, kind: type = float, least: float = -math.inf) -> tuple:

@@ -16,7 +16,9 @@ class Completion:
     """Print a script by which a shell completes commands and flags.
 
     bash: sehdr-warp completion bash > ~/.local/share/bash-completion/completions/sehdr-warp
-    zsh:  sehdr-warp completion zsh > DIR/_sehdr-warp, where DIR is in $fpath
+
+    zsh: sehdr-warp completion zsh > DIR/_sehdr-warp, where DIR is in $fpath
+
     fish: sehdr-warp completion fish > ~/.config/fish/completions/sehdr-warp.fish
     """
 

@@ -22,7 +22,7 @@ def run(embedded_run):
     return embedded_run
 
 
-@pytest.mark.parametrize("command", [["check", "--cases", "needle"], ["train", "--help"], ["--help"], ["presets"]])
+@pytest.mark.parametrize("command", [["responses"], ["train", "--help"], ["--help"], ["presets"]])
 def test_output_that_nobody_reads_ends_quietly(command):
     process = subprocess.Popen(
         [sys.executable, "-m", "sehdr_warp", *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -106,10 +106,10 @@ def test_help_is_quick_and_needs_no_torch(words):
         ("train x --out y --loss.predictor net.pt", "--loss.predictor is gone: it gained nothing"),
         ("train x --out y --response.form mlp", 'write response.name = "learned"'),
         ("render x", "render needs --out, a folder"),
-        ("render x --out y --pixel byte", "--pixel byte: is none of 'half', 'float'"),
+        ("render x --out y --pixel byte", "--pixel byte: is none of 'float', 'half'"),
         ("bench setp", "bench setp: no such command, did you mean step?"),
         ("bench step --repetitions many", "--repetitions many: is no number"),
-        ("completion tsch", "tsch"),
+        ("completion tsch", "shell tsch: is none of 'bash', 'fish', 'tcsh', 'zsh'"),
     ],
 )
 def test_wrong_usage_is_one_line_with_the_nearest_right_word(line, told, capsys):

@@ -51,7 +51,7 @@ class Evaluate(_Figures):
 class Compare:
     """Compare trained runs in one table; runs that differ by their seed alone become a mean with its spread."""
 
-    runs: Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN ...")]
+    runs: Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN ...", help_behavior_hint="")]
     """Folders of runs."""
     plot: Path | None = None
     """Also draw held-out error against training time to this PNG file."""

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import tyro
 from tyro.conf import Positional
 
 from ..training.commands import open_scene, read_scene
@@ -18,7 +19,7 @@ log = logging.getLogger(__name__)
 class View:
     """Look at trained scenes in a browser: fly through, expose, probe, compare, save. Runs until Ctrl-C."""
 
-    runs: Positional[tuple[Path, ...]]
+    runs: Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN ...", help_behavior_hint="")]
     """Folders of runs, or files of Gaussians; with several, the page compares them."""
     port: int = 8080
     """Port; the next free one where it is taken."""
