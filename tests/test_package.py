@@ -1,11 +1,14 @@
 """The package as installed: public names, version, data, and how fast it is there."""
 
 import ast
+import inspect
 import json
+import re
 import subprocess
 import sys
 import time
 import tomllib
+from dataclasses import fields, is_dataclass
 from importlib import resources
 from pathlib import Path
 
@@ -29,6 +32,18 @@ def test_stub_and_lazy_names_agree():
 def test_public_names_load_and_are_documented(name):
     assert getattr(sehdr_warp, name).__doc__
     assert name in dir(sehdr_warp)
+
+
+@pytest.mark.parametrize("name", sehdr_warp.__all__)
+def test_docstrings_name_every_argument_and_field_in_googles_form(name):
+    """Else the site of the pages takes what is said of them for something else."""
+    made = getattr(sehdr_warp, name)
+    if inspect.isclass(made):
+        section, names = "Attributes", [each.name for each in fields(made)] if is_dataclass(made) else []
+    else:
+        section, names = "Args", list(inspect.signature(made).parameters)
+    told = re.search(rf"^{section}:\n((?: {{4}}.*\n)+)", inspect.getdoc(made) + "\n", re.MULTILINE)
+    assert not names or {*re.findall(r"^ {4}(\w+): ", told[1], re.MULTILINE)} == {*names}
 
 
 def test_unknown_names_are_attribute_errors():
@@ -55,8 +70,7 @@ def test_every_subpackage_is_listed_for_installation():
 
 
 def test_import_is_quick():
-    best = min(_seconds("import sehdr_warp") for _ in range(3))
-    assert best < 1.0
+    assert any(_seconds("import sehdr_warp") < 1.0 for _ in range(3))
 
 
 def _seconds(code):

@@ -42,18 +42,39 @@ def rasterization(
     channel_chunk: int = 32,
     **others: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """N Gaussians seen by C cameras.
+    """N Gaussians seen by C cameras, with gsplat's arguments and results.
 
-    means [N, 3]; quats [N, 4] (w, x, y, z); scales [N, 3], positive; opacities [N]; viewmats [C, 4, 4] world to camera;
-    Ks [C, 3, 3]; backgrounds [C, D]. colors: [N, D] or [C, N, D], or with sh_degree coefficients [N, K, 3].
-    near_plane, far_plane: what is nearer or farther is left out; in scene units.
-    packed: is taken for gsplat's sake: the third result is as without it. tile_size and channel_chunk have no effect.
+    Args:
+        means: [N, 3].
+        quats: [N, 4] (w, x, y, z).
+        scales: [N, 3], positive.
+        opacities: [N].
+        colors: [N, D] or [C, N, D], or with sh_degree coefficients [N, K, 3].
+        viewmats: [C, 4, 4] world to camera.
+        Ks: [C, 3, 3].
+        width: of the images, pixels.
+        height: likewise.
+        near_plane: what is nearer is left out, scene units.
+        far_plane: what is farther.
+        eps2d: variance in square pixels added to each splat.
+        sh_degree: of the harmonics; None for plain colors.
+        packed: is taken for gsplat's sake: the third result is as without it.
+        tile_size: has no effect.
+        backgrounds: [C, D].
+        render_mode: "RGB", "D", "ED", "RGB+D" or "RGB+ED".
+        rasterize_mode: "classic" or "antialiased".
+        channel_chunk: has no effect.
+        others: gsplat's further arguments, with the one value that is supported here (ONE_VALUE: no absgrad, sparse
+            gradients, distortion, other camera models).
 
-    Returns colors [C, H, W, D], with depths as one more channel ("RGB+D": blended, "RGB+ED": expected) or as the only
-    one ("D", "ED"); alphas [C, H, W, 1]; and what densification reads: means2d [C, N, 2], which can retain its
-    gradient, radii [C, N, 2] int32 (0 where culled), depths [C, N], width, height, n_cameras and the like.
-    Raises ValueError for another render_mode, and for any of gsplat's further arguments with a value that is not the
-    one here (ONE_VALUE: no absgrad, sparse gradients, distortion, other camera models); TypeError for unknown ones.
+    Returns:
+        Colors [C, H, W, D], with depths as one more channel ("RGB+D": blended, "RGB+ED": expected) or as the only one
+        ("D", "ED"); alphas [C, H, W, 1]; and what densification reads: means2d [C, N, 2], which can retain its
+        gradient, radii [C, N, 2] int32 (0 where culled), depths [C, N], width, height, n_cameras and the like.
+
+    Raises:
+        ValueError: for another render_mode, or another value of a further argument.
+        TypeError: for unknown ones.
     """
     if render_mode not in RENDER_MODES:
         raise ValueError(f"render_mode {render_mode!r} is none of {', '.join(RENDER_MODES)}")

@@ -53,7 +53,11 @@ class ComparedRuns:
 def compare_runs(runs: Sequence[Any]) -> list[ComparedRuns]:
     """Rows of a comparison, in the order of the runs; runs of one scene and config but for the seed share a row.
 
-    Raises SehdrError without runs, for a run that is given twice, or one without evaluations in its metrics.
+    Args:
+        runs: of load_run.
+
+    Raises:
+        SehdrError: without runs, for a run that is given twice, or one without evaluations in its metrics.
     """
     if not runs:
         raise SehdrError("compare: no runs are given; give their folders")

@@ -34,15 +34,19 @@ class FolderPictures:
 def score_folder(folder: Path | str, truth: Scene, *, lpips_weights: Path | str | None = None) -> dict[str, Any]:
     """Scores pictures of any origin against a scene's HDR truth.
 
-    folder: EXR files of scene-linear radiance with Rec.709 primaries, named as the views (`r_0.exr`). truth: a scene
-    whose views hold HDR truth; its test views are scored, or all named ones where it has none. lpips_weights: as of
-    evaluate().
+    Args:
+        folder: EXR files of scene-linear radiance with Rec.709 primaries, named as the views (`r_0.exr`).
+        truth: a scene whose views hold HDR truth; its test views are scored, or all named ones where it has none.
+        lpips_weights: as of evaluate().
 
-    Returns what evaluate() does, without figures of photos; and "missing", test views without a file, "extra", files of
-    no view, and "scale_from": the scale of "aligned" is fitted on the training views that have a file ("train"), else
-    on the scored views ("scored"), which favors the folder.
+    Returns:
+        What evaluate() does, without figures of photos; and "missing", test views without a file, "extra", files of no
+        view, and "scale_from": the scale of "aligned" is fitted on the training views that have a file ("train"), else
+        on the scored views ("scored"), which favors the folder.
 
-    Raises InputError for a folder without a file of a scored view, SehdrError for a picture of another size.
+    Raises:
+        InputError: for a folder without a file of a scored view.
+        SehdrError: for a picture of another size.
     """
     folder = Path(folder)
     found = {file.stem: file for file in sorted(folder.glob("*.exr"))} if folder.is_dir() else {}

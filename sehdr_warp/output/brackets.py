@@ -72,16 +72,29 @@ def write_brackets(
 ) -> list[Path]:
     """Writes exposure brackets of HDR views; returns the EXR files.
 
-    views: name -> [H, W, 3] scene-linear Rec.709 radiance E, >= 0, not multiplied by an exposure time. evs or
-    exposures: see bracket_exposures. cameras: by name, for the EXR attributes. Other parameters: see Brackets.
-
     Every pixel is E dt, computed in float64 and rounded once. Files: `out/brackets/<view>/<view>_b<i>_ev<+x.x>.exr`
     with i ascending by exposure, by="exposure" `out/brackets/b<i>_ev<+x.x>/<view>.exr`, or `out/brackets/<view>.exr`;
     the like in `out/brackets_ldr` where ldr is given; and `out/brackets.json`. All appear together when the last one is
     written.
 
-    Raises SehdrError for unusable exposures or options, InputError where something would be replaced (unless
-    overwrite) or a pixel is not finite.
+    Args:
+        out: the folder for the files.
+        views: name -> [H, W, 3] scene-linear Rec.709 radiance E, >= 0, not multiplied by an exposure time.
+        base_time: seconds at 0 EV.
+        evs: stops, such as "-4,-2,0" or [-4, -2, 0]; either these or exposures.
+        exposures: seconds, stops or multiples of the base time, such as "1/125, -2ev, 8x"; numbers are seconds.
+        cameras: by name, for the EXR attributes.
+        colorspace: primaries of the EXR files.
+        pixel: "half" (float where half would overflow) or "float".
+        multipart: one EXR file with all exposures of a view.
+        by: "view" or "exposure", what a folder is of.
+        ldr: "jpeg", "png" or "png16" adds simulated photos, through the response.
+        response: the camera's, for ldr.
+        overwrite: replace folders that an earlier call wrote.
+
+    Raises:
+        SehdrError: for unusable exposures or options.
+        InputError: where something would be replaced or a pixel is not finite.
     """
     made = bracket_exposures(base_time, evs=evs, exposures=exposures)
     brackets = Brackets(made, base_time, colorspace, pixel, multipart, ldr, response, by=by)

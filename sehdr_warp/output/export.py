@@ -32,16 +32,23 @@ def export(
     cameras: bool = False,
     overwrite: bool = False,
 ) -> Path:
-    """Writes the Gaussians of a trained run; returns the path. The suffix decides: .ply, .glb (glTF), .usda, .usdc,
-    .usdz (OpenUSD). What the file keeps of the scene is measured on pictures and goes to the log.
+    """Writes the Gaussians of a trained run; returns the path.
 
-    kind: "ldr" for the colors of a photo at exposure_time, which viewers show: seconds, by default the scene's;
-        refined to the run's own pictures. "hdr" for scene-linear radiance. None: hdr for USD, else ldr.
-    degree: harmonics are padded with zeros up to this, for readers that take no other; at most 3.
-    cameras: also writes `cameras.json` beside it, as the reference release of 3D Gaussian Splatting does.
+    What the file keeps of the scene is measured on pictures and goes to the log.
 
-    Raises SehdrError for options that do not fit, InputError for an unknown suffix, where a file exists (unless
-    overwrite) or a value is not finite.
+    Args:
+        run: of load_run, train or load_splats.
+        path: the file; its suffix decides: .ply, .glb (glTF), .usda, .usdc, .usdz (OpenUSD).
+        kind: "ldr" for the colors of a photo, which viewers show, refined to the run's own pictures; "hdr" for
+            scene-linear radiance. None: hdr for USD, else ldr.
+        exposure_time: seconds, of ldr colors; by default the scene's.
+        degree: harmonics are padded with zeros up to this, for readers that take no other; at most 3.
+        cameras: also write `cameras.json` beside it, as the reference release of 3D Gaussian Splatting does.
+        overwrite: replace files that exist.
+
+    Raises:
+        SehdrError: for options that do not fit.
+        InputError: for an unknown suffix, where a file exists or a value is not finite.
     """
     path = Path(path)
     held = color_model_of(path)

@@ -56,17 +56,24 @@ def write_panorama(
 ) -> Path:
     """Writes the light that reaches a point of a trained scene from all directions; returns the path.
 
-    path: .exr (R, G, B radiance; A how far a direction was seen; in a second part, `data`, distance.Z and, if the run
-        has it, confidence; attribute `envmap`) or .hdr (Radiance, no more than R, G, B). at: a point in the scene's
-        coordinates, "camera:NAME", or "center": the middle of the training cameras. size: pixels across, of a cube
-        those of one face.
-    layout: "latlong": size x size / 2, the left edge at longitude pi, its middle along +Z, +X at a quarter, +Y up.
-        "cube": OpenEXR's six faces, one above the other. axes: "upright": +Y is up in the photos, +Z is ahead of the
-        named camera or of the middle one; "scene": those of the scene's coordinates.
-    fill: what no photo saw gets the light around it, smoothly, as far as A is below 1; A tells it still.
+    Args:
+        run: of load_run, train or load_splats.
+        path: .exr (R, G, B radiance; A how far a direction was seen; in a second part, `data`, distance.Z and, if the
+            run has it, confidence; attribute `envmap`) or .hdr (Radiance, no more than R, G, B).
+        at: a point in the scene's coordinates, "camera:NAME", or "center": the middle of the training cameras.
+        size: pixels across, of a cube those of one face.
+        layout: "latlong": size x size / 2, the left edge at longitude pi, its middle along +Z, +X at a quarter, +Y up.
+            "cube": OpenEXR's six faces, one above the other.
+        axes: "upright": +Y is up in the photos, +Z is ahead of the named camera or of the middle one; "scene": those of
+            the scene's coordinates.
+        fill: what no photo saw gets the light around it, smoothly, as far as A is below 1; A tells it still.
+        colorspace: primaries of the file.
+        pixel: "half" (float where half would overflow) or "float".
+        overwrite: replace a file that exists.
 
-    Raises SehdrError for options that do not fit, or a point that sees next to nothing; InputError where the file
-    exists (unless overwrite) or a pixel is not finite.
+    Raises:
+        SehdrError: for options that do not fit, or a point that sees next to nothing.
+        InputError: where the file exists or a pixel is not finite.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:

@@ -57,22 +57,35 @@ def render_views(
     ocio: str | None = None,
     view: str | None = None,
 ) -> list[Path]:
-    """Renders views of a run into `out`; returns the files written.
+    """Renders views of a run; returns the files written. Everything appears when the last view is done.
 
     Always: `hdr/<view>.exr` (R, G, B scene-linear radiance; A coverage; Z distance along the axis, 0 where empty;
-    confidence, if the run has it), `preview/<view>.png` (tone-mapped, sRGB) and `cameras.usda`. With evs or exposures:
-    brackets, see write_brackets, with ldr_brackets as its ldr, through the run's response.
+    confidence, if the run has it), `preview/<view>.png` (tone-mapped, sRGB) and `cameras.usda`. Cameras that see
+    nothing are named in a warning.
 
-    cameras: "train", "test", "all", "orbit", "interpolate", or a file (see load_cameras). count: views of an orbit or
-    interpolation. size: width and height in pixels, or "1920x1080", in place of the cameras' own: the vertical field of
-    view stays. white: what `hdr/` shows the photos' white as, by an exposure that its `expTime` states; None leaves
-    radiance. ocio, view: a config of OpenColorIO and a view in it, for the previews (see ocio_view). passes: of depth,
-    position, normals, alpha, confidence and clipped, each a part of its own of `hdr/<view>.exr`.
-    overwrite: replaces the folders hdr, preview and brackets of an earlier render; other files in `out` stay.
-    Cameras that see nothing are named in a warning.
+    Args:
+        run: of load_run, train or load_splats.
+        out: the folder for the files.
+        cameras: "train", "test", "all", "orbit", "interpolate", or a file (see load_cameras).
+        count: views of an orbit or interpolation.
+        evs: brackets, as write_brackets makes them, through the run's response.
+        exposures: likewise.
+        multipart: as of write_brackets.
+        by: as of write_brackets.
+        colorspace: primaries of the EXR files.
+        white: what `hdr/` shows the photos' white as, by an exposure that its `expTime` states; None leaves radiance.
+        pixel: "half" or "float".
+        overwrite: replaces the folders hdr, preview and brackets of an earlier render; other files in `out` stay.
+        ldr_brackets: as ldr of write_brackets.
+        passes: of depth, position, normals, alpha, confidence and clipped, each a part of its own of `hdr/<view>.exr`.
+        size: width and height in pixels, or "1920x1080", in place of the cameras' own: the vertical field of view
+            stays.
+        ocio: a config of OpenColorIO for the previews (see ocio_view).
+        view: a view in it.
 
-    Everything appears when the last view is done. Raises SehdrError for unusable options or an empty set of cameras,
-    InputError where something would be replaced or a pixel is not finite.
+    Raises:
+        SehdrError: for unusable options or an empty set of cameras.
+        InputError: where something would be replaced or a pixel is not finite.
     """
     out = Path(out)
     wanted = evs is not None or exposures is not None

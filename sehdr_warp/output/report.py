@@ -55,15 +55,24 @@ def write_report(
 ) -> list[Path]:
     """Renders some held-out views of a trained run and writes the report; returns the paths of its files.
 
-    `report.html`: one page without a network: figures (of evaluation, which evaluate() gives), what was left out and
-    why, photo, scene and truth as Ultra HDR, brackets with an exposure dial, confidence,
-    unexplained regions, error against time, cameras. For papers:
-    `comparison.png`: photo; photo, HDR scene and truth (where there is some) at -4 EV; a new view; one row for each of
-    view_count views, evenly chosen. `stops.png`: the view of most clipped light from -4 to +4 stops: the photo alone,
-    the HDR scene with its confidence, the truth. `training.png`: held-out error against training time; left out for a
-    run without evaluations. Of a scene without test views the training views are shown, and captions say so.
+    `report.html`: one page without a network: figures, what was left out and why, photo, scene and truth as Ultra HDR,
+    brackets with an exposure dial, confidence, unexplained regions, error against time, cameras. For papers:
+    `comparison.png`: photo; photo, HDR scene and truth (where there is some) at -4 EV; a new view. `stops.png`: the
+    view of most clipped light from -4 to +4 stops: the photo alone, the HDR scene with its confidence, the truth.
+    `training.png`: held-out error against training time; left out for a run without evaluations. Of a scene without
+    test views the training views are shown, and captions say so.
 
-    Raises InputError where a file exists (unless overwrite), SehdrError for a scene without views.
+    Args:
+        run: of load_run or train.
+        scene: what it was trained on.
+        out: the folder for the files.
+        view_count: how many views, evenly chosen.
+        overwrite: replace files that exist.
+        evaluation: of evaluate(), for the page's figures.
+
+    Raises:
+        InputError: where a file exists.
+        SehdrError: for a scene without views.
     """
     metrics = run.metrics()
     charted = any(training_points(metrics, key) for key in PANELS)

@@ -22,14 +22,20 @@ def look_at(position, target=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0)) -> np.ndarray:
 class Camera:
     """An undistorted pinhole camera in COLMAP's (OpenCV's) convention: +x right, +y down, +z into the scene.
 
-    A world point X lands at pixel (fx x/z + cx, fy y/z + cy) with (x, y, z) = (world_to_camera @ [X, 1])[:3];
-    the centre of the top left pixel is at (0.5, 0.5).
+    A world point X lands at pixel (fx x/z + cx, fy y/z + cy) with (x, y, z) = (world_to_camera @ [X, 1])[:3]; the
+    centre of the top left pixel is at (0.5, 0.5).
 
-    width, height: image size in pixels, at least 1.
-    fx, fy, cx, cy: focal lengths and principal point in pixels; focal lengths are positive.
-    world_to_camera: [4, 4] float64, rigid.
+    Attributes:
+        width: of the image in pixels, at least 1.
+        height: likewise.
+        fx: focal length in pixels, positive.
+        fy: likewise.
+        cx: principal point in pixels.
+        cy: likewise.
+        world_to_camera: [4, 4] float64, rigid.
 
-    Raises ValueError if a size or focal length is not positive, a value is not finite or the pose is not rigid.
+    Raises:
+        ValueError: if a size or focal length is not positive, a value is not finite or the pose is not rigid.
     """
 
     width: int

@@ -30,12 +30,14 @@ _DATAPARSER = "dataparser_transforms.json"
 def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
     """Named cameras from a file, in its order, without distortion.
 
-    Accepted: {"cameras": [{"name": ..., **Camera.to_dict()}, ...]}, nerfstudio's camera_path.json, transforms.json, the
-    cameras.json of 3DGS's reference release, a COLMAP model's folder, and the cameras of an OpenUSD stage, one for each
-    frame if they move. nerfstudio's paths lie in the space of its dataparser: a dataparser_transforms.json beside the
-    file, which it writes with a training, leads back to the photos' own.
+    Args:
+        path: {"cameras": [{"name": ..., **Camera.to_dict()}, ...]}, nerfstudio's camera_path.json, transforms.json, the
+            cameras.json of 3DGS's reference release, a COLMAP model's folder, or an OpenUSD stage, whose moving cameras
+            are one for each frame. nerfstudio's paths lie in the space of its dataparser: a dataparser_transforms.json
+            beside the file, which it writes with a training, leads back to the photos' own.
 
-    Raises InputError where the file is damaged, a pose or size cannot be, or two cameras share a name.
+    Raises:
+        InputError: where the file is damaged, a pose or size cannot be, or two cameras share a name.
     """
     path = Path(path)
     if path.is_dir():

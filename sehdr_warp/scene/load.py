@@ -53,25 +53,31 @@ def load_scene(
 ) -> Scene:
     """Read a folder of posed or bare photos, whatever its layout, and develop it.
 
-    path: a folder (COLMAP, transforms.json, HDR-NeRF synthetic or real, HDR-GS, LLFF, or bare photos), "embedded"
-        for the room that comes with the package, or "embedded:NAME" for another of embedded_scenes().
-    response: the camera's: a name, a file or an object; "auto" chooses it from the training photos' codes by `method`
-        among `candidates` (names and files; none: the built-in ones); "learned" stands for sRGB here. "linear" is of
-        photos whose 16-bit codes are proportional to light. The light of RAW files, OpenEXR and Radiance pictures is
-        known: they take none.
-    exposure_index: the exposure to take where each view has several (the k of `<view>_<k>.png`); None: the middle one.
-    max_size: longest side of the views in pixels; None keeps the photos' sizes. Averages are exact areas, of light
-        for photos and of values for truth and masks; a value of 1 stays 1 where half of its area was clipped.
-    holdout: every so many views is held out, 0 for none, whatever the set states; None keeps the set's split, or the
-        protocol of its layout, or takes the middle of every eight. Sets of fewer than 5 views have no test view.
-    cache: a folder where structure from motion keeps its results; None is the user's ($SEHDR_CACHE).
+    Args:
+        path: a folder (COLMAP, transforms.json, HDR-NeRF synthetic or real, HDR-GS, LLFF, or bare photos), "embedded"
+            for the room that comes with the package, or "embedded:NAME" for another of embedded_scenes().
+        response: the camera's: a name, a file or an object; "auto" chooses it from the training photos' codes;
+            "learned" stands for sRGB here. "linear" is of photos whose 16-bit codes are proportional to light. The
+            light of RAW files, OpenEXR and Radiance pictures is known: they take none.
+        method: how "auto" chooses, "posterior" or "paper".
+        candidates: names and files that "auto" chooses among; none: the built-in ones.
+        exposure_index: the exposure to take where each view has several (the k of `<view>_<k>.png`); None: the middle
+            one.
+        max_size: longest side of the views in pixels; None keeps the photos' sizes. Averages are exact areas, of light
+            for photos and of values for truth and masks; a value of 1 stays 1 where half of its area was clipped.
+        holdout: every so many views is held out, 0 for none, whatever the set states; None keeps the set's split, or
+            the protocol of its layout, or takes the middle of every eight. Sets of fewer than 5 views have no test
+            view.
+        cache: a folder where structure from motion keeps its results; None is the user's ($SEHDR_CACHE).
+        photos: where they stay: "memory", "disk" (in a nameless file beside the cache, which goes with the process), or
+            "auto": the disk if they would take more than half of the memory that is free.
 
-    photos: where they stay: "memory", "disk" (in a nameless file beside the cache, which goes with the process), or
-        "auto": the disk if they would take more than half of the memory that is free.
+    Returns:
+        A Scene in the set's own world coordinates, with the points that the set has.
 
-    Returns a Scene in the set's own world coordinates, with the points that the set has.
-    Raises InputError where a file is missing, damaged or hostile, sizes disagree, an exposure is impossible, fewer
-    than two training views remain, or the photos show nothing but black or white.
+    Raises:
+        InputError: where a file is missing, damaged or hostile, sizes disagree, an exposure is impossible, fewer than
+            two training views remain, or the photos show nothing but black or white.
     """
     from ..response import response_by_name
 

@@ -58,13 +58,18 @@ def calibrate(
 ) -> "Response":
     """The response of the camera that took an exposure stack (Debevec and Malik 1997); exposure 1 is white.
 
-    stack: a folder of photos of one still scene. times: seconds, in the order of the files' names; by default
-        exposures.json's, or EXIF's (which counts ISO and f-number too).
-    channel: "red", "green" or "blue" alone; by default one curve for all three.
-    out: a CSV file for the curve, which `response_by_name` reads; a plot goes beside it, with the suffix .png.
-
     What it finds is logged: the residual, channels that clearly differ, photos that are off their times.
-    Raises InputError for a stack that tells nothing, with the reason, or an existing file (unless overwrite).
+
+    Args:
+        stack: a folder of photos of one still scene.
+        times: seconds, in the order of the files' names; by default exposures.json's, or EXIF's (which counts ISO and
+            f-number too).
+        channel: "red", "green" or "blue" alone; by default one curve for all three.
+        out: a CSV file for the curve, which `response_by_name` reads; a plot goes beside it, with the suffix .png.
+        overwrite: replace these files.
+
+    Raises:
+        InputError: for a stack that tells nothing, with the reason, or a file that exists.
     """
     from ..files import atomic_path, check_absent
     from ..response.calibration import calibrate_codes

@@ -16,14 +16,19 @@ if TYPE_CHECKING:
 class View:
     """One photo with its undistorted pinhole camera.
 
-    name: the image's stem in the data (`r_0`); unique within a scene.
-    codes: [H, W, 3] uint8 as photographed, or uint16 where the photo has 16 bits or was averaged; at the camera's size.
-    exposure_time: seconds, positive. split: "train" or "test".
-    mask: [H, W] float32 in [0, 1], 1 where the pixel counts; None means all count.
-    hdr: [H, W, 3] float32 scene-linear truth (radiance, not multiplied by the exposure time); None without truth.
-    source: the file the photo came from.
+    Attributes:
+        name: the image's stem in the data (`r_0`); unique within a scene.
+        codes: [H, W, 3] uint8 as photographed, or uint16 where the photo has 16 bits or was averaged; at the camera's
+            size.
+        camera: where it was taken from.
+        exposure_time: seconds, positive.
+        split: "train" or "test".
+        mask: [H, W] float32 in [0, 1], 1 where the pixel counts; None means all count.
+        hdr: [H, W, 3] float32 scene-linear truth (radiance, not multiplied by the exposure time); None without truth.
+        source: the file the photo came from.
 
-    Raises ValueError for codes of another type or shape; codes_of makes them of encoded values.
+    Raises:
+        ValueError: for codes of another type or shape; codes_of makes them of encoded values.
     """
 
     name: str
@@ -56,15 +61,20 @@ class View:
 class Scene:
     """A set of posed views and the sparse points seen in them.
 
-    format: the layout that was read (colmap, transforms, hdr-nerf, hdr-nerf-real, hdr-gs, llff, photos).
-    points: [P, 3] float64 world coordinates, P may be 0. point_colors: [P, 3] float32 in [0, 1], encoded like photos.
-    exposure_times_known: False where no file stated them (then each view's is 1 second).
-    notes: one line each on what the user should know (differing exposures, views left out, ...).
-    response: the curve the photos were averaged by; None for a scene made by hand.
-    chosen_by: the method and the candidates that chose the response; None where it was named.
-    light_known: the photos' codes were made of light by `response`, of no camera's choice: RAW, linear, float.
-    evened: what the camera changed between photos unsaid is taken out of them; see photo_gains.
-    color_matrix: [3, 3] from the colors of the codes' light to linear Rec.709; None where these are Rec.709 themselves.
+    Attributes:
+        name: of the set.
+        format: the layout that was read (colmap, transforms, hdr-nerf, hdr-nerf-real, hdr-gs, llff, photos).
+        views: in the order of their names.
+        points: [P, 3] float64 world coordinates, P may be 0.
+        point_colors: [P, 3] float32 in [0, 1], encoded like photos.
+        exposure_times_known: False where no file stated them (then each view's is 1 second).
+        notes: one line each on what the user should know (differing exposures, views left out, ...).
+        response: the curve the photos were averaged by; None for a scene made by hand.
+        chosen_by: the method and the candidates that chose the response; None where it was named.
+        light_known: the photos' codes were made of light by `response`, of no camera's choice: RAW, linear, float.
+        evened: what the camera changed between photos unsaid is taken out of them; see photo_gains.
+        color_matrix: [3, 3] from the colors of the codes' light to linear Rec.709; None where these are Rec.709
+            themselves.
     """
 
     name: str

@@ -145,10 +145,13 @@ def differentiable(body: Callable[Concatenate[Program, P], Tensor]) -> Callable[
 
 
 def differentiable(body: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a torch operation of a program: body(program, *tensors, **options) -> tensors made by program.write().
+    """Make a torch operation of a program.
 
-    The operation takes the tensors positionally (on one device) and the options by keyword, returns the tensors
-    that body returns, and can be differentiated once with respect to every positional tensor.
+    The operation takes the tensors positionally (on one device) and the options by keyword, returns the tensors that
+    body returns, and can be differentiated once with respect to every positional tensor.
+
+    Args:
+        body: body(program, *tensors, **options) -> tensors made by program.write().
     """
 
     @wraps(body)

@@ -19,13 +19,19 @@ def spherical_harmonics(
 ) -> Tensor:
     """Evaluate spherical harmonics for the direction from the camera to each Gaussian (3DGS's basis and signs).
 
-    degree: 0 to 3, not above what the coefficients hold.
-    coefficients: [N, K, 3] with K >= (degree + 1)^2, or the pair ([N, 1, 3], [N, K - 1, 3]) of the constant term and
-        the rest, which saves joining them.
-    means: [N, 3] world coordinates; camera_position: [3].
+    Args:
+        degree: 0 to 3, not above what the coefficients hold.
+        coefficients: [N, K, 3] with K >= (degree + 1)^2, or the pair ([N, 1, 3], [N, K - 1, 3]) of the constant term
+            and the rest, which saves joining them.
+        means: [N, 3] world coordinates.
+        camera_position: [3].
 
-    Returns [N, 3]. Differentiable with respect to every tensor. Raises TypeError for what is no tensor, ValueError for
-    a degree out of range, and for shapes, dtypes or devices that do not fit.
+    Returns:
+        [N, 3], differentiable with respect to every tensor.
+
+    Raises:
+        TypeError: for what is no tensor.
+        ValueError: for a degree out of range, and for shapes, dtypes or devices that do not fit.
     """
     given: dict[str, Any] = {"means": (means, ("N", 3))}
     if isinstance(coefficients, tuple | list) and len(coefficients) == 2:

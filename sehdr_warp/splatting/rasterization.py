@@ -22,17 +22,18 @@ LARGEST_SIDE = 1 << 20  # of an image, in pixels
 class Rendering:
     """One rendered view of N Gaussians; of B cameras in one call all but the last three begin with an axis of B.
 
-    image: [H, W, C] blended features over the background, or over zero.
-    transmittance: [H, W] in [0, 1], how much of each pixel's background is seen. The backward pass reads it: do not
-        write to it.
-    means2d: [N, 2] centres in pixels; part of the graph, so means2d.retain_grad() gives densification its signal.
-    depths: [N] along the camera's axis, in scene units; 0 where culled.
-    extents: [N, 2] half-width and half-height in pixels within which a Gaussian counts; 0 where culled.
-    entry_count: (Gaussian, tile) pairs that there was room for.
-    overflow: scalar bool tensor, whether the given capacity left some of them out; None without a capacity.
-    pair_count: scalar int64 tensor, how many there are; None without a capacity.
-    depth: [H, W] blended depths along the camera's axis over zero, where they were asked for; over alpha they are the
-        expected depth.
+    Attributes:
+        image: [H, W, C] blended features over the background, or over zero.
+        transmittance: [H, W] in [0, 1], how much of each pixel's background is seen. The backward pass reads it: do not
+            write to it.
+        means2d: [N, 2] centres in pixels; part of the graph, so means2d.retain_grad() gives densification its signal.
+        depths: [N] along the camera's axis, in scene units; 0 where culled.
+        extents: [N, 2] half-width and half-height in pixels within which a Gaussian counts; 0 where culled.
+        entry_count: (Gaussian, tile) pairs that there was room for.
+        overflow: scalar bool tensor, whether the given capacity left some of them out; None without a capacity.
+        pair_count: scalar int64 tensor, how many there are; None without a capacity.
+        depth: [H, W] blended depths along the camera's axis over zero, where they were asked for; over alpha they are
+            the expected depth.
     """
 
     image: Tensor
@@ -83,32 +84,40 @@ def rasterize(
 ) -> Rendering:
     """Splat Gaussians with any number of feature channels onto cameras' image planes (3DGS, Kerbl et al. 2023).
 
-    means: [N, 3] world coordinates.
-    log_scales: [N, 3] natural logarithm of the standard deviations along the local axes, in scene units.
-    quaternions: [N, 4] (w, x, y, z), of any length.
-    opacities: [N] in [0, 1].
-    features: [N, C], any C >= 1 and any finite range; several colour sets go side by side in one pass.
-    world_to_camera: [4, 4], OpenCV convention. intrinsics: [4] fx, fy, cx, cy in pixels. width, height: in pixels.
-    B cameras in one call: world_to_camera [B, 4, 4], intrinsics [B, 4]; features may then be [B, N, C], opacities
-        [B, N].
-    near: points nearer to the camera plane are culled; > 0. low_pass: variance in square pixels added to each splat;
-        >= 0.
-    alpha_threshold: contributions below it are left out, in (0, 1).
-    antialiased: keep a Gaussian's energy under the low pass by lowering its opacity.
-    background: [C] what shows through, or with B cameras [B, C].
-    depth: also blend depths, Rendering.depth.
-    capacity: room for this many (Gaussian, tile) pairs of a camera, from 1. On a GPU nothing then waits for the device,
-        so that the call can be part of a CUDA graph; Rendering.overflow says whether the room was enough.
-    deterministic: on a GPU, sum gradients in a fixed order, so that the same input gives the same bits; slower, and the
-        gradients of every (Gaussian, tile) pair take memory.
+    All tensors share one device (CPU or CUDA) and one dtype (float32 or float64). Differentiable with respect to every
+    tensor, camera included. On the CPU results repeat bit for bit, whatever the number of threads. A Gaussian whose
+    position or shape in the image, or a feature, is not finite is culled; a camera that is not finite culls them all.
+    Warns on the CPU of log_scales that look like sizes.
 
-    All tensors share one device (CPU or CUDA) and one dtype (float32 or float64). Differentiable with respect to
-    every tensor, camera included. On the CPU results repeat bit for bit, whatever the number of threads.
-    A Gaussian whose position or shape in the image, or a feature, is not finite is culled; a camera that is not finite
-    culls them all.
-    Raises TypeError for what is no tensor or no whole number, ValueError for shapes, dtypes, devices or options that do
-    not fit, and on the CPU for opacities outside of [0, 1]; OutOfMemory (an SehdrError), with the sizes, if memory does
-    not suffice. Warns on the CPU of log_scales that look like sizes.
+    B cameras in one call: world_to_camera [B, 4, 4], intrinsics [B, 4]; features may then be [B, N, C], opacities [B,
+    N].
+
+    Args:
+        means: [N, 3] world coordinates.
+        log_scales: [N, 3] natural logarithm of the standard deviations along the local axes, in scene units.
+        quaternions: [N, 4] (w, x, y, z), of any length.
+        opacities: [N] in [0, 1].
+        features: [N, C], any C >= 1 and any finite range; several color sets go side by side in one pass.
+        world_to_camera: [4, 4], OpenCV convention.
+        intrinsics: [4] fx, fy, cx, cy in pixels.
+        width: of the image, pixels.
+        height: likewise.
+        near: points nearer to the camera plane are culled; > 0.
+        low_pass: variance in square pixels added to each splat; >= 0.
+        alpha_threshold: contributions below it are left out, in (0, 1).
+        antialiased: keep a Gaussian's energy under the low pass by lowering its opacity.
+        background: [C] what shows through, or with B cameras [B, C].
+        depth: also blend depths, Rendering.depth.
+        capacity: room for this many (Gaussian, tile) pairs of a camera, from 1. On a GPU nothing then waits for the
+            device, so that the call can be part of a CUDA graph; Rendering.overflow says whether the room was enough.
+        deterministic: on a GPU, sum gradients in a fixed order, so that the same input gives the same bits; slower, and
+            the gradients of every (Gaussian, tile) pair take memory.
+
+    Raises:
+        TypeError: for what is no tensor or no whole number.
+        ValueError: for shapes, dtypes, devices or options that do not fit, and on the CPU for opacities outside of [0,
+            1].
+        OutOfMemory: (an SehdrError), with the sizes, if memory does not suffice.
     """
     cameras: tuple[str, ...] = ("B",) if isinstance(world_to_camera, Tensor) and world_to_camera.ndim == 3 else ()
     by_camera = [bool(cameras) and isinstance(t, Tensor) and t.ndim == n for t, n in ((opacities, 2), (features, 3))]

@@ -33,17 +33,34 @@ def rasterize_directions(
     near: float = NEAR,
     alpha_threshold: float = ALPHA_THRESHOLD,
 ) -> tuple[Tensor, Tensor]:
-    """Blend Gaussians along unit directions [H, W, 3] from a position [3]: image [H, W, C] and transmittance [H, W].
+    """Blend Gaussians along directions from a place: an environment map, or any picture of the sphere.
 
-    means, log_scales [N, 3]; quaternions [N, 4]; opacities [N]; features [N, C]: as rasterize() takes them.
-    focal_length: of the cameras that the Gaussians were trained on, in pixels: their pixels' footprint belongs to what
-        a Gaussian looks like. pixel_angle: of the picture's pixels, radians; where they are larger, Gaussians are
-        smoothed to them and keep their energy. Order is by distance from the position.
     Differentiable with respect to every tensor but the directions. On the CPU gradients repeat bit for bit, whatever
     the number of threads. Neighboring pixels should look in neighboring directions; blocks of 128 x 128 pixels are
-    culled as one.
+    culled as one. Order is by distance from the position.
 
-    Raises TypeError and ValueError as rasterize() does, OutOfMemory if memory does not suffice.
+    Args:
+        means: [N, 3]; this and the next four as rasterize() takes them.
+        log_scales: [N, 3].
+        quaternions: [N, 4].
+        opacities: [N].
+        features: [N, C].
+        position: [3] the place, world coordinates.
+        directions: [H, W, 3] unit vectors.
+        focal_length: of the cameras that the Gaussians were trained on, in pixels: their pixels' footprint belongs to
+            what a Gaussian looks like.
+        pixel_angle: of the picture's pixels, radians; where they are larger, Gaussians are smoothed to them and keep
+            their energy.
+        antialiased: as of rasterize().
+        near: as of rasterize().
+        alpha_threshold: as of rasterize().
+
+    Returns:
+        Image [H, W, C] and transmittance [H, W].
+
+    Raises:
+        TypeError: as rasterize() does; likewise ValueError.
+        OutOfMemory: if memory does not suffice.
     """
     check_tensors(
         means=(means, ("N", 3)),

@@ -16,12 +16,19 @@ STEPS_PER_THREAD = 4096  # Smallest share of such steps that is worth handing to
 def ssim(a: Tensor, b: Tensor) -> Tensor:
     """Mean structural similarity (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5, data range 1.
 
-    a, b: [H, W, C] float32 or float64 on one device, any size from 1 x 1 x 1. Beyond the border both images count as
-    zero and every pixel is averaged, as in 3DGS's loss.
+    Beyond the border both images count as zero and every pixel is averaged, as in 3DGS's loss.
 
-    Returns a scalar of the same type, at most 1, differentiable once with respect to both images, the same whatever the
-    number of threads.
-    Raises TypeError for what is no tensor, ValueError if shapes, types or devices differ or are others.
+    Args:
+        a: [H, W, C] float32 or float64, any size from 1 x 1 x 1.
+        b: likewise, on the same device.
+
+    Returns:
+        A scalar of the same type, at most 1, differentiable once with respect to both images, the same whatever the
+        number of threads.
+
+    Raises:
+        TypeError: for what is no tensor.
+        ValueError: if shapes, types or devices differ or are others.
     """
     return _Similarity.apply(a, b, True)
 

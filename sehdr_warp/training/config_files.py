@@ -42,14 +42,29 @@ def preset_purpose(name: str) -> str:
 def load_config(
     preset: str | Path = "default", overrides: dict[str, Any] | None = None, flags: Mapping[str, str] | None = None
 ) -> Config:
-    """The config of a preset, a name of preset_names(), or of a TOML file.
+    """The config of a preset or of a TOML file.
 
-    overrides: dotted field names and values that replace the file's, e.g. {"schedule.iterations": 500}. flags: what
-    these are called in errors, where they are flags of a command line. What is missing, unknown or wrong is an
-    InputError with file, field and value.
+    Args:
+        preset: a name of preset_names(), or a file.
+        overrides: dotted field names and values that replace the file's, e.g. {"schedule.iterations": 500}.
+        flags: what these are called in errors, where they are flags of a command line.
+
+    Raises:
+        InputError: with file, field and value, for what is missing, unknown or wrong.
     """
     config = config_from_dict(*_read(preset))
     return override_config(config, overrides or {}, "overrides", flags)
+
+
+def as_config(config: object) -> Config | None:
+    """A config in any of the forms that Training takes."""
+    if config is None or isinstance(config, Config):
+        return config
+    if isinstance(config, str | Path):
+        return load_config(config)
+    if isinstance(config, Mapping):
+        return override_config(Config(), dict(config), "overrides")
+    raise InputError("config", f"is {type(config).__name__}", "give a preset's name, a dict of fields or a Config")
 
 
 def override_config(

@@ -1,5 +1,8 @@
 """What held-out photos say of a field while it trains."""
 
+import logging
+from collections.abc import Sequence
+
 import torch
 
 from ..evaluation.metrics import psnr
@@ -7,6 +10,9 @@ from ..evaluation.protocols import normalise, tone_map
 from ..field.radiance_field import RadianceField
 from ..scene import View
 
+log = logging.getLogger(__name__)
+
+FALL = 0.2  # Decibels by which the last figure may be below the best before it is told
 BEST = 100.0  # Identical images count this many dB, so that a mean over views stays a number
 
 
@@ -26,3 +32,11 @@ def evaluate_views(field: RadianceField, views: tuple[View, ...], degree: int) -
             images = normalise("gt-max", hdr, torch.tensor(view.hdr, device=device), mask)
             scores.setdefault("psnr_mu", []).append(min(psnr(*tone_map("gt-max", *images), mask), BEST))
     return {name: sum(values) / len(values) for name, values in scores.items()}
+
+
+def warn_of_fall(metrics: Sequence[dict]) -> None:
+    """Tells where held-out photos were better some time ago. metrics: the lines of metrics.jsonl."""
+    scores = [(line["psnr_ldr"], line["iteration"]) for line in metrics if "psnr_ldr" in line]
+    if scores and (best := max(scores))[0] > scores[-1][0] + FALL:
+        told = "held-out photos were best at iteration %d (%.2f dB), now %.2f dB: fewer iterations would do"
+        log.warning(told, best[1], best[0], scores[-1][0])

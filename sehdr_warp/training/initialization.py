@@ -137,10 +137,19 @@ def match_points(
     device: torch.device | str = "cpu",
     seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """[N, 3] points of the surfaces that the training photos show, and their encoded colors [N, 3] in [0, 1].
+    """Points of the surfaces that the training photos show.
 
-    A plane sweep (Collins 1996) for about `count` pixels all over the photos; N of them have a depth on which photos
-    agree. response: by which photos of differing exposure are compared, None for the scene's own.
+    A plane sweep (Collins 1996) for pixels all over the photos; those have a depth on which photos agree.
+
+    Args:
+        scene: of load_scene.
+        count: about how many pixels are looked at; of N of them a depth is found.
+        response: by which photos of differing exposure are compared, None for the scene's own.
+        device: "cpu", "cuda:0", ...
+        seed: of the choice of pixels.
+
+    Returns:
+        [N, 3] places, and their encoded colors [N, 3] in [0, 1].
     """
     return _matched(make_matcher(scene, response or scene.response or response_by_name("srgb"), device), count, seed)
 

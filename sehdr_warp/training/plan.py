@@ -92,8 +92,14 @@ class Decision:
 
 @dataclass(frozen=True)
 class Plan:
-    """config: ready to be trained. decisions: in the order of RULES. kept: fields that a decision would have changed
-    and the user had given."""
+    """What a training does, and why.
+
+    Attributes:
+        config: ready to be trained.
+        facts: what was found out of scene and device.
+        decisions: in the order of RULES.
+        kept: fields that a decision would have changed and the user had given.
+    """
 
     config: Config
     facts: SceneFacts
@@ -133,10 +139,15 @@ def _stated(fields: dict) -> list[str]:
 
 
 def make_plan(scene: Scene, config: Config, device: str | torch.device | None = None) -> Plan:
-    """Decides what a scene's training on a device can leave out, on top of a config but for the fields in
-    config.plan.keep.
+    """Decides what a scene's training can leave out.
 
-    Raises InputError for a scene that no plan makes sense for, and for kept values that the scene contradicts.
+    Args:
+        scene: of load_scene.
+        config: what is asked for; fields in config.plan.keep stay.
+        device: what it is to be trained on.
+
+    Raises:
+        InputError: for a scene that no plan makes sense for, and for kept values that the scene contradicts.
     """
     device = pick_device(device)
     facts = measure_scene(scene, config.seed)

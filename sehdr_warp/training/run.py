@@ -93,8 +93,12 @@ class _Rendered:
 class Splats(_Rendered):
     """A file of Gaussians as a scene to render, re-expose and export. Its response is sRGB.
 
-    path: of the file. model: the RadianceField. base_time: seconds, as the file states it, else 1. cameras: those of a
-    cameras.json beside the file, as the reference release of 3D Gaussian Splatting writes it; else none.
+    Attributes:
+        path: of the file.
+        model: the RadianceField.
+        base_time: seconds, as the file states it, else 1.
+        cameras: those of a cameras.json beside the file, as the reference release of 3D Gaussian Splatting writes it;
+            else none.
     """
 
     iterations = None
@@ -106,9 +110,14 @@ class Splats(_Rendered):
 
 
 def load_splats(path: Path | str, *, device: str | torch.device = "cpu") -> Splats:
-    """The scene in a file of Gaussians: PLY, glTF (.glb) or OpenUSD (.usda, .usdc, .usdz).
+    """The scene in a file of Gaussians.
 
-    Raises InputError where the file, or the cameras.json beside it, is missing, damaged or of another kind.
+    Args:
+        path: PLY, glTF (.glb) or OpenUSD (.usda, .usdc, .usdz).
+        device: "cpu", "cuda:0", ...
+
+    Raises:
+        InputError: where the file, or the cameras.json beside it, is missing, damaged or of another kind.
     """
     path = Path(path)
     model = field_of(read_gaussians(path)).to(device)
@@ -122,10 +131,19 @@ def load_splats(path: Path | str, *, device: str | torch.device = "cpu") -> Spla
 class Run(_Rendered):
     """A trained scene.
 
-    path, folder: where it is. config: the choices it was trained with. model: the RadianceField, on `device`.
-    cameras: the views of the scene, in its order. response: the camera's curve. base_time: seconds.
-    iterations, train_seconds, degree of the harmonics: how far the training was. checkpoint_hash: of the tensors.
-    data: where the photos were, for load_scene; may be empty.
+    Attributes:
+        path: its folder.
+        folder: the same, as who reads and writes it.
+        config: the choices it was trained with.
+        model: the RadianceField, on `device`.
+        cameras: the views of the scene, in its order.
+        response: the camera's curve.
+        base_time: seconds.
+        iterations: how far the training was.
+        train_seconds: how long it took.
+        degree: of the harmonics.
+        checkpoint_hash: of the tensors.
+        data: where the photos were, for load_scene; may be empty.
     """
 
     def __init__(self, folder: RunFolder, config: Config, model: RadianceField, info: dict, values: dict):
@@ -178,7 +196,12 @@ class Run(_Rendered):
 def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
     """The trained scene in a run folder, from its newest complete checkpoint.
 
-    Raises InputError naming file and field if the folder is no run, or has no usable checkpoint.
+    Args:
+        path: the folder.
+        device: "cpu", "cuda:0", ...
+
+    Raises:
+        InputError: naming file and field, if the folder is no run, or has no usable checkpoint.
     """
     folder = RunFolder(path)
     folder.require()

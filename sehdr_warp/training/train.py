@@ -22,9 +22,9 @@ from ..scene.photo_gains import PhotoGains
 from ..splatting.memory import memory_told
 from .checkpoint import first_not_finite
 from .config import Config
-from .config_files import config_fields, load_config, override_config
+from .config_files import as_config, config_fields, override_config
 from .following import hand_on, told_of_ranks
-from .held_out import evaluate_views
+from .held_out import evaluate_views, warn_of_fall
 from .initialization import choose_response, make_field, make_matcher, sizes_of
 from .machine import interruptible, machine_figures, pick_device, summary_writer, torch_settings
 from .photo_gains import decided, evens, find_gains
@@ -36,14 +36,17 @@ from .trainer import Trainer
 
 log = logging.getLogger(__name__)
 
-FALL = 0.2  # Decibels by which the last held-out figure may be below the best before it is told
-
 
 class Step:
     """What a training tells after a step.
 
-    iteration: steps done, of `total`. seconds: of training so far. seconds_left: expected to the end; None at first.
-    loss, psnr (dB, of the step's photo) and gaussians are read when they are asked for, until the next step.
+    `loss`, `psnr` (dB, of the step's photo) and `gaussians` are read when they are asked for, until the next step.
+
+    Attributes:
+        iteration: steps done.
+        total: steps in all.
+        seconds: of training so far.
+        seconds_left: expected to the end; None at first.
     """
 
     def __init__(self, training: "Training"):
@@ -263,10 +266,7 @@ class Training:
             "steps_without_room": trainer.steps_without_room,
         }
         self.folder.write_summary(summary | machine_figures(self.device))
-        scores = [(line["psnr_ldr"], line["iteration"]) for line in self.folder.read_metrics() if "psnr_ldr" in line]
-        if scores and (best := max(scores))[0] > scores[-1][0] + FALL:
-            told = "held-out photos were best at iteration %d (%.2f dB), now %.2f dB: fewer iterations would do"
-            log.warning(told, best[1], best[0], scores[-1][0])
+        warn_of_fall(self.folder.read_metrics())
         if self._writer is not None:
             self._writer.close()
 
@@ -381,20 +381,18 @@ class Training:
 def train(
     scene: Scene, out: Path | str, config: Config | str | Path | Mapping[str, Any] | None = None, **options: Any
 ) -> Run:
-    """Trains a scene to the end, as Training does with these arguments, and returns the trained run. Raises also
-    KeyboardInterrupt, with a usable checkpoint left."""
+    """Trains a scene to the end; returns the trained run.
+
+    Args:
+        scene: of load_scene.
+        out: the folder of the run.
+        config: as of Training.
+        options: the other arguments of Training.
+
+    Raises:
+        KeyboardInterrupt: with a usable checkpoint left; and what Training raises.
+    """
     training = Training(scene, out, config, **options)
     for _ in training:
         pass
     return training.run
-
-
-def as_config(config: object) -> Config | None:
-    """The config that Training was given, in any form."""
-    if config is None or isinstance(config, Config):
-        return config
-    if isinstance(config, str | Path):
-        return load_config(config)
-    if isinstance(config, Mapping):
-        return override_config(Config(), dict(config), "overrides")
-    raise InputError("config", f"is {type(config).__name__}", "give a preset's name, a dict of fields or a Config")
