@@ -98,8 +98,8 @@ def test_rates_of_a_short_training_are_raised_once_and_those_given_stay(scene):
     short = {"schedule__iterations": 1000, "plan__keep": ["schedule.iterations", "optimizer.means"]}
     plan = make_plan(scene, config_of(**short))
     rates, usual = plan.config.optimizer, config_of().optimizer
-    assert rates.log_scales == pytest.approx(2.11 * usual.log_scales, rel=2e-3)
-    assert rates.opacity_logits == pytest.approx(2.11 * usual.opacity_logits, rel=2e-3)
+    assert rates.log_scales == pytest.approx(2.11 * usual.log_scales, rel=5e-3)
+    assert rates.opacity_logits == pytest.approx(2.11 * usual.opacity_logits, rel=5e-3)
     assert (rates.means, rates.harmonics_dc) == (usual.means, usual.harmonics_dc)
     enough = make_plan(scene, config_of(schedule__iterations=30_000, plan__keep=["schedule.iterations"]))
     assert enough.config.optimizer == usual
