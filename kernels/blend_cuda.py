@@ -1,13 +1,14 @@
-"""N-channel front-to-back blend for CUDA: one warp of 32 lanes owns a few pixels of a tile.
+"""N-channel front-to-back blend for CUDA: one warp of 32 lanes owns 8 x 4 pixels of a tile.
 
 The maths is blend_cpu's; what differs is who does what. The adjoint is in blend_cuda_adjoint.py.
 
-Both directions walk the tile's list 32 entries at a time. Each lane tests one entry's ellipse exactly against the
-warp's rectangle of pixels, and the survivors are packed into a queue in shared memory; whenever 32 have gathered they
-are blended. Most entries of a 16 x 16 tile miss an 8 x 8 or 8 x 4 corner of it, so most of the work is never done.
-The features of the 32 survivors are fetched together, as rows of four.
+Both directions walk the tile's list 32 entries at a time, a lane for each of 8 x 4 pixels. Each lane tests one entry's
+ellipse exactly against the warp's rectangle of pixels, and the survivors are packed into a queue in shared memory, a
+ring; whenever 32 have gathered they are blended. Most entries of a 16 x 16 tile miss an 8 x 4 corner of it, so most of
+the work is never done. The features of the 32 survivors are fetched together, as rows of four.
 
-Forward: a warp owns 8 x 8 pixels, two to a lane.
+A warp that waits for a result that it has just asked for does nothing else, and a small picture has few warps. So the
+alphas of TOGETHER Gaussians, which depend on nothing, are worked out before the first is drawn, without a branch.
 
 The queue is read by all lanes before it is overwritten; a vote or a scatter with its barrier always stands between.
 These kernels also run on the CPU where wp.config.enable_cpu_blocks is set: slow, but the same logic, for tests.
@@ -21,7 +22,8 @@ from .constants import ALPHA_MAX, TILE_SIZE, TRANSMITTANCE_MIN
 from .geometry import geometry, vector
 
 BLOCK_DIM = 32
-BLOCKS_PER_TILE = (TILE_SIZE // 8) * (TILE_SIZE // 8)
+BLOCKS_PER_TILE = (TILE_SIZE // 8) * (TILE_SIZE // 4)
+TOGETHER = 4  # Gaussians whose alphas are worked out before the first of them is drawn; divides 32
 
 
 def padded_channels(channels: int) -> int:
@@ -34,9 +36,59 @@ def module_options(dtype) -> dict:
     return {"fast_math": dtype is wp.float32, "max_unroll": 64, "enable_backward": False}
 
 
+BALLOT = """
+#if defined(__CUDA_ARCH__)
+    return __ballot_sync(0xffffffffu, vote);
+#else
+    return 0u;
+#endif
+"""
+ROW = """
+    const float4 four = reinterpret_cast<const float4*>(rows.data)[i];
+    return wp::vec_t<4, wp::float32>(four.x, four.y, four.z, four.w);
+"""
+
+
+@wp.func_native(BALLOT)
+def ballot(vote: bool, lane: int) -> wp.uint32:
+    """The lanes of the warp whose vote is true, on CUDA."""
+
+
 @cache
-def forward_kernel(dtype, channels: int):
-    """blend_forward over tiles x BLOCKS_PER_TILE x 32 threads.
+def block_functions(dtype, cuda: bool) -> tuple:
+    """For one scalar type, votes(): a word with a bit for each lane whose vote is true; row(): a row of four numbers,
+    on CUDA by one access where numbers are float32."""
+    vec4 = geometry(dtype).vec4
+
+    if cuda:
+        votes = ballot
+    else:
+
+        @wp.func
+        def votes(vote: bool, lane: int) -> wp.uint32:
+            bit = wp.uint32(0)
+            if vote:
+                bit = wp.uint32(1) << wp.uint32(lane)
+            total = wp.tile_sum(wp.tile(bit))
+            return total[0]
+
+    if dtype is wp.float32 and cuda:
+
+        @wp.func_native(ROW)
+        def row(rows: wp.array(dtype=vec4), i: int) -> vec4: ...
+
+    else:
+
+        @wp.func
+        def row(rows: wp.array(dtype=vec4), i: int) -> vec4:
+            return rows[i]
+
+    return votes, row
+
+
+@cache
+def forward_kernel(dtype, channels: int, cuda: bool = False):
+    """blend_forward over tiles x BLOCKS_PER_TILE x 32 threads. cuda: not to run on the CPU's fibers.
 
     ranges: [tiles] first and one past the last entry; entries: [M] Gaussians; shapes: [N] (x, y, opacity, -);
     ellipses: [N] (conic a, b, c, level); features: [N padded_channels / 4] rows of four, flat
@@ -45,8 +97,9 @@ def forward_kernel(dtype, channels: int):
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4
     quads = padded_channels(channels) // 4
-    vec_padded, vec_image = vector(4 * quads, dtype), vector(channels, dtype)
+    vec_padded, vec_image, vec_many = vector(4 * quads, dtype), vector(channels, dtype), vector(TOGETHER, dtype)
     blocks_across = TILE_SIZE // 8
+    votes, row = block_functions(dtype, cuda)
 
     @wp.kernel(
         module="unique", enable_backward=False, launch_bounds=BLOCK_DIM, grid_stride=False,
@@ -65,29 +118,20 @@ def forward_kernel(dtype, channels: int):
         corner = block - tile * wp.static(BLOCKS_PER_TILE)
         tile_row = tile // columns
         left = (tile - tile_row * columns) * wp.static(TILE_SIZE) + (corner % wp.static(blocks_across)) * 8
-        top = tile_row * wp.static(TILE_SIZE) + (corner // wp.static(blocks_across)) * 8
+        top = tile_row * wp.static(TILE_SIZE) + (corner // wp.static(blocks_across)) * 4
         px = left + (lane & 7)
         py = top + (lane >> 3)
-        upper_inside = px < width and py < height
-        lower_inside = px < width and py + 4 < height
+        inside = px < width and py < height
         x = real(px) + real(0.5)
         y = real(py) + real(0.5)
         corner_x = real(left) + real(0.5)
         corner_y = real(top) + real(0.5)
 
-        # The lane's two pixels, four rows apart.
-        upper_t = real(1.0)
-        lower_t = real(1.0)
-        upper_sum = vec_padded()
-        lower_sum = vec_padded()
-        upper_done = int(0)
-        lower_done = int(0)
-        upper_last = int(0)
-        lower_last = int(0)
-        if not upper_inside:
-            upper_done = 1
-        if not lower_inside:
-            lower_done = 1
+        t = real(1.0)
+        # What an alpha must exceed: nothing does where nothing more is drawn.
+        bar = wp.where(inside, alpha_threshold, real(wp.inf))
+        drawn = int(0)
+        sums = vec_padded()
 
         bounds = ranges[tile]
         begin = bounds[0]
@@ -98,16 +142,19 @@ def forward_kernel(dtype, channels: int):
         queue_ellipse = wp.tile_empty(shape=64, dtype=vec4, storage="shared")
         queue_entry = wp.tile_empty(shape=64, dtype=wp.vec2i, storage="shared")
         queue_features = wp.tile_empty(shape=wp.static(32 * quads), dtype=vec4, storage="shared")
+        head = int(0)
         queued = int(0)
 
         # Records are fetched one round ahead of their use.
         gaussian = int(0)
         upcoming = int(0)
+        shape = vec4()
+        ellipse = vec4()
         if count > 0:
             gaussian = entries[begin + wp.min(lane, final)]
             upcoming = entries[begin + wp.min(lane + 32, final)]
-        shape = shapes[gaussian]
-        ellipse = ellipses[gaussian]
+            shape = row(shapes, gaussian)
+            ellipse = row(ellipses, gaussian)
         rounds = (count + 31) // 32
         turn = int(0)
         alive = int(1)
@@ -115,22 +162,18 @@ def forward_kernel(dtype, channels: int):
             place = turn * 32 + lane
             hit = place < count and g.ellipse_meets_rectangle(
                 shape[0], shape[1], ellipse[0], ellipse[1], ellipse[2], ellipse[3],
-                corner_x, corner_y, real(7.0), real(7.0),
+                corner_x, corner_y, real(7.0), real(3.0),
             )
-            bit = wp.uint32(0)
-            if hit:
-                bit = wp.uint32(1) << wp.uint32(lane)
-            votes = wp.tile_sum(wp.tile(bit))
-            mask = votes[0]
-            slot = queued + wp.bit_count(mask & lanes_below)
+            mask = votes(hit, lane)
+            slot = (head + queued + wp.bit_count(mask & lanes_below)) & 63
             wp.tile_scatter_masked(queue_shape, slot, shape, hit)
             wp.tile_scatter_masked(queue_ellipse, slot, ellipse, hit)
             wp.tile_scatter_masked(queue_entry, slot, wp.vec2i(gaussian, place + 1), hit)
             queued += wp.bit_count(mask)
             turn += 1
             gaussian = upcoming
-            shape = shapes[gaussian]
-            ellipse = ellipses[gaussian]
+            shape = row(shapes, gaussian)
+            ellipse = row(ellipses, gaussian)
             upcoming = entries[begin + wp.min(place + 64, final)]
             rest = int(0)
             if turn == rounds:
@@ -139,82 +182,57 @@ def forward_kernel(dtype, channels: int):
                 ready = wp.min(queued, 32)
                 fetched = vec_padded()
                 for e in range(wp.static(quads)):
-                    row = (e * 32 + lane) // wp.static(quads)
-                    entry = wp.tile_extract(queue_entry, row)
-                    if row < ready:
-                        quad = features[entry[0] * wp.static(quads) + (e * 32 + lane) - row * wp.static(quads)]
-                        fetched[e * 4] = quad[0]
-                        fetched[e * 4 + 1] = quad[1]
-                        fetched[e * 4 + 2] = quad[2]
-                        fetched[e * 4 + 3] = quad[3]
+                    owner = (e * 32 + lane) // wp.static(quads)
+                    entry = wp.tile_extract(queue_entry, head + owner)
+                    if owner < ready:
+                        quad = row(features, entry[0] * wp.static(quads) + (e * 32 + lane) - owner * wp.static(quads))
+                        for h in range(wp.static(4)):
+                            fetched[e * 4 + h] = quad[h]
                 for e in range(wp.static(quads)):
                     wp.tile_scatter_masked(
                         queue_features, e * 32 + lane,
                         vec4(fetched[e * 4], fetched[e * 4 + 1], fetched[e * 4 + 2], fetched[e * 4 + 3]), True,
                     )
-                for j in range(ready):
-                    s = wp.tile_extract(queue_shape, j)
-                    q = wp.tile_extract(queue_ellipse, j)
-                    entry = wp.tile_extract(queue_entry, j)
-                    dx = s[0] - x
-                    dy = s[1] - y
-                    upper_a = wp.min(real(ALPHA_MAX), s[2] * wp.exp(g.splat_exponent(q[0], q[1], q[2], dx, dy)))
-                    upper_next = upper_t - upper_t * upper_a
-                    draw = upper_done == 0 and upper_a > alpha_threshold
-                    if draw and upper_next <= real(TRANSMITTANCE_MIN):
-                        upper_done = 1
-                        draw = False
-                    upper_w = real(0.0)
-                    if draw:
-                        upper_w = upper_a * upper_t
-                        upper_t = upper_next
-                        upper_last = entry[1]
-                    dy = dy - real(4.0)
-                    lower_a = wp.min(real(ALPHA_MAX), s[2] * wp.exp(g.splat_exponent(q[0], q[1], q[2], dx, dy)))
-                    lower_next = lower_t - lower_t * lower_a
-                    draw = lower_done == 0 and lower_a > alpha_threshold
-                    if draw and lower_next <= real(TRANSMITTANCE_MIN):
-                        lower_done = 1
-                        draw = False
-                    lower_w = real(0.0)
-                    if draw:
-                        lower_w = lower_a * lower_t
-                        lower_t = lower_next
-                        lower_last = entry[1]
-                    if upper_w + lower_w > real(0.0):
+                for group in range((ready + wp.static(TOGETHER - 1)) // wp.static(TOGETHER)):
+                    alphas = vec_many()
+                    weights = vec_many()
+                    for k in range(wp.static(TOGETHER)):
+                        j = group * wp.static(TOGETHER) + k
+                        s = wp.tile_extract(queue_shape, head + j)
+                        q = wp.tile_extract(queue_ellipse, head + j)
+                        a = s[2] * wp.exp(g.splat_exponent(q[0], q[1], q[2], s[0] - x, s[1] - y))
+                        # Rows of the queue that hold nothing yet hold anything.
+                        alphas[k] = wp.where(j < ready, wp.min(real(ALPHA_MAX), a), real(0.0))
+                    for k in range(wp.static(TOGETHER)):
+                        entry = wp.tile_extract(queue_entry, head + group * wp.static(TOGETHER) + k)
+                        weight = alphas[k] * t
+                        following = t - weight
+                        draw = alphas[k] > bar
+                        if draw and following <= real(TRANSMITTANCE_MIN):
+                            bar = real(wp.inf)
+                            draw = False
+                        weights[k] = wp.where(draw, weight, real(0.0))
+                        t = wp.where(draw, following, t)
+                        drawn = wp.where(draw, entry[1], drawn)
+                    for k in range(wp.static(TOGETHER)):
                         for e in range(wp.static(quads)):
-                            quad = wp.tile_extract(queue_features, j * wp.static(quads) + e)
+                            at = (group * wp.static(TOGETHER) + k) * wp.static(quads) + e
+                            quad = wp.tile_extract(queue_features, at)
                             for h in range(wp.static(4)):
-                                upper_sum[e * 4 + h] += quad[h] * upper_w
-                                lower_sum[e * 4 + h] += quad[h] * lower_w
-                done = wp.tile_sum(wp.tile(upper_done + lower_done))
-                if done[0] == 64:
-                    alive = 0
+                                sums[e * 4 + h] += quad[h] * weights[k]
+                head = (head + 32) & 63
                 queued = queued - ready
-                keep = lane < queued
-                late_shape = wp.tile_extract(queue_shape, 32 + lane)
-                late_ellipse = wp.tile_extract(queue_ellipse, 32 + lane)
-                late_entry = wp.tile_extract(queue_entry, 32 + lane)
-                wp.tile_scatter_masked(queue_shape, lane, late_shape, keep)
-                wp.tile_scatter_masked(queue_ellipse, lane, late_ellipse, keep)
-                wp.tile_scatter_masked(queue_entry, lane, late_entry, keep)
-                if alive == 0:
+                if votes(bar < real(1.0), lane) == wp.uint32(0):
+                    alive = 0
                     queued = 0
 
-        upper_image = vec_image()
-        lower_image = vec_image()
-        for channel in range(wp.static(channels)):
-            upper_image[channel] = upper_sum[channel]
-            lower_image[channel] = lower_sum[channel]
-        if upper_inside:
+        if inside:
             pixel = py * width + px
-            image[pixel] = upper_image
-            transmittance[pixel] = upper_t
-            last[pixel] = upper_last
-        if lower_inside:
-            pixel = (py + 4) * width + px
-            image[pixel] = lower_image
-            transmittance[pixel] = lower_t
-            last[pixel] = lower_last
+            colors = vec_image()
+            for channel in range(wp.static(channels)):
+                colors[channel] = sums[channel]
+            image[pixel] = colors
+            transmittance[pixel] = t
+            last[pixel] = drawn
 
     return blend_forward

@@ -10,16 +10,37 @@ from functools import cache
 
 import warp as wp
 
-from .blend_cuda import BLOCK_DIM, module_options, padded_channels
+from .blend_cuda import BLOCK_DIM, BLOCKS_PER_TILE, TOGETHER, block_functions, module_options, padded_channels
 from .constants import ALPHA_MAX, TILE_SIZE
 from .geometry import geometry, vector
 
-BLOCKS_PER_TILE = (TILE_SIZE // 8) * (TILE_SIZE // 4)
 ROWS = 4  # of pixels of one warp
 
 
+ADD_ROW = """
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+    atomicAdd(reinterpret_cast<float4*>(numbers.data) + i, make_float4(a, b, c, d));
+#elif defined(__CUDA_ARCH__)
+    atomicAdd(numbers.data + 4 * i, a);
+    atomicAdd(numbers.data + 4 * i + 1, b);
+    atomicAdd(numbers.data + 4 * i + 2, c);
+    atomicAdd(numbers.data + 4 * i + 3, d);
+#endif
+"""
+
+
+@wp.func_native(ADD_ROW)
+def add_row(numbers: wp.array(dtype=wp.float32), i: int, a: float, b: float, c: float, d: float):
+    """Adds to four numbers, from number 4 i on, on CUDA; by one access where the GPU can."""
+
+
+def adds_rows(dtype, ordered: bool, cuda: bool) -> bool:
+    """Whether gradients are added to by rows of four, and have as many columns as a multiple of that."""
+    return cuda and dtype is wp.float32 and not ordered
+
+
 @cache
-def backward_kernel(dtype, channels: int, ordered: bool):
+def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
     """blend_backward over tiles x BLOCKS_PER_TILE x 32 threads.
 
     As blend_cuda.forward_kernel, and image_gradient: [H W] vectors of C; transmittance_gradient: [H W], or [0] for 0;
@@ -33,10 +54,15 @@ def backward_kernel(dtype, channels: int, ordered: bool):
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4
     quads = padded_channels(channels) // 4
-    vec_padded, vec_image = vector(4 * quads, dtype), vector(channels, dtype)
+    vec_padded, vec_image, vec_many = vector(4 * quads, dtype), vector(channels, dtype), vector(TOGETHER, dtype)
+    vec_terms = vector(2 * TOGETHER, dtype)
+    votes, row = block_functions(dtype, cuda)
     gradient_columns = channels + 6
     staging_columns = gradient_columns + 1 - gradient_columns % 2  # odd, so that lanes fall on different banks
     blocks_across = TILE_SIZE // 8
+    by_rows = adds_rows(dtype, ordered, cuda)
+    row_quads = padded_channels(gradient_columns) // 4
+    vec_row = vector(4 * row_quads, dtype)
 
     @wp.kernel(
         module="unique", enable_backward=False, launch_bounds=BLOCK_DIM, grid_stride=False,
@@ -95,33 +121,34 @@ def backward_kernel(dtype, channels: int, ordered: bool):
         queue_features = wp.tile_empty(shape=wp.static(32 * quads), dtype=vec4, storage="shared")
         # (weight, slope) of two Gaussians for each of the 32 pixels; 33 columns keep lanes on different banks
         pixel_terms = wp.tile_empty(shape=wp.static(16 * 33), dtype=vec4, storage="shared")
-        staging = wp.tile_empty(shape=(32, wp.static(staging_columns)), dtype=real, storage="shared")
+        head = int(0)
         queued = int(0)
 
         rounds = (count + 31) // 32
-        gaussian = entries[begin + wp.max(count - 1 - lane, 0)] if count > 0 else 0
-        upcoming = entries[begin + wp.max(count - 33 - lane, 0)] if count > 0 else 0
-        shape = shapes[gaussian]
-        ellipse = ellipses[gaussian]
+        gaussian = int(0)
+        upcoming = int(0)
+        shape = vec4()
+        ellipse = vec4()
+        if count > 0:
+            gaussian = entries[begin + wp.max(count - 1 - lane, 0)]
+            upcoming = entries[begin + wp.max(count - 33 - lane, 0)]
+            shape = row(shapes, gaussian)
+            ellipse = row(ellipses, gaussian)
         for turn in range(rounds):
             place = count - 1 - (turn * 32 + lane)
             hit = place >= 0 and g.ellipse_meets_rectangle(
                 shape[0], shape[1], ellipse[0], ellipse[1], ellipse[2], ellipse[3],
                 corner_x, corner_y, real(7.0), real(3.0),
             )
-            bit = wp.uint32(0)
-            if hit:
-                bit = wp.uint32(1) << wp.uint32(lane)
-            votes = wp.tile_sum(wp.tile(bit))
-            mask = votes[0]
-            slot = queued + wp.bit_count(mask & lanes_below)
+            mask = votes(hit, lane)
+            slot = (head + queued + wp.bit_count(mask & lanes_below)) & 63
             wp.tile_scatter_masked(queue_shape, slot, shape, hit)
             wp.tile_scatter_masked(queue_ellipse, slot, ellipse, hit)
             wp.tile_scatter_masked(queue_entry, slot, wp.vec2i(gaussian, place), hit)
             queued += wp.bit_count(mask)
             gaussian = upcoming
-            shape = shapes[gaussian]
-            ellipse = ellipses[gaussian]
+            shape = row(shapes, gaussian)
+            ellipse = row(ellipses, gaussian)
             upcoming = entries[begin + wp.max(place - 64, 0)]
             rest = int(0)
             if turn == rounds - 1:
@@ -130,69 +157,59 @@ def backward_kernel(dtype, channels: int, ordered: bool):
                 ready = wp.min(queued, 32)
                 fetched = vec_padded()
                 for e in range(wp.static(quads)):
-                    row = (e * 32 + lane) // wp.static(quads)
-                    entry = wp.tile_extract(queue_entry, row)
-                    if row < ready:
-                        quad = features[entry[0] * wp.static(quads) + (e * 32 + lane) - row * wp.static(quads)]
-                        fetched[e * 4] = quad[0]
-                        fetched[e * 4 + 1] = quad[1]
-                        fetched[e * 4 + 2] = quad[2]
-                        fetched[e * 4 + 3] = quad[3]
+                    owner = (e * 32 + lane) // wp.static(quads)
+                    entry = wp.tile_extract(queue_entry, head + owner)
+                    if owner < ready:
+                        quad = row(features, entry[0] * wp.static(quads) + (e * 32 + lane) - owner * wp.static(quads))
+                        for h in range(wp.static(4)):
+                            fetched[e * 4 + h] = quad[h]
                 for e in range(wp.static(quads)):
                     wp.tile_scatter_masked(
                         queue_features, e * 32 + lane,
                         vec4(fetched[e * 4], fetched[e * 4 + 1], fetched[e * 4 + 2], fetched[e * 4 + 3]), True,
                     )
 
-                # A lane is a pixel: two Gaussians a step, back to front.
-                for pair in range((ready + 1) // 2):
-                    j = pair * 2
-                    s = wp.tile_extract(queue_shape, j)
-                    q = wp.tile_extract(queue_ellipse, j)
-                    entry = wp.tile_extract(queue_entry, j)
-                    s2 = wp.tile_extract(queue_shape, j + 1)
-                    q2 = wp.tile_extract(queue_ellipse, j + 1)
-                    entry2 = wp.tile_extract(queue_entry, j + 1)
-                    unclamped = s[2] * wp.exp(g.splat_exponent(q[0], q[1], q[2], s[0] - x, s[1] - y))
-                    a = wp.min(real(ALPHA_MAX), unclamped)
-                    draw = entry[1] < drawn and a > alpha_threshold
-                    unclamped2 = s2[2] * wp.exp(g.splat_exponent(q2[0], q2[1], q2[2], s2[0] - x, s2[1] - y))
-                    a2 = wp.min(real(ALPHA_MAX), unclamped2)
-                    draw2 = j + 1 < ready and entry2[1] < drawn and a2 > alpha_threshold
-                    weight = real(0.0)
-                    slope = real(0.0)
-                    weight2 = real(0.0)
-                    slope2 = real(0.0)
-                    if draw:
+                # A lane is a pixel: back to front, one that is not drawn with an alpha of 0.
+                for group in range((ready + wp.static(TOGETHER - 1)) // wp.static(TOGETHER)):
+                    alphas = vec_many()
+                    gains = vec_many()
+                    alongs = vec_many()
+                    for k in range(wp.static(TOGETHER)):
+                        j = group * wp.static(TOGETHER) + k
+                        s = wp.tile_extract(queue_shape, head + j)
+                        q = wp.tile_extract(queue_ellipse, head + j)
+                        entry = wp.tile_extract(queue_entry, head + j)
+                        unclamped = s[2] * wp.exp(g.splat_exponent(q[0], q[1], q[2], s[0] - x, s[1] - y))
+                        a = wp.min(real(ALPHA_MAX), unclamped)
+                        # Rows of the queue that hold nothing yet hold anything.
+                        draw = j < ready and entry[1] < drawn and a > alpha_threshold
+                        alphas[k] = wp.where(draw, a, real(0.0))
+                        gains[k] = wp.where(draw and unclamped < real(ALPHA_MAX), a, real(0.0))
                         along = real(0.0)
                         for e in range(wp.static(quads)):
                             quad = wp.tile_extract(queue_features, j * wp.static(quads) + e)
                             for h in range(wp.static(4)):
                                 along += quad[h] * incoming[e * 4 + h]
+                        alongs[k] = along
+                    own = vec_terms()
+                    for k in range(wp.static(TOGETHER)):
+                        a = alphas[k]
                         inverse = real(1.0) / (real(1.0) - a)
                         # t * inverse would round each of many faint factors the same way.
                         t += t * (a * inverse)
                         weight = a * t
-                        if unclamped < real(ALPHA_MAX):
-                            slope = a * (t * along - behind * inverse)
-                        behind += weight * along
-                    if draw2:
-                        along = real(0.0)
-                        for e in range(wp.static(quads)):
-                            quad = wp.tile_extract(queue_features, (j + 1) * wp.static(quads) + e)
-                            for h in range(wp.static(4)):
-                                along += quad[h] * incoming[e * 4 + h]
-                        inverse = real(1.0) / (real(1.0) - a2)
-                        t += t * (a2 * inverse)
-                        weight2 = a2 * t
-                        if unclamped2 < real(ALPHA_MAX):
-                            slope2 = a2 * (t * along - behind * inverse)
-                        behind += weight2 * along
-                    wp.tile_scatter_masked(pixel_terms, pair * 33 + lane, vec4(weight, slope, weight2, slope2), True)
+                        own[2 * k] = weight
+                        own[2 * k + 1] = gains[k] * (t * alongs[k] - behind * inverse)
+                        behind += weight * alongs[k]
+                    for k in range(wp.static(TOGETHER // 2)):
+                        wp.tile_scatter_masked(
+                            pixel_terms, (group * wp.static(TOGETHER // 2) + k) * 33 + lane,
+                            vec4(own[4 * k], own[4 * k + 1], own[4 * k + 2], own[4 * k + 3]), True,
+                        )
 
                 # A lane is a Gaussian: moments of the slope over the 32 pixels.
-                s = wp.tile_extract(queue_shape, lane)
-                q = wp.tile_extract(queue_ellipse, lane)
+                s = wp.tile_extract(queue_shape, head + lane)
+                q = wp.tile_extract(queue_ellipse, head + lane)
                 is_second = (lane & 1) == 1
                 base = (lane >> 1) * 33
                 feature_sum = vec_padded()
@@ -226,34 +243,41 @@ def backward_kernel(dtype, channels: int, ordered: bool):
                     sum_xy += row_x * dy
                     sum_y += row_0 * dy
                     sum_yy += row_0 * dy * dy
+                sums = vec_row()
                 for channel in range(wp.static(channels)):
-                    wp.tile_scatter_masked(staging, lane, channel, feature_sum[channel], True)
-                wp.tile_scatter_masked(staging, lane, wp.static(channels), real(-0.5) * sum_xx, True)
-                wp.tile_scatter_masked(staging, lane, wp.static(channels + 1), -sum_xy, True)
-                wp.tile_scatter_masked(staging, lane, wp.static(channels + 2), real(-0.5) * sum_yy, True)
-                wp.tile_scatter_masked(staging, lane, wp.static(channels + 3), -(q[0] * sum_x + q[1] * sum_y), True)
-                wp.tile_scatter_masked(staging, lane, wp.static(channels + 4), -(q[1] * sum_x + q[2] * sum_y), True)
-                wp.tile_scatter_masked(staging, lane, wp.static(channels + 5), sum_0 / s[2], True)
-                for e in range(gradient_count):
-                    flat = e * 32 + lane
-                    owner = flat // wp.static(gradient_columns)
-                    part = flat - owner * wp.static(gradient_columns)
-                    entry = wp.tile_extract(queue_entry, owner)
-                    value = wp.tile_extract(staging, owner, part)
-                    if owner < ready:
-                        if wp.static(ordered):
-                            place_of = rows_of[begin + entry[1]] * wp.static(gradient_columns) + part
-                            gradients[place_of] = gradients[place_of] + value
-                        else:
-                            wp.atomic_add(gradients, entry[0] * wp.static(gradient_columns) + part, value)
+                    sums[channel] = feature_sum[channel]
+                sums[wp.static(channels)] = real(-0.5) * sum_xx
+                sums[wp.static(channels + 1)] = -sum_xy
+                sums[wp.static(channels + 2)] = real(-0.5) * sum_yy
+                sums[wp.static(channels + 3)] = -(q[0] * sum_x + q[1] * sum_y)
+                sums[wp.static(channels + 4)] = -(q[1] * sum_x + q[2] * sum_y)
+                sums[wp.static(channels + 5)] = sum_0 / s[2]
+                if wp.static(by_rows):
+                    own_entry = wp.tile_extract(queue_entry, head + lane)
+                    if lane < ready:
+                        for e in range(wp.static(row_quads)):
+                            add_row(
+                                gradients, own_entry[0] * wp.static(row_quads) + e,
+                                sums[4 * e], sums[4 * e + 1], sums[4 * e + 2], sums[4 * e + 3],
+                            )
+                else:
+                    staging = wp.tile_empty(shape=(32, wp.static(staging_columns)), dtype=real, storage="shared")
+                    for column in range(wp.static(gradient_columns)):
+                        wp.tile_scatter_masked(staging, lane, column, sums[column], True)
+                    for e in range(gradient_count):
+                        flat = e * 32 + lane
+                        owner = flat // wp.static(gradient_columns)
+                        part = flat - owner * wp.static(gradient_columns)
+                        entry = wp.tile_extract(queue_entry, head + owner)
+                        value = wp.tile_extract(staging, owner, part)
+                        if owner < ready:
+                            if wp.static(ordered):
+                                place_of = rows_of[begin + entry[1]] * wp.static(gradient_columns) + part
+                                gradients[place_of] = gradients[place_of] + value
+                            else:
+                                wp.atomic_add(gradients, entry[0] * wp.static(gradient_columns) + part, value)
 
+                head = (head + 32) & 63
                 queued = queued - ready
-                keep = lane < queued
-                late_shape = wp.tile_extract(queue_shape, 32 + lane)
-                late_ellipse = wp.tile_extract(queue_ellipse, 32 + lane)
-                late_entry = wp.tile_extract(queue_entry, 32 + lane)
-                wp.tile_scatter_masked(queue_shape, lane, late_shape, keep)
-                wp.tile_scatter_masked(queue_ellipse, lane, late_ellipse, keep)
-                wp.tile_scatter_masked(queue_entry, lane, late_entry, keep)
 
     return blend_backward

@@ -17,6 +17,11 @@ import warp as wp
 from .constants import TILE_SIZE
 from .geometry import geometry
 
+DEPTH_BITS = 30
+DEPTH_OFFSET = (127 - 40) << 23
+"""Of the bits of a float32 depth those count that differ between 2^-40 and 2^88: a pass of the sort less. Nearer and
+farther ones are alike."""
+
 
 @cache
 def tile_kernels(dtype) -> SimpleNamespace:
@@ -136,15 +141,16 @@ def tile_kernels(dtype) -> SimpleNamespace:
         capacity: int,
         keys: int64s, gaussians: ints,
     ):
-        """As emit_entries, of Gaussians as they come. keys: the tile above the bits of the depth, which order positive
-        numbers as the numbers are."""
+        """As emit_entries, of Gaussians as they come. keys: the tile above DEPTH_BITS of the depth, whose order is that
+        of positive numbers."""
         i = first + wp.tid()
         extent = extents[i]
         entry = int(0)
         if i > 0:
             entry = int(wp.min(ends[i - 1], wp.int64(capacity)))
         end = int(wp.min(ends[i], wp.int64(capacity)))
-        depth = wp.int64(wp.cast(depths[i], wp.int32))
+        bits = wp.cast(depths[i], wp.int32) - wp.static(DEPTH_OFFSET)
+        depth = wp.int64(wp.clamp(bits, 0, wp.static((1 << DEPTH_BITS) - 1)))
         if extent[0] > real(0.0) and end > entry:
             shape = shapes[i]
             ellipse = ellipses[i]
@@ -153,11 +159,11 @@ def tile_kernels(dtype) -> SimpleNamespace:
             for row in range(down[0], down[1]):
                 for column in range(across[0], across[1]):
                     if entry < end and tile_is_touched(shape, ellipse, column, row):
-                        keys[entry] = (wp.int64(row * columns + column) << wp.int64(32)) | depth
+                        keys[entry] = (wp.int64(row * columns + column) << wp.int64(DEPTH_BITS)) | depth
                         gaussians[entry] = i
                         entry += 1
         while entry < end:
-            keys[entry] = wp.int64(columns * rows) << wp.int64(32)
+            keys[entry] = wp.int64(columns * rows) << wp.int64(DEPTH_BITS)
             gaussians[entry] = i
             entry += 1
 
@@ -187,23 +193,28 @@ def tile_kernels(dtype) -> SimpleNamespace:
     )
 
 
-@wp.func
-def first_of(tiles: wp.array(dtype=wp.int32), tile: int) -> int:
-    """The place of the first entry of this tile or a later one."""
-    low = int(0)
-    high = tiles.shape[0]
-    while low < high:
-        middle = low + (high - low) // 2
-        if tiles[middle] < tile:
-            low = middle + 1
-        else:
-            high = middle
-    return low
+@cache
+def ranges_kernel(key, shift: int):
+    """find_ranges for sorted keys, wp.int32 or wp.int64, whose tile is above their lowest `shift` bits.
 
+    ranges: [2 tiles], for each tile the first and one past the last of its entries. Covers [0, tiles + 1). Unused
+    entries carry a tile number beyond all, and belong to no list.
+    """
 
-@wp.kernel(module="unique", module_options={"enable_backward": False})
-def find_ranges(tiles: wp.array(dtype=wp.int32), ranges: wp.array(dtype=wp.vec2i)):
-    """ranges[t]: the first and one past the last entry of tile t in the sorted list. Unused entries carry a tile number
-    beyond all, and belong to no list."""
-    tile = wp.tid()
-    ranges[tile] = wp.vec2i(first_of(tiles, tile), first_of(tiles, tile + 1))
+    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    def find_ranges(first: int, keys: wp.array(dtype=key), tiles: int, ranges: wp.array(dtype=wp.int32)):
+        tile = first + wp.tid()
+        low = int(0)
+        high = keys.shape[0]
+        while low < high:
+            middle = low + (high - low) // 2
+            if int(keys[middle] >> key(shift)) < tile:
+                low = middle + 1
+            else:
+                high = middle
+        if tile < tiles:
+            ranges[2 * tile] = low
+        if tile > 0:
+            ranges[2 * tile - 1] = low
+
+    return find_ranges

@@ -10,9 +10,11 @@ import warp as wp
 
 from .constants import LOG_SCALE_MAX
 from .geometry import geometry, vector
-from .harmonics import coefficient_gradient
 
 SHARPNESS, CENTRE = 100.0, 0.995  # 3DGS-MCMC, equation 8: noise is for Gaussians of opacity below 1 - 0.995
+AT_ONCE = 4  # Parameters of one launch of Adam
+CHECKED_AT_ONCE = 8  # Tensors of one launch that looks for what is not finite
+NUMBERS = 4  # That one thread of the harmonics' Adam takes
 NOTHING = 16.0  # The exponent from which on a Gaussian's noise is a ten-millionth, and is not drawn
 
 _g = geometry(wp.float32)
@@ -63,47 +65,126 @@ def step_by_adam(
     parameters[i] = parameters[i] - rate / bias_correction(first_decay_log, step) * mean / deviation
 
 
+_floats = wp.array(dtype=wp.float32)
+
+
 @wp.kernel(module="unique", module_options={"enable_backward": False})
 def update_by_adam(
     first: int,
-    gradients: wp.array(dtype=wp.float32), step: wp.array(dtype=wp.float32), rate: wp.array(dtype=wp.float32),
-    skipped: wp.array(dtype=wp.float32),
+    skipped: _floats,
     first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
-    parameters: wp.array(dtype=wp.float32), first_moments: wp.array(dtype=wp.float32),
-    second_moments: wp.array(dtype=wp.float32),
+    gradients_a: _floats, step_a: _floats, rate_a: _floats, parameters_a: _floats, means_a: _floats, squares_a: _floats,
+    gradients_b: _floats, step_b: _floats, rate_b: _floats, parameters_b: _floats, means_b: _floats, squares_b: _floats,
+    gradients_c: _floats, step_c: _floats, rate_c: _floats, parameters_c: _floats, means_c: _floats, squares_c: _floats,
+    gradients_d: _floats, step_d: _floats, rate_d: _floats, parameters_d: _floats, means_d: _floats, squares_d: _floats,
 ):
-    """One step of every number, in place; none where skipped[0] is not 0. step: [1], already counted up; rate: [1];
-    *_decay_log: log of the decays; *_gain: 1 - decay, not as float32 would round it."""
+    """One step of every number of AT_ONCE parameters, in place; none where skipped[0] is not 0. Covers the longest.
+    step: [1], already counted up; rate: [1]; all of length 0 for a parameter that is not there. *_decay_log: log of the
+    decays; *_gain: 1 - decay, not as float32 would round it. means, squares: the moments."""
     i = first + wp.tid()
     if skipped[0] == 0.0:
-        step_by_adam(
-            i, gradients[i], step[0], rate[0], first_gain, second_gain, first_decay_log, second_decay_log, epsilon,
-            parameters, first_moments, second_moments,
-        )  # fmt: skip
+        if i < parameters_a.shape[0]:
+            step_by_adam(
+                i, gradients_a[i], step_a[0], rate_a[0], first_gain, second_gain, first_decay_log, second_decay_log,
+                epsilon, parameters_a, means_a, squares_a,
+            )  # fmt: skip
+        if i < parameters_b.shape[0]:
+            step_by_adam(
+                i, gradients_b[i], step_b[0], rate_b[0], first_gain, second_gain, first_decay_log, second_decay_log,
+                epsilon, parameters_b, means_b, squares_b,
+            )  # fmt: skip
+        if i < parameters_c.shape[0]:
+            step_by_adam(
+                i, gradients_c[i], step_c[0], rate_c[0], first_gain, second_gain, first_decay_log, second_decay_log,
+                epsilon, parameters_c, means_c, squares_c,
+            )  # fmt: skip
+        if i < parameters_d.shape[0]:
+            step_by_adam(
+                i, gradients_d[i], step_d[0], rate_d[0], first_gain, second_gain, first_decay_log, second_decay_log,
+                epsilon, parameters_d, means_d, squares_d,
+            )  # fmt: skip
+
+
+@wp.kernel(module="unique", module_options={"enable_backward": False})
+def find_nonfinite(
+    first: int,
+    a: _floats, b: _floats, c: _floats, d: _floats, e: _floats, f: _floats, g: _floats, h: _floats,
+    found: _floats,
+):
+    """found[0]: infinity where one of the numbers is not finite, else as it was. Covers the longest."""
+    i = first + wp.tid()
+    finite = bool(True)
+    if i < a.shape[0]:
+        finite = finite and wp.isfinite(a[i])
+    if i < b.shape[0]:
+        finite = finite and wp.isfinite(b[i])
+    if i < c.shape[0]:
+        finite = finite and wp.isfinite(c[i])
+    if i < d.shape[0]:
+        finite = finite and wp.isfinite(d[i])
+    if i < e.shape[0]:
+        finite = finite and wp.isfinite(e[i])
+    if i < f.shape[0]:
+        finite = finite and wp.isfinite(f[i])
+    if i < g.shape[0]:
+        finite = finite and wp.isfinite(g[i])
+    if i < h.shape[0]:
+        finite = finite and wp.isfinite(h[i])
+    if not finite:
+        found[0] = wp.inf
 
 
 @cache
 def harmonics_adam_kernel(count: int):
     """update_by_adam of coefficients of harmonics, [3 N count], whose gradients nobody stored: they are as
-    coefficient_gradient() multiplies them out."""
-    gradient_of = coefficient_gradient(wp.float32, count)
+    harmonics.coefficient_adjoint_kernel() multiplies them out. Covers [0, stride): a thread takes NUMBERS, `stride`
+    apart, and asks for the memory of all before it waits for any."""
+    numbers, whole_numbers = vector(NUMBERS, wp.float32), vector(NUMBERS, wp.int32)
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def update_harmonics_by_adam(
         first: int,
-        basis: wp.array3d(dtype=wp.float32), value_gradients: wp.array3d(dtype=wp.float32), start: int,
+        basis: wp.array3d(dtype=wp.float32), value_gradients: wp.array3d(dtype=wp.float32), start: int, stride: int,
         step: wp.array(dtype=wp.float32), rate: wp.array(dtype=wp.float32), skipped: wp.array(dtype=wp.float32),
         first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
         parameters: wp.array(dtype=wp.float32), first_moments: wp.array(dtype=wp.float32),
         second_moments: wp.array(dtype=wp.float32),
     ):
-        i = first + wp.tid()
+        thread = first + wp.tid()
         if skipped[0] == 0.0:
-            gradient = gradient_of(i, start, basis, value_gradients)
-            step_by_adam(
-                i, gradient, step[0], rate[0], first_gain, second_gain, first_decay_log, second_decay_log, epsilon,
-                parameters, first_moments, second_moments,
-            )  # fmt: skip
+            final = parameters.shape[0] - 1
+            owners = whole_numbers()
+            rows = whole_numbers()
+            channels = whole_numbers()
+            gradients = numbers()
+            means = numbers()
+            squares = numbers()
+            values = numbers()
+            for k in range(wp.static(NUMBERS)):
+                i = wp.min(thread + k * stride, final)
+                means[k] = first_moments[i]
+                squares[k] = second_moments[i]
+                values[k] = parameters[i]
+                owners[k] = i // wp.static(3 * count)
+                rest = i - owners[k] * wp.static(3 * count)
+                rows[k] = start + rest // 3
+                channels[k] = rest % 3
+            degrees = basis.shape[1]
+            for view in range(basis.shape[0]):
+                for k in range(wp.static(NUMBERS)):
+                    seen = basis[view, wp.min(rows[k], degrees - 1), owners[k]]
+                    by_value = value_gradients[view, owners[k], channels[k]]
+                    gradients[k] += wp.where(rows[k] < degrees, seen, 0.0) * by_value
+            length = rate[0] / bias_correction(first_decay_log, step[0])
+            enlarged = 1.0 / wp.sqrt(bias_correction(second_decay_log, step[0]))
+            for k in range(wp.static(NUMBERS)):
+                mean = means[k] + first_gain * (gradients[k] - means[k])
+                square = squares[k] + second_gain * (gradients[k] * gradients[k] - squares[k])
+                i = thread + k * stride
+                if i <= final:
+                    first_moments[i] = mean
+                    second_moments[i] = square
+                    parameters[i] = values[k] - length * mean / (wp.sqrt(square) * enlarged + epsilon)
 
     return update_harmonics_by_adam
 

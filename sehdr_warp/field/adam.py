@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ..splatting import HarmonicsGradients
-from ..splatting.training_step import adam_step, harmonics_adam_step
+from ..splatting.training_step import AdamStep, adam_steps, harmonics_adam_step
 
 FIRST_COEFFICIENT = {"harmonics_dc": 0, "harmonics_rest": 1}
 """Of the groups that hold coefficients of harmonics."""
@@ -62,11 +62,13 @@ class Adam:
         # With lists on both sides: to add one tensor to many, torch reads it on the host, which no recording allows.
         steps = [self.state[p]["step"] for p in parameters]
         torch._foreach_add_(steps, [made] * len(steps))  # pyright: ignore[reportPrivateImportUsage]
+        own, options = [], {}  # All groups have the same options.
         for group, parameter in grouped:
             first, second, step = (self.state[parameter][key] for key in ("exp_avg", "exp_avg_sq", "step"))
-            options = {"rate": group["lr"], "betas": group["betas"], "epsilon": group["eps"]}
-            state, values = (first, second, step, skipped), parameter.detach()
+            options, values = {"betas": group["betas"], "epsilon": group["eps"]}, parameter.detach()
             if parameter.grad is not None:
-                adam_step(values, parameter.grad.contiguous(), *state, **options)
+                own.append(AdamStep(values, parameter.grad.contiguous(), first, second, step, group["lr"]))
             elif harmonics is not None:
-                harmonics_adam_step(values, FIRST_COEFFICIENT[group["name"]], harmonics, *state, **options)
+                state, rate = (first, second, step, skipped), {"rate": group["lr"]}
+                harmonics_adam_step(values, FIRST_COEFFICIENT[group["name"]], harmonics, *state, **rate, **options)
+        adam_steps(own, skipped, **options)

@@ -16,8 +16,8 @@ from .launching import launch, warp_scalar
 from .tile_lists import ONE_SORT, Emission, TileLists
 
 Adjoint = Callable[[Tensor, Tensor | None], Tensor]
-"""The backward pass: from the gradients by image and transmittance (None for 0) to those by Gaussian, [N, C + 6]:
-features, conic a b c, x, y, opacity."""
+"""The backward pass: from the gradients by image and transmittance (None for 0) to those by Gaussian, [N, C + 6 or
+more]: features, conic a b c, x, y, opacity, and what fills up a row."""
 
 
 class Picture(NamedTuple):
@@ -81,7 +81,8 @@ class _Blend(torch.autograd.Function):
         # Of an axis of length 1 torch calls any stride contiguous, and kernels do not.
         by_image = by_image.as_strided(ctx.sizes, (width * channels, channels, 1))
         gathered = adjoint(by_image, None if by_transmittance is None else by_transmittance.contiguous())
-        by_features, by_conics, by_means2d, by_opacities = gathered.split((channels, 3, 2, 1), dim=1)
+        rest = gathered.shape[1] - channels - 6
+        by_features, by_conics, by_means2d, by_opacities, _ = gathered.split((channels, 3, 2, 1, rest), dim=1)
         gradients = by_means2d, by_conics, by_opacities[:, 0], by_features
         return *(part if needed else None for part, needed in zip(gradients, ctx.needs_input_grad, strict=False)), None
 
@@ -148,10 +149,13 @@ def blend_on_cuda(
     last = torch.empty(height * width, dtype=torch.int32, device=features.device)
     tile_count = lists.columns * lists.rows
     frame = lists.columns, width, height, alpha_threshold
+    cuda = features.device.type == "cuda"
 
     def padded(features):
         padding = padded_channels - features.shape[1]
-        return torch.nn.functional.pad(features, (0, padding)) if padding else features
+        if padding:
+            return torch.nn.functional.pad(features, (0, padding))
+        return features.clone() if features.data_ptr() % 16 else features  # Rows of four are read at once.
 
     def by_gaussian(features):
         return lists.ranges, lists.gaussians, *records, features.reshape(-1, 4), *frame
@@ -162,7 +166,7 @@ def blend_on_cuda(
 
     rows = padded(features)
     given = *by_gaussian(rows), image, transmittance, last
-    launch_blocks(blend_cuda.forward_kernel(scalar, channels), blend_cuda.BLOCKS_PER_TILE, *given)
+    launch_blocks(blend_cuda.forward_kernel(scalar, channels, cuda), blend_cuda.BLOCKS_PER_TILE, *given)
     # Padded they are larger, and few are not padded again.
     count, kept = len(features), rows if len(features) <= ONE_SORT else features
     del rows, given
@@ -170,12 +174,14 @@ def blend_on_cuda(
     def backward(image_gradient: Tensor, transmittance_gradient: Tensor | None) -> Tensor:
         if transmittance_gradient is None:
             transmittance_gradient = transmittance.view(-1)[:0]
-        kernel = blend_cuda_adjoint.backward_kernel(scalar, channels, deterministic)
-        corners, sizes = blend_cuda_adjoint.BLOCKS_PER_TILE, (blend_cuda_adjoint.ROWS, channels + 6)
+        kernel = blend_cuda_adjoint.backward_kernel(scalar, channels, deterministic, cuda)
+        corners, sizes = blend_cuda.BLOCKS_PER_TILE, (blend_cuda_adjoint.ROWS, channels + 6)
         gradients = image_gradient, transmittance_gradient
         given = *by_gaussian(padded(kept)), transmittance, last, *gradients, *sizes
         if not deterministic:
-            gathered = transmittance.new_zeros(count, channels + 6)
+            by_rows = blend_cuda_adjoint.adds_rows(scalar, deterministic, cuda)
+            columns = channels + 6
+            gathered = transmittance.new_zeros(count, blend_cuda.padded_channels(columns) if by_rows else columns)
             launch_blocks(kernel, corners, *given, 0, lists.gaussians, gathered)
             return gathered
         emission, by_entry = lists.emission, transmittance.new_zeros(lists.entry_count, channels + 6)

@@ -15,6 +15,7 @@ Positional arguments are tensors and take part in autograd; keyword arguments ar
 
 from collections.abc import Callable, Sequence
 from functools import wraps
+from itertools import accumulate
 from typing import Any, Concatenate, ParamSpec, overload
 
 import torch
@@ -83,14 +84,15 @@ class Program:
 
 
 def _zeros_like(tensors: list[Tensor]) -> list[Tensor]:
-    """Contiguous zeros of the tensors' shapes; where all are of one type in one memory, filled by a single launch."""
-    if len(tensors) < 2 or len({tensor.dtype for tensor in tensors}) > 1:
+    """Contiguous zeros of the tensors' shapes; where all are of one type and contiguous in one memory, filled by a
+    single launch."""
+    together = len({tensor.dtype for tensor in tensors}) == 1 and all(tensor.is_contiguous() for tensor in tensors)
+    if len(tensors) < 2 or not together:
         return [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in tensors]
     # Each starts at a multiple of 64 numbers, as memory of its own would.
-    sizes = [tensor.numel() for tensor in tensors]
-    rooms = [-(-size // 64) * 64 for size in sizes]
-    parts = tensors[0].new_zeros(sum(rooms)).split(rooms)
-    return [part[:size].view(tensor.shape) for part, size, tensor in zip(parts, sizes, tensors, strict=True)]
+    rooms = [-(-tensor.numel() // 64) * 64 for tensor in tensors]
+    whole, starts = tensors[0].new_zeros(sum(rooms)), accumulate(rooms, initial=0)
+    return [whole.as_strided(t.shape, t.stride(), start) for t, start in zip(tensors, starts, strict=False)]
 
 
 class _ProgramFunction(torch.autograd.Function):

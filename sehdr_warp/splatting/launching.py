@@ -1,5 +1,6 @@
 """The one way kernels are launched: torch tensors in, on torch's device and stream, on the CPU spread over threads."""
 
+import ctypes
 import math
 import threading
 from collections.abc import Sequence
@@ -62,16 +63,11 @@ def launch(
     adjoint = gradients is not None
     if ranged and device.type == "cpu" and isinstance(dim, int):
         ranges = threads.even_ranges(dim, smallest) if ranges is None else ranges
-        if len(ranges) > 1:
-            with _loading:
-                wp.load_module(kernel.module, device="cpu")
-
-        def task(bounds: tuple[int, int]) -> None:
-            _launch(kernel, device, block_dim, adjoint, bounds[1] - bounds[0], [bounds[0], *values], None)
-
-        threads.run_parallel(task, ranges)
+        values = [0, *values]
+        _packed(kernel, device, block_dim, adjoint, dim, values).launch_ranges(ranges, values)
         return
-    _launch(kernel, device, block_dim, adjoint, dim, [0, *values] if ranged else values, _stream(device))
+    values = [0, *values] if ranged else values
+    _packed(kernel, device, block_dim, adjoint, dim, values).launch(dim, values, _stream(device))
 
 
 @cache
@@ -101,8 +97,44 @@ class _Packed:
             device=wp.device_from_torch(device), block_dim=block_dim, record_tape=False, record_cmd=True,
         )  # fmt: skip
         self.dim: int | Sequence[int] | None = None
+        self.structures: list[type[ctypes.Structure]] | None = None
 
     def launch(self, dim: int | Sequence[int], values: list, stream: wp.Stream | None) -> None:
+        self._pack(values)
+        if dim != self.dim:
+            self.recorded.set_dim(dim)
+            self.dim = dim
+        self.recorded.launch(stream)
+
+    def launch_ranges(self, ranges: list[tuple[int, int]], values: list) -> None:
+        """On the CPU, side by side; `first`, the kernel's first parameter, is where a range begins. A range needs the
+        interpreter's lock, for which all threads wait, for no more than a copy of what was packed."""
+        self._pack(values)
+        bounds, *params = self.recorded.params
+        count = len(self.arguments)
+        if self.structures is None:
+            kinds = [type(param) for param in params]
+            names = [argument.label for argument in self.arguments]
+            self.structures = [
+                type("Arguments", (ctypes.Structure,), {"_fields_": list(zip(names, part, strict=True))})
+                for part in (kinds[:count], kinds[count:])
+                if part
+            ]
+        given, *gradients = (
+            kind(*part) for kind, part in zip(self.structures, (params[:count], params[count:]), strict=False)
+        )
+        hooks = self.recorded.hooks
+        function = hooks.backward if gradients else hooks.forward
+        further = [ctypes.byref(part) for part in gradients]
+
+        def task(span: tuple[int, int]) -> None:
+            mine = type(given).from_buffer_copy(given)
+            mine.first = span[0]
+            function(ctypes.byref(type(bounds)((span[1] - span[0],))), ctypes.byref(mine), *further)
+
+        threads.run_parallel(task, ranges)
+
+    def _pack(self, values: list) -> None:
         packed, seen = self.recorded.params, self.seen
         for index, value in enumerate(values):
             if isinstance(value, Tensor):
@@ -117,26 +149,20 @@ class _Packed:
             elif value != seen[index]:
                 self.recorded.set_param_at_index(index, value)
                 seen[index] = value
-        if dim != self.dim:
-            self.recorded.set_dim(dim)
-            self.dim = dim
-        self.recorded.launch(stream)
 
 
 _of_thread = threading.local()
 
 
-def _launch(
-    kernel: Any, device: torch.device, block_dim: int | None, adjoint: bool, dim: Any, values: list, stream: Any
-) -> None:
-    """By this thread's packed launch of the kernel: another thread's may be at work."""
+def _packed(kernel: Any, device: torch.device, block_dim: int | None, adjoint: bool, dim: Any, values: list) -> _Packed:
+    """This thread's packed launch of the kernel: another thread's may be at work."""
     if not hasattr(_of_thread, "launches"):
         _of_thread.launches = {}
     key = kernel, device, block_dim, adjoint
     if key not in _of_thread.launches:
         with _loading:
             _of_thread.launches[key] = _Packed(*key, dim, values)
-    _of_thread.launches[key].launch(dim, values, stream)
+    return _of_thread.launches[key]
 
 
 def _lay_out(array: Any, tensor: Tensor, kind: wp.array) -> None:

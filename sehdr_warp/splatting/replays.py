@@ -66,7 +66,7 @@ def replayed(given: Given, frame: Frame, differentiable: bool) -> tuple[Picture,
     if device.type != "cuda" or features.dtype != torch.float32 or not small or is_recording(device):
         return None
     kind = _kind((device, stream_handle(device), *features.shape, frame, differentiable))
-    recording = kind.take(lambda pairs: _Recording(given, frame, differentiable, pairs))
+    recording = kind.take(lambda pairs: _Recording(given, frame, pairs))
     if recording is None:
         return None
     image, transmittance, pairs = recording.play(given)
@@ -75,27 +75,26 @@ def replayed(given: Given, frame: Frame, differentiable: bool) -> tuple[Picture,
         return None
     if not differentiable:
         kind.idle.append(recording)
-        return Picture(image, transmittance, recording.play_adjoint), pairs
+        return Picture(image, transmittance, recording.adjoint), pairs
     lease = _Lease(kind.idle, recording)
-    return Picture(image, transmittance, lease.play_adjoint), pairs
+    return Picture(image, transmittance, lease.adjoint), pairs
 
 
 class _Recording:
-    """One drawing on fixed memory, in two parts, between which the host learns how many pairs there are; its adjoint.
+    """One drawing on fixed memory, in two parts, between which the host learns how many pairs there are.
 
     pairs: room is made for so many at least."""
 
-    def __init__(self, given: Given, frame: Frame, differentiable: bool, pairs: int) -> None:
+    def __init__(self, given: Given, frame: Frame, pairs: int) -> None:
         width, height, threshold = frame
         self._given = Given(*(tensor.detach().clone() for tensor in given))
         means2d, conics, opacities, features, depths, extents = self._given
         self._image = features.new_empty(height, width, features.shape[1])
         self._transmittance = features.new_empty(height, width)
-        self._by_image = by_image = torch.zeros_like(self._image) if differentiable else None
         self._pairs = torch.empty(1, dtype=torch.int64, pin_memory=True)
         self._counted, self._stream = torch.cuda.Event(), torch.cuda.current_stream(features.device)
         self._counter = GraphRecorder(features.device)
-        self._drawer, self._differentiator = (GraphRecorder(features.device, self._counter.stream) for _ in range(2))
+        self._drawer = GraphRecorder(features.device, self._counter.stream)
 
         def count():
             records, counts = pack_records(means2d, conics, opacities, extents, threshold, width, height, features)
@@ -111,16 +110,12 @@ class _Recording:
             records, numbered = count()
             room = int(ROOM * max(pairs, int(numbered[1][-1])))
             self.room = min(max(LEAST_ROOM, room), LARGEST_CAPACITY)
-            adjoint = draw(records, numbered, self.room)
-            if by_image is not None:
-                adjoint(by_image, None)
-            del records, numbered, adjoint
+            draw(records, numbered, self.room)
+            del records, numbered
         records, numbered = self._counter.record(None, count)
         self._ends = numbered[1]
-        self._adjoint = self._drawer.record(None, lambda: draw(records, numbered, self.room))
-        self._gathered = None
-        if by_image is not None:
-            self._gathered = self._differentiator.record(None, lambda: self._adjoint(by_image, None))
+        self.adjoint: Adjoint = self._drawer.record(None, lambda: draw(records, numbered, self.room))
+        """Of the picture played last; one launch, which needs no recording."""
 
     def play(self, given: Given) -> tuple[Tensor, Tensor, int]:
         """Image, transmittance and the number of pairs, of which those beyond the room are not drawn."""
@@ -133,14 +128,6 @@ class _Recording:
         given.extents.copy_(self._given.extents)
         self._counted.synchronize()
         return *picture, int(self._pairs)
-
-    def play_adjoint(self, by_image: Tensor, by_transmittance: Tensor | None) -> Tensor:
-        """The adjoint of the picture played last; launched where it is not of the image alone, which is rare."""
-        if by_transmittance is not None or self._by_image is None or self._gathered is None:
-            return self._adjoint(by_image, by_transmittance)
-        self._by_image.copy_(by_image)
-        self._differentiator.replay()
-        return self._gathered.clone()
 
 
 @dataclass
@@ -178,8 +165,8 @@ class _Lease:
     def __init__(self, idle: list[_Recording], recording: _Recording) -> None:
         self._idle, self._recording = idle, recording
 
-    def play_adjoint(self, by_image: Tensor, by_transmittance: Tensor | None) -> Tensor:
-        return self._recording.play_adjoint(by_image, by_transmittance)
+    def adjoint(self, by_image: Tensor, by_transmittance: Tensor | None) -> Tensor:
+        return self._recording.adjoint(by_image, by_transmittance)
 
     def __del__(self) -> None:
         self._idle.append(self._recording)

@@ -5,7 +5,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from ..kernels.ssim import RADIUS, ssim_kernels, window
+from ..kernels.ssim import RADIUS, STRIP, ssim_kernels, window
 from .checks import check_tensors
 from .launching import launch, warp_scalar
 
@@ -102,7 +102,7 @@ def _compare(a: Tensor, b: Tensor, weights: tuple[float, float] | None = None) -
     similarity, derivatives = torch.empty_like(a), a.new_empty(3, runs.rows, runs.length)
     moments = runs.view(runs.padded(4))
     images = runs.view(a), runs.view(b)
-    runs.launch(runs.kernels.blur_columns, images, [moments], borders=True)
+    runs.launch(runs.kernels.blur_columns, images, [moments], blurs=1)
     compared = *images, *runs.weights_of_both, runs.view(similarity), runs.view(derivatives)
     runs.launch(runs.kernels.compare, [moments], compared)
     return similarity, derivatives
@@ -113,9 +113,9 @@ def _gradient(a, b, derivatives, scale: Tensor, weights: tuple[float, float] | N
     runs = _Runs(a, weights)
     result = torch.empty_like(a)
     blurred = runs.view(runs.padded(3))
-    runs.launch(runs.kernels.blur_derivatives, [runs.view(derivatives)], [blurred], borders=True)
+    runs.launch(runs.kernels.blur_derivatives, [runs.view(derivatives)], [blurred], blurs=3)
     scaled = scale, *runs.weights_of_both, runs.view(result)
-    runs.launch(runs.kernels.gradient, [blurred, runs.view(a), runs.view(b)], scaled)
+    runs.launch(runs.kernels.gradient, [blurred, runs.view(a), runs.view(b)], scaled, strips=True)
     return result
 
 
@@ -148,13 +148,16 @@ class _Runs:
         strides = (length,) if len(rows) == 1 else (rows[1] * length, length)
         return tensor.as_strided((*rows, length - self.lanes + 1, self.lanes), (*strides, 1, 1))
 
-    def launch(self, kernel, inputs, results, *, borders: bool = False) -> None:
-        """Launch a kernel over the whole image. borders: with one lane it also writes the zeros beyond the image."""
-        blocks = -(-self.length // self.lanes)
-        if self.lanes == 1 and borders:
-            blocks += 2 * RADIUS * self.channels
+    def launch(self, kernel, inputs, results, *, blurs: int = 0, strips: bool = False) -> None:
+        """Launch a kernel over the whole image. With one lane: blurs: it blurs columns of so many planes, and writes
+        the zeros beyond the image; strips: it takes several pixels at once."""
+        rows, blocks = self.rows, -(-self.length // self.lanes)
+        if self.lanes == 1 and blurs:
+            rows, blocks = blurs * -(-rows // STRIP), blocks + 2 * RADIUS * self.channels
+        elif self.lanes == 1 and strips:
+            blocks = -(-self.length // self.channels // STRIP) * self.channels
         arguments = *inputs, self.weights, self.length, self.channels, *results
-        launch(kernel, self.rows * blocks, *arguments, smallest=STEPS_PER_THREAD)
+        launch(kernel, rows * blocks, *arguments, smallest=STEPS_PER_THREAD)
 
 
 @cache

@@ -5,10 +5,13 @@ one launch run side by side from a thread pool (launching.py). No range writes w
 depend on the number of threads.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any
+
+import torch
 
 from ..parallel import thread_count
 
@@ -56,3 +59,15 @@ def even_ranges(count: int, smallest: int = 4096) -> list[tuple[int, int]]:
     pieces = max(1, min(thread_count() * 2, count // smallest))
     bounds = [count * k // pieces for k in range(pieces + 1)]
     return [(a, b) for a, b in pairwise(bounds) if b > a]
+
+
+@contextmanager
+def torch_threads() -> Iterator[None]:
+    """torch on all threads too, where there are some: for what no thread's share decides, each number by itself and no
+    sums."""
+    before, count = torch.get_num_threads(), thread_count()
+    torch.set_num_threads(max(before, count if count > 3 else 1))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -12,6 +12,7 @@ from ..kernels import tiles as kernels
 from ..kernels.constants import TILE_SIZE
 from ..kernels.tiles import tile_kernels
 from .launching import launch, torch_stream, warp_scalar
+from .threads import torch_threads
 
 LARGEST_CAPACITY = 2**31 - 1  # Entries are counted in int32
 ONE_SORT = 1 << 18
@@ -77,7 +78,7 @@ def number_entries(
     """
     one_sort = len(depths) <= ONE_SORT and not emission and depths.dtype == torch.float32
     order = None if one_sort else depth_order(depths, extents)
-    return order, (counts if order is None else counts[order]).cumsum(0)
+    return order, (counts if order is None else _taken(counts, order)).cumsum(0)
 
 
 @torch.no_grad()
@@ -111,14 +112,14 @@ def build_tile_lists(
     padded = capacity is not None
     if order is None:
         touched = *records, extents, depths, columns, rows
-        tiles, gaussians = sort_keys(*emit_keys(*touched, ends, room, padded), room, tile_count)
+        sorted_keys, gaussians = sort_keys(*emit_keys(*touched, ends, room, padded), room, tile_count)
     else:
         touched = order, *records, extents, columns, rows
         tiles, gaussians = emit_entries(*touched, ends, room, padded)
-        tiles, gaussians, places = sort_by_tile(tiles, gaussians, room, tile_count, emission)
+        sorted_keys, gaussians, places = sort_by_tile(tiles, gaussians, room, tile_count, emission)
         by_gaussian = None if places is None else Emission(order.clone(), ends, places)
         total = total.clone()
-    return TileLists(find_ranges(tiles, tile_count), gaussians, by_gaussian, width, height, overflow, total)
+    return TileLists(find_ranges(sorted_keys, tile_count), gaussians, by_gaussian, width, height, overflow, total)
 
 
 def pack_records(
@@ -185,11 +186,11 @@ def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends
 
 
 def emit_keys(shapes, ellipses, extents, depths, columns: int, rows: int, ends, room: int, padded: bool):
-    """As emit_entries, of Gaussians as they come: int64 keys, the tile above the bits of the depth, and Gaussians."""
+    """As emit_entries, of Gaussians as they come: int64 keys, the tile above those of the depth, and Gaussians."""
     keys = torch.empty(2 * room, dtype=torch.int64, device=ends.device)
     gaussians = torch.empty(2 * room, dtype=torch.int32, device=ends.device)
     if padded:
-        keys[:room] = columns * rows << 32
+        keys[:room] = columns * rows << kernels.DEPTH_BITS
         gaussians[:room] = 0
     if room:
         touched = shapes, ellipses, extents, depths, columns, rows
@@ -208,20 +209,28 @@ def sort_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: 
     torch.arange(entry_count, dtype=torch.int32, device=tiles.device, out=places[:entry_count])
     _sort_pairs(tiles, places, entry_count, bits)
     places = places[:entry_count].clone()
-    return tiles[:entry_count], gaussians[:entry_count][places] if entry_count else gaussians, places
+    return tiles[:entry_count], _taken(gaussians[:entry_count], places) if entry_count else gaussians, places
+
+
+def _taken(values: Tensor, places: Tensor) -> Tensor:
+    if values.device.type != "cpu":
+        return values[places]
+    with torch_threads():
+        return values[places]
 
 
 def sort_keys(keys, gaussians, entry_count: int, tile_count: int):
-    """Stable sort of emit_keys()'s by tile and depth: tiles [M] and Gaussians [M], in the same memory."""
-    _sort_pairs(keys, gaussians, entry_count, 32 + tile_count.bit_length())
-    # The upper half of each key, on the machines that CUDA runs on.
-    return keys[:entry_count].view(torch.int32)[1::2], gaussians[:entry_count]
+    """Stable sort of emit_keys()'s by tile and depth: keys [M] and Gaussians [M], in the same memory."""
+    _sort_pairs(keys, gaussians, entry_count, kernels.DEPTH_BITS + tile_count.bit_length())
+    return keys[:entry_count], gaussians[:entry_count]
 
 
 def find_ranges(tiles, tile_count: int):
-    """[tiles, 2] int32: first and one past the last entry of each tile in the sorted list; alike for none."""
+    """[tiles, 2] int32: first and one past the last entry of each tile in the sorted list; alike for none. tiles:
+    int32, or int64 as sort_keys() gives them."""
     ranges = torch.empty(tile_count, 2, dtype=torch.int32, device=tiles.device)
-    launch(kernels.find_ranges, tile_count, tiles, ranges)
+    kind = (wp.int64, kernels.DEPTH_BITS) if tiles.dtype == torch.int64 else (wp.int32, 0)
+    launch(kernels.ranges_kernel(*kind), tile_count + 1, tiles, tile_count, ranges.view(-1))
     return ranges
 
 

@@ -1,7 +1,8 @@
 """What a training does at every step beside rendering, on either device without waiting for it."""
 
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -9,6 +10,7 @@ from torch import Tensor
 from ..kernels import training_step as kernels
 from .harmonics import HarmonicsGradients
 from .launching import launch
+from .threads import torch_threads
 
 
 @torch.no_grad()
@@ -24,45 +26,73 @@ def judge_step(loss: Tensor, norms: Tensor, incomplete: Tensor | None = None) ->
 
 
 @torch.no_grad()
-def adam_step(
-    parameter: Tensor,
-    gradient: Tensor,
-    first_moment: Tensor,
-    second_moment: Tensor,
-    step: Tensor,
-    skipped: Tensor,
-    *,
-    rate: Tensor | float,
-    betas: tuple[float, float],
-    epsilon: float,
-) -> None:
-    """Changes parameter and moments in place, or nothing where `skipped` is 1: torch's step on the CPU, a kernel of the
-    same numbers on a GPU, where torch's leaves most of it idle.
+def norms(gradients: Sequence[Tensor]) -> Tensor:
+    """[K] float32, finite where all the gradients are: on a CPU their norms, on a GPU one number, 0 or infinity."""
+    if gradients[0].device.type == "cuda":
+        return _nonfinite_by_kernel(gradients)
+    return torch.stack(torch._foreach_norm(list(gradients)))  # pyright: ignore[reportPrivateImportUsage]
 
-    parameter, gradient, first_moment, second_moment: contiguous float32 of one shape. step, skipped, rate: float32 of
-    one element; step is the number of this step, from 1. All on one device, so that the call can be part of a CUDA
-    graph; a rate that is a number cannot change there.
+
+def _nonfinite_by_kernel(gradients: Sequence[Tensor]) -> Tensor:
+    found = gradients[0].new_zeros(1)
+    flat = [gradient.reshape(-1) for gradient in gradients if gradient.numel()]
+    for start in range(0, len(flat), kernels.CHECKED_AT_ONCE):
+        given = flat[start : start + kernels.CHECKED_AT_ONCE]
+        nothing = [found[:0]] * (kernels.CHECKED_AT_ONCE - len(given))
+        launch(kernels.find_nonfinite, max(map(len, given)), *given, *nothing, found)
+    return found
+
+
+class AdamStep(NamedTuple):
+    """What a step changes and what it takes: parameter, gradient, moments, contiguous float32 of one shape; float32 of
+    one element the number of this step, from 1, and the rate. A rate that is a number cannot change in a CUDA graph."""
+
+    parameter: Tensor
+    gradient: Tensor
+    first_moment: Tensor
+    second_moment: Tensor
+    step: Tensor
+    rate: Tensor | float
+
+
+@torch.no_grad()
+def adam_steps(steps: Sequence[AdamStep], skipped: Tensor, *, betas: tuple[float, float], epsilon: float) -> None:
+    """Changes parameters and moments in place, or nothing where `skipped`, float32 of one element, is 1: torch's step
+    on the CPU; on a GPU, where torch's leaves most of it idle, a kernel of the same numbers, several parameters at
+    once. All on one device, so that the call can be part of a CUDA graph.
+
     Raises ValueError for a tensor that is not contiguous float32 of the parameter's shape.
     """
-    shape = parameter.shape
-    for name, tensor in {"gradient": gradient, "first moment": first_moment, "second moment": second_moment}.items():
-        if tensor.shape != shape or tensor.dtype != torch.float32 or not tensor.is_contiguous():
-            is_ = f"{tensor.dtype} {list(tensor.shape)}"
-            raise ValueError(f"the {name} is {is_}, expected contiguous float32 {list(shape)}")
-    if not parameter.numel():
+    for each in steps:
+        shape = each.parameter.shape
+        for name in ("gradient", "first_moment", "second_moment"):
+            tensor: Tensor = getattr(each, name)
+            if tensor.shape != shape or tensor.dtype != torch.float32 or not tensor.is_contiguous():
+                is_ = f"{tensor.dtype} {list(tensor.shape)}"
+                raise ValueError(f"the {name.replace('_', ' ')} is {is_}, expected contiguous float32 {list(shape)}")
+    steps = [step for step in steps if step.parameter.numel()]
+    if skipped.device.type == "cuda":
+        _steps_by_kernel(steps, skipped, betas, epsilon)
         return
-    if parameter.device.type == "cpu":
-        lists = [parameter], [gradient], [first_moment], [second_moment], [], [step]
-        numbers: Any = {"lr": float(rate), "beta1": betas[0], "beta2": betas[1], "weight_decay": 0.0, "eps": epsilon}
-        torch._fused_adam_(*lists, **numbers, amsgrad=False, maximize=False, found_inf=skipped)  # pyright: ignore[reportPrivateImportUsage]
-        return
-    _step_by_kernel(parameter, gradient, first_moment, second_moment, step, skipped, rate, betas, epsilon)
+    numbers: Any = {"beta1": betas[0], "beta2": betas[1], "weight_decay": 0.0, "eps": epsilon, "found_inf": skipped}
+    numbers |= {"amsgrad": False, "maximize": False}
+    with torch_threads():
+        for parameter, gradient, first_moment, second_moment, step, rate in steps:
+            lists = [parameter], [gradient], [first_moment], [second_moment], [], [step]
+            torch._fused_adam_(*lists, lr=float(rate), **numbers)  # pyright: ignore[reportPrivateImportUsage]
 
 
-def _step_by_kernel(parameter, gradient, first_moment, second_moment, step, skipped, rate, betas, epsilon) -> None:
-    changed = parameter.view(-1), first_moment.view(-1), second_moment.view(-1)
-    numbers = _numbers(step, rate, skipped, betas, epsilon)
-    launch(kernels.update_by_adam, parameter.numel(), gradient.view(-1), *numbers, *changed)
+def _steps_by_kernel(steps: Sequence[AdamStep], skipped, betas, epsilon) -> None:
+    nothing = [skipped.view(1)[:0]] * 6
+    for start in range(0, len(steps), kernels.AT_ONCE):
+        given = steps[start : start + kernels.AT_ONCE]
+        told = []
+        for parameter, gradient, first_moment, second_moment, step, rate in given:
+            flat = (tensor.view(-1) for tensor in (parameter, first_moment, second_moment))
+            told += [gradient.view(-1), step.view(1), _rate(rate, skipped).view(1), *flat]
+        told += nothing * (kernels.AT_ONCE - len(given))
+        most = max(step.parameter.numel() for step in given)
+        launch(kernels.update_by_adam, most, skipped.view(1), *_numbers(betas), epsilon, *told)
 
 
 @torch.no_grad()
@@ -79,21 +109,23 @@ def harmonics_adam_step(
     betas: tuple[float, float],
     epsilon: float,
 ) -> None:
-    """adam_step() of coefficients of harmonics [N, K, 3] from number `start` on, whose gradients are multiplied out
+    """adam_steps() of coefficients of harmonics [N, K, 3] from number `start` on, whose gradients are multiplied out
     where they are used."""
     if not parameter.numel():
         return
-    numbers = _numbers(step, rate, skipped, betas, epsilon)
+    numbers = step, _rate(rate, skipped), skipped, *_numbers(betas), epsilon
     changed = parameter.view(-1), first_moment.view(-1), second_moment.view(-1)
-    kernel = kernels.harmonics_adam_kernel(parameter.shape[1])
-    launch(kernel, parameter.numel(), gradients.basis, gradients.by_values, start, *numbers, *changed)
+    kernel, stride = kernels.harmonics_adam_kernel(parameter.shape[1]), -(-parameter.numel() // kernels.NUMBERS)
+    launch(kernel, stride, gradients.basis, gradients.by_values, start, stride, *numbers, *changed)
 
 
-def _numbers(step: Tensor, rate: Tensor | float, skipped: Tensor, betas: tuple[float, float], epsilon: float) -> tuple:
-    """What Adam's kernels read beside gradient and state."""
-    rate = rate if isinstance(rate, Tensor) else torch.full_like(skipped, rate)
-    gains, logs = [1 - beta for beta in betas], [math.log(beta) for beta in betas]
-    return step, rate, skipped, *gains, *logs, epsilon
+def _rate(rate: Tensor | float, like: Tensor) -> Tensor:
+    return rate if isinstance(rate, Tensor) else torch.full_like(like, rate)
+
+
+def _numbers(betas: tuple[float, float]) -> tuple[float, ...]:
+    """What Adam's kernels know of the decays."""
+    return *(1 - beta for beta in betas), *(math.log(beta) for beta in betas)
 
 
 @torch.no_grad()

@@ -58,6 +58,7 @@ def torch_settings(deterministic: bool) -> Iterator[None]:
     interval = sys.getswitchinterval()
     torch.set_num_threads(1)
     sys.setswitchinterval(SWITCH_SECONDS)
+    _keep_memory(True)
     if deterministic:
         # cuBLAS repeats itself only with a workspace of its own; it reads this when it is first used.
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
@@ -68,9 +69,26 @@ def torch_settings(deterministic: bool) -> Iterator[None]:
     finally:
         torch.set_num_threads(threads)
         sys.setswitchinterval(interval)
+        _keep_memory(False)
         if deterministic:  # The call alone loads torch's compiler, two seconds.
             torch.use_deterministic_algorithms(ordered)
         memory.fill_uninitialized_memory = filled
+
+
+def _keep_memory(keep: bool) -> None:
+    """Whether large memory stays the process's when it is let go. A step of a training asks for what the one before let
+    go, and new memory the system fills with zeros, page by page, on one thread. glibc's; nothing elsewhere."""
+    if sys.platform != "linux":
+        return
+    import ctypes
+
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "mallopt") and hasattr(libc, "malloc_trim"):
+        mmap_max, trim_threshold = -4, -1
+        libc.mallopt(mmap_max, 0 if keep else 1 << 16)
+        libc.mallopt(trim_threshold, 2**31 - 1 if keep else 1 << 17)
+        if not keep:
+            libc.malloc_trim(0)
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from ..field.adam import BETAS, FIRST_COEFFICIENT, Adam
 from ..field.gaussians import PARAMETER_NAMES
 from ..field.radiance_field import RadianceField
 from ..splatting import HarmonicsGradients
-from ..splatting.training_step import judge_step
+from ..splatting.training_step import judge_step, norms
 from .config import Config
 
 
@@ -60,8 +60,7 @@ def guarded_step(
     device, without waiting for it. Two scalar float tensors: 1 if something was not finite; 1 if the step was made."""
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
     gradients += [] if harmonics is None else [harmonics.by_values]
-    norms = torch.stack(torch._foreach_norm(gradients))
-    nonfinite, skipped, made = judge_step(loss, norms, incomplete)
+    nonfinite, skipped, made = judge_step(loss, norms(gradients), incomplete)
     optimizer.step(skipped, made, harmonics)
     return nonfinite, made
 

@@ -6,7 +6,7 @@ import torch
 from scipy.special import sph_harm_y
 
 from sehdr_warp.splatting import HarmonicsGradients, spherical_harmonics
-from sehdr_warp.splatting.training_step import adam_step, harmonics_adam_step
+from sehdr_warp.splatting.training_step import AdamStep, adam_steps, harmonics_adam_step
 
 from .scenes import finite_differences, relative_error
 
@@ -116,7 +116,8 @@ def test_adam_multiplies_the_factors_of_two_views_out(device, degree):
         plain, factored = (
             [t[:, part].clone(), *(torch.zeros_like(t[:, part]) for _ in range(2))] for t in [coefficients] * 2
         )
-        adam_step(plain[0], leaf.grad[:, part].contiguous(), *plain[1:], one, 0 * one, **options)
+        gradient, decays = leaf.grad[:, part].contiguous(), {k: options[k] for k in ("betas", "epsilon")}
+        adam_steps([AdamStep(plain[0], gradient, *plain[1:], one, options["rate"])], 0 * one, **decays)
         gradients = HarmonicsGradients(by_values, positions, means, degree)
         harmonics_adam_step(factored[0], start, gradients, *factored[1:], one, 0 * one, **options)
         for a, b in zip(plain, factored, strict=True):

@@ -7,7 +7,14 @@ import pytest
 import torch
 
 from sehdr_warp.splatting import training_step
-from sehdr_warp.splatting.training_step import adam_step, add_gradient_statistics, add_position_noise, judge_step
+from sehdr_warp.splatting.training_step import (
+    AdamStep,
+    adam_steps,
+    add_gradient_statistics,
+    add_position_noise,
+    judge_step,
+    norms,
+)
 
 OPTIONS = {"betas": (0.9, 0.999), "epsilon": 1e-15}
 COUNT, STRENGTH = 200_000, 0.5
@@ -19,11 +26,11 @@ def run_adam(step_function, parameter, gradients, rate, skip=()):
     for number, gradient in enumerate(gradients):
         skipped = one * (number in skip)
         step += 1 - skipped
-        step_function(parameter, gradient, first, second, step, skipped, rate=one * rate, **OPTIONS)
+        step_function([AdamStep(parameter, gradient, first, second, step, one * rate)], skipped, **OPTIONS)
     return first, second, step
 
 
-@pytest.mark.parametrize("function", [adam_step, training_step._step_by_kernel])
+@pytest.mark.parametrize("function", [adam_steps, training_step._steps_by_kernel])
 @pytest.mark.parametrize("scale", [1.0, 1e-12, 1e12])
 def test_many_steps_are_torchs_in_float64(device, scale, function):
     generator = torch.Generator().manual_seed(0)
@@ -42,7 +49,7 @@ def test_many_steps_are_torchs_in_float64(device, scale, function):
         assert ((moment.cpu() - true_moment).norm() / true_moment.norm()) < 1e-6
 
 
-@pytest.mark.parametrize("function", [adam_step, training_step._step_by_kernel])
+@pytest.mark.parametrize("function", [adam_steps, training_step._steps_by_kernel])
 def test_a_skipped_step_changes_nothing(device, function):
     gradients = [torch.full((5,), value, device=device) for value in (1.0, float("nan"), -0.5)]
     with_skip, without = torch.zeros(5, device=device), torch.zeros(5, device=device)
@@ -53,14 +60,41 @@ def test_a_skipped_step_changes_nothing(device, function):
     assert all(moment.isfinite().all() for moment in moments)
 
 
+@pytest.mark.parametrize("function", [adam_steps, training_step._steps_by_kernel])
+def test_many_parameters_step_as_each_by_itself(device, function):
+    generator = torch.Generator().manual_seed(2)
+    one = torch.ones((), device=device)
+    made = [
+        [
+            AdamStep(*(t.to(device, copy=True) for t in tensors), one, 0.01 * size)
+            for size, tensors in ((n, torch.rand(4, n, 2, generator=generator)) for n in (5, 70, 1, 33, 12, 4))
+        ]
+        for generator in (generator, torch.Generator().manual_seed(2))
+    ]
+    function(made[0], 0 * one, **OPTIONS)
+    for step in made[1]:
+        function([step], 0 * one, **OPTIONS)
+    for together, alone in zip(*made, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(together[:4], alone[:4], strict=True))
+
+
+@pytest.mark.parametrize("function", [norms, training_step._nonfinite_by_kernel])
+@pytest.mark.parametrize("place", [None, 0, 9])
+def test_one_number_that_is_not_finite_shows_in_the_norms(device, place, function):
+    gradients = [torch.ones(7 * k + 1, 3, device=device) for k in range(10)]
+    if place is not None:
+        gradients[place][-1, 2] = float("inf")
+    assert bool(function(gradients).isfinite().all()) == (place is None)
+
+
 def test_no_numbers_are_no_work_and_another_layout_is_refused(device):
     empty, one = torch.zeros(0, 3, device=device), torch.ones((), device=device)
-    adam_step(empty, empty, empty, empty, one, one, rate=one, **OPTIONS)
+    adam_steps([AdamStep(empty, empty, empty, empty, one, one)], one, **OPTIONS)
     square = torch.zeros(4, 4, device=device)
     with pytest.raises(ValueError, match="gradient is torch.float32"):
-        adam_step(square, torch.zeros(3, device=device), square, square, one, one, rate=0.1, **OPTIONS)
+        adam_steps([AdamStep(square, torch.zeros(3, device=device), square, square, one, 0.1)], one, **OPTIONS)
     with pytest.raises(ValueError, match="second moment is torch.float64"):
-        adam_step(square, square, square, square.double(), one, one, rate=0.1, **OPTIONS)
+        adam_steps([AdamStep(square, square, square, square.double(), one, 0.1)], one, **OPTIONS)
 
 
 def test_a_step_is_skipped_where_something_is_not_finite_or_incomplete(device):
@@ -68,10 +102,10 @@ def test_a_step_is_skipped_where_something_is_not_finite_or_incomplete(device):
         [0.0, 3.0, math.inf, math.nan], [0.0, math.inf, math.nan], (None, False, True)
     ):
         told = None if incomplete is None else torch.tensor(incomplete, device=device)
-        norms = torch.tensor([1.0, norm, 2.0], device=device)
+        given = torch.tensor([1.0, norm, 2.0], device=device)
         nonfinite = not (math.isfinite(loss) and math.isfinite(norm))
         skipped = nonfinite or bool(incomplete)
-        found = judge_step(torch.tensor(loss, device=device), norms, told)
+        found = judge_step(torch.tensor(loss, device=device), given, told)
         assert [float(value) for value in found] == [nonfinite, skipped, not skipped]
 
 
