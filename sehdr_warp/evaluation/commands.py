@@ -90,7 +90,9 @@ def run_score(asked: Score) -> None:
     from .score import score_folder
 
     def figures():
-        return score_folder(asked.folder, load_scene(asked.truth, max_size=asked.max_size), lpips_weights=asked.lpips)
+        # Of the set's photos it counts alone where they are clipped: no response need be chosen for them.
+        truth = load_scene(asked.truth, response="srgb", max_size=asked.max_size)
+        return score_folder(asked.folder, truth, lpips_weights=asked.lpips)
 
     asked.tell(figures)
 

@@ -1,0 +1,61 @@
+"""Fields of the config that no other test changes: each changes what is trained."""
+
+import pytest
+import torch
+
+from sehdr_warp.training.config_files import override_config
+from sehdr_warp.training.initialization import choose_response, make_field
+from sehdr_warp.training.trainer import Trainer
+
+from .toy import quick
+
+EARLY = {f"densification.{name}": value for name, value in (("start", 1), ("stop", 18), ("every", 5))}
+EARLY |= {"densification.reset_every": 10, "schedule.harmonics_every": 4}
+BASE = {
+    "relocation": quick(length=20, **EARLY),
+    "gradient": quick(
+        length=20,
+        **EARLY | {"densification.strategy": "gradient", "loss.opacity_weight": 0.0, "densification.noise": 0.0},
+    ),
+}
+FIELDS = [
+    ("relocation", "model.antialiased", True),
+    ("relocation", "optimizer.means_final", 1e-3),
+    ("relocation", "optimizer.log_scales", 0.05),
+    ("relocation", "optimizer.quaternions", 0.01),
+    ("relocation", "optimizer.opacity_logits", 0.1),
+    ("relocation", "optimizer.harmonics_rest", 0.01),
+    ("relocation", "densification.prune_opacity", 0.3),
+    ("gradient", "densification.prune_opacity", 0.3),
+    ("gradient", "densification.grow_gradient", 1e-6),
+    ("gradient", "densification.grow_scale", 1.0),
+    ("gradient", "densification.prune_scale", 0.01),
+]
+
+
+@pytest.fixture(scope="module")
+def end(scene):
+    """end(config): what is trained, after all its steps."""
+
+    def train(config):
+        trainer = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cpu"))
+        for _ in range(config.schedule.iterations):
+            trainer.step()
+        return torch.cat([tensor.flatten() for tensor in trainer.field.gaussians.tensors().values()]).detach()
+
+    return train
+
+
+@pytest.fixture(scope="module")
+def plain(end):
+    return {name: end(config) for name, config in BASE.items()}
+
+
+@pytest.mark.parametrize("strategy, field, value", FIELDS)
+def test_a_field_has_an_effect(end, plain, strategy, field, value):
+    changed = end(override_config(BASE[strategy], {field: value}))
+    assert not torch.equal(changed, plain[strategy])
+
+
+def test_nothing_changed_changes_nothing(end, plain):
+    assert torch.equal(end(BASE["gradient"]), plain["gradient"])
