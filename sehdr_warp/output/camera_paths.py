@@ -2,12 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera
+
+Item = TypeVar("Item")
 
 # More than an hour of film at 24 views a second is a slip of the hand.
 _LONGEST = 100_000
@@ -15,6 +17,11 @@ _LONGEST = 100_000
 _ROUND_GAP = np.radians(120)
 # Mean squared sine between optical axes below which they are parallel in effect and meet nowhere (1 degree).
 _PARALLEL = np.sin(np.radians(1)) ** 2
+
+
+def evenly(items: Sequence[Item], count: int) -> list[Item]:
+    """At most `count` of them, evenly chosen from the first to the last."""
+    return [items[i] for i in sorted({round(i) for i in np.linspace(0, len(items) - 1, count)})]
 
 
 def common_focus(cameras: Sequence[Camera]) -> np.ndarray | None:

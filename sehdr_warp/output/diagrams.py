@@ -12,6 +12,7 @@ from PIL import Image
 
 from sehdr_warp.scene import Camera
 
+from .camera_paths import evenly
 from .charts import PANELS, training_points
 from .images import as_array, quantize
 
@@ -98,7 +99,7 @@ def camera_map(run: Any, tone_map: Any, names: Sequence[str] = ()) -> str:
 def _seen(cameras: Sequence[Camera], run: Any, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points of the scene [N, 3] and their radiance, from small renders of some cameras; what lies higher than the
     cameras, such as a ceiling, is left out."""
-    chosen = [cameras[i] for i in sorted({round(i) for i in np.linspace(0, len(cameras) - 1, _MAP_VIEWS)})]
+    chosen = evenly(cameras, _MAP_VIEWS)
     ceiling, points, colors = max(float(camera.position @ up) for camera in chosen), [], []
     for camera in chosen:
         small = camera.resized(_SAMPLES, max(1, round(_SAMPLES * camera.height / camera.width)))

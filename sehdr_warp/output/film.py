@@ -19,7 +19,8 @@ from ..files import atomic_path
 from .colorspace import matrix_from_rec709, matrix_to
 from .images import as_array
 from .light_pictures import display_gain
-from .tonemap import encode_srgb, fit_tone_map
+from .render_views import shared_tone_map
+from .tonemap import encode_srgb
 
 log = logging.getLogger(__name__)
 
@@ -90,8 +91,7 @@ def write_film(
     stops = np.linspace(*ev_ramp, len(cameras))
     look = None
     if transfer == "sdr" and not exposed and ev_ramp[0] == ev_ramp[1]:
-        chosen = [cameras[i] for i in sorted({round(i) for i in np.linspace(0, len(cameras) - 1, 4)})]
-        look = fit_tone_map([as_array(run.render(camera.resized(160, 120)).hdr) for camera in chosen])
+        look = shared_tone_map(run, cameras)
     with atomic_path(out, overwrite) as temporary:
         try:
             with av.open(str(temporary), "w", options={"movflags": "faststart"}) as container:

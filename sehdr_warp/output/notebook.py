@@ -25,9 +25,7 @@ def run_html(run: Any) -> str:
     figures += [f"view {shown.name}"] if shown else []
     body, height = f"<p><b>{escape(run.scene_name)}</b> &middot; {escape(' · '.join(figures))}</p>", 72
     if shown is not None:
-        camera = shown.camera
-        factor = min(1.0, _LONGEST / max(camera.width, camera.height))
-        camera = camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+        camera = shown.camera.within(_LONGEST)
         light = as_array(run.render(camera).hdr) * np.float32(run.base_time)
         body += dial({"scene": light}, run.base_time, display_gain(run.response), "scene")
         height += 34 + round(_LONGEST * camera.height / camera.width)

@@ -17,7 +17,7 @@ from sehdr_warp.scene.images import MAX_PIXELS
 from ..field.exposure import Items
 from ..files import atomic_folder, atomic_path
 from .brackets import Brackets, bracket_exposures
-from .camera_paths import interpolate, orbit
+from .camera_paths import evenly, interpolate, orbit
 from .colorspace import from_rec709
 from .exr import Part, rgb_channels, write_multipart_exr
 from .images import as_array, quantize, write_picture
@@ -25,15 +25,14 @@ from .light_pictures import display_gain
 from .names import safe_names
 from .ocio import ocio_view
 from .passes import data_parts, read_passes
-from .tonemap import fit_tone_map
+from .tonemap import ToneMap, fit_tone_map
 from .usd_cameras import usd_cameras
 
 log = logging.getLogger(__name__)
 SPLITS = ("train", "test", "all")
 PATHS = ("orbit", "interpolate")
 
-# The tone map is fitted to a few small pictures, evenly chosen, so that all previews of a set share it.
-_FIT_VIEWS, _FIT_SIZE = 4, 160
+_FIT_VIEWS, _FIT_SIZE = 4, 160  # Of the pictures that a tone map is fitted to
 _SEEN = 0.01  # Mean coverage below which a picture shows nothing: stray Gaussians are nearly everywhere
 
 
@@ -110,8 +109,7 @@ def render_views(
 
     def write_pictures(hdr_folder: Path, preview_folder: Path) -> Iterator[tuple[str, np.ndarray, Camera]]:
         """Writes each view, and yields what its brackets are made of."""
-        chosen = [views[i][1] for i in sorted({round(i) for i in np.linspace(0, len(views) - 1, _FIT_VIEWS)})]
-        tone_map = look or fit_tone_map([as_array(run.render(_small(camera)).hdr) for camera in chosen])
+        tone_map = look or shared_tone_map(run, [camera for _, camera in views])
         for index, (name, camera) in enumerate(views, start=1):
             rendered, confidence = run.render(camera), run.render_confidence(camera)
             hdr = as_array(rendered.hdr)
@@ -149,6 +147,11 @@ def render_views(
         problem = "see nothing of the scene, or next to nothing: are they in its coordinates, and do they look at it?"
         log.warning("%d of %d cameras (%s) %s", len(empty), len(views), listed, problem)
     return [*files, out / "cameras.usda"]
+
+
+def shared_tone_map(run: Any, cameras: Sequence[Camera]) -> ToneMap:
+    """One for all pictures of these cameras, fitted to a few small ones."""
+    return fit_tone_map([as_array(run.render(camera.within(_FIT_SIZE)).hdr) for camera in evenly(cameras, _FIT_VIEWS)])
 
 
 def read_size(size: str | tuple[int, int]) -> tuple[int, int]:
@@ -197,15 +200,10 @@ def provenance(run) -> dict[str, str]:
     return {key: str(value) for key, value in known.items() if value not in (None, "")}
 
 
-def _small(camera: Camera) -> Camera:
-    factor = min(1.0, _FIT_SIZE / max(camera.width, camera.height))
-    return camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
-
-
 def _focus_distance(run, cameras: Sequence[Camera]) -> float:
     """The median depth in a small render of the middle camera; 1 where nothing is seen."""
     if not cameras:
         return 1.0
-    depth = as_array(run.render(_small(cameras[len(cameras) // 2])).depth)
+    depth = as_array(run.render(cameras[len(cameras) // 2].within(_FIT_SIZE)).depth)
     depth = depth[depth > 0]
     return float(np.median(depth)) if depth.size else 1.0

@@ -14,7 +14,7 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Scene, View
 
 from ..files import atomic_path, check_absent
-from .camera_paths import interpolate
+from .camera_paths import evenly, interpolate
 from .charts import PANELS, QUIET, STYLE, training_chart, training_points
 from .images import as_array
 from .light_pictures import photo_light, shown_photo
@@ -84,7 +84,7 @@ def write_report(
     given, held_out = scene.test_views or scene.train_views, bool(scene.test_views)
     if not given:
         raise SehdrError("the scene has no views to report on; check its splits")
-    views = [given[i] for i in sorted({round(i) for i in np.linspace(0, len(given) - 1, max(view_count, 1))})]
+    views = evenly(given, max(view_count, 1))
     comparisons = [compare(run, view, scene.views) for view in views]
     brightest = max(comparisons, key=lambda comparison: float((comparison.photo > 0.99).mean()))
     time = views[0].exposure_time

@@ -5,10 +5,11 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from PIL import Image
 
 from sehdr_warp import __version__
 from sehdr_warp.scene import Scene
+from sehdr_warp.scene.camera import limited_size
+from sehdr_warp.scene.lens import area_average
 
 from .diagrams import camera_map, training_svg
 from .light_pictures import (
@@ -302,18 +303,13 @@ def _rows(titles: Sequence[str], rows: Sequence[Sequence], mean: Sequence = (), 
 
 def smaller(picture: np.ndarray, longest: int) -> np.ndarray:
     """[H, W, 3] with at most `longest` pixels on a side, each the mean of what it covers."""
-    width, height = _size(picture, longest)
-    if (height, width) == picture.shape[:2]:
-        return picture
-    planes = (Image.fromarray(np.ascontiguousarray(plane, np.float32)) for plane in np.moveaxis(picture, 2, 0))
-    return np.stack([np.asarray(plane.resize((width, height), Image.Resampling.BOX)) for plane in planes], axis=2)
+    return area_average(picture, *_size(picture, longest))
 
 
 def _size(picture: np.ndarray, longest: int) -> tuple[int, int]:
     """Width and height of a picture that is reduced to a longest side."""
     height, width = picture.shape[:2]
-    factor = min(1.0, longest / max(height, width))
-    return max(1, round(width * factor)), max(1, round(height * factor))
+    return limited_size(width, height, longest)
 
 
 def stops_text(stops: float) -> str:

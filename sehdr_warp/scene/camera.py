@@ -6,6 +6,12 @@ from typing import Any
 import numpy as np
 
 
+def limited_size(width: int, height: int, max_size: int | None) -> tuple[int, int]:
+    """The size with the longest side at most max_size pixels and the same aspect, rounded; never larger."""
+    scale = 1.0 if max_size is None else min(1.0, max_size / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
 def look_at(position, target=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0)) -> np.ndarray:
     """[4, 4] world_to_camera of a camera at `position` that looks at `target`, upright where `up` is not along that."""
     position = np.asarray(position, float)
@@ -86,6 +92,10 @@ class Camera:
         """The same view at another size; the principal point and the focal lengths scale with each axis."""
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.world_to_camera)
+
+    def within(self, max_size: int | None) -> "Camera":
+        """The same view, at most so many pixels on its longest side."""
+        return self.resized(*limited_size(self.width, self.height, max_size))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON; from_dict reads them back exactly."""

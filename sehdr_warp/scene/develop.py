@@ -15,7 +15,7 @@ from .camera import Camera
 from .capture import Capture, Shot, reinhard_gamma
 from .hdr_files import hdr_size, read_hdr
 from .images import EncodedImage, image_sizes, read_ldr, read_mask
-from .lens import Lens, Undistortion, area_average, limited_size
+from .lens import Lens, Undistortion, area_average
 from .linear_photos import float_codes, kind_of, linear_codes
 from .names import unique_names
 from .photo_file import PhotoKeeper
@@ -109,7 +109,7 @@ class _Developer:
                     self._last = working, Undistortion(working)
                 undistortion = self._last[1]
             full = undistortion.camera(shot.world_to_camera)
-        camera = full.resized(*limited_size(full.width, full.height, self.max_size))
+        camera = full.within(self.max_size)
 
         def warped(image: np.ndarray, values: Callable[[slice], np.ndarray] | None = None) -> np.ndarray:
             """[H, W] or [H, W, C] at the photo's size -> float32 at the camera's, undistorted; see area_average."""

@@ -136,12 +136,6 @@ class Undistortion:
         return done
 
 
-def limited_size(width: int, height: int, max_size: int | None) -> tuple[int, int]:
-    """The size with the longest side at most max_size pixels and the same aspect, rounded; never larger."""
-    scale = 1.0 if max_size is None else min(1.0, max_size / max(width, height))
-    return max(1, round(width * scale)), max(1, round(height * scale))
-
-
 def area_average(
     image: np.ndarray, width: int, height: int, values: Callable[[slice], np.ndarray] | None = None
 ) -> np.ndarray:

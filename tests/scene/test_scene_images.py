@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.scene.camera import limited_size
 from sehdr_warp.scene.hdr_files import hdr_size, read_hdr
 from sehdr_warp.scene.images import exif_of, image_sizes, open_image, read_ldr, read_mask
-from sehdr_warp.scene.lens import area_average, limited_size
+from sehdr_warp.scene.lens import area_average
 
 RNG = np.random.default_rng(1)
 
