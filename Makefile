@@ -15,7 +15,7 @@ PYTEST ?= -q -n auto --dist worksteal
 BIN = $(VENV)/bin
 PIP = $(BIN)/python -m pip --disable-pip-version-check install -qq --no-compile --constraint constraints.txt
 # On all cores, which pip does not. Not left to the first import: that of a full disk would leave half a file.
-COMPILE = $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true
+COMPILE = $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib sehdr_warp || true
 
 # Editable as one plain line in site-packages, which editors and type checkers can follow; setuptools' default is an import
 # hook, which they cannot. The links sehdr_warp/kernels and sehdr_warp/configs complete the package in a checkout.
