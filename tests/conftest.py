@@ -40,6 +40,14 @@ def own_cache(tmp_path_factory):
     os.environ["SEHDR_CACHE"] = str(tmp_path_factory.mktemp("cache"))
 
 
+@pytest.fixture(autouse=True, scope="session")
+def no_flushes():
+    """What tests write need not outlive a power cut: some ten thousand flushes of a disk take their time."""
+    real, os.fsync = os.fsync, lambda handle: None
+    yield
+    os.fsync = real
+
+
 @pytest.fixture(scope="session")
 def embedded_run(own_cache, tmp_path_factory) -> Path:
     """A very short training of the embedded scene, made through the command line; not to be changed."""
