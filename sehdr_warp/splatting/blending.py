@@ -94,8 +94,7 @@ def blend_on_cpu(
     scalar, emission = warp_scalar(features.dtype), lists.emission
     assert emission is not None, "sums in a fixed order need the entries as they were emitted"
     height, width, channels = image.shape
-    # How often the polynomial exponential halves its argument to reach down to log(alpha_threshold).
-    halvings = max(1, math.ceil(math.log2(-math.log(alpha_threshold) / 0.7)))
+    kind = scalar, channels, halvings(alpha_threshold)
     tile_count, pieces = lists.columns * lists.rows, balanced_pieces(lists)
 
     def rows(*shape):
@@ -105,7 +104,7 @@ def blend_on_cpu(
     frame = features, lists.columns, width, height, alpha_threshold, iota
     transmittance, last = rows(count), rows(count)
     launch(
-        blend_cpu.forward_kernel(scalar, channels, halvings),
+        blend_cpu.forward_kernel(*kind),
         tile_count,
         *(lists.ranges, lists.gaussians, *records, *frame),
         *(transmittance, rows(channels, count), last, image.view(-1, channels), left_over),
@@ -118,7 +117,7 @@ def blend_on_cpu(
         scratch = rows(count), rows(channels, count), rows(TILE_SIZE), rows(TILE_SIZE), rows(channels + 6)
         entry_gradients = features.new_empty(lists.entry_count, channels + 6)
         launch(
-            blend_cpu.backward_kernel(scalar, channels, halvings),
+            blend_cpu.backward_kernel(*kind),
             tile_count,
             *(lists.ranges, lists.gaussians, emission.places, *records, *frame, last),
             *(image_gradient.view(-1, channels), left_over_gradient, transmittance, *scratch, entry_gradients),
@@ -127,6 +126,11 @@ def blend_on_cpu(
         return gather_by_gaussian(emission, entry_gradients)
 
     return backward
+
+
+def halvings(alpha_threshold: float) -> int:
+    """How often the CPU's polynomial exponential halves its argument to reach down to log(alpha_threshold)."""
+    return max(1, math.ceil(math.log2(-math.log(alpha_threshold) / 0.7)))
 
 
 def balanced_pieces(lists: TileLists) -> list[tuple[int, int]]:

@@ -3,6 +3,7 @@
 import ctypes
 import math
 import threading
+from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
@@ -25,7 +26,9 @@ kernel_cache.check()
 
 _SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 _streams: dict[tuple[int, int], wp.Stream] = {}
-_loading = threading.Lock()  # Kernels are neither made, compiled nor loaded by two threads at once
+_loading = threading.Lock()  # Kernels that are launched are neither compiled nor loaded by two threads at once
+module_locks: defaultdict[Any, Any] = defaultdict(threading.Lock)
+"""Each is held while its Warp module is compiled or loaded, by ahead.py too."""
 
 
 def warp_scalar(dtype: torch.dtype) -> Any:
@@ -160,7 +163,7 @@ def _packed(kernel: Any, device: torch.device, block_dim: int | None, adjoint: b
         _of_thread.launches = {}
     key = kernel, device, block_dim, adjoint
     if key not in _of_thread.launches:
-        with _loading:
+        with _loading, module_locks[kernel.module]:
             _of_thread.launches[key] = _Packed(*key, dim, values)
     return _of_thread.launches[key]
 

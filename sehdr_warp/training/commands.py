@@ -171,25 +171,34 @@ def _train(asked: Train, ranks=None) -> None:
     options = config.response
     photos = {"device": "memory"}.get(config.schedule.photos, config.schedule.photos)
     given = {"method": options.method, "candidates": options.candidates, "photos": photos}
-    scene = _load(data, response=options.name, **given)
-    if out is None:
-        from .plan import make_plan
+    with nullcontext() if out is None or device.type != "cpu" else _kernels_ahead(config):
+        scene = _load(data, response=options.name, **given)
+        if out is None:
+            from .plan import make_plan
 
-        plan = make_plan(scene, config, device)
-        print(json.dumps(plan.to_dict()) if output.json else plan.table())
-        return
-    from ..console import follow
-    from ..viewer.commands import viewed
-    from .train import Training
+            plan = make_plan(scene, config, device)
+            print(json.dumps(plan.to_dict()) if output.json else plan.table())
+            return
+        from ..console import follow
+        from ..viewer.commands import viewed
+        from .train import Training
 
-    training = Training(
-        scene, out, config, device=device, tensorboard=output.tensorboard, data=data, ranks=ranks, **how
-    )
-    with viewed(training, str(out)) if output.view else nullcontext(training) as steps:
-        follow(steps, training.total)
+        training = Training(
+            scene, out, config, device=device, tensorboard=output.tensorboard, data=data, ranks=ranks, **how
+        )
+        with viewed(training, str(out)) if output.view else nullcontext(training) as steps:
+            follow(steps, training.total)
     run = training.run
     summary = run.summary() | {"run": str(run.path), "metrics": run.metrics()}
     print(json.dumps(summary) if output.json else _ending(run.path, summary))
+
+
+def _kernels_ahead(config):
+    """Compiles what a training by this config will launch, as far as it can be told."""
+    from ..splatting.ahead import loaded_ahead, training_kernels
+
+    plain = config.model.tone_map == "pixel" and not config.fusion.enabled
+    return loaded_ahead(training_kernels(3 if plain else None, config.model.antialiased))
 
 
 def run_presets(asked: Presets) -> None:
