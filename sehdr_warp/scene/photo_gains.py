@@ -11,6 +11,7 @@ from .types import Scene, View, codes_of, encoded_values
 FAINT, BRIGHT = 10 / 255, 245 / 255  # Encoded values within tell light; beyond, noise or less than all of it
 TIGHT = 1.0, 0.5, 0.25, 0.1, 0.05, 0.05
 """Differences of log light that count half, round by round: what is hidden, or shines, is to count nothing."""
+ROUNDS = 4  # Of the rough look
 NEGLIGIBLE = 0.01  # Of light: what differs by less is left as it is
 
 
@@ -27,6 +28,14 @@ class PhotoGains:
     def stops(self) -> float:
         """Deviation of the photos' gains, of the channel that varies most."""
         return float(np.log2(list(self.gains.values())).std(0).max()) if self.gains else 0.0
+
+    def stops_beside(self, views: Sequence[View]) -> float:
+        """Deviation of the gains of photos from what follows their exposure times: that a wrong curve makes."""
+        gains = np.log2([self.gains[view.name] for view in views])
+        times = np.log2([view.exposure_time for view in views])[:, None]
+        times = times - times.mean()
+        along = (times * gains).sum(0) / max(float((times**2).sum()), 1e-6)
+        return float((gains - times * along).std(0).max())
 
     @property
     def corners(self) -> float:
@@ -63,15 +72,41 @@ def start_gains(views: Sequence[View], response: Response) -> PhotoGains:
     return _of([view.name for view in views], np.array(found) - np.mean(found, 0))
 
 
-def fit_gains(views: Sequence[View], others: Sequence[View], points: np.ndarray, response: Response) -> PhotoGains:
+def rough_stops(views: Sequence[View], points: np.ndarray, seen: np.ndarray, response: Response) -> float:
+    """About the stops of fit_gains() in a small part of its time: means in turn over photos and over points, in which
+    what shines counts as all else does."""
+    light = _lights(views, points, seen, response)[0]
+    told = np.isfinite(light)
+    light, gains = np.where(told, light, 0.0), np.zeros((len(views), 1, 3))
+    for _ in range(ROUNDS):
+        surfaces = ((light - gains) * told).sum(0) / np.maximum(told.sum(0), 1)
+        gains = ((light - surfaces) * told).sum(1, keepdims=True) / np.maximum(told.sum(1, keepdims=True), 1)
+    return _of([view.name for view in views], gains[:, 0]).stops
+
+
+def disagreement(
+    views: Sequence[View], points: np.ndarray, seen: np.ndarray, response: Response, gains: PhotoGains | None = None
+) -> float:
+    """By how many stops photos differ, in the median, from the median of all that show a point; less their gains."""
+    light, radius = _lights(views, points, seen, response)
+    if gains is not None:
+        light += _power(radius, *gains.falloff)[..., None]
+        light -= np.log([gains.gains[view.name] for view in views])[:, None]
+    light = light[:, np.isfinite(light).any(0)]
+    return float(np.nanmedian(np.abs(light - np.nanmedian(light, 0))) / np.log(2))
+
+
+def fit_gains(
+    views: Sequence[View], others: Sequence[View], points: np.ndarray, seen: np.ndarray, response: Response
+) -> PhotoGains:
     """Gains and falloff by which photos show points [P, 3] of surfaces in one light: least squares of logarithms, in
-    which what disagrees counts ever less (Cauchy's weights). others: photos that take no part, and get their median."""
+    which what disagrees counts ever less (Cauchy's weights). others: photos that take no part, and get their median.
+    seen: [V + others, P] bool, which photos show a point: what lies before it is not known otherwise."""
     from scipy import sparse
     from scipy.sparse.linalg import lsmr
 
     names = [view.name for view in (*views, *others)]
-    light, radius = zip(*(_light(view, points, response) for view in (*views, *others)), strict=True)
-    light, radius = np.stack(light), np.stack(radius)  # [V, P, 3], nan where unknown; [V, P]
+    light, radius = _lights((*views, *others), points, seen, response)
     trained, count, most = light[: len(views)], len(points), len(views)
     view, point, channel = np.nonzero(np.isfinite(trained))
     values, r = trained[view, point, channel], radius[view, point]
@@ -117,6 +152,12 @@ def _radius(view: View) -> np.ndarray:
     height, width = view.codes.shape[:2]
     row, column = np.mgrid[:height, :width] + 0.5
     return (np.hypot(column - width / 2, row - height / 2) / np.hypot(width / 2, height / 2))[..., None]
+
+
+def _lights(views: Sequence[View], points, seen, response) -> tuple[np.ndarray, np.ndarray]:
+    """[V, P, 3], nan where unknown or not seen, and [V, P]: _light() of all."""
+    light, radius = zip(*(_light(view, points, response) for view in views), strict=True)
+    return np.where(seen[: len(views), :, None], np.stack(light), np.nan), np.stack(radius)
 
 
 def _light(view: View, points: np.ndarray, response: Response) -> tuple[np.ndarray, np.ndarray]:

@@ -48,10 +48,10 @@ class ModelConfig(_Table):
     initial_density: Annotated[float, Field(ge=0.0, le=1000.0)] = 20.0
     """Gaussians to start from, times the square root of the training photos' pixels: the scene's points and, up to so
     many, points matched between the photos; 0: the scene's points alone"""
-    photo_gains: Literal["unstated", "always", "never"] = "unstated"
+    photo_gains: Literal["auto", "unstated", "always", "never"] = "auto"
     """take out of the photos what the camera changed between them (exposure, white balance, falloff towards the
-    corners), where points that they share show that it did; unstated: where photos state no exposure times; needs the
-    plan and matched points"""
+    corners), where points that they share show that it did; auto: where photos state no exposure times, or times that
+    the points contradict; unstated: only where they state none; needs the plan and matched points"""
     start: str = ""
     """a file of Gaussians to start from in place of points, in the scene's coordinates: PLY, OpenUSD or glTF;
     empty: none"""

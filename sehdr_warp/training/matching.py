@@ -34,11 +34,13 @@ CHUNK = 1 << 20  # Costs held at one time
 @dataclass(frozen=True)
 class Matches:
     """points: [M, 3] world coordinates; colors: [M, 3] in [0, 1], encoded as the photos that show them; footprints: [M]
-    what a pixel of the photo covers there, world units. All float32 on the matcher's device."""
+    what a pixel of the photo covers there, world units; views: [M] int64, of which photo. The others are float32; all
+    on the matcher's device."""
 
     points: Tensor
     colors: Tensor
     footprints: Tensor
+    views: Tensor
 
 
 class Matcher:
@@ -53,9 +55,9 @@ class Matcher:
         tables = [_as_if(view.exposure_time / base, response) for view in views]
         matchable = made_ahead(lambda given: _matchable(*given), zip(views, tables, strict=True), len(views))
         self._images, cameras = zip(*matchable, strict=True)
-        self._masks = [view.mask for view in views]
+        self._cameras, self._masks = cameras, [view.mask for view in views]
         self.device = torch.device(device)
-        neighbors = _neighbors(cameras)
+        neighbors = _neighbors(cameras, cameras)
         self._photos = PhotoSet.of(self._images, cameras, neighbors, device)
         self.sizes = self._photos.sizes
         """[V, 2] int32: width and height at which the photos are matched."""
@@ -86,6 +88,14 @@ class Matcher:
         column_and_row, sizes = pixels[:, 1:], self.sizes[pixels[:, 0].long()]
         return ((column_and_row >= BORDER) & (column_and_row < sizes - BORDER)).all(1)
 
+    def near(self, others: Sequence[Camera]) -> np.ndarray:
+        """[V + len(others), V] bool: which photos were taken near each photo, and then near each of the other cameras,
+        and look the same way: the photo itself, and its neighbors."""
+        neighbors = _neighbors((*self._cameras, *others), self._cameras)
+        near = np.eye(len(neighbors), len(self._cameras) + 1, dtype=bool)
+        np.put_along_axis(near, neighbors, True, 1)  # -1 is the last.
+        return near[:, :-1]
+
     @torch.no_grad()
     def match(self, pixels: Tensor) -> Matches:
         """The points that pixels [N, 3] show, of those whose depth the photos agree on."""
@@ -101,7 +111,7 @@ class Matcher:
         points = (pose[:, :3, :3] @ local[:, :, None])[:, :, 0] + pose[:, :3, 3]
         place = self._photos.offsets[view] + row * self.sizes[view, 0] + column
         colors = self._photos.codes[place, :3].float() / 255
-        return Matches(points, colors, depth / fx)
+        return Matches(points, colors, depth / fx, view)
 
     def _depth(self, pixels: Tensor) -> Tensor:
         """[N] depths of pixels, between planes; 0 where none is to be trusted."""
@@ -171,12 +181,12 @@ def _one_for_each_square(chance: np.ndarray, side: float, rng: np.random.Generat
     return np.stack([np.full_like(row, view), column, row], 1)
 
 
-def _neighbors(cameras: Sequence[Camera]) -> np.ndarray:
-    """[V, NEIGHBORS] the nearest cameras that look the same way, -1 where there are no more."""
-    positions = np.stack([camera.position for camera in cameras])
-    axes = np.stack([camera.world_to_camera[2, :3] for camera in cameras])
-    distance = np.linalg.norm(positions[:, None] - positions, axis=2)
-    distance[(axes @ axes.T < LEAST_COSINE) | (distance == 0)] = np.inf
+def _neighbors(cameras: Sequence[Camera], others: Sequence[Camera]) -> np.ndarray:
+    """[V, NEIGHBORS] the nearest of others, elsewhere, that look the same way, -1 where there are no more."""
+    positions, others_positions = (np.stack([camera.position for camera in given]) for given in (cameras, others))
+    axes, others_axes = (np.stack([camera.world_to_camera[2, :3] for camera in given]) for given in (cameras, others))
+    distance = np.linalg.norm(positions[:, None] - others_positions, axis=2)
+    distance[(axes @ others_axes.T < LEAST_COSINE) | (distance == 0)] = np.inf
     nearest = np.argsort(distance, axis=1, kind="stable")[:, :NEIGHBORS]
     return np.where(np.isfinite(np.take_along_axis(distance, nearest, 1)), nearest, -1).astype(np.int32)
 

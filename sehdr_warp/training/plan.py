@@ -128,7 +128,8 @@ class Plan:
     def lines(self) -> list[str]:
         """One line for each decision that changes something, and for each field that stays."""
         made = [f"plan: {row.name}: {row.choice} ({row.reason})" for row in self.decisions if row.fields or row.told]
-        if self.facts.drift >= DRIFT:
+        evened = any(row.name == "photo-gains" and row.told for row in self.decisions)
+        if self.facts.drift >= DRIFT and not evened:
             spread = f"the photos' brightness differs by {self.facts.drift:.1f} stops and no exposure times are known"
             made.append(f"plan: {spread}: if exposure changed between them, give their times in exposures.json")
         return made + [f"plan: {line}, as given" for line in _stated(self.kept)]

@@ -27,7 +27,7 @@ from .following import hand_on, told_of_ranks
 from .held_out import evaluate_views, warn_of_fall
 from .initialization import choose_response, make_field, make_matcher, sizes_of
 from .machine import interruptible, machine_figures, pick_device, summary_writer, torch_settings
-from .photo_gains import decided, evens, find_gains
+from .photo_gains import evens, find_gains
 from .plan import apply_plan
 from .ranks import END, GO, WAIT, Ranks
 from .run import Run, field_from_checkpoint, load_run, photo_gains
@@ -317,8 +317,8 @@ class Training:
         response = choose_response(scene, config)
         matcher, gains = cache(partial(make_matcher, scene, response, self.device)), None
         if plan is not None and evens(scene, config, response):
-            gains, found = self.timed(partial(find_gains, scene, response, self.device))
-            matcher, plan = (lambda: found), plan.with_decision(decided(gains))
+            gains, found, decision = self.timed(partial(find_gains, scene, config, response, self.device))
+            matcher, plan = (lambda: found), plan.with_decision(decision)
         evened = self._even(scene, gains, response)
         field = self.timed(partial(make_field, evened, config, response, self.device, matcher))
         trainer = Trainer(evened, config, field, matcher, self.ranks)

@@ -8,7 +8,7 @@ import pytest
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View, codes_of
 from sehdr_warp.scene.camera import look_at
-from sehdr_warp.scene.photo_gains import PhotoGains, fit_gains, start_gains
+from sehdr_warp.scene.photo_gains import PhotoGains, disagreement, fit_gains, rough_stops, start_gains
 
 SIZE, PHOTOS = 48, 6
 SRGB = response_by_name("srgb")
@@ -49,20 +49,24 @@ def photographed(gains, falloff) -> Scene:
 
 def test_gains_and_falloff_are_found(gains, points):
     scene = photographed(gains, FALLOFF)
-    hidden = points.copy()
+    hidden, seen = points.copy(), np.ones((PHOTOS, len(points)), bool)
     hidden[::10, 2] = 2.0  # points that are none
-    found = fit_gains(scene.train_views, scene.test_views, hidden, SRGB)
+    hidden[1::2, 2], seen[1:, 1::2] = 7.0, False  # behind the wall, and known to be
+    found = fit_gains(scene.train_views, scene.test_views, hidden, seen, SRGB)
     for name, gain in gains.items():
         np.testing.assert_allclose(found.gains[name], gain, rtol=0.02)
     assert found.corners == pytest.approx(1 - np.exp(-sum(FALLOFF)), abs=0.03)
     assert found.stops > 0.3
     rough = start_gains(scene.train_views, SRGB)
     np.testing.assert_allclose([rough.gains[v.name] for v in scene.train_views], list(gains.values())[:-1], rtol=0.25)
+    assert rough_stops(scene.train_views, hidden, seen, SRGB) == pytest.approx(found.stops, rel=0.15)
+    before, after = (disagreement(scene.train_views, hidden, seen, SRGB, taken) for taken in (None, found))
+    assert after < 0.1 * before
 
 
 def test_photos_that_do_not_drift_have_no_gains(points):
     scene = photographed({}, (0.0, 0.0))
-    found = fit_gains(scene.train_views, scene.test_views, points, SRGB)
+    found = fit_gains(scene.train_views, scene.test_views, points, np.ones((PHOTOS, len(points)), bool), SRGB)
     assert found.stops < 0.02 and abs(found.corners) < 0.02
 
 

@@ -14,6 +14,7 @@ from sehdr_warp.training.train import Training
 from .wall_and_lamp import wall_and_lamp
 
 LINEAR = response_by_name("linear")
+CONFIG = load_config("default")
 TIMES = (1.0, 0.5, 1.4)
 SHORT = {"response.name": "linear", "schedule.iterations": 30, "plan.keep": ("schedule.iterations",)}
 
@@ -27,13 +28,23 @@ def drifting():
 
 def test_drift_is_found_where_there_is_some(device):
     scene, times = drifting()
-    gains, matcher = find_gains(scene, LINEAR, device)
+    gains, matcher, _ = find_gains(scene, CONFIG, LINEAR, device)
     found = np.array([gains.gains[view.name] for view in scene.views])
     np.testing.assert_allclose(
         found, np.repeat(np.array(times)[:, None], 3, 1) / np.exp(np.log(times).mean()), rtol=0.03
     )
     assert len(matcher.match(matcher.pixels(400, np.random.default_rng(0))).points) > 200
-    assert find_gains(wall_and_lamp(TIMES), LINEAR, device)[0] is None
+
+
+def test_stated_times_are_doubted_where_photos_contradict_them(device):
+    scene, _ = drifting()
+    gains, _, decision = find_gains(replace(scene, exposure_times_known=True), CONFIG, LINEAR, device)
+    assert gains.stops > 0.4 and "over the times they state" in decision.choice and decision.told
+    right = wall_and_lamp(TIMES)
+    # A curve that is not the photos' makes right times look wrong, and evened photos would not agree.
+    for curve in (LINEAR, response_by_name("gamma")):
+        gains, _, decision = find_gains(right, CONFIG, curve, device)
+        assert gains is None and "do not contradict" in decision.reason
 
 
 def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
@@ -53,4 +64,6 @@ def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
     resumed = Training(scene, tmp_path / "run", resume=True, device="cpu")
     for views in (training.scene.views, resumed.scene.views):
         assert [view.exposure_time for view in views] == pytest.approx([view.exposure_time for view in evened.views])
-    assert not evens(scene, load_config("default", {"model.photo_gains": "never"}), LINEAR)
+    for value, known, asked in (("never", False, False), ("unstated", True, False), ("unstated", False, True)):
+        config = load_config("default", {"model.photo_gains": value})
+        assert evens(replace(scene, exposure_times_known=known), config, LINEAR) == asked

@@ -11,7 +11,7 @@ import torch
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import Camera, codes_of
 from sehdr_warp.training.config_files import load_config, override_config
-from sehdr_warp.training.plan import RULES, apply_plan, cpu_step_seconds, make_plan, measure_scene
+from sehdr_warp.training.plan import RULES, Decision, apply_plan, cpu_step_seconds, make_plan, measure_scene
 from sehdr_warp.training.run_folder import RunFolder
 from sehdr_warp.training.train import train
 
@@ -88,8 +88,11 @@ def test_photos_whose_exposure_drifts_unsaid_get_a_line(scene):
     shares = iter(np.linspace(0.1, 0.9, len(scene.views)))
     drifting = with_images(scene, lambda view: np.full_like(view.image, 0.02) + view.image * next(shares))
     for known, told in ((False, 1), (True, 0)):
-        lines = make_plan(replace(drifting, exposure_times_known=known), config_of()).lines()
-        assert len([line for line in lines if "no exposure times" in line and "exposures.json" in line]) == told
+        plan = make_plan(replace(drifting, exposure_times_known=known), config_of())
+        found = plan.with_decision(Decision("photo-gains", {}, "taken out of the photos", "", told=True))
+        for given, count in ((plan, told), (found, 0)):
+            lines = [line for line in given.lines() if "no exposure times" in line and "exposures.json" in line]
+            assert len(lines) == count
     plain = make_plan(replace(scene, exposure_times_known=False), config_of())
     assert not any("exposure times" in line for line in plain.lines())
 
@@ -207,7 +210,7 @@ def test_values_that_the_scene_contradicts_are_refused_with_both(scene, changes,
 def test_a_training_follows_its_plan_and_keeps_it(scene, tmp_path):
     config = config_of(schedule__iterations=12, plan__keep=["schedule.iterations"])
     run = train(scene, tmp_path / "run", config, device="cpu")
-    assert [decision["name"] for decision in run.folder.read_decisions()] == list(RULES)
+    assert [decision["name"] for decision in run.folder.read_decisions()] == [*RULES, "photo-gains"]
     assert run.config == make_plan(scene, config).config
     assert run.summary()["plan"]["brackets"] == "plain scaling"
     # Asking again for the same plan resumes; without one the old plan goes with the old run.
