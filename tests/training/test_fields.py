@@ -32,7 +32,7 @@ FIELDS = [
     ("gradient", "densification.prune_opacity", 0.3),
     ("gradient", "densification.grow_gradient", 5e-3),
     ("gradient", "densification.grow_scale", 1.0),
-    ("gradient", "densification.prune_scale", 0.01),
+    ("gradient", "densification.prune_scale", 0.04),
 ]
 
 
