@@ -1,6 +1,7 @@
 """A training's kernels for the CPU, compiled while its photos are read: the compiler takes a quarter of a minute for
 them, once on each machine, and a second to find them in the cache."""
 
+import importlib
 import logging
 import threading
 from collections.abc import Iterator, Sequence
@@ -38,24 +39,25 @@ def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
 
 
 @contextmanager
-def loaded_ahead(kernels: Sequence[Any]) -> Iterator[None]:
-    """Compiles kernels for the CPU, or finds them in the cache, on a thread beside this block, which waits for one of
-    them at most, at its end. What cannot be compiled is told to whoever launches it."""
+def loaded_ahead(kernels: Sequence[Any], modules: Sequence[str] = ()) -> Iterator[None]:
+    """Imports modules and compiles kernels for the CPU, or finds them in the cache, on a thread beside this block,
+    which waits for one of them at most, at its end. What fails is told to whoever needs it."""
     over = threading.Event()
 
     def work() -> None:
         if over.wait(PATIENCE):
             return
-        for kernel in kernels:
-            if over.is_set():
-                return
-            try:
+        try:
+            for name in modules:
+                importlib.import_module(name)
+            for kernel in kernels:
+                if over.is_set():
+                    return
                 with module_locks[kernel.module]:
                     check_room_to_compile()
                     wp.load_module(kernel.module, device="cpu")
-            except Exception:
-                log.debug("a kernel could not be loaded ahead", exc_info=True)
-                return
+        except Exception:
+            log.debug("not all could be loaded ahead", exc_info=True)
 
     # Not a daemon: what compiles while the interpreter ends would abort the process.
     thread = threading.Thread(target=work, name="sehdr-warp compiles")

@@ -198,7 +198,8 @@ def _kernels_ahead(config):
     from ..splatting.ahead import loaded_ahead, training_kernels
 
     plain = config.model.tone_map == "pixel" and not config.fusion.enabled
-    return loaded_ahead(training_kernels(3 if plain else None, config.model.antialiased))
+    kernels = training_kernels(3 if plain else None, config.model.antialiased)
+    return loaded_ahead(kernels, ["scipy.spatial"])  # Half a second, at the first Gaussians' neighbors.
 
 
 def run_presets(asked: Presets) -> None:
