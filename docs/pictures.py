@@ -17,8 +17,9 @@ from PIL import Image, ImageChops
 
 import sehdr_warp as sw
 from sehdr_warp.output.camera_paths import interpolate
+from sehdr_warp.output.comparison import compare
 from sehdr_warp.output.images import as_array, quantize
-from sehdr_warp.output.report import compare, comparison_figure
+from sehdr_warp.output.report import comparison_figure
 from sehdr_warp.synth.expose import expose, exposure_ladder
 
 PICTURES = Path(__file__).parent / "images"

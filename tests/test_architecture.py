@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -92,6 +93,20 @@ def test_imports_go_down_the_line(path, room):
             assert fits, f"{room} may not import {name}"
         if top in ONLY_IN and room in ALLOWED:
             assert room in ONLY_IN[top], f"{room} may not import {name}"
+
+
+def test_no_files_import_each_other():
+    """Nor by way of others, nor within functions."""
+    files = {}
+    for path in (PACKAGE / "__init__.py", *(parameter.values[0] for parameter in sources())):
+        parts = path.relative_to(PACKAGE if PACKAGE in path.parents else ROOT).with_suffix("").parts
+        files[".".join(["sehdr_warp", *parts]).removesuffix(".__init__")] = path
+
+    def file_of(name):
+        return name if name in files else file_of(name.rpartition(".")[0]) if name else None
+
+    graph = {name: {file_of(imported) for imported in imports(path)} - {None, name} for name, path in files.items()}
+    TopologicalSorter(graph).prepare()  # Else CycleError names them.
 
 
 def test_kernels_import_warp_only():

@@ -4,7 +4,6 @@ stops, error against time."""
 import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,9 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Scene, View
 
 from ..files import atomic_path, check_absent
-from .camera_paths import evenly, interpolate
+from .camera_paths import evenly
 from .charts import PANELS, QUIET, STYLE, training_chart, training_points
-from .images import as_array
-from .light_pictures import photo_light, shown_photo
+from .comparison import Comparison, compare
 from .report_page import STOPS, report_page
 from .report_page import seconds as _seconds
 from .report_page import stops_text as _stops
@@ -25,23 +23,6 @@ from .tonemap import expose, fit_tone_map
 
 DARKER = -4
 """Stops at which photo, scene and truth stand side by side: what was clipped tells them apart."""
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """One view of the report, all [H, W, 3] radiance but where said.
-
-    photo: encoded, in [0, 1]. from_photo: what the photo alone gives, its response undone. hdr: rendered. confidence:
-    [H, W] in [0, 1] of the render, if it was measured. new: rendered half-way to the nearest other view, if any.
-    """
-
-    name: str
-    photo: np.ndarray
-    from_photo: np.ndarray
-    hdr: np.ndarray
-    truth: np.ndarray | None = None
-    confidence: np.ndarray | None = None
-    new: np.ndarray | None = None
 
 
 def write_report(
@@ -157,17 +138,6 @@ def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, ce
                 axes.set_ylabel(name if column == places[0] else "", fontsize=8.5)
         figure.supxlabel(textwrap.fill(caption, round(16 * width)), x=0.02, ha="left", fontsize=8.5, color=QUIET)
         return figure
-
-
-def compare(run, view: View, views: Sequence[View]) -> Comparison:
-    """What comparison_figure shows of a view of the scene whose views are `views`."""
-    confidence, hdr, new = run.render_confidence(view.camera), as_array(run.render(view.camera).hdr), None
-    others = [other.camera for other in views if other.name != view.name]
-    if others:
-        nearest = min(others, key=lambda camera: float(np.linalg.norm(camera.position - view.camera.position)))
-        new = as_array(run.render(interpolate([view.camera, nearest], 3)[1]).hdr)
-    confidence = None if confidence is None else as_array(confidence)
-    return Comparison(view.name, shown_photo(run, view), photo_light(run, view), hdr, view.hdr, confidence, new)
 
 
 def _caption(views: Sequence[View], metrics: Sequence[dict], held_out: bool) -> str:

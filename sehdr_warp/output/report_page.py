@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from sehdr_warp.scene import Scene
 from sehdr_warp.scene.camera import limited_size
 from sehdr_warp.scene.lens import area_average
 
+from .comparison import Comparison
 from .diagrams import camera_map, training_svg
 from .light_pictures import (
     dial,
@@ -26,9 +27,6 @@ from .light_pictures import (
 from .tonemap import expose, fit_tone_map
 from .ultra_hdr import MOST_STOPS, ultra_hdr
 
-if TYPE_CHECKING:
-    from .report import Comparison
-
 STOPS = (-4, -2, 0, 2, 4)
 _PICTURE, _DIAL, _STRIP = 880, 420, 220  # Longest sides of pictures, pixels
 _MOST_PHOTOS = 6  # With unexplained regions
@@ -38,8 +36,8 @@ SPACE = "\N{NARROW NO-BREAK SPACE}"
 def report_page(
     run: Any,
     scene: Scene,
-    comparisons: Sequence["Comparison"],
-    brightest: "Comparison",
+    comparisons: Sequence[Comparison],
+    brightest: Comparison,
     *,
     held_out: bool,
     evaluation: Mapping[str, Any] | None = None,
@@ -113,7 +111,7 @@ def _header(run: Any, scene: Scene) -> str:
     )
 
 
-def _pictures(run: Any, comparisons: Sequence["Comparison"], times: Mapping[str, float], held_out: bool) -> str:
+def _pictures(run: Any, comparisons: Sequence[Comparison], times: Mapping[str, float], held_out: bool) -> str:
     """Photo, scene and truth, two at a time with a slider between them."""
     figures, gain = [], display_gain(run.response)
     for each in comparisons:
@@ -145,7 +143,7 @@ def _pictures(run: Any, comparisons: Sequence["Comparison"], times: Mapping[str,
     )
 
 
-def _brackets(shown: "Comparison", time: float, gain: float) -> str:
+def _brackets(shown: Comparison, time: float, gain: float) -> str:
     sources = {"Photo alone": shown.from_photo, "Scene": shown.hdr, "Truth": shown.truth}
     known = {name: light for name, light in sources.items() if light is not None}
     lights = {name: smaller(light * time, _DIAL) for name, light in known.items()}
@@ -164,7 +162,7 @@ def _brackets(shown: "Comparison", time: float, gain: float) -> str:
     return _section("Brackets", lead, body)
 
 
-def _confidence(comparisons: Sequence["Comparison"]) -> str:
+def _confidence(comparisons: Sequence[Comparison]) -> str:
     figures = [
         _figure(
             img(jpeg(smaller(np.repeat(each.confidence[..., None], 3, 2), 560)), f"confidence of {each.name}", size),
@@ -269,7 +267,7 @@ def _table(evaluation: Mapping[str, Any] | None, held_out: bool) -> str:
     return _section("Figures", f"{split}.{told}", body)
 
 
-def _map(run: Any, comparisons: Sequence["Comparison"]) -> str:
+def _map(run: Any, comparisons: Sequence[Comparison]) -> str:
     tone_map = fit_tone_map([each.hdr for each in comparisons])
     lead = (
         'From above, as the photos see it. <span style="color: var(--accent)">Amber</span>: trained on. '

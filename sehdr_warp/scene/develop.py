@@ -14,11 +14,12 @@ from ..parallel import made_ahead
 from .camera import Camera
 from .capture import Capture, Shot, reinhard_gamma
 from .hdr_files import hdr_size, read_hdr
-from .images import EncodedImage, image_sizes, read_ldr, read_mask
+from .images import EncodedImage, read_mask
 from .lens import Lens, Undistortion, area_average
 from .linear_photos import float_codes, kind_of, linear_codes
 from .names import unique_names
 from .photo_file import PhotoKeeper
+from .photos import photo_sizes, read_photo
 from .types import Scene, View, codes_of
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ def as_photographed(shot: Shot, *, oriented: bool = False) -> EncodedImage:
     if not shot.derived and kind_of(shot.image) == "float":
         return EncodedImage(float_codes(read_hdr(shot.image), shot.seconds), None)
     if not shot.derived:
-        read = read_ldr(shot.image, oriented=oriented)
+        read = read_photo(shot.image, oriented=oriented)
         return EncodedImage(linear_codes(read.pixels / read.levels), read.alpha) if shot.linear else read
     return EncodedImage(codes_of(reinhard_gamma(read_hdr(shot.image) * shot.seconds), 8), None)
 
@@ -174,7 +175,7 @@ def fitted_lens(shot: Shot) -> tuple[Lens, bool]:
     and stored pixels win where both do. Whole-number reductions of the camera's size (images_2 ...) are taken.
     """
     lens = shot.lens
-    stored, turned = image_sizes(shot.image)
+    stored, turned = photo_sizes(shot.image)
     choices = [(stored, False), (turned, True)] if shot.oriented is None else [(turned, True)]
     for factor in range(1, 17):
         for (width, height), oriented in choices:

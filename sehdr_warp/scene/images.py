@@ -54,14 +54,6 @@ class EncodedImage:
 
 def image_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     """The photo's size in its file and after its EXIF orientation, each (width, height); errors as open_image."""
-    if path.suffix.lower() in RAW_SUFFIXES:
-        from .linear_photos import raw_sizes
-
-        return raw_sizes(path)
-    if path.suffix.lower() in HDR_SUFFIXES:
-        from .hdr_files import hdr_size
-
-        return hdr_size(path), hdr_size(path)
     with open_image(path) as image:
         width, height = image.size
         return image.size, (height, width) if _orientation(image) in (5, 6, 7, 8) else image.size
@@ -71,17 +63,9 @@ def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> Encod
     """Decode a photo; 16-bit files keep their 16 bits, palettes and grey become RGB.
 
     oriented: turn the pixels as the EXIF orientation says. mask: one bit a pixel is enough.
-    RAW files become 16-bit codes of the sensor's colors, float pictures 8-bit ones at an exposure of their own; see
-    linear_photos.py.
 
     Raises InputError where the file is missing, damaged, truncated, of another kind, or larger than MAX_PIXELS.
     """
-    if path.suffix.lower() in (*RAW_SUFFIXES, *HDR_SUFFIXES):
-        from . import linear_photos
-
-        raw = path.suffix.lower() in RAW_SUFFIXES
-        codes = linear_photos.raw_codes(path, oriented=oriented) if raw else linear_photos.tone_mapped(path)
-        return EncodedImage(codes, None)
     with open_image(path, mask=mask) as image:
         try:
             pixels, alpha = _decode(image, path)

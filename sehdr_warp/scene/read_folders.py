@@ -11,10 +11,11 @@ from ..files import contained, read_bytes, read_json
 from .capture import NO_POINTS, Capture, Cloud, Shot, pose_from_camera_to_world
 from .colmap_model import SparseModel, find_model, read_model
 from .exposure import parse_seconds
-from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES, image_sizes
+from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 from .lens import Lens
 from .linear_photos import color_matrix, one_kind
 from .names import list_images, mask_of, natural_key, sibling, view_and_exposure
+from .photos import photo_sizes
 from .sfm import reconstruct
 
 # From the full size to reduced copies.
@@ -190,7 +191,7 @@ def read_photos(folder: Path, cache: Path | str | None = None) -> Capture:
     if len(photos) < 2:
         raise InputError(photos[0], "is the only photo; one view does not show depth", "add photos from other places")
     for photo in photos:
-        image_sizes(photo)
+        photo_sizes(photo)
     if kind == "raw":
         color_matrix(photos)  # Photos of several cameras are refused before minutes of matching.
     model, shots, lost = reconstruct(photos, cache), [], []

@@ -12,9 +12,10 @@ from ..files import contained, read_json
 from .capture import DERIVED_PHOTOS, NO_POINTS, Capture, Cloud, Shot, pose_from_camera_to_world
 from .colmap_model import find_model, read_ply_points, read_points
 from .exposure import parse_seconds
-from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES, image_sizes
+from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 from .lens import Lens
 from .names import sibling
+from .photos import photo_sizes
 
 _REMEDY = "correct the file or export it again"
 _INCOMPLETE = "copy the whole set"
@@ -160,7 +161,7 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
     if width is None or height is None:
         if image is None:
             raise InputError(path, "states no image size", "add w and h")
-        width, height = image_sizes(image)[0]
+        width, height = photo_sizes(image)[0]
     fx, fy = focal("fl_x", "camera_angle_x", width), focal("fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
         raise InputError(path, "states no focal length", "add camera_angle_x (radians, below pi) or fl_x (pixels)")

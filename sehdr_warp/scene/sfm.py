@@ -24,7 +24,8 @@ from ..errors import InputError, SehdrError
 from ..files import atomic_folder, is_sealed, usable, user_cache
 from .colmap_model import SparseModel, read_model
 from .develop import told
-from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image, read_ldr
+from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
+from .photos import read_photo
 
 _log = logging.getLogger("sehdr_warp.scene")
 
@@ -119,7 +120,7 @@ def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tup
     folder.mkdir()
     sizes, small, shown = [], [], False
     for i, photo in told("reading photos", photos):
-        codes = read_ldr(photo, oriented=True).pixels
+        codes = read_photo(photo, oriented=True).pixels
         image = Image.fromarray(codes if codes.dtype == np.uint8 else (codes >> 8).astype(np.uint8))
         image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
         sizes.append(codes.shape[1::-1])

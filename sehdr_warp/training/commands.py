@@ -180,7 +180,7 @@ def _train(asked: Train, ranks=None) -> None:
             print(json.dumps(plan.to_dict()) if output.json else plan.table())
             return
         from ..console import follow
-        from ..viewer.commands import viewed
+        from ..viewer.live import viewed
         from .train import Training
 
         training = Training(

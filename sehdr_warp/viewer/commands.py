@@ -1,11 +1,9 @@
 """The command line of `sehdr-warp view`. torch is imported when it runs."""
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 from tyro.conf import Positional
@@ -29,26 +27,6 @@ class View:
     """cpu or cuda:N; by default the first GPU if there is one."""
     data: str | None = None
     """The photos, if they have moved since the training."""
-
-
-@contextmanager
-def viewed(training: Any, name: str) -> Iterator[Iterator]:
-    """The steps of a Training, while a server shows it."""
-    from threading import Thread
-
-    from .live import LiveTraining
-    from .server import Server, Viewer
-
-    live = LiveTraining(training, name)
-    photos = {view.name: view for view in training.scene.views}
-    with Server(Viewer([live], lambda index: photos, live)) as server:
-        log.info("%s shows the training", server.url)
-        Thread(target=server.serve_forever, daemon=True).start()
-        try:
-            yield live.attend()
-        finally:
-            live.ended = True
-            server.shutdown()
 
 
 def run_view(asked: View) -> None:

@@ -1,9 +1,11 @@
 """A training as the viewer shows it: pictures are made between its steps, by the thread that trains."""
 
+import logging
 import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -13,6 +15,9 @@ from sehdr_warp.scene import Camera
 from ..console import format_seconds
 from ..errors import SehdrError
 from .frames import Rendering
+from .server import Server, Viewer
+
+log = logging.getLogger(__name__)
 
 SHARE = 0.1
 """Of the time goes to pictures, at most."""
@@ -145,3 +150,18 @@ class _Picture:
         except Exception as error:  # noqa: BLE001  It is raised where it was asked for.
             self.error = error
         self.made.set()
+
+
+@contextmanager
+def viewed(training: Any, name: str) -> Iterator[Iterator]:
+    """The steps of a Training, while a server shows it."""
+    live = LiveTraining(training, name)
+    photos = {view.name: view for view in training.scene.views}
+    with Server(Viewer([live], lambda index: photos, live)) as server:
+        log.info("%s shows the training", server.url)
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            yield live.attend()
+        finally:
+            live.ended = True
+            server.shutdown()

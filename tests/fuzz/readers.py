@@ -28,8 +28,9 @@ from sehdr_warp.scene import load_cameras, load_scene
 from sehdr_warp.scene.colmap_model import read_ply_points
 from sehdr_warp.scene.exposure import exif_exposure
 from sehdr_warp.scene.hdr_files import hdr_size, read_exr_channels, read_hdr
-from sehdr_warp.scene.images import image_sizes, read_ldr, read_mask
+from sehdr_warp.scene.images import read_mask
 from sehdr_warp.scene.linear_photos import color_matrix, raw_exposure
+from sehdr_warp.scene.photos import photo_sizes, read_photo
 from sehdr_warp.scene.read_folders import read_colmap, read_hdr_nerf_real, read_llff
 from sehdr_warp.scene.read_transforms import read_hdr_nerf, read_transforms
 from sehdr_warp.splats import USD_SUFFIXES, GaussianArrays, read_gaussians, write_gaussians
@@ -261,7 +262,7 @@ def _load(folder: Path):
 
 
 def _read_photo(path: Path):
-    return read_ldr(path, oriented=True)
+    return read_photo(path, oriented=True)
 
 
 def _read_matrix(path: Path):
@@ -294,8 +295,8 @@ READERS = {
     "ply-points": Reader(_points, ("*.ply",), each(read_ply_points), text=True, cost=0.5),
     "exr": Reader(_exr, ("*.exr",), each(hdr_size, read_hdr, read_exr_channels)),
     "radiance": Reader(_radiance, ("*.hdr",), each(read_hdr), cost=0.5),
-    "photos": Reader(_photos, ("*",), each(image_sizes, read_mask, exif_exposure, _read_photo), cost=1.2),
-    "raw": Reader(_raw, ("*",), each(image_sizes, raw_exposure, _read_matrix, _read_photo), cost=2),
+    "photos": Reader(_photos, ("*",), each(photo_sizes, read_mask, exif_exposure, _read_photo), cost=1.2),
+    "raw": Reader(_raw, ("*",), each(photo_sizes, raw_exposure, _read_matrix, _read_photo), cost=2),
     "config": Reader(_config, ("*.toml",), each(load_config), text=True, cost=0.6),
     "run": Reader(_run, _RUN_FILES, _read_run, text=True, repair=_resign, cost=5),
     "checkpoint": Reader(_run, ("checkpoints/*/*",), _read_run, text=True, repair=_resign, cost=4),

@@ -4,7 +4,8 @@ from PIL import Image
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.output.charts import training_chart
-from sehdr_warp.output.report import Comparison, compare, comparison_figure, stops_figure, write_report
+from sehdr_warp.output.comparison import Comparison, compare
+from sehdr_warp.output.report import comparison_figure, stops_figure, write_report
 from sehdr_warp.output.tonemap import encode_srgb
 from sehdr_warp.scene import Scene, View, codes_of
 

@@ -11,8 +11,7 @@ import pytest
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.training.train import Training, train
-from sehdr_warp.viewer.commands import viewed
-from sehdr_warp.viewer.live import SHARE, LiveTraining
+from sehdr_warp.viewer.live import SHARE, LiveTraining, viewed
 
 from ..training.toy import toy_scene
 from .browser import browser

@@ -1,0 +1,40 @@
+"""One view beside its photo: what a report shows of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sehdr_warp.scene import View
+
+from .camera_paths import interpolate
+from .images import as_array
+from .light_pictures import photo_light, shown_photo
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A view, all [H, W, 3] radiance but where said.
+
+    photo: encoded, in [0, 1]. from_photo: what the photo alone gives, its response undone. hdr: rendered. confidence:
+    [H, W] in [0, 1] of the render, if it was measured. new: rendered half-way to the nearest other view, if any.
+    """
+
+    name: str
+    photo: np.ndarray
+    from_photo: np.ndarray
+    hdr: np.ndarray
+    truth: np.ndarray | None = None
+    confidence: np.ndarray | None = None
+    new: np.ndarray | None = None
+
+
+def compare(run, view: View, views: Sequence[View]) -> Comparison:
+    """A view of a run beside its photo; views: all of the scene."""
+    confidence, hdr, new = run.render_confidence(view.camera), as_array(run.render(view.camera).hdr), None
+    others = [other.camera for other in views if other.name != view.name]
+    if others:
+        nearest = min(others, key=lambda camera: float(np.linalg.norm(camera.position - view.camera.position)))
+        new = as_array(run.render(interpolate([view.camera, nearest], 3)[1]).hdr)
+    confidence = None if confidence is None else as_array(confidence)
+    return Comparison(view.name, shown_photo(run, view), photo_light(run, view), hdr, view.hdr, confidence, new)
