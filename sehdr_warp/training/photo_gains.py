@@ -15,6 +15,9 @@ POINTS, FEW_POINTS = 1500, 500  # That are looked for, and for a rough look
 LEAST_STOPS, LEAST_CORNERS = 0.15, 0.15
 """Drift, and part of the light that corners lack, from which photos are evened: less is within the fit's own error on
 scenes that shine."""
+LEAST_DISAGREEMENT = 0.12
+"""Stops by which photos differ in the median from which drift is one: matches that slide along a clear sky differ by
+less, and gains explain them well."""
 LEFT, LEFT_OF_STATED = 0.9, 0.6
 """Part of the photos' disagreement that may be left when they are evened. Over stated times only drift that explains
 much is believed: a wrong curve, and what shines, look like some."""
@@ -77,7 +80,8 @@ def _find(scene: Scene, response: Response, device, stated: bool) -> tuple[Photo
     if gains.stops < LEAST_STOPS and gains.corners < LEAST_CORNERS:
         return None, matcher
     before, left = (disagreement(views, *found, response, taken) for taken in (None, gains))
-    if left > (LEFT_OF_STATED if stated else LEFT) * before:
+    smooth = gains.corners < LEAST_CORNERS and before < LEAST_DISAGREEMENT
+    if smooth or left > (LEFT_OF_STATED if stated else LEFT) * before:
         return None, matcher
     matcher = make(gains.even(scene, response))
     gains = fit_gains(views, others, *points_of(matcher), response)

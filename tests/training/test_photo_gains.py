@@ -11,7 +11,7 @@ from sehdr_warp.training.photo_gains import evens, find_gains
 from sehdr_warp.training.run import load_run
 from sehdr_warp.training.train import Training
 
-from .wall_and_lamp import wall_and_lamp
+from .wall_and_lamp import photographed, wall_and_lamp
 
 LINEAR = response_by_name("linear")
 CONFIG = load_config("default")
@@ -45,6 +45,17 @@ def test_stated_times_are_doubted_where_photos_contradict_them(device):
     for curve in (LINEAR, response_by_name("gamma")):
         gains, _, decision = find_gains(right, CONFIG, curve, device)
         assert gains is None and "do not contradict" in decision.reason
+
+
+def test_a_clear_sky_is_no_drift(device):
+    """Matches slide along it, and gains would explain well what little they differ by."""
+
+    def light_at(_, rays):
+        away = rays / np.linalg.norm(rays, axis=-1, keepdims=True) - [0.3, 0.2, 0.9]
+        return 0.04 + 0.6 * np.exp(-(away**2).sum(-1, keepdims=True) / 0.2) * [0.7, 0.8, 1]
+
+    scene = replace(photographed(light_at, turn=0.3), exposure_times_known=False)
+    assert find_gains(scene, CONFIG, LINEAR, device)[0] is None
 
 
 def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
