@@ -193,6 +193,32 @@ def tile_kernels(dtype) -> SimpleNamespace:
     )
 
 
+@wp.kernel(module="unique", module_options={"enable_backward": False})
+def count_tiles(first: int, tiles: wp.array(dtype=wp.int32), size: int, counts: wp.array2d(dtype=wp.int32)):
+    """counts[c, t], of zeros: how many entries of chunk c, `size` of them, are tile t's. Covers [0, chunks)."""
+    chunk = first + wp.tid()
+    for entry in range(chunk * size, wp.min((chunk + 1) * size, tiles.shape[0])):
+        counts[chunk, tiles[entry]] = counts[chunk, tiles[entry]] + 1
+
+
+@wp.kernel(module="unique", module_options={"enable_backward": False})
+def place_entries(
+    first: int,
+    tiles: wp.array(dtype=wp.int32), given: wp.array(dtype=wp.int32), size: int, starts: wp.array2d(dtype=wp.int32),
+    gaussians: wp.array(dtype=wp.int32), places: wp.array(dtype=wp.int32),
+):
+    """Puts the Gaussians `given` by entry where starts[c, t], counted up, says, and the entry's own place beside it, if
+    there is room for any. Covers [0, chunks)."""
+    chunk = first + wp.tid()
+    for entry in range(chunk * size, wp.min((chunk + 1) * size, tiles.shape[0])):
+        tile = tiles[entry]
+        slot = starts[chunk, tile]
+        starts[chunk, tile] = slot + 1
+        gaussians[slot] = given[entry]
+        if places.shape[0] > 0:
+            places[slot] = entry
+
+
 @cache
 def ranges_kernel(key, shift: int):
     """find_ranges for sorted keys, wp.int32 or wp.int64, whose tile is above their lowest `shift` bits.

@@ -13,7 +13,7 @@ from .checks import check_opacities, check_tensors
 from .launching import launch, warp_scalar
 from .memory import memory_told
 from .threads import even_ranges
-from .tile_lists import Emission, checked_room, depth_order, find_ranges, sort_by_tile
+from .tile_lists import Emission, checked_room, depth_order, lists_by_tile
 
 _PIXELS = TILE_SIZE * TILE_SIZE
 
@@ -127,9 +127,9 @@ def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, emission: b
     starts = (ends - counts).int()
     tiles, gaussians = (torch.empty(2 * room, dtype=torch.int32, device=order.device) for _ in range(2))
     launch(kernel, count * bool(room), *frame, starts, counts, tiles, gaussians, smallest=256)
-    tiles, gaussians, places = sort_by_tile(tiles, gaussians, room, columns * rows, emission)
+    ranges, gaussians, places = lists_by_tile(tiles, gaussians, room, columns * rows, emission)
     by_gaussian = None if places is None else Emission(order.clone(), ends, places)
-    return _Lists(directions, columns, find_ranges(tiles, columns * rows), gaussians, by_gaussian)
+    return _Lists(directions, columns, ranges, gaussians, by_gaussian)
 
 
 class _Blend(torch.autograd.Function):

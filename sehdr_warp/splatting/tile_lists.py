@@ -11,12 +11,14 @@ from ..errors import SehdrError
 from ..kernels import tiles as kernels
 from ..kernels.constants import TILE_SIZE
 from ..kernels.tiles import tile_kernels
+from ..parallel import thread_count
 from .launching import launch, torch_stream, warp_scalar
 from .threads import torch_threads
 
 LARGEST_CAPACITY = 2**31 - 1  # Entries are counted in int32
 ONE_SORT = 1 << 18
 """Up to so many Gaussians lists are made by one sort on a GPU, which then waits for the host rather than for memory."""
+SMALLEST_CHUNK = 1 << 14  # Of entries, that are worth handing to another thread
 
 
 @dataclass(frozen=True)
@@ -112,14 +114,15 @@ def build_tile_lists(
     padded = capacity is not None
     if order is None:
         touched = *records, extents, depths, columns, rows
-        sorted_keys, gaussians = sort_keys(*emit_keys(*touched, ends, room, padded), room, tile_count)
+        keys, gaussians = sort_keys(*emit_keys(*touched, ends, room, padded), room, tile_count)
+        ranges = find_ranges(keys, tile_count)
     else:
         touched = order, *records, extents, columns, rows
         tiles, gaussians = emit_entries(*touched, ends, room, padded)
-        sorted_keys, gaussians, places = sort_by_tile(tiles, gaussians, room, tile_count, emission)
+        ranges, gaussians, places = lists_by_tile(tiles, gaussians, room, tile_count, emission)
         by_gaussian = None if places is None else Emission(order.clone(), ends, places)
         total = total.clone()
-    return TileLists(find_ranges(sorted_keys, tile_count), gaussians, by_gaussian, width, height, overflow, total)
+    return TileLists(ranges, gaussians, by_gaussian, width, height, overflow, total)
 
 
 def pack_records(
@@ -198,18 +201,40 @@ def emit_keys(shapes, ellipses, extents, depths, columns: int, rows: int, ends, 
     return keys, gaussians
 
 
-def sort_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: bool):
-    """Stable sort of emit_entries()'s by tile: tiles [M], in the same memory, and copied out of it, which is kept,
-    Gaussians [M] and where each entry stood before [M] or None."""
+def lists_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: bool):
+    """A stable sort of emit_entries()'s by tile: the tiles' ranges as find_ranges() gives them, Gaussians [M], and
+    where each entry stood before [M] or None."""
+    by_device = _count_by_tile if tiles.device.type == "cpu" else _sort_by_tile
+    return by_device(tiles, gaussians, entry_count, tile_count, emission)
+
+
+def _sort_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: bool):
     bits = tile_count.bit_length()
     if not emission:
         _sort_pairs(tiles, gaussians, entry_count, bits)
-        return tiles[:entry_count], gaussians[:entry_count].clone(), None
+        return find_ranges(tiles[:entry_count], tile_count), gaussians[:entry_count].clone(), None
     places = torch.empty(2 * entry_count, dtype=torch.int32, device=tiles.device)
     torch.arange(entry_count, dtype=torch.int32, device=tiles.device, out=places[:entry_count])
     _sort_pairs(tiles, places, entry_count, bits)
     places = places[:entry_count].clone()
-    return tiles[:entry_count], _taken(gaussians[:entry_count], places) if entry_count else gaussians, places
+    ranges = find_ranges(tiles[:entry_count], tile_count)
+    return ranges, gaussians[:entry_count][places] if entry_count else gaussians, places
+
+
+def _count_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: bool):
+    """By counting, each thread a few chunks of the entries: within a tile those of the first chunk come first."""
+    tiles, gaussians = tiles[:entry_count], gaussians[:entry_count]
+    chunks = max(1, min(2 * thread_count(), entry_count // SMALLEST_CHUNK))
+    counts = torch.zeros(chunks, tile_count + 1, dtype=torch.int32)
+    size, spans = -(-entry_count // chunks), [(chunk, chunk + 1) for chunk in range(chunks)]
+    launch(kernels.count_tiles, chunks, tiles, size, counts, ranges=spans)
+    by_tile = counts.t().reshape(-1)
+    starts = (by_tile.cumsum(0) - by_tile).int().view(tile_count + 1, chunks).t().contiguous()
+    ranges = torch.stack([starts[0, :-1], starts[0, 1:]], 1)
+    sorted_ones = torch.empty_like(gaussians)
+    places = torch.empty(entry_count if emission else 0, dtype=torch.int32)
+    launch(kernels.place_entries, chunks, tiles, gaussians, size, starts, sorted_ones, places, ranges=spans)
+    return ranges, sorted_ones, places if emission else None
 
 
 def _taken(values: Tensor, places: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from sehdr_warp.kernels.tiles import DEPTH_BITS
+from sehdr_warp.splatting import tile_lists
 from sehdr_warp.splatting.tile_lists import (
     build_tile_lists,
     depth_order,
@@ -114,3 +115,21 @@ def test_lists_keep_no_more_memory_than_they_use(device, emission, spare):
     by_gaussian = entries + 3 * 500 if emission else 0
     one_sort = 0 if emission else 4 * entries + 8 * 500 - 8
     assert kept_bytes(lists) == 4 * (2 * COLUMNS * ROWS + entries + by_gaussian) + total_and_overflow + one_sort
+
+
+@pytest.mark.parametrize("emission", [True, False])
+@pytest.mark.parametrize("count, chunks", [(0, 1), (1, 3), (5000, 7)])
+def test_entries_counted_by_chunks_are_those_sorted(monkeypatch, count, chunks, emission):
+    monkeypatch.setattr(tile_lists, "SMALLEST_CHUNK", max(1, count // chunks))
+    monkeypatch.setenv("SEHDR_THREADS", str(chunks))
+    generator, tiles = torch.Generator().manual_seed(count), 40
+    # Some belong to no tile, and some tiles have none.
+    given = [torch.randint(3, tiles + 1, (2 * count,), generator=generator, dtype=torch.int32)]
+    given.append(torch.randint(1000, (2 * count,), generator=generator, dtype=torch.int32))
+    both = [
+        function(*(tensor.clone() for tensor in given), count, tiles, emission)
+        for function in (tile_lists._count_by_tile, tile_lists._sort_by_tile)
+    ]
+    for ours, sorted_ones in zip(*both, strict=True):
+        assert (ours is None) == (sorted_ones is None)
+        assert ours is None or torch.equal(ours, sorted_ones[: len(ours)])
