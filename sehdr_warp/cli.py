@@ -31,8 +31,8 @@ COMMANDS = {
     "what there is to choose from": {
         "presets": ("training.commands", "Presets", "run_presets"),
         "config": ("training.commands", "ShowConfig", "run_config"),
-        "calibrate": ("response.commands", "Calibrate", "run_calibrate"),
-        "responses": ("response.commands", "Responses", "run_responses"),
+        "calibrate": ("scene.commands", "Calibrate", "run_calibrate"),
+        "responses": ("scene.commands", "Responses", "run_responses"),
         "scenes": ("scene.commands", "Scenes", "run_scenes"),
     },
     "measure and make": {

@@ -71,16 +71,16 @@ def test_every_command_explains_itself(name, capsys):
     assert f"sehdr-warp {name}" in text and "None" not in text
 
 
-@pytest.mark.parametrize("words", ["train", "--help"])
-def test_help_is_quick_and_needs_no_torch(words):
-    """Under a second of processor time, in one of three tries: how long that takes is a matter of what else runs."""
-    code = f"import sys, time; from sehdr_warp import cli\ntry: cli.main(['{words}', '--help'])\n"
+@pytest.mark.parametrize("words, most", [("train --help", 1.0), ("--help", 1.0), ("completion bash", 2.0)])
+def test_help_is_quick_and_needs_no_torch(words, most):
+    """Seconds of processor time, in one of three tries: how long that takes is a matter of what else runs."""
+    code = f"import sys, time; from sehdr_warp import cli\ntry: cli.main({words.split()})\n"
     code += "except SystemExit: print('torch' in sys.modules, time.process_time())"
     for _ in range(3):
         out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
         torch, seconds = out.split()[-2:]
         assert torch == "False"
-        if float(seconds) < 1.0:
+        if float(seconds) < most:
             return
     pytest.fail(f"{seconds} s")
 
@@ -157,7 +157,7 @@ def test_a_training_ends_by_saying_what_to_type_next(run, capsys):
 
 
 def test_fields_named_on_the_command_line_override_the_preset_and_stay(capsys):
-    line = "train embedded --plan-only --json --max-size 40 --iterations 5000"
+    line = "train embedded --plan-only --json --max-size 40 --iterations 5000 --response srgb"
     assert call(*line.split(), "--loss.ssim_weight=0.3") == 0
     plan = json.loads(capsys.readouterr().out)
     fields = {path: value for decision in plan["decisions"] for path, value in decision["fields"].items()}

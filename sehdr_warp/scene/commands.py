@@ -1,7 +1,11 @@
-"""The command line of `sehdr-warp scenes`."""
+"""The command lines of `sehdr-warp scenes`, `responses` and `calibrate`. torch is imported when they run."""
 
 import json
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
 
 
 @dataclass(frozen=True)
@@ -12,9 +16,55 @@ class Scenes:
     """Print them as JSON."""
 
 
+@dataclass(frozen=True)
+class Responses:
+    """List the camera responses that have a name, and what each is for."""
+
+    json: bool = False
+    """Print them as JSON."""
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Measure a camera's response from an exposure stack: photos of one still scene at several exposure times."""
+
+    stack: Positional[Path]
+    """Folder of photos; their times come from EXIF, exposures.json or --exposures."""
+    out: Path
+    """CSV file for the curve, for --response; a plot goes beside it (.png)."""
+    exposures: str | None = None
+    """Times in the order of the files' names, such as 1/500,1/125,1/30."""
+    channel: Literal["red", "green", "blue"] | None = None
+    """One channel alone; by default one curve for all three."""
+    overwrite: bool = False
+    """Replace files that exist."""
+
+
 def run_scenes(asked: Scenes) -> None:
     """Prints the names; `embedded` alone is embedded:room."""
     from . import embedded_scenes
 
     names = [f"embedded:{name}" for name in embedded_scenes()]
     print(json.dumps(names) if asked.json else "\n".join(names))
+
+
+def run_responses(asked: Responses) -> None:
+    from ..response import response_names
+
+    names = response_names()
+    if asked.json:
+        print(json.dumps(names))
+        return
+    names["colour:NAME"] = "a camera's encoding of colour-science, such as colour:S-Log3"
+    names["FILE"] = "a curve in CSV, JSON or EMoR's layout, FILE:INDEX of DoRF's; `sehdr-warp calibrate` makes one"
+    for name, meaning in names.items():
+        print(f"{name:<12}  {meaning}")
+
+
+def run_calibrate(asked: Calibrate) -> None:
+    from ..field.exposure import seconds
+    from .stack import calibrate
+
+    times = None if asked.exposures is None else seconds(asked.exposures, "--exposures")
+    calibrate(asked.stack, times=times, channel=asked.channel, out=asked.out, overwrite=asked.overwrite)
+    print(f"{asked.out}: take it with --response {asked.out}; the plot is {asked.out.with_suffix('.png')}")
