@@ -181,9 +181,8 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     """The whole file; raises InputError where it is missing, unreadable, empty or larger than `limit` bytes."""
     try:
         if (size := plain_size(path)) > limit:
-            raise InputError(
-                path, f"{size} bytes is more than the limit of {limit}", "check that this is the right file"
-            )
+            problem = f"{size} bytes is more than the limit of {limit}"
+            raise InputError(path, problem, "check that this is the right file")
         data = path.read_bytes()
     except OSError as error:
         problem = "file not found" if isinstance(error, FileNotFoundError) else f"cannot be read ({error.strerror})"
@@ -204,7 +203,8 @@ def read_text(path: Path, limit: int = MAX_FILE_BYTES) -> str:
 def read_lines(path: Path) -> Iterator[str]:
     """The lines of a file of UTF-8 text, one by one; raises InputError as read_text does, and for a line too long."""
     try:
-        plain_size(path) or read_bytes(path)  # Which refuses an empty one.
+        if plain_size(path) == 0:
+            read_bytes(path)  # It refuses an empty one.
         with open(path, encoding="utf-8-sig") as file:
             while line := file.readline(_MAX_LINE):
                 if len(line) == _MAX_LINE:
