@@ -1,7 +1,6 @@
 """New Gaussians where the photos are explained worst, at the depths that the photos agree on."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -12,7 +11,6 @@ from ..splats.arrays import HARMONIC_0
 from .matching import Matcher
 from .targets import TrainingView
 
-VIEWS = 2  # Photos that are looked at for each change
 MOST = 500  # Gaussians that are born at a change
 OPACITY = 0.5  # Of one that is born: it must be seen to be shaped
 LEAST_ERROR = 0.02  # Mean difference of encoded values from which a pixel is not explained
@@ -20,16 +18,15 @@ LEAST_ERROR = 0.02  # Mean difference of encoded values from which a pixel is no
 
 @torch.no_grad()
 def born_rows(
-    field: RadianceField, matcher: Matcher, views: Sequence[TrainingView], count: int, degree: int, seed: int
+    field: RadianceField, matcher: Matcher, shown: Tensor, view: TrainingView, index: int, count: int, seed: int
 ) -> dict[str, Tensor]:
     """Rows of up to `count` Gaussians, as Gaussians.append takes them: of pixels drawn by the square of their error.
 
-    matcher: of the photos in `views`. degree: of the harmonics that renders take. The same seed gives the same rows.
+    shown: [H, W, 3] encoded, the scene from `view`. matcher: of the training photos, in which that of the view
+    is the one at `index`. The same seed gives the same rows.
     """
     rng = np.random.default_rng(seed)
-    chosen = rng.permutation(len(views))[:VIEWS]
-    pixels = [_unexplained(field, matcher, views[k], int(k), min(count, MOST) // VIEWS, degree, rng) for k in chosen]
-    found = matcher.match(torch.cat(pixels))
+    found = matcher.match(_unexplained(shown.clamp(0, 1), matcher, view, index, min(count, MOST), rng))
     start = torch.from_numpy(field.color_model.start(found.colors.cpu().numpy(), field.response))
     rest = field.gaussians.harmonics_rest
     count = len(found.points)
@@ -43,9 +40,8 @@ def born_rows(
     }
 
 
-def _unexplained(field, matcher: Matcher, view: TrainingView, index: int, count: int, degree: int, rng) -> Tensor:
+def _unexplained(photo: Tensor, matcher: Matcher, view: TrainingView, index: int, count: int, rng) -> Tensor:
     """[up to count, 3] pixels of a photo, as the matcher takes them."""
-    photo = field.photograph(view.camera, view.exposure_time, degree=degree).encoded.clamp(0, 1)
     error = (photo - view.target.encoded).abs().mean(2, keepdim=True)
     if view.target.mask is not None:
         error = error * view.target.mask

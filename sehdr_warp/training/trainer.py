@@ -87,6 +87,7 @@ class Trainer:
         self._launched: set = set()
         self._capacity = GraphCapacity(self.device)
         self._loss: Tensor | None = None
+        self._shown: Tensor | None = None  # What the last step compared with its photo
         self._last_index = 0
 
     @property
@@ -139,12 +140,12 @@ class Trainer:
         kind = (self.degree, watched, gaussians.count < EXACT_BELOW, gaussians.count <= ONE_SORT)
         self._last_index, count = index, gaussians.count
         if self._can_record(views, kind):
-            self._loss = self._replay(views, index, watched, kind)
+            self._loss, self._shown = self._replay(views, index, watched, kind)
             if isinstance(views, PhotoStream):
                 views.used(self._following())
         else:
             with self._launching():
-                self._loss = self._step(lambda: self._gradients(views[index], watched), self._apply)
+                self._loss, self._shown = self._step(lambda: self._gradients(views[index], watched), self._apply)
         self.densification.perturb(self.iteration, gaussians, rate)
         if self._change() and self._recorder is not None:
             # Other Gaussians need about so many times the room.
@@ -195,15 +196,18 @@ class Trainer:
         """New Gaussians where the photos are explained worst; of the iteration alone, so that a resumed training has
         the same."""
         seed = self.config.seed * SEED_STEP + self.iteration
+        assert self._shown is not None
+        view = self._training_views()[self._last_index]
         with self._launching():
-            return born_rows(self.field, self._matcher(), self._training_views(), count, self.degree, seed)
+            shown = self._shown if self._encoded else self.field.response.encode_extended(self._shown)
+            return born_rows(self.field, self._matcher(), shown, view, self._last_index, count, seed)
 
-    def _step(self, gradients: Callable[[], "_Seen"], apply: Callable[["_Seen"], Tensor]) -> Tensor:
-        """Gradients, of all ranks, and the step that they make; its loss."""
+    def _step(self, gradients: Callable[[], "_Seen"], apply: Callable[["_Seen"], Tensor]) -> tuple[Tensor, Tensor]:
+        """Gradients, of all ranks, and the step that they make; its loss, and the image that it compared."""
         seen = gradients()
         if self.ranks is not None and self._flat is not None:
             self.ranks.mean(self._flat.buffer)
-        return apply(seen)
+        return apply(seen), seen.image
 
     def _gradients(self, view: TrainingView, watched: bool, capacity: int | None = None) -> "_Seen":
         """Photograph, compare, differentiate. With a capacity all of it works on fixed memory and nothing waits for the
@@ -220,6 +224,8 @@ class Trainer:
         if watched:
             rendering.means2d.retain_grad()
         loss = data_loss(self.field, photo, target, self.config.loss, self._largest_truth)
+        image = photo.encoded if self._encoded else photo.light
+        assert image is not None
         del photo, target, view
         loss = regularised(loss, self.field, self.config.loss)
         loss.backward()
@@ -229,7 +235,7 @@ class Trainer:
             harmonics = HarmonicsGradients(shown.grad[None], camera.position[None], means, self.degree)
         if self.ranks is not None:
             self._flattened().take(loss, rendering.overflow, harmonics)
-        return _Seen(loss.detach(), rendering, camera.width, camera.height, watched, capacity, harmonics)
+        return _Seen(loss.detach(), image.detach(), rendering, watched, capacity, harmonics)
 
     def _apply(self, seen: "_Seen") -> Tensor:
         """The step that gradients make; its loss. Nothing waits for the device."""
@@ -238,7 +244,7 @@ class Trainer:
             loss, incomplete, harmonics = self._flat.give()
         nonfinite, made = adam.guarded_step(self.optimizer, loss, incomplete, harmonics)
         if seen.watched:
-            self.densification.observe(rendering, seen.width, seen.height, made)
+            self.densification.observe(rendering, *seen.image.shape[1::-1], made)
         self.optimizer.zero_grad()
         self._skipped += nonfinite
         if seen.capacity is None:
@@ -268,7 +274,7 @@ class Trainer:
         """Launched work shares stream and memory with recorded steps."""
         return nullcontext() if self._recorder is None else self._recorder.launching()
 
-    def _replay(self, views: ViewStack | PhotoStream, index: int, watched: bool, kind) -> Tensor:
+    def _replay(self, views: ViewStack | PhotoStream, index: int, watched: bool, kind) -> tuple[Tensor, Tensor]:
         capacity = self._capacity.capacity()
         self._index.fill_(index)
         if isinstance(views, PhotoStream):
@@ -382,13 +388,13 @@ class Trainer:
 
 @dataclass(frozen=True)
 class _Seen:
-    """What the second half of a step knows of the first: its own loss, what was rendered and at what size, whether the
-    densification watches, the room for pairs, and the gradients by the harmonics where no parameter has them."""
+    """What the second half of a step knows of the first: its own loss, the image [H, W, 3] that it compared, what was
+    rendered, whether the densification watches, the room for pairs, and the gradients by the harmonics where no
+    parameter has them."""
 
     loss: Tensor
+    image: Tensor
     rendering: Rendering
-    width: int
-    height: int
     watched: bool
     capacity: int | None
     harmonics: HarmonicsGradients | None
