@@ -97,7 +97,7 @@ def test_photos_whose_exposure_drifts_unsaid_get_a_line(scene):
     assert not any("exposure times" in line for line in plain.lines())
 
 
-def test_rates_of_a_short_training_are_raised_once_and_those_given_stay(scene):
+def test_rates_of_a_short_training_are_raised_once_and_those_given_stay(scene, facts):
     short = {"schedule__iterations": 1000, "plan__keep": ["schedule.iterations", "optimizer.means"]}
     plan = make_plan(scene, config_of(**short))
     rates, usual = plan.config.optimizer, config_of().optimizer
@@ -106,6 +106,10 @@ def test_rates_of_a_short_training_are_raised_once_and_those_given_stay(scene):
     assert (rates.means, rates.harmonics_dc) == (usual.means, usual.harmonics_dc)
     enough = make_plan(scene, config_of(schedule__iterations=30_000, plan__keep=["schedule.iterations"]))
     assert enough.config.optimizer == usual
+    few, many = (
+        RULES["rates"](replace(facts, photos=n), config_of(schedule__iterations=1000), CPU)[0] for n in (40, 41)
+    )
+    assert few and not many
 
 
 def test_a_cpu_gets_the_iterations_that_fit_into_minutes(facts, monkeypatch):
