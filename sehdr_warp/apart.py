@@ -62,7 +62,8 @@ def main(module: str, name: str, path: str, memory: str) -> int:
             import resource
 
             used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-            resource.setrlimit(resource.RLIMIT_AS, (used + int(memory),) * 2)
+            most = used + int(memory)
+            resource.setrlimit(resource.RLIMIT_AS, (most, most))
         packed = io.BytesIO()
         np.savez(packed, **read(Path(path)))
         with open(1, "wb", closefd=False) as out:

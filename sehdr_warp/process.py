@@ -2,6 +2,7 @@
 nobody. What a program says of its work never ends the work; what is asked of it, on standard output, fails in one line.
 """
 
+import io
 import os
 import signal
 import sys
@@ -53,7 +54,7 @@ def prepare() -> None:
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", encoding="utf-8", closefd=False))
     for number, stream in ((1, sys.stdout), (2, sys.stderr)):
-        if hasattr(stream, "reconfigure"):
+        if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
         setattr(sys, ("stdout", "stderr")[number - 1], _Stream(stream, number, asked=number == 1))
     os.environ["MPLBACKEND"] = "agg"  # Pictures go to files, whatever a shell was set up for.

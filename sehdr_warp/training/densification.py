@@ -96,14 +96,17 @@ class GradientDensification(Densification):
 
     @torch.no_grad()
     def observe(self, rendering: Rendering, width: int, height: int, usable: Tensor) -> None:
-        statistics = self.gradient_sum, self.seen
-        add_gradient_statistics(rendering.means2d.grad, rendering.radii, usable, width, height, *statistics)
+        gradients, total, seen = rendering.means2d.grad, self.gradient_sum, self.seen
+        assert gradients is not None and total is not None and seen is not None
+        add_gradient_statistics(gradients, rendering.radii, usable, width, height, total, seen)
 
     @torch.no_grad()
     def change(self, iteration: int, gaussians: Gaussians, optimizer, generator, births: Births | None = None) -> bool:
-        changed = self._is_due(iteration) and self.gradient_sum is not None
-        if changed:
-            self._grow(gaussians, self.gradient_sum / self.seen.clamp_min(1), optimizer, generator)
+        total, seen = self.gradient_sum, self.seen
+        changed = False
+        if self._is_due(iteration) and total is not None and seen is not None:
+            changed = True
+            self._grow(gaussians, total / seen.clamp_min(1), optimizer, generator)
             self._prune(gaussians, optimizer, oversized=iteration > self.reset_every)
             self.gradient_sum = self.seen = None
         if self._resets(iteration):
@@ -152,7 +155,8 @@ class GradientDensification(Densification):
             gaussians.keep(~unwanted, optimizer)
 
     def state(self) -> dict[str, Tensor]:
-        return {} if self.gradient_sum is None else {"gradient_sum": self.gradient_sum, "seen": self.seen}
+        given = {"gradient_sum": self.gradient_sum, "seen": self.seen}
+        return {name: values for name, values in given.items() if values is not None}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         self.gradient_sum, self.seen = state.get("gradient_sum"), state.get("seen")

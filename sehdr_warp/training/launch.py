@@ -34,8 +34,10 @@ def launch(count: int, run: Callable[[list[str]], None], words: list[str]) -> No
         try:
             while True:
                 for rank in [context.sentinels[sentinel] for sentinel in wait(context.sentinels)]:
-                    context.processes[rank].join()
-                    code = context.processes[rank].exitcode
+                    process = context.processes[rank]
+                    assert process is not None
+                    process.join()
+                    code = process.exitcode or 0
                     # Before the others are waited for: they would tell less.
                     if code < 0 and store.add("ended", 1) == 1:
                         killed = f"rank {rank} of {count} was killed ({signal.Signals(-code).name})"

@@ -79,6 +79,7 @@ def image_loss(prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str
 def ldr_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor:
     """L_LDR, on the target's scale, and where the camera saturated only as far as the photo can tell."""
     image = photo.light if target.scale.mu else photo.encoded
+    assert image is not None
     seen, truth = clipped_residual(image, target.codes, target.scale, target.index)
     return image_loss(seen, truth, target.mask, config.form, config.ssim_weight)
 
@@ -112,6 +113,7 @@ def linear_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor
     if truth is None and photo.base is photo.exposure:
         return None
     # The base follows: without the detached side both would settle on what is easiest to agree on.
+    assert photo.exposure is not None and photo.base is not None
     truth = photo.exposure.detach() if truth is None else truth
     return image_loss(photo.base, truth, target.mask, config.form, config.ssim_weight)
 
@@ -119,8 +121,9 @@ def linear_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor
 def hdr_loss(photo: Photograph, target: Target, config: LossConfig, largest: float) -> Tensor:
     """The HDR color's exposure against the true one, both divided by the greatest of all views, in the mu-law. HDR-GS
     divides each image by its own maximum, and with that leaves the scale of the scene open."""
-    images = photo.exposure / largest, target.exposure_truth / largest
-    return image_loss(*(mu_law(image, 1.0) for image in images), target.mask, config.form, config.ssim_weight)
+    assert photo.exposure is not None and target.exposure_truth is not None
+    shown, truth = (mu_law(image / largest, 1.0) for image in (photo.exposure, target.exposure_truth))
+    return image_loss(shown, truth, target.mask, config.form, config.ssim_weight)
 
 
 def needed_colours(config: LossConfig, has_truth: bool) -> frozenset[str]:
@@ -143,8 +146,9 @@ def data_loss(
     if config.linear_weight > 0:
         linear = linear_loss(photo, target, config)
         loss = loss if linear is None else loss + config.linear_weight * linear
-    if config.anchor_weight > 0:
+    if config.anchor_weight > 0 and isinstance(field.response, ToneMapper):
         loss = loss + config.anchor_weight * anchor_loss(field.response)
+    assert isinstance(loss, Tensor), "a config without any loss is refused"
     return loss
 
 

@@ -28,7 +28,7 @@ def make_optimizer(field: RadianceField, config: Config, extent: float, batch: i
     groups = [{"name": name, "params": [getattr(field.gaussians, name)], "lr": rate} for name, rate in rates.items()]
     if field.fusion is not None:
         groups.append({"name": "fusion", "params": list(field.fusion.parameters()), "lr": config.optimizer.fusion})
-    if field.response.learnable:
+    if isinstance(field.response, torch.nn.Module):
         learned = list(field.response.parameters())
         groups.append({"name": "response", "params": learned, "lr": config.optimizer.response})
     for group in groups:

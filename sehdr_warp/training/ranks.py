@@ -63,7 +63,7 @@ class Ranks:
         """Finds the others; raises SehdrError where they run other versions."""
         with self._together():
             backend = "nccl" if self._cuda else "gloo"
-            given = {"device_id": self.device} if self._cuda else {}
+            given: dict[str, Any] = {"device_id": self.device} if self._cuda else {}
             given |= {"store": self.store, "rank": self.rank, "world_size": self.count}
             dist.init_process_group(backend, timeout=_EVER, **given)
             # What hosts say to each other must not wait for their devices.
@@ -132,7 +132,8 @@ class Ranks:
     def share(self, value: Any, size: int) -> None:
         """From rank 0: hands a value of about so many bytes on, whose large arrays all ranks then read in one file."""
         self._photos = PhotoFile(size + (1 << 30))
-        self.store.set("shared", pickle.dumps(self._photos.share(value)))
+        # It takes bytes, whatever its stub says.
+        self.store.set("shared", pickle.dumps(self._photos.share(value)))  # pyright: ignore[reportArgumentType]
 
     def shared(self) -> Any:
         """On the others: what rank 0 shares, however long it takes to read its photos; None where there is nothing."""

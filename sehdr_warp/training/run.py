@@ -224,7 +224,7 @@ def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) ->
     try:
         gaussians = Gaussians(*(checkpoint.tensors[f"gaussians.{name}"] for name in PARAMETER_NAMES))
         field = assemble_field(gaussians, config, Response.from_dict(info["response"]), info["base_time"])
-        learned = field.response if field.response.learnable else None
+        learned = field.response if isinstance(field.response, torch.nn.Module) else None
         for name, part in (("fusion.", field.fusion), ("response.", learned)):
             if part is not None:
                 part.load_state_dict(under(checkpoint.tensors, name))

@@ -64,14 +64,14 @@ class ViewStack:
         return len(self.cameras)
 
     def __getitem__(self, index: int) -> TrainingView:
-        time = self.times if isinstance(self.times, float) else float(self.times[index])
+        time = float(self.times[index]) if isinstance(self.times, Tensor) else self.times
         view = self._view(lambda values: values[index], time)
         return replace(view, target=replace(view.target, codes=self.targets.codes[index]))
 
     def at(self, index: Tensor) -> TrainingView:
         """The view whose number is in index [1], int64, on the views' device. The photo stays in the stack until it is
         asked for: here taking is copying."""
-        time = self.times if isinstance(self.times, float) else one_of(self.times, index)
+        time = one_of(self.times, index) if isinstance(self.times, Tensor) else self.times
         view = self._view(lambda values: one_of(values, index), time)
         return replace(view, target=replace(view.target, index=index))
 
@@ -90,14 +90,14 @@ def largest_truth(scene: Scene, loss: LossConfig) -> float:
         return 1.0
     field = f"loss.hdr_weight = {loss.hdr_weight}" if loss.hdr_weight > 0 else "loss.hdr_truth = true"
     remedy = "take a scene with HDR truth, or a preset that needs none"
-    given = [view for view in scene.train_views if view.hdr is not None]
+    given = [(view.hdr, view.mask) for view in scene.train_views if view.hdr is not None]
     lacking = [view.name for view in scene.train_views if view.hdr is None]
     if not given:
         raise InputError(scene.name, f"no training view has the HDR truth that {field} needs", remedy)
     if loss.ldr_weight == 0 and lacking:
         problem = f"view {lacking[0]} lacks the HDR truth that {field} needs where loss.ldr_weight = 0.0"
         raise InputError(scene.name, problem, remedy)
-    counted = (view.hdr if view.mask is None else view.hdr[view.mask > 0] for view in given)
+    counted = (hdr if mask is None else hdr[mask > 0] for hdr, mask in given)
     largest = max((float(radiance.max()) for radiance in counted if radiance.size), default=0.0)
     if not largest > 0:
         raise InputError(scene.name, f"the HDR truth that {field} needs is black in every training view", remedy)

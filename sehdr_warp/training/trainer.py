@@ -106,6 +106,7 @@ class Trainer:
         view = self._training_views()[self._last_index]
         with self._launching():
             photo = self.field.photograph(view.camera, view.exposure_time, degree=self.degree).encoded
+        assert photo is not None
         return float(-10 * (photo.clamp(0, 1) - view.target.encoded).square().mean().clamp_min(1e-10).log10())
 
     def render(self, camera: Camera) -> RenderedView:
@@ -139,7 +140,7 @@ class Trainer:
         # The last: few are ordered otherwise, and a learned response encodes few otherwise, by kernels of their own.
         kind = (self.degree, watched, gaussians.count < EXACT_BELOW, gaussians.count <= ONE_SORT)
         self._last_index, count = index, gaussians.count
-        if self._can_record(views, kind):
+        if isinstance(views, ViewStack | PhotoStream) and self._can_record(views, kind):
             self._loss, self._shown = self._replay(views, index, watched, kind)
             if isinstance(views, PhotoStream):
                 views.used(self._following())
@@ -193,8 +194,7 @@ class Trainer:
                 recorder.invalidate()
 
     def _births(self, count: int) -> dict[str, Tensor]:
-        """New Gaussians where the photos are explained worst; of the iteration alone, so that a resumed training has
-        the same."""
+        """New Gaussians where the step's photo is explained worst; a resumed training has the same."""
         seed = self.config.seed * SEED_STEP + self.iteration
         assert self._shown is not None
         view = self._training_views()[self._last_index]
@@ -230,24 +230,25 @@ class Trainer:
         loss = regularised(loss, self.field, self.config.loss)
         loss.backward()
         harmonics = None
-        if self._factored:
+        if self._factored and shown is not None and shown.grad is not None:
             means = self.field.gaussians.means
             harmonics = HarmonicsGradients(shown.grad[None], camera.position[None], means, self.degree)
         if self.ranks is not None:
             self._flattened().take(loss, rendering.overflow, harmonics)
-        return _Seen(loss.detach(), image.detach(), rendering, watched, capacity, harmonics)
+        return _Seen(loss.detach(), image.detach(), rendering, watched, harmonics)
 
     def _apply(self, seen: "_Seen") -> Tensor:
         """The step that gradients make; its loss. Nothing waits for the device."""
-        rendering, loss, incomplete, harmonics = seen.rendering, seen.loss, seen.rendering.overflow, seen.harmonics
+        rendering, loss, harmonics, (height, width, _) = seen.rendering, seen.loss, seen.harmonics, seen.image.shape
+        incomplete = rendering.overflow
         if self._flat is not None:
             loss, incomplete, harmonics = self._flat.give()
         nonfinite, made = adam.guarded_step(self.optimizer, loss, incomplete, harmonics)
         if seen.watched:
-            self.densification.observe(rendering, *seen.image.shape[1::-1], made)
+            self.densification.observe(rendering, width, height, made)
         self.optimizer.zero_grad()
         self._skipped += nonfinite
-        if seen.capacity is None:
+        if rendering.pair_count is None or incomplete is None:
             self._capacity.launched(rendering.entry_count)
         else:
             self._capacity.note(rendering.pair_count, incomplete)
@@ -260,9 +261,9 @@ class Trainer:
             self._flat = adam.FlatGradients(self.optimizer, self.rank, self.batch, factored=self._factored)
         return self._flat
 
-    def _can_record(self, views, kind) -> bool:
-        """Whether this step can be a recorded one: on a GPU, photos of one size, after a step like it was launched."""
-        if self._recorder is None or not isinstance(views, ViewStack | PhotoStream):
+    def _can_record(self, views: ViewStack | PhotoStream, kind) -> bool:
+        """Whether a step on photos of one size can be recorded: on a GPU, after a step like it was launched."""
+        if self._recorder is None:
             return False
         if self.field.color_model.encoded and not isinstance(views.times, float):
             return False
@@ -275,7 +276,8 @@ class Trainer:
         return nullcontext() if self._recorder is None else self._recorder.launching()
 
     def _replay(self, views: ViewStack | PhotoStream, index: int, watched: bool, kind) -> tuple[Tensor, Tensor]:
-        capacity = self._capacity.capacity()
+        capacity, recorder, follower = self._capacity.capacity(), self._recorder, self._follower
+        assert recorder is not None
         self._index.fill_(index)
         if isinstance(views, PhotoStream):
             views.bring(index)
@@ -284,12 +286,11 @@ class Trainer:
             return self._gradients(views.at(self._index), watched, capacity)
 
         try:
-            if self._follower is None:
-                return self._recorder.run(kind, lambda: self._step(gradients, self._apply))
+            if follower is None:
+                return recorder.run(kind, lambda: self._step(gradients, self._apply))
             self._flattened()  # Not in the recording's own memory.
-            follower = self._follower
             return self._step(
-                lambda: self._recorder.run(kind, gradients),
+                lambda: recorder.run(kind, gradients),
                 lambda seen: follower.run(kind, lambda: self._apply(seen)),
             )
         except RuntimeError as error:
@@ -314,10 +315,11 @@ class Trainer:
 
     def state(self) -> tuple[dict[str, Tensor], dict]:
         """Named tensors and plain values that together are the whole state."""
+        response = self.field.response
         parts = {
             "gaussians": self.field.gaussians.tensors(),
             "fusion": {} if self.field.fusion is None else self.field.fusion.state_dict(),
-            "response": self.field.response.state_dict() if self.field.response.learnable else {},
+            "response": response.state_dict() if isinstance(response, torch.nn.Module) else {},
             "optimizer": adam.optimizer_tensors(self.optimizer, self.batch),
             "densification": self.densification.state(),
             "average": self._averaging.state(),
@@ -388,13 +390,11 @@ class Trainer:
 
 @dataclass(frozen=True)
 class _Seen:
-    """What the second half of a step knows of the first: its own loss, the image [H, W, 3] that it compared, what was
-    rendered, whether the densification watches, the room for pairs, and the gradients by the harmonics where no
-    parameter has them."""
+    """What the second half of a step knows of the first: its own loss, the image [H, W, 3] that it compared, what else
+    was rendered, whether the densification watches, gradients by the harmonics where no parameter has them."""
 
     loss: Tensor
     image: Tensor
     rendering: Rendering
     watched: bool
-    capacity: int | None
     harmonics: HarmonicsGradients | None
