@@ -108,7 +108,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
         tiles: ints, gaussians: ints,
     ):
         """ends: the running sum of the counts: Gaussian `place` fills the entries before ends[place] and `capacity`,
-        with columns * rows, no tile at all, where there are fewer tiles than were counted."""
+        with columns * rows, no tile at all, where there are fewer tiles than were counted. All fill so what is left."""
         place = first + wp.tid()
         i = order[place]
         extent = extents[i]
@@ -131,6 +131,12 @@ def tile_kernels(dtype) -> SimpleNamespace:
             tiles[entry] = columns * rows
             gaussians[entry] = i
             entry += 1
+        count = order.shape[0]
+        entry = int(wp.min(ends[count - 1], wp.int64(capacity))) + place
+        while entry < capacity:
+            tiles[entry] = columns * rows
+            gaussians[entry] = 0
+            entry += count
 
     @wp.kernel(module="unique", module_options=options)
     def emit_keys(
@@ -166,6 +172,12 @@ def tile_kernels(dtype) -> SimpleNamespace:
             keys[entry] = wp.int64(columns * rows) << wp.int64(DEPTH_BITS)
             gaussians[entry] = i
             entry += 1
+        count = depths.shape[0]
+        entry = int(wp.min(ends[count - 1], wp.int64(capacity))) + i
+        while entry < capacity:
+            keys[entry] = wp.int64(columns * rows) << wp.int64(DEPTH_BITS)
+            gaussians[entry] = 0
+            entry += count
 
     @wp.kernel(module="unique", module_options=options)
     def gather_entries(

@@ -190,6 +190,21 @@ def harmonics_adam_kernel(count: int):
 
 
 @wp.kernel(module="unique", module_options={"enable_backward": False})
+def sum_opacities(
+    first: int, logits: wp.array(dtype=wp.float32), sums: wp.array(dtype=wp.float32), slopes: wp.array(dtype=wp.float32)
+):
+    """sums: [T], T threads' shares of the mean of the sigmoids; slopes: [N] of the mean by the logits."""
+    thread = first + wp.tid()
+    part = 1.0 / float(logits.shape[0])
+    total = float(0.0)
+    for i in range(thread, logits.shape[0], sums.shape[0]):
+        opacity = 1.0 / (1.0 + wp.exp(-logits[i]))
+        total += opacity
+        slopes[i] = opacity * (1.0 - opacity) * part
+    sums[thread] = total * part
+
+
+@wp.kernel(module="unique", module_options={"enable_backward": False})
 def add_gradient_statistics(
     first: int,
     gradients: wp.array(dtype=wp.vec2), radii: wp.array(dtype=wp.float32), usable: wp.array(dtype=wp.float32),

@@ -111,14 +111,13 @@ def build_tile_lists(
     overflow = None if capacity is None else total > capacity
     room = checked_room(int(total) if capacity is None else capacity, count, columns, rows)
     by_gaussian = None
-    padded = capacity is not None
     if order is None:
         touched = *records, extents, depths, columns, rows
-        keys, gaussians = sort_keys(*emit_keys(*touched, ends, room, padded), room, tile_count)
+        keys, gaussians = sort_keys(*emit_keys(*touched, ends, room), room, tile_count)
         ranges = find_ranges(keys, tile_count)
     else:
         touched = order, *records, extents, columns, rows
-        tiles, gaussians = emit_entries(*touched, ends, room, padded)
+        tiles, gaussians = emit_entries(*touched, ends, room)
         ranges, gaussians, places = lists_by_tile(tiles, gaussians, room, tile_count, emission)
         by_gaussian = None if places is None else Emission(order.clone(), ends, places)
         total = total.clone()
@@ -173,29 +172,27 @@ def checked_room(room: int, count: int, columns: int, rows: int) -> int:
     return room
 
 
-def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends, room: int, padded: bool):
+def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends, room: int):
     """One entry for each tile that each Gaussian touches, front to back: tiles and Gaussians, each [2 room], of which
-    the first halves are filled; the sort needs the rest. padded: there may be fewer entries than room, and the unused
-    ones belong to tile columns * rows."""
+    the first halves are filled; the sort needs the rest. Entries that there is room for and that are not used belong
+    to tile columns * rows."""
     tiles, gaussians = (torch.empty(2 * room, dtype=torch.int32, device=order.device) for _ in range(2))
-    if padded:
-        tiles[:room] = columns * rows
-        gaussians[:room] = 0
-    if room:
+    if not len(order):
+        tiles[:room], gaussians[:room] = columns * rows, 0
+    elif room:
         kernel = tile_kernels(warp_scalar(shapes.dtype)).emit_entries
         touched = order, shapes, ellipses, extents, columns, rows
         launch(kernel, len(order), *touched, ends, room, tiles, gaussians)
     return tiles, gaussians
 
 
-def emit_keys(shapes, ellipses, extents, depths, columns: int, rows: int, ends, room: int, padded: bool):
+def emit_keys(shapes, ellipses, extents, depths, columns: int, rows: int, ends, room: int):
     """As emit_entries, of Gaussians as they come: int64 keys, the tile above those of the depth, and Gaussians."""
     keys = torch.empty(2 * room, dtype=torch.int64, device=ends.device)
     gaussians = torch.empty(2 * room, dtype=torch.int32, device=ends.device)
-    if padded:
-        keys[:room] = columns * rows << kernels.DEPTH_BITS
-        gaussians[:room] = 0
-    if room:
+    if not len(depths):
+        keys[:room], gaussians[:room] = columns * rows << kernels.DEPTH_BITS, 0
+    elif room:
         touched = shapes, ellipses, extents, depths, columns, rows
         launch(tile_kernels(wp.float32).emit_keys, len(depths), *touched, ends, room, keys, gaussians)
     return keys, gaussians

@@ -12,6 +12,8 @@ from .harmonics import HarmonicsGradients
 from .launching import launch
 from .threads import torch_threads
 
+MEAN_THREADS = 1 << 14
+
 
 @torch.no_grad()
 def judge_step(loss: Tensor, norms: Tensor, incomplete: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
@@ -126,6 +128,26 @@ def _rate(rate: Tensor | float, like: Tensor) -> Tensor:
 def _numbers(betas: tuple[float, float]) -> tuple[float, ...]:
     """What Adam's kernels know of the decays."""
     return *(1 - beta for beta in betas), *(math.log(beta) for beta in betas)
+
+
+def mean_opacity(logits: Tensor) -> Tensor:
+    """The mean of the sigmoids of [N] float32 logits, N >= 1, differentiable once; on a GPU in a third of the time that
+    torch takes for it."""
+    return torch.sigmoid(logits).mean() if logits.device.type == "cpu" else _MeanOpacity.apply(logits)
+
+
+class _MeanOpacity(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, logits):
+        sums, slopes = logits.new_empty(min(len(logits), MEAN_THREADS)), torch.empty_like(logits)
+        launch(kernels.sum_opacities, len(sums), logits.detach(), sums, slopes)
+        ctx.save_for_backward(slopes)
+        return sums.sum()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, upstream):
+        return ctx.saved_tensors[0] * upstream
 
 
 @torch.no_grad()

@@ -10,6 +10,7 @@ from ..field.radiance_field import Photograph, RadianceField
 from ..response import Response, ToneMapper
 from ..splatting.clipped_residual import CodeScale, clipped_residual, code_values
 from ..splatting.ssim import image_distance, ssim
+from ..splatting.training_step import mean_opacity
 from .config import LossConfig
 
 CODE = 1 / 255  # One step of an 8-bit photo
@@ -155,5 +156,5 @@ def data_loss(
 def regularised(loss: Tensor, field: RadianceField, config: LossConfig) -> Tensor:
     """The loss and what the Gaussians themselves cost, whatever the view: the opacities."""
     if config.opacity_weight > 0:
-        loss = loss + config.opacity_weight * field.gaussians.opacities().mean()
+        loss = loss + config.opacity_weight * mean_opacity(field.gaussians.opacity_logits)
     return loss

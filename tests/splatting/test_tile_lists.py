@@ -45,7 +45,7 @@ def emit(records, counts, monkeypatch):
     empty = torch.empty
     monkeypatch.setattr(torch, "empty", lambda *a, **k: empty(*a, **k).fill_(UNWRITTEN))
     room = int(counts.sum())
-    tiles, gaussians = emit_entries(*records, counts.cumsum(0), room, False)
+    tiles, gaussians = emit_entries(*records, counts.cumsum(0), room)
     monkeypatch.undo()
     return tiles[:room], gaussians[:room]
 
@@ -85,7 +85,7 @@ def test_one_sort_makes_the_lists_of_two(device, spare):
     depths = (depths * 4).round().clamp_min(1) / 4
     lists = built(records, counts, depths, extents)
     room = lists.entry_count + spare
-    given = *records, extents, depths, COLUMNS, ROWS, counts.cumsum(0), room, spare != 0
+    given = *records, extents, depths, COLUMNS, ROWS, counts.cumsum(0), room
     keys, gaussians = sort_keys(*emit_keys(*given), room, COLUMNS * ROWS)
     ranges = find_ranges(keys, COLUMNS * ROWS)
     if spare < 0:

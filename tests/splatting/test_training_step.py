@@ -13,6 +13,7 @@ from sehdr_warp.splatting.training_step import (
     add_gradient_statistics,
     add_position_noise,
     judge_step,
+    mean_opacity,
     norms,
 )
 
@@ -85,6 +86,18 @@ def test_one_number_that_is_not_finite_shows_in_the_norms(device, place, functio
     if place is not None:
         gradients[place][-1, 2] = float("inf")
     assert bool(function(gradients).isfinite().all()) == (place is None)
+
+
+@pytest.mark.parametrize("function", [mean_opacity, training_step._MeanOpacity.apply])
+@pytest.mark.parametrize("count", [1, 7, 40_000])
+def test_the_mean_opacity_and_its_gradient_are_torchs_in_float64(device, count, function):
+    logits = (2 * torch.randn(count, generator=torch.Generator().manual_seed(0))).to(device).requires_grad_()
+    truth = logits.detach().double().requires_grad_()
+    mean, true_mean = function(logits), torch.sigmoid(truth).mean()
+    (3 * mean).backward()
+    (3 * true_mean).backward()
+    assert mean.item() == pytest.approx(true_mean.item(), rel=1e-6)
+    assert ((logits.grad - truth.grad).norm() / truth.grad.norm()) < 1e-5
 
 
 def test_no_numbers_are_no_work_and_another_layout_is_refused(device):
