@@ -113,9 +113,11 @@ def linear_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor
     truth = target.exposure_truth if config.hdr_truth else None
     if truth is None and photo.base is photo.exposure:
         return None
-    # The base follows: without the detached side both would settle on what is easiest to agree on.
-    assert photo.exposure is not None and photo.base is not None
-    truth = photo.exposure.detach() if truth is None else truth
+    assert photo.base is not None
+    if truth is None:
+        assert photo.exposure is not None
+        # The base follows: without the detached side both would settle on what is easiest to agree on.
+        truth = photo.exposure.detach()
     return image_loss(photo.base, truth, target.mask, config.form, config.ssim_weight)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from typing import TypeGuard
 
 import torch
 from torch import Tensor
@@ -87,7 +88,7 @@ class Trainer:
         self._launched: set = set()
         self._capacity = GraphCapacity(self.device)
         self._loss: Tensor | None = None
-        self._shown: Tensor | None = None  # What the last step compared with its photo
+        self._shown = torch.empty(0)  # What the last step compared with its photo
         self._last_index = 0
 
     @property
@@ -140,7 +141,7 @@ class Trainer:
         # The last: few are ordered otherwise, and a learned response encodes few otherwise, by kernels of their own.
         kind = (self.degree, watched, gaussians.count < EXACT_BELOW, gaussians.count <= ONE_SORT)
         self._last_index, count = index, gaussians.count
-        if isinstance(views, ViewStack | PhotoStream) and self._can_record(views, kind):
+        if self._can_record(views, kind):
             self._loss, self._shown = self._replay(views, index, watched, kind)
             if isinstance(views, PhotoStream):
                 views.used(self._following())
@@ -196,7 +197,6 @@ class Trainer:
     def _births(self, count: int) -> dict[str, Tensor]:
         """New Gaussians where the step's photo is explained worst; a resumed training has the same."""
         seed = self.config.seed * SEED_STEP + self.iteration
-        assert self._shown is not None
         view = self._training_views()[self._last_index]
         with self._launching():
             shown = self._shown if self._encoded else self.field.response.encode_extended(self._shown)
@@ -261,9 +261,9 @@ class Trainer:
             self._flat = adam.FlatGradients(self.optimizer, self.rank, self.batch, factored=self._factored)
         return self._flat
 
-    def _can_record(self, views: ViewStack | PhotoStream, kind) -> bool:
-        """Whether a step on photos of one size can be recorded: on a GPU, after a step like it was launched."""
-        if self._recorder is None:
+    def _can_record(self, views, kind) -> TypeGuard[ViewStack | PhotoStream]:
+        """Whether this step can be a recorded one: on a GPU, photos of one size, after a step like it was launched."""
+        if self._recorder is None or not isinstance(views, ViewStack | PhotoStream):
             return False
         if self.field.color_model.encoded and not isinstance(views.times, float):
             return False
