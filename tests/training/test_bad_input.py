@@ -53,7 +53,7 @@ def test_a_sky_that_fills_the_photo(tmp_path, device):
     run = train(
         scene,
         tmp_path / "run",
-        SHORT | {"schedule.iterations": 700, "densification.max_gaussians": 1000},
+        SHORT | {"schedule.iterations": 400, "densification.max_gaussians": 1000},
         device=device,
     )
     assert decibels(run, scene) > flat + 2
