@@ -212,10 +212,10 @@ class Trainer:
     def _gradients(self, view: TrainingView, watched: bool, capacity: int | None = None) -> "_Seen":
         """Photograph, compare, differentiate. With a capacity all of it works on fixed memory and nothing waits for the
         device."""
-        target, camera, time = view.target, view.camera, view.exposure_time
+        target, camera, time, field = view.target, view.camera, view.exposure_time, self.field
         also = needed_colours(self.config.loss, target.exposure_truth is not None)
         options = {"degree": self.degree, "also": also, "capacity": capacity, "encode": self._encoded}
-        photo = self.field.photograph(camera, time, **options, factored=self._factored)
+        photo = field.photograph(camera, time, **options, factored=self._factored)
         shown = photo.harmonics
         # What the backward pass does not read, or only its first part does, must not stay until the end of the step.
         kept = {"means2d", "extents"} if watched else set()
@@ -223,16 +223,16 @@ class Trainer:
         rendering = replace(photo.rendering, **dict.fromkeys(unread))
         if watched:
             rendering.means2d.retain_grad()
-        loss = data_loss(self.field, photo, target, self.config.loss, self._largest_truth)
+        loss = data_loss(field, photo, target, self.config.loss, self._largest_truth)
         image = photo.encoded if self._encoded else photo.light
         assert image is not None
         del photo, target, view
-        loss = regularised(loss, self.field, self.config.loss)
+        loss = regularised(loss, field, self.config.loss)
         loss.backward()
         harmonics = None
-        if self._factored and shown is not None and shown.grad is not None:
-            means = self.field.gaussians.means
-            harmonics = HarmonicsGradients(shown.grad[None], camera.position[None], means, self.degree)
+        if self._factored:
+            assert shown is not None and shown.grad is not None
+            harmonics = HarmonicsGradients(shown.grad[None], camera.position[None], field.gaussians.means, self.degree)
         if self.ranks is not None:
             self._flattened().take(loss, rendering.overflow, harmonics)
         return _Seen(loss.detach(), image.detach(), rendering, watched, harmonics)
