@@ -38,9 +38,21 @@ class PhotoGains:
         return float((gains - times * along).std(0).max())
 
     @property
+    def tint(self) -> float:
+        """Deviation of the photos' white balance, in stops, of the channel that varies most."""
+        return self.parts(exposure=False).stops
+
+    @property
     def corners(self) -> float:
         """Part of the light that the corners lack."""
         return 1 - float(np.exp(-sum(self.falloff)))
+
+    def parts(self, *, exposure: bool = True, tint: bool = True, falloff: bool = True) -> "PhotoGains":
+        """These gains without what is not asked for: exposure, which is green's, since cameras balance white by red
+        and blue; white balance; falloff."""
+        values = np.log(list(self.gains.values())).reshape(-1, 3)
+        shared = values[:, 1:2]
+        return _of(list(self.gains), exposure * shared + tint * (values - shared), falloff * np.array(self.falloff))
 
     def even(self, scene: Scene, response: Response) -> Scene:
         """The scene as if its camera had changed nothing: a photo's largest gain is part of its exposure time, the rest
@@ -72,28 +84,69 @@ def start_gains(views: Sequence[View], response: Response) -> PhotoGains:
     return _of([view.name for view in views], np.array(found) - np.mean(found, 0))
 
 
-def rough_stops(views: Sequence[View], points: np.ndarray, seen: np.ndarray, response: Response) -> float:
-    """About the stops of fit_gains() in a small part of its time: means in turn over photos and over points, in which
-    what shines counts as all else does."""
-    light = _lights(views, points, seen, response)[0]
+def rough_gains(views: Sequence[View], points: np.ndarray, seen: np.ndarray, response: Response) -> PhotoGains:
+    """About what fit_gains() finds, in a small part of its time: means in turn over photos and over points, and a line
+    over the radius, in which what shines counts as all else does."""
+    light, radius = _lights(views, points, seen, response)
     told = np.isfinite(light)
-    light, gains = np.where(told, light, 0.0), np.zeros((len(views), 1, 3))
+    light, square = np.where(told, light, 0.0), radius[..., None] ** 2
+    gains, slope = np.zeros((len(views), 1, 3)), 0.0
+    beside = (square - _mean(square * told, told, 0)) * told
     for _ in range(ROUNDS):
-        surfaces = ((light - gains) * told).sum(0) / np.maximum(told.sum(0), 1)
-        gains = ((light - surfaces) * told).sum(1, keepdims=True) / np.maximum(told.sum(1, keepdims=True), 1)
-    return _of([view.name for view in views], gains[:, 0]).stops
+        left = light - gains + slope * square
+        left -= _mean(left * told, told, 0)
+        slope -= float((left * beside).sum() / max((beside**2).sum(), 1e-9))
+        left = light + slope * square
+        gains = _mean((left - _mean((left - gains) * told, told, 0)) * told, told, 1)
+    return _of([view.name for view in views], gains[:, 0], (max(slope, 0.0), 0.0))
+
+
+def _mean(values: np.ndarray, told: np.ndarray, axis: int) -> np.ndarray:
+    return values.sum(axis, keepdims=True) / np.maximum(told.sum(axis, keepdims=True), 1)
 
 
 def disagreement(
-    views: Sequence[View], points: np.ndarray, seen: np.ndarray, response: Response, gains: PhotoGains | None = None
+    views: Sequence[View],
+    points: np.ndarray,
+    seen: np.ndarray,
+    response: Response,
+    gains: PhotoGains | None = None,
+    *,
+    colors: bool = False,
 ) -> float:
-    """By how many stops photos differ, in the median, from the median of all that show a point; less their gains."""
+    """By how many stops photos differ, in the median, from the median of all that show a point; less their gains.
+    colors: in white balance alone, which differs less where points do not quite match."""
     light, radius = _lights(views, points, seen, response)
-    if gains is not None:
-        light += _power(radius, *gains.falloff)[..., None]
-        light -= np.log([gains.gains[view.name] for view in views])[:, None]
+    light -= _logarithms(gains, views, radius) if gains is not None else 0.0
+    if colors:
+        light -= light.mean(2, keepdims=True)
     light = light[:, np.isfinite(light).any(0)]
-    return float(np.nanmedian(np.abs(light - np.nanmedian(light, 0))) / np.log(2))
+    return float(np.nanmedian(np.abs(light - np.nanmedian(light, 0))) / np.log(2)) if light.size else 0.0
+
+
+def left_of_falloff(views: Sequence[View], points: np.ndarray, seen: np.ndarray, response: Response, gains: PhotoGains):
+    """Part of the disagreement between evened photos and photos with their falloff, in the median over where falloff
+    says that they differ, by how much: few points lie far from the middle in one photo and near it in another."""
+    light, radius = _lights(views, points, seen, response)
+    said = np.where(np.isfinite(light), -_power(radius, *gains.falloff)[..., None], np.nan)
+    light -= _logarithms(gains.parts(falloff=False), views, radius)
+    several = np.isfinite(light).sum(0) > 1
+    light, said = light[:, several], said[:, several]
+    before, left, said = (values - np.nanmedian(values, 0) for values in (light, light - said, said))
+    told = np.isfinite(said)
+    before, left = (_weighted_median(np.abs(values[told]), np.abs(said[told])) for values in (before, left))
+    return left / before if before > 0 else 1.0
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    order = np.argsort(values)
+    sums = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(sums, sums[-1] / 2)]) if len(values) else 0.0
+
+
+def _logarithms(gains: PhotoGains, views: Sequence[View], radius: np.ndarray) -> np.ndarray:
+    """[V, P, 3] of the light that gains and falloff leave of all."""
+    return np.log([gains.gains[view.name] for view in views])[:, None] - _power(radius, *gains.falloff)[..., None]
 
 
 def fit_gains(
@@ -140,7 +193,8 @@ def fit_gains(
 
 def _of(names: Sequence[str], logarithms: np.ndarray, falloff=(0.0, 0.0)) -> PhotoGains:
     gains = np.exp(logarithms).tolist()
-    return PhotoGains({name: tuple(gain) for name, gain in zip(names, gains, strict=True)}, falloff)
+    a, b = map(float, falloff)
+    return PhotoGains({name: tuple(gain) for name, gain in zip(names, gains, strict=True)}, (a, b))
 
 
 def _power(r: np.ndarray, a: float, b: float) -> np.ndarray:

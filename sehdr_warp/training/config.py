@@ -50,8 +50,8 @@ class ModelConfig(_Table):
     many, points matched between the photos; 0: the scene's points alone"""
     photo_gains: Literal["auto", "unstated", "always", "never"] = "auto"
     """take out of the photos what the camera changed between them (exposure, white balance, falloff towards the
-    corners), where points that they share show that it did; auto: where photos state no exposure times, or times that
-    the points contradict; unstated: only where they state none; needs the plan and matched points"""
+    corners), where points that they share show that it did; auto: exposure only where photos state no times, or times
+    that the points contradict; unstated: only photos that state none; needs the plan and matched points"""
     start: str = ""
     """a file of Gaussians to start from in place of points, in the scene's coordinates: PLY, OpenUSD or glTF;
     empty: none"""

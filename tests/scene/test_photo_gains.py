@@ -8,7 +8,14 @@ import pytest
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View, codes_of
 from sehdr_warp.scene.camera import look_at
-from sehdr_warp.scene.photo_gains import PhotoGains, disagreement, fit_gains, rough_stops, start_gains
+from sehdr_warp.scene.photo_gains import (
+    PhotoGains,
+    disagreement,
+    fit_gains,
+    left_of_falloff,
+    rough_gains,
+    start_gains,
+)
 
 SIZE, PHOTOS = 48, 6
 SRGB = response_by_name("srgb")
@@ -59,9 +66,24 @@ def test_gains_and_falloff_are_found(gains, points):
     assert found.stops > 0.3
     rough = start_gains(scene.train_views, SRGB)
     np.testing.assert_allclose([rough.gains[v.name] for v in scene.train_views], list(gains.values())[:-1], rtol=0.25)
-    assert rough_stops(scene.train_views, hidden, seen, SRGB) == pytest.approx(found.stops, rel=0.15)
-    before, after = (disagreement(scene.train_views, hidden, seen, SRGB, taken) for taken in (None, found))
-    assert after < 0.1 * before
+    rough, known = rough_gains(scene.train_views, hidden, seen, SRGB), (scene.train_views, hidden, seen, SRGB)
+    assert (rough.stops, rough.tint) == pytest.approx((found.stops, found.tint), rel=0.15)
+    assert rough.corners == pytest.approx(found.corners, abs=0.1)
+    for colors in (False, True):
+        before, after = (disagreement(*known, taken, colors=colors) for taken in (None, found))
+        assert after < 0.1 * before
+    wrong = replace(found, falloff=(0.0, 0.8))
+    assert left_of_falloff(*known, found) < 0.15 and left_of_falloff(*known, wrong) > 0.8
+
+
+def test_exposure_white_balance_and_falloff_are_parts(gains):
+    whole = PhotoGains(gains, FALLOFF)
+    values, exposure, tint = (
+        np.array(list(found.gains.values())) for found in (whole, whole.parts(tint=False), whole.parts(exposure=False))
+    )
+    np.testing.assert_allclose(exposure, values[:, 1:2].repeat(3, 1))
+    np.testing.assert_allclose(exposure * tint, values)
+    assert whole.parts(falloff=False).falloff == (0, 0) and whole.parts().falloff == FALLOFF
 
 
 def test_photos_that_do_not_drift_have_no_gains(points):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp.response import response_by_name
+from sehdr_warp.scene import codes_of
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.photo_gains import evens, find_gains
 from sehdr_warp.training.run import load_run
@@ -45,6 +46,25 @@ def test_stated_times_are_doubted_where_photos_contradict_them(device):
     for curve in (LINEAR, response_by_name("gamma")):
         gains, _, decision = find_gains(right, CONFIG, curve, device)
         assert gains is None and "do not contradict" in decision.reason
+
+
+def test_stated_times_stay_where_colors_or_corners_alone_drift(device):
+    """Cameras state no white balance and no falloff: exposures are held to what they do state."""
+    light = np.linspace(-0.5, 0.5, 9)[:, None] * [1, 0, -1]
+    scene = wall_and_lamp()
+    views, tinted, darkened = scene.views, [], []
+    column, row = np.meshgrid(np.arange(64) - 31.5, np.arange(64) - 31.5)
+    corners = 0.5 ** ((column**2 + row**2) / (2 * 32**2))[..., None]
+    for view, tint in zip(views, light, strict=True):
+        tinted.append(replace(view, codes=codes_of(view.image * 2**tint, 8)))
+        darkened.append(replace(view, codes=codes_of(view.image * corners, 8)))
+    gains, _, decision = find_gains(replace(scene, views=tuple(tinted)), CONFIG, LINEAR, device)
+    assert "stay as stated" in decision.choice and "white balance" in decision.reason and gains.corners == 0
+    found = np.log2([gains.gains[view.name] for view in views])
+    np.testing.assert_allclose(found, light, atol=0.06)
+    assert (found[:, 1] == 0).all()
+    gains, _, decision = find_gains(replace(scene, views=tuple(darkened)), CONFIG, LINEAR, device)
+    assert "stay as stated" in decision.choice and gains.corners == pytest.approx(0.5, abs=0.1) and not gains.stops
 
 
 def test_a_clear_sky_is_no_drift(device):
