@@ -1,11 +1,13 @@
 """The plots of the reports: matplotlib figures that need no display, saved small."""
 
 import io
+import math
 from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
 
 import numpy as np
+from matplotlib.ticker import EngFormatter
 
 from sehdr_warp.bench.results import groups
 from sehdr_warp.output.charts import COLORS, RULE
@@ -25,18 +27,22 @@ def plot_kernels(result: dict, path: Path) -> None:
 
 
 def plot_scale(result: dict, path: Path) -> None:
-    """Median times and, below, peak memory over what is varied; both axes in decades."""
+    """Median times and, below, peak memory over what is varied; both axes in decades, panels of a row on one scale."""
     names, sweeps = groups(result["rows"], "implementation", "what"), groups(result["rows"], "sweep")
     panels = []
-    for field, unit in (("median_ms", "median, ms"), ("peak_memory_bytes", "peak, bytes")):
+    for field, unit, factor in (("median_ms", "median, ms", 1.0), ("peak_memory_bytes", "peak, MiB", 2.0**-20)):
+        values = [factor * row[field] for row in result["rows"] if row.get(field)]
+        scale = {"ylabel": unit, "yscale": "log", "xscale": "log", "ylim": (min(values) / 1.3, max(values) * 1.3)}
         panels.append([])
         for (sweep,), rows in sweeps.items():
             found = groups(rows, "implementation", "what")
             lines = {
-                ": ".join(name): [(row["varied"], row[field]) for row in found.get(name, ()) if row.get(field)]
+                ": ".join(name): [(row["varied"], factor * row[field]) for row in found.get(name, ()) if row.get(field)]
                 for name in names
             }
-            panels[-1].append((lines, {"xlabel": sweep, "ylabel": unit, "xscale": "log", "yscale": "log"}))
+            ticks = sorted({row["varied"] for row in rows})
+            labels = [EngFormatter(sep="")(float(f"{value:.2g}")) for value in ticks]
+            panels[-1].append((lines, scale | {"xlabel": sweep, "xticks": ticks, "xticklabels": labels}))
     _draw(path, panels)
 
 
@@ -54,6 +60,12 @@ def plot_quality(result: dict, path: Path) -> None:
         labels = {"xlabel": "training seconds", "ylabel": "held-out HDR PSNR, dB", "xscale": "log"}
         panels.append((lines, labels | {"title": f"{curve}, {response}"}))
     _draw(path, [panels], form="-")
+
+
+def decade_ticks(least: float, most: float) -> list[float]:
+    """1, 2 and 5 times the powers of ten within two bounds."""
+    powers = range(math.floor(math.log10(least)), math.ceil(math.log10(most)) + 1)
+    return [tick for power in powers for part in (1, 2, 5) if least <= (tick := part * 10.0**power) <= most]
 
 
 def error_over_time(trainings: Sequence[Sequence], count: int = 60) -> list[tuple[float, float]]:
@@ -84,6 +96,9 @@ def _draw(path: Path, panels: Sequence[Sequence[tuple[dict, dict]]], form: str =
             if points:
                 (named[name],) = axes.plot(*zip(*points, strict=True), form, color=color, markersize=3, label=name)
         axes.set(**labels)
+        if "xticks" in labels:
+            axes.minorticks_off()
+            axes.set_yticks(ticks := decade_ticks(*labels["ylim"]), [f"{tick:g}" for tick in ticks])
         axes.grid(color=RULE, linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
     if named:
