@@ -12,6 +12,7 @@ from ..field.radiance_field import Photograph
 from ..response import Response, response_by_name
 from ..response.table import TabulatedResponse
 from ..splatting import ssim
+from ..splatting.clipped_light import clipped_light_energy
 from ..training.config import LossConfig
 from ..training.losses import CODE, Target, code_scale, ldr_loss
 from .case import ROUNDINGS, UNIT, Case, Reading, compare, count, not_finite
@@ -146,6 +147,24 @@ def _loss(prediction, photo):
     return ldr_loss(shown, target, LossConfig())
 
 
+def _clipped_light(device):
+    """Of a disk that clips: light around white, far above it, equal, and with one pixel at 2^100."""
+    noise = torch.randn(11, 13, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    y, x = torch.meshgrid(torch.arange(11), torch.arange(13), indexing="ij")
+    codes = torch.where(((y - 5) ** 2 + (x - 6) ** 2 < 20)[..., None], 255, 90).expand(11, 13, 3).to(torch.uint8)
+    spike = torch.full_like(noise, 4.0)
+    spike[5, 6] = 2.0**100
+    cases = {"around white": noise.exp(), "far above": 2**20 * noise.exp(), "equal": 0 * noise + 4, "one spike": spike}
+    for name, image in cases.items():
+
+        def energy(image):
+            return {"energy": clipped_light_energy(image, codes.to(image.device), 1.0, smoothness=1.0, lift=0.3)}
+
+        # A logarithm of float32 is known to some units of its own, whatever is left of a difference of two.
+        given = {"gradients": ("image",), "extra": 64 * UNIT, "label": f"{name} {{}}"}
+        yield from compare(energy, {"image": image}, device, **given)
+
+
 def _similarity(device):
     """Of 1 x 1, of odd size, of flat, nearly equal and tiny images."""
     generator = torch.Generator().manual_seed(0)
@@ -172,5 +191,6 @@ LIGHT_CASES = (
     Case("logits", "softmax logits of +-1e4", partial(_fused, 1e3, 1e5),
          note="a logit of 1e4 is known to 1e-3 in float32, and the weights of the brackets to no better"),
     Case("photos", "photos all clipped, all black, and with one bright pixel", _photos),
+    Case("clipped-light", "clipped light around white, far above it, equal, and one pixel at 2^100", _clipped_light),
     Case("similarity", "SSIM of flat, equal, opposite and tiny images", _similarity),
 )  # fmt: skip

@@ -15,7 +15,7 @@ from torch import Tensor
 from ..kernels.clipped_residual import clipped_residual_kernel
 from .launching import launch, warp_scalar
 
-_CODES = {torch.uint8: wp.uint8, torch.int16: wp.uint16}
+CODES = {torch.uint8: wp.uint8, torch.int16: wp.uint16}
 WHITE = {torch.uint8: 255, torch.int16: 65535}  # The largest code, by the type of the tensor that holds it
 
 
@@ -77,7 +77,7 @@ class _ClippedResidual(torch.autograd.Function):
         law = (scale.mu / scale.white, 1 / math.log1p(scale.mu)) if scale.mu else (0.0, 0.0)
         # Codes that no pixel has where none of them is special.
         special = (-1, -1, 0.0, 0.0) if scale.half_codes is None else (len(scale.table) - 1, 0, *scale.half_codes)
-        kernel = clipped_residual_kernel(warp_scalar(image.dtype), _CODES[codes.dtype], scale.mu > 0)
+        kernel = clipped_residual_kernel(warp_scalar(image.dtype), CODES[codes.dtype], scale.mu > 0)
         photos = codes.contiguous().view(len(codes), -1)
         launch(kernel, image.numel(), image, photos, index, scale.table, *law, *special, seen, slopes, truth)
         ctx.save_for_backward(slopes)

@@ -96,6 +96,11 @@ class LossConfig(_Table):
     """weight of the HDR colour against HDR truth in the mu-law, where a view has it (HDR-GS: 0.6)"""
     clipping: bool = True
     """a clipped pixel only says `at least`, a black one only `at most`; off: both are plain values"""
+    clipped_smoothness: Weight = 0.001
+    """weight of how far the log light of a clipped pixel is from the mean of those around it, squared, where exposures
+    are compared"""
+    clipped_lift: Weight = 0.0003
+    """weight of the log light of clipped pixels beside others, which goes up: the blur of Gaussians takes from it"""
     linear_weight: Weight = 0.0
     """weight of the linear loss (SeHDR: 0.5)"""
     hdr_truth: bool = False

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ..field.radiance_field import Photograph, RadianceField
 from ..response import Response, ToneMapper
+from ..splatting.clipped_light import clipped_light_energy
 from ..splatting.clipped_residual import CodeScale, clipped_residual, code_values
 from ..splatting.ssim import image_distance, ssim
 from ..splatting.training_step import mean_opacity
@@ -51,6 +52,7 @@ def code_scale(
 
     largest: code, 255 or 65535. clipping: it says `at least white less half a code`, and 0 says `at most half
     a code`; the half, of 8 bits for 16 too, keeps a response that never quite reaches white from being pulled up.
+    Of exposures a code is worth the middle of what it stands for, which near white may be stops of light.
     """
     values = torch.arange(largest + 1, dtype=torch.float64) / largest
     if response is None:
@@ -60,8 +62,9 @@ def code_scale(
         exposures = (float(response.decode(value)) for value in (1.0, 1.0 - CODE / 2, CODE / 2, 0.0))
         white, below, above, black = (math.log1p(mu * x / response.white) / math.log1p(mu) for x in exposures)
         halves = white - below, above - black
-    table = mu_law(response.decode(values), response.white, mu).to(device, dtype)
-    return CodeScale(table, mu, response.white, halves)
+    table, between = (mu_law(response.decode(at), response.white, mu) for at in (values, values[:-1] + 0.5 / largest))
+    table[1:-1] = (between[1:] + between[:-1]) / 2
+    return CodeScale(table.to(device, dtype), mu, response.white, halves)
 
 
 def image_loss(prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str, weight: float) -> Tensor:
@@ -78,11 +81,17 @@ def image_loss(prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str
 
 
 def ldr_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor:
-    """L_LDR, on the target's scale, and where the camera saturated only as far as the photo can tell."""
+    """L_LDR, on the target's scale, and where the camera saturated only as far as the photo can tell; where exposures
+    are compared, the light that it does not tell is as smooth as it can be."""
     image = photo.light if target.scale.mu else photo.encoded
     assert image is not None
     seen, truth = clipped_residual(image, target.codes, target.scale, target.index)
-    return image_loss(seen, truth, target.mask, config.form, config.ssim_weight)
+    loss = image_loss(seen, truth, target.mask, config.form, config.ssim_weight)
+    smoothness, lift = config.clipped_smoothness, config.clipped_lift
+    if target.scale.mu and config.clipping and (smoothness or lift):
+        told = target.codes, target.scale.white, target.index, target.mask
+        loss = loss + clipped_light_energy(image, *told, smoothness=smoothness, lift=lift)
+    return loss
 
 
 def compares_light(config: LossConfig, field: RadianceField) -> bool:

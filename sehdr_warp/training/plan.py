@@ -278,7 +278,10 @@ def _response(facts: SceneFacts, config: Config, device: torch.device) -> Choice
 
 def _light(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     if not (facts.unclipped and facts.truths == facts.photos and config.loss.ldr_weight):
-        return {}, "as photos show it", f"{facts.clipped:.1%} of the pixels are a bound alone"
+        unneeded: dict[str, object] = (
+            {} if facts.clipped else {"loss.clipped_smoothness": 0.0, "loss.clipped_lift": 0.0}
+        )
+        return unneeded, "as photos show it", f"{facts.clipped:.1%} of the pixels are a bound alone"
     fields: dict[str, object] = {"loss.ldr_weight": 0.0, "loss.hdr_weight": 1.0, "loss.form": "blend"}
     reason = f"{facts.truths} float pictures hold all light: behind a photo's curve the brightest would hardly count"
     return fields, "in the mu-law", reason
