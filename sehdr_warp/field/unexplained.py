@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from ..response import Response
+from ..response.curve import HALF_CODE
 from ..scene import View
 from .confidence import MOST_VIEWS
 from .radiance_field import RadianceField
@@ -19,8 +20,8 @@ MOST_NAMED = 20
 @dataclass(frozen=True)
 class Region:
     """photo: the view's name. column, row: of the region's middle; pixels: its area; at the size of training. stops: by
-    how much the photo is brighter than the scene, in the mean; where the photo is clipped, at least. box: left, top,
-    width and height around it."""
+    how much the photo is brighter than the scene, in the mean; where either is clipped or black, at least. box: left,
+    top, width and height around it."""
 
     photo: str
     column: float
@@ -59,7 +60,8 @@ def _differences(view: View, exposure: torch.Tensor, response: Response) -> tupl
     none where the photo is clipped and the scene at white, or the photo does not count."""
     photo = torch.from_numpy(view.image).to(exposure.device)
     shown = response.encode_extended(exposure).clamp(0, 1)
-    light = [response.decode(encoded).mean(2).clamp_min(1e-9) for encoded in (photo, shown)]
+    # Below half a code two exposures are the same to the photo.
+    light = [response.decode(encoded.clamp_min(HALF_CODE)).mean(2) for encoded in (photo, shown)]
     stops, code = (light[0] / light[1]).log2(), (photo - shown).abs().amax(2)
     counted = 1.0 if view.mask is None else view.mask > 0.5
     return stops.cpu().numpy() * counted, code.cpu().numpy()

@@ -51,6 +51,9 @@ def test_what_does_not_count_is_not_missing_and_light_that_is_not_there_is(tmp_p
     assert (
         all(region.stops < -1 for region in unexplained_regions(run.model, dark.views)) and "summary" not in caplog.text
     )
+    black = unexplained_regions(run.model, [replace(view, codes=np.zeros_like(view.codes)) for view in scene.views])
+    # A black photo says "less than half a code", not "none": from white of a linear curve that is 9 stops.
+    assert min(region.stops for region in black) > -np.log2(2 * 255) - 0.01 and black
     masked = [replace(view, mask=np.zeros((64, 64), np.float32)) for view in dark.views]
     assert unexplained_regions(run.model, dark.views) and not unexplained_regions(run.model, masked)
     # A finished run is asked again when it is resumed.
