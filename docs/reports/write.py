@@ -19,7 +19,8 @@ from sehdr_warp.files import atomic_path, read_json
 
 HERE = Path(__file__).resolve().parent
 PAGES: dict[str, dict[str, Any]] = tomllib.loads((HERE / "pages.toml").read_text(encoding="utf-8"))
-"""Title, text and caption of each page."""
+"""Title, text, caption and commands of each page."""
+NOTHING_CLIPS = 0.001  # Of the pixels
 
 
 def write_reports(folder: Path) -> list[Path]:
@@ -33,7 +34,9 @@ def write_reports(folder: Path) -> list[Path]:
     written, index = [], []
     for name, path in found.items():
         page, result = PAGES[name], _read(path)
-        parts = [f"# {page['title']}", page["text"], f"```sh\n{result['command']}\n```", machine_line(result) + "."]
+        parts = [f"# {page['title']}", page["text"], f"```sh\n{result['command']}\n```"]
+        parts += [f"Anew: `python docs/reports/measure.py {name}`."] if "command" in page else []
+        parts += [machine_line(result) + "."]
         if name in PLOTS:
             written.append(folder / f"{name}.png")
             with atomic_path(written[-1], ours=True) as temporary:
@@ -42,12 +45,16 @@ def write_reports(folder: Path) -> list[Path]:
         written.append(_write(folder / f"{name}.md", [*parts, *TABLES[name](result), *result["notes"]]))
         machine = result["machine"]
         place = machine["gpu"]["name"] if machine["gpu"] else f"{machine['cpu']}, {machine['cores']} cores"
-        index.append({"report": f"[{page['title']}]({name}.md)", "machine": place})
+        build = machine.get("build")
+        index.append({"report": f"[{page['title']}]({name}.md)", "machine": place, "build": build})
     if (folder / "tried.csv").is_file():
         written.append(_write(folder / "tried.md", _tried_page(folder / "tried.csv")))
         index.append({"report": "[Tried and lost](tried.md)"})
-    text = "What was measured. `python docs/reports/write.py` makes these pages of `results/*.json` and `tried.csv`."
-    table = markdown_table(index, {"report": "", "machine": ""})
+    text = (
+        "What was measured. `python docs/reports/measure.py` measures all anew, by one build; "
+        "`python docs/reports/write.py` makes the pages and the README's figures of `results/*.json` and `tried.csv`."
+    )
+    table = markdown_table(index, {"report": "", "machine": "", "build": ""})
     return [*written, _write(folder / "README.md", ["# Reports", text, table])]
 
 
@@ -107,19 +114,9 @@ def _quality_tables(result: dict) -> Iterable[str]:
     for row in rows:
         (bound, *_) = bounds.get(tuple(row[field] for field in places), [row])
         row["to_bound"] = None if bound is row else row["gt_max"] - bound["gt_max"]
-    middle = [row for row in rows if (row["exposure"], row["seed"]) == (EXPOSURES // 2, rows[0]["seed"])]
-    short = [
-        {
-            "method": method,
-            "HDR dB": fmean(row["gt_max"] for row in mine),
-            "photos dB": fmean(row["ldr"] for row in mine),
-            "lost": f"{sum(row['lights_lost'] for row in mine)} of {sum(row['lights_count'] for row in mine)} lights",
-        }
-        for (method, response), mine in groups(middle, "method", "response").items()
-        if response in (KNOWN, LEARNED)
-    ]
     yield "## In short: the middle exposure, one seed, the curve known"
-    yield markdown_table(short, {"method": "", "HDR dB": ".1f", "photos dB": ".1f", "lost": ""})
+    yield markdown_table(in_short(rows), SHORT)
+    yield from _irradiance_tables([row for row in rows if row["response"] in (KNOWN, LEARNED)])
     for curve, response in groups([row for row in rows if row["response"] != LEARNED], "curve", "response"):
         members = [row for row in rows if row["curve"] == curve and row["response"] in (response, LEARNED)]
         table = []
@@ -147,6 +144,65 @@ def _quality_tables(result: dict) -> Iterable[str]:
         yield f"{shared} trainings shared a device: seconds and renders / s are those of a shared one."
 
 
+SHORT = {"method": "", "HDR dB": ".1f", "photos dB": ".1f", "lost": ""}
+
+
+def in_short(rows: Sequence[Mapping]) -> list[dict]:
+    """A row for each method: means over scenes of one seed at the middle exposure, told the curve."""
+    middle = [row for row in rows if (row["exposure"], row["seed"]) == (EXPOSURES // 2, rows[0]["seed"])]
+    return [
+        {
+            "method": method,
+            "HDR dB": fmean(row["gt_max"] for row in mine),
+            "photos dB": fmean(row["ldr"] for row in mine),
+            "lost": f"{sum(row['lights_lost'] for row in mine)} of {sum(row['lights_count'] for row in mine)} lights",
+        }
+        for (method, response), mine in groups(middle, "method", "response").items()
+        if response in (KNOWN, LEARNED)
+    ]
+
+
+def _irradiance_tables(rows: Sequence[Mapping]) -> Iterable[str]:
+    """How well surfaces would be lit, by what clips."""
+    rows = [row for row in rows if row.get("irradiance") is not None]
+    if not rows:
+        return
+    yield "## Irradiance: off by, and what the photos clip"
+    told = []
+    for (method,), mine in groups(rows, "method").items():
+        whole = [row["irradiance"] for row in mine if row["clipped_share"] < NOTHING_CLIPS]
+        told += [f"{method} {median(whole):.1%} ({len(whole)} trainings)"] if whole else []
+    if told:
+        yield f"Where less than {NOTHING_CLIPS:.1%} of the pixels clip, in the median: {', '.join(told)}."
+    means = [
+        {"scene": scene, "exposure": exposure, "method": method, "off": fmean(row["irradiance"] for row in here)}
+        for (scene, exposure, method), here in groups(rows, "scene", "exposure", "method").items()
+    ]
+    clipped = [
+        {"scene": row["scene"], "exposure": row["exposure"], "method": "clipped pixels", "off": row["clipped_share"]}
+        for row in {(row["scene"], row["exposure"]): row for row in rows}.values()
+    ]
+    yield _pivot([*clipped, *means], {"scene": "", "exposure": "d"}, "method", "off", ".1%")
+
+
+def write_readme(path: Path, result: dict) -> None:
+    """Puts the figures of the page of quality into the table of the README."""
+    text, table = path.read_text(encoding="utf-8"), readme_table(result["rows"])
+    start = text.index(table.partition("\n")[0])
+    with atomic_path(path, ours=True) as temporary:
+        temporary.write_text(text[:start] + table + text[text.index("\n\n", start) :], encoding="utf-8")
+
+
+def readme_table(rows: Sequence[Mapping]) -> str:
+    """The rows of in_short() that the README shows."""
+    short, lines = {row["method"]: row for row in in_short(rows)}, []
+    for method, named in PAGES["quality"]["readme"].items():
+        row = short[method]
+        cells = named, f"{row['HDR dB']:.1f} dB", f"{row['photos dB']:.1f} dB", row["lost"].removesuffix(" lights")
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(["| trained on photos by | HDR | photos | lights lost |", "| --- | -: | -: | -: |", *lines])
+
+
 def _seeds_tables(result: dict) -> Iterable[str]:
     table = []
     for (scene,), rows in groups(result["rows"], "scene").items():
@@ -164,6 +220,7 @@ def _readings_tables(result: dict) -> Iterable[str]:
     for truth in (False, True):
         rows = [row for row in result["rows"] if row["sees_truth"] is truth]
         yield f"## {'With' if truth else 'Without'} truth"
+        rows = [row | {"reads": PAGES["readings"]["reads"].get(row["method"], "")} for row in rows]
         yield markdown_table(sorted(rows, key=lambda row: (row["scene"], -row["gt_max"])), columns)
 
 
@@ -272,3 +329,4 @@ def _tried_page(path: Path) -> list[str]:
 
 if __name__ == "__main__":
     print(*write_reports(HERE), sep="\n")
+    write_readme(HERE.parents[1] / "README.md", _read(HERE / "results" / "quality.json"))

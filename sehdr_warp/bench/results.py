@@ -1,5 +1,6 @@
 """A benchmark's result: rows and checks with the machine and the command that made them; as JSON, and as a table."""
 
+import hashlib
 import importlib.metadata
 import math
 import os
@@ -53,9 +54,19 @@ def _describe_machine(device: torch.device) -> dict[str, Any]:
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
+        "build": build(),
         "versions": {"sehdr-warp": __version__} | {name: _version(name) for name in ("torch", "warp-lang", "gsplat")},
         "gpu": gpu,
     }
+
+
+def build() -> str:
+    """Eight hexadecimal digits of what the package's code and presets hold: results of one build share them."""
+    root, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
+    paths = (Path(folder, name) for folder, _, names in os.walk(root, followlinks=True) for name in names)
+    for path in sorted(path for path in paths if path.suffix in (".py", ".toml")):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:8]
 
 
 def _version(package: str) -> str | None:
@@ -78,7 +89,8 @@ def machine_line(result: dict) -> str:
     if machine["gpu"]:
         place = f"{machine['gpu']['name']} (driver {machine['gpu']['driver']}), {place}"
     versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items() if version)
-    return f"{place}; {versions}; {result['date'][:10]}"
+    built = f"; build {machine['build']}" if machine.get("build") else ""
+    return f"{place}; {versions}{built}; {result['date'][:10]}"
 
 
 def check(what: str, against: str, difference: float, bound: float) -> dict:

@@ -1,6 +1,7 @@
 """`sehdr-warp bench kernels`, `step` and `scale`, at sizes that take seconds."""
 
 import json
+import re
 import sys
 import time
 from itertools import pairwise
@@ -10,7 +11,7 @@ import pytest
 import torch
 
 from sehdr_warp.bench import gsplat_peer, kernels, scale, step
-from sehdr_warp.bench.results import finish, markdown_table
+from sehdr_warp.bench.results import build, finish, machine_line, markdown_table, new_result
 from sehdr_warp.bench.splats import Size, make_splat_scene, parse_size
 from sehdr_warp.bench.timing import Variant, peak_memory, time_variants
 from sehdr_warp.errors import SehdrError
@@ -218,3 +219,9 @@ def test_tables_leave_out_what_nothing_has_and_mark_what_one_lacks():
     assert markdown_table(rows, {"A=a": ".1f", "b": "", "c": "d"}) == "\n".join(
         ["|   A | b  |", "| --: | -- |", "| 1.2 | x  |", "|   - | yy |"]
     )
+
+
+def test_a_result_names_its_build():
+    result = new_result("step", torch.device("cpu"), {})
+    assert re.fullmatch("[0-9a-f]{8}", result["machine"]["build"]) and result["machine"]["build"] == build()
+    assert f"build {build()}" in machine_line(result)

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -31,6 +32,15 @@ def test_the_pages_are_what_the_results_make(tmp_path):
         {path.name for path in folder.iterdir() if path.suffix in (".md", ".png")} for folder in (tmp_path, REPORTS)
     ]
     assert pages[0] == pages[1]
+
+
+def test_the_readme_shows_the_page_of_quality(tmp_path):
+    stored = json.loads((REPORTS / "results" / "quality.json").read_text())
+    readme = REPORTS.parents[1] / "README.md"
+    (copy := tmp_path / "README.md").write_text(re.sub(r"\d dB \|", "0 dB |", readme.read_text()))
+    assert copy.read_text() != readme.read_text()
+    importlib.import_module("write").write_readme(copy, stored)
+    assert copy.read_text() == readme.read_text()
 
 
 def test_quality_is_paired_with_the_upper_bound(tmp_path):
