@@ -10,7 +10,6 @@ from functools import cache
 
 import numpy as np
 import torch
-from numpy.lib.stride_tricks import sliding_window_view
 
 from ..errors import SehdrError
 from .analytic import DESCRIPTIONS, analytic_response
@@ -52,8 +51,8 @@ UNLIKELY, LINEAR_PRIOR = 12.0, 1000.0
 # How likely it is beforehand that no formula made the photos, and the probability from which a formula is taken for the
 # truth (docs/response.md: set on half of the scenes and curves).
 NO_FORMULA, DECISIVE = 0.5, 0.25
-# Candidates whose edges are judged at once; photos larger than MOST_PIXELS are read in bands.
-BATCH, MOST_PIXELS, BAND_ROWS = 16, 400_000, 32
+# Edges that are judged at once; photos larger than MOST_PIXELS are read in bands.
+BATCH, MOST_PIXELS, BAND_ROWS = 256, 400_000, 32
 
 # The smooth family of cameras' curves, for photos that no response with a formula of its own explains:
 # x(z) = z^p (z + TOE)^q (1 + SHOULDER - z)^-r up to scale, z the encoded value: p and p + q are the log-log slopes
@@ -285,23 +284,24 @@ def _range_and_roughness(bands, logs: np.ndarray) -> tuple[float, float]:
 
 def _edge_colors(image: np.ndarray, clear: np.ndarray) -> np.ndarray:
     """[E, 3, 3] encoded colors (one side, middle, other side) of clean, colored edges along rows and columns."""
-    found = [np.zeros((0, 3, 3))]
-    for rows, known in ((image, clear), (image.swapaxes(0, 1), clear.T)):
-        length = 2 * EDGE_REACH + 3
-        if len(rows) < length:
+    found, length = [np.zeros((0, 3, 3))], 2 * EDGE_REACH + 3
+    planes = np.ascontiguousarray(np.moveaxis(image, 2, 0))  # Sums over the first axis are many times as fast.
+    for rows, known in ((planes, clear), (planes.swapaxes(1, 2), clear.T)):
+        starts = len(known) - length + 1
+        if starts < 1:
             continue
-        at = np.moveaxis(sliding_window_view(rows, length, axis=0), -1, 0)
-        seen = sliding_window_view(known, length, axis=0)[..., 1:-1:EDGE_REACH].all(-1)
+        at = [rows[:, k : k + starts] for k in range(length)]
+        seen = np.logical_and.reduce([known[k : k + starts] for k in range(1, length - 1, EDGE_REACH)])
         first, middle, last = at[1:-1:EDGE_REACH]
-        flat = np.maximum(np.abs(at[0] - first), np.abs(at[-1] - last)).max(-1) <= (FLAT_CODES + SLACK) * CODE
-        apart = np.abs(last - first).max(-1) >= (EDGE_CODES - SLACK) * CODE
+        flat = np.maximum(np.abs(at[0] - first), np.abs(at[-1] - last)).max(0) <= (FLAT_CODES + SLACK) * CODE
+        apart = np.abs(last - first).max(0) >= (EDGE_CODES - SLACK) * CODE
         # Between the sides in every channel, and well off both: another surface at the edge is not.
-        between = ((middle - first) * (last - middle) >= -(1 + SLACK) * CODE**2).all(-1)
-        share = np.linalg.norm(middle - first, axis=-1) / np.maximum(np.linalg.norm(last - first, axis=-1), CODE)
-        cosine = (first * last).sum(-1) / (np.linalg.norm(first, axis=-1) * np.linalg.norm(last, axis=-1) + 1e-12)
+        between = ((middle - first) * (last - middle) >= -(1 + SLACK) * CODE**2).all(0)
+        share = np.linalg.norm(middle - first, axis=0) / np.maximum(np.linalg.norm(last - first, axis=0), CODE)
+        cosine = (first * last).sum(0) / (np.linalg.norm(first, axis=0) * np.linalg.norm(last, axis=0) + 1e-12)
         mixed = (share > LEAST_SHARE) & (share < MOST_SHARE) & (cosine < np.cos(EDGE_ANGLE))
         chosen = seen & flat & apart & between & mixed
-        found.append(np.stack([first[chosen], middle[chosen], last[chosen]], axis=1))
+        found.append(np.stack([side[:, chosen].T for side in (first, middle, last)], axis=1))
     return np.concatenate(found)
 
 
@@ -316,35 +316,44 @@ def _edges(edges: np.ndarray, logs: np.ndarray, rises: np.ndarray) -> np.ndarray
     points = np.concatenate([edges.reshape(-1, 9), *limits, first, last], axis=1)
     place = torch.from_numpy(np.clip(points * 255, 1, 255) * FINE).float()
     below = place.floor().clamp_max(255 * FINE - 1).long()
-    part = place - below
+    part = (place - below)[..., None]
+    between = bool(part[:, :9].any())  # Codes of 8 bits are all on GRID.
+    # Candidates last: a point reads one row of all of them, and every sum adds rows.
+    exposures = torch.from_numpy(np.exp(logs).T).float().contiguous()
+    slopes = 1 / (exposures * torch.from_numpy(rises.T).float())
 
-    def read(table, count):
-        return table[:, below[:, :count]].lerp(table[:, below[:, :count] + 1], part[:, :count])
+    def read(table, chosen, between=True):
+        rows = table[below[chosen]]
+        return rows.lerp_(table[below[chosen] + 1], part[chosen]) if between else rows
 
-    exposures = torch.from_numpy(np.exp(logs)).float()
-    slopes = 1 / (exposures * torch.from_numpy(rises).float())
-    batches = zip(exposures.split(BATCH), slopes.split(BATCH), strict=True)
-    return torch.cat([_mixture_surprise(read(x, 13), read(slope, 9)) for x, slope in batches]).double().numpy()
+    total = torch.zeros(len(EDGE_MISFITS), len(logs), dtype=torch.float64)
+    for start in range(0, len(points), BATCH):
+        colors, lines = ((slice(start, start + BATCH), part) for part in (slice(9), slice(9, 13)))
+        total += _mixture_surprise(read(exposures, colors, between), read(slopes, colors, between), read(exposures, lines))
+    return (total / len(points)).amin(0).numpy()
 
 
-def _mixture_surprise(exposures: torch.Tensor, slopes: torch.Tensor) -> torch.Tensor:
-    """[K] from exposures [K, E, 13] at the points of _edges and the curve's slopes [K, E, 9] at the nine colors.
+def _mixture_surprise(exposures: torch.Tensor, slopes: torch.Tensor, lines: torch.Tensor) -> torch.Tensor:
+    """[misfits, K] sums over E edges, from exposures and the curve's slopes [E, 9, K] at the nine colors, and exposures
+    [E, 4, K] at the last points of _edges.
 
     The middle color's distance from the line of its two sides, in code values at the middle color, has the variance
     that rounding of all three gives it. Along the line every share of linear light within the limits is as likely.
     Both densities are normalized: else the curve that crowds colors together would win.
     """
-    first, middle, last = exposures[..., :9].unflatten(-1, (3, 3)).unbind(-2)
-    slope_first, slope, slope_last = slopes.unflatten(-1, (3, 3)).unbind(-2)
-    low, high, begin, end = exposures[..., 9:].unbind(-1)
+    first, middle, last = exposures.unflatten(1, (3, 3)).unbind(1)
+    slope_first, slope, slope_last = slopes.unflatten(1, (3, 3)).unbind(1)
+    low, high, begin, end = lines.unbind(1)
     offset, line = slope * (middle - first) / CODE, slope * (last - first) / CODE
-    share = ((offset * line).sum(-1) / line.square().sum(-1).clamp_min(1e-30))[..., None]
+    share = ((offset * line).sum(1) / line.square().sum(1).clamp_min(1e-30))[:, None]
     variance = CODE_VARIANCE * (1 + ((1 - share) * slope / slope_first) ** 2 + (share * slope / slope_last) ** 2)
-    weighted = (line.square() / variance).sum(-1).clamp_min(1e-30)
-    share = ((offset * line / variance).sum(-1) / weighted)[..., None]
-    distance = ((offset - share * line).square() / variance).sum(-1)
+    weighted = (line.square() / variance).sum(1).clamp_min(1e-30)
+    share = ((offset * line / variance).sum(1) / weighted)[:, None]
+    distance = ((offset - share * line).square() / variance).sum(1)
     width = ((high - low) / (end - begin)).abs().clamp_min(1e-3)
-    spread = 0.5 * (variance.log().sum(-1) + weighted.log()) + width.log()
-    tail = (EDGE_FREEDOM + 2) / 2
-    costs = [tail * (distance / (EDGE_FREEDOM * misfit)).log1p().mean(-1) + np.log(misfit) for misfit in EDGE_MISFITS]
-    return torch.stack(costs).amin(0) + spread.mean(-1)
+    spread = 0.5 * (variance.log().sum(1) + weighted.log()) + width.log()
+    # A sum of logarithms is that of products, of four, which stay below 1e38.
+    tail, count = (EDGE_FREEDOM + 2) / 2, len(exposures)
+    four = torch.nn.functional.pad(distance, (0, 0, 0, -count % 4)).unflatten(0, (4, -1)) / EDGE_FREEDOM
+    costs = [tail * (four / misfit + 1).prod(0).log().sum(0) + count * np.log(misfit) for misfit in EDGE_MISFITS]
+    return torch.stack(costs) + spread.sum(0)
