@@ -4,6 +4,8 @@ from functools import cache
 
 import warp as wp
 
+from .constants import FORWARD
+
 
 @cache
 def clipped_residual_kernel(dtype, code, mu_law: bool):
@@ -24,7 +26,7 @@ def clipped_residual_kernel(dtype, code, mu_law: bool):
                 result *= x / (u - real(1.0))
         return result
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False, "fuse_fp": False})
+    @wp.kernel(module="unique", module_options=FORWARD | {"fuse_fp": False})
     def clipped_residual(
         first: int,
         image: wp.array(dtype=real), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64),

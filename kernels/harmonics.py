@@ -9,6 +9,7 @@ from functools import cache
 
 import warp as wp
 
+from .constants import FORWARD
 from .geometry import geometry
 
 
@@ -79,7 +80,7 @@ def harmonics_kernel(dtype, degree: int):
     vec3 = geometry(dtype).vec3
     direction_of, harmonic = harmonic_functions(dtype)
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.kernel(module="unique", module_options=FORWARD)
     def evaluate_harmonics(
         first: int,
         constant: wp.array2d(dtype=vec3), rest: wp.array2d(dtype=vec3), means: wp.array(dtype=vec3),
@@ -107,7 +108,7 @@ def harmonics_adjoint_kernel(dtype, degree: int, coefficients: bool):
     direction_of, harmonic = harmonic_functions(dtype)
     used = (degree + 1) * (degree + 1) - 1
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.kernel(module="unique", module_options=FORWARD)
     def harmonics_adjoint(
         first: int,
         rest: wp.array2d(dtype=vec3), means: wp.array(dtype=vec3), camera_position: wp.array(dtype=vec3),
@@ -183,7 +184,7 @@ def basis_kernel(dtype, degree: int):
     vec3 = geometry(dtype).vec3
     direction_of, harmonic = harmonic_functions(dtype)
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.kernel(module="unique", module_options=FORWARD)
     def evaluate_basis(
         first: int,
         means: wp.array(dtype=vec3), positions: wp.array(dtype=vec3), basis: wp.array3d(dtype=dtype),
@@ -229,7 +230,7 @@ def coefficient_adjoint_kernel(dtype, count: int):
     """
     gradient_of = coefficient_gradient(dtype, count)
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.kernel(module="unique", module_options=FORWARD)
     def coefficient_adjoint(
         first: int,
         basis: wp.array3d(dtype=dtype), value_gradients: wp.array3d(dtype=dtype), start: int,

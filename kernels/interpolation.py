@@ -6,6 +6,7 @@ function is constant, above the last one a straight line.
 
 import warp as wp
 
+from .constants import FORWARD
 from .geometry import vector
 
 COPIES = 32
@@ -48,7 +49,7 @@ def weight_slopes(part: float) -> _weights4:
     )
 
 
-@wp.kernel(module="unique", module_options={"enable_backward": False})
+@wp.kernel(module="unique", module_options=FORWARD)
 def interpolate(
     table: wp.array2d(dtype=wp.float32),
     low: float, inverse_step: float,
@@ -65,7 +66,7 @@ def interpolate(
     values[i, column] = wp.where(wp.isnan(positions[i, column]), positions[i, column], value)
 
 
-@wp.kernel(module="unique", module_options={"enable_backward": False})
+@wp.kernel(module="unique", module_options=FORWARD)
 def interpolate_adjoint(
     table: wp.array2d(dtype=wp.float32),
     low: float, inverse_step: float,

@@ -7,6 +7,8 @@ bright thing is then compared by itself, and not together with the wall that ano
 
 import warp as wp
 
+from .constants import FORWARD
+
 RADIUS = wp.constant(2)
 """Patches are 5 x 5 pixels."""
 WHITE = wp.constant(765.0)
@@ -17,9 +19,9 @@ LARGEST = wp.constant(0.25)
 """Differences count up to here: what a photo does not see must not outweigh what others see."""
 MOST_NEIGHBORS = 8
 
-_SIDE = 2 * int(RADIUS) + 1
+SIDE = 2 * int(RADIUS) + 1
 _costs8 = wp.types.vector(length=8, dtype=wp.float32)
-_patch = wp.types.vector(length=_SIDE * _SIDE, dtype=wp.float32)
+_patch = wp.types.vector(length=SIDE * SIDE, dtype=wp.float32)
 
 
 @wp.func
@@ -63,7 +65,7 @@ def is_inside(pixel: wp.vec3, nearest: float, right: float, bottom: float) -> bo
     return pixel[2] > nearest and u >= 0.0 and v >= 0.0 and u < right and v < bottom
 
 
-@wp.kernel(module="unique", module_options={"enable_backward": False})
+@wp.kernel(module="unique", module_options=FORWARD)
 def sweep(
     first: int,
     photos: wp.array(dtype=wp.vec4ub), offsets: wp.array(dtype=wp.int64), sizes: wp.array2d(dtype=wp.int32),
@@ -90,11 +92,11 @@ def sweep(
 
     weights = _patch()
     total = float(0.0)
-    for y in range(wp.static(_SIDE)):
-        for x in range(wp.static(_SIDE)):
+    for y in range(wp.static(SIDE)):
+        for x in range(wp.static(SIDE)):
             color = color_at(photos, place + wp.int64((y - RADIUS) * width + x - RADIUS))
             weight = wp.exp(difference(color, middle) * (-1.0 / (WHITE * SIMILARITY)))
-            weights[y * wp.static(_SIDE) + x] = weight
+            weights[y * wp.static(SIDE) + x] = weight
             total += weight
     total *= WHITE
 
@@ -121,15 +123,15 @@ def sweep(
             ):
                 offset = offsets[other]
                 unlike = float(0.0)
-                for y in range(wp.static(_SIDE)):
-                    for x in range(wp.static(_SIDE)):
+                for y in range(wp.static(SIDE)):
+                    for x in range(wp.static(SIDE)):
                         pixel = center + float(x - RADIUS) * across + float(y - RADIUS) * down
                         nearness = 1.0 / pixel[2]
                         u, v = pixel[0] * nearness, pixel[1] * nearness
                         seen = color_between(photos, offset, size[0], size[1], u, v)
                         color = color_at(photos, place + wp.int64((y - RADIUS) * width + x - RADIUS))
                         apart = wp.min(difference(color, seen), WHITE * LARGEST)
-                        unlike += weights[y * wp.static(_SIDE) + x] * apart
+                        unlike += weights[y * wp.static(SIDE) + x] * apart
                 cost = unlike / total
                 rank = int(counted)
                 while rank > 0 and best[wp.max(rank - 1, 0)] > cost:

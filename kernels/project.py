@@ -13,7 +13,7 @@ from functools import cache
 
 import warp as wp
 
-from .constants import FRUSTUM_MARGIN, LOG_SCALE_MAX
+from .constants import FRUSTUM_MARGIN, LOG_SCALE_MAX, cpu_flags
 from .geometry import geometry, matrix
 
 
@@ -36,7 +36,7 @@ def projection_kernel(dtype, antialiased: bool):
     def _no_gradient(determinant: real, blurred: real, adj_ret: real):
         pass
 
-    @wp.kernel(module="unique", module_options={"enable_backward": True})
+    @wp.kernel(module="unique", module_options={"enable_backward": True, "cpu_compiler_flags": cpu_flags()})
     def project(
         first: int,
         means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quaternions: wp.array(dtype=vec4),

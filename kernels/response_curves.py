@@ -4,6 +4,7 @@ from functools import cache
 
 import warp as wp
 
+from .constants import FORWARD
 from .geometry import vector
 
 NO_TONE, REINHARD, FILMIC, KNEE = 0, 1, 2, 3
@@ -15,7 +16,7 @@ def encode_kernel(dtype, tone: int):
     real = dtype
     vec4, vec5 = vector(4, dtype), vector(5, dtype)
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.kernel(module="unique", module_options=FORWARD)
     def encode(
         first: int,
         exposures: wp.array(dtype=real),

@@ -17,7 +17,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .constants import ALPHA_MAX, LOG_SCALE_MAX, TILE_SIZE, TRANSMITTANCE_MIN
+from .constants import ALPHA_MAX, FORWARD, LOG_SCALE_MAX, TILE_SIZE, TRANSMITTANCE_MIN, cpu_flags
 from .geometry import geometry, vector
 
 # Tiles along the side of a block: the pairs of Gaussians and blocks are few, and so are the tiles of a block.
@@ -34,7 +34,7 @@ def projection_kernel(dtype, antialiased: bool):
     g = geometry(dtype)
     real, vec3, vec4 = g.real, g.vec3, g.vec4
 
-    @wp.kernel(module="unique", module_options={"enable_backward": True})
+    @wp.kernel(module="unique", module_options={"enable_backward": True, "cpu_compiler_flags": cpu_flags()})
     def project_to_sphere(
         first: int,
         means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quaternions: wp.array(dtype=vec4),
@@ -112,7 +112,7 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
     g = geometry(dtype)
     real, vec3, vec4 = g.real, g.vec3, g.vec4
     features_type = vector(channels, dtype)
-    options = {"enable_backward": False, "fuse_fp": False}
+    options = FORWARD | {"fuse_fp": False}
 
     @wp.func
     def caps_meet(one: vec4, other: vec4) -> bool:

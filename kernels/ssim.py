@@ -20,6 +20,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from .constants import FORWARD
 from .geometry import vector
 
 RADIUS = 5
@@ -52,8 +53,8 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
     real, run = dtype, wp.types.vector(length=lanes, dtype=dtype)
     taps, radius = wp.constant(2 * RADIUS + 1), wp.constant(RADIUS)
     c1, c2 = wp.constant(real(C1)), wp.constant(real(C2))
-    options = {"enable_backward": False}
-    strip_options = {"enable_backward": False, "max_unroll": 32}
+    options = FORWARD
+    strip_options = FORWARD | {"max_unroll": 32}
     column, windowed = vector(STRIP + 2 * RADIUS, dtype), vector(STRIP, dtype)
     window_type = vector(2 * RADIUS + 1, dtype)
 

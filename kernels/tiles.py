@@ -14,7 +14,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .constants import TILE_SIZE
+from .constants import FORWARD, TILE_SIZE
 from .geometry import geometry
 
 DEPTH_BITS = 30
@@ -33,7 +33,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
     vec2s, vec4s = wp.array(dtype=vec2), wp.array(dtype=vec4)
     size = float(TILE_SIZE)
     # Without fused multiply-adds: who counts and who emits must decide alike; a compiler fuses each its own way.
-    options = {"enable_backward": False, "fuse_fp": False}
+    options = FORWARD | {"fuse_fp": False}
 
     @wp.func
     def tile_span(centre: real, extent: real, tiles: int) -> wp.vec2i:
@@ -205,7 +205,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
     )
 
 
-@wp.kernel(module="unique", module_options={"enable_backward": False})
+@wp.kernel(module="unique", module_options=FORWARD)
 def count_tiles(first: int, tiles: wp.array(dtype=wp.int32), size: int, counts: wp.array2d(dtype=wp.int32)):
     """counts[c, t], of zeros: how many entries of chunk c, `size` of them, are tile t's. Covers [0, chunks)."""
     chunk = first + wp.tid()
@@ -213,7 +213,7 @@ def count_tiles(first: int, tiles: wp.array(dtype=wp.int32), size: int, counts: 
         counts[chunk, tiles[entry]] = counts[chunk, tiles[entry]] + 1
 
 
-@wp.kernel(module="unique", module_options={"enable_backward": False})
+@wp.kernel(module="unique", module_options=FORWARD)
 def place_entries(
     first: int,
     tiles: wp.array(dtype=wp.int32), given: wp.array(dtype=wp.int32), size: int, starts: wp.array2d(dtype=wp.int32),
@@ -239,7 +239,7 @@ def ranges_kernel(key, shift: int):
     entries carry a tile number beyond all, and belong to no list.
     """
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.kernel(module="unique", module_options=FORWARD)
     def find_ranges(first: int, keys: wp.array(dtype=key), tiles: int, ranges: wp.array(dtype=wp.int32)):
         tile = first + wp.tid()
         low = int(0)

@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from .constants import LOG_SCALE_MAX
+from .constants import FORWARD, LOG_SCALE_MAX
 from .geometry import geometry, vector
 
 SHARPNESS, CENTRE = 100.0, 0.995  # 3DGS-MCMC, equation 8: noise is for Gaussians of opacity below 1 - 0.995
@@ -21,7 +21,7 @@ _g = geometry(wp.float32)
 _vec3, _vec4 = vector(3, wp.float32), vector(4, wp.float32)
 
 
-@wp.kernel(module="unique", module_options={"enable_backward": False})
+@wp.kernel(module="unique", module_options=FORWARD)
 def judge_step(
     loss: wp.array(dtype=wp.float32), norms: wp.array(dtype=wp.float32), incomplete: wp.array(dtype=wp.bool),
     verdict: wp.array(dtype=wp.float32),
@@ -68,7 +68,7 @@ def step_by_adam(
 _floats = wp.array(dtype=wp.float32)
 
 
-@wp.kernel(module="unique", module_options={"enable_backward": False})
+@wp.kernel(module="unique", module_options=FORWARD)
 def update_by_adam(
     first: int,
     skipped: _floats,
@@ -105,7 +105,7 @@ def update_by_adam(
             )  # fmt: skip
 
 
-@wp.kernel(module="unique", module_options={"enable_backward": False})
+@wp.kernel(module="unique", module_options=FORWARD)
 def find_nonfinite(
     first: int,
     a: _floats, b: _floats, c: _floats, d: _floats, e: _floats, f: _floats, g: _floats, h: _floats,
@@ -141,7 +141,7 @@ def harmonics_adam_kernel(count: int):
     apart, and asks for the memory of all before it waits for any."""
     numbers, whole_numbers = vector(NUMBERS, wp.float32), vector(NUMBERS, wp.int32)
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.kernel(module="unique", module_options=FORWARD)
     def update_harmonics_by_adam(
         first: int,
         basis: wp.array3d(dtype=wp.float32), value_gradients: wp.array3d(dtype=wp.float32), start: int, stride: int,
@@ -189,7 +189,7 @@ def harmonics_adam_kernel(count: int):
     return update_harmonics_by_adam
 
 
-@wp.kernel(module="unique", module_options={"enable_backward": False})
+@wp.kernel(module="unique", module_options=FORWARD)
 def sum_opacities(
     first: int, logits: wp.array(dtype=wp.float32), sums: wp.array(dtype=wp.float32), slopes: wp.array(dtype=wp.float32)
 ):
@@ -204,7 +204,7 @@ def sum_opacities(
     sums[thread] = total * part
 
 
-@wp.kernel(module="unique", module_options={"enable_backward": False})
+@wp.kernel(module="unique", module_options=FORWARD)
 def add_gradient_statistics(
     first: int,
     gradients: wp.array(dtype=wp.vec2), radii: wp.array(dtype=wp.float32), usable: wp.array(dtype=wp.float32),
@@ -226,7 +226,7 @@ def add_gradient_statistics(
         seen[i] = seen[i] + 1.0
 
 
-@wp.kernel(module="unique", module_options={"enable_backward": False})
+@wp.kernel(module="unique", module_options=FORWARD)
 def add_position_noise(
     first: int,
     log_scales: wp.array(dtype=_vec3), quaternions: wp.array(dtype=_vec4),

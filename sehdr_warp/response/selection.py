@@ -329,7 +329,9 @@ def _edges(edges: np.ndarray, logs: np.ndarray, rises: np.ndarray) -> np.ndarray
     total = torch.zeros(len(EDGE_MISFITS), len(logs), dtype=torch.float64)
     for start in range(0, len(points), BATCH):
         colors, lines = ((slice(start, start + BATCH), part) for part in (slice(9), slice(9, 13)))
-        total += _mixture_surprise(read(exposures, colors, between), read(slopes, colors, between), read(exposures, lines))
+        total += _mixture_surprise(
+            read(exposures, colors, between), read(slopes, colors, between), read(exposures, lines)
+        )
     return (total / len(points)).amin(0).numpy()
 
 

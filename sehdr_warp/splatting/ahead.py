@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from ..kernels import blend_cpu, harmonics, plane_sweep, ssim, tiles, training_step
+from ..kernels import blend_cpu, harmonics, plane_sweep_cpu, ssim, tiles, training_step
 from ..kernels.constants import ALPHA_THRESHOLD
 from ..kernels.project import projection_kernel
 from .blending import halvings
@@ -31,7 +31,13 @@ def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
     kind = real, channels, halvings(ALPHA_THRESHOLD)
     blend = [] if channels is None else [blend_cpu.forward_kernel(*kind), blend_cpu.backward_kernel(*kind)]
     return [
-        *(*blend, distance.compare, projection_kernel(real, antialiased), plane_sweep.sweep, distance.gradient),
+        *(
+            *blend,
+            distance.compare,
+            projection_kernel(real, antialiased),
+            plane_sweep_cpu.sweep_rows,
+            distance.gradient,
+        ),
         *(lists.emit_entries, lists.pack_records, distance.blur_columns, distance.blur_derivatives),
         *(harmonics.harmonics_kernel(real, 0), harmonics.harmonics_adjoint_kernel(real, 0, True)),
         *(lists.gather_entries, training_step.add_position_noise, training_step.judge_step),

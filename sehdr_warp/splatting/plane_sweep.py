@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..kernels import plane_sweep
+from ..kernels import plane_sweep, plane_sweep_cpu
 from .launching import launch
 
 BORDER = int(plane_sweep.RADIUS)
@@ -54,7 +54,12 @@ class PhotoSet:
 def matching_costs(photos: PhotoSet, pixels: Tensor, depths: Tensor) -> Tensor:
     """[N, D] in [0, 0.25]: how unlike the photos are where pixels [N, 3] (view, column, row; int32) would be at depths
     [N, D] (float32, along the axis); 0.5 where fewer than two neighbors show the place."""
-    costs = torch.empty_like(depths)
-    given = photos.codes, photos.offsets, photos.sizes, photos.intrinsics, photos.neighbors, photos.between
-    launch(plane_sweep.sweep, depths.numel(), *given, pixels.contiguous(), depths.contiguous(), costs)
+    costs = torch.empty(depths.shape, device=depths.device)
+    others = photos.offsets, photos.sizes, photos.intrinsics, photos.neighbors, photos.between
+    asked = pixels.contiguous(), depths.contiguous(), costs
+    if depths.device.type == "cpu":
+        rows = -(-depths.shape[1] // plane_sweep_cpu.LANES)
+        launch(plane_sweep_cpu.sweep_rows, len(depths) * rows, photos.codes.view(torch.int32)[:, 0], *others, *asked)
+    else:
+        launch(plane_sweep.sweep, depths.numel(), photos.codes, *others, *asked)
     return costs

@@ -60,7 +60,7 @@ def test_costs_are_the_reference(photos, device):
     assert (costs[:5] < 0.5).any() and (costs[5] == 0.5).all()
 
 
-@pytest.mark.parametrize("depth", [1e-30, 1e30, float("inf"), float("nan"), 0.0, -1.0])
+@pytest.mark.parametrize("depth", [1e-30, 1e30, 3e38, float("inf"), float("nan"), 0.0, -1.0])
 def test_impossible_depths_cost_what_is_not_seen(photos, device, depth):
     images, cameras = photos
     pixels = torch.tensor([[0, 11, 8]], dtype=torch.int32, device=device)

@@ -9,7 +9,7 @@ import warp as wp
 
 from sehdr_warp.bench.splats import Size, make_photo_scene
 from sehdr_warp.bench.step import make_trainer
-from sehdr_warp.kernels.plane_sweep import sweep
+from sehdr_warp.kernels.plane_sweep_cpu import sweep_rows
 from sehdr_warp.splatting import ahead, launching
 from sehdr_warp.training.config_files import load_config
 
@@ -59,6 +59,6 @@ def test_a_training_launches_what_was_compiled_ahead():
     trainer = make_trainer(scene, load_config("default", {"response.name": "srgb"}), torch.device("cpu"))
     trainer.iteration = 0
     trainer.step()
-    launched = {kernel for kernel, *_ in launching._of_thread.launches} | {sweep}
+    launched = {kernel for kernel, *_ in launching._of_thread.launches} | {sweep_rows}
     assert launched.issuperset(ahead.training_kernels(3, antialiased=False))
     assert launched.issuperset(ahead.training_kernels(None, antialiased=False))

@@ -1,0 +1,177 @@
+"""The plane sweep of plane_sweep.py for the CPU: rows of 8 depths, of one pixel, which LLVM turns into AVX2.
+
+Where a neighbor shows a pixel of the patch is linear in the depth, before the division: origin + depth * ray.
+"""
+
+import warp as wp
+
+from .constants import FORWARD, FUSED, cpu_flags
+from .geometry import vector
+from .plane_sweep import LARGEST, MOST_NEIGHBORS, RADIUS, SIDE, SIMILARITY, WHITE, in_pixels
+
+LANES = 8
+OPTIONS = FORWARD | {"cpu_compiler_flags": cpu_flags(depth=8) + FUSED, "max_unroll": 8}
+PATCH = SIDE * SIDE
+
+_row, _codes, _patch = vector(LANES, wp.float32), vector(LANES, wp.int32), vector(PATCH, wp.float32)
+_costs = wp.types.matrix(shape=(MOST_NEIGHBORS, LANES), dtype=wp.float32)
+
+
+@wp.func
+def channel_of(code: int, channel: int) -> float:
+    return float((code >> (8 * channel)) & 255)
+
+
+@wp.func
+def channels_of(codes: _codes, channel: int) -> _row:
+    shifted = (codes >> _codes(8 * channel)) & _codes(255)
+    result = _row()
+    for lane in range(wp.static(LANES)):
+        result[lane] = float(shifted[lane])
+    return result
+
+
+@wp.func
+def codes_at(photos: wp.array(dtype=wp.int32), offset: wp.int64, places: _row) -> _codes:
+    """places: of pixels, which floats hold exactly up to 16 million."""
+    result = _codes()
+    for lane in range(wp.static(LANES)):
+        result[lane] = photos[offset + wp.int64(int(places[lane]))]
+    return result
+
+
+@wp.func
+def whole(x: _row) -> _row:
+    result = _row()
+    for lane in range(wp.static(LANES)):
+        result[lane] = float(int(x[lane]))
+    return result
+
+
+@wp.func
+def mixed(a: _row, b: _row, share: _row) -> _row:
+    return a + wp.cw_mul(b - a, share)
+
+
+@wp.kernel(module="unique", module_options=OPTIONS)
+def sweep_rows(
+    first: int,
+    photos: wp.array(dtype=wp.int32), offsets: wp.array(dtype=wp.int64), sizes: wp.array2d(dtype=wp.int32),
+    intrinsics: wp.array(dtype=wp.vec4), neighbors: wp.array2d(dtype=wp.int32), between: wp.array2d(dtype=wp.mat44),
+    pixels: wp.array2d(dtype=wp.int32), depths: wp.array2d(dtype=wp.float32),
+    costs: wp.array2d(dtype=wp.float32),
+):
+    """The costs of plane_sweep.sweep; an index is one pixel and one row of depths, ceil(D / 8) to a pixel. photos: a
+    pixel's four codes in one number, red lowest."""
+    i = first + wp.tid()
+    count = depths.shape[1]
+    rows = (count + wp.static(LANES - 1)) / wp.static(LANES)
+    n = i / rows
+    start = (i - n * rows) * wp.static(LANES)
+    end = wp.min(start + wp.static(LANES), count)
+    view, column, line = pixels[n, 0], pixels[n, 1], pixels[n, 2]
+    width, own = sizes[view, 0], intrinsics[view]
+    corner = offsets[view] + wp.int64((line - RADIUS) * width + column - RADIUS)
+    depth = _row(depths[n, start])
+    for d in range(start, end):
+        depth[d - start] = depths[n, d]
+
+    middle = photos[corner + wp.int64(RADIUS * width + RADIUS)]
+    weights = _patch()
+    total = float(0.0)
+    for k in range(wp.static(PATCH)):
+        y = k / wp.static(SIDE)
+        code = photos[corner + wp.int64(y * width + k - y * wp.static(SIDE))]
+        unlike = float(0.0)
+        for channel in range(3):
+            unlike += wp.abs(channel_of(code, channel) - channel_of(middle, channel))
+        weights[k] = wp.exp(unlike * (-1.0 / (WHITE * SIMILARITY)))
+        total += weights[k]
+    total *= WHITE
+
+    found = _costs()
+    for slot in range(neighbors.shape[1]):
+        found[slot] = _row(2.0 * LARGEST)
+        other = neighbors[view, slot]
+        if other >= 0:
+            to_other, lens = between[view, slot], intrinsics[other]
+            stride, offset = sizes[other, 0], offsets[other]
+            # Less what rounding may take a pixel of the patch beyond its corners.
+            right, bottom = float(stride - 1) - 1.0e-3, float(sizes[other, 1] - 1) - 1.0e-3
+            origin = in_pixels(lens, wp.transform_point(to_other, wp.vec3(0.0, 0.0, 0.0)))
+            across = in_pixels(lens, wp.transform_vector(to_other, wp.vec3(1.0 / own[0], 0.0, 0.0)))
+            down = in_pixels(lens, wp.transform_vector(to_other, wp.vec3(0.0, 1.0 / own[1], 0.0)))
+            u = (float(column - RADIUS) + 0.5 - own[2]) / own[0]
+            v = (float(line - RADIUS) + 0.5 - own[3]) / own[1]
+            ray = in_pixels(lens, wp.transform_vector(to_other, wp.vec3(u, v, 1.0)))
+            # How far within the photo the patch's corners are.
+            margin = _row(1.0)
+            finite = _row()
+            k = int(0)
+            while k < 4:
+                along = ray + float(k / 2 * wp.static(SIDE - 1)) * across + float(k % 2 * wp.static(SIDE - 1)) * down
+                z = depth * along[2] + _row(origin[2])
+                x_there = wp.cw_div(depth * along[0] + _row(origin[0]), z)
+                y_there = wp.cw_div(depth * along[1] + _row(origin[1]), z)
+                margin = wp.min(margin, wp.min(wp.min(x_there, _row(right) - x_there), _row(bottom) - y_there))
+                margin = wp.min(margin, wp.min(y_there, z - depth * 1.0e-6))
+                finite += (x_there + y_there) * 0.0
+                k += 1
+            margin += finite  # Minima pass over what is not a number; this sum becomes none.
+            shown = int(-1)
+            for lane in range(wp.static(LANES)):
+                if margin[lane] >= 0.0:
+                    shown = lane
+            if shown >= 0:
+                # Depths that the neighbor does not show are looked up where it shows another.
+                safe = depth
+                for lane in range(wp.static(LANES)):
+                    if not margin[lane] >= 0.0:
+                        safe[lane] = depth[shown]
+                sums = _row()
+                for k in range(wp.static(PATCH)):
+                    y = k / wp.static(SIDE)
+                    x = k - y * wp.static(SIDE)
+                    along = ray + float(x) * across + float(y) * down
+                    nearness = wp.cw_div(_row(1.0), safe * along[2] + _row(origin[2]))
+                    x_there = wp.cw_mul(safe * along[0] + _row(origin[0]), nearness)
+                    y_there = wp.cw_mul(safe * along[1] + _row(origin[1]), nearness)
+                    left = whole(x_there)
+                    top = whole(y_there)
+                    a = x_there - left
+                    b = y_there - top
+                    places = top * float(stride) + left
+                    codes = codes_at(photos, offset, places)
+                    after = codes_at(photos, offset + wp.int64(1), places)
+                    below = codes_at(photos, offset + wp.int64(stride), places)
+                    below_after = codes_at(photos, offset + wp.int64(stride + 1), places)
+                    code = photos[corner + wp.int64(y * width + x)]
+                    apart = _row()
+                    for channel in range(3):
+                        upper = mixed(channels_of(codes, channel), channels_of(after, channel), a)
+                        lower = mixed(channels_of(below, channel), channels_of(below_after, channel), a)
+                        apart += wp.abs(mixed(upper, lower, b) - _row(channel_of(code, channel)))
+                    sums += wp.min(apart, _row(WHITE * LARGEST)) * weights[k]
+                for lane in range(wp.static(LANES)):
+                    if margin[lane] >= 0.0:
+                        found[slot, lane] = sums[lane] / total
+
+    for d in range(start, end):
+        best = _row()  # In order, the best first.
+        counted = int(0)
+        for slot in range(neighbors.shape[1]):
+            cost = found[slot, d - start]
+            if cost < 2.0 * LARGEST:
+                rank = int(counted)
+                while rank > 0 and best[wp.max(rank - 1, 0)] > cost:
+                    best[rank] = best[rank - 1]
+                    rank -= 1
+                best[rank] = cost
+                counted += 1
+        result = 2.0 * LARGEST
+        if counted >= 2:
+            half = wp.max(2, (counted + 1) / 2)
+            result = float(0.0)
+            for slot in range(half):
+                result += best[slot] / float(half)
+        costs[n, d] = result
