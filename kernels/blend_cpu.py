@@ -53,6 +53,9 @@ def row_functions(dtype, halvings: int):
     lowest = -0.7 * 2.0**halvings
     highest, *others = EXP_COEFFICIENTS
     degree = len(others)
+    # Not wp.static(others[k]): of a function that kernels share, the cache would take it for another one once it is
+    # compiled.
+    lower = vector(degree, dtype)(*others)
 
     @wp.func
     def spread(value: real) -> row:
@@ -79,7 +82,7 @@ def row_functions(dtype, halvings: int):
             x = wp.max(p, row(real(lowest))) * real(wp.static(0.5**halvings))
             e = row(real(highest))
             for k in range(wp.static(degree)):
-                e = wp.cw_mul(e, x) + row(real(wp.static(others[k])))
+                e = wp.cw_mul(e, x) + row(lower[k])
             for _ in range(wp.static(halvings)):
                 e = wp.cw_mul(e, e)
             return e

@@ -10,7 +10,7 @@ from .geometry import vector
 from .plane_sweep import LARGEST, MOST_NEIGHBORS, RADIUS, SIDE, SIMILARITY, WHITE, in_pixels
 
 LANES = 8
-OPTIONS = FORWARD | {"cpu_compiler_flags": cpu_flags(depth=8) + FUSED, "max_unroll": 8}
+OPTIONS = FORWARD | {"cpu_compiler_flags": cpu_flags() + FUSED, "max_unroll": 8}
 PATCH = SIDE * SIDE
 
 _row, _codes, _patch = vector(LANES, wp.float32), vector(LANES, wp.int32), vector(PATCH, wp.float32)
@@ -19,15 +19,17 @@ _costs = wp.types.matrix(shape=(MOST_NEIGHBORS, LANES), dtype=wp.float32)
 
 @wp.func
 def channel_of(code: int, channel: int) -> float:
-    return float((code >> (8 * channel)) & 255)
+    """Times 256^channel."""
+    return float(code & (255 << (8 * channel)))
 
 
 @wp.func
 def channels_of(codes: _codes, channel: int) -> _row:
-    shifted = (codes >> _codes(8 * channel)) & _codes(255)
+    """Times 256^channel: without a shift, which LLVM would follow by packing bytes."""
+    masked = codes & _codes(255 << (8 * channel))
     result = _row()
     for lane in range(wp.static(LANES)):
-        result[lane] = float(shifted[lane])
+        result[lane] = float(masked[lane])
     return result
 
 
@@ -84,7 +86,7 @@ def sweep_rows(
         code = photos[corner + wp.int64(y * width + k - y * wp.static(SIDE))]
         unlike = float(0.0)
         for channel in range(3):
-            unlike += wp.abs(channel_of(code, channel) - channel_of(middle, channel))
+            unlike += wp.abs(channel_of(code, channel) - channel_of(middle, channel)) / float(1 << (8 * channel))
         weights[k] = wp.exp(unlike * (-1.0 / (WHITE * SIMILARITY)))
         total += weights[k]
     total *= WHITE
@@ -150,7 +152,8 @@ def sweep_rows(
                     for channel in range(3):
                         upper = mixed(channels_of(codes, channel), channels_of(after, channel), a)
                         lower = mixed(channels_of(below, channel), channels_of(below_after, channel), a)
-                        apart += wp.abs(mixed(upper, lower, b) - _row(channel_of(code, channel)))
+                        unlike_here = wp.abs(mixed(upper, lower, b) - _row(channel_of(code, channel)))
+                        apart += unlike_here * (1.0 / float(1 << (8 * channel)))
                     sums += wp.min(apart, _row(WHITE * LARGEST)) * weights[k]
                 for lane in range(wp.static(LANES)):
                     if margin[lane] >= 0.0:

@@ -14,8 +14,7 @@ from ..kernels import blend_cpu, harmonics, plane_sweep_cpu, ssim, tiles, traini
 from ..kernels.constants import ALPHA_THRESHOLD
 from ..kernels.project import projection_kernel
 from .blending import halvings
-from .launching import module_locks
-from .memory import check_room_to_compile
+from .launching import is_fused, load_on_cpu
 from .ssim import CPU_LANES
 
 log = logging.getLogger(__name__)
@@ -24,33 +23,29 @@ PATIENCE = 1.0  # Seconds that a block may end in with nothing begun, as one doe
 
 
 def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
-    """Those that take the compiler longest, of which the latest ones are asked for last. channels: that are blended;
-    None where that is not known."""
+    """Those that take the compiler longest, about as they are asked for. channels: that are blended; None where that is
+    not known."""
     real = wp.float32
     distance, lists = ssim.ssim_kernels(real, CPU_LANES, True), tiles.tile_kernels(real)
     kind = real, channels, halvings(ALPHA_THRESHOLD)
-    blend = [] if channels is None else [blend_cpu.forward_kernel(*kind), blend_cpu.backward_kernel(*kind)]
+    blend = [] if channels is None else [blend_cpu.backward_kernel(*kind), blend_cpu.forward_kernel(*kind)]
     return [
-        *(
-            *blend,
-            distance.compare,
-            projection_kernel(real, antialiased),
-            plane_sweep_cpu.sweep_rows,
-            distance.gradient,
-        ),
-        *(lists.emit_entries, lists.pack_records, distance.blur_columns, distance.blur_derivatives),
-        *(harmonics.harmonics_kernel(real, 0), harmonics.harmonics_adjoint_kernel(real, 0, True)),
-        *(lists.gather_entries, training_step.add_position_noise, training_step.judge_step),
+        *(plane_sweep_cpu.sweep_rows, *blend, projection_kernel(real, antialiased), distance.compare),
+        *(harmonics.harmonics_kernel(real, 0), lists.pack_records, lists.key_by_depth, lists.emit_entries),
+        *(tiles.count_tiles, tiles.place_entries, distance.blur_columns, distance.blur_derivatives, distance.gradient),
+        *(lists.gather_entries, harmonics.harmonics_adjoint_kernel(real, 0, True)),
+        *(training_step.judge_step, training_step.add_position_noise),
     ]
 
 
 @contextmanager
 def loaded_ahead(kernels: Sequence[Any], modules: Sequence[str] = ()) -> Iterator[None]:
-    """Imports modules and compiles kernels for the CPU, or finds them in the cache, on a thread beside this block,
-    which waits for one of them at most, at its end. What fails is told to whoever needs it."""
+    """Imports modules and compiles kernels for the CPU, or finds them in the cache, on two threads beside this block,
+    which waits for one of them each at most, at its end. What fails is told to whoever needs it."""
     over = threading.Event()
+    fused = [kernel for kernel in kernels if is_fused(kernel)]
 
-    def work() -> None:
+    def work(kernels: Sequence[Any], modules: Sequence[str]) -> None:
         if over.wait(PATIENCE):
             return
         try:
@@ -59,17 +54,18 @@ def loaded_ahead(kernels: Sequence[Any], modules: Sequence[str] = ()) -> Iterato
             for kernel in kernels:
                 if over.is_set():
                     return
-                with module_locks[kernel.module]:
-                    check_room_to_compile()
-                    wp.load_module(kernel.module, device="cpu")
+                load_on_cpu(kernel)
         except Exception:
             log.debug("not all could be loaded ahead", exc_info=True)
 
-    # Not a daemon: what compiles while the interpreter ends would abort the process.
-    thread = threading.Thread(target=work, name="sehdr-warp compiles")
-    thread.start()
+    # Not daemons: what compiles while the interpreter ends would abort the process.
+    given = (fused, modules), ([kernel for kernel in kernels if kernel not in fused], ())
+    workers = [threading.Thread(target=work, args=each, name="sehdr-warp ahead") for each in given]
+    for worker in workers:
+        worker.start()
     try:
         yield
     finally:
         over.set()
-        thread.join()
+        for worker in workers:
+            worker.join()

@@ -3,8 +3,8 @@
 import ctypes
 import math
 import threading
-from collections import defaultdict
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from typing import Any
@@ -13,6 +13,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from ..kernels.constants import FUSED
 from ..quiet import silent_stderr
 from . import kernel_cache, threads
 from .memory import check_room_to_compile
@@ -27,8 +28,7 @@ kernel_cache.check()
 _SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 _streams: dict[tuple[int, int], wp.Stream] = {}
 _loading = threading.Lock()  # Kernels that are launched are neither compiled nor loaded by two threads at once
-module_locks: defaultdict[Any, Any] = defaultdict(threading.Lock)
-"""Each is held while its Warp module is compiled or loaded, by ahead.py too."""
+_compilers = {fused: ThreadPoolExecutor(1, thread_name_prefix="sehdr-warp compiles") for fused in (False, True)}
 
 
 def warp_scalar(dtype: torch.dtype) -> Any:
@@ -77,6 +77,19 @@ def launch(
 def starts_at_first(kernel: Any) -> bool:
     """Whether the kernel takes the start of a range, `first`."""
     return kernel.adj.args[0].label == "first"
+
+
+def load_on_cpu(kernel: Any) -> None:
+    """Compiles a kernel for the CPU, or finds it in the cache, on a thread for those that are compiled like it: Warp
+    reads its headers, which takes seconds, once on each thread for each kind."""
+    check_room_to_compile()
+    compiler = _compilers[is_fused(kernel)]
+    compiler.submit(wp.load_module, kernel.module, device="cpu").result()
+
+
+def is_fused(kernel: Any) -> bool:
+    """Whether the compiler may fuse the kernel's multiply-adds on the CPU."""
+    return FUSED in (kernel.module.options["cpu_compiler_flags"] or "")
 
 
 class _Packed:
@@ -163,7 +176,9 @@ def _packed(kernel: Any, device: torch.device, block_dim: int | None, adjoint: b
         _of_thread.launches = {}
     key = kernel, device, block_dim, adjoint
     if key not in _of_thread.launches:
-        with _loading, module_locks[kernel.module]:
+        if device.type == "cpu":
+            load_on_cpu(kernel)
+        with _loading:
             _of_thread.launches[key] = _Packed(*key, dim, values)
     return _of_thread.launches[key]
 

@@ -43,7 +43,7 @@ def test_a_block_that_refuses_at_once_has_nothing_compiled():
     with pytest.raises(ValueError, match="refused"), ahead.loaded_ahead([kernel]):
         raise ValueError("refused")
     assert not is_loaded(kernel)
-    assert not [each for each in threading.enumerate() if each.name == "sehdr-warp compiles"]
+    assert not [each for each in threading.enumerate() if each.name == "sehdr-warp ahead"]
 
 
 def test_what_cannot_be_compiled_is_no_end_of_the_block(monkeypatch):
