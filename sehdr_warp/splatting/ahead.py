@@ -19,7 +19,7 @@ from .ssim import CPU_LANES
 
 log = logging.getLogger(__name__)
 
-PATIENCE = 1.0  # Seconds that a block may end in with nothing begun, as one does that refuses its input
+PATIENCE = 0.2  # Seconds that a block may end in with nothing begun, as one does that refuses its input
 
 
 def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
