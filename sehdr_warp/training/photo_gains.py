@@ -58,8 +58,10 @@ def find_gains(
 
     matcher = make(scene)
     if stated:
-        rough = rough_gains(views, *points_of(matcher, FEW_POINTS), response)
-        if rough.stops < LEAST_STOPS and rough.tint < LEAST_TINT and rough.corners < LEAST_CORNERS:
+        few = points_of(matcher, FEW_POINTS)
+        rough = rough_gains(views, *few, response)
+        falls = rough.corners >= LEAST_CORNERS and left_of_falloff(views, *few, response, rough) < 1
+        if rough.stops < LEAST_STOPS and rough.tint < LEAST_TINT and not falls:
             return none(matcher)
     found, guess = points_of(matcher), start_gains(views, response)
     if not stated and len(found[0]) < ENOUGH * POINTS and guess.stops > LEAST_STOPS:
