@@ -23,6 +23,7 @@ import warp as wp
 from torch import Tensor
 
 from .launching import launch
+from .threads import torch_threads
 
 P = ParamSpec("P")
 
@@ -131,9 +132,10 @@ class _ProgramFunction(torch.autograd.Function):
         wanted = [place for place, needed in enumerate(ctx.needs_input_grad[2:]) if needed]
         # On a GPU leaves, whose gradients stay, have them in one memory; others' are soon let go, each by itself.
         together = [p for p in wanted if ctx.leaves[p] and plain[p].device.type != "cpu"]
-        for group in (together, *([p] for p in wanted if p not in together)):
-            for place, zeros in zip(group, _zeros_like([plain[p] for p in group]), strict=True):
-                results[place] = gradients[place] = zeros
+        with torch_threads(plain[0].device):
+            for group in (together, *([p] for p in wanted if p not in together)):
+                for place, zeros in zip(group, _zeros_like([plain[p] for p in group]), strict=True):
+                    results[place] = gradients[place] = zeros
         tape.backward()
         return (None, None, *results)
 

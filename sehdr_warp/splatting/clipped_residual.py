@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..kernels.clipped_residual import clipped_residual_kernel
 from .launching import launch, warp_scalar
+from .threads import torch_threads
 
 CODES = {torch.uint8: wp.uint8, torch.int16: wp.uint16}
 WHITE = {torch.uint8: 255, torch.int16: 65535}  # The largest code, by the type of the tensor that holds it
@@ -89,4 +90,7 @@ class _ClippedResidual(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, by_seen, _):
         (slopes,) = ctx.saved_tensors
-        return None if by_seen is None else by_seen * slopes, None, None, None
+        if by_seen is None:
+            return None, None, None, None
+        with torch_threads(slopes.device):
+            return by_seen * slopes, None, None, None

@@ -8,6 +8,7 @@ from torch import Tensor
 from ..kernels.ssim import RADIUS, STRIP, ssim_kernels, window
 from .checks import check_tensors
 from .launching import launch, warp_scalar
+from .threads import torch_threads
 
 CPU_LANES = 16  # Numbers that one step of the CPU kernels takes: one AVX-512 register of float32
 STEPS_PER_THREAD = 4096  # Smallest share of such steps that is worth handing to another thread: about 0.1 ms of work
@@ -54,12 +55,18 @@ class _Distance(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             # Made at once: it takes a fifth of the memory of what it is made of.
             ctx.save_for_backward(_gradient(a, b, derivatives, _constant((1.0,), a.dtype, a.device)[0], weights))
-        return terms.sum() if a.device.type == "cuda" else terms.flatten(1).sum(1).sum()
+        if a.device.type == "cuda":
+            return terms.sum()
+        with torch_threads(a.device):  # Each row is one thread's.
+            rows = terms.flatten(1).sum(1)
+        return rows.sum()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, upstream):
-        return ctx.saved_tensors[0] * upstream, None, None, None
+        (gradient,) = ctx.saved_tensors
+        with torch_threads(gradient.device):
+            return gradient * upstream, None, None, None
 
 
 class _Similarity(torch.autograd.Function):

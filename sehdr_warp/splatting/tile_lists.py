@@ -235,9 +235,7 @@ def _count_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission
 
 
 def _taken(values: Tensor, places: Tensor) -> Tensor:
-    if values.device.type != "cpu":
-        return values[places]
-    with torch_threads():
+    with torch_threads(values.device):
         return values[places]
 
 

@@ -32,7 +32,9 @@ def norms(gradients: Sequence[Tensor]) -> Tensor:
     """[K] float32, finite where all the gradients are: on a CPU their norms, on a GPU one number, 0 or infinity."""
     if gradients[0].device.type == "cuda":
         return _nonfinite_by_kernel(gradients)
-    return torch.stack(torch._foreach_norm(list(gradients)))  # pyright: ignore[reportPrivateImportUsage]
+    with torch_threads(gradients[0].device):  # They are sums, but nobody asks how large.
+        found = torch._foreach_norm(list(gradients))  # pyright: ignore[reportPrivateImportUsage]
+    return torch.stack(found)
 
 
 def _nonfinite_by_kernel(gradients: Sequence[Tensor]) -> Tensor:
@@ -78,7 +80,7 @@ def adam_steps(steps: Sequence[AdamStep], skipped: Tensor, *, betas: tuple[float
         return
     numbers: Any = {"beta1": betas[0], "beta2": betas[1], "weight_decay": 0.0, "eps": epsilon, "found_inf": skipped}
     numbers |= {"amsgrad": False, "maximize": False}
-    with torch_threads():
+    with torch_threads(skipped.device):
         for parameter, gradient, first_moment, second_moment, step, rate in steps:
             lists = [parameter], [gradient], [first_moment], [second_moment], [], [step]
             torch._fused_adam_(*lists, lr=float(rate), **numbers)  # pyright: ignore[reportPrivateImportUsage]
