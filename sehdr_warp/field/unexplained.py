@@ -41,17 +41,18 @@ def unexplained_regions(field: RadianceField, views: Sequence[View], *, degree: 
     for view in views[:: -(-len(views) // MOST_VIEWS) or 1]:
         exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time
         stops, code = _differences(view, exposure, field.response)
-        off = (np.abs(stops) >= LEAST_STOPS) & (code >= LEAST_CODE)
-        labels = np.empty(off.shape, np.int32)
-        ndimage.label(ndimage.binary_opening(off, np.ones((2, 2))), np.ones((3, 3)), output=labels)
-        for index, place in enumerate(ndimage.find_objects(labels), start=1):
-            row, column = np.nonzero(labels[place] == index)
-            if len(row) >= LEAST_PIXELS:
-                mean = float(stops[place][row, column].mean())
-                x, y = column.mean() + place[1].start + 0.5, row.mean() + place[0].start + 0.5
-                middle = round(float(x), 1), round(float(y), 1)
-                box = place[1].start, place[0].start, *(side.stop - side.start for side in reversed(place))
-                found.append(Region(view.name, *middle, len(row), round(mean, 2), box))
+        labels = np.empty(stops.shape, np.int32)
+        for sign in (1, -1):  # Apart: what is too bright beside what is too dark would be off by nothing in the mean
+            off = (sign * stops >= LEAST_STOPS) & (code >= LEAST_CODE)
+            ndimage.label(ndimage.binary_opening(off, np.ones((2, 2))), np.ones((3, 3)), output=labels)
+            for index, place in enumerate(ndimage.find_objects(labels), start=1):
+                row, column = np.nonzero(labels[place] == index)
+                if len(row) >= LEAST_PIXELS:
+                    mean = float(stops[place][row, column].mean())
+                    x, y = column.mean() + place[1].start + 0.5, row.mean() + place[0].start + 0.5
+                    middle = round(float(x), 1), round(float(y), 1)
+                    box = place[1].start, place[0].start, *(side.stop - side.start for side in reversed(place))
+                    found.append(Region(view.name, *middle, len(row), round(mean, 2), box))
     return sorted(found, key=lambda region: -region.pixels * abs(region.stops))
 
 

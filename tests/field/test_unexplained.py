@@ -54,6 +54,13 @@ def test_what_does_not_count_is_not_missing_and_light_that_is_not_there_is(tmp_p
     black = unexplained_regions(run.model, [replace(view, codes=np.zeros_like(view.codes)) for view in scene.views])
     # A black photo says "less than half a code", not "none": from white of a linear curve that is 9 stops.
     assert min(region.stops for region in black) > -np.log2(2 * 255) - 0.01 and black
+    half = np.where(np.arange(64)[:, None, None] < 32, 255, 0).repeat(64, 1).repeat(3, 2).astype(np.uint8)
+    regions = unexplained_regions(run.model, [replace(view, codes=half) for view in scene.views])
+    # White above, black below: two regions that touch, and not one that is off by nothing in the mean.
+    assert min(abs(region.stops) for region in regions) >= 1 and {region.stops > 0 for region in regions} == {
+        True,
+        False,
+    }
     masked = [replace(view, mask=np.zeros((64, 64), np.float32)) for view in dark.views]
     assert unexplained_regions(run.model, dark.views) and not unexplained_regions(run.model, masked)
     # A finished run is asked again when it is resumed.
