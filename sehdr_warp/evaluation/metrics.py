@@ -71,7 +71,7 @@ def ssim(prediction: Tensor, truth: Tensor, mask: Tensor | None = None, *, peak:
 
 
 def pu21_encode(luminance: Tensor) -> Tensor:
-    """PU21 values of absolute luminance or colour, limited to [0.005, 10000] cd/m^2: 0 at 0.005, 256 at 100, 595 at
+    """PU21 values of absolute luminance or color, limited to [0.005, 10000] cd/m^2: 0 at 0.005, 256 at 100, 595 at
     10000 (Mantiuk and Azimi, PU21, PCS 2021)."""
     p = PU21
     power = luminance.double().clamp(*PU21_RANGE) ** p[3]
@@ -81,7 +81,7 @@ def pu21_encode(luminance: Tensor) -> Tensor:
 def pu21_metrics(
     prediction: Tensor, truth: Tensor, mask: Tensor | None = None, *, peak_luminance: float = 1000.0
 ) -> dict[str, float]:
-    """PSNR of PU21-encoded colour and SSIM of PU21-encoded luminance, both with peak 256: {"psnr": dB, "ssim": ...}.
+    """PSNR of PU21-encoded color and SSIM of PU21-encoded luminance, both with peak 256: {"psnr": dB, "ssim": ...}.
 
     prediction, truth: [H, W, 3] relative radiance in one unit, Rec.709 primaries. PU21 needs absolute values: the
     truth's maximum is shown at peak_luminance cd/m^2, and the prediction by the same factor.

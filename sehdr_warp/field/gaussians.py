@@ -22,7 +22,7 @@ class Optimizer(Protocol):
 
 
 class Gaussians(nn.Module):
-    """N anisotropic 3D Gaussians with a view-dependent colour.
+    """N anisotropic 3D Gaussians with a view-dependent color.
 
     means: [N, 3] world coordinates. log_scales: [N, 3] natural logarithms of the standard deviations, world units.
     quaternions: [N, 4] (w, x, y, z), of any length but zero. opacity_logits: [N]; the opacity is their sigmoid.

@@ -1,6 +1,6 @@
-"""Gaussians that know light: the colours of a view, from base exposure over brackets and fusion to encoded values.
+"""Gaussians that know light: the colors of a view, from base exposure over brackets and fusion to encoded values.
 
-Every colour set that a step needs is a group of three channels of one rasterisation, so that geometry is projected,
+Every color set that a step needs is a group of three channels of one rasterisation, so that geometry is projected,
 sorted and blended once.
 """
 
@@ -243,7 +243,7 @@ class RadianceField(nn.Module):
         return spherical_harmonics(used, coefficients, gaussians.means, position)
 
     def _exposures(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Exposures at the base time of each Gaussian's base colour and of its HDR colour, [N, 3] each."""
+        """Exposures at the base time of each Gaussian's base color and of its HDR color, [N, 3] each."""
         base, logarithm = self.color_model.colors(values)
         if self.fusion is None:
             return base, base

@@ -1,10 +1,12 @@
 """Exposure brackets of HDR views: scene-linear EXR files whose ratios are exact, and simulated photos of them."""
 
 import logging
+import math
 from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import datetime
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +43,7 @@ def bracket_exposures(
     """
     if evs is not None and exposures is None:
         stops = [ev for ev in evs.split(",") if ev.strip()] if isinstance(evs, str) else evs
-        name, made = "evs", read_exposures([f"{str(ev).strip()}ev" for ev in stops], base_time, "evs")
+        name, made = "evs", read_exposures([_stops_item(ev) for ev in stops], base_time, "evs")
     elif exposures is not None and evs is None:
         name, made = "exposures", read_exposures(exposures, base_time, "exposures")
     else:
@@ -52,6 +54,17 @@ def bracket_exposures(
             time = f"{exposure.time:.6g} s ({exposure.ev:+g} EV)"
             raise SehdrError(f"{name}: {time} is outside {_SHORTEST:g} to {_LONGEST:g} seconds")
     return made
+
+
+def _stops_item(ev: str | float) -> str:
+    """The item of the grammar that a number of stops is."""
+    text = str(ev).strip()
+    try:
+        if math.isfinite(float(Fraction(text))):
+            return f"{text}ev"
+    except (ValueError, ZeroDivisionError, OverflowError):
+        pass
+    raise SehdrError(f"evs: {ev!r} is no number of stops; write numbers, such as -4,-2,0,2,4")
 
 
 def write_brackets(

@@ -12,7 +12,7 @@ from ..files import read_bytes
 from ..quiet import silent_output
 from .images import DAMAGED, MAX_PIXELS, check_size, require_file
 
-# OpenEXR asks for the memory of all pixels before it reads one. Its ZIP of a single colour holds 500 pixels in a byte.
+# OpenEXR asks for the memory of all pixels before it reads one. Its ZIP of a single color holds 500 pixels in a byte.
 _MOST_PIXELS_PER_BYTE = 4096
 _REMEDY = "export the image again"
 _MAX_HEADER_BYTES = 1 << 16
@@ -126,7 +126,7 @@ def _radiance_header(data: bytes, path: Path) -> tuple[int, int, int, float]:
     if size is None:
         raise InputError(path, "Radiance header has no '-Y height +X width' line", _REMEDY)
     if b"32-bit_rle_xyze" in data[:end]:
-        raise InputError(path, "holds XYZ colours, not RGB", "convert it to RGB (ra_xyze -r)")
+        raise InputError(path, "holds XYZ colors, not RGB", "convert it to RGB (ra_xyze -r)")
     try:
         stated = re.findall(rb"^EXPOSURE\s*=\s*([^\s]{1,40})", data[:end], re.MULTILINE)
         exposure = float(np.prod([float(value) for value in stated]))

@@ -82,7 +82,7 @@ def has_16_bits(path: Path) -> bool:
 
 
 def read_mask(path: Path, *, oriented: bool = False) -> np.ndarray:
-    """[H, W] float32 in [0, 1] from grey, colour (its mean) or transparent (its alpha); 1 counts."""
+    """[H, W] float32 in [0, 1] from grey, color (its mean) or transparent (its alpha); 1 counts."""
     image = read_ldr(path, oriented=oriented, mask=True)
     return image.alpha if image.alpha is not None else (image.pixels.mean(axis=2) / image.levels).astype(np.float32)
 
@@ -191,7 +191,7 @@ def _split(values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _low_byte_tiles(image: ImageFile.ImageFile) -> list | None:
-    """Pillow keeps the high byte of 16-bit colour; asking for the other byte order makes it keep the low one."""
+    """Pillow keeps the high byte of 16-bit color; asking for the other byte order makes it keep the low one."""
     other = {"16B": "16L", "16L": "16B", "16N": "16B" if np.little_endian else "16L"}
     tiles = []
     for tile in image.tile:

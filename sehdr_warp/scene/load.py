@@ -154,7 +154,7 @@ def choose_response(capture: Capture, method: str = "posterior", candidates: Seq
     def codes() -> Iterator[tuple[np.ndarray, None]]:
         for shot in photos_to_judge(shots, method):
             image = as_photographed(shot)
-            if image.alpha is not None:  # What is not there has no colour.
+            if image.alpha is not None:  # What is not there has no color.
                 image.pixels[image.alpha < 1] = 0
             photo = image.pixels, None
             del image  # Before the next is read: they may be large.

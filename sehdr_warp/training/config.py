@@ -36,7 +36,7 @@ class _Table(BaseModel):
 
 
 class ModelConfig(_Table):
-    """What a Gaussian's colour means and how an image comes of it."""
+    """What a Gaussian's color means and how an image comes of it."""
 
     radiance: Literal["log", "linear", "display"] = "log"
     """log: log exposure is a harmonic series, so radiance is always positive; linear: exposure itself is (SeHDR);
@@ -76,7 +76,7 @@ class FusionConfig(_Table):
     """Exposure brackets and their neural fusion (SeHDR, equations 6 to 9)."""
 
     enabled: bool = False
-    """fuse exposure brackets into the HDR colour; off, the base colour is the HDR colour"""
+    """fuse exposure brackets into the HDR color; off, the base color is the HDR color"""
     exposures: Annotated[tuple[Name, ...], Many] = ("1/8x", "1/4x", "1x", "8x", "16x")
     """exposures of the brackets: multiples of the photos' own (1/8x), stops from it (-3ev) or seconds (1/125)"""
     radiance_scale: Literal["unit", "base"] = "unit"
@@ -93,7 +93,7 @@ class LossConfig(_Table):
     ldr_weight: Weight = 1.0
     """weight of the photos; 0 leaves them out"""
     hdr_weight: Weight = 0.0
-    """weight of the HDR colour against HDR truth in the mu-law, where a view has it (HDR-GS: 0.6)"""
+    """weight of the HDR color against HDR truth in the mu-law, where a view has it (HDR-GS: 0.6)"""
     clipping: bool = True
     """a clipped pixel only says `at least`, a black one only `at most`; off: both are plain values"""
     clipped_smoothness: Weight = 0.001
@@ -104,7 +104,7 @@ class LossConfig(_Table):
     linear_weight: Weight = 0.0
     """weight of the linear loss (SeHDR: 0.5)"""
     hdr_truth: bool = False
-    """compare the base colour with HDR truth in the linear loss, where a view has it"""
+    """compare the base color with HDR truth in the linear loss, where a view has it"""
     anchor_weight: Weight = 0.0
     """learned response: weight of (f(1) - 1/2)^2, which holds the scale (HDR-NeRF: 0.5)"""
     opacity_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 0.01
@@ -167,9 +167,9 @@ class OptimizerConfig(_Table):
     opacity_logits: Rate = 5e-2
     """opacities before the sigmoid"""
     harmonics_dc: Rate = 2e-2
-    """colours, degree 0"""
+    """colors, degree 0"""
     harmonics_rest: Rate = 1e-3
-    """colours, higher degrees"""
+    """colors, higher degrees"""
     fusion: Rate = 1e-3
     """perceptrons and widths of the fusion"""
     response: Rate = 5e-4

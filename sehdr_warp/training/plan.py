@@ -235,7 +235,7 @@ def check_scene(scene: Scene, facts: SceneFacts) -> None:
         problem = f"{facts.photos} training photos: depth and light cannot be told apart from so few"
         raise InputError(scene.name, problem, f"take {FEWEST_PHOTOS} or more from different places, better 20")
     if facts.contrast < LEAST_CONTRAST:
-        problem = f"all photos show a single colour (deviation {255 * facts.contrast:.2f} of 255): nothing to match"
+        problem = f"all photos show a single color (deviation {255 * facts.contrast:.2f} of 255): nothing to match"
         raise InputError(scene.name, problem, "check that the files are the photos, and their exposure")
     if facts.overlap < LEAST_OVERLAP:
         problem = f"the photos share no view: {facts.overlap:.1%} of the places that one shows another shows too"

@@ -30,10 +30,10 @@ def test_exposures_ascend_and_are_of_the_one_grammar():
     [  # The grammar's own refusals are field's to test.
         ({"evs": [0], "exposures": [1]}, "both were given"),
         ({}, "neither was given"),
-        ({"evs": [0, float("nan")]}, "evs: 'nanev' is no exposure"),
+        ({"evs": [0, float("nan")]}, "evs: nan is no number of stops"),
         ({"exposures": [2, 1, "4x"]}, "exposures: 2 s is given twice"),
         ({"evs": [1, 1.0]}, "evs: 1 s is given twice"),
-        ({"evs": "0,two"}, "evs: 'twoev' is no exposure"),
+        ({"evs": "0,two"}, "evs: 'two' is no number of stops; write numbers"),
         ({"exposures": [1e-30]}, "exposures: 1e-30 s .* is outside"),
     ],
 )

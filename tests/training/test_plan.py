@@ -166,7 +166,7 @@ def outwards(index):
     "spoil,words",
     [
         (lambda scene: toy_scene(2), ["2 training photos", "20"]),
-        (lambda scene: with_images(scene, lambda view: np.full_like(view.image, 0.5)), ["single colour", "0.00"]),
+        (lambda scene: with_images(scene, lambda view: np.full_like(view.image, 0.5)), ["single color", "0.00"]),
         (
             lambda scene: replace(
                 scene,
