@@ -200,7 +200,7 @@ def readme_table(rows: Sequence[Mapping]) -> str:
         row = short[method]
         cells = named, f"{row['HDR dB']:.1f} dB", f"{row['photos dB']:.1f} dB", row["lost"].removesuffix(" lights")
         lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(["| trained on photos by | HDR | photos | lights lost |", "| --- | -: | -: | -: |", *lines])
+    return "\n".join(["| trained by | HDR | photos | lights lost |", "| --- | -: | -: | -: |", *lines])
 
 
 def _seeds_tables(result: dict) -> Iterable[str]:
