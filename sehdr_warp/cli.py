@@ -45,7 +45,7 @@ COMMANDS = {
 """Every command, under the headings of the help: its module, dataclass of options, and the function that runs them."""
 words_given: list[str] = []
 """The words of the command line that is run."""
-_LIGHT = {"presets", "config", "scenes", "completion"}
+_LIGHT = {"presets", "config", "responses", "scenes", "completion"}
 """Commands that load no torch."""
 _LEAST_ADDRESS_SPACE = 1536 << 20
 _reserve = [bytearray(4 << 20)]

@@ -15,7 +15,6 @@ import platform
 import re
 import secrets
 import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import takewhile
@@ -123,22 +122,6 @@ def foreign(path: Path) -> Path | None:
             if file.is_symlink() or not file.is_file() or hash_line(file, name) not in known:
                 return file
     return None
-
-
-def usable(folder: Path) -> bool:
-    """Whether files can be made in a folder, which is made where it is missing."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return True
-    except (OSError, ValueError):
-        return False
-
-
-def user_cache(name: str) -> Path | None:
-    """The user's folder for what a program can make again; None where there is no home."""
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return None if home.startswith("~") else Path(home) / name
 
 
 def hash_line(file: Path, name: str) -> bytes:
@@ -261,8 +244,10 @@ def contained(folder: Path, name: str, source: Path) -> Path:
 
 def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = False, ours: bool = False) -> None:
     """Raises InputError where a file (or a folder that is not empty) at `path` would have to be replaced without leave
-    or is not this program's, or something else is in the way."""
+    or is not this program's, or something else is in the way, and SehdrError where it cannot be written: for before the
+    work."""
     path = Path(path)
+    _check_place(path)
     if not (path.exists() or path.is_symlink()):
         return
     if path.is_dir() != folder or path.is_symlink() or not (path.is_dir() or path.is_file()):
@@ -276,6 +261,15 @@ def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = Fa
     if (other := foreign(path)) is not None:
         problem = "was not written by sehdr-warp, or was changed since, and is never replaced"
         raise InputError(other, problem, "move it away, or choose another place")
+
+
+def _check_place(path: Path) -> None:
+    """Raises InputError where what is to hold `path` is a file, SehdrError where there is no right to write there."""
+    parent = next(parent for parent in path.absolute().parents if parent.exists())
+    if not parent.is_dir():
+        raise InputError(parent, "is a file, or in one, and not a folder", "choose another place")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise SehdrError(f"{path}: cannot be written (nothing may be made in {parent}); choose another folder")
 
 
 @contextmanager

@@ -13,13 +13,14 @@ PACKAGE = ROOT / "sehdr_warp"
 
 # What each room may import of the others: training -> field -> response -> splatting -> kernels, and below them all
 # what any room may use. Rooms that read a trained scene take it as an object with named methods.
-ANY = {"errors", "quiet", "arguments", "files", "console", "apart", "parallel"}
+ANY = {"errors", "quiet", "arguments", "files", "console", "apart", "parallel", "caches"}
 ALLOWED = {
     "kernels": set(),
     "errors": set(),
     "quiet": set(),
     "apart": {"errors"},
     "parallel": set(),
+    "caches": set(),
     "files": {"errors"},
     "arguments": {"errors"},
     "splats": ANY,

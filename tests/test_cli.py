@@ -71,7 +71,9 @@ def test_every_command_explains_itself(name, capsys):
     assert f"sehdr-warp {name}" in text and "None" not in text
 
 
-@pytest.mark.parametrize("words, most", [("train --help", 1.0), ("--help", 1.0), ("completion bash", 2.0)])
+@pytest.mark.parametrize(
+    "words, most", [("train --help", 1.0), ("--help", 1.0), ("completion bash", 2.0), ("responses", 1.0)]
+)
 def test_help_is_quick_and_needs_no_torch(words, most):
     """Seconds of processor time, in one of three tries: how long that takes is a matter of what else runs."""
     code = f"import sys, time; from sehdr_warp import cli\ntry: cli.main({words.split()})\n"
@@ -83,6 +85,13 @@ def test_help_is_quick_and_needs_no_torch(words, most):
         if float(seconds) < most:
             return
     pytest.fail(f"{seconds} s")
+
+
+@pytest.mark.parametrize("line", ["report run --out", "score pictures --truth embedded --json"])
+def test_what_cannot_be_written_is_said_before_the_work(line, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert call(*line.split(), str(tmp_path / "file" / "out")) == 1
+    assert "file: is a file, or in one, and not a folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

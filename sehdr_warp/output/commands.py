@@ -209,9 +209,9 @@ def run_report(asked: Report) -> None:
     from ..evaluation.evaluate import evaluate
     from .report import write_report
 
+    check_absent(asked.out / "report.html", asked.overwrite)
     run = open_run(asked.run, asked.device)
     scene = ensured_scene(run, asked.data)
-    check_absent(asked.out / "report.html", asked.overwrite)
     for path in write_report(run, scene, asked.out, overwrite=asked.overwrite, evaluation=evaluate(run, scene)):
         print(path)
 

@@ -1,12 +1,16 @@
-"""Camera responses by name: the formulae, the encodings of colour-science, and curves from files."""
+"""Camera responses by name: the formulae, the encodings of colour-science, and curves from files. To list their names
+loads no torch."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..errors import InputError
-from .analytic import DESCRIPTIONS, analytic_response
-from .curve import Response
-from .files import colour_response, response_from_file, responses_in_file
-from .learned import ToneMapper
+from .names import DESCRIPTIONS
+
+if TYPE_CHECKING:
+    from .curve import Response
+    from .files import responses_in_file
+    from .learned import ToneMapper
 
 __all__ = [
     "Response",
@@ -18,12 +22,22 @@ __all__ = [
 ]
 
 
+def __getattr__(name: str):
+    if name not in ("Response", "ToneMapper", "responses_in_file"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from . import analytic, files, learned  # All: Response.from_dict() knows the kinds whose modules are loaded.
+
+    globals().update(Response=analytic.Response, ToneMapper=learned.ToneMapper)
+    globals().update(responses_in_file=files.responses_in_file)
+    return globals()[name]
+
+
 def response_names() -> dict[str, str]:
     """The responses with a formula, each with a line that says what it stands for."""
     return dict(DESCRIPTIONS)
 
 
-def response_by_name(text: str | Path) -> Response:
+def response_by_name(text: str | Path) -> "Response":
     """A response from what a user writes.
 
     Args:
@@ -34,6 +48,9 @@ def response_by_name(text: str | Path) -> Response:
         SehdrError: for a name that is not known.
         InputError: for a file that cannot be used.
     """
+    from .analytic import analytic_response
+    from .files import colour_response, response_from_file
+
     text = str(text).strip()
     if text.lower().startswith("colour:"):
         return colour_response(text.split(":", 1)[1])
@@ -43,8 +60,10 @@ def response_by_name(text: str | Path) -> Response:
     return response_from_file(Path(path), selector) if _is_file(path) else analytic_response(text)
 
 
-def responses_named(text: str | Path) -> list[Response]:
+def responses_named(text: str | Path) -> "list[Response]":
     """Every curve of a file that holds many, or the one that response_by_name gives."""
+    from .files import responses_in_file
+
     if _is_file(str(text)):
         try:
             return responses_in_file(text)

@@ -8,6 +8,7 @@ import torch
 from ..errors import SehdrError, did_you_mean
 from ..splatting.response_curves import FormulaCurve, encode_with_slope
 from .curve import HALF_CODE, Response
+from .names import DESCRIPTIONS
 
 
 class PowerLaw(NamedTuple):
@@ -114,17 +115,15 @@ _ACES = Filmic(2.51, 0.03, 2.43, 0.59, 0.14, (0.56 + math.sqrt(0.56**2 + 4 * 0.0
 # The knee's two numbers are the best on a grid for the worse of two measured cameras (Canon EOS 5D Mark II, Sony A6000:
 # docs/response.md).
 _CURVES = {
-    "camera": (_REC709, Knee(0.55, 0.25), "a camera's own JPEG: Rec.709 with a roll-off into white"),
-    "srgb": (_SRGB, None, "sRGB (IEC 61966-2-1): renders, and photos developed without a tone curve"),
-    "rec709": (_REC709, None, "Rec.709 video (ITU-R BT.709)"),
-    "gamma-2.2": (_gamma(2.2), None, "a power law; gamma-G with any G from 1 to 5"),
-    "linear": (PowerLaw(1.0, 0.0, 1.0, 1.0), None, "values proportional to light"),
-    "hdr-nerf": (_gamma(2.2), Reinhard(), "Reinhard's curve and gamma 2.2, of HDR-NeRF's sets; also reinhard-gamma"),
-    "filmic": (_SRGB, _HABLE, "Hable's filmic curve (Uncharted 2), shown as sRGB"),
-    "aces": (_SRGB, _ACES, "Narkowicz's fit to the ACES display transform, shown as sRGB"),
+    "camera": (_REC709, Knee(0.55, 0.25)),
+    "srgb": (_SRGB, None),
+    "rec709": (_REC709, None),
+    "gamma-2.2": (_gamma(2.2), None),
+    "linear": (PowerLaw(1.0, 0.0, 1.0, 1.0), None),
+    "hdr-nerf": (_gamma(2.2), Reinhard()),
+    "filmic": (_SRGB, _HABLE),
+    "aces": (_SRGB, _ACES),
 }
-DESCRIPTIONS = {name: meaning for name, (_, _, meaning) in _CURVES.items()}
-"""What each name stands for; without aliases and without other exponents of `gamma-`."""
 _ALIASES = {"reinhard-gamma": "hdr-nerf", "gamma": "gamma-2.2", "rec.709": "rec709", "bt709": "rec709"}
 
 
@@ -135,7 +134,7 @@ def analytic_response(name: str) -> Response:
     """
     key = _ALIASES.get(name.lower(), name.lower())
     if key in _CURVES:
-        display, tone, _ = _CURVES[key]
+        display, tone = _CURVES[key]
         return AnalyticResponse(key, display, tone)
     if key.startswith("gamma-"):
         try:

@@ -12,8 +12,9 @@ import numpy as np
 import torch
 
 from ..errors import SehdrError
-from .analytic import DESCRIPTIONS, analytic_response
+from .analytic import analytic_response
 from .curve import Response
+from .names import DESCRIPTIONS
 from .table import TabulatedResponse
 
 CODE = 1.0 / 255

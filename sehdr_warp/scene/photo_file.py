@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from ..caches import usable, user_cache
 from ..errors import InputError
-from ..files import usable, user_cache
 from .types import View
 
 _LARGE = 1 << 14  # Arrays of fewer bytes are pickled

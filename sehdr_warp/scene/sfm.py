@@ -20,8 +20,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from ..caches import usable, user_cache
 from ..errors import InputError, SehdrError
-from ..files import atomic_folder, is_sealed, usable, user_cache
+from ..files import atomic_folder, is_sealed
 from .colmap_model import SparseModel, read_model
 from .develop import told
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image

@@ -16,8 +16,9 @@ from pathlib import Path
 
 import warp as wp
 
+from ..caches import usable, user_cache
 from ..errors import SehdrError
-from ..files import LIST, atomic_path, hash_line, listed, usable, user_cache
+from ..files import LIST, atomic_path, hash_line, listed
 
 _log = logging.getLogger("sehdr_warp.splatting")
 # Named by their content; neither what is being compiled nor what Warp compiles anew in its place.

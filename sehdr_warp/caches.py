@@ -1,0 +1,21 @@
+"""Where a program keeps what it can make again."""
+
+import os
+import tempfile
+from pathlib import Path
+
+
+def usable(folder: Path) -> bool:
+    """Whether files can be made in a folder, which is made where it is missing."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except (OSError, ValueError):
+        return False
+
+
+def user_cache(name: str) -> Path | None:
+    """The user's folder for what a program can make again; None where there is no home."""
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return None if home.startswith("~") else Path(home) / name
