@@ -15,19 +15,21 @@ from ..response import Response
 from ..response.curve import HALF_CODE
 from ..scene import View
 from .radiance_field import CameraTensors, RadianceField
+from .unexplained import MOST_VIEWS, unexplained_pixels
 
 CLIPPED_STOPS = 1.0  # Uncertainty of a pixel that is clipped in all channels
 PARTLY_CLIPPED_STOPS = 0.25  # Of a clipped channel beside others, which say where the light is, and it the hue
 MOST_STOPS = 4.0  # A misfit counts no more than this: 1/16 of the confidence already says that nothing is known
 LEAST_SEEN = 0.01  # Pixels of blending weight, over all photos, at which half of the confidence that they give counts
-MOST_VIEWS = 200  # Training views that are looked at, evenly chosen: more change the means little
+UNEXPLAINED = 8.0  # Times that a pixel counts of what the scene lacks: places behind it are hidden in few photos each
 
 
 @dataclass(frozen=True)
 class Evidence:
     """What the training photos say of each of N Gaussians; [N] each.
 
-    seen: pixels, the sum of its blending weights. stops: their mean uncertainty. clipped: the share of their values.
+    seen: pixels, the sum of its blending weights, UNEXPLAINED times where a photo shows what the scene lacks. stops:
+    their mean uncertainty. clipped: the share of their values.
     """
 
     seen: Tensor
@@ -78,13 +80,16 @@ def gather_evidence(
     total = torch.zeros(field.gaussians.count, 3, device=device)
     for view in views[:: -(-len(views) // MOST_VIEWS) or 1]:
         exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time
+        counted = torch.ones_like(exposure[..., 0])
         if truth and view.hdr is not None:
             observed = torch.tensor(view.hdr, device=device) * view.exposure_time
             stops = (exposure.clamp_min(1e-9) / observed.clamp_min(1e-9)).log2().abs().clamp_max(MOST_STOPS).mean(2)
             clipped = torch.zeros_like(stops)
         else:
             stops, clipped = pixel_uncertainty(torch.tensor(view.image, device=device), exposure, field.response)
-        counted = torch.ones_like(stops) if view.mask is None else torch.tensor(view.mask, device=device).to(stops)
+            counted = counted + (UNEXPLAINED - 1) * unexplained_pixels(view, exposure, field.response)
+        if view.mask is not None:
+            counted = counted * torch.tensor(view.mask, device=device)
         images = torch.stack([counted, counted * stops, counted * clipped], dim=2)
         total += field.weighted_sums(CameraTensors.of(view.camera, device), images)
     seen = total[:, 0].clamp_min(0)

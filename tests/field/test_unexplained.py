@@ -5,7 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+from sehdr_warp.field.confidence import gather_evidence
+from sehdr_warp.field.radiance_field import CameraTensors
 from sehdr_warp.field.unexplained import unexplained_regions
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.train import train
@@ -39,6 +42,14 @@ def test_a_missing_lamp_is_named_and_told(tmp_path, caplog):
         expected = cameras[region.photo].world_to_camera @ [0, 0, LAMP, 1]
         place = [32 + 70 * expected[0] / LAMP, 32 + 70 * expected[1] / LAMP]
         np.testing.assert_allclose([region.column, region.row], place, atol=70 * HALF / LAMP)
+    # The wall behind the lamp is hidden elsewhere in each photo, and is seen in all others: doubt is left all the same.
+    confidence, shares = gather_evidence(run.model, scene.views).confidence(), []
+    for view in scene.views:
+        lamp = torch.from_numpy((view.codes.min(2) > 250).astype(np.float32))
+        sums = run.model.weighted_sums(CameraTensors.of(view.camera, "cpu"), torch.stack([lamp, 1 - lamp], 2))
+        shares.append((sums * confidence[:, None]).sum(0) / sums.sum(0))
+    inside, outside = torch.stack(shares).mean(0).tolist()
+    assert inside < 0.45 and outside > 0.9
     areas = [region.pixels * abs(region.stops) for region in regions]
     assert areas == sorted(areas, reverse=True)
 
