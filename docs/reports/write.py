@@ -51,7 +51,7 @@ def write_reports(folder: Path) -> list[Path]:
         written.append(_write(folder / "tried.md", _tried_page(folder / "tried.csv")))
         index.append({"report": "[Tried and lost](tried.md)"})
     text = (
-        "What was measured. `python docs/reports/measure.py` measures all anew, by one build; "
+        "What was measured. `python docs/reports/measure.py` measures anew, by one build, what says so on its page; "
         "`python docs/reports/write.py` makes the pages and the README's figures of `results/*.json` and `tried.csv`."
     )
     table = markdown_table(index, {"report": "", "machine": "", "build": ""})
