@@ -10,7 +10,7 @@ from functools import cache
 import warp as wp
 
 from .constants import FORWARD
-from .geometry import geometry
+from .geometry import geometry, vector
 
 
 @cache
@@ -71,6 +71,67 @@ def harmonic_functions(dtype):
 
 
 @cache
+def turn_function(dtype, degree: int):
+    """A function: the gradient by a mean of the sum of weights times harmonics, of which the first is number 1, and a
+    vector of as many. direction: direction_of() the mean."""
+    g = geometry(dtype)
+    real, vec3, vec4 = g.real, g.vec3, g.vec4
+    weight_vector = vector(max((degree + 1) * (degree + 1) - 1, 1), dtype)
+
+    @wp.func
+    def turn(weights: weight_vector, direction: vec4) -> vec3:
+        x = direction[0]
+        y = direction[1]
+        z = direction[2]
+        by_direction = vec3()
+        if wp.static(degree > 0):
+            c1 = real(0.4886025119029199)
+            by_direction = c1 * vec3(-weights[2], -weights[0], weights[1])
+        xx = x * x
+        yy = y * y
+        zz = z * z
+        if wp.static(degree > 1):
+            a = real(1.0925484305920792)
+            b = real(0.31539156525252005)
+            c = real(0.5462742152960396)
+            by_direction += (a * weights[3]) * vec3(y, x, real(0.0))
+            by_direction += (-a * weights[4]) * vec3(real(0.0), z, y)
+            by_direction += (real(2.0) * b * weights[5]) * vec3(-x, -y, real(2.0) * z)
+            by_direction += (-a * weights[6]) * vec3(z, real(0.0), x)
+            by_direction += (real(2.0) * c * weights[7]) * vec3(x, -y, real(0.0))
+        if wp.static(degree > 2):
+            e = real(-0.5900435899266435)
+            f = real(2.890611442640554)
+            h = real(-0.4570457994644658)
+            m = real(0.3731763325901154)
+            n = real(1.445305721320277)
+            three = real(3.0)
+            xy = x * y
+            xz = x * z
+            yz = y * z
+            by_direction += (three * e * weights[8]) * vec3(real(2.0) * xy, xx - yy, real(0.0))
+            by_direction += (f * weights[9]) * vec3(yz, xz, xy)
+            by_direction += (h * weights[10]) * vec3(
+                real(-2.0) * xy, real(4.0) * zz - xx - three * yy, real(8.0) * yz
+            )
+            by_direction += (three * m * weights[11]) * vec3(
+                real(-2.0) * xz, real(-2.0) * yz, real(2.0) * zz - xx - yy
+            )
+            by_direction += (h * weights[12]) * vec3(
+                real(4.0) * zz - three * xx - yy, real(-2.0) * xy, real(8.0) * xz
+            )
+            by_direction += (n * weights[13]) * vec3(real(2.0) * xz, real(-2.0) * yz, xx - yy)
+            by_direction += (three * e * weights[14]) * vec3(xx - yy, real(-2.0) * xy, real(0.0))
+        if wp.static(degree > 0):
+            # Only what turns the direction counts: along it the harmonics do not change.
+            d = vec3(x, y, z)
+            by_direction = (by_direction - d * wp.dot(d, by_direction)) * direction[3]
+        return by_direction
+
+    return turn, weight_vector
+
+
+@cache
 def harmonics_kernel(dtype, degree: int):
     """values[i] = sum of coefficient[i, k] * Y_k(direction) over all k of degrees up to `degree`, three channels at
     once.
@@ -97,15 +158,66 @@ def harmonics_kernel(dtype, degree: int):
 
 
 @cache
+def channels_kernel(dtype, degree: int, turning: bool):
+    """harmonics_kernel() with a thread for each channel: neighbouring threads read neighbouring numbers, as a GPU likes
+    best.
+
+    constant, rest: [N, ..., 3], values: [N, 3]. turns, if `turning`: [N, 3] vec3, the gradient of each channel's value
+    by the centre. Covers [0, 3 N).
+    """
+    vec3 = geometry(dtype).vec3
+    direction_of, harmonic = harmonic_functions(dtype)
+    turn, weight_vector = turn_function(dtype, degree)
+
+    @wp.kernel(module="unique", module_options=FORWARD)
+    def evaluate_channels(
+        first: int,
+        constant: wp.array3d(dtype=dtype), rest: wp.array3d(dtype=dtype), means: wp.array(dtype=vec3),
+        camera_position: wp.array(dtype=vec3), values: wp.array2d(dtype=dtype), turns: wp.array2d(dtype=vec3),
+    ):
+        place = first + wp.tid()
+        i = place // 3
+        channel = place - 3 * i
+        d = direction_of(means[i], camera_position[0])
+        value = harmonic(0, d[0], d[1], d[2]) * constant[i, 0, channel]
+        weights = weight_vector()
+        for k in range(wp.static((degree + 1) * (degree + 1) - 1)):
+            weights[k] = rest[i, k, channel]
+            value += harmonic(k + 1, d[0], d[1], d[2]) * weights[k]
+        if wp.static(turning):
+            turns[i, channel] = turn(weights, d)
+        values[i, channel] = value
+
+    return evaluate_channels
+
+
+@cache
+def turns_adjoint_kernel(dtype):
+    """mean_gradients[i]: the sum over the channels of value_gradients[i, c] turns[i, c]. Covers [0, N)."""
+    vec3 = geometry(dtype).vec3
+
+    @wp.kernel(module="unique", module_options=FORWARD)
+    def turns_adjoint(
+        first: int,
+        turns: wp.array2d(dtype=vec3), value_gradients: wp.array(dtype=vec3), mean_gradients: wp.array(dtype=vec3),
+    ):
+        i = first + wp.tid()
+        gradient = value_gradients[i]
+        mean_gradients[i] = gradient[0] * turns[i, 0] + gradient[1] * turns[i, 1] + gradient[2] * turns[i, 2]
+
+    return turns_adjoint
+
+
+@cache
 def harmonics_adjoint_kernel(dtype, degree: int, coefficients: bool):
     """The adjoint of harmonics_kernel by centres and, if `coefficients`, by those, written rather than added to.
 
     value_gradients, mean_gradients: [N] vec3; constant_gradients, rest_gradients: as the coefficients; those of higher
     degrees are set to 0. By the camera's position the gradient is the sum of mean_gradients, negated.
     """
-    g = geometry(dtype)
-    real, vec3 = g.real, g.vec3
+    vec3 = geometry(dtype).vec3
     direction_of, harmonic = harmonic_functions(dtype)
+    turn, weight_vector = turn_function(dtype, degree)
     used = (degree + 1) * (degree + 1) - 1
 
     @wp.kernel(module="unique", module_options=FORWARD)
@@ -127,52 +239,10 @@ def harmonics_adjoint_kernel(dtype, degree: int, coefficients: bool):
                 rest_gradients[i, k] = harmonic(k + 1, x, y, z) * gradient
             for unused in range(wp.static(used), rest_gradients.shape[1]):
                 rest_gradients[i, unused] = vec3()
-        by_direction = vec3()
-        if wp.static(degree > 0):
-            c1 = real(0.4886025119029199)
-            by_direction = c1 * vec3(
-                -wp.dot(rest[i, 2], gradient), -wp.dot(rest[i, 0], gradient), wp.dot(rest[i, 1], gradient)
-            )
-        xx = x * x
-        yy = y * y
-        zz = z * z
-        if wp.static(degree > 1):
-            a = real(1.0925484305920792)
-            b = real(0.31539156525252005)
-            c = real(0.5462742152960396)
-            by_direction += (a * wp.dot(rest[i, 3], gradient)) * vec3(y, x, real(0.0))
-            by_direction += (-a * wp.dot(rest[i, 4], gradient)) * vec3(real(0.0), z, y)
-            by_direction += (real(2.0) * b * wp.dot(rest[i, 5], gradient)) * vec3(-x, -y, real(2.0) * z)
-            by_direction += (-a * wp.dot(rest[i, 6], gradient)) * vec3(z, real(0.0), x)
-            by_direction += (real(2.0) * c * wp.dot(rest[i, 7], gradient)) * vec3(x, -y, real(0.0))
-        if wp.static(degree > 2):
-            e = real(-0.5900435899266435)
-            f = real(2.890611442640554)
-            h = real(-0.4570457994644658)
-            m = real(0.3731763325901154)
-            n = real(1.445305721320277)
-            three = real(3.0)
-            xy = x * y
-            xz = x * z
-            yz = y * z
-            by_direction += (three * e * wp.dot(rest[i, 8], gradient)) * vec3(real(2.0) * xy, xx - yy, real(0.0))
-            by_direction += (f * wp.dot(rest[i, 9], gradient)) * vec3(yz, xz, xy)
-            by_direction += (h * wp.dot(rest[i, 10], gradient)) * vec3(
-                real(-2.0) * xy, real(4.0) * zz - xx - three * yy, real(8.0) * yz
-            )
-            by_direction += (three * m * wp.dot(rest[i, 11], gradient)) * vec3(
-                real(-2.0) * xz, real(-2.0) * yz, real(2.0) * zz - xx - yy
-            )
-            by_direction += (h * wp.dot(rest[i, 12], gradient)) * vec3(
-                real(4.0) * zz - three * xx - yy, real(-2.0) * xy, real(8.0) * xz
-            )
-            by_direction += (n * wp.dot(rest[i, 13], gradient)) * vec3(real(2.0) * xz, real(-2.0) * yz, xx - yy)
-            by_direction += (three * e * wp.dot(rest[i, 14], gradient)) * vec3(xx - yy, real(-2.0) * xy, real(0.0))
-        if wp.static(degree > 0):
-            # Only what turns the direction counts: along it the harmonics do not change.
-            d = vec3(x, y, z)
-            by_direction = (by_direction - d * wp.dot(d, by_direction)) * direction[3]
-        mean_gradients[i] = by_direction
+        weights = weight_vector()
+        for k in range(wp.static(used)):
+            weights[k] = wp.dot(rest[i, k], gradient)
+        mean_gradients[i] = turn(weights, direction)
 
     return harmonics_adjoint
 

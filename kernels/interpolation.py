@@ -9,7 +9,7 @@ import warp as wp
 from .constants import FORWARD
 from .geometry import vector
 
-COPIES = 32
+COPIES = 128
 """The adjoint adds to this many tables in turn, summed afterwards: on a GPU thousands of threads would otherwise wait
 for the few nodes that most values fall between."""
 
@@ -86,7 +86,8 @@ def interpolate_adjoint(
     copy = i % table_gradients.shape[0]
     for node in range(4):
         slope += slopes[node] * table[cell + node, column]
-        wp.atomic_add(table_gradients, copy, cell + node, column, weights[node] * gradient)
+        if gradient != 0.0:  # As of most Gaussians that a photo does not show
+            wp.atomic_add(table_gradients, copy, cell + node, column, weights[node] * gradient)
     if offset < 0.0:
         slope = float(0.0)
     position_gradients[i, column] = wp.where(wp.isnan(offset), offset, gradient * slope * inverse_step)

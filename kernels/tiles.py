@@ -54,7 +54,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
         first: int,
         means2d: vec2s, conics: wp.array(dtype=vec3), opacities: reals, features: reals2d,
         channels: int, alpha_threshold: real, columns: int, rows: int,
-        extents: vec2s, shapes: vec4s, ellipses: vec4s, counts: ints,
+        extents: vec2s, shapes: vec4s, ellipses: vec4s, counts: int64s,
     ):
         """shapes: (x, y, opacity, half-height); ellipses: (conic a, b, c, level at which alpha meets the threshold);
         counts: of the tiles that it touches, of columns x rows.
@@ -83,7 +83,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
                 for column in range(across[0], across[1]):
                     if tile_is_touched(shape, ellipse, column, row):
                         touched += 1
-        counts[i] = touched
+        counts[i] = wp.int64(touched)
 
     @wp.kernel(module="unique", module_options=options)
     def key_by_depth(

@@ -13,7 +13,7 @@ from .geometry import geometry, vector
 
 SHARPNESS, CENTRE = 100.0, 0.995  # 3DGS-MCMC, equation 8: noise is for Gaussians of opacity below 1 - 0.995
 AT_ONCE = 4  # Parameters of one launch of Adam
-CHECKED_AT_ONCE = 8  # Tensors of one launch that looks for what is not finite
+CHECKED_AT_ONCE = 12  # Tensors of one launch that looks for what is not finite
 NUMBERS = 4  # That one thread of the harmonics' Adam takes
 NOTHING = 16.0  # The exponent from which on a Gaussian's noise is a ten-millionth, and is not drawn
 
@@ -24,19 +24,26 @@ _vec3, _vec4 = vector(3, wp.float32), vector(4, wp.float32)
 @wp.kernel(module="unique", module_options=FORWARD)
 def judge_step(
     loss: wp.array(dtype=wp.float32), norms: wp.array(dtype=wp.float32), incomplete: wp.array(dtype=wp.bool),
-    verdict: wp.array(dtype=wp.float32),
+    tally: wp.array(dtype=wp.int64), pairs: wp.array(dtype=wp.int64), verdict: wp.array(dtype=wp.float32),
 ):
-    """verdict: [3], 1 or 0 each: the loss or a gradient is not finite; the step is to be skipped; it is not to be.
-    norms: [K] of the gradients; incomplete: [1], or [0] where nothing can be. One thread."""
+    """verdict: [2], 1 or 0 each: the step is to be skipped, as the loss or a gradient is not finite; it is not to be.
+    norms: [K] of the gradients; incomplete: [1], or [0] where nothing can be. tally: [3] or [0], counts steps that are
+    not finite, and with pairs, [1] or [0], the most of them and the steps that are incomplete. One thread."""
     finite = wp.isfinite(loss[0])
     for i in range(norms.shape[0]):
         finite = finite and wp.isfinite(norms[i])
-    skipped = not finite
+    whole = bool(True)
     if incomplete.shape[0] > 0:
-        skipped = skipped or incomplete[0]
-    verdict[0] = wp.where(finite, 0.0, 1.0)
-    verdict[1] = wp.where(skipped, 1.0, 0.0)
-    verdict[2] = wp.where(skipped, 0.0, 1.0)
+        whole = not incomplete[0]
+    if tally.shape[0] > 0:
+        if not finite:
+            tally[0] = tally[0] + wp.int64(1)
+        if pairs.shape[0] > 0:
+            tally[1] = wp.max(tally[1], pairs[0])
+            if not whole:
+                tally[2] = tally[2] + wp.int64(1)
+    verdict[0] = wp.where(finite and whole, 0.0, 1.0)
+    verdict[1] = 1.0 - verdict[0]
 
 
 @wp.func
@@ -68,10 +75,19 @@ def step_by_adam(
 _floats = wp.array(dtype=wp.float32)
 
 
+@wp.func
+def counted(parameters: _floats, live: wp.array(dtype=wp.int32), width: int) -> int:
+    """How many of the numbers count: where `live`, [1] or [0], says how many rows do, those of so many of a width."""
+    count = parameters.shape[0]
+    if live.shape[0] > 0 and width > 0:
+        count = wp.min(count, live[0] * width)
+    return count
+
+
 @wp.kernel(module="unique", module_options=FORWARD)
 def update_by_adam(
     first: int,
-    skipped: _floats,
+    skipped: _floats, live: wp.array(dtype=wp.int32), width_a: int, width_b: int, width_c: int, width_d: int,
     first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
     gradients_a: _floats, step_a: _floats, rate_a: _floats, parameters_a: _floats, means_a: _floats, squares_a: _floats,
     gradients_b: _floats, step_b: _floats, rate_b: _floats, parameters_b: _floats, means_b: _floats, squares_b: _floats,
@@ -80,25 +96,26 @@ def update_by_adam(
 ):
     """One step of every number of AT_ONCE parameters, in place; none where skipped[0] is not 0. Covers the longest.
     step: [1], already counted up; rate: [1]; all of length 0 for a parameter that is not there. *_decay_log: log of the
-    decays; *_gain: 1 - decay, not as float32 would round it. means, squares: the moments."""
+    decays; *_gain: 1 - decay, not as float32 would round it. means, squares: the moments. live, width_*: as counted()
+    takes them."""
     i = first + wp.tid()
     if skipped[0] == 0.0:
-        if i < parameters_a.shape[0]:
+        if i < counted(parameters_a, live, width_a):
             step_by_adam(
                 i, gradients_a[i], step_a[0], rate_a[0], first_gain, second_gain, first_decay_log, second_decay_log,
                 epsilon, parameters_a, means_a, squares_a,
             )  # fmt: skip
-        if i < parameters_b.shape[0]:
+        if i < counted(parameters_b, live, width_b):
             step_by_adam(
                 i, gradients_b[i], step_b[0], rate_b[0], first_gain, second_gain, first_decay_log, second_decay_log,
                 epsilon, parameters_b, means_b, squares_b,
             )  # fmt: skip
-        if i < parameters_c.shape[0]:
+        if i < counted(parameters_c, live, width_c):
             step_by_adam(
                 i, gradients_c[i], step_c[0], rate_c[0], first_gain, second_gain, first_decay_log, second_decay_log,
                 epsilon, parameters_c, means_c, squares_c,
             )  # fmt: skip
-        if i < parameters_d.shape[0]:
+        if i < counted(parameters_d, live, width_d):
             step_by_adam(
                 i, gradients_d[i], step_d[0], rate_d[0], first_gain, second_gain, first_decay_log, second_decay_log,
                 epsilon, parameters_d, means_d, squares_d,
@@ -108,28 +125,37 @@ def update_by_adam(
 @wp.kernel(module="unique", module_options=FORWARD)
 def find_nonfinite(
     first: int,
-    a: _floats, b: _floats, c: _floats, d: _floats, e: _floats, f: _floats, g: _floats, h: _floats,
+    a: _floats, b: _floats, c: _floats, d: _floats, e: _floats, f: _floats,
+    g: _floats, h: _floats, i: _floats, j: _floats, k: _floats, m: _floats,
     found: _floats,
 ):
     """found[0]: infinity where one of the numbers is not finite, else as it was. Covers the longest."""
-    i = first + wp.tid()
+    place = first + wp.tid()
     finite = bool(True)
-    if i < a.shape[0]:
-        finite = finite and wp.isfinite(a[i])
-    if i < b.shape[0]:
-        finite = finite and wp.isfinite(b[i])
-    if i < c.shape[0]:
-        finite = finite and wp.isfinite(c[i])
-    if i < d.shape[0]:
-        finite = finite and wp.isfinite(d[i])
-    if i < e.shape[0]:
-        finite = finite and wp.isfinite(e[i])
-    if i < f.shape[0]:
-        finite = finite and wp.isfinite(f[i])
-    if i < g.shape[0]:
-        finite = finite and wp.isfinite(g[i])
-    if i < h.shape[0]:
-        finite = finite and wp.isfinite(h[i])
+    if place < a.shape[0]:
+        finite = finite and wp.isfinite(a[place])
+    if place < b.shape[0]:
+        finite = finite and wp.isfinite(b[place])
+    if place < c.shape[0]:
+        finite = finite and wp.isfinite(c[place])
+    if place < d.shape[0]:
+        finite = finite and wp.isfinite(d[place])
+    if place < e.shape[0]:
+        finite = finite and wp.isfinite(e[place])
+    if place < f.shape[0]:
+        finite = finite and wp.isfinite(f[place])
+    if place < g.shape[0]:
+        finite = finite and wp.isfinite(g[place])
+    if place < h.shape[0]:
+        finite = finite and wp.isfinite(h[place])
+    if place < i.shape[0]:
+        finite = finite and wp.isfinite(i[place])
+    if place < j.shape[0]:
+        finite = finite and wp.isfinite(j[place])
+    if place < k.shape[0]:
+        finite = finite and wp.isfinite(k[place])
+    if place < m.shape[0]:
+        finite = finite and wp.isfinite(m[place])
     if not finite:
         found[0] = wp.inf
 
@@ -146,13 +172,14 @@ def harmonics_adam_kernel(count: int):
         first: int,
         basis: wp.array3d(dtype=wp.float32), value_gradients: wp.array3d(dtype=wp.float32), start: int, stride: int,
         step: wp.array(dtype=wp.float32), rate: wp.array(dtype=wp.float32), skipped: wp.array(dtype=wp.float32),
+        live: wp.array(dtype=wp.int32),
         first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
         parameters: wp.array(dtype=wp.float32), first_moments: wp.array(dtype=wp.float32),
         second_moments: wp.array(dtype=wp.float32),
     ):
         thread = first + wp.tid()
-        if skipped[0] == 0.0:
-            final = parameters.shape[0] - 1
+        final = counted(parameters, live, wp.static(3 * count)) - 1
+        if skipped[0] == 0.0 and thread <= final:
             owners = whole_numbers()
             rows = whole_numbers()
             channels = whole_numbers()
@@ -191,11 +218,16 @@ def harmonics_adam_kernel(count: int):
 
 @wp.kernel(module="unique", module_options=FORWARD)
 def sum_opacities(
-    first: int, logits: wp.array(dtype=wp.float32), sums: wp.array(dtype=wp.float32), slopes: wp.array(dtype=wp.float32)
+    first: int,
+    logits: wp.array(dtype=wp.float32), weight: float, live: wp.array(dtype=wp.int32),
+    sums: wp.array(dtype=wp.float32), slopes: wp.array(dtype=wp.float32),
 ):
-    """sums: [T], T threads' shares of the mean of the sigmoids; slopes: [N] of the mean by the logits."""
+    """sums: [T], T threads' shares of `weight` times the mean of the sigmoids; slopes: [N] of that by the logits. live:
+    [1], of how many it is the mean, or [0] for all."""
     thread = first + wp.tid()
-    part = 1.0 / float(logits.shape[0])
+    part = weight / float(logits.shape[0])
+    if live.shape[0] > 0:
+        part = weight / float(live[0])
     total = float(0.0)
     for i in range(thread, logits.shape[0], sums.shape[0]):
         opacity = 1.0 / (1.0 + wp.exp(-logits[i]))

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ..splatting import HarmonicsGradients
 from ..splatting.training_step import AdamStep, adam_steps, harmonics_adam_step
+from .gaussians import PARAMETER_NAMES
 
 FIRST_COEFFICIENT = {"harmonics_dc": 0, "harmonics_rest": 1}
 """Of the groups that hold coefficients of harmonics."""
@@ -39,9 +40,11 @@ class Adam:
         skipped: Tensor | None = None,
         made: Tensor | None = None,
         harmonics: HarmonicsGradients | None = None,
+        live: Tensor | None = None,
     ) -> None:
         """skipped: scalar, 1 where parameters, moments and step count stay as they are. made: 1 - skipped. harmonics:
-        the gradients of coefficients that have none of their own."""
+        the gradients of coefficients that have none of their own. live: [1] int32, how many Gaussians count, where the
+        rows of their parameters are more, with gradients of 0."""
         factored = FIRST_COEFFICIENT if harmonics is not None else ()
         grouped = [
             (group, parameter)
@@ -67,8 +70,10 @@ class Adam:
             first, second, step = (self.state[parameter][key] for key in ("exp_avg", "exp_avg_sq", "step"))
             options, values = {"betas": group["betas"], "epsilon": group["eps"]}, parameter.detach()
             if parameter.grad is not None:
-                own.append(AdamStep(values, parameter.grad.contiguous(), first, second, step, group["lr"]))
+                width = values.numel() // len(values) if group.get("name") in PARAMETER_NAMES else 0
+                own.append(AdamStep(values, parameter.grad.contiguous(), first, second, step, group["lr"], width))
             elif harmonics is not None:
                 state, rate = (first, second, step, skipped), {"rate": group["lr"]}
-                harmonics_adam_step(values, FIRST_COEFFICIENT[group["name"]], harmonics, *state, **rate, **options)
-        adam_steps(own, skipped, **options)
+                start = FIRST_COEFFICIENT[group["name"]]
+                harmonics_adam_step(values, start, harmonics, *state, **rate, **options, live=live)
+        adam_steps(own, skipped, **options, live=live)

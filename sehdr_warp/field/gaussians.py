@@ -1,6 +1,8 @@
 """The 3D Gaussians of a scene: their parameters, their start values, and changes of their number during training."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,6 +12,7 @@ from torch import Tensor, nn
 from ..errors import SehdrError
 from ..parallel import thread_count
 from ..splats.arrays import HARMONIC_0
+from .spare_rows import SpareRows, first_rows, moments_of
 
 PARAMETER_NAMES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics_dc", "harmonics_rest")
 
@@ -48,6 +51,11 @@ class Gaussians(nn.Module):
             setattr(self, name, nn.Parameter(value.detach().contiguous()))
         if math.isqrt(harmonics) ** 2 != harmonics:
             raise ValueError(f"{harmonics} harmonics are not a whole number of degrees")
+        self._spare: SpareRows | None = None
+        self.live: Tensor | None = None
+        """[1] int32, how many of the rows count, where steps work on more."""
+        self.moves = 0
+        """How often they came to lie elsewhere in memory."""
 
     @classmethod
     def from_points(
@@ -96,14 +104,78 @@ class Gaussians(nn.Module):
         """Keeps only the Gaussians at an index or mask [N], with their optimizer state."""
         if index.dtype == torch.bool:
             index = index.nonzero()[:, 0]  # once: each tensor indexed by a mask would wait for the device
+        spare, count = self._spare, self.count
+        self.moves += spare is None
         for name in PARAMETER_NAMES:
-            self._exchange(name, getattr(self, name).detach()[index], optimizer, lambda state: state[index])
+            old, moments = getattr(self, name), moments_of(optimizer, getattr(self, name))
+            if spare is None:
+                new = nn.Parameter(old.detach()[index]), {key: moment[index] for key, moment in moments.items()}
+            else:
+                for tensor in (old.detach(), *moments.values()):
+                    tensor[: len(index)] = tensor[index]
+                spare.clear(name, len(index), count)
+                new = spare.first(name, len(index))
+            self._put(name, *new, optimizer)
+        self._tell()
 
     def append(self, rows: dict[str, Tensor], optimizer: Optimizer | None = None) -> None:
         """Adds M Gaussians, given as by rows(); their optimizer state starts at zero."""
-        for name, old in self.tensors().items():
-            nothing = torch.zeros_like(rows[name])
-            self._exchange(name, torch.cat([old, rows[name]]), optimizer, lambda m, new=nothing: torch.cat([m, new]))
+        count, total = self.count, self.count + len(rows["means"])
+        if self._spare is not None and total > self._spare.rows:
+            self._spare = None
+        self.moves += self._spare is None
+        for name in PARAMETER_NAMES:
+            old, added = getattr(self, name), rows[name]
+            if self._spare is None:
+                nothing, moments = torch.zeros_like(added), moments_of(optimizer, old)
+                joined = {key: torch.cat([moment, nothing]) for key, moment in moments.items()}
+                new = nn.Parameter(torch.cat([old.detach(), added])), joined
+            else:
+                self._spare.whole[name].detach()[count:total] = added
+                new = self._spare.first(name, total)
+            self._put(name, *new, optimizer)
+        self._tell()
+
+    def reserve(self, rows: int, optimizer: Optimizer | None = None) -> None:
+        """Makes memory for so many, not fewer than there are. As long as they are not more, changes of their number
+        leave them, and their optimizer state, where they are."""
+        spare = SpareRows(rows, self.means.device)
+        for name in PARAMETER_NAMES:
+            old = getattr(self, name)
+            spare.take(name, old.detach(), moments_of(optimizer, old))
+            self._put(name, *spare.first(name, self.count), optimizer)
+        self._spare = spare
+        self.moves += 1
+        self._tell()
+
+    def release(self) -> None:
+        """Forgets what was reserved: each parameter is what it is."""
+        self._spare = None
+
+    @property
+    def reserved(self) -> int:
+        """How many there is memory for."""
+        return self.count if self._spare is None else self._spare.rows
+
+    @contextmanager
+    def all_rows(self, optimizer: Optimizer) -> Iterator[None]:
+        """Within this block the parameters, in the optimizer too, have all the rows that reserve() made, which stay
+        where they are; those that do not count are seen by no camera, and their gradients are 0."""
+        spare = self._spare
+        if spare is None:
+            yield
+            return
+        own = {name: getattr(self, name) for name in PARAMETER_NAMES}
+        for name in PARAMETER_NAMES:
+            self._put(name, spare.whole[name], spare.moments[name], optimizer)
+        self.live = spare.live
+        try:
+            yield
+        finally:
+            self.live = None
+            for name, parameter in own.items():
+                spare.moments[name] = moments_of(optimizer, spare.whole[name])
+                self._put(name, parameter, first_rows(spare.moments[name], len(parameter)), optimizer)
 
     def resize(self, count: int, optimizer: Optimizer | None = None) -> None:
         """Makes them so many, the last of them arbitrary: for values that are written next."""
@@ -125,25 +197,24 @@ class Gaussians(nn.Module):
 
     def forget(self, name: str, where, optimizer: Optimizer | None) -> None:
         """Zeroes a parameter's optimizer state at an index, mask or slice."""
-        for state in _moments(optimizer, getattr(self, name)).values():
+        for state in moments_of(optimizer, getattr(self, name)).values():
             state[where] = 0
 
-    def _exchange(self, name: str, value: Tensor, optimizer, change_state) -> None:
-        old, new = getattr(self, name), nn.Parameter(value.contiguous())
+    def _put(self, name: str, new: nn.Parameter, moments: dict[str, Tensor], optimizer: Optimizer | None) -> None:
+        """Puts a parameter in the place of the one of this name, with its moments."""
+        old = getattr(self, name)
         setattr(self, name, new)
         if optimizer is None:
             return
         for group in optimizer.param_groups:
             group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
-        if moments := _moments(optimizer, old):
-            changed = {key: change_state(moment) for key, moment in moments.items()}
-            optimizer.state[new] = optimizer.state.pop(old) | changed
+        if old in optimizer.state:
+            optimizer.state[new] = optimizer.state.pop(old) | moments
 
-
-def _moments(optimizer, parameter: nn.Parameter) -> dict[str, Tensor]:
-    """The optimizer's tensors that have one row a Gaussian: all but Adam's step counter."""
-    state = {} if optimizer is None else optimizer.state.get(parameter, {})
-    return {key: value for key, value in state.items() if torch.is_tensor(value) and value.shape == parameter.shape}
+    def _tell(self) -> None:
+        """The device how many there are."""
+        if self._spare is not None:
+            self._spare.live.fill_(self.count)
 
 
 def neighbour_distances(points: Tensor) -> Tensor:

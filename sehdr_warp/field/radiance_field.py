@@ -44,7 +44,8 @@ class Photograph:
     base: of the base color at the base time (I^b); the same tensor as `exposure` without fusion.
     rendering: what the rasterizer knows: alpha, projected means, radii.
     light: exposure of this photo, which the response encoded; None where colors are encoded before they are composited.
-    harmonics: [N, 3], what each Gaussian's harmonics are in this direction.
+    by_harmonics: where they are factored, has after a backward pass the gradient [N, 3] by what each Gaussian's
+        harmonics are in this direction.
     """
 
     encoded: Tensor | None
@@ -52,7 +53,7 @@ class Photograph:
     base: Tensor | None
     rendering: Rendering
     light: Tensor | None = None
-    harmonics: Tensor | None = None
+    by_harmonics: tuple[Tensor, ...] | list[Tensor] = ()
 
 
 @dataclass(frozen=True)
@@ -127,17 +128,18 @@ class RadianceField(nn.Module):
     ) -> Photograph:
         """A photo of exposure_time seconds, harmonics up to `degree`; also: which of "exposure" and "base" are wanted;
         capacity: as rasterize() takes it; encode: False leaves a photo that has an exposure at that; factored: the
-        harmonics' coefficients get no gradient, their values keep one."""
+        harmonics' coefficients get no gradient, and that by their values is in by_harmonics."""
         ratio = exposure_time / self.base_time
         values = self._values(camera.position, degree, factored)
+        kept: list[Tensor] = []
         if factored:
-            values.retain_grad()
+            values.register_hook(kept.append)  # As retain_grad(), without a copy.
         if self.color_model.encoded:
             rendering = self._rasterize(camera, self.color_model.colors(values)[0], capacity)
             image = rendering.image
             if ratio != 1.0:
                 image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
-            return Photograph(image, None, None, rendering, None, values)
+            return Photograph(image, None, None, rendering, None, kept)
         base, fused = self._exposures(values)
         sets = {"fused": fused}
         if self.tone_map == "gaussian":
@@ -155,7 +157,7 @@ class RadianceField(nn.Module):
             # Most photos of a set have its base time.
             light = exposure if isinstance(ratio, float) and ratio == 1 else images["fused"] * ratio
             encoded = self.response.encode_extended(light) if encode else None
-        return Photograph(encoded, exposure, images.get("base", exposure), rendering, light, values)
+        return Photograph(encoded, exposure, images.get("base", exposure), rendering, light, kept)
 
     @torch.no_grad()
     def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:

@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from ..kernels import blend_cpu, harmonics, plane_sweep_cpu, ssim, tiles, training_step
+from ..kernels import blend_cpu, harmonics, plane_sweep_cpu, relocation, ssim, tiles, training_step
 from ..kernels.constants import ALPHA_THRESHOLD
 from ..kernels.project import projection_kernel
 from .blending import halvings
@@ -35,6 +35,7 @@ def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
         *(tiles.count_tiles, tiles.place_entries, distance.blur_columns, distance.blur_derivatives, distance.gradient),
         *(lists.gather_entries, harmonics.harmonics_adjoint_kernel(real, 0, True)),
         *(training_step.judge_step, training_step.add_position_noise),
+        *(relocation.share_opacities, relocation.copy_rows),
     ]
 
 

@@ -7,7 +7,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..kernels.harmonics import basis_kernel, coefficient_adjoint_kernel, harmonics_adjoint_kernel, harmonics_kernel
+from ..kernels.harmonics import (
+    basis_kernel,
+    channels_kernel,
+    coefficient_adjoint_kernel,
+    harmonics_adjoint_kernel,
+    harmonics_kernel,
+    turns_adjoint_kernel,
+)
 from .checks import check_tensors, whole_number
 from .launching import launch, warp_scalar
 
@@ -89,28 +96,45 @@ class _Evaluation(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, degree, constant, rest, means, camera_position):
-        ctx.degree = degree
-        values = torch.empty_like(means)
-        kernel = harmonics_kernel(warp_scalar(means.dtype), degree)
-        launch(kernel, len(means), constant, rest, means, camera_position, values)
-        ctx.save_for_backward(constant, rest, means, camera_position)
+        scalar, given, values = (
+            warp_scalar(means.dtype),
+            (constant, rest, means, camera_position),
+            torch.empty_like(means),
+        )
+        # A GPU waits for memory: what the backward pass needs of 48 numbers a Gaussian are 9, made while they are here.
+        turning = writes_turns(means.device) and any(ctx.needs_input_grad[3:])
+        turns = means.new_empty(len(means) if turning else 0, 3, 3)
+        if writes_turns(means.device):
+            launch(channels_kernel(scalar, degree, turning), 3 * len(means), *given, values, turns)
+        else:
+            launch(harmonics_kernel(scalar, degree), len(means), *given, values)
+        ctx.degree, ctx.turning = degree, turning
+        ctx.save_for_backward(constant, rest, means, camera_position, turns)
         return values
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):
-        constant, rest, means, position = ctx.saved_tensors
+        constant, rest, means, position, turns = ctx.saved_tensors
         scalar, degree, gradient = warp_scalar(gradient.dtype), ctx.degree, gradient.contiguous()
-        by_constant, by_rest, turns, by_camera = ctx.needs_input_grad[1:]
+        by_constant, by_rest, by_means, by_camera = ctx.needs_input_grad[1:]
         # On the CPU a thread takes a Gaussian with all of its coefficients.
-        together = gradient.device.type == "cpu" and (by_constant or by_rest)
+        together = not writes_turns(gradient.device) and (by_constant or by_rest)
         made = [torch.empty_like(part) if together else None for part in (constant, rest)]
         mean_gradients = torch.empty_like(means)
-        if turns or by_camera or together:
+        if ctx.turning:
+            launch(turns_adjoint_kernel(scalar), len(means), turns, gradient, mean_gradients)
+        elif by_means or by_camera or together:
             kernel = harmonics_adjoint_kernel(scalar, degree, together)
             launch(kernel, len(means), rest, means, position, gradient, mean_gradients, *made)
         if not together and (by_constant or by_rest):
             factors = HarmonicsGradients(gradient[None], position[None], means, degree)
             made = [factors.by_coefficients(part, start) for start, part in enumerate((constant, rest))]
         by_position = -mean_gradients.sum(0) if by_camera else None
-        return None, *made, mean_gradients if turns else None, by_position
+        return None, *made, mean_gradients if by_means else None, by_position
+
+
+def writes_turns(device: torch.device) -> bool:
+    """Whether the forward pass on a device has a thread for each channel, which writes what the gradient by the means
+    needs."""
+    return device.type == "cuda"

@@ -211,6 +211,22 @@ def _lay_out(array: Any, tensor: Tensor, kind: wp.array) -> None:
         array.shape[axis], array.strides[axis] = length, step
 
 
+@cache
+def constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """A vector of these values, which nobody may change."""
+    return torch.tensor(values, dtype=dtype, device=device)
+
+
+def one(like: Tensor) -> Tensor:
+    """The scalar 1 on a tensor's device: where it is what a scalar is differentiated by, times() has nothing to do."""
+    return constant((1.0,), like.dtype, like.device)[0]
+
+
+def times(gradient: Tensor, upstream: Tensor) -> Tensor:
+    """A gradient times the scalar that is the gradient by what it belongs to."""
+    return gradient if upstream.data_ptr() == one(upstream).data_ptr() else gradient * upstream
+
+
 def sums_are_ordered(device: torch.device) -> bool:
     """Whether sums on a device must be made in a fixed order that atomics of many threads do not keep."""
     return device.type == "cuda" and torch.are_deterministic_algorithms_enabled()

@@ -1,13 +1,11 @@
 """Structural similarity of two images as a differentiable torch operation (kernels/ssim.py)."""
 
-from functools import cache
-
 import torch
 from torch import Tensor
 
 from ..kernels.ssim import RADIUS, STRIP, ssim_kernels, window
 from .checks import check_tensors
-from .launching import launch, warp_scalar
+from .launching import constant, launch, one, times, warp_scalar
 from .threads import torch_threads
 
 CPU_LANES = 16  # Numbers that one step of the CPU kernels takes: one AVX-512 register of float32
@@ -54,7 +52,7 @@ class _Distance(torch.autograd.Function):
         terms, derivatives = _compare(a, b, weights)
         if ctx.needs_input_grad[0]:
             # Made at once: it takes a fifth of the memory of what it is made of.
-            ctx.save_for_backward(_gradient(a, b, derivatives, _constant((1.0,), a.dtype, a.device)[0], weights))
+            ctx.save_for_backward(_gradient(a, b, derivatives, one(a), weights))
         if a.device.type == "cuda":
             return terms.sum()
         with torch_threads(a.device):  # Each row is one thread's.
@@ -64,9 +62,7 @@ class _Distance(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, upstream):
-        (gradient,) = ctx.saved_tensors
-        with torch_threads(gradient.device):
-            return gradient * upstream, None, None, None
+        return times(ctx.saved_tensors[0], upstream), None, None, None
 
 
 class _Similarity(torch.autograd.Function):
@@ -136,7 +132,7 @@ class _Runs:
         self.lanes = CPU_LANES if image.device.type == "cpu" and self.length >= CPU_LANES else 1
         self.kernels = ssim_kernels(warp_scalar(image.dtype), self.lanes, weights is not None)
         self.weights_of_both = weights or (0.0, 0.0)
-        self.weights = _constant(tuple(window()), image.dtype, image.device)
+        self.weights = constant(tuple(window()), image.dtype, image.device)
 
     def padded(self, count: int) -> Tensor:
         """[count, rows, ...] uninitialised rows with the zeros that the horizontal blur finds beyond the border; with
@@ -165,8 +161,3 @@ class _Runs:
             blocks = -(-self.length // self.channels // STRIP) * self.channels
         arguments = *inputs, self.weights, self.length, self.channels, *results
         launch(kernel, rows * blocks, *arguments, smallest=STEPS_PER_THREAD)
-
-
-@cache
-def _constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    return torch.tensor(values, dtype=dtype, device=device)

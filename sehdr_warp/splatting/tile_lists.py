@@ -137,12 +137,12 @@ def pack_records(
     """What is drawn of each projected Gaussian, in rows of four, shapes and ellipses; and the tiles that it touches.
 
     shapes: [N, 4] x, y, opacity, half-height; ellipses: [N, 4] conic a, b, c and the level where alpha meets the
-    threshold, -1 where culled. counts: [N] int32.
+    threshold, -1 where culled. counts: [N] int64.
     features: [N, C]; a Gaussian with one that is not finite is culled: its extents are set to 0.
     """
     count = len(means2d)
     shapes, ellipses = means2d.new_empty(count, 4), means2d.new_empty(count, 4)
-    counts = torch.empty(count, dtype=torch.int32, device=means2d.device)
+    counts = torch.empty(count, dtype=torch.int64, device=means2d.device)
     given = (means2d, 0) if features is None else (features, features.shape[1])
     tiles = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
     kernel = tile_kernels(warp_scalar(means2d.dtype)).pack_records

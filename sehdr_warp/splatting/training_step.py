@@ -9,22 +9,32 @@ from torch import Tensor
 
 from ..kernels import training_step as kernels
 from .harmonics import HarmonicsGradients
-from .launching import launch
+from .launching import launch, one, times
 from .threads import torch_threads
 
 MEAN_THREADS = 1 << 14
 
 
 @torch.no_grad()
-def judge_step(loss: Tensor, norms: Tensor, incomplete: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-    """Three scalars, 1 or 0: whether the loss or a norm is not finite; whether a step is therefore, or as `incomplete`
-    is true, to be skipped; whether it is to be made. loss: float32 scalar; norms: [K] float32; incomplete: bool scalar.
-    """
-    verdict = norms.new_empty(3)
+def judge_step(
+    loss: Tensor,
+    norms: Tensor,
+    incomplete: Tensor | None = None,
+    tally: Tensor | None = None,
+    pairs: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Two scalars, 1 or 0: whether a step is to be skipped, as the loss or a norm is not finite or `incomplete` is
+    true; whether it is to be made. loss: float32 scalar; norms: [K] float32; incomplete: bool scalar.
+
+    tally: [3] int64, is told: it counts steps that are not finite, and with pairs, an int64 scalar, the most of them
+    and the steps that are incomplete."""
+    verdict = norms.new_empty(2)
     if incomplete is None:
         incomplete = torch.empty(0, dtype=torch.bool, device=norms.device)
-    launch(kernels.judge_step, 1, loss.detach(), norms, incomplete, verdict)
-    return verdict[0], verdict[1], verdict[2]
+    none = torch.empty(0, dtype=torch.int64, device=norms.device) if tally is None or pairs is None else None
+    counted = (none if tally is None else tally), (none if pairs is None else pairs)
+    launch(kernels.judge_step, 1, loss.detach(), norms, incomplete, *counted, verdict)
+    return verdict[0], verdict[1]
 
 
 @torch.no_grad()
@@ -47,9 +57,26 @@ def _nonfinite_by_kernel(gradients: Sequence[Tensor]) -> Tensor:
     return found
 
 
+def differentiate(loss: Tensor) -> None:
+    """loss.backward(), for whose gradient torch would make a 1 that everything is multiplied by."""
+    _ByOne.apply(loss).backward()
+
+
+class _ByOne(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, loss):
+        return loss.detach()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, upstream):
+        return one(upstream)
+
+
 class AdamStep(NamedTuple):
     """What a step changes and what it takes: parameter, gradient, moments, contiguous float32 of one shape; float32 of
-    one element the number of this step, from 1, and the rate. A rate that is a number cannot change in a CUDA graph."""
+    one element the number of this step, from 1, and the rate. A rate that is a number cannot change in a CUDA graph.
+    width: of a Gaussian's row, where adam_steps() is told how many of them count; else 0."""
 
     parameter: Tensor
     gradient: Tensor
@@ -57,13 +84,22 @@ class AdamStep(NamedTuple):
     second_moment: Tensor
     step: Tensor
     rate: Tensor | float
+    width: int = 0
 
 
 @torch.no_grad()
-def adam_steps(steps: Sequence[AdamStep], skipped: Tensor, *, betas: tuple[float, float], epsilon: float) -> None:
+def adam_steps(
+    steps: Sequence[AdamStep],
+    skipped: Tensor,
+    *,
+    betas: tuple[float, float],
+    epsilon: float,
+    live: Tensor | None = None,
+) -> None:
     """Changes parameters and moments in place, or nothing where `skipped`, float32 of one element, is 1: torch's step
     on the CPU; on a GPU, where torch's leaves most of it idle, a kernel of the same numbers, several parameters at
-    once. All on one device, so that the call can be part of a CUDA graph.
+    once. All on one device, so that the call can be part of a CUDA graph. live: [1] int32, how many rows count; the
+    gradients of others are 0.
 
     Raises ValueError for a tensor that is not contiguous float32 of the parameter's shape.
     """
@@ -76,27 +112,28 @@ def adam_steps(steps: Sequence[AdamStep], skipped: Tensor, *, betas: tuple[float
                 raise ValueError(f"the {name.replace('_', ' ')} is {is_}, expected contiguous float32 {list(shape)}")
     steps = [step for step in steps if step.parameter.numel()]
     if skipped.device.type == "cuda":
-        _steps_by_kernel(steps, skipped, betas, epsilon)
+        _steps_by_kernel(steps, skipped, betas, epsilon, live)
         return
     numbers: Any = {"beta1": betas[0], "beta2": betas[1], "weight_decay": 0.0, "eps": epsilon, "found_inf": skipped}
     numbers |= {"amsgrad": False, "maximize": False}
     with torch_threads(skipped.device):
-        for parameter, gradient, first_moment, second_moment, step, rate in steps:
+        for parameter, gradient, first_moment, second_moment, step, rate, _ in steps:
             lists = [parameter], [gradient], [first_moment], [second_moment], [], [step]
             torch._fused_adam_(*lists, lr=float(rate), **numbers)  # pyright: ignore[reportPrivateImportUsage]
 
 
-def _steps_by_kernel(steps: Sequence[AdamStep], skipped, betas, epsilon) -> None:
-    nothing = [skipped.view(1)[:0]] * 6
+def _steps_by_kernel(steps: Sequence[AdamStep], skipped, betas, epsilon, live=None) -> None:
+    nothing, live = [skipped.view(1)[:0]] * 6, _live(live, skipped)
     for start in range(0, len(steps), kernels.AT_ONCE):
         given = steps[start : start + kernels.AT_ONCE]
         told = []
-        for parameter, gradient, first_moment, second_moment, step, rate in given:
+        for parameter, gradient, first_moment, second_moment, step, rate, _ in given:
             flat = (tensor.view(-1) for tensor in (parameter, first_moment, second_moment))
             told += [gradient.view(-1), step.view(1), _rate(rate, skipped).view(1), *flat]
         told += nothing * (kernels.AT_ONCE - len(given))
         most = max(step.parameter.numel() for step in given)
-        launch(kernels.update_by_adam, most, skipped.view(1), *_numbers(betas), epsilon, *told)
+        widths = [step.width for step in given] + [0] * (kernels.AT_ONCE - len(given))
+        launch(kernels.update_by_adam, most, skipped.view(1), live, *widths, *_numbers(betas), epsilon, *told)
 
 
 @torch.no_grad()
@@ -112,15 +149,20 @@ def harmonics_adam_step(
     rate: Tensor | float,
     betas: tuple[float, float],
     epsilon: float,
+    live: Tensor | None = None,
 ) -> None:
     """adam_steps() of coefficients of harmonics [N, K, 3] from number `start` on, whose gradients are multiplied out
     where they are used."""
     if not parameter.numel():
         return
-    numbers = step, _rate(rate, skipped), skipped, *_numbers(betas), epsilon
+    numbers = step, _rate(rate, skipped), skipped, _live(live, skipped), *_numbers(betas), epsilon
     changed = parameter.view(-1), first_moment.view(-1), second_moment.view(-1)
     kernel, stride = kernels.harmonics_adam_kernel(parameter.shape[1]), -(-parameter.numel() // kernels.NUMBERS)
     launch(kernel, stride, gradients.basis, gradients.by_values, start, stride, *numbers, *changed)
+
+
+def _live(live: Tensor | None, like: Tensor) -> Tensor:
+    return torch.empty(0, dtype=torch.int32, device=like.device) if live is None else live
 
 
 def _rate(rate: Tensor | float, like: Tensor) -> Tensor:
@@ -132,24 +174,28 @@ def _numbers(betas: tuple[float, float]) -> tuple[float, ...]:
     return *(1 - beta for beta in betas), *(math.log(beta) for beta in betas)
 
 
-def mean_opacity(logits: Tensor) -> Tensor:
-    """The mean of the sigmoids of [N] float32 logits, N >= 1, differentiable once; on a GPU in a third of the time that
-    torch takes for it."""
-    return torch.sigmoid(logits).mean() if logits.device.type == "cpu" else _MeanOpacity.apply(logits)
+def mean_opacity(logits: Tensor, weight: float = 1.0, live: Tensor | None = None) -> Tensor:
+    """weight times the mean of the sigmoids of [N] float32 logits, N >= 1, differentiable once; on a GPU in a third of
+    the time that torch takes for it. live: [1] int32 on the device, how many there are, where those behind them have a
+    sigmoid of 0."""
+    if logits.device.type == "cuda":
+        return _MeanOpacity.apply(logits, weight, live)
+    opacities = torch.sigmoid(logits)
+    return weight * (opacities.mean() if live is None else opacities.sum() / live[0])
 
 
 class _MeanOpacity(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, logits):
+    def forward(ctx, logits, weight, live):
         sums, slopes = logits.new_empty(min(len(logits), MEAN_THREADS)), torch.empty_like(logits)
-        launch(kernels.sum_opacities, len(sums), logits.detach(), sums, slopes)
+        launch(kernels.sum_opacities, len(sums), logits.detach(), weight, _live(live, logits), sums, slopes)
         ctx.save_for_backward(slopes)
         return sums.sum()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, upstream):
-        return ctx.saved_tensors[0] * upstream
+        return times(ctx.saved_tensors[0], upstream), None, None
 
 
 @torch.no_grad()

@@ -1,13 +1,17 @@
 """New Gaussians where the photos are explained worst, at the depths that the photos agree on."""
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ..field.color_models import ColorModel
 from ..field.radiance_field import RadianceField
+from ..response import Response
 from ..splats.arrays import HARMONIC_0
+from ..splatting.plane_sweep import BORDER
 from .matching import Matcher
 from .targets import TrainingView
 
@@ -18,38 +22,66 @@ LEAST_ERROR = 0.02  # Mean difference of encoded values from which a pixel is no
 
 @torch.no_grad()
 def born_rows(
-    field: RadianceField, matcher: Matcher, shown: Tensor, view: TrainingView, index: int, count: int, seed: int
-) -> dict[str, Tensor]:
-    """Rows of up to `count` Gaussians, as Gaussians.append takes them: of pixels drawn by the square of their error.
+    field: RadianceField,
+    matcher: Matcher,
+    shown: Tensor,
+    view: TrainingView,
+    index: int,
+    wanted: Tensor,
+    room: int,
+    seed: int,
+) -> tuple[dict[str, Tensor], Tensor]:
+    """Rows of Gaussians, as Gaussians.append takes them, of which the first are meant, and how many: of pixels drawn by
+    the square of their error. Nothing waits for the device.
 
     shown: [H, W, 3] encoded, the scene from `view`. matcher: of the training photos, in which that of the view
-    is the one at `index`. The same seed gives the same rows.
+    is the one at `index`. wanted: int64 [], how many at most, which is not above room. The same seed gives the same.
     """
-    rng = np.random.default_rng(seed)
-    found = matcher.match(_unexplained(shown.clamp(0, 1), matcher, view, index, min(count, MOST), rng))
-    start = torch.from_numpy(field.color_model.start(found.colors.cpu().numpy(), field.response))
+    room = min(room, MOST) if min(matcher.size(index)) > 2 * BORDER else 0
+    pixels, drawn = _unexplained(shown.clamp(0, 1), matcher, view, index, room, np.random.default_rng(seed))
+    found, known = matcher.match_each(pixels)
+    known &= drawn & (torch.arange(room, device=known.device) < wanted)
+    starts = _starts(field.color_model, field.response, found.colors.device)
+    start = starts.gather(0, (found.colors * 255).round().long())
     rest = field.gaussians.harmonics_rest
-    count = len(found.points)
-    return {
+    quaternions = torch.zeros(room, 4, device=rest.device)
+    quaternions[:, 0] = 1
+    rows = {
         "means": found.points,
         "log_scales": found.footprints.log()[:, None].repeat(1, 3),
-        "quaternions": rest.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        "opacity_logits": rest.new_full((count,), math.log(OPACITY / (1 - OPACITY))),
+        "quaternions": quaternions,
+        "opacity_logits": rest.new_full((room,), math.log(OPACITY / (1 - OPACITY))),
         "harmonics_dc": (start / HARMONIC_0).to(rest)[:, None, :],
-        "harmonics_rest": rest.new_zeros(count, *rest.shape[1:]),
+        "harmonics_rest": rest.new_zeros(room, *rest.shape[1:]),
     }
+    order = known.byte().argsort(descending=True, stable=True)
+    return {name: values[order] for name, values in rows.items()}, known.sum()
 
 
-def _unexplained(photo: Tensor, matcher: Matcher, view: TrainingView, index: int, count: int, rng) -> Tensor:
-    """[up to count, 3] pixels of a photo, as the matcher takes them."""
+@lru_cache(maxsize=1)
+def _starts(model: ColorModel, response: Response, device: torch.device) -> Tensor:
+    """[256, 3] start values of the harmonics' constant part, for each code of a photo."""
+    levels = np.arange(256, dtype=np.float32)[:, None].repeat(3, 1) / np.float32(255)
+    return torch.from_numpy(model.start(levels, response)).to(device)
+
+
+def _unexplained(
+    photo: Tensor, matcher: Matcher, view: TrainingView, index: int, count: int, rng
+) -> tuple[Tensor, Tensor]:
+    """[count, 3] pixels of a photo, as the matcher takes them, and [count] whether each is one that is meant."""
     error = (photo - view.target.encoded).abs().mean(2, keepdim=True)
     if view.target.mask is not None:
         error = error * view.target.mask
     steps = torch.where(error > LEAST_ERROR, error, 0.0).square().double().flatten().cumsum(0)
-    uniform = torch.from_numpy(rng.random(count)).to(steps)
+    uniform = torch.from_numpy(rng.random(count))
+    if steps.device.type == "cuda":
+        uniform = uniform.pin_memory().to(steps.device, non_blocking=True)
     place = torch.searchsorted(steps, uniform * steps[-1]).clamp_max(len(steps) - 1)
     width, height = view.camera.width, view.camera.height
-    ratio = matcher.sizes[index] / matcher.sizes.new_tensor([width, height])
-    column_and_row = torch.stack([place % width, place // width], 1).add(0.5) * ratio
-    pixels = torch.cat([torch.full_like(place[:, None], index), column_and_row.long()], 1).int()
-    return pixels[matcher.inside(pixels) & (steps[-1] > 0)]
+    across, down = matcher.size(index)
+    column = ((place % width + 0.5) * (across / width)).long()
+    row = ((place // width + 0.5) * (down / height)).long()
+    pixels = torch.stack([torch.full_like(place, index), column, row], 1).int()
+    meant = matcher.inside(pixels) & (steps[-1] > 0)
+    inside = column.clamp(BORDER, across - BORDER - 1), row.clamp(BORDER, down - BORDER - 1)
+    return torch.stack([torch.full_like(place, index), *inside], 1).int(), meant

@@ -12,7 +12,9 @@ import torch
 from torch import Tensor
 
 from ..field.gaussians import PARAMETER_NAMES, Gaussians
+from ..field.spare_rows import moments_of
 from ..splatting import Rendering
+from ..splatting.relocation import copy_rows, share_opacities
 from ..splatting.training_step import add_gradient_statistics, add_position_noise
 from .config import Config, DensificationConfig
 
@@ -21,14 +23,14 @@ SHORTEST_INTERVAL = 20
 """Iterations between changes are never fewer, however short the training: gradients need photos to be means of."""
 SHORTEST_RESET = 300
 """Where resets would come closer together they are left out: opacities would not recover in between."""
-MOST_COPIES = 51
-"""A Gaussian is shared by at most this many at once, as in the authors' code: the binomial sums stay exact."""
+SPARE = 1.17  # Rows in multiples of the Gaussians: changes that add a twentieth each fill them in three
 MOST_GROWTH = 1.0  # A change adds at most as many as there are: each then shares with one other in the mean
 SEED_STEP = 1_000_003  # Seeds of trainings are this far apart in the seeds of their noise, one for each iteration
 
 
-Births = Callable[[int], dict[str, Tensor]]
-"""Rows of at most so many new Gaussians, where the photos are explained worst."""
+Births = Callable[[Tensor, int], tuple[dict[str, Tensor], Tensor]]
+"""Of a number of new Gaussians that is wanted, int64 [], and one that it is not above: rows, where the photos are
+explained worst, and how many of them, the first, are meant, int64 []."""
 
 
 class Densification:
@@ -51,8 +53,12 @@ class Densification:
         """Whether observe() wants the gradients of the projected means at this iteration."""
         return False
 
-    def prepare(self, count: int, device: torch.device | str) -> None:
-        """Makes room for what observe() adds to."""
+    def prepare(self, rows: int, device: torch.device | str) -> None:
+        """Makes room for what observe() adds to: so many rows, of which the Gaussians are the first."""
+
+    def room(self, iteration: int, count: int) -> int:
+        """The rows that are worth having for `count` Gaussians and those that changes after an iteration may add."""
+        return count if self._is_last(iteration) else max(count, min(self.most, math.ceil(SPARE * count)))
 
     def observe(self, rendering: Rendering, width: int, height: int, usable: Tensor) -> None:
         """Takes note of a step's image gradients. usable: scalar tensor, 0 where the step is to be ignored."""
@@ -68,12 +74,16 @@ class Densification:
     def perturb(self, iteration: int, gaussians: Gaussians, means_rate: float) -> None:
         """What happens to the positions after each step of the optimizer."""
 
-    def state(self) -> dict[str, Tensor]:
-        """Running statistics, for a checkpoint."""
+    def state(self, count: int) -> dict[str, Tensor]:
+        """Running statistics of so many Gaussians, for a checkpoint."""
         return {}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Takes up the statistics of state()."""
+
+    def _is_last(self, iteration: int) -> bool:
+        """Whether no change of the count follows that of an iteration."""
+        return (max(iteration, self.start) // self.every + 1) * self.every >= self.stop
 
     def _is_due(self, iteration: int) -> bool:
         past = iteration % self.every
@@ -90,9 +100,10 @@ class GradientDensification(Densification):
     def needs_gradients(self, iteration: int) -> bool:
         return iteration < self.stop
 
-    def prepare(self, count: int, device: torch.device | str) -> None:
-        if self.gradient_sum is None:
-            self.gradient_sum, self.seen = torch.zeros(count, device=device), torch.zeros(count, device=device)
+    def prepare(self, rows: int, device: torch.device | str) -> None:
+        if self.gradient_sum is None or len(self.gradient_sum) != rows:
+            given = self.gradient_sum, self.seen
+            self.gradient_sum, self.seen = (_with_rows(values, rows, device) for values in given)
 
     @torch.no_grad()
     def observe(self, rendering: Rendering, width: int, height: int, usable: Tensor) -> None:
@@ -106,9 +117,16 @@ class GradientDensification(Densification):
         changed = False
         if self._is_due(iteration) and total is not None and seen is not None:
             changed = True
-            self._grow(gaussians, total / seen.clamp_min(1), optimizer, generator)
-            self._prune(gaussians, optimizer, oversized=iteration > self.reset_every)
-            self.gradient_sum = self.seen = None
+            gradient = (total / seen.clamp_min(1))[: gaussians.count]
+            stays, added = self._grown(gaussians, gradient, generator)
+            stays, added = self._pruned(gaussians, stays, added, oversized=iteration > self.reset_every)
+            if not bool(stays.all()):
+                gaussians.keep(stays, optimizer)
+            if len(added["means"]):
+                gaussians.append(added, optimizer)
+            # In place, where a recorded step adds to them.
+            total.zero_()
+            seen.zero_()
         if self._resets(iteration):
             opacity = 2 * self.options.prune_opacity
             logits = gaussians.opacity_logits.clamp_max(math.log(opacity / (1 - opacity)))
@@ -122,22 +140,18 @@ class GradientDensification(Densification):
         past = iteration % self.reset_every
         return past < self.photos and iteration - past < self.stop and self.reset_every >= SHORTEST_RESET
 
-    def _grow(self, gaussians: Gaussians, gradient: Tensor, optimizer, generator) -> None:
+    def _grown(self, gaussians: Gaussians, gradient: Tensor, generator) -> tuple[Tensor, dict[str, Tensor]]:
+        """[N] bool, which Gaussians stay as they are, and rows of those to add: clones, and halves of the others."""
         wanted = gradient > self.options.grow_gradient
         room = self.most - gaussians.count
         if int(wanted.sum()) > room:
-            if room <= 0:
-                return
             # Short of room, those that the image pulls at hardest go first.
-            wanted = torch.zeros_like(wanted).index_fill_(0, gradient.topk(room).indices, True) & wanted
+            first = gradient.topk(max(room, 0)).indices
+            wanted = torch.zeros_like(wanted).index_fill_(0, first, True) & wanted
         small = gaussians.log_scales.amax(1) <= math.log(self.options.grow_scale * self.extent)
         clones, parents = (wanted & small).nonzero()[:, 0], (wanted & ~small).nonzero()[:, 0]
-        if len(clones) + len(parents) == 0:
-            return
         added = [gaussians.rows(clones), *(self._half(gaussians, parents, generator) for _ in range(2))]
-        if len(parents):
-            gaussians.keep(torch.ones_like(wanted).index_fill_(0, parents, False), optimizer)
-        gaussians.append({name: torch.cat([rows[name] for rows in added]) for name in PARAMETER_NAMES}, optimizer)
+        return ~(wanted & ~small), {name: torch.cat([rows[name] for rows in added]) for name in PARAMETER_NAMES}
 
     def _half(self, gaussians: Gaussians, parents: Tensor, generator) -> dict[str, Tensor]:
         """One smaller Gaussian for each parent, at a point drawn from it."""
@@ -147,16 +161,23 @@ class GradientDensification(Densification):
         rows["log_scales"] -= math.log(SPLIT_SHRINK)
         return rows
 
-    def _prune(self, gaussians: Gaussians, optimizer, oversized: bool) -> None:
-        unwanted = gaussians.opacities() < self.options.prune_opacity
-        if oversized:
-            unwanted |= gaussians.log_scales.amax(1) > math.log(self.options.prune_scale * self.extent)
-        if 0 < int(unwanted.sum()) < gaussians.count:
-            gaussians.keep(~unwanted, optimizer)
+    def _pruned(self, gaussians: Gaussians, stays: Tensor, added: dict[str, Tensor], oversized: bool):
+        """_grown()'s without the faint and the huge; all of them where nothing else is left."""
+        good, new = (self._wanted(rows, oversized) for rows in (gaussians.tensors(), added))
+        good, index = stays & good, new.nonzero()[:, 0]
+        if len(index) == 0 and not bool(good.any()):
+            return stays, added
+        return good, {name: values[index] for name, values in added.items()}
 
-    def state(self) -> dict[str, Tensor]:
+    def _wanted(self, rows: dict[str, Tensor], oversized: bool) -> Tensor:
+        wanted = torch.sigmoid(rows["opacity_logits"]) >= self.options.prune_opacity
+        if oversized:
+            wanted &= rows["log_scales"].amax(1) <= math.log(self.options.prune_scale * self.extent)
+        return wanted
+
+    def state(self, count: int) -> dict[str, Tensor]:
         given = {"gradient_sum": self.gradient_sum, "seen": self.seen}
-        return {name: values for name, values in given.items() if values is not None}
+        return {name: values[:count] for name, values in given.items() if values is not None}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         self.gradient_sum, self.seen = state.get("gradient_sum"), state.get("seen")
@@ -173,36 +194,39 @@ class Relocation(Densification):
     def __init__(self, config: Config, extent: float, pixels: int):
         super().__init__(config, extent, pixels)
         self.most = gaussian_budget(self.options, pixels)
-        self._sums = _relocation_sums()
 
     @torch.no_grad()
     def change(self, iteration: int, gaussians: Gaussians, optimizer, generator, births: Births | None = None) -> bool:
         if not self._is_due(iteration):
             return False
+        count, part = gaussians.count, self.options.births
+        added = self.next_count(iteration, count) - count
         opacities = gaussians.opacities()
         dead = opacities <= self.options.prune_opacity
-        moved, alive = dead.nonzero()[:, 0], (~dead).nonzero()[:, 0]
-        count = gaussians.count
-        added = self.next_count(iteration, count) - count
-        if births is not None and (wanted := int(self.options.births * (len(moved) + added))):
-            rows = births(wanted)
-            here, moved = moved.tensor_split([len(rows["means"])])
-            gaussians.overwrite({name: values[: len(here)] for name, values in rows.items()}, here, optimizer)
-            rows = {name: values[len(here) :] for name, values in rows.items()}
-            if new := len(rows["means"]):
-                gaussians.append(rows, optimizer)
-                added -= new
-        if len(moved) and len(alive):
-            chosen = alive[_draw(opacities[alive], len(moved), generator)]
-            self._share(gaussians, chosen, optimizer)
-            # In the authors' code the moved ones keep their Adam state, and only those that share lose it.
-            for name, values in gaussians.rows(chosen).items():
-                getattr(gaussians, name)[moved] = values
+        # The device alone knows how many die: it numbers the places to be filled, those of the dead and then the new.
+        numbers = dead.cumsum(0)
+        gone = numbers[-1]
+        new = torch.arange(added, device=dead.device)
+        places = torch.cat([torch.where(dead, numbers - 1, -1), gone + new])
+        gaussians.resize(count + added, optimizer)
+        born = torch.zeros_like(gone)
+        if births is not None and part:
+            wanted = (part * (gone + added).double()).long()
+            if room := _room(wanted, int(part * (count + added))):
+                rows, born = births(wanted, room)
+                sources = torch.where(places < born, places, -1)
+                for name, values in gaussians.tensors().items():
+                    copy_rows(values, sources, rows[name])
+                self._forget(gaussians, optimizer, sources >= 0)
+        alive = torch.cat([torch.where(dead, 0.0, opacities), torch.zeros_like(new, dtype=opacities.dtype)])
+        moved = torch.where((places >= born) & (places < gone), places - born, -1)
+        self._fill(gaussians, optimizer, generator, alive, moved, (gone - born).clamp_min(0), count)
         if added > 0:
-            chosen = _draw(gaussians.opacities(), added, generator)
-            self._share(gaussians, chosen, optimizer)
-            gaussians.append(gaussians.rows(chosen), optimizer)
-        return gaussians.count > count
+            first = torch.maximum(gone, born)
+            grown = torch.where(places >= first, places - first, -1)
+            shown = torch.where(grown < 0, gaussians.opacities(), 0.0)
+            self._fill(gaussians, optimizer, generator, shown, grown, gone + added - first, added)
+        return added > 0
 
     def next_count(self, iteration: int, count: int) -> int:
         """How many Gaussians there are after the change at an iteration: more by `growth`, or by as much as takes the
@@ -225,21 +249,28 @@ class Relocation(Densification):
                 seed=(self.config.seed * SEED_STEP + iteration) % 2**31,
             )
 
-    def _share(self, gaussians: Gaussians, chosen: Tensor, optimizer) -> None:
-        """Makes each chosen Gaussian the n-th part of itself, n = 1 + how often it was chosen (equation 9)."""
-        copies = torch.bincount(chosen, minlength=gaussians.count)
-        index = copies.nonzero()[:, 0]
-        parts = (copies[index] + 1).clamp_max(MOST_COPIES)
-        opacity = gaussians.opacities()[index].clamp_max(1 - 1e-6)
-        part = 1 - (1 - opacity) ** (1 / parts)
-        powers = part[:, None].double() ** torch.arange(1, MOST_COPIES + 1, device=part.device)
-        total = (self._sums.to(part.device)[parts - 1] * powers).sum(1)
-        shrink = (opacity.double() / total).clamp(1e-3, 1.0).float()
-        logits = torch.logit(part.clamp(self.options.prune_opacity, 1 - 1e-6))
-        scales = gaussians.log_scales[index] + shrink.log()[:, None]
-        gaussians.overwrite({"opacity_logits": logits, "log_scales": scales}, index, optimizer)
-        for name in ("means", "quaternions", "harmonics_dc", "harmonics_rest"):
-            gaussians.forget(name, index, optimizer)
+    def _fill(self, gaussians, optimizer, generator, weights, ranks, number: Tensor, most: int) -> None:
+        """Puts into the places that have a rank [N], from 0 on, copies of Gaussians drawn by weights [N], which share
+        what they are with them. number: of ranks, at most `most`."""
+        room = _room(number, most)
+        if not room:
+            return
+        chosen, possible = _draw(weights, room, generator), weights.any()
+        used = (torch.arange(room, device=chosen.device) < number) & possible
+        copies = torch.zeros_like(ranks).index_add_(0, chosen, used.long())
+        least = self.options.prune_opacity
+        share_opacities(gaussians.opacity_logits.detach(), gaussians.log_scales.detach(), copies, least=least)
+        sources = torch.where((ranks >= 0) & possible, chosen[ranks.clamp(0, room - 1)], -1)
+        for values in gaussians.tensors().values():
+            copy_rows(values, sources, values)
+        # In the authors' code the moved ones keep their Adam state, and only those that share lose it.
+        self._forget(gaussians, optimizer, copies > 0)
+
+    def _forget(self, gaussians: Gaussians, optimizer, which: Tensor) -> None:
+        """Zeroes the optimizer's state of those that a mask [N] names; nothing waits for the device."""
+        for name in PARAMETER_NAMES:
+            for moment in moments_of(optimizer, getattr(gaussians, name)).values():
+                moment.masked_fill_(which.view(-1, *[1] * (moment.ndim - 1)), 0)
 
 
 def make_densification(config: Config, extent: float, pixels: int) -> Densification:
@@ -262,19 +293,23 @@ def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
     return vectors + scalar * cross + torch.linalg.cross(axis, cross)
 
 
+def _with_rows(values: Tensor | None, rows: int, device) -> Tensor:
+    """The first of values, and zeros behind them."""
+    made = torch.zeros(rows, device=device)
+    if values is not None:
+        made[: len(values)] = values[:rows]
+    return made
+
+
+def _room(number: Tensor, most: int) -> int:
+    """Room for a number of things, of which there are at most so many: a GPU is not waited for to tell it."""
+    return min(most, int(number)) if number.device.type == "cpu" else most
+
+
 def _draw(weights: Tensor, count: int, generator) -> Tensor:
     """[count] indices drawn in proportion to weights, with replacement; by bisection, for any number of weights."""
     steps = weights.double().cumsum(0)
     uniform = torch.rand(count, generator=generator, device=weights.device, dtype=torch.float64)
+    # Not 0, which the first would be drawn by, whatever it weighs.
+    uniform = uniform.clamp_min(torch.finfo(torch.float64).tiny)
     return torch.searchsorted(steps, uniform * steps[-1]).clamp_max(len(weights) - 1)
-
-
-def _relocation_sums() -> Tensor:
-    """[MOST_COPIES, MOST_COPIES] float64; row n - 1 dotted with (o, o^2, ...) is the denominator of equation 9 for n:
-    sum over i <= n and k < i of binomial(i - 1, k) (-1)^k o^(k + 1) / sqrt(k + 1)."""
-    rows = torch.zeros(MOST_COPIES, MOST_COPIES, dtype=torch.float64)
-    for n in range(1, MOST_COPIES + 1):
-        for k in range(n):
-            # The binomials of a column sum to one binomial (hockey stick).
-            rows[n - 1, k] = math.comb(n, k + 1) * (-1) ** k / math.sqrt(k + 1)
-    return rows

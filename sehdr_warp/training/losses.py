@@ -167,5 +167,5 @@ def data_loss(
 def regularised(loss: Tensor, field: RadianceField, config: LossConfig) -> Tensor:
     """The loss and what the Gaussians themselves cost, whatever the view: the opacities."""
     if config.opacity_weight > 0:
-        loss = loss + config.opacity_weight * mean_opacity(field.gaussians.opacity_logits)
+        loss = loss + mean_opacity(field.gaussians.opacity_logits, config.opacity_weight, field.gaussians.live)
     return loss

@@ -88,6 +88,11 @@ class Matcher:
         column_and_row, sizes = pixels[:, 1:], self.sizes[pixels[:, 0].long()]
         return ((column_and_row >= BORDER) & (column_and_row < sizes - BORDER)).all(1)
 
+    def size(self, index: int) -> tuple[int, int]:
+        """Width and height at which a photo is matched."""
+        height, width = self._images[index].shape[:2]
+        return width, height
+
     def near(self, others: Sequence[Camera]) -> np.ndarray:
         """[V + len(others), V] bool: which photos were taken near each photo, and then near each of the other cameras,
         and look the same way: the photo itself, and its neighbors."""
@@ -99,10 +104,22 @@ class Matcher:
     @torch.no_grad()
     def match(self, pixels: Tensor) -> Matches:
         """The points that pixels [N, 3] show, of those whose depth the photos agree on."""
+        depth = self._depths_of(pixels)
+        return self._matches(pixels[depth > 0], depth[depth > 0])
+
+    @torch.no_grad()
+    def match_each(self, pixels: Tensor) -> tuple[Matches, Tensor]:
+        """The points that pixels [N, 3] show, and [N] whether the photos agree on a depth of theirs: otherwise a point
+        is none. Nothing waits for the device."""
+        depth = self._depths_of(pixels)
+        return self._matches(pixels, depth), depth > 0
+
+    def _depths_of(self, pixels: Tensor) -> Tensor:
         parts = [self._depth(part) for part in pixels.split(max(1, CHUNK // len(self._depths)))]
-        depth = torch.cat(parts) if parts else self._depths[:0]
-        pixels, depth = pixels[depth > 0].long(), depth[depth > 0]
-        view, column, row = pixels.unbind(1)
+        return torch.cat(parts) if parts else self._depths[:0]
+
+    def _matches(self, pixels: Tensor, depth: Tensor) -> Matches:
+        view, column, row = pixels.long().unbind(1)
         fx, fy, cx, cy = self._photos.intrinsics[view].unbind(1)
         local = (
             torch.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, torch.ones_like(depth)], 1) * depth[:, None]

@@ -54,15 +54,23 @@ def set_means_rate(optimizer: Adam, rate: float) -> None:
 
 
 def guarded_step(
-    optimizer: Adam, loss: Tensor, incomplete: Tensor | None = None, harmonics: HarmonicsGradients | None = None
-) -> tuple[Tensor, Tensor]:
+    optimizer: Adam,
+    loss: Tensor,
+    incomplete: Tensor | None = None,
+    harmonics: HarmonicsGradients | None = None,
+    *,
+    tally: Tensor | None = None,
+    pairs: Tensor | None = None,
+    live: Tensor | None = None,
+) -> Tensor:
     """One step of Adam, or none if the loss or a gradient is not finite or the rendering was incomplete; decided on the
-    device, without waiting for it. Two scalar float tensors: 1 if something was not finite; 1 if the step was made."""
+    device, without waiting for it. A scalar float tensor: 1 if the step was made, else 0. tally, pairs: as of
+    judge_step(); live: as of Adam.step()."""
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
     gradients += [] if harmonics is None else [harmonics.by_values]
-    nonfinite, skipped, made = judge_step(loss, norms(gradients), incomplete)
-    optimizer.step(skipped, made, harmonics)
-    return nonfinite, made
+    skipped, made = judge_step(loss, norms(gradients), incomplete, tally, pairs)
+    optimizer.step(skipped, made, harmonics, live)
+    return made
 
 
 class FlatGradients:

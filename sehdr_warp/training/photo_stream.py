@@ -4,6 +4,8 @@ A recorded step reads its photo at a place in a ring of a few. A thread copies t
 file, to pinned memory and from there on a stream of its own, while the step before it is at work.
 """
 
+import logging
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -16,6 +18,8 @@ from ..field.radiance_field import CameraTensors
 from .losses import Target, one_of
 from .targets import PhotoSource, TrainingView, ViewStack
 
+log = logging.getLogger(__name__)
+
 SLOTS = 3  # One is read, one is being filled, and one may still be read by a step that is not done
 SHARE = 0.4
 """Of the device's free memory, photos stay on it up to so much: to stack them takes as much again for a while."""
@@ -24,6 +28,27 @@ SHARE = 0.4
 def fits_device(source: PhotoSource, device: torch.device) -> bool:
     """Whether all photos may stay on a GPU."""
     return source.bytes <= SHARE * torch.cuda.mem_get_info(device)[0]
+
+
+def held_views(source: PhotoSource, where: str, recorded: bool) -> "ViewStack | PhotoStream | Sequence[TrainingView]":
+    """The views of a source as steps take them. where: schedule.photos. recorded: whether steps are."""
+    device = torch.device(source.device)
+    if device.type == "cpu":  # Memory is the device's, or a file is mapped into it.
+        return source
+    if where in ("memory", "disk") or (where == "auto" and not fits_device(source, device)):
+        log.info("plan: photos: %.3g GB go to %s one by one, a step ahead", source.bytes / 1e9, device)
+        return _streamed(source) if recorded else source
+    views = list(source)
+    # Only recorded steps need what they read in one place.
+    return (ViewStack.of(views) if recorded else None) or views
+
+
+def _streamed(source: PhotoSource) -> "PhotoStream | PhotoSource":
+    try:
+        return PhotoStream(source)
+    except ValueError as error:
+        log.info("%s: they are copied one by one, and steps are not recorded", error)
+        return source
 
 
 class PhotoStream:

@@ -1,6 +1,5 @@
 """The training loop's state and its single step. What happens around steps is train.py's business."""
 
-import logging
 import operator
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -18,6 +17,7 @@ from ..scene import Camera, Scene
 from ..splatting import GraphRecorder, HarmonicsGradients, Rendering
 from ..splatting.memory import bytes_asked_for
 from ..splatting.tile_lists import ONE_SORT
+from ..splatting.training_step import differentiate
 from . import optimizer as adam
 from .averaging import Averaging
 from .births import born_rows
@@ -27,14 +27,13 @@ from .graph_capacity import GraphCapacity
 from .initialization import make_matcher, scene_extent
 from .losses import compares_light, data_loss, needed_colours, regularised
 from .matching import Matcher
-from .photo_stream import PhotoStream, fits_device
+from .photo_stream import PhotoStream, held_views
 from .ranks import Ranks
-from .targets import PhotoSource, TrainingView, ViewStack, largest_truth, photo_source
+from .targets import TrainingView, ViewStack, largest_truth, photo_source
 
-log = logging.getLogger(__name__)
-
-CHECK_EVERY = 20  # Iterations between looks at the count of skipped steps, each of which waits for the device
+CHECK_EVERY = 20  # Iterations between looks at what steps count on the device
 COMPARE_EVERY = 500  # Iterations between looks at whether all ranks still have the same Gaussians
+MOST_ROOM = 1.5  # In multiples of the Gaussians: rows that do not count cost memory, and a little time
 MOST_SKIPPED = 20  # Steps with a loss or gradient that is not finite are skipped; more than so many end the training
 
 
@@ -76,12 +75,14 @@ class Trainer:
         self._order: list[int] = []
         self._order_generator = torch.Generator().manual_seed(config.seed)
         self._generator = torch.Generator(device=self.device).manual_seed(config.seed)
-        self._skipped = torch.zeros((), device=self.device)
         self._index = torch.zeros(1, dtype=torch.int64, device=self.device)
         recorded = self.device.type == "cuda" and config.schedule.recorded
         self._recorder = GraphRecorder(self.device) if recorded else None
         # What follows the exchange of gradients is a recording of its own.
         self._follower = GraphRecorder(self.device, self._recorder.stream) if self._recorder and ranks else None
+        # Recorded steps work on more rows than there are Gaussians, so that these may become more.
+        self._reserves, self._rows = recorded and not config.deterministic, 0
+        field.gaussians.release()  # What another training reserved
         # A GPU waits for memory: the 48 numbers of each Gaussian's gradients by its harmonics are never written there.
         self._factored = self.device.type == "cuda"
         self._flat: adam.FlatGradients | None = None
@@ -118,7 +119,7 @@ class Trainer:
     @property
     def skipped_steps(self) -> int:
         """Steps that were left out because the loss or a gradient was not finite."""
-        return int(self._skipped)
+        return int(self._capacity.tally[0])
 
     @property
     def steps_without_room(self) -> int:
@@ -133,14 +134,16 @@ class Trainer:
         self.iteration += self.photos
         views, gaussians = self._training_views(), self.field.gaussians
         index = self._next_index(len(views))
-        watched = self.densification.needs_gradients(self.iteration)
+        if self._reserves and not self._rows:
+            self._make_room()
+        rows, watched = gaussians.reserved, self.densification.needs_gradients(self.iteration)
         if watched:
-            self.densification.prepare(gaussians.count, self.device)
+            self.densification.prepare(rows, self.device)
         rate = adam.means_rate(self.config, self.extent, self.iteration, self.batch)
         adam.set_means_rate(self.optimizer, rate)
         # The last: few are ordered otherwise, and a learned response encodes few otherwise, by kernels of their own.
-        kind = (self.degree, watched, gaussians.count < EXACT_BELOW, gaussians.count <= ONE_SORT)
-        self._last_index, count = index, gaussians.count
+        kind = (self.degree, watched, rows < EXACT_BELOW, rows <= ONE_SORT)
+        self._last_index, count, moves = index, gaussians.count, gaussians.moves
         if self._can_record(views, kind):
             self._loss, self._shown = self._replay(views, index, watched, kind)
             if isinstance(views, PhotoStream):
@@ -151,11 +154,12 @@ class Trainer:
         self.densification.perturb(self.iteration, gaussians, rate)
         if self._change() and self._recorder is not None:
             # Other Gaussians need about so many times the room.
-            self._invalidate()
-            self._capacity.change(gaussians.count / max(1, count))
+            growth, stayed = gaussians.count / max(1, count), gaussians.moves == moves
+            if not self._capacity.change(growth, keep=stayed):
+                self._invalidate()
         self._averaging.follow(self.iteration, self.photos, gaussians)
         if self.came_to(CHECK_EVERY):
-            self.check()
+            self.check(wait=False)
         if self.came_to(COMPARE_EVERY):
             self.settle()
 
@@ -166,48 +170,64 @@ class Trainer:
     def settle(self) -> None:
         """Gathers on rank 0 what belongs to a checkpoint. Raises SehdrError where the ranks are no longer alike."""
         if self.ranks is not None:
-            self.ranks.collect(list(self.densification.state().values()))
+            self.ranks.collect(list(self.densification.state(self.field.gaussians.count).values()))
             self.ranks.compare(self.field.gaussians.tensors(), self.iteration)
 
     def _change(self) -> bool:
-        """Changes the Gaussians where the iteration is one for it: rank 0 does, for all; whether their tensors are
-        others now."""
+        """Changes the Gaussians where the iteration is one for it: rank 0 does, for all; whether there are others or
+        more now."""
         gaussians, strategy, ranks = self.field.gaussians, self.densification, self.ranks
         given = self.iteration, gaussians, self.optimizer, self._generator, self._births
         if ranks is None:
-            return strategy.change(*given)
-        if not strategy.changes_at(self.iteration):
+            changed = strategy.change(*given)
+        elif not strategy.changes_at(self.iteration):
             return False
-        ranks.collect(list(strategy.state().values()))
-        changed = ranks.leads and strategy.change(*given)
-        told = torch.tensor([changed, gaussians.count, bool(strategy.state())], dtype=torch.int64, device=self.device)
-        ranks.spread([told])
-        changed, count, watching = told.tolist()
-        gaussians.resize(count, self.optimizer)
-        if not watching:
-            strategy.load_state({})
-        ranks.spread([*gaussians.tensors().values(), *self.optimizer.moments(gaussians.parameters())])
+        else:
+            ranks.collect(list(strategy.state(gaussians.count).values()))
+            decided = ranks.leads and strategy.change(*given)
+            told = [decided, gaussians.count, bool(strategy.state(gaussians.count))]
+            told = torch.tensor(told, dtype=torch.int64, device=self.device)
+            ranks.spread([told])
+            changed, count, watching = told.tolist()
+            gaussians.resize(count, self.optimizer)
+            if not watching:
+                strategy.load_state({})
+            ranks.spread([*gaussians.tensors().values(), *self.optimizer.moments(gaussians.parameters())])
+        if changed and self._reserves:
+            self._make_room()
         return bool(changed)
+
+    def _make_room(self) -> None:
+        """Room for the Gaussians that changes will add, alike on all ranks."""
+        gaussians, count = self.field.gaussians, self.field.gaussians.count
+        wanted = self.densification.room(self.iteration, count)
+        if wanted == count or not count <= self._rows <= MOST_ROOM * count:
+            self._rows = wanted
+        if gaussians.reserved != self._rows:
+            gaussians.reserve(self._rows, self.optimizer)
 
     def _invalidate(self) -> None:
         for recorder in (self._recorder, self._follower):
             if recorder is not None:
                 recorder.invalidate()
 
-    def _births(self, count: int) -> dict[str, Tensor]:
+    def _births(self, wanted: Tensor, room: int) -> tuple[dict[str, Tensor], Tensor]:
         """New Gaussians where the step's photo is explained worst; a resumed training has the same."""
         seed = self.config.seed * SEED_STEP + self.iteration
-        view = self._training_views()[self._last_index]
+        view, index = self._training_views()[self._last_index], self._last_index
         with self._launching():
             shown = self._shown if self._encoded else self.field.response.encode_extended(self._shown)
-            return born_rows(self.field, self._matcher(), shown, view, self._last_index, count, seed)
+            return born_rows(self.field, self._matcher(), shown, view, index, wanted, room, seed)
 
     def _step(self, gradients: Callable[[], "_Seen"], apply: Callable[["_Seen"], Tensor]) -> tuple[Tensor, Tensor]:
         """Gradients, of all ranks, and the step that they make; its loss, and the image that it compared."""
-        seen = gradients()
-        if self.ranks is not None and self._flat is not None:
-            self.ranks.mean(self._flat.buffer)
-        return apply(seen), seen.image
+        with self.field.gaussians.all_rows(self.optimizer):
+            if self.ranks is not None:
+                self._flattened()  # Not in a recording's own memory.
+            seen = gradients()
+            if self.ranks is not None and self._flat is not None:
+                self.ranks.mean(self._flat.buffer)
+            return apply(seen), seen.image
 
     def _gradients(self, view: TrainingView, watched: bool, capacity: int | None = None) -> "_Seen":
         """Photograph, compare, differentiate. With a capacity all of it works on fixed memory and nothing waits for the
@@ -216,7 +236,7 @@ class Trainer:
         also = needed_colours(self.config.loss, target.exposure_truth is not None)
         options = {"degree": self.degree, "also": also, "capacity": capacity, "encode": self._encoded}
         photo = field.photograph(camera, time, **options, factored=self._factored)
-        shown = photo.harmonics
+        by_harmonics = photo.by_harmonics
         # What the backward pass does not read, or only its first part does, must not stay until the end of the step.
         kept = {"means2d", "extents"} if watched else set()
         unread = {"image", "transmittance", "depths", "means2d", "extents"} - kept
@@ -228,11 +248,11 @@ class Trainer:
         assert image is not None
         del photo, target, view
         loss = regularised(loss, field, self.config.loss)
-        loss.backward()
+        differentiate(loss)
         harmonics = None
         if self._factored:
-            assert shown is not None and shown.grad is not None
-            harmonics = HarmonicsGradients(shown.grad[None], camera.position[None], field.gaussians.means, self.degree)
+            values = by_harmonics[0].contiguous()
+            harmonics = HarmonicsGradients(values[None], camera.position[None], field.gaussians.means, self.degree)
         if self.ranks is not None:
             self._flattened().take(loss, rendering.overflow, harmonics)
         return _Seen(loss.detach(), image.detach(), rendering, watched, harmonics)
@@ -243,15 +263,13 @@ class Trainer:
         incomplete = rendering.overflow
         if self._flat is not None:
             loss, incomplete, harmonics = self._flat.give()
-        nonfinite, made = adam.guarded_step(self.optimizer, loss, incomplete, harmonics)
+        counted = {"tally": self._capacity.tally, "pairs": rendering.pair_count, "live": self.field.gaussians.live}
+        made = adam.guarded_step(self.optimizer, loss, incomplete, harmonics, **counted)
         if seen.watched:
             self.densification.observe(rendering, width, height, made)
         self.optimizer.zero_grad()
-        self._skipped += nonfinite
-        if rendering.pair_count is None or incomplete is None:
+        if rendering.pair_count is None:
             self._capacity.launched(rendering.entry_count)
-        else:
-            self._capacity.note(rendering.pair_count, incomplete)
         return loss
 
     def _flattened(self) -> adam.FlatGradients:
@@ -288,7 +306,6 @@ class Trainer:
         try:
             if follower is None:
                 return recorder.run(kind, lambda: self._step(gradients, self._apply))
-            self._flattened()  # Not in the recording's own memory.
             return self._step(
                 lambda: recorder.run(kind, gradients),
                 lambda seen: follower.run(kind, lambda: self._apply(seen)),
@@ -302,14 +319,15 @@ class Trainer:
                 f"({str(error).splitlines()[0]}); train with --schedule.recorded=false, which is slower"
             ) from error
 
-    def check(self) -> None:
-        """Raises SehdrError if more than MOST_SKIPPED steps were skipped."""
-        if self.skipped_steps > MOST_SKIPPED:
+    def check(self, *, wait: bool = True) -> None:
+        """Raises SehdrError if more than MOST_SKIPPED steps were skipped. wait: False leaves out the latest."""
+        skipped, lacking = self._capacity.look(wait=wait)
+        if skipped > MOST_SKIPPED:
             raise SehdrError(
-                f"iteration {self.iteration}: {self.skipped_steps} steps had a loss or gradient that is not finite, "
+                f"iteration {self.iteration}: {skipped} steps had a loss or gradient that is not finite, "
                 f"more than {MOST_SKIPPED}; lower the learning rates or check photos and cameras"
             )
-        if self._recorder is not None and self._capacity.look():
+        if lacking:
             # Steps without room for all pairs changed nothing; record again with what they needed.
             self._invalidate()
 
@@ -321,7 +339,7 @@ class Trainer:
             "fusion": {} if self.field.fusion is None else self.field.fusion.state_dict(),
             "response": response.state_dict() if isinstance(response, torch.nn.Module) else {},
             "optimizer": adam.optimizer_tensors(self.optimizer, self.batch),
-            "densification": self.densification.state(),
+            "densification": self.densification.state(self.field.gaussians.count),
             "average": self._averaging.state(),
             "generators": {"order": self._order_generator.get_state(), "device": self._generator.get_state()},
         }
@@ -346,33 +364,15 @@ class Trainer:
         self._order = [operator.index(place) for place in values["order"]]
         if not all(0 <= place < len(self._views) for place in self._order):
             raise ValueError(f"the order of the photos names others than the {len(self._views)} there are")
-        self._skipped.fill_(values["skipped_steps"])
+        self._capacity.tally[0] = values["skipped_steps"]
 
     def _training_views(self) -> ViewStack | PhotoStream | Sequence[TrainingView]:
         if self._stack is None:
-            source, wanted = self._source(), self.config.schedule.photos
-            if self.device.type == "cpu":  # Memory is the device's, or a file is mapped into it.
-                self._stack = source
-            elif wanted in ("memory", "disk") or (wanted == "auto" and not fits_device(source, self.device)):
-                log.info("plan: photos: %.3g GB go to %s one by one, a step ahead", source.bytes / 1e9, self.device)
-                self._stack = self._streamed(source) if self._recorder else source
-            else:
-                views = list(source)
-                # Only recorded steps need what they read in one place.
-                self._stack = (None if self._recorder is None else ViewStack.of(views)) or views
+            given, loss = (self._views, self.field.base_time, self.device), self.config.loss
+            light = self.field.response if compares_light(loss, self.field) else None
+            source = photo_source(*given, truth=loss.uses_hdr, clipping=loss.clipping, light=light)
+            self._stack = held_views(source, self.config.schedule.photos, self._recorder is not None)
         return self._stack
-
-    def _streamed(self, source: PhotoSource) -> PhotoStream | PhotoSource:
-        try:
-            return PhotoStream(source)
-        except ValueError as error:
-            log.info("%s: they are copied one by one, and steps are not recorded", error)
-            return source
-
-    def _source(self) -> PhotoSource:
-        given, loss = (self._views, self.field.base_time, self.device), self.config.loss
-        light = self.field.response if compares_light(loss, self.field) else None
-        return photo_source(*given, truth=loss.uses_hdr, clipping=loss.clipping, light=light)
 
     def _next_index(self, count: int) -> int:
         """Every photo once in random order, then again in another; one for each rank, of which this one's is given."""

@@ -74,6 +74,43 @@ def test_keep_and_append_carry_adams_state():
     assert [p is getattr(gaussians, g["name"]) for g in optimizer.param_groups for p in g["params"]] == [True] * 6
 
 
+def test_spare_rows_keep_gaussians_where_they_are_and_change_nothing_else():
+    plain, roomy = (Gaussians.from_points(grid(2), torch.zeros(8, 3), 1) for _ in range(2))
+    optimizers = adam(plain), adam(roomy)
+    roomy.reserve(11, optimizers[1])
+    moves = roomy.moves
+    with roomy.all_rows(optimizers[1]):
+        held = {name: getattr(roomy, name).data_ptr() for name in PARAMETER_NAMES}
+        assert roomy.means.shape == (11, 3) and roomy.live.tolist() == [8]
+    for change in (
+        lambda g, o: g.keep(torch.tensor([5, 1, 2, 7, 0, 3]), o),
+        lambda g, o: g.append(g.rows(torch.tensor([0, 4, 4])), o),
+        lambda g, o: g.overwrite({"opacity_logits": torch.tensor([7.0])}, torch.tensor([8]), o),
+        lambda g, o: g.keep(torch.arange(9) < 7, o),
+        lambda g, o: g.resize(10, o),
+    ):
+        for gaussians, optimizer in zip((plain, roomy), optimizers, strict=True):
+            change(gaussians, optimizer)
+            for name in PARAMETER_NAMES:
+                optimizer.state[getattr(gaussians, name)]["exp_avg"].add_(1)
+        with roomy.all_rows(optimizers[1]):
+            assert {name: getattr(roomy, name).data_ptr() for name in PARAMETER_NAMES} == held
+            assert roomy.live.tolist() == [plain.count] and not roomy.opacities()[plain.count :].any()
+            torch.testing.assert_close(roomy.quaternions[plain.count :].norm(dim=1), torch.ones(11 - plain.count))
+            for group in optimizers[1].param_groups:
+                (whole,) = group["params"]
+                assert whole is getattr(roomy, group["name"]) and len(whole) == 11
+                assert not optimizers[1].state[whole]["exp_avg_sq"][plain.count :].any()
+        for name in PARAMETER_NAMES:
+            ours, theirs = getattr(roomy, name), getattr(plain, name)
+            assert torch.equal(ours, theirs) and ours.data_ptr() == held[name]
+            for key, moment in optimizers[0].state[theirs].items():
+                assert torch.equal(optimizers[1].state[ours][key], moment)
+    assert roomy.moves == moves and len(optimizers[1].state) == len(PARAMETER_NAMES)
+    roomy.append(roomy.rows(torch.tensor([0, 1])), optimizers[1])
+    assert roomy.moves > moves and roomy.reserved == roomy.count == 12
+
+
 def test_overwrite_forgets_where_it_wrote():
     gaussians = Gaussians.from_points(grid(2), torch.rand(8, 3), 0)
     optimizer = adam(gaussians)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.special import sph_harm_y
 
-from sehdr_warp.splatting import HarmonicsGradients, spherical_harmonics
+from sehdr_warp.splatting import HarmonicsGradients, harmonics, spherical_harmonics
 from sehdr_warp.splatting.training_step import AdamStep, adam_steps, harmonics_adam_step
 
 from .scenes import finite_differences, relative_error
@@ -50,7 +50,9 @@ def test_basis_is_the_real_spherical_harmonics(device, degree):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("which", range(3), ids=["coefficients", "means", "camera_position"])
-def test_gradients_match_finite_differences(device, degree, which):
+@pytest.mark.parametrize("turning", [False, True])
+def test_gradients_match_finite_differences(device, degree, which, turning, monkeypatch):
+    monkeypatch.setattr(harmonics, "writes_turns", lambda device: turning)
     tensors = inputs(count=6)
     weights = torch.randn(6, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 

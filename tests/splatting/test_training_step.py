@@ -6,12 +6,14 @@ from itertools import product
 import pytest
 import torch
 
-from sehdr_warp.splatting import training_step
+from sehdr_warp.splatting import HarmonicsGradients, training_step
 from sehdr_warp.splatting.training_step import (
     AdamStep,
     adam_steps,
     add_gradient_statistics,
     add_position_noise,
+    differentiate,
+    harmonics_adam_step,
     judge_step,
     mean_opacity,
     norms,
@@ -90,14 +92,45 @@ def test_one_number_that_is_not_finite_shows_in_the_norms(device, place, functio
 
 @pytest.mark.parametrize("function", [mean_opacity, training_step._MeanOpacity.apply])
 @pytest.mark.parametrize("count", [1, 7, 40_000])
-def test_the_mean_opacity_and_its_gradient_are_torchs_in_float64(device, count, function):
-    logits = (2 * torch.randn(count, generator=torch.Generator().manual_seed(0))).to(device).requires_grad_()
-    truth = logits.detach().double().requires_grad_()
-    mean, true_mean = function(logits), torch.sigmoid(truth).mean()
+@pytest.mark.parametrize("spare", [None, 0, 5])
+def test_the_mean_opacity_and_its_gradient_are_torchs_in_float64(device, count, function, spare):
+    logits = (2 * torch.randn(count, generator=torch.Generator().manual_seed(0))).to(device)
+    truth, live = logits.double().requires_grad_(), None
+    if spare is not None:
+        logits = torch.cat([logits, torch.full((spare,), -1e4, device=device)])
+        live = torch.tensor([count], dtype=torch.int32, device=device)
+    logits.requires_grad_()
+    mean, true_mean = function(logits, 1.5, live), 1.5 * torch.sigmoid(truth).mean()
     (3 * mean).backward()
     (3 * true_mean).backward()
     assert mean.item() == pytest.approx(true_mean.item(), rel=1e-6)
-    assert ((logits.grad - truth.grad).norm() / truth.grad.norm()) < 1e-5
+    assert ((logits.grad[:count] - truth.grad).norm() / truth.grad.norm()) < 1e-5
+    assert not logits.grad[count:].any()
+
+
+def test_a_loss_is_differentiated_as_torch_does(device):
+    values = torch.linspace(-2, 2, 9, device=device).requires_grad_()
+    differentiate(mean_opacity(values) + values.square().sum())
+    ours, values.grad = values.grad, None
+    (torch.sigmoid(values).mean() + values.square().sum()).backward()
+    torch.testing.assert_close(ours, values.grad)
+
+
+def test_rows_that_do_not_count_are_left_alone(device):
+    values, other, one = torch.zeros(6, 4, device=device), torch.zeros(50, device=device), torch.ones((), device=device)
+    steps = [
+        AdamStep(tensor, torch.ones_like(tensor), torch.zeros_like(tensor), torch.zeros_like(tensor), one, one, width)
+        for tensor, width in ((values, 4), (other, 0))
+    ]
+    live = torch.tensor([5], dtype=torch.int32, device=device)
+    training_step._steps_by_kernel(steps, 0 * one, *OPTIONS.values(), live)
+    assert (values[:5] == values[0, 0]).all() and values[0, 0] < 0 and not values[5].any() and other.all()
+    moments = (torch.zeros(6, 15, 3, device=device) for _ in range(3))
+    ones = torch.ones(6, 3, device=device)
+    factors = HarmonicsGradients(ones[None], 0 * ones[:1], ones, 3)
+    parameter, *state = moments
+    harmonics_adam_step(parameter, 1, factors, *state, one, 0 * one, rate=0.1, **OPTIONS, live=live)
+    assert parameter[:5, 1].all() and not parameter[5].any() and not state[0][5].any()
 
 
 def test_no_numbers_are_no_work_and_another_layout_is_refused(device):
@@ -118,8 +151,11 @@ def test_a_step_is_skipped_where_something_is_not_finite_or_incomplete(device):
         given = torch.tensor([1.0, norm, 2.0], device=device)
         nonfinite = not (math.isfinite(loss) and math.isfinite(norm))
         skipped = nonfinite or bool(incomplete)
-        found = judge_step(torch.tensor(loss, device=device), given, told)
-        assert [float(value) for value in found] == [nonfinite, skipped, not skipped]
+        tally, pairs = (torch.tensor(values, device=device) for values in ([4, 7, 2], 9))
+        for counted in (None, pairs):
+            found = judge_step(torch.tensor(loss, device=device), given, told, tally, counted)
+            assert [float(value) for value in found] == [skipped, not skipped]
+        assert tally.tolist() == [4 + 2 * nonfinite, 9, 2 + bool(incomplete)]
 
 
 @pytest.mark.parametrize("usable", [0.0, 1.0])

@@ -8,8 +8,10 @@ import torch
 
 from sehdr_warp.field.gaussians import PARAMETER_NAMES, Gaussians
 from sehdr_warp.splatting import rasterize
+from sehdr_warp.splatting.relocation import relocation_sums
+from sehdr_warp.training import densification
 from sehdr_warp.training.config_files import load_config
-from sehdr_warp.training.densification import GradientDensification, _draw, _relocation_sums, make_densification, rotate
+from sehdr_warp.training.densification import GradientDensification, _draw, make_densification, rotate
 
 EXTENT = 2.0
 
@@ -96,6 +98,18 @@ def test_split_points_are_drawn_from_the_parent():
     torch.testing.assert_close(torch.cov(offsets.T), expected, atol=0.01, rtol=0.05)
 
 
+def test_statistics_stay_where_recorded_steps_add_to_them():
+    strategy, gaussians = gradient_strategy(), cloud(4)
+    observe(strategy, [1e-6] * 4)
+    held = strategy.gradient_sum, strategy.seen
+    for iteration in (600, 14_900):  # The last change too: steps after it still add.
+        strategy.change(iteration, gaussians, adam(gaussians), torch.Generator().manual_seed(0))
+        strategy.prepare(4, "cpu")
+        assert strategy.gradient_sum is held[0] and strategy.seen is held[1] and not torch.cat(held).any()
+    strategy.prepare(6, "cpu")
+    assert strategy.seen.shape == (6,) and strategy.state(5)["seen"].shape == (5,)
+
+
 def test_rotation_is_the_quaternions():
     half = math.sqrt(0.5)
     turned = rotate(torch.tensor([[2 * half, 0.0, 0.0, 2 * half]]), torch.tensor([[1.0, 0.0, 0.0]]))
@@ -153,7 +167,7 @@ def relocation(**options):
 
 
 def test_relocation_sums_are_equation_9():
-    sums, opacity = _relocation_sums(), 0.3
+    sums, opacity = relocation_sums(torch.device("cpu")), 0.3
     for n in (1, 2, 5, 20):
         direct = sum(
             math.comb(i - 1, k) * (-1) ** k * opacity ** (k + 1) / math.sqrt(k + 1)
@@ -164,7 +178,14 @@ def test_relocation_sums_are_equation_9():
         assert float(sums[n - 1] @ powers) == pytest.approx(direct, rel=1e-9)
 
 
-def test_relocation_moves_the_dead_and_keeps_the_image():
+@pytest.fixture(params=[False, True], ids=["counted", "not waited for"])
+def rooms(request, monkeypatch):
+    """Numbers that the device alone knows: read, as on the CPU, or not, as on a GPU."""
+    if request.param:
+        monkeypatch.setattr(densification, "_room", lambda number, most: most)
+
+
+def test_relocation_moves_the_dead_and_keeps_the_image(rooms):
     generator = torch.Generator().manual_seed(0)
     gaussians = cloud(8)
     gaussians.overwrite(
@@ -194,7 +215,64 @@ def test_relocation_moves_the_dead_and_keeps_the_image():
     assert (after - before).abs().mean() < 0.05 * before.abs().mean()
 
 
-def test_relocation_grows_to_the_budget():
+def born(colors):
+    """Births of Gaussians of these colors at the origin, of which the wanted ones are meant."""
+
+    def rows(wanted, room):
+        made = cloud(len(colors)).tensors()
+        given = torch.tensor(colors)[:, None, None].expand(-1, 1, 3)
+        made |= {"means": torch.zeros_like(made["means"]), "harmonics_dc": given}
+        return {name: values[:room].contiguous() for name, values in made.items()}, wanted.clamp_max(len(colors))
+
+    return rows
+
+
+@pytest.mark.parametrize(("dead", "colors"), [(6, 3), (2, 8), (0, 4), (9, 1), (10, 4)])
+def test_the_born_come_first_and_take_the_places_of_the_dead(rooms, dead, colors):
+    gaussians = cloud(10)
+    optimizer = adam(gaussians)
+    logits = torch.logit(torch.tensor([0.004] * dead + [0.5] * (10 - dead)))[torch.randperm(10)]
+    gaussians.overwrite({"opacity_logits": logits})
+    gone, before = (logits < -5).nonzero()[:, 0].tolist(), gaussians.rows(torch.arange(10))
+    strategy = relocation(births=0.5, growth=0.3)
+    strategy.change(
+        600, gaussians, optimizer, torch.Generator().manual_seed(0), born([10.0 + k for k in range(colors)])
+    )
+    assert gaussians.count == 13
+    places = [*gone, 10, 11, 12][: min(colors, (dead + 3) // 2)]
+    found = gaussians.harmonics_dc.detach()[:, 0, 0]
+    assert found[places].tolist() == [10.0 + k for k in range(len(places))]
+    assert not gaussians.means.detach()[places].any()
+    for name in PARAMETER_NAMES:
+        assert not optimizer.state[getattr(gaussians, name)]["exp_avg"][places].any()
+    if dead == 10:  # Nobody can be copied but the born.
+        assert torch.equal(found[gone[len(places) :]], before["harmonics_dc"][gone[len(places) :], 0, 0])
+        return
+    others = [place for place in [*gone, 10, 11, 12] if place not in places]
+    kept = [place for place in range(10) if place not in gone]
+    sources = {tuple(row) for row in gaussians.means.detach()[[*kept, *places]].tolist()}
+    assert all(tuple(row) in sources for row in gaussians.means.detach()[others].tolist())
+    assert (gaussians.opacities() > 0.005 - 1e-6).all()
+    assert torch.equal(gaussians.means.detach()[kept], before["means"][kept])
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="the CPU is never waited for")
+def test_relocation_does_not_wait_for_a_gpu():
+    for waited in ("first", "error"):  # What is made once may wait.
+        gaussians = cloud(100).to("cuda:0")
+        optimizer, generator = adam(gaussians), torch.Generator("cuda:0").manual_seed(0)
+        gaussians.overwrite({"opacity_logits": torch.linspace(-6, 2, 100, device="cuda:0")})
+        gaussians.reserve(120, optimizer)
+        strategy = relocation()
+        torch.cuda.set_sync_debug_mode(waited if waited == "error" else "default")
+        try:
+            strategy.change(600, gaussians, optimizer, generator)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+        assert gaussians.count == strategy.next_count(600, 100) > 105 and (gaussians.opacities() > 0.004).all()
+
+
+def test_relocation_grows_to_the_budget(rooms):
     gaussians = cloud(100)
     optimizer = adam(gaussians)
     gaussians.overwrite({"opacity_logits": torch.zeros(100)})

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from sehdr_warp.splatting.training_step import judge_step
 from sehdr_warp.training.graph_capacity import KEPT, LEAST_ROOM, ROOM, GraphCapacity
 
 MANY = 10 * LEAST_ROOM
@@ -10,10 +11,10 @@ MANY = 10 * LEAST_ROOM
 
 def replay(room, pairs):
     """Recorded steps that need so many pairs each; the room that they were given."""
+    loss = torch.zeros((), device=room.tally.device)
     for needed in pairs:
-        given = room.capacity()
-        overflow = torch.tensor(needed > given, device=room._needed.device)
-        room.note(torch.tensor(needed, device=room._needed.device), overflow)
+        given, needed = room.capacity(), torch.tensor(needed, device=loss.device)
+        judge_step(loss, loss[None], needed > given, room.tally, needed)
     return given
 
 
@@ -24,12 +25,12 @@ def test_room_follows_the_most_pairs_seen(device):
     assert room.known
     most = MANY * 6 // 5
     assert replay(room, [MANY, most, MANY]) == ROOM * MANY
-    assert not room.look()
-    room.change(1.0)
+    assert room.look() == (0, False)
+    assert not room.change(1.0, keep=False)
     assert replay(room, [MANY] * 2) == ROOM * most
-    room.change(1.1)
+    assert not room.change(1.1, keep=False)
     assert replay(room, [MANY]) == pytest.approx(ROOM * KEPT * most, abs=3)
-    room.change(2.5)
+    assert not room.change(2.5, keep=True)
     assert replay(room, [MANY]) == pytest.approx(ROOM * 2.5 * MANY, abs=3)
 
 
@@ -38,9 +39,31 @@ def test_a_lack_of_room_is_noticed_and_mended(device):
     room.launched(MANY)
     replay(room, [MANY, 5 * MANY, MANY])
     assert room.lacked == 1
-    assert room.look()
+    assert room.look() == (0, True)
     assert replay(room, [5 * MANY]) == ROOM * 5 * MANY
-    assert not room.look()
+    assert room.look() == (0, False)
+
+
+def test_room_stays_while_it_is_enough(device):
+    room = GraphCapacity(device)
+    room.launched(MANY)
+    given = replay(room, [MANY])
+    assert room.change(1.05, keep=True) and room.capacity() == given
+    assert replay(room, [MANY * 21 // 20]) == given
+    assert room.change(1.05, keep=True)
+    replay(room, [MANY * 11 // 10])
+    assert not room.change(1.1, keep=True)
+    assert room.capacity() == pytest.approx(ROOM * 1.1 * 1.1 * MANY, abs=3)
+
+
+def test_looks_that_do_not_wait_tell_what_the_one_before_asked_for(device):
+    room, nan = GraphCapacity(device), torch.full((1,), float("nan"), device=device)
+    room.launched(MANY)
+    pairs = torch.tensor(5 * MANY, device=device)
+    judge_step(nan[0], nan, pairs > room.capacity(), room.tally, pairs)
+    late = [room.look(wait=False) for _ in range(2)]
+    assert late[-1 if room.tally.is_cuda else 0] == (1, True)
+    assert room.lacked == 1
 
 
 def test_few_pairs_get_the_least_room(device):

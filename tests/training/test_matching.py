@@ -88,8 +88,15 @@ def test_gaussians_are_born_where_the_photos_are_not_explained(device):
         # Opaque, so that the wall is explained from the start.
         field.gaussians.opacity_logits.fill_(4.0)
         shown = field.photograph(views[0].camera, views[0].exposure_time, degree=0).encoded
-    rows, again = (born_rows(field, matcher, shown, views[0], 0, 200, seed=3) for _ in range(2))
+    wanted = torch.tensor(200, device=device)
+    given = field, matcher, shown, views[0], 0
+    (rows, born), (again, roomy) = (born_rows(*given, wanted, room, seed=3) for room in (200, 300))
+    assert 0 < int(born) < 200 and born == roomy
+    rows, again = ({name: values[: int(born)] for name, values in each.items()} for each in (rows, again))
     assert all(torch.equal(values, again[name]) for name, values in rows.items())
+    assert all(values.isfinite().all() for values in rows.values())
+    none = born_rows(*given, torch.tensor(0, device=device), 10, seed=3)
+    assert not int(none[1])
     white = rows["harmonics_dc"].amax((1, 2)) == rows["harmonics_dc"].max()
     depth = rows["means"][white, 2]
     assert white.float().mean() > 0.3 and ((depth - LAMP).abs() < 0.15 * LAMP).float().mean() > 0.6

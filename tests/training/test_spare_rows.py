@@ -1,0 +1,57 @@
+"""Steps on more rows than there are Gaussians, as recorded ones are: the same training, and nothing moves."""
+
+import pytest
+import torch
+
+from sehdr_warp.training import densification, graph_capacity, trainer
+from sehdr_warp.training.config_files import override_config
+from sehdr_warp.training.initialization import choose_response, make_field
+
+from .toy import VARIANTS
+
+
+def trained_steps(scene, config, device, reserves):
+    """A trainer after 60 steps, and how often its Gaussians moved in how many changes of their number."""
+    training = trainer.Trainer(scene, config, make_field(scene, config, choose_response(scene, config), device))
+    training._reserves, gaussians, moves = reserves, training.field.gaussians, []
+    for _ in range(60):
+        count, before = gaussians.count, gaussians.moves
+        training.step()
+        if gaussians.count != count:
+            moves.append(gaussians.moves > before)
+    return training, moves
+
+
+@pytest.mark.parametrize("variant", ["default", "gradient"])
+def test_spare_rows_change_nothing_of_a_training(scene, device, variant, monkeypatch):
+    monkeypatch.setattr(densification, "SPARE", 8.0)  # So few Gaussians become many at once.
+    monkeypatch.setattr(trainer, "MOST_ROOM", 8.0)
+    config = override_config(VARIANTS[variant], {"deterministic": True, "schedule.recorded": False})
+    (plain, all_moved), (roomy, moved) = (trained_steps(scene, config, device, reserves) for reserves in (False, True))
+    assert all(all_moved) and not any(moved) and len(moved) == len(all_moved) > 1
+    assert roomy.field.gaussians.reserved > roomy.field.gaussians.count
+    assert roomy.state()[1] == plain.state()[1]
+    for name, expected in plain.field.gaussians.tensors().items():
+        # Not in every bit: torch takes the last of a tensor's numbers, and a GPU sums, otherwise.
+        apart = (roomy.field.gaussians.tensors()[name] - expected).abs() > 1e-4 + 1e-3 * expected.abs()
+        assert apart.float().mean() < 0.02, name
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
+def test_recorded_steps_go_on_through_changes_and_do_not_wait(scene, monkeypatch):
+    monkeypatch.setattr(densification, "SPARE", 8.0)
+    monkeypatch.setattr(trainer, "MOST_ROOM", 8.0)
+    monkeypatch.setattr(graph_capacity, "ENOUGH", 0.0)
+    config = VARIANTS["default"]
+    training = trainer.Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cuda:0"))
+    for _ in range(48):
+        training.step()
+    recorded, count = training._recorder._graph, training.field.gaussians.count
+    assert recorded is not None
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(10):
+            training.step()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert training.field.gaussians.count > count and training._recorder._graph is recorded
