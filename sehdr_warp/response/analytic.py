@@ -3,6 +3,7 @@
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 
 from ..errors import SehdrError, did_you_mean
@@ -90,6 +91,14 @@ class AnalyticResponse(Response, kind="analytic"):
     def _invert(self, value):
         light = self._display.invert(value)
         return light if self._tone is None else self._tone.invert(light)
+
+    def rise(self, value):
+        # By the inverse: what the slope needs is a kernel of its own for each curve.
+        values = torch.from_numpy(np.minimum(value, self._limit)).requires_grad_()
+        with torch.enable_grad():
+            self._invert(values).log().sum().backward()
+        assert values.grad is not None
+        return values.grad.numpy()
 
     def to_dict(self):
         return {"kind": "analytic", "name": self.name}

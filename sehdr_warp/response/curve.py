@@ -104,17 +104,31 @@ class Response(ABC):
 
         A curve that only approaches its peak is inverted up to `white`, since the exact inverse of 1 is infinite.
         """
-        return self._through(lambda y: _Pointwise.apply(y, self._decode), value)
+        return self._through(
+            lambda y: _Pointwise.apply(y, self._decode) if y.requires_grad else self._exposure_of(y), value
+        )
+
+    def rise(self, value: np.ndarray) -> np.ndarray:
+        """d ln x / dz at values z in (black, peak) of exposures x, float64."""
+        exposure = np.asarray(self.decode(value))
+        return 1 / (exposure * np.maximum(np.asarray(self.slope(exposure)), 1e-9))
 
     def slope(self, exposure):
         """df/dx of encode, shaped like the exposures; 0 beyond the clip point. Not differentiable itself."""
         return self._through(lambda x: self._encode(x.detach(), 0.0)[1], exposure)
 
+    @property
+    def _limit(self) -> float:
+        return self.peak if self.clips else self.peak - HALF_CODE
+
+    @torch.no_grad()
+    def _exposure_of(self, value: torch.Tensor) -> torch.Tensor:
+        return self._invert(value.clamp(self.black, self._limit)).clamp_max(self.clip_exposure)
+
     def _decode(self, value: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        limit = self.peak if self.clips else self.peak - HALF_CODE
-        exposure = self._invert(value.clamp(self.black, limit)).clamp_max(self.clip_exposure)
+        exposure = self._exposure_of(value)
         _, slope = self._encode(exposure, 0.0)
-        return exposure, torch.where((value < self.black) | (value > limit), 0.0, 1.0 / slope)
+        return exposure, torch.where((value < self.black) | (value > self._limit), 0.0, 1.0 / slope)
 
     @staticmethod
     def _through(function, argument):

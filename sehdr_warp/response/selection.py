@@ -181,8 +181,8 @@ def edge_facts(count: int) -> float:
 
 def _on_grid(response: Response) -> tuple[np.ndarray, np.ndarray]:
     """[2041] ln x at each place z of GRID, and d ln x / dz there; below code 1 all count as it."""
-    exposures = np.asarray(response.decode(np.maximum(GRID, response.black + CODE)))
-    return np.log(exposures), 1 / (exposures * np.maximum(np.asarray(response.slope(exposures)), 1e-9))
+    values = np.maximum(GRID, response.black + CODE)
+    return np.log(np.asarray(response.decode(values))), response.rise(values)
 
 
 def _bands(image) -> list[tuple[np.ndarray, np.ndarray]]:
