@@ -64,7 +64,9 @@ class PhotoGains:
     def _view(self, view: View, response: Response) -> View:
         gain = np.array(self.gains.get(view.name, (1.0, 1.0, 1.0)))
         time = view.exposure_time * gain.max()
-        light = np.exp(-_power(_radius(view), *self.falloff)) * (gain / gain.max())
+        height, width = view.codes.shape[:2]
+        radius = _radius(view, *np.ogrid[:height, :width])[..., None]
+        light = np.exp(-_power(radius, *self.falloff)) * (gain / gain.max())
         if light.min() > 1 - NEGLIGIBLE:
             return replace(view, exposure_time=time)
         decoded = response.decode(np.arange(view.levels + 1) / view.levels)[view.codes]
@@ -201,11 +203,10 @@ def _power(r: np.ndarray, a: float, b: float) -> np.ndarray:
     return a * r**2 + b * r**4
 
 
-def _radius(view: View) -> np.ndarray:
-    """[H, W, 1] distance of pixels from the middle of the picture, in half diagonals."""
+def _radius(view: View, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Distance of pixels from the middle of the picture, in half diagonals."""
     height, width = view.codes.shape[:2]
-    row, column = np.mgrid[:height, :width] + 0.5
-    return (np.hypot(column - width / 2, row - height / 2) / np.hypot(width / 2, height / 2))[..., None]
+    return np.hypot(column + 0.5 - width / 2, row + 0.5 - height / 2) / np.hypot(width / 2, height / 2)
 
 
 def _lights(views: Sequence[View], points, seen, response) -> tuple[np.ndarray, np.ndarray]:
@@ -229,4 +230,4 @@ def _light(view: View, points: np.ndarray, response: Response) -> tuple[np.ndarr
     encoded = encoded_values(view.codes[place])
     told = inside[:, None] & (encoded > FAINT) & (encoded < BRIGHT)
     light = np.log(np.maximum(response.decode(encoded), 1e-9) / view.exposure_time)
-    return np.where(told, light, np.nan), _radius(view)[place][:, 0]
+    return np.where(told, light, np.nan), _radius(view, *place)

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from ..kernels.clipped_light import clipped_light_kernel
+from ..kernels.clipped_light import clipped_light_kernel, clipped_logarithms_kernel
 from .clipped_residual import CODES, WHITE
 from .launching import launch, warp_scalar
 
@@ -36,13 +36,14 @@ class _ClippedLight(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, codes, index, mask, white, smoothness, lift):
         image = image.detach().contiguous()
-        energies, slopes = torch.empty_like(image), torch.empty_like(image)
+        energies, slopes, logarithms = (torch.empty_like(image) for _ in range(3))
         if index is None:
             codes, index = codes[None], torch.zeros(1, dtype=torch.int64, device=codes.device)
-        kernel = clipped_light_kernel(warp_scalar(image.dtype), CODES[codes.dtype])
+        scalar, numbers = warp_scalar(image.dtype), (*image.shape[:2], smoothness, lift)
         photos, mask = codes.contiguous().view(len(codes), -1), None if mask is None else mask.contiguous().view(-1)
-        numbers = *image.shape[:2], WHITE[codes.dtype], white, smoothness, lift
-        launch(kernel, image.numel(), image, photos, index, mask, *numbers, energies, slopes)
+        found = image, photos, index, mask, WHITE[codes.dtype], white, logarithms
+        launch(clipped_logarithms_kernel(scalar, CODES[codes.dtype]), image.numel(), *found)
+        launch(clipped_light_kernel(scalar), image.numel(), image, logarithms, *numbers, energies, slopes)
         ctx.save_for_backward(slopes)
         return energies.mean()
 
