@@ -20,7 +20,7 @@ LARGEST = wp.constant(0.25)
 MOST_NEIGHBORS = 8
 
 SIDE = 2 * int(RADIUS) + 1
-_costs8 = wp.types.vector(length=8, dtype=wp.float32)
+costs8 = wp.types.vector(length=8, dtype=wp.float32)
 _patch = wp.types.vector(length=SIDE * SIDE, dtype=wp.float32)
 
 
@@ -65,6 +65,30 @@ def is_inside(pixel: wp.vec3, nearest: float, right: float, bottom: float) -> bo
     return pixel[2] > nearest and u >= 0.0 and v >= 0.0 and u < right and v < bottom
 
 
+@wp.func
+def in_order(costs: costs8, count: int, cost: float) -> costs8:
+    """The first `count` of costs, the best first, and one more in its place."""
+    result = costs
+    rank = int(count)
+    while rank > 0 and result[wp.max(rank - 1, 0)] > cost:
+        result[rank] = result[rank - 1]
+        rank -= 1
+    result[rank] = cost
+    return result
+
+
+@wp.func
+def better_half(costs: costs8, count: int) -> float:
+    """The mean of the better half, two at least, of `count` costs in order; 2 * LARGEST where they are fewer."""
+    result = 2.0 * LARGEST
+    if count >= 2:
+        half = wp.max(2, (count + 1) / 2)
+        result = float(0.0)
+        for slot in range(half):
+            result += costs[slot] / float(half)
+    return result
+
+
 @wp.kernel(module="unique", module_options=FORWARD)
 def sweep(
     first: int,
@@ -100,8 +124,7 @@ def sweep(
             total += weight
     total *= WHITE
 
-    # In order, the best first.
-    best = _costs8()
+    best = costs8()
     counted = int(0)
     here = depth * wp.vec3((float(column) + 0.5 - own[2]) / own[0], (float(row) + 0.5 - own[3]) / own[1], 1.0)
     reach = float(RADIUS)
@@ -132,17 +155,6 @@ def sweep(
                         color = color_at(photos, place + wp.int64((y - RADIUS) * width + x - RADIUS))
                         apart = wp.min(difference(color, seen), WHITE * LARGEST)
                         unlike += weights[y * wp.static(SIDE) + x] * apart
-                cost = unlike / total
-                rank = int(counted)
-                while rank > 0 and best[wp.max(rank - 1, 0)] > cost:
-                    best[rank] = best[rank - 1]
-                    rank -= 1
-                best[rank] = cost
+                best = in_order(best, counted, unlike / total)
                 counted += 1
-    result = 2.0 * LARGEST
-    if counted >= 2:
-        half = wp.max(2, (counted + 1) / 2)
-        result = float(0.0)
-        for slot in range(half):
-            result += best[slot] / float(half)
-    costs[n, i - n * count] = result
+    costs[n, i - n * count] = better_half(best, counted)

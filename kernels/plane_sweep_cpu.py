@@ -7,7 +7,18 @@ import warp as wp
 
 from .constants import FORWARD, FUSED, cpu_flags
 from .geometry import vector
-from .plane_sweep import LARGEST, MOST_NEIGHBORS, RADIUS, SIDE, SIMILARITY, WHITE, in_pixels
+from .plane_sweep import (
+    LARGEST,
+    MOST_NEIGHBORS,
+    RADIUS,
+    SIDE,
+    SIMILARITY,
+    WHITE,
+    better_half,
+    costs8,
+    in_order,
+    in_pixels,
+)
 
 LANES = 8
 OPTIONS = FORWARD | {"cpu_compiler_flags": cpu_flags() + FUSED, "max_unroll": 8}
@@ -160,21 +171,11 @@ def sweep_rows(
                         found[slot, lane] = sums[lane] / total
 
     for d in range(start, end):
-        best = _row()  # In order, the best first.
+        best = costs8()
         counted = int(0)
         for slot in range(neighbors.shape[1]):
             cost = found[slot, d - start]
             if cost < 2.0 * LARGEST:
-                rank = int(counted)
-                while rank > 0 and best[wp.max(rank - 1, 0)] > cost:
-                    best[rank] = best[rank - 1]
-                    rank -= 1
-                best[rank] = cost
+                best = in_order(best, counted, cost)
                 counted += 1
-        result = 2.0 * LARGEST
-        if counted >= 2:
-            half = wp.max(2, (counted + 1) / 2)
-            result = float(0.0)
-            for slot in range(half):
-                result += best[slot] / float(half)
-        costs[n, d] = result
+        costs[n, d] = better_half(best, counted)
