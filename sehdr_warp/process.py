@@ -2,6 +2,7 @@
 nobody. What a program says of its work never ends the work; what is asked of it, on standard output, fails in one line.
 """
 
+import gc
 import io
 import os
 import signal
@@ -13,6 +14,7 @@ from typing import Any, TextIO
 from .errors import SehdrError
 
 _SOON = 3.0  # Seconds within which another Ctrl-C says nothing new
+_LIBRARIES = 400_000  # About as many objects as torch's and Warp's modules are
 _interrupted = -_SOON
 
 
@@ -57,6 +59,7 @@ def prepare() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
         setattr(sys, ("stdout", "stderr")[number - 1], _Stream(stream, number, asked=number == 1))
+    _collect_late()
     os.environ["MPLBACKEND"] = "agg"  # Pictures go to files, whatever a shell was set up for.
     for each, handler in (("SIGINT", _interrupt), ("SIGTERM", _end), ("SIGHUP", _end)):
         number = getattr(signal, each, None)
@@ -65,6 +68,20 @@ def prepare() -> None:
     hook, thread_hook = sys.unraisablehook, threading.excepthook
     sys.unraisablehook = lambda told: None if interrupted() else hook(told)
     threading.excepthook = lambda told: None if interrupted() else thread_hook(told)
+
+
+def _collect_late() -> None:
+    """Garbage is looked for only once libraries are loaded, and not in them: they leave next to none, and to look makes
+    a quarter of the time that they take."""
+    usual = gc.get_threshold()
+
+    def begin(*_) -> None:
+        gc.callbacks.remove(begin)
+        gc.set_threshold(*usual)
+        gc.freeze()
+
+    gc.callbacks.append(begin)
+    gc.set_threshold(_LIBRARIES, *usual[1:])
 
 
 def interrupted() -> bool:

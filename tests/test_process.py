@@ -1,5 +1,6 @@
 """Standard streams that fail, signals that end, and what the system refuses: one line, and the work is not lost."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -8,7 +9,7 @@ import sys
 import pytest
 
 from sehdr_warp.errors import SehdrError, UsageError, surroundings_told
-from sehdr_warp.process import _Stream
+from sehdr_warp.process import _collect_late, _Stream
 from sehdr_warp.training.machine import interruptible
 
 
@@ -42,6 +43,22 @@ def test_what_is_said_of_the_work_never_ends_it():
     os.close(written)
     assert os.read(read, 99) == b""
     os.close(read)
+
+
+def test_the_first_look_for_garbage_is_late_and_others_are_as_ever():
+    usual, frozen, begun = gc.get_threshold(), gc.get_freeze_count(), len(gc.callbacks)
+    _collect_late()
+    try:
+        assert gc.isenabled() and gc.get_threshold()[0] > 100 * usual[0]
+        gc.collect()
+        assert gc.get_threshold() == usual and len(gc.callbacks) == begun
+        assert gc.get_freeze_count() > frozen  # What was there is never looked through again ...
+        circle = []
+        circle.append(circle)
+        del circle
+        assert gc.collect() > 0  # ... and what comes is.
+    finally:
+        gc.unfreeze()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
