@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from .capture import Shot
 from .images import HDR_SUFFIXES, PILLOW_ERRORS, RAW_SUFFIXES, exif_of, open_image
 
 _EXIF_IFD = 0x8769
+_CAMERA, _LENS = (271, 272), (42036, 37386, 33437)  # Make and model; lens, focal length, f-number
 _EXPOSURE_TIME, _F_NUMBER, _SPEED, _SHUTTER_APEX = 33434, 33437, 34855, 37377
 SHORTEST, LONGEST = 1e-12, 1e12
 """Seconds: what an exposure time may be."""
@@ -139,6 +141,22 @@ def exif_exposure(path: Path) -> tuple[float | None, float | None, float | None]
     if time is not None and not (math.isfinite(time) and time > 0):
         raise InputError(path, f"EXIF exposure time is {time}", _REMEDY)
     return time, speed if speed and 0 < speed < 1e9 else None, aperture if aperture and 0 < aperture < 1e4 else None
+
+
+@lru_cache(maxsize=4096)
+def exif_lens(path: Path | None) -> tuple[str, ...]:
+    """What EXIF states of how a photo's corners darken: camera, lens, focal length and f-number; empty where it states
+    none of them, and where there is no such file."""
+    if path is None or path.suffix.lower() in (*HDR_SUFFIXES, *RAW_SUFFIXES) or not path.is_file():
+        return ()
+    try:
+        with open_image(path) as image:
+            first = exif_of(image)
+            table = first.get_ifd(_EXIF_IFD)
+            stated = [first.get(tag) for tag in _CAMERA] + [table.get(tag) for tag in _LENS]
+    except (*PILLOW_ERRORS, InputError):
+        return ()
+    return tuple(map(str, stated)) if set(stated) != {None} else ()
 
 
 def made_by_camera(sources: Sequence[Path | None]) -> bool:

@@ -1,11 +1,13 @@
 """What a camera changed between photos and no file states: exposure, white balance, and falloff towards the corners."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ..response import Response
+from .exposure import exif_lens
 from .types import Scene, View, codes_of, encoded_values
 
 FAINT, BRIGHT = 10 / 255, 245 / 255  # Encoded values within tell light; beyond, noise or less than all of it
@@ -13,16 +15,20 @@ TIGHT = 1.0, 0.5, 0.25, 0.1, 0.05, 0.05
 """Differences of log light that count half, round by round: what is hidden, or shines, is to count nothing."""
 ROUNDS = 4  # Of the rough look
 NEGLIGIBLE = 0.01  # Of light: what differs by less is left as it is
+NONE = 0.0, 0.0  # Falloff
+LENS = 0.05  # Focal lengths that differ by less, as a part, are one lens: structure from motion finds each anew
+FEWEST_OF_LENS = 3  # Photos that tell a falloff
 
 
 @dataclass(frozen=True)
 class PhotoGains:
     """gains: by photo, what its light was multiplied by in each channel, beyond the exposure that is stated; of
-    geometric mean 1 over the training photos. falloff: (a, b) >= 0 in all; light at r half diagonals from the middle is
-    exp(-(a r^2 + b r^4)) of what it would be there."""
+    geometric mean 1 over the training photos. falloff: by photo, (a, b) >= 0 in all, alike for one camera and lens;
+    light at r half diagonals from the middle is exp(-(a r^2 + b r^4)) of what it would be there. Photos that are absent
+    have none."""
 
     gains: dict[str, tuple[float, float, float]]
-    falloff: tuple[float, float] = (0.0, 0.0)
+    falloff: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def stops(self) -> float:
@@ -44,15 +50,16 @@ class PhotoGains:
 
     @property
     def corners(self) -> float:
-        """Part of the light that the corners lack."""
-        return 1 - float(np.exp(-sum(self.falloff)))
+        """Part of the light that the corners lack, of the lens that lacks most."""
+        return 1 - float(np.exp(-max(map(sum, self.falloff.values()), default=0.0)))
 
     def parts(self, *, exposure: bool = True, tint: bool = True, falloff: bool = True) -> "PhotoGains":
         """These gains without what is not asked for: exposure, which is green's, since cameras balance white by red
         and blue; white balance; falloff."""
         values = np.log(list(self.gains.values())).reshape(-1, 3)
         shared = values[:, 1:2]
-        return _of(list(self.gains), exposure * shared + tint * (values - shared), falloff * np.array(self.falloff))
+        kept = self.falloff if falloff else {}
+        return _of(list(self.gains), exposure * shared + tint * (values - shared), kept)
 
     def even(self, scene: Scene, response: Response) -> Scene:
         """The scene as if its camera had changed nothing: a photo's largest gain is part of its exposure time, the rest
@@ -66,7 +73,7 @@ class PhotoGains:
         time = view.exposure_time * gain.max()
         height, width = view.codes.shape[:2]
         radius = _radius(view, *np.ogrid[:height, :width])[..., None]
-        light = np.exp(-_power(radius, *self.falloff)) * (gain / gain.max())
+        light = np.exp(-_power(radius, *self.falloff.get(view.name, NONE))) * (gain / gain.max())
         if light.min() > 1 - NEGLIGIBLE:
             return replace(view, exposure_time=time)
         decoded = response.decode(np.arange(view.levels + 1) / view.levels)[view.codes]
@@ -87,20 +94,24 @@ def start_gains(views: Sequence[View], response: Response) -> PhotoGains:
 
 
 def rough_gains(views: Sequence[View], points: np.ndarray, seen: np.ndarray, response: Response) -> PhotoGains:
-    """About what fit_gains() finds, in a small part of its time: means in turn over photos and over points, and a line
-    over the radius, in which what shines counts as all else does."""
+    """About what fit_gains() finds, in a small part of its time: means in turn over photos and over points, and for
+    each lens a line over the radius, in which what shines counts as all else does."""
     light, radius = _lights(views, points, seen, response)
-    told = np.isfinite(light)
+    told, of = np.isfinite(light), lenses_of(views)
     light, square = np.where(told, light, 0.0), radius[..., None] ** 2
-    gains, slope = np.zeros((len(views), 1, 3)), 0.0
-    beside = (square - _mean(square * told, told, 0)) * told
+    gains, slopes = np.zeros((len(views), 1, 3)), np.zeros(of.max() + 2)  # The last: of no lens
+    mine = [(of == lens)[:, None, None] * square for lens in range(of.max() + 1)]
+    beside = [(own - _mean(own * told, told, 0)) * told for own in mine]
     for _ in range(ROUNDS):
-        left = light - gains + slope * square
-        left -= _mean(left * told, told, 0)
-        slope -= float((left * beside).sum() / max((beside**2).sum(), 1e-9))
-        left = light + slope * square
+        for lens, own in enumerate(beside):
+            left = light - gains + slopes[of][:, None, None] * square
+            left -= _mean(left * told, told, 0)
+            slopes[lens] -= float((left * own).sum() / max((own**2).sum(), 1e-9))
+        left = light + slopes[of][:, None, None] * square
         gains = _mean((left - _mean((left - gains) * told, told, 0)) * told, told, 1)
-    return _of([view.name for view in views], gains[:, 0], (max(slope, 0.0), 0.0))
+    names = [view.name for view in views]
+    falloff = {name: (max(float(slopes[lens]), 0.0), 0.0) for name, lens in zip(names, of, strict=True)}
+    return _of(names, gains[:, 0], falloff)
 
 
 def _mean(values: np.ndarray, told: np.ndarray, axis: int) -> np.ndarray:
@@ -130,7 +141,7 @@ def left_of_falloff(views: Sequence[View], points: np.ndarray, seen: np.ndarray,
     """Part of the disagreement between evened photos and photos with their falloff, in the median over where falloff
     says that they differ, by how much: few points lie far from the middle in one photo and near it in another."""
     light, radius = _lights(views, points, seen, response)
-    said = np.where(np.isfinite(light), -_power(radius, *gains.falloff)[..., None], np.nan)
+    said = np.where(np.isfinite(light), -_powers(gains, views, radius)[..., None], np.nan)
     light -= _logarithms(gains.parts(falloff=False), views, radius)
     several = np.isfinite(light).sum(0) > 1
     light, said = light[:, several], said[:, several]
@@ -148,58 +159,89 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
 
 def _logarithms(gains: PhotoGains, views: Sequence[View], radius: np.ndarray) -> np.ndarray:
     """[V, P, 3] of the light that gains and falloff leave of all."""
-    return np.log([gains.gains[view.name] for view in views])[:, None] - _power(radius, *gains.falloff)[..., None]
+    return np.log([gains.gains[view.name] for view in views])[:, None] - _powers(gains, views, radius)[..., None]
+
+
+def _powers(gains: PhotoGains, views: Sequence[View], radius: np.ndarray) -> np.ndarray:
+    """[V, P] by the falloff of each photo."""
+    a, b = np.array([gains.falloff.get(view.name, NONE) for view in views]).T[..., None]
+    return _power(radius, a, b)
+
+
+def lenses_of(views: Sequence[View]) -> np.ndarray:
+    """[V] int: which camera, lens, focal length and aperture took each photo, by EXIF and by the field of view. Those
+    that took fewer than FEWEST_OF_LENS count as one, and as -1 where that took fewer too."""
+    fields = np.log([view.camera.fx / np.hypot(view.camera.width, view.camera.height) for view in views])
+    order, steps = np.argsort(fields, kind="stable"), np.zeros(len(views), int)
+    steps[order] = np.cumsum(np.diff(fields[order], prepend=fields[order[0]]) > LENS)
+    keys = [(*exif_lens(view.source), int(step)) for view, step in zip(views, steps, strict=True)]
+    for _ in range(2):
+        counts = Counter(keys)
+        keys = [key if counts[key] >= FEWEST_OF_LENS else () for key in keys]
+    lenses = list(dict.fromkeys(key for key in keys if counts[key] >= FEWEST_OF_LENS))
+    return np.array([lenses.index(key) if key in lenses else -1 for key in keys])
 
 
 def fit_gains(
     views: Sequence[View], others: Sequence[View], points: np.ndarray, seen: np.ndarray, response: Response
 ) -> PhotoGains:
-    """Gains and falloff by which photos show points [P, 3] of surfaces in one light: least squares of logarithms, in
-    which what disagrees counts ever less (Cauchy's weights). others: photos that take no part, and get their median.
+    """Gains, and falloff of each lens, by which photos show points [P, 3] of surfaces in one light: least squares of
+    logarithms, in which what disagrees counts ever less (Cauchy's weights). others: photos that take no part, and get
+    their median.
     seen: [V + others, P] bool, which photos show a point: what lies before it is not known otherwise."""
     from scipy import sparse
     from scipy.sparse.linalg import lsmr
 
     names = [view.name for view in (*views, *others)]
     light, radius = _lights((*views, *others), points, seen, response)
-    trained, count, most = light[: len(views)], len(points), len(views)
+    trained, count, most, of = light[: len(views)], len(points), len(views), lenses_of((*views, *others))
     view, point, channel = np.nonzero(np.isfinite(trained))
-    values, r = trained[view, point, channel], radius[view, point]
+    values, lens = trained[view, point, channel], of[view]
+    r = np.where(lens >= 0, radius[view, point], 0.0)
     one = np.ones(len(values))
     rows = np.arange(len(values))
-    columns = 3 * point + channel, 3 * (count + view) + channel
     first = 3 * (count + most)
+    columns = 3 * point + channel, 3 * (count + view) + channel, first + 2 * lens.clip(0)
     system = sparse.csr_matrix(
         (
             np.concatenate([one, one, -(r**2), -(r**4)]),
-            (np.tile(rows, 4), np.concatenate([*columns, np.full_like(rows, first), np.full_like(rows, first + 1)])),
+            (np.tile(rows, 4), np.concatenate([*columns, columns[2] + 1])),
         ),
-        shape=(len(rows), first + 2),
+        shape=(len(rows), first + 2 * (of.max() + 2)),
     )
-    found = np.zeros(first + 2)
+    found: np.ndarray = np.zeros(first + 2 * (of.max() + 2))
     for width in TIGHT:
         off = (values - system @ found) / width if found.any() else np.zeros_like(values)
         weight = 1 / (1 + off**2)
         found = lsmr(sparse.diags(weight) @ system, weight * values, damp=1e-3, x0=found, maxiter=80)[0]
-    a, b = found[first:]
-    falloff = (float(a), float(b)) if _power(np.linspace(0, 1, 20), a, b).min() > -NEGLIGIBLE else (0.0, 0.0)
+    pairs = [*map(_possible, found[first:].reshape(-1, 2)[: of.max() + 1]), NONE]
+    falloff = {name: pairs[lens] for name, lens in zip(names, of, strict=True)}
+    powers = _powers(PhotoGains({}, falloff), (*views, *others), radius)
     surfaces = found[: 3 * count].reshape(count, 3)
     gains = list(found[3 * count : first].reshape(most, 3))
     mean = np.mean(gains, 0)
     for index in range(most, len(names)):
-        differences = light[index] - surfaces + _power(radius[index], *falloff)[:, None]
+        differences = light[index] - surfaces + powers[index][:, None]
         told = np.isfinite(differences).sum(0).min() > 0
         gains.append(np.nanmedian(differences, 0) if told else mean)
     return _of(names, np.array(gains) - mean, falloff)
 
 
-def _of(names: Sequence[str], logarithms: np.ndarray, falloff=(0.0, 0.0)) -> PhotoGains:
+def _possible(pair: np.ndarray) -> tuple[float, float]:
+    """A falloff, or none where light would grow towards the corners."""
+    a, b = map(float, pair)
+    return (a, b) if _power(np.linspace(0, 1, 20), a, b).min() > -NEGLIGIBLE else NONE
+
+
+def _of(
+    names: Sequence[str], logarithms: np.ndarray, falloff: Mapping[str, tuple[float, float]] | None = None
+) -> PhotoGains:
     gains = np.exp(logarithms).tolist()
-    a, b = map(float, falloff)
-    return PhotoGains({name: tuple(gain) for name, gain in zip(names, gains, strict=True)}, (a, b))
+    fallen = {name: pair for name, pair in (falloff or {}).items() if pair != NONE}
+    return PhotoGains({name: tuple(gain) for name, gain in zip(names, gains, strict=True)}, fallen)
 
 
-def _power(r: np.ndarray, a: float, b: float) -> np.ndarray:
+def _power(r: np.ndarray, a: float | np.ndarray, b: float | np.ndarray) -> np.ndarray:
     return a * r**2 + b * r**4
 
 

@@ -39,7 +39,7 @@ class _DataValues(Values):
 
 class _GainValues(Values):
     gains: dict[str, Annotated[list[_Gain], _Three]]
-    falloff: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
+    falloff: dict[str, Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]]
 
 
 class RunValues(Values):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View, codes_of
@@ -13,6 +14,7 @@ from sehdr_warp.scene.photo_gains import (
     disagreement,
     fit_gains,
     left_of_falloff,
+    lenses_of,
     rough_gains,
     start_gains,
 )
@@ -36,26 +38,32 @@ def points():
     return np.c_[np.random.default_rng(1).uniform(-1.5, 1.5, (400, 2)), np.full(400, 4.0)]
 
 
-def photographed(gains, falloff) -> Scene:
-    """A wall of smooth colors, its photos taken by a camera of such gains; the last photo is held out."""
+def everywhere(falloff, photos=range(PHOTOS)):
+    return {f"p_{k}": falloff for k in photos}
+
+
+def photographed(gains, falloff, focal=lambda name: 60.0) -> Scene:
+    """A wall of smooth colors, its photos taken by cameras of such gains, falloff and focal lengths, by name; the last
+    photo is held out."""
     views = []
     for index in range(PHOTOS):
-        place = (0.25 * index - 0.6, 0.1 * (index % 3), 0.0)
-        camera = Camera(SIZE, SIZE, 60.0, 60.0, SIZE / 2, SIZE / 2, look_at(place, (place[0], place[1], 1), (0, -1, 0)))
+        place, f = (0.25 * index - 0.6, 0.1 * (index % 3), 0.0), focal(f"p_{index}")
+        camera = Camera(SIZE, SIZE, f, f, SIZE / 2, SIZE / 2, look_at(place, (place[0], place[1], 1), (0, -1, 0)))
         row, column = np.mgrid[:SIZE, :SIZE] + 0.5
-        rays = np.stack([(column - 24) / 60, (row - 24) / 60, np.ones_like(row)], -1) @ camera.world_to_camera[:3, :3]
+        rays = np.stack([(column - 24) / f, (row - 24) / f, np.ones_like(row)], -1) @ camera.world_to_camera[:3, :3]
         wall = place[0] + 4 * rays[..., :1], place[1] + 4 * rays[..., 1:2]
         light = 0.12 + 0.05 * np.sin(np.concatenate([wall[0] + wall[1], 2 * wall[0], 1 - wall[1]], 2))
         r = np.hypot(column - 24, row - 24)[..., None] / np.hypot(24, 24)
         name = f"p_{index}"
-        light = light * np.array(gains.get(name, (1, 1, 1))) * np.exp(-falloff[0] * r**2 - falloff[1] * r**4)
+        a, b = falloff.get(name, (0, 0))
+        light = light * np.array(gains.get(name, (1, 1, 1))) * np.exp(-a * r**2 - b * r**4)
         split = "test" if index == PHOTOS - 1 else "train"
         views.append(View(name, codes_of(SRGB.encode(light), 8), camera, 1.0, split))
     return Scene("wall", "hand-made", tuple(views), np.zeros((0, 3)), np.zeros((0, 3), np.float32))
 
 
 def test_gains_and_falloff_are_found(gains, points):
-    scene = photographed(gains, FALLOFF)
+    scene = photographed(gains, everywhere(FALLOFF))
     hidden, seen = points.copy(), np.ones((PHOTOS, len(points)), bool)
     hidden[::10, 2] = 2.0  # points that are none
     hidden[1::2, 2], seen[1:, 1::2] = 7.0, False  # behind the wall, and known to be
@@ -72,30 +80,69 @@ def test_gains_and_falloff_are_found(gains, points):
     for colors in (False, True):
         before, after = (disagreement(*known, taken, colors=colors) for taken in (None, found))
         assert after < 0.1 * before
-    wrong = replace(found, falloff=(0.0, 0.8))
+    wrong = replace(found, falloff=everywhere((0.0, 0.8)))
     assert left_of_falloff(*known, found) < 0.15 and left_of_falloff(*known, wrong) > 0.8
 
 
+def test_each_lens_has_its_falloff(gains, points):
+    dark = everywhere(FALLOFF, range(0, PHOTOS, 2))
+    scene = photographed(gains, dark, lambda name: 60.0 if name in dark else 70.0)
+    views, seen = scene.train_views, np.ones((PHOTOS, len(points)), bool)
+    found = fit_gains(views, scene.test_views, points, seen, SRGB)
+    corners = {name: 1 - np.exp(-sum(found.falloff.get(name, (0, 0)))) for name in gains}
+    for name, lacking in corners.items():
+        assert lacking == pytest.approx(1 - np.exp(-sum(dark.get(name, (0, 0)))), abs=0.03)
+    rough = rough_gains(views, points, seen, SRGB)
+    assert rough.corners == pytest.approx(found.corners, abs=0.1)
+    assert left_of_falloff(views, points, seen, SRGB, found) < 0.15
+
+
+def test_a_lens_is_told_by_exif_and_by_the_field_of_view(tmp_path):
+    def taken(index, model, focal=35, aperture=2.8):
+        exif, path = Image.Exif(), tmp_path / f"{index}.jpg"
+        exif[272] = model
+        exif.get_ifd(0x8769).update({37386: focal, 33437: aperture})
+        Image.new("RGB", (4, 4)).save(path, exif=exif)
+        return path
+
+    views = photographed({}, {}).views
+
+    def lenses(sources, focals=(60.0,) * PHOTOS):
+        given = zip(views, sources, focals, strict=True)
+        return lenses_of([replace(v, source=s, camera=replace(v.camera, fx=f, fy=f)) for v, s, f in given]).tolist()
+
+    one, two = taken(0, "One"), taken(1, "Two")
+    assert lenses([None] * PHOTOS) == [0] * PHOTOS == lenses([tmp_path / "none.jpg"] * PHOTOS)
+    assert lenses([one, two] * 3) == [0, 1] * 3 == lenses([one, taken(2, "One", aperture=8)] * 3)
+    assert lenses([one, taken(3, "One", focal=70)] * 3) == [0, 1] * 3
+    # Structure from motion finds a focal length a little differently for each photo.
+    assert lenses([one] * PHOTOS, (60.0, 61.0, 62.5, 59.0, 60.5, 61.5)) == [0] * PHOTOS
+    assert lenses([one] * PHOTOS, (60.0, 70.0) * 3) == [0, 1] * 3
+    # Too few of a lens are one with others, and none where those are few too.
+    zoomed = [taken(4 + k, "One", focal=35 + k) for k in range(PHOTOS)]
+    assert lenses(zoomed) == [0] * PHOTOS and lenses([one] * 4 + [two, None]) == [0, 0, 0, 0, -1, -1]
+
+
 def test_exposure_white_balance_and_falloff_are_parts(gains):
-    whole = PhotoGains(gains, FALLOFF)
+    whole = PhotoGains(gains, everywhere(FALLOFF))
     values, exposure, tint = (
         np.array(list(found.gains.values())) for found in (whole, whole.parts(tint=False), whole.parts(exposure=False))
     )
     np.testing.assert_allclose(exposure, values[:, 1:2].repeat(3, 1))
     np.testing.assert_allclose(exposure * tint, values)
-    assert whole.parts(falloff=False).falloff == (0, 0) and whole.parts().falloff == FALLOFF
+    assert whole.parts(falloff=False).falloff == {} and whole.parts().falloff == whole.falloff
 
 
 def test_photos_that_do_not_drift_have_no_gains(points):
-    scene = photographed({}, (0.0, 0.0))
+    scene = photographed({}, {})
     found = fit_gains(scene.train_views, scene.test_views, points, np.ones((PHOTOS, len(points)), bool), SRGB)
     assert found.stops < 0.02 and abs(found.corners) < 0.02
 
 
 def test_evened_photos_hold_the_light_without_gains(gains):
-    plain, scene = photographed({}, (0.0, 0.0)), photographed(gains, FALLOFF)
-    evened = PhotoGains(gains, FALLOFF).even(scene, SRGB)
-    assert PhotoGains(gains, FALLOFF).even(evened, SRGB) is evened
+    plain, scene = photographed({}, {}), photographed(gains, everywhere(FALLOFF))
+    evened = PhotoGains(gains, everywhere(FALLOFF)).even(scene, SRGB)
+    assert PhotoGains(gains, everywhere(FALLOFF)).even(evened, SRGB) is evened
     for ours, truth in zip(evened.views, plain.views, strict=True):
         told = (truth.image > 0.1) & (ours.image < 0.95)
         light = SRGB.decode(ours.image) / ours.exposure_time
@@ -104,15 +151,15 @@ def test_evened_photos_hold_the_light_without_gains(gains):
 
 
 def test_an_exposure_alone_leaves_the_codes(gains):
-    scene = photographed({}, (0.0, 0.0))
+    scene = photographed({}, {})
     twice = PhotoGains({"p_0": (2.0, 2.0, 2.0)}).even(scene, SRGB)
     assert twice.views[0].exposure_time == 2.0 and twice.views[0].codes is scene.views[0].codes
 
 
 def test_white_stays_white_and_black_black(gains):
-    scene = photographed({}, (0.0, 0.0))
+    scene = photographed({}, {})
     codes = scene.views[0].codes.copy()
     codes[:8], codes[-8:] = 255, 0
     scene = replace(scene, views=(replace(scene.views[0], codes=codes), *scene.views[1:]))
-    (first, *_) = PhotoGains(gains, FALLOFF).even(scene, SRGB).views
+    (first, *_) = PhotoGains(gains, everywhere(FALLOFF)).even(scene, SRGB).views
     assert first.codes.dtype == np.uint16 and (first.codes[:8] == 65535).all() and (first.codes[-8:] == 0).all()
