@@ -79,10 +79,11 @@ class _Blend(torch.autograd.Function):
         _, width, channels = ctx.sizes
         by_image = by_transmittance.new_zeros(ctx.sizes) if by_image is None else by_image.contiguous()
         # Of an axis of length 1 torch calls any stride contiguous, and kernels do not.
-        by_image = by_image.as_strided(ctx.sizes, (width * channels, channels, 1))
+        if by_image.stride() != (width * channels, channels, 1):
+            by_image = by_image.as_strided(ctx.sizes, (width * channels, channels, 1))
         gathered = adjoint(by_image, None if by_transmittance is None else by_transmittance.contiguous())
         rest = gathered.shape[1] - channels - 6
-        by_features, by_conics, by_means2d, by_opacities, _ = gathered.split((channels, 3, 2, 1, rest), dim=1)
+        by_features, by_conics, by_means2d, by_opacities, _ = gathered.split_with_sizes((channels, 3, 2, 1, rest), 1)
         gradients = by_means2d, by_conics, by_opacities[:, 0], by_features
         return *(part if needed else None for part, needed in zip(gradients, ctx.needs_input_grad, strict=False)), None
 

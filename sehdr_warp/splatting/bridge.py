@@ -84,6 +84,26 @@ class Program:
         return self._places.get(id(tensor), -1)
 
 
+def zeros_for(tensors: Sequence[Tensor], needed: Sequence[bool], leaves: Sequence[bool]) -> list[Tensor | None]:
+    """For each tensor that needs a gradient zeros to add it to, for others None. leaves: which of them are leaves."""
+    made: list[Tensor | None] = [None] * len(tensors)
+    wanted = [place for place, need in enumerate(needed) if need]
+    # On a GPU leaves, whose gradients stay, have them in one memory; others' are soon let go, each by itself.
+    together = [p for p in wanted if leaves[p] and tensors[p].device.type != "cpu"]
+    with torch_threads(tensors[0].device):
+        for group in (together, *([p] for p in wanted if p not in together)):
+            for place, zeros in zip(group, _zeros_like([tensors[p] for p in group]), strict=True):
+                made[place] = zeros
+    return made
+
+
+def readable(gradient: Tensor | None) -> Tensor | None:
+    """A gradient as kernels read it: any rows, but a vector in one piece."""
+    if gradient is None or gradient.ndim < 2 or gradient.is_contiguous() or gradient[0].is_contiguous():
+        return gradient
+    return gradient.contiguous()
+
+
 def _zeros_like(tensors: list[Tensor]) -> list[Tensor]:
     """Contiguous zeros of the tensors' shapes; where all are of one type and contiguous in one memory, filled by a
     single launch."""
@@ -121,21 +141,10 @@ class _ProgramFunction(torch.autograd.Function):
         if tape is None:
             raise RuntimeError("this Warp operation was already differentiated once; run its forward pass again")
         ctx.tape = ctx.plain = ctx.gradients = None
-        for place, gradient in zip(ctx.places, upstream, strict=True):
-            if gradient is not None:
-                # Kernels read any rows, but a vector in one piece.
-                whole = gradient.is_contiguous() or gradient.ndim < 2 or gradient[0].is_contiguous()
-                gradients[place] = gradient if whole else gradient.contiguous()
-        for place, tensor in ctx.between.items():
-            gradients[place] = torch.zeros_like(tensor)
-        results: list[Tensor | None] = [None] * len(plain)
-        wanted = [place for place, needed in enumerate(ctx.needs_input_grad[2:]) if needed]
-        # On a GPU leaves, whose gradients stay, have them in one memory; others' are soon let go, each by itself.
-        together = [p for p in wanted if ctx.leaves[p] and plain[p].device.type != "cpu"]
-        with torch_threads(plain[0].device):
-            for group in (together, *([p] for p in wanted if p not in together)):
-                for place, zeros in zip(group, _zeros_like([plain[p] for p in group]), strict=True):
-                    results[place] = gradients[place] = zeros
+        gradients |= {p: readable(given) for p, given in zip(ctx.places, upstream, strict=True) if given is not None}
+        gradients |= {place: torch.zeros_like(tensor) for place, tensor in ctx.between.items()}
+        results = zeros_for(plain, ctx.needs_input_grad[2:], ctx.leaves)
+        gradients |= {place: made for place, made in enumerate(results) if made is not None}
         tape.backward()
         return (None, None, *results)
 

@@ -44,19 +44,22 @@ def check_tensors(**arguments: tuple[Any, tuple[int | str, ...]]) -> None:
 
 def _fit(arguments: Iterable[tuple[Any, tuple[int | str, ...]]]) -> bool:
     """Whether check_tensors() has nothing to say, found in the least time: it is asked at every call."""
-    sizes: dict[int | str, int] = {}
-    first = None
+    sizes: dict[str, int] = {}
+    dtype = device = None
     for value, shape in arguments:
         if not isinstance(value, Tensor):
             return False
-        if first is None:
-            first = value
-        if value.dtype != first.dtype or value.device != first.device or value.ndim != len(shape):
+        if dtype is None:
+            dtype, device = value.dtype, value.device
+        elif value.dtype != dtype or value.device != device:
             return False
-        for size, expected in zip(value.shape, shape, strict=True):
-            if sizes.setdefault(expected, size if isinstance(expected, str) else expected) != size:
+        given = value.shape
+        if len(given) != len(shape):
+            return False
+        for size, expected in zip(given, shape, strict=True):
+            if size != expected and (isinstance(expected, int) or sizes.setdefault(expected, size) != size):
                 return False
-    return first is not None and first.dtype in (torch.float32, torch.float64)
+    return dtype in (torch.float32, torch.float64)
 
 
 def whole_number(name: str, value: Any, least: int, most: int) -> int:

@@ -57,8 +57,10 @@ def test_what_cannot_be_compiled_is_no_end_of_the_block(monkeypatch):
 def test_a_training_launches_what_was_compiled_ahead():
     scene = make_photo_scene(Size(200, 48, 48), 2)
     trainer = make_trainer(scene, load_config("default", {"response.name": "srgb"}), torch.device("cpu"))
-    trainer.iteration = 0
-    trainer.step()
+    changing = trainer.iteration - 1
+    for iteration in (0, changing):  # The first step, and one that changes the Gaussians
+        trainer.iteration = iteration
+        trainer.step()
     launched = {kernel for kernel, *_ in launching._of_thread.launches} | {sweep_rows}
     assert launched.issuperset(ahead.training_kernels(3, antialiased=False))
     assert launched.issuperset(ahead.training_kernels(None, antialiased=False))
