@@ -65,11 +65,13 @@ def _check_flags(options: type, words: list[str], program: str) -> None:
             raise UsageError(f"{program} {words[0]}: no such command{hint}")
         _check_flags(below[words[0]], words[1:], f"{program} {words[0]}")
         return
-    known = {"--help", *flags(options)}
+    known, bare = {"--help", *flags(options)}, {"--" + name for name in positional(options)}
     for word in words:
         flag = word.partition("=")[0].replace("_", "-")
         if not re.match(r"--[a-z]", flag) or flag in known:
             continue
+        if flag in bare:
+            raise UsageError(f"{program} takes {flag[2:].upper()} without {flag}; see {program} --help")
         if flag in getattr(options, "gone", {}):
             raise UsageError(f"{flag} is gone: {options.gone[flag]}")
         # A field's own name is nearer than its part's: --los.clipping, --clipping.
@@ -95,12 +97,20 @@ def subcommands(options: type) -> dict[str, type]:
 
 def flags(options: typing.Any) -> Iterator[str]:
     """The flags of options, without those of their subcommands."""
+    without = set(positional(options))
     for name, hint in _hints(options).items():
         kind = _plain(hint)
+        if name in without:
+            continue
         if dataclasses.is_dataclass(kind) or typing.is_typeddict(kind):
             yield from flags(kind)
         else:
             yield "--" + name.replace("_", "-")
+
+
+def positional(options: typing.Any) -> list[str]:
+    """The options that stand on a command line without a flag."""
+    return [name for name, hint in _hints(options).items() if tyro.conf.Positional in getattr(hint, "__metadata__", ())]
 
 
 def _hide_empty_defaults(options: type) -> None:

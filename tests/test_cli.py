@@ -104,6 +104,8 @@ def test_what_cannot_be_written_is_said_before_the_work(line, tmp_path, capsys):
         ("train --out y", "train needs SCENE"),
         ("train x y --out z", "y: more than is asked for"),
         ("train x --out", "--out needs a value"),
+        ("eval --run x", "eval takes RUN without --run"),
+        ("convert x --out y", "convert takes OUT without --out"),
         ("train x --otu y", "train has no --otu, did you mean --out?"),
         ("train x --los.clipping false", "did you mean --loss.clipping?"),
         ("train x --clipping=false", "did you mean --loss.clipping?"),

@@ -67,7 +67,8 @@ def compare_runs(runs: Sequence[Any]) -> list[ComparedRuns]:
         if places.count(place) > 1:
             raise SehdrError(f"compare: {run.path} is given twice; leave one out")
         if not run.metrics():
-            raise SehdrError(f"{run.path}: has no evaluations to compare; train it further")
+            problem = f"{run.path}: has no evaluations of held-out views"
+            raise SehdrError(f"{problem}; train it with some held out (--holdout 8), or further")
         config = run.config.model_dump(mode="json", exclude={"seed"})
         groups.setdefault(json.dumps([run.scene_name, run.data, config], sort_keys=True, default=str), []).append(run)
     return [_compared(members) for members in groups.values()]

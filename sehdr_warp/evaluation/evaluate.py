@@ -97,7 +97,8 @@ class Evaluation:
     def result(self) -> dict:
         """The figures, as evaluate() describes them."""
         truths = [view.hdr is not None for view in self.views]
-        missing = None if any(truths) else f"the {self.split} views hold no HDR truth"
+        kind = "training" if self.split == "train" else self.split
+        missing = None if any(truths) else f"the {kind} views hold no HDR truth"
         scale, scale_reason = (None, missing) if missing else self._scale()
         rows = []
         for number, view in enumerate(self.views, 1):

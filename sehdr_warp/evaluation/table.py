@@ -27,7 +27,8 @@ def format_table(result: dict) -> str:
     for region, figures in result["regions"].items():
         values = [figures["psnr_ldr"], *(figures["psnr_mu"][name] for name in names)]
         regions.append([region, f"{figures['fraction']:.1%}", *(number(value, 2) for value in values)])
-    lines = [f"{result['scene']}: {len(result['views'])} {result['split']} views, {origin}", "", *columns(rows)]
+    count, split = len(result["views"]), {"train": "training"}.get(result["split"], result["split"])
+    lines = [f"{result['scene']}: {count} {split} view{'s' * (count != 1)}, {origin}", "", *columns(rows)]
     lines += ["", *columns(regions)]
     ranking = result["confidence"]
     if ranking["spearman_log2"] is not None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.scene import Camera
+from sehdr_warp.scene.exposure import shutter
 
 from ..field.baking import agreement, gaussians_of, refine
 from ..files import atomic_path, check_absent
@@ -91,18 +92,19 @@ def _check(path: Path, kind: str, held: str | None, exposure_time: float | None,
 
 def _tell(path: Path, run, gaussians, kind: str, exposure_time: float | None) -> None:
     time = exposure_time or run.base_time
-    meaning = f"display colors of {time:g} s" if kind == "ldr" else "scene-linear radiance"
+    meaning = f"display colors of {shutter(time)}" if kind == "ldr" else "scene-linear radiance"
     log.info("%s: %d Gaussians, harmonics of degree %d, %s", path.name, gaussians.count, gaussians.degree, meaning)
     views = _judged(run)
+    where = f"{len(views)} view{'s' * (len(views) != 1)}"
     if not views:
         log.info("it is not compared with the scene, which has no cameras of its own")
     elif kind == "ldr":
         kept = agreement(gaussians, _photographed(run, time), views, time)
-        log.info("kept: %.1f dB of the scene's own pictures in %d views; lost: light above white", kept, len(views))
+        log.info("kept: %.1f dB of the scene's own pictures in %s; lost: light above white", kept, where)
     else:
         dark = time / 2**_DARKER
         kept = [agreement(gaussians, _shown(run, t), views, t) for t in (time, dark)]
-        log.info("kept: %.1f dB of the scene at 0 EV, %.1f dB at -%d EV, in %d views", *kept, _DARKER, len(views))
+        log.info("kept: %.1f dB of the scene at 0 EV, %.1f dB at -%d EV, in %s", *kept, _DARKER, where)
 
 
 def _judged(run) -> Sequence[Camera]:

@@ -11,13 +11,13 @@ import numpy as np
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Scene, View
+from sehdr_warp.scene.exposure import shutter
 
 from ..files import atomic_path, check_absent
 from .camera_paths import evenly
 from .charts import PANELS, QUIET, STYLE, training_chart, training_points
 from .comparison import Comparison, compare
 from .report_page import STOPS, report_page
-from .report_page import seconds as _seconds
 from .report_page import stops_text as _stops
 from .tonemap import expose, fit_tone_map
 
@@ -104,7 +104,7 @@ def stops_figure(comparison: Comparison, exposure_time: float):
     rows[0][0] = comparison.photo
     titles = ["Photo", *map(_stops, STOPS)]
     caption = (
-        f"View {comparison.name}, re-exposed from {_seconds(exposure_time)} (0 EV) and shown on a plain sRGB display. "
+        f"View {comparison.name}, re-exposed from {shutter(exposure_time)} (0 EV) and shown on a plain sRGB display. "
         "What the photo clipped stays flat."
     )
     if comparison.confidence is not None:
@@ -142,7 +142,7 @@ def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, ce
 
 def _caption(views: Sequence[View], metrics: Sequence[dict], held_out: bool) -> str:
     times = sorted({view.exposure_time for view in views})
-    text = f"Photos at {' and '.join(map(_seconds, times)) if len(times) < 3 else 'several exposures'}"
+    text = f"Photos at {' and '.join(map(shutter, times)) if len(times) < 3 else 'several exposures'}"
     text += ", none of them trained on." if held_out else ", all of them trained on: the scene has no test views."
     last = {key: points[-1] for key in PANELS if (points := training_points(metrics, key))}
     if last and held_out:

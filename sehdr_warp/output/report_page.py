@@ -9,6 +9,7 @@ import numpy as np
 from sehdr_warp import __version__
 from sehdr_warp.scene import Scene
 from sehdr_warp.scene.camera import limited_size
+from sehdr_warp.scene.exposure import shutter
 from sehdr_warp.scene.lens import area_average
 
 from .comparison import Comparison
@@ -93,7 +94,7 @@ def _header(run: Any, scene: Scene) -> str:
         "photos trained on": len(scene.train_views),
         "photos held out": len(scene.test_views),
         "pixels each": f"{camera.width} \N{MULTIPLICATION SIGN} {camera.height}",
-        "exposure": " to ".join(seconds(time) for time in sorted({times[0], times[-1]})).replace(" s to", " to"),
+        "exposure": " to ".join(shutter(time) for time in sorted({times[0], times[-1]})).replace(" s to", " to"),
         "response": escape(str(run.response.name)),
         "Gaussians": f"{run.gaussian_count:,}".replace(",", SPACE),
         "steps": run.iterations,
@@ -155,7 +156,7 @@ def _brackets(shown: Comparison, time: float, gain: float) -> str:
             picture = jpeg(expose(small, stop, scale=time * gain), 82)
             cells.append(img(picture, f"{name} at {stops_text(stop)}", (small.shape[1], small.shape[0])))
     lead = (
-        f"View {escape(shown.name)}, re-exposed from {seconds(time)} (0 EV) and shown as a plain display does. "
+        f"View {escape(shown.name)}, re-exposed from {shutter(time)} (0 EV) and shown as a plain display does. "
         "What the photo clipped stays flat; the scene keeps its light."
     )
     body = _figure(dial(lights, time, gain, "Scene")) + _figure(_wide(f'<div class="strip">{"".join(cells)}</div>'))
@@ -313,11 +314,6 @@ def _size(picture: np.ndarray, longest: int) -> tuple[int, int]:
 def stops_text(stops: float) -> str:
     """`+2 EV`, `-1.5 EV` with a true minus sign, `0 EV`."""
     return f"{round(stops, 1):+g} EV".replace("-", "\N{MINUS SIGN}") if stops else "0 EV"
-
-
-def seconds(time: float) -> str:
-    """An exposure time as photographers write it."""
-    return f"1/{1 / time:.0f} s" if time < 0.3 else f"{time:.3g} s"
 
 
 def duration(time: float) -> str:

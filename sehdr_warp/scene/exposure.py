@@ -72,8 +72,15 @@ def with_exposure_times(shots: list[Shot], source: Path) -> tuple[list[Shot], bo
     shortest, longest = min(times), max(times)
     if longest > shortest * 1.01:
         stops = math.log2(longest / shortest)
-        notes.append(f"exposures differ: {shortest:g} to {longest:g} s ({stops:.1f} stops); each view keeps its own")
+        span = f"{shutter(shortest)} to {shutter(longest)}".replace(" s to", " to")
+        notes.append(f"exposures differ: {span} ({stops:.1f} stops); each view keeps its own")
     return [replace(shot, exposure_time=time) for shot, time in zip(shots, times, strict=True)], True, notes
+
+
+def shutter(time: float) -> str:
+    """An exposure time as photographers write it: `1/640 s`, `0.4 s`, `2 s`."""
+    parts = round(1 / time)
+    return f"1/{parts} s" if time < 0.3 and abs(parts * time - 1) < 0.02 else f"{time:.3g} s"
 
 
 def parse_seconds(value, source: Path, field: str) -> float:

@@ -233,7 +233,8 @@ def _with_splits(shots: list[Shot], capture: Capture, holdout: int | None) -> tu
         return shots, ("no views are held out for testing",)
     names = [shot.view for shot in shots if shot.split == "test"]
     listed = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
-    return shots, (f"{len(names)} of {len(shots)} views are held out for testing: {listed}",)
+    are = "is" if len(names) == 1 else "are"
+    return shots, (f"{len(names)} of {len(shots)} views {are} held out for testing: {listed}",)
 
 
 def _held_out(count: int, step: int | None, published: tuple[int, int] | None) -> set[int]:

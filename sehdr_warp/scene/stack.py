@@ -69,13 +69,15 @@ def calibrate(
         overwrite: replace these files.
 
     Raises:
-        InputError: for a stack that tells nothing, with the reason, or a file that exists.
+        InputError: for a stack that tells nothing, with the reason, another suffix, or a file that exists.
     """
     from ..files import atomic_path, check_absent
     from ..response.calibration import calibrate_codes
 
     folder = Path(stack)
     paths = [] if out is None else [Path(out), Path(out).with_suffix(".png")]
+    if paths and paths[0].suffix.lower() != ".csv":
+        raise InputError(paths[0], "the curve is a CSV file", f"name it {paths[0].with_suffix('.csv').name}")
     for path in paths:
         check_absent(path, overwrite)
     files, times = read_stack(folder, times)

@@ -79,6 +79,9 @@ def test_channels_that_differ_are_said_and_the_curve_can_be_read(tmp_path, logge
     assert Image.open(tmp_path / "camera.png").width > 500
     with pytest.raises(InputError, match="exists already"):
         sw.calibrate(folder, out=tmp_path / "camera.csv")
+    with pytest.raises(InputError, match="curve.png: the curve is a CSV file; name it curve.csv"):
+        sw.calibrate(folder, out=tmp_path / "curve.png")
+    assert not list(tmp_path.glob("curve.*"))
     assert stops_off(sw.calibrate(folder, times=times, channel="red"), response_by_name("srgb")) < 0.05
 
 

@@ -15,6 +15,7 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.files import LIST
 from sehdr_warp.scene import load_scene, sfm
 from sehdr_warp.scene.capture import Shot
+from sehdr_warp.scene.exposure import shutter
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import _held_out
 from sehdr_warp.scene.names import natural_key, unique_names
@@ -33,7 +34,15 @@ def test_exif_times_count_sensitivity_and_aperture(tmp_path):
     np.testing.assert_allclose([view.exposure_time for view in scene.views], light, rtol=1e-5)
     assert scene.exposure_times_known
     text = " ".join(scene.notes)
-    assert "ISO differs (100 to 400)" in text and "exposures differ: 0.0025 to 1 s" in text
+    assert "ISO differs (100 to 400)" in text and "exposures differ: 1/400 to 1 s" in text
+
+
+@pytest.mark.parametrize(
+    "seconds, text",
+    [(1 / 640, "1/640 s"), (0.000634115, "1/1577 s"), (0.125, "1/8 s"), (0.28, "0.28 s"), (0.4, "0.4 s"), (8, "8 s")],
+)
+def test_times_read_as_photographers_write_them(seconds, text):
+    assert shutter(seconds) == text
 
 
 def test_shutter_speed_stands_in_for_exposure_time(tmp_path):
@@ -67,7 +76,7 @@ def test_layouts_without_a_protocol_hold_out_the_middle_of_each_block(tmp_path):
     write_ply(tmp_path / "p.ply", [(0, 0, 0)])
     scene = load(tmp_path)
     assert [view.name for view in scene.test_views] == ["r_4"], "not the last of the arc"
-    assert "1 of 13 views are held out for testing: r_4" in scene.notes
+    assert "1 of 13 views is held out for testing: r_4" in scene.notes
     assert [view.name for view in load(tmp_path, holdout=4).test_views] == ["r_2", "r_6", "r_10"]
     for count, held in ((5, {2}), (6, {4}), (9, {4}), (16, {4, 12}), (4, set())):
         assert _held_out(count, None, None) == held
