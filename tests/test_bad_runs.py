@@ -145,6 +145,7 @@ def test_damaged_run_is_not_resumed(run, capfd):
 
 
 def test_a_folder_of_other_things_is_no_run(tmp_path, capfd):
+    (tmp_path / "dog.ply").write_bytes(b"ply")
     (tmp_path / "letters").mkdir()
     (tmp_path / "letters" / "mother.txt").write_text("dear")
     (tmp_path / "other" / "checkpoints").mkdir(parents=True)
@@ -155,6 +156,7 @@ def test_a_folder_of_other_things_is_no_run(tmp_path, capfd):
         for name in ("letters", "other"):
             assert name in refused(capfd, "train", "embedded", "--out", tmp_path / name, "--device", "cpu", *flag)
     assert "no such folder" in refused(capfd, "render", tmp_path / "gone", "--out", tmp_path / "out")
+    assert "dog.ply: is a file, not a run; give the folder" in refused(capfd, "eval", tmp_path / "dog.ply")
     (tmp_path / "empty").mkdir()
     assert "nothing to resume" in refused(capfd, "train", "embedded", "--out", tmp_path / "empty", "--resume")
     assert snapshot(tmp_path) == before

@@ -38,7 +38,7 @@ def run_cases(cases: Sequence[tuple[str, Case]], device: torch.device) -> list[d
     """
     rows, threads, bounds, begun = [], torch.get_num_threads(), 0, time.perf_counter()
     torch.set_num_threads(1)
-    print(f"{'case':17} {'quantity':42} {'error':>9} {'bound':>9}  verdict")
+    print(f"{'case':17} {'quantity':47} {'error':>9} {'bound':>9}  verdict")
     try:
         for group, case in cases:
             started = time.perf_counter()
@@ -49,7 +49,7 @@ def run_cases(cases: Sequence[tuple[str, Case]], device: torch.device) -> list[d
             bounds += len(readings)
             for place, reading in enumerate(readings):
                 numbers = f"{_number(reading.error)} {_number(reading.bound)}  {'ok' if reading.holds else 'FAILED'}"
-                print(f"{'' if place else case.name:17} {reading.quantity:42.42} {numbers}")
+                print(f"{'' if place else case.name:17} {reading.quantity:47} {numbers}")
     finally:
         torch.set_num_threads(threads)
     failed = sum(not row["holds"] for row in rows)

@@ -27,8 +27,8 @@ def check_suffix(path: Path | str) -> str:
     """The suffix of a splat file, in lower case; InputError for one that is not read and written."""
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
-        problem = f"is no splat file: {suffix or 'no suffix'} {_OTHER.get(suffix, 'is not known')}"
-        raise InputError(path, problem, f"choose one of {' '.join(SUFFIXES)}")
+        why = f"{suffix} is not read or written here: it {_OTHER[suffix]}" if suffix in _OTHER else "is no splat file"
+        raise InputError(path, why, f"use one of {' '.join(SUFFIXES)}")
     return suffix
 
 

@@ -135,7 +135,8 @@ class RunFolder:
                 self.unlock()
         for file in (self.config, self.info):
             if not file.is_file():
-                problem = f"is not a run (no {file.name})" if self.path.is_dir() else "no such folder"
+                problem = "is a file, not a run" if self.path.is_file() else "no such folder"
+                problem = f"is not a run (no {file.name})" if self.path.is_dir() else problem
                 raise InputError(self.path, problem, "give the folder that `sehdr-warp train --out` wrote")
 
     def begin(

@@ -59,7 +59,7 @@ def test_unusable_requests(tmp_path, run):
         ("a.ply", {"degree": 4}, "degree 4"),
         ("a.glb", {"kind": "hdr"}, "knows display colors only"),
         ("a.usdc", {"kind": "ldr"}, "is tagged as scene-linear"),
-        ("a.splat", {}, "is no splat file"),
+        ("a.splat", {}, "a.splat: .splat is not read or written here: it holds 8 bits and no harmonics"),
     ):
         with pytest.raises(SehdrError, match=words):
             export(run, tmp_path / name, **options)

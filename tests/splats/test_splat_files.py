@@ -135,7 +135,8 @@ BAD = {
     "f.ply": (ply(f"element vertex 1\n{NUMBERS}property uchar opacity\n", bytes(53)), "opacity is of whole numbers"),
     "a.glb": (b"glTF" + bytes(40), "is not binary glTF"),
     "b.glb": (struct.pack("<5I", 0x46546C67, 2, 22, 2, 0x4E4F534A) + b"{}", "is damaged glTF"),
-    "a.spz": (b"x", "is no splat file"),
+    "a.spz": (b"x", ".spz is not read or written here"),
+    "a.txt": (b"x", "a.txt: is no splat file; use one of .ply"),
     "a.usda": (b"#usda 1.0\ndef Sphere \"a\" {}\n", "has 0 prims of ParticleField3DGaussianSplat"),
     "b.usda": (b"#usda 1.0\ndef {", "cannot be read as USD"),
 }  # fmt: skip

@@ -33,6 +33,7 @@ def test_the_page_shows_the_light_of_the_scene(run, tmp_path):
         started = time.monotonic()
         page.wait_for_selector(FULL)
         loaded = time.monotonic() - started
+        assert page.text_content("#told") == page.title() and f"{page.title()} &middot; loading<" in file.read_text()
         camera = Camera.from_dict(page.evaluate("document.getElementById('stage').seen"))
         light = as_array(run.render(camera).hdr) * run.base_time * display_gain(run.response)
         for stops in (-4, 0, 3):

@@ -88,7 +88,7 @@ async function request(draft) {
     if (!isDraft && !sorted) break;  // A full picture waits for the first order of its Gaussians, which asks for it.
     await render(isDraft ? scale : 1);
     if (isDraft) scale = Math.min(1, Math.max(0.15, scale * Math.min(1.5, Math.max(0.5, Math.sqrt(DRAFT_TIME / (performance.now() - started))))));
-    else if (wanted === null && sorted) stage.dataset.frame = "full";
+    else if (wanted === null && sorted) stage.dataset.frame = "full", $("told").textContent = document.title;
   }
   busy = false;
 }
