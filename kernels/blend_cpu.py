@@ -121,7 +121,7 @@ def forward_kernel(dtype, channels: int, halvings: int):
     image: [H W, C]; left_over: [H W], the transmittance behind everything
     """
     row, spread, step, exponential, halves = row_functions(dtype, halvings)
-    real, vec4, size, lanes, rows = dtype, vector(4, dtype), TILE_SIZE, LANES, TILE_SIZE * HALVES
+    real, vec4, size, lanes = dtype, vector(4, dtype), TILE_SIZE, LANES
 
     @wp.kernel(module="unique", module_options=_options(dtype))
     def blend_forward(
@@ -137,6 +137,8 @@ def forward_kernel(dtype, channels: int, halvings: int):
         x0 = (tile % columns) * size
         y0 = (tile // columns) * size
         offsets = iota[0]
+        # Not a constant of 32, which the compiler would take five times as long to write out.
+        rows = transmittance.shape[1]
         for j in range(rows):
             transmittance[tile, j] = spread(real(1.0))
             last[tile, j] = spread(real(0.0))
@@ -206,7 +208,7 @@ def backward_kernel(dtype, channels: int, halvings: int):
     entry_gradients: [M, C + 6], in the order of emission: features, conic a b c, x, y, opacity
     """
     row, spread, step, exponential, halves = row_functions(dtype, halvings)
-    real, vec4, size, lanes, rows = dtype, vector(4, dtype), TILE_SIZE, LANES, TILE_SIZE * HALVES
+    real, vec4, size, lanes = dtype, vector(4, dtype), TILE_SIZE, LANES
 
     @wp.kernel(module="unique", module_options=_options(dtype))
     def blend_backward(
@@ -226,7 +228,7 @@ def backward_kernel(dtype, channels: int, halvings: int):
         offsets = iota[0]
         ones = spread(real(1.0))
         furthest = spread(real(0.0))
-        for at in range(rows):
+        for at in range(transmittance.shape[1]):  # As in the forward kernel.
             t = wp.max(transmittance[tile, at], transmittance[tile, at] * real(-1.0))
             transmittance[tile, at] = t
             furthest = wp.max(furthest, last[tile, at])

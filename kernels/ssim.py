@@ -51,7 +51,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
     distance: for a weighted sum of |a - b| and 1 - SSIM in place of the SSIM; the weights are read with it alone.
     """
     real, run = dtype, wp.types.vector(length=lanes, dtype=dtype)
-    taps, radius = wp.constant(2 * RADIUS + 1), wp.constant(RADIUS)
+    radius = wp.constant(RADIUS)
     c1, c2 = wp.constant(real(C1)), wp.constant(real(C2))
     options = FORWARD
     strip_options = FORWARD | {"max_unroll": 32}
@@ -161,7 +161,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
         md = run(real(0.0))
         ss = run(real(0.0))
         dd = run(real(0.0))
-        for k in range(taps):
+        for k in range(weights.shape[0]):
             weight = weights[k]
             ms += moments[0, y, i + k * channels] * weight
             md += moments[1, y, i + k * channels] * weight
@@ -273,7 +273,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
         sd = run(real(0.0))
         ss = run(real(0.0))
         dd = run(real(0.0))
-        for k in range(taps):
+        for k in range(weights.shape[0]):
             weight = weights[k]
             sd += blurred[0, y, i + k * channels] * weight
             ss += blurred[1, y, i + k * channels] * weight

@@ -1,4 +1,4 @@
-"""A training's kernels for the CPU, compiled while its photos are read: the compiler takes a quarter of a minute for
+"""A training's kernels for the CPU, compiled while its photos are read: the compiler takes some ten seconds for
 them, once on each machine, and a second to find them in the cache."""
 
 import importlib
