@@ -35,13 +35,21 @@ class PhotoGains:
         """Deviation of the photos' gains, of the channel that varies most."""
         return float(np.log2(list(self.gains.values())).std(0).max()) if self.gains else 0.0
 
+    def following(self, views: Sequence[View]) -> "PhotoGains":
+        """These gains of photos with only that part of their exposure that follows the times they state: that a wrong
+        curve makes."""
+        values = np.log([self.gains[view.name] for view in views])
+        times = np.log([view.exposure_time for view in views])
+        times -= times.mean()
+        along = times * (times @ values[:, 1]) / max(float(times @ times), 1e-6)
+        return _of([view.name for view in views], values + (along - values[:, 1])[:, None], self.falloff)
+
     def stops_beside(self, views: Sequence[View]) -> float:
-        """Deviation of the gains of photos from what follows their exposure times: that a wrong curve makes."""
-        gains = np.log2([self.gains[view.name] for view in views])
-        times = np.log2([view.exposure_time for view in views])[:, None]
-        times = times - times.mean()
-        along = (times * gains).sum(0) / max(float((times**2).sum()), 1e-6)
-        return float((gains - times * along).std(0).max())
+        """Deviation of that part of the photos' exposure which does not follow the times they state."""
+        ours, along = (
+            np.log2([gains.gains[view.name][1] for view in views]) for gains in (self, self.following(views))
+        )
+        return float((ours - along).std())
 
     @property
     def tint(self) -> float:
@@ -68,12 +76,15 @@ class PhotoGains:
             return scene
         return replace(scene, views=tuple(self._view(view, response) for view in scene.views), evened=True)
 
-    def _view(self, view: View, response: Response) -> View:
-        gain = np.array(self.gains.get(view.name, (1.0, 1.0, 1.0)))
-        time = view.exposure_time * gain.max()
+    def light(self, view: View) -> np.ndarray:
+        """[H, W, 3] what the light of a photo was multiplied by."""
         height, width = view.codes.shape[:2]
         radius = _radius(view, *np.ogrid[:height, :width])[..., None]
-        light = np.exp(-_power(radius, *self.falloff.get(view.name, NONE))) * (gain / gain.max())
+        return np.exp(-_power(radius, *self.falloff.get(view.name, NONE))) * self.gains.get(view.name, (1.0, 1.0, 1.0))
+
+    def _view(self, view: View, response: Response) -> View:
+        largest = max(self.gains.get(view.name, (1.0,)))
+        time, light = view.exposure_time * largest, self.light(view) / largest
         if light.min() > 1 - NEGLIGIBLE:
             return replace(view, exposure_time=time)
         decoded = response.decode(np.arange(view.levels + 1) / view.levels)[view.codes]

@@ -20,9 +20,13 @@ evened: less is within the fit's own error on scenes that shine."""
 LEAST_DISAGREEMENT = 0.12
 """Stops by which photos differ in the median from which drift is one: matches that slide along a clear sky differ by
 less, and gains explain them well."""
-LEFT, LEFT_OF_STATED, LEFT_OF_TINT, LEFT_OF_FALLOFF = 0.9, 0.6, 0.6, 0.85
-"""Part of the photos' disagreement that may be left when they are evened. Over stated times only drift that explains
-much is believed: a wrong curve, and what shines, look like some. White balance is believed by colors alone."""
+LEFT, LEFT_OF_FALLOFF = 0.9, 0.85
+"""Part of the photos' disagreement that may be left when they are evened."""
+LEAST_BESIDE = 0.05  # Stops of drift, of what does not follow stated times, from which they are put right
+LEFT_OF_OTHERS, LEFT_OF_TINT = 0.95, 0.75
+"""The same of what gains that half of the points tell leave of how photos disagree at the other half: in exposure over
+stated times, beside what follows them, and in white balance, by colors. EXIF rounds times and sensitivities, and
+cameras tone each photo by itself; what shines, and a wrong curve, explain nothing at other points."""
 ENOUGH = 0.4  # Part of the pixels that are matched from which photos are alike enough as they are
 FEWEST = 100  # Points that a fit needs
 
@@ -61,7 +65,7 @@ def find_gains(
         few = points_of(matcher, FEW_POINTS)
         rough = rough_gains(views, *few, response)
         falls = rough.corners >= LEAST_CORNERS and left_of_falloff(views, *few, response, rough) < 1
-        if rough.stops < LEAST_STOPS and rough.tint < LEAST_TINT and not falls:
+        if rough.stops < LEAST_BESIDE and rough.tint < LEAST_TINT and not falls:
             return none(matcher)
     found, guess = points_of(matcher), start_gains(views, response)
     if not stated and len(found[0]) < ENOUGH * POINTS and guess.stops > LEAST_STOPS:
@@ -80,18 +84,33 @@ def _believed(
     gains: PhotoGains, views: Sequence[View], found: tuple[np.ndarray, np.ndarray], response: Response, stated: bool
 ) -> dict[str, bool]:
     """Which parts of gains explain the points that were found: exposure, white balance, falloff."""
-
-    def left(taken: PhotoGains, colors: bool = False) -> float:
-        before, after = (disagreement(views, *found, response, gains, colors=colors) for gains in (None, taken))
-        return after / before if before and (colors or before >= LEAST_DISAGREEMENT) else 1.0
-
-    drift, shared = gains.parts(falloff=False), gains.parts(tint=False)
-    exposure = (shared.stops_beside(views) if stated else shared.stops) >= LEAST_STOPS
-    exposure = exposure and left(drift) <= (LEFT_OF_STATED if stated else LEFT)
-    tint = exposure or (gains.tint >= LEAST_TINT and left(drift, colors=True) <= LEFT_OF_TINT)
+    before, after = (disagreement(views, *found, response, taken) for taken in (None, gains.parts(falloff=False)))
+    told = before >= LEAST_DISAGREEMENT and after <= LEFT * before
+    exposure = tint = not stated and gains.stops >= LEAST_STOPS and told
+    if not exposure:
+        drift, colors = _left_of_others(views, found, response)
+        exposure = stated and gains.stops_beside(views) >= LEAST_BESIDE and drift <= LEFT_OF_OTHERS
+        tint = (exposure or gains.tint >= LEAST_TINT) and colors <= LEFT_OF_TINT
     falloff = gains.corners >= LEAST_CORNERS
     falloff = falloff and left_of_falloff(views, *found, response, gains) <= LEFT_OF_FALLOFF
     return {"exposure": exposure, "tint": tint, "falloff": falloff}
+
+
+def _left_of_others(
+    views: Sequence[View], found: tuple[np.ndarray, np.ndarray], response: Response
+) -> tuple[float, float]:
+    """Parts of the disagreement at half of the points that gains of the other half leave: what of their exposure does
+    not follow the stated times, and their white balance by colors."""
+    points, seen = found[0], found[1][: len(views)]
+    halves, left = (slice(0, None, 2), slice(1, None, 2)), []
+    for this, other in (halves, halves[::-1]):
+        drift = fit_gains(views, (), points[this], seen[:, this], response).parts(falloff=False)
+        rest = views, points[other], seen[:, other], response
+        pairs = [disagreement(*rest, taken) for taken in (drift, drift.following(views))]
+        pairs += [disagreement(*rest, taken, colors=True) for taken in (drift.parts(exposure=False), None)]
+        left.append([pairs[k] / pairs[k + 1] if pairs[k + 1] else 1.0 for k in (0, 2)])
+    drift, colors = np.mean(left, 0)
+    return float(drift), float(colors)
 
 
 def _decided(gains: PhotoGains, parts: dict[str, bool], stated: bool) -> Decision:
@@ -99,7 +118,7 @@ def _decided(gains: PhotoGains, parts: dict[str, bool], stated: bool) -> Decisio
     figures = []
     if parts["exposure"]:
         figures.append(f"{gains.stops:.2f} stops between photos")
-    elif parts["tint"]:
+    if parts["tint"] and gains.tint >= LEAST_TINT:
         figures.append(f"{gains.tint:.2f} stops of white balance between photos")
     if parts["falloff"]:
         figures.append(f"{gains.corners:.0%} towards the corners")

@@ -84,6 +84,18 @@ def test_gains_and_falloff_are_found(gains, points):
     assert left_of_falloff(*known, found) < 0.15 and left_of_falloff(*known, wrong) > 0.8
 
 
+def test_what_follows_stated_times_is_told_apart(gains):
+    """A wrong curve makes gains of the times themselves; what a camera rounds is beside them."""
+    views = [replace(v, exposure_time=2.0**k) for k, v in enumerate(photographed({}, {}).train_views)]
+    along = PhotoGains({v.name: (v.exposure_time**0.4,) * 3 for v in views})
+    assert along.stops > 0.5 and along.stops_beside(views) == pytest.approx(0, abs=1e-9)
+    off = np.array([0.1, -0.2, 0.2, -0.2, 0.1])  # Of no slope over times
+    both = PhotoGains({v.name: tuple(2**e * np.array(along.gains[v.name])) for v, e in zip(views, off, strict=True)})
+    assert both.stops_beside(views) == pytest.approx(off.std())
+    shared = np.array(list(both.following(views).gains.values())) / list(along.gains.values())
+    np.testing.assert_allclose(shared, shared[0, 0])
+
+
 def test_each_lens_has_its_falloff(gains, points):
     dark = everywhere(FALLOFF, range(0, PHOTOS, 2))
     scene = photographed(gains, dark, lambda name: 60.0 if name in dark else 70.0)

@@ -12,7 +12,7 @@ from sehdr_warp.training.photo_gains import evens, find_gains
 from sehdr_warp.training.run import load_run
 from sehdr_warp.training.train import Training
 
-from .wall_and_lamp import photographed, wall_and_lamp
+from .wall_and_lamp import WALL, photographed, texture, wall_and_lamp
 
 LINEAR = response_by_name("linear")
 CONFIG = load_config("default")
@@ -65,6 +65,28 @@ def test_stated_times_stay_where_colors_or_corners_alone_drift(device):
     assert (found[:, 1] == 0).all()
     gains, _, decision = find_gains(replace(scene, views=tuple(darkened)), CONFIG, LINEAR, device)
     assert "stay as stated" in decision.choice and gains.corners == pytest.approx(0.5, abs=0.1) and not gains.stops
+
+
+def test_times_that_a_camera_rounds_are_put_right(device):
+    """EXIF rounds times and sensitivities: what photos differ by then is less than they differ by otherwise."""
+    off = np.array([0.15, -0.2, 0.05, 0.1, -0.1, -0.15, 0.2, 0.0, -0.05])
+    scene = wall_and_lamp(TIMES)
+    views = [replace(v, exposure_time=v.exposure_time * 2**-e) for v, e in zip(scene.views, off, strict=True)]
+    gains, _, decision = find_gains(replace(scene, views=tuple(views)), CONFIG, LINEAR, device)
+    assert "over the times they state" in decision.choice and "white balance" not in decision.reason
+    found = np.log2([gains.gains[view.name] for view in views])
+    np.testing.assert_allclose(found, (off - off.mean())[:, None].repeat(3, 1), atol=0.03)
+
+
+def test_a_lamp_that_moves_is_no_drift(device):
+    """Half of the photos are lit from the left, half from the right: no gain of a photo explains it."""
+
+    def light_at(position, rays):
+        places = position[:2] + rays[..., :2] / rays[..., 2:] * WALL
+        side = 1 if position[1] > 0.1 else -1
+        return texture(places) * (0.7 + 0.5 * np.tanh(1.5 * side * places[..., :1]))
+
+    assert find_gains(photographed(light_at), CONFIG, LINEAR, device)[0] is None
 
 
 def test_a_clear_sky_is_no_drift(device):
