@@ -20,6 +20,7 @@ from .images import as_array, quantize
 from .tonemap import encode_srgb
 
 MIDDLE_GREY = 0.18
+CURVE_STOPS, CURVE_SIZE = (-20.0, 20.0), 1024  # As light.js has them
 
 
 def display_gain(response: Any) -> float:
@@ -27,6 +28,13 @@ def display_gain(response: Any) -> float:
     for an sRGB or linear camera."""
     grey = float(response.decode(encode_srgb(np.array([MIDDLE_GREY])).astype(np.float64))[0])
     return MIDDLE_GREY / grey if grey > 0 else 1.0
+
+
+def curve_table(response: Any) -> str:
+    """A response over CURVE_STOPS of exposure, evenly, as half floats in base64: what a page draws the camera's look
+    by."""
+    values = response.encode(2.0 ** np.linspace(*CURVE_STOPS, CURVE_SIZE))
+    return base64.b64encode(np.asarray(values).astype("<f2").tobytes()).decode()
 
 
 def photo_light(run: Any, view: View) -> np.ndarray:

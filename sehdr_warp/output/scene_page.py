@@ -20,7 +20,7 @@ from ..field.baking import gaussians_of
 from ..files import atomic_path, check_absent
 from ..splats.arrays import HARMONIC_0
 from .camera_paths import facts_of_cameras
-from .light_pictures import display_gain, page_file, whole_page
+from .light_pictures import curve_table, display_gain, page_file, whole_page
 
 _HALF = float(np.finfo(np.float16).max)
 
@@ -53,6 +53,7 @@ def write_scene_page(run: Any, path: Path | str, *, overwrite: bool = False) -> 
         "columns": list(columns),
         "base_time": run.base_time,
         "grey": display_gain(run.response),
+        "curve": curve_table(run.response),
     }
     body = Template(page_file("scene.html")).substitute(
         title=escape(str(run.scene_name)),

@@ -1,22 +1,19 @@
 """What the page asks of a run: float frames of a camera, and the facts that it draws with."""
 
-import base64
 import json
 import threading
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from sehdr_warp.scene import Camera
 
 from ..output.camera_paths import facts_of_cameras
-from ..output.light_pictures import display_gain
+from ..output.light_pictures import curve_table, display_gain
 
 MOST_PIXELS = 4096 * 2304
-CURVE_STOPS, CURVE_SIZE = (-20.0, 20.0), 1024  # As light.js has them
 _HALF_MOST = 65504.0
 
 
@@ -79,7 +76,7 @@ class Rendering:
             "response": self.response.name,
             "base_time": self.base_time,
             "grey": display_gain(self.response),
-            "curve": _curve(self.response),
+            "curve": curve_table(self.response),
             "clipped": self.clipped is not None,
         } | facts_of_cameras(self.cameras)
 
@@ -97,9 +94,3 @@ def camera_file(cameras: Sequence[Camera]) -> str:
     digits = max(3, len(str(len(cameras) - 1)))
     named = [{"name": f"view_{i:0{digits}d}"} | camera.to_dict() for i, camera in enumerate(cameras)]
     return json.dumps({"cameras": named}, indent=1)
-
-
-def _curve(response: Any) -> str:
-    """The response over CURVE_STOPS of exposure as half floats in base64."""
-    values = response.encode(2.0 ** np.linspace(*CURVE_STOPS, CURVE_SIZE))
-    return base64.b64encode(np.asarray(values).astype("<f2").tobytes()).decode()

@@ -8,6 +8,7 @@ let app, eye, color, target, sorted = 0, wanted = null, busy = false, timer = 0,
 
 async function start() {
   if (!light.gl) throw new Error("this browser has no WebGL2, by which the scene is drawn");
+  light.putCurve(facts.curve);
   const means = new Float32Array((await unpackLight($("means").textContent)).buffer), half = await unpackLight($("rest").textContent);
   const count = means.length / 3;
   const properties = facts.columns.map((name, k) => {

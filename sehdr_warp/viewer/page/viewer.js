@@ -54,8 +54,7 @@ async function renew() {
 
 function useRun(index) {
   facts = runs[index];
-  const curve = Uint8Array.from(atob(facts.curve), c => c.charCodeAt(0));
-  light.put("curve", CURVE_SIZE, 1, new Uint16Array(curve.buffer), 1);
+  light.putCurve(facts.curve);
   light.settings.grey = facts.grey;
   $("overlay").querySelector("[value=clipped]").disabled = !facts.clipped;
   state.run = index;
