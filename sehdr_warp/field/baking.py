@@ -71,7 +71,8 @@ def gaussians_of(
         if stored.color_model == "display" and time == field.base_time and color_matrix is None:
             return stored
         radiance = to_radiance or (lambda exposure: exposure / field.base_time)
-        return bake(stored, lambda colors: field.response.encode(radiance(colors) * time), "display", seen_from)
+        shown = bake(stored, lambda colors: field.response.encode(radiance(colors) * time), "display", seen_from)
+        return replace(shown, base_time=time)  # By which their light is found again.
     if to_radiance is None and color_model == stored.color_model:
         harmonics = stored.harmonics.astype(np.float64)
         if color_model == "linear":

@@ -27,7 +27,8 @@ class GaussianArrays:
     means [N, 3] world; log_scales [N, 3], natural logarithm of the standard deviations; quaternions [N, 4] (w x y z);
     opacity_logits [N]; harmonics [N, (degree + 1)^2, 3], degree 0 to 3. color_model: what their sum over a viewing
     direction means, per channel: "display": sRGB-encoded color max(sum + 0.5, 0), as every 3DGS viewer takes it; "log":
-    scene-linear radiance exp(sum); "linear": max(sum, 0). base_time: seconds at which the scene was photographed.
+    scene-linear radiance exp(sum); "linear": max(sum, 0). base_time: seconds at which the scene was photographed, of
+    display colors those of the photo that they show.
     """
 
     means: np.ndarray

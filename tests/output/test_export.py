@@ -30,12 +30,18 @@ def test_suffix_and_kind_decide(tmp_path, run, logged):
     assert sum(line.startswith("kept:") for line in logged) == 3
 
 
-def test_exposure_of_display_colors(tmp_path, run):
+def test_exposure_of_display_colors(tmp_path, run, logged):
     export(run, tmp_path / "a.ply")
     export(run, tmp_path / "b.ply", exposure_time=2.0)
+    kept = [float(line.split()[1]) for line in logged if line.startswith("kept:")]
+    assert len(kept) == 2 and min(kept) > 30
+    assert [read_gaussians(tmp_path / name).base_time for name in ("a.ply", "b.ply")] == [0.5, 2.0]
     shown = [load_splats(tmp_path / name).render_ldr(camera()).mean() for name in ("a.ply", "b.ply")]
     wanted = [run.render_ldr(camera(), time).mean() for time in (0.5, 2.0)]
     np.testing.assert_allclose(shown, wanted, rtol=0.05)
+    export(run, tmp_path / "dark.ply", exposure_time=0.125)
+    light = [each.render(camera()).hdr.mean() for each in (load_splats(tmp_path / "dark.ply"), run)]
+    np.testing.assert_allclose(*light, rtol=0.1)
 
 
 def test_cameras_beside_are_read_again(tmp_path, run):
