@@ -59,7 +59,7 @@ def prepare() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
         setattr(sys, ("stdout", "stderr")[number - 1], _Stream(stream, number, asked=number == 1))
-    _collect_late()
+    collect_late()
     os.environ["MPLBACKEND"] = "agg"  # Pictures go to files, whatever a shell was set up for.
     for each, handler in (("SIGINT", _interrupt), ("SIGTERM", _end), ("SIGHUP", _end)):
         number = getattr(signal, each, None)
@@ -70,7 +70,7 @@ def prepare() -> None:
     threading.excepthook = lambda told: None if interrupted() else thread_hook(told)
 
 
-def _collect_late() -> None:
+def collect_late() -> None:
     """Garbage is looked for only once libraries are loaded, and not in them: they leave next to none, and to look makes
     a quarter of the time that they take."""
     usual = gc.get_threshold()

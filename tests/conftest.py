@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from sehdr_warp.process import collect_late
+
+collect_late()
 # As the command line does, and for its reason; before anything loads torch.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # Tests run side by side: threads of linear algebra would wait for each other.

@@ -21,7 +21,7 @@ CODE = 1.0 / 255
 # Edges: pixels this far on both sides of the middle one; each side must be flat to 3 codes and 20 from the other, with
 # some slack for how a float rounds, and the sides' encoded colors at an angle (radians), not one gray scaled.
 EDGE_REACH, FLAT_CODES, EDGE_CODES, SLACK, EDGE_ANGLE = 2, 3, 20, 0.25, 0.05
-MAX_EDGES, MIN_EDGES = 12_000, 50
+MAX_EDGES, MIN_EDGES = 4000, 50
 # The middle lies between these shares of the way from one side to the other, in encoded values.
 LEAST_SHARE, MOST_SHARE = 0.15, 0.85
 # Variance of a stored value in codes^2: rounding, and a little for what two evenly colored sides still hide.
@@ -126,7 +126,7 @@ def select_response(
             "paper" is SeHDR, section 3.3: the curve that does best on one photo "by dynamic range and smoothness"; the
             paper gives no formula, ours is ResponseScore.paper_score.
         from_camera: the photos are a camera's own JPEGs, with the prior of cameras.
-        seed: of the sample of edges where there are more than 12 000.
+        seed: of the sample of edges where there are more than 4000.
 
     Raises SehdrError for another method, no candidates, an image of another shape or not finite, or, by "paper", under
     100 pixels that are neither black nor clipped.

@@ -36,7 +36,7 @@ _log = logging.getLogger("sehdr_warp.scene")
 _MARK = "transforms_train.json"  # What a folder of an embedded scene has.
 _HOLDOUT = 8  # Every eighth view is held out: the habit of LLFF, Mip-NeRF 360 and 3DGS.
 _FEWEST_FOR_TEST = 5  # Below this many views none can be spared for testing.
-_MOST_JUDGED = 24  # Photos that a response is chosen from: they give about as many edges as are looked at.
+_MOST_JUDGED = 24  # Photos that a response is chosen from: they give as many edges as are looked at, and more.
 
 
 def load_scene(

@@ -47,10 +47,10 @@ def test_papers_score_orders_by_range_and_smoothness():
     assert linear.dynamic_range == pytest.approx(np.log2(high / low), rel=1e-3)
 
 
-def test_thousands_of_edges_are_all_looked_at_and_count_as_few_facts():
-    photos, few = [photograph("srgb", mosaic(seed)) for seed in range(8)], named("srgb", "filmic")
-    selection, again = (select_response(photos, few, seed=seed) for seed in (0, 1))
-    assert 3000 < selection.edge_count < 12_000
+def test_thousands_of_edges_are_all_looked_at_and_count_as_few_facts_and_more_are_drawn_from():
+    photos, few = [photograph("srgb", mosaic(seed)) for seed in range(4)], named("srgb", "filmic")
+    selection, again = (select_response(photos[:3], few, seed=seed) for seed in (0, 1))
+    assert 3000 < selection.edge_count < select_response(photos, few).edge_count == 4000
     assert [score.posterior for score in selection.scores] == [score.posterior for score in again.scores]
     assert edge_facts(1600) == 10 and edge_facts(selection.edge_count) == edge_facts(10**6) == 18.75
     for score in selection.scores:
