@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from ..errors import SehdrError
+from ..splatting.threads import one_torch_thread
 from .case import Case
 from .light_cases import LIGHT_CASES
 from .splat_cases import POISON_CASES, SPLAT_CASES
@@ -36,10 +37,9 @@ def run_cases(cases: Sequence[tuple[str, Case]], device: torch.device) -> list[d
 
     torch runs on one thread, so that the figures do not depend on the machine's cores.
     """
-    rows, threads, bounds, begun = [], torch.get_num_threads(), 0, time.perf_counter()
-    torch.set_num_threads(1)
+    rows, bounds, begun = [], 0, time.perf_counter()
     print(f"{'case':17} {'quantity':47} {'error':>9} {'bound':>9}  verdict")
-    try:
+    with one_torch_thread():
         for group, case in cases:
             started = time.perf_counter()
             readings = list(case.measure(device))
@@ -50,8 +50,6 @@ def run_cases(cases: Sequence[tuple[str, Case]], device: torch.device) -> list[d
             for place, reading in enumerate(readings):
                 numbers = f"{_number(reading.error)} {_number(reading.bound)}  {'ok' if reading.holds else 'FAILED'}"
                 print(f"{'' if place else case.name:17} {reading.quantity:47} {numbers}")
-    finally:
-        torch.set_num_threads(threads)
     failed = sum(not row["holds"] for row in rows)
     print(f"{len(rows)} cases, {bounds} bounds, {failed} failed, {time.perf_counter() - begun:.1f} s")
     return rows

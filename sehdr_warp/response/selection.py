@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from ..errors import SehdrError
+from ..splatting.threads import one_torch_thread
 from .analytic import analytic_response
 from .curve import Response
 from .names import DESCRIPTIONS
@@ -156,7 +157,8 @@ def select_response(
     if beside:
         fine, rises = (np.concatenate(pair) for pair in zip((fine, rises), family_logs(), strict=True))
     logs = fine[:, ::FINE]
-    parts = _edges(edges, fine, rises), _highlights(shares, fine), _span(shares, logs), _density(shares, logs)
+    with one_torch_thread():
+        parts = _edges(edges, fine, rises), _highlights(shares, fine), _span(shares, logs), _density(shares, logs)
     evidence = np.nan_to_num(parts[0]) * edge_facts(len(edges)) + np.sum(parts[1:], axis=0)
     priors = np.array([_prior(each, from_camera) for each in candidates])
     posteriors = evidence[:count] + priors

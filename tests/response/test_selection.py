@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.response import Response, response_by_name
@@ -45,6 +46,23 @@ def test_papers_score_orders_by_range_and_smoothness():
     clear = photo[((photo > 1.5 / 255) & (photo < 1 - 4.5 / 255)).all(2)]
     low, high = np.percentile(clear, (0.1, 99.9))
     assert linear.dynamic_range == pytest.approx(np.log2(high / low), rel=1e-3)
+
+
+def test_candidates_are_compared_on_one_thread_of_torch(monkeypatch):
+    """Between so many small operations further threads would spin."""
+    found, compare, before = set(), response_selection._mixture_surprise, torch.get_num_threads()
+
+    def noted(*given):
+        found.add(torch.get_num_threads())
+        return compare(*given)
+
+    monkeypatch.setattr(response_selection, "_mixture_surprise", noted)
+    torch.set_num_threads(2)
+    try:
+        select_response(photograph("srgb", mosaic()), named("srgb", "filmic"))
+        assert found == {1} and torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_thousands_of_edges_are_all_looked_at_and_count_as_few_facts_and_more_are_drawn_from():
