@@ -297,6 +297,7 @@ def _trust_tables(result: dict) -> Iterable[str]:
 TABLES: dict[str, Callable[[dict], Iterable[str]]] = {
     "quality": _quality_tables,
     "seeds": _seeds_tables,
+    "seeds-cpu": _seeds_tables,
     "readings": _readings_tables,
     "captures": _captures_tables,
     "bits": _bits_tables,
