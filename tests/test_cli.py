@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 
@@ -12,6 +13,7 @@ from sehdr_warp import __version__, cli
 from sehdr_warp.response import response_by_name, response_names
 from sehdr_warp.scene.hdr_files import read_hdr
 from sehdr_warp.scene.images import read_ldr
+from sehdr_warp.training.commands import response_around
 from sehdr_warp.training.config_files import config_fields, flag_of, load_config, preset_names
 
 from .refusals import call
@@ -308,6 +310,24 @@ def test_eval_writes_json_and_prints_a_table(run, tmp_path, capsys):
     capsys.readouterr()
     assert call("eval", run, "--json", "-", "--device", "cpu") == 0
     assert json.loads(capsys.readouterr().out)["ldr"] == result["ldr"]
+
+
+def test_score_parts_photos_into_the_regions_of_eval(run, tmp_path, capsys):
+    """They are reduced through the run's response: the pictures lie in the run, or a training would choose it."""
+
+    def shares(*words):
+        assert call(*words, "--json", "-") == 0
+        return {name: found["fraction"] for name, found in json.loads(capsys.readouterr().out)["regions"].items()}
+
+    inside, outside = shutil.copytree(run, tmp_path / "run") / "views", tmp_path / "views"
+    assert call("render", run, "--out", outside, "--device", "cpu") == 0
+    shutil.copytree(outside, inside)
+    capsys.readouterr()
+    wanted, options = shares("eval", run, "--device", "cpu"), ("--truth", "embedded", "--max-size", 48)
+    assert wanted == shares("score", inside / "hdr", *options) == shares("score", outside / "hdr", *options)
+    assert wanted != shares("score", inside / "hdr", *options, "--response", "srgb")
+    assert response_around(outside / "hdr") is None
+    assert getattr(response_around(inside / "hdr"), "name", None) == "hdr-nerf"
 
 
 def test_export_writes_files_that_render_and_convert(run, tmp_path, capsys):

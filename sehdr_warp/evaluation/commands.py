@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from ..training.commands import ensured_scene, open_run
+from ..training.commands import ensured_scene, open_run, response_around
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +73,9 @@ class Score(_Figures):
     """The set: a folder with HDR truth, or an embedded scene."""
     max_size: int | None = None
     """Longest side of the truth in pixels, as the pictures have it; larger truth is reduced."""
+    response: str | None = None
+    """The response by which photos are reduced: a name, a file or auto; by default that of the run that FOLDER lies in,
+    else auto."""
 
 
 def run_evaluate(asked: Evaluate) -> None:
@@ -87,11 +90,17 @@ def run_evaluate(asked: Evaluate) -> None:
 
 def run_score(asked: Score) -> None:
     from ..scene import load_scene
+    from ..scene.load import read_capture
     from .score import score_folder
 
     def figures():
-        # Of the set's photos it counts alone where they are clipped: no response need be chosen for them.
-        truth = load_scene(asked.truth, response="srgb", max_size=asked.max_size)
+        response = asked.response or response_around(asked.folder)
+        if response is None:
+            capture = read_capture(asked.truth)
+            bent = capture.alpha == "background" or not all(shot.lens.is_pinhole for shot in capture.shots)
+            # Photos that keep their codes are clipped and dark where they are by any response.
+            response = "auto" if bent or asked.max_size is not None else "srgb"
+        truth = load_scene(asked.truth, response=response, max_size=asked.max_size)
         return score_folder(asked.folder, truth, lpips_weights=asked.lpips)
 
     asked.tell(figures)

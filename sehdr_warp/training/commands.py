@@ -6,7 +6,7 @@ torch is imported when they run.
 import json
 import logging
 from collections.abc import Mapping
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -255,9 +255,26 @@ def read_scene(run, data: str | None):
         raise SehdrError(f"{run.path}: does not say where its photos are; give --data")
     if data is None and not is_embedded(place) and not Path(place).is_dir():
         raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
-    # A learned response was not known when the photos of the training were developed, and linear codes became others.
-    named = run.config.response.name
-    return _load({**run.data, "path": place}, response=named if named in ("learned", "linear") else run.response)
+    return _load({**run.data, "path": place}, response=_developing(run.config, run.response))
+
+
+def response_around(folder: Path):
+    """What load_scene takes as the response, to develop photos like the run in whose folder this one lies; None where
+    that is no run's."""
+    from ..response import Response
+    from .run_folder import RunFolder
+
+    for place in map(RunFolder, folder.resolve().parents):
+        if place.info.is_file() and place.checkpoints.is_dir():
+            with suppress(InputError):  # Another program's run.json.
+                return _developing(place.read_config(), Response.from_dict(place.read_info()["response"]))
+    return None
+
+
+def _developing(config, response):
+    """The response that a run's photos were developed by: a learned one was not known then, and linear codes became
+    others."""
+    return config.response.name if config.response.name in ("learned", "linear") else response
 
 
 def _data(asked: Train, resumed) -> dict:
