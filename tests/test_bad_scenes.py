@@ -40,6 +40,13 @@ def png_bomb(width: int, height: int) -> bytes:
 # ---------------------------------------------------------------------------------------------------- data folders
 
 
+@pytest.mark.parametrize("preset", ["truth", "hdr-gs-truth", "paper-truth"])
+def test_photos_without_truth_are_refused_before_a_response_is_chosen(data, capfd, monkeypatch, preset):
+    monkeypatch.setattr("sehdr_warp.scene.load.choose_response", lambda *_: pytest.fail("chose a response"))
+    line = train_refused(capfd, data, "--preset", preset)
+    assert "data: no training view has the HDR truth that loss.hdr_" in line and "a preset that needs none" in line
+
+
 def test_folders_without_a_scene(tmp_path, capfd):
     (tmp_path / "empty").mkdir()
     (tmp_path / "text").mkdir()

@@ -171,6 +171,8 @@ def _train(asked: Train, ranks=None) -> None:
     options = config.response
     photos = {"device": "memory"}.get(config.schedule.photos, config.schedule.photos)
     given = {"method": options.method, "candidates": options.candidates, "photos": photos}
+    if out is not None:
+        _check_truth(data, config)
     with nullcontext() if out is None or device.type != "cpu" else _kernels_ahead(config):
         scene = _load(data, response=options.name, **given)
         if out is None:
@@ -191,6 +193,22 @@ def _train(asked: Train, ranks=None) -> None:
     run = training.run
     summary = run.summary() | {"run": str(run.path), "metrics": run.metrics()}
     print(json.dumps(summary) if output.json else _ending(run.path, summary))
+
+
+def _check_truth(data: Mapping, config) -> None:
+    """Refuses photos without the HDR truth that the loss needs before a response is chosen for them."""
+    from ..scene.load import read_capture
+    from ..scene.names import unique_names
+    from .targets import check_truth
+
+    mended = config.plan.enabled and not config.loss.hdr_weight  # A plan leaves out what compares brackets with truth.
+    if not config.loss.uses_hdr or mended:
+        return
+    known = {name: data.get(name) for name in ("exposure_index", "holdout")}
+    capture = read_capture(data["path"], **known)
+    named = zip(unique_names(capture.shots), capture.shots, strict=True)
+    views = [(name, shot.hdr is not None) for name, shot in named if shot.split == "train"]
+    check_truth(capture.name, views, config.loss)
 
 
 def _kernels_ahead(config):

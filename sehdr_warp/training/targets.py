@@ -16,6 +16,8 @@ from ..splatting.clipped_residual import CodeScale, code_tensor
 from .config import LossConfig
 from .losses import Target, code_scale, one_of
 
+_TRUTH_REMEDY = "take a scene with HDR truth, or a preset that needs none"
+
 
 @dataclass(frozen=True)
 class TrainingView:
@@ -86,22 +88,33 @@ class ViewStack:
 def largest_truth(scene: Scene, loss: LossConfig) -> float:
     """The greatest radiance in the HDR truth of the training views, where it counts; 1.0 where the loss needs none.
     Raises InputError naming scene and field where truth that the loss needs is missing or black."""
+    check_truth(scene.name, [(view.name, view.hdr is not None) for view in scene.train_views], loss)
     if not loss.uses_hdr:
         return 1.0
-    field = f"loss.hdr_weight = {loss.hdr_weight}" if loss.hdr_weight > 0 else "loss.hdr_truth = true"
-    remedy = "take a scene with HDR truth, or a preset that needs none"
     given = [(view.hdr, view.mask) for view in scene.train_views if view.hdr is not None]
-    lacking = [view.name for view in scene.train_views if view.hdr is None]
-    if not given:
-        raise InputError(scene.name, f"no training view has the HDR truth that {field} needs", remedy)
-    if loss.ldr_weight == 0 and lacking:
-        problem = f"view {lacking[0]} lacks the HDR truth that {field} needs where loss.ldr_weight = 0.0"
-        raise InputError(scene.name, problem, remedy)
     counted = (hdr if mask is None else hdr[mask > 0] for hdr, mask in given)
     largest = max((float(radiance.max()) for radiance in counted if radiance.size), default=0.0)
     if not largest > 0:
-        raise InputError(scene.name, f"the HDR truth that {field} needs is black in every training view", remedy)
+        problem = f"the HDR truth that {_truth_field(loss)} needs is black in every training view"
+        raise InputError(scene.name, problem, _TRUTH_REMEDY)
     return largest
+
+
+def check_truth(scene: str, views: Sequence[tuple[str, bool]], loss: LossConfig) -> None:
+    """Raises InputError naming scene and field where truth that the loss needs is missing. views: the training views'
+    names, and whether they have truth."""
+    if not loss.uses_hdr:
+        return
+    if not any(known for _, known in views):
+        problem = f"no training view has the HDR truth that {_truth_field(loss)} needs"
+        raise InputError(scene, problem, _TRUTH_REMEDY)
+    if loss.ldr_weight == 0 and (lacking := next((name for name, known in views if not known), None)):
+        problem = f"view {lacking} lacks the HDR truth that {_truth_field(loss)} needs where loss.ldr_weight = 0.0"
+        raise InputError(scene, problem, _TRUTH_REMEDY)
+
+
+def _truth_field(loss: LossConfig) -> str:
+    return f"loss.hdr_weight = {loss.hdr_weight}" if loss.hdr_weight > 0 else "loss.hdr_truth = true"
 
 
 def training_views(

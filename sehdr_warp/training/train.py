@@ -32,6 +32,7 @@ from .plan import apply_plan
 from .ranks import END, GO, WAIT, Ranks
 from .run import Run, field_from_checkpoint, load_run, photo_gains
 from .run_folder import RunFolder
+from .targets import check_truth
 from .trainer import Trainer
 
 log = logging.getLogger(__name__)
@@ -314,6 +315,7 @@ class Training:
 
     def _begin(self, scene: Scene, config: Config, data: dict, overwrite: bool) -> Trainer:
         config, plan = apply_plan(scene, config, self.device)
+        check_truth(scene.name, [(view.name, view.hdr is not None) for view in scene.train_views], config.loss)
         response = choose_response(scene, config)
         matcher, gains = cache(partial(make_matcher, scene, response, self.device)), None
         if plan is not None and evens(scene, config, response):
