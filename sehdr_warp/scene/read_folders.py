@@ -17,6 +17,7 @@ from .linear_photos import color_matrix, one_kind
 from .names import list_images, mask_of, natural_key, sibling, view_and_exposure
 from .photos import photo_sizes
 from .sfm import reconstruct
+from .stack import refuse_stack
 
 # From the full size to reduced copies.
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
@@ -194,6 +195,7 @@ def read_photos(folder: Path, cache: Path | str | None = None) -> Capture:
         photo_sizes(photo)
     if kind == "raw":
         color_matrix(photos)  # Photos of several cameras are refused before minutes of matching.
+    refuse_stack(photos, folder)
     model, shots, lost = reconstruct(photos, cache), [], []
     placed = {int(Path(image.name).stem): image for image in model.images}
     for i, photo in enumerate(photos):

@@ -2,16 +2,18 @@
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import pairwise, starmap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from PIL import Image
 
 from ..errors import InputError
 from .capture import Shot
-from .exposure import with_exposure_times
-from .images import LDR_SUFFIXES, read_ldr
+from .exposure import shutter, with_exposure_times
+from .images import LDR_SUFFIXES, PILLOW_ERRORS, open_image, read_ldr
 from .lens import Lens
 from .names import list_images
 
@@ -24,6 +26,9 @@ log = logging.getLogger(__name__)
 
 # Stops, RMS, from which channels clearly differ from the shared curve; and by which a photo may be off its time.
 CHANNELS_DIFFER, WRONG_TIME = 0.15, 0.25
+# By what photos are plainly a stack: a factor between times, and the ranks' correlation, in thumbnails of this side, of
+# the part of the pixels that both show. Real stacks correlate by 0.98 and more, photos from different places by 0.9.
+LEAST_STEP, LEAST_ALIKE, THUMBNAIL, LEAST_SHOWN, MOST_OF_STACK = 1.4, 0.96, 64, 0.05, 32
 
 
 def read_stack(folder: Path, times: Sequence[float] | None = None) -> tuple[list[Path], Sequence[float]]:
@@ -46,6 +51,47 @@ def read_stack(folder: Path, times: Sequence[float] | None = None) -> tuple[list
     if len(times) != len(files):
         raise InputError(folder, f"has {len(files)} photos, and {len(times)} times are given", "give one for each")
     return files, times
+
+
+def refuse_stack(photos: Sequence[Path], folder: Path) -> None:
+    """Raises InputError for photos that are plainly an exposure stack: each time differs from the others by a factor,
+    and what one photo shows the next shows at the same places, by ranks of gray in thumbnails."""
+    if len(photos) > MOST_OF_STACK or any(photo.suffix.lower() not in LDR_SUFFIXES for photo in photos):
+        return
+    no_lens = Lens("PINHOLE", 1, 1, (1.0, 1.0, 0.5, 0.5), folder)
+    try:
+        shots, known, _ = with_exposure_times([Shot(file.stem, file, no_lens, np.eye(4)) for file in photos], folder)
+        shots = sorted(shots, key=lambda shot: shot.seconds)
+        steps = [b.seconds / a.seconds for a, b in pairwise(shots)]
+        if not known or min(steps) < LEAST_STEP or not all(starmap(_alike, pairwise(_thumbnails(shots)))):
+            return
+    except (InputError, *PILLOW_ERRORS):
+        return  # Who reads these photos says what is wrong with them.
+    span = f"{shutter(shots[0].seconds)} to {shutter(shots[-1].seconds)}"
+    problem = f"its {len(photos)} photos are an exposure stack from one place ({span}), which does not show depth"
+    command = f"`sehdr-warp calibrate {photos[0].parent}`"
+    remedy = f"take photos from different places; {command} finds the camera's response in the stack"
+    raise InputError(folder, problem, remedy)
+
+
+def _thumbnails(shots: Sequence[Shot]) -> Iterator[np.ndarray]:
+    for shot in shots:
+        with open_image(shot.image) as image:
+            small = image.convert("L")
+            small.thumbnail((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
+            yield np.asarray(small)
+
+
+def _alike(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether thumbnails rank the places alike that neither shows black or white."""
+    if one.shape != other.shape:
+        return False
+    shown = (np.minimum(one, other) > 8) & (np.maximum(one, other) < 247)
+    if shown.mean() < LEAST_SHOWN:
+        return False
+    from scipy.stats import rankdata
+
+    return bool(np.corrcoef(rankdata(one[shown]), rankdata(other[shown]))[0, 1] >= LEAST_ALIKE)
 
 
 def calibrate(
