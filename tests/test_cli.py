@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -163,7 +164,8 @@ def test_existing_run_is_refused_and_resume_continues(run, capsys):
 def test_a_training_ends_by_saying_what_to_type_next(run, capsys):
     assert call("train", "--resume", "--out", run, "--device", "cpu") == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith(f"{run}: 30 iterations, ") and "held-out PSNR" in lines[0]
+    assert lines[0].startswith(f"{run}: 30 iterations, ")
+    assert re.search(r", held-out photos [\d.]+ dB, HDR [\d.]+ dB \(mu-law\), [\d.]+ s on cpu", lines[0])
     assert len(lines) == 4 and all(
         f"sehdr-warp {word} {run}" in "".join(lines) for word in ("view", "render", "report", "export")
     )

@@ -353,8 +353,10 @@ def _cost(config) -> str:
 
 def _ending(path: Path, summary: dict) -> str:
     """What was made, and what to type next."""
-    scores = [(line["psnr_ldr"], line["iteration"]) for line in summary["metrics"] if "psnr_ldr" in line]
-    heldout = f", held-out PSNR {scores[-1][0]:.2f} dB" if scores else ""
+    from .held_out import figures_told
+
+    told = [figures for line in summary["metrics"] if (figures := figures_told(line))]
+    heldout = f", {told[-1]}" if told else ""
     made = f"{summary['iteration']} iterations, {summary['gaussians']} Gaussians{heldout}"
     return f"""{path}: {made}, {summary["train_seconds"]:.1f} s on {summary["device"]}
 look at it:         sehdr-warp view {path}

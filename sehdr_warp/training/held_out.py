@@ -1,7 +1,7 @@
 """What held-out photos say of a field while it trains."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 
@@ -32,6 +32,12 @@ def evaluate_views(field: RadianceField, views: tuple[View, ...], degree: int) -
             images = normalise("gt-max", hdr, torch.tensor(view.hdr, device=device), mask)
             scores.setdefault("psnr_mu", []).append(min(psnr(*tone_map("gt-max", *images), mask), BEST))
     return {name: sum(values) / len(values) for name, values in scores.items()}
+
+
+def figures_told(scores: Mapping[str, float]) -> str:
+    """What evaluate_views() found, in words; empty without its figures."""
+    told = {"psnr_ldr": "held-out photos {:.1f} dB", "psnr_mu": "HDR {:.1f} dB (mu-law)"}
+    return ", ".join(text.format(scores[name]) for name, text in told.items() if name in scores)
 
 
 def warn_of_fall(metrics: Sequence[dict]) -> None:

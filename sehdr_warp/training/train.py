@@ -24,7 +24,7 @@ from .checkpoint import first_not_finite
 from .config import Config
 from .config_files import as_config, config_fields, override_config
 from .following import hand_on, told_of_ranks
-from .held_out import evaluate_views, warn_of_fall
+from .held_out import evaluate_views, figures_told, warn_of_fall
 from .initialization import choose_response, make_field, make_matcher, sizes_of
 from .machine import interruptible, machine_figures, pick_device, summary_writer, torch_settings
 from .photo_gains import evens, find_gains
@@ -290,8 +290,7 @@ class Training:
         line |= {name: round(value, 4) for name, value in scores.items()}
         self.folder.append_metrics(line | {"gaussians": self.trainer.field.gaussians.count})
         self._log("test", scores)
-        figures = ", ".join(f"{name} {value:.2f} dB" for name, value in scores.items())
-        log.info("iteration %d: held-out %s after %.1f s", self.iteration, figures, self.seconds)
+        log.info("iteration %d: %s, after %.1f s", self.iteration, figures_told(scores), self.seconds)
 
     def _checkpoint(self) -> None:
         """Saves the state, unless the training has diverged: the last good checkpoint then stays the newest."""

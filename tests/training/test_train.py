@@ -267,6 +267,13 @@ def test_tensorboard_gets_the_figures_of_the_held_out_views(scene, tmp_path, mon
     assert written.step == last["iteration"] == 4 and abs(written.value - last["psnr_ldr"]) < 1e-3
 
 
+def test_held_out_figures_are_told_in_words(scene, tmp_path, logged):
+    short = quick(**{"schedule.iterations": 4})
+    last = train(scene, tmp_path / "run", short, device="cpu").metrics()[-1]
+    figures = f"held-out photos {last['psnr_ldr']:.1f} dB, HDR {last['psnr_mu']:.1f} dB (mu-law)"
+    assert any(line.startswith(f"iteration 4: {figures}, after ") for line in logged)
+
+
 def test_a_training_is_driven_step_by_step_and_left_at_any_time(scene, tmp_path):
     training = Training(scene, tmp_path / "run", quick(), device="cpu")
     seen = []
