@@ -16,6 +16,7 @@ from .errors import SehdrError
 _SOON = 3.0  # Seconds within which another Ctrl-C says nothing new
 _LIBRARIES = 400_000  # About as many objects as torch's and Warp's modules are
 _interrupted = -_SOON
+_collects_late = False
 
 
 class _Stream:
@@ -72,8 +73,11 @@ def prepare() -> None:
 
 def collect_late() -> None:
     """Garbage is looked for only once libraries are loaded, and not in them: they leave next to none, and to look makes
-    a quarter of the time that they take."""
-    usual = gc.get_threshold()
+    a quarter of the time that they take. For programs of our own, once in a process: another's garbage is its own."""
+    global _collects_late
+    if _collects_late:
+        return
+    _collects_late, usual = True, gc.get_threshold()
 
     def begin(*_) -> None:
         gc.callbacks.remove(begin)

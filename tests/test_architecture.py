@@ -29,7 +29,7 @@ ALLOWED = {
     "response": ANY | {"splatting"},
     "scene": ANY | {"response", "splats"},
     "field": ANY | {"scene", "response", "splatting", "splats"},
-    "output": ANY | {"scene", "response", "splats", "field.exposure", "field.baking"},
+    "output": ANY | {"scene", "response", "splats", "field.exposure", "field.baking", "field.sensor_colors"},
     "viewer": ANY | {"scene", "output"},
     "evaluation": ANY | {"scene", "splatting.ssim", "field.baking", "output.names", "output.charts", "output.panorama"},
     "training": ANY

@@ -16,6 +16,7 @@ from PIL import Image
 from sehdr_warp import __version__
 from sehdr_warp.scene import View
 
+from ..field.sensor_colors import rec709_of
 from .images import as_array, quantize
 from .tonemap import encode_srgb
 
@@ -40,7 +41,9 @@ def curve_table(response: Any) -> str:
 def photo_light(run: Any, view: View) -> np.ndarray:
     """[H, W, 3] linear Rec.709 radiance that a photo alone tells: the run's response undone."""
     light = np.asarray(run.response.decode(view.image), np.float32) / view.exposure_time
-    return light if run.color_matrix is None else as_array(run.in_rec709(torch.from_numpy(light)))
+    if run.color_matrix is None:
+        return light
+    return as_array(rec709_of(torch.from_numpy(light), run.color_matrix, run.base_time))
 
 
 def shown_photo(run: Any, view: View) -> np.ndarray:

@@ -17,6 +17,7 @@ from .config_files import field_and_problem
 FORMAT = 2  # Version of what a run holds; a reader refuses others
 TENSORS, VALUES = "state.safetensors", "checkpoint.json"
 REMEDY = "the run is damaged: train again"
+OTHER_VERSION = "train again, or use the version that wrote it"
 _OLDER = "remove this folder to use an older checkpoint, or train again"
 
 
@@ -108,7 +109,11 @@ def read_values(path: Path, kind: type[BaseModel], remedy: str = REMEDY) -> dict
     values = read_run_json(path, remedy)
     if (found := values.get("format")) != FORMAT:
         problem = f"format = {found!r:.60} is not {FORMAT}, which this version reads"
-        raise InputError(path, problem, "train again, or use the version that wrote it")
+        raise InputError(path, problem, OTHER_VERSION)
+    gains = values.get("photo_gains")
+    if isinstance(gains, dict) and isinstance(gains.get("falloff"), list):
+        problem = f"photo_gains.falloff = {gains['falloff']!r:.60} is of all photos, and this version reads one of each"
+        raise InputError(path, problem, OTHER_VERSION)
     try:
         kind.model_validate(values)
     except ValidationError as error:

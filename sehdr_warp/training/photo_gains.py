@@ -65,7 +65,7 @@ def find_gains(
         few = points_of(matcher, FEW_POINTS)
         rough = rough_gains(views, *few, response)
         falls = rough.corners >= LEAST_CORNERS and left_of_falloff(views, *few, response, rough) < 1
-        if rough.stops < LEAST_BESIDE and rough.tint < LEAST_TINT and not falls:
+        if not falls and not _drifts(rough, views):
             return none(matcher)
     found, guess = points_of(matcher), start_gains(views, response)
     if not stated and len(found[0]) < ENOUGH * POINTS and guess.stops > LEAST_STOPS:
@@ -87,13 +87,18 @@ def _believed(
     before, after = (disagreement(views, *found, response, taken) for taken in (None, gains.parts(falloff=False)))
     told = before >= LEAST_DISAGREEMENT and after <= LEFT * before
     exposure = tint = not stated and gains.stops >= LEAST_STOPS and told
-    if not exposure:
+    if not exposure and (gains.tint >= LEAST_TINT or (stated and _drifts(gains, views))):
         drift, colors = _left_of_others(views, found, response)
         exposure = stated and gains.stops_beside(views) >= LEAST_BESIDE and drift <= LEFT_OF_OTHERS
         tint = (exposure or gains.tint >= LEAST_TINT) and colors <= LEFT_OF_TINT
     falloff = gains.corners >= LEAST_CORNERS
     falloff = falloff and left_of_falloff(views, *found, response, gains) <= LEFT_OF_FALLOFF
     return {"exposure": exposure, "tint": tint, "falloff": falloff}
+
+
+def _drifts(gains: PhotoGains, views: Sequence[View]) -> bool:
+    """Whether gains are large enough to be asked about, beside what follows the stated times."""
+    return gains.stops_beside(views) >= LEAST_BESIDE or gains.tint >= LEAST_TINT
 
 
 def _left_of_others(

@@ -55,8 +55,7 @@ class _Rendered:
 
     def render(self, camera: Camera) -> RenderedView:
         """HDR radiance [H, W, 3], alpha [H, W] and depth [H, W] from a camera."""
-        rendered = self.model.render(camera, degree=self.degree)
-        return replace(rendered, hdr=self.in_rec709(rendered.hdr))
+        return as_rec709(self.model.render(camera, degree=self.degree), self.color_matrix, self.base_time)
 
     def render_directions(
         self, position: np.ndarray, directions: np.ndarray, *, focal_length: float, pixel_angle: float
@@ -212,6 +211,11 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
     model = field_from_checkpoint(checkpoint, config, info)
     model.confidence = folder.read_confidence(checkpoint)
     return Run(folder, config, model.to(device).requires_grad_(False), info, checkpoint.values)
+
+
+def as_rec709(rendered: RenderedView, matrix: np.ndarray | None, base_time: float) -> RenderedView:
+    """A view of a field in linear Rec.709. matrix: Scene.color_matrix, None where the field's colors are these."""
+    return rendered if matrix is None else replace(rendered, hdr=rec709_of(rendered.hdr, matrix, base_time))
 
 
 def photo_gains(info: dict) -> PhotoGains | None:

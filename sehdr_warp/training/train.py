@@ -30,7 +30,7 @@ from .machine import interruptible, machine_figures, pick_device, summary_writer
 from .photo_gains import evens, find_gains
 from .plan import apply_plan
 from .ranks import END, GO, WAIT, Ranks
-from .run import Run, field_from_checkpoint, load_run, photo_gains
+from .run import Run, as_rec709, field_from_checkpoint, load_run, photo_gains
 from .run_folder import RunFolder
 from .targets import check_truth
 from .trainer import Trainer
@@ -159,8 +159,8 @@ class Training:
         return self._stopped or self._interrupted.is_set()
 
     def render(self, camera: Camera) -> RenderedView:
-        """What the scene shows now from a camera, between steps; its time is not the training's."""
-        return self.trainer.render(camera)
+        """What the scene shows now from a camera, in Rec.709, between steps; its time is not the training's."""
+        return as_rec709(self.trainer.render(camera), self.scene.color_matrix, self.trainer.field.base_time)
 
     def stop(self) -> None:
         """Ends the training after the step that is being made."""

@@ -48,6 +48,7 @@ class LiveTraining(Rendering):
         field = self.run.trainer.field
         known = {"response": field.response, "base_time": field.base_time, "gaussian_count": field.gaussians.count}
         known |= {"scene_name": self.run.scene.name, "iterations": self.run.iteration, "cameras": self.run.scene.views}
+        known |= {"color_matrix": self.run.scene.color_matrix}
         if name not in known:
             raise AttributeError(name)
         return known[name]

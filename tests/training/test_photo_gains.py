@@ -7,6 +7,7 @@ import pytest
 
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import codes_of
+from sehdr_warp.training import photo_gains as gains_of_a_training
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.photo_gains import evens, find_gains
 from sehdr_warp.training.run import load_run
@@ -76,6 +77,19 @@ def test_times_that_a_camera_rounds_are_put_right(device):
     assert "over the times they state" in decision.choice and "white balance" not in decision.reason
     found = np.log2([gains.gains[view.name] for view in views])
     np.testing.assert_allclose(found, (off - off.mean())[:, None].repeat(3, 1), atol=0.03)
+
+
+def test_no_gains_are_fitted_where_a_rough_look_finds_none(device, monkeypatch):
+    """A wrong curve makes gains that follow the stated times, which the look leaves out."""
+    monkeypatch.setattr(gains_of_a_training, "fit_gains", lambda *_: pytest.fail("fitted"))
+    right = wall_and_lamp(TIMES)
+    for scene, curve in ((wall_and_lamp(), LINEAR), (right, LINEAR), (right, response_by_name("gamma"))):
+        assert find_gains(scene, CONFIG, curve, device)[0] is None
+
+
+def test_halves_are_compared_only_where_drift_is_large_enough(device, monkeypatch):
+    monkeypatch.setattr(gains_of_a_training, "_left_of_others", lambda *_: pytest.fail("compared"))
+    assert find_gains(replace(wall_and_lamp(), exposure_times_known=False), CONFIG, LINEAR, device)[0] is None
 
 
 def test_a_lamp_that_moves_is_no_drift(device):

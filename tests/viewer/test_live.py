@@ -1,15 +1,20 @@
 """`train --view`: the result is that without a viewer, and pictures take their share."""
 
 import http.client
+import io
 import json
 import re
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from sehdr_warp.errors import SehdrError
+from sehdr_warp.output.images import quantize
+from sehdr_warp.output.light_pictures import shown_photo
 from sehdr_warp.training.train import Training, train
 from sehdr_warp.viewer.live import SHARE, LiveTraining, viewed
 
@@ -67,6 +72,23 @@ def ask_fails(address):
     except OSError:
         return True
     return False
+
+
+def test_a_sensors_colors_are_shown_in_rec709_as_the_run_shows_them(tmp_path, logged):
+    matrix = np.array([[1.6, -0.5, -0.1], [-0.2, 1.5, -0.3], [0.0, -0.6, 1.6]])
+    scene = replace(toy_scene(), color_matrix=matrix, light_known=True)
+    training = Training(scene, tmp_path / "raw", CONFIG | {"schedule.iterations": 3}, device="cpu")
+    with viewed(training, "raw") as steps:
+        address = re.search(r"http://([^/]*)/", logged[-1])[1]
+        for _ in steps:
+            pass
+        status, photo = ask(address, "/photo/0/1")
+    camera, run = scene.views[1].camera, training.run
+    shown = training.render(camera).hdr.detach()
+    np.testing.assert_allclose(shown, run.render(camera).hdr, atol=1e-5)
+    assert (shown - run.model.render(camera, degree=run.degree).hdr).abs().max() > 0.1
+    assert status == 200
+    np.testing.assert_array_equal(Image.open(io.BytesIO(photo)), quantize(shown_photo(run, scene.views[1])))
 
 
 class Steps:
