@@ -51,9 +51,11 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
     distance: for a weighted sum of |a - b| and 1 - SSIM in place of the SSIM; the weights are read with it alone.
     """
     real, run = dtype, wp.types.vector(length=lanes, dtype=dtype)
-    radius = wp.constant(RADIUS)
+    taps, radius = wp.constant(2 * RADIUS + 1), wp.constant(RADIUS)
     c1, c2 = wp.constant(real(C1)), wp.constant(real(C2))
     options = FORWARD
+    # The CPU's compiler takes many times as long where the loop over the window is written out, which a GPU gains by.
+    compare_options = FORWARD if lanes == 1 else FORWARD | {"max_unroll": 8}
     strip_options = FORWARD | {"max_unroll": 32}
     column, windowed = vector(STRIP + 2 * RADIUS, dtype), vector(STRIP, dtype)
     window_type = vector(2 * RADIUS + 1, dtype)
@@ -147,7 +149,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
                 moments[2, top + row, i + margin] = run(s2[row])
                 moments[3, top + row, i + margin] = run(d2[row])
 
-    @wp.kernel(module="unique", module_options=options)
+    @wp.kernel(module="unique", module_options=compare_options)
     def compare(
         first: int,
         moments: wp.array3d(dtype=run), weights: wp.array(dtype=real),
@@ -161,7 +163,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
         md = run(real(0.0))
         ss = run(real(0.0))
         dd = run(real(0.0))
-        for k in range(weights.shape[0]):
+        for k in range(taps):
             weight = weights[k]
             ms += moments[0, y, i + k * channels] * weight
             md += moments[1, y, i + k * channels] * weight
@@ -273,7 +275,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
         sd = run(real(0.0))
         ss = run(real(0.0))
         dd = run(real(0.0))
-        for k in range(weights.shape[0]):
+        for k in range(weights.shape[0]):  # Not a constant, for the same reason: one lane has gradient_in_strips.
             weight = weights[k]
             sd += blurred[0, y, i + k * channels] * weight
             ss += blurred[1, y, i + k * channels] * weight
