@@ -1,16 +1,18 @@
-"""N-channel front-to-back blend for CUDA: one warp of 32 lanes owns 8 x 4 pixels of a tile.
+"""N-channel front-to-back blend for CUDA: one warp of 32 lanes owns a corner of a tile, 8 x 4 pixels.
 
 The maths is blend_cpu's; what differs is who does what. The adjoint is in blend_cuda_adjoint.py.
 
-Both directions walk the tile's list 32 entries at a time, a lane for each of 8 x 4 pixels. Each lane tests one entry's
-ellipse exactly against the warp's rectangle of pixels, and the survivors are packed into a queue in shared memory, a
-ring; whenever 32 have gathered they are blended. Most entries of a 16 x 16 tile miss an 8 x 4 corner of it, so most of
-the work is never done. The features of the 32 survivors are fetched together, as rows of four.
+Most entries of a 16 x 16 tile miss an 8 x 4 corner of it. `mark_corners` tests every entry's ellipse exactly against
+the corners of its tile, and leaves a bit for each. A warp walks its tile's list 32 entries at a time, ROUNDS of them
+together, and packs those that touch its corner into a queue in shared memory, a ring; they are blended in batches of
+32. In a batch a lane fetches one Gaussian's records and features, and then each lane draws all of them on its pixel.
 
-A warp that waits for a result that it has just asked for does nothing else, and a small picture has few warps. So the
-alphas of TOGETHER Gaussians, which depend on nothing, are worked out before the first is drawn, without a branch.
+Lists differ in length by a hundred times, and the longest decide how long a picture takes: a warp that waits for what
+it has just asked for does nothing else. So the next rounds, and the next batch, are on their way while a batch is
+blended, and the alphas of TOGETHER Gaussians, which depend on nothing, are worked out before the first is drawn,
+without a branch. What they leave of a pixel's light only falls: whether it is still enough is asked behind all of them.
 
-The queue is read by all lanes before it is overwritten; a vote or a scatter with its barrier always stands between.
+All lanes read a batch before it is overwritten; a vote or a scatter with its barrier always stands between.
 These kernels also run on the CPU where wp.config.enable_cpu_blocks is set: slow, but the same logic, for tests.
 """
 
@@ -23,7 +25,9 @@ from .geometry import geometry, vector
 
 BLOCK_DIM = 32
 BLOCKS_PER_TILE = (TILE_SIZE // 8) * (TILE_SIZE // 4)
-TOGETHER = 4  # Gaussians whose alphas are worked out before the first of them is drawn; divides 32
+TOGETHER = 8  # Gaussians whose alphas are worked out before the first of them is drawn; divides 32
+ROUNDS = 4  # Of 32 entries, that are looked at together
+QUEUE = 64 * ROUNDS  # Room for those of ROUNDS and for 31 that were left: a power of 2
 
 
 def padded_channels(channels: int) -> int:
@@ -87,17 +91,64 @@ def block_functions(dtype, cuda: bool) -> tuple:
 
 
 @cache
+def corners_kernel(dtype):
+    """mark_corners over entries, for one scalar type: ranges, entries, shapes, ellipses as blend_forward takes them;
+    corners: [M], bit k is set where the entry's ellipse touches corner k of its tile. For an entry of no tile nothing
+    is written."""
+    g = geometry(dtype)
+    real, vec4 = g.real, g.vec4
+    blocks_across = TILE_SIZE // 8
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def mark_corners(
+        ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), shapes: wp.array(dtype=vec4),
+        ellipses: wp.array(dtype=vec4), columns: int,
+        corners: wp.array(dtype=wp.uint8),
+    ):
+        entry = wp.tid()
+        tiles = ranges.shape[0]
+        tile = int(0)
+        high = int(tiles)
+        while tile < high:
+            middle = (tile + high) // 2
+            if ranges[middle][1] <= entry:
+                tile = middle + 1
+            else:
+                high = middle
+        if tile < tiles:
+            gaussian = entries[entry]
+            s = shapes[gaussian]
+            e = ellipses[gaussian]
+            tile_row = tile // columns
+            left = real((tile - tile_row * columns) * wp.static(TILE_SIZE)) + real(0.5)
+            top = real(tile_row * wp.static(TILE_SIZE)) + real(0.5)
+            touched = int(0)
+            for corner in range(wp.static(BLOCKS_PER_TILE)):
+                if g.ellipse_meets_rectangle(
+                    s[0], s[1], e[0], e[1], e[2], e[3],
+                    left + real((corner % wp.static(blocks_across)) * 8),
+                    top + real((corner // wp.static(blocks_across)) * 4), real(7.0), real(3.0),
+                ):
+                    touched = touched | (1 << corner)
+            corners[entry] = wp.uint8(touched)
+
+    return mark_corners
+
+
+@cache
 def forward_kernel(dtype, channels: int, cuda: bool = False):
     """blend_forward over tiles x BLOCKS_PER_TILE x 32 threads. cuda: not to run on the CPU's fibers.
 
-    ranges: [tiles] first and one past the last entry; entries: [M] Gaussians; shapes: [N] (x, y, opacity, -);
-    ellipses: [N] (conic a, b, c, level); features: [N padded_channels / 4] rows of four, flat
+    ranges: [tiles] first and one past the last entry; entries: [M] Gaussians; corners: [M] mark_corners()'s;
+    shapes: [N] (x, y, opacity, -); ellipses: [N] (conic a, b, c, level);
+    features: [N padded_channels / 4] rows of four, flat
     image: [H W] vectors of C; transmittance: [H W]; last: [H W] 1 + list place of the last Gaussian drawn
     """
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4
     quads = padded_channels(channels) // 4
     vec_padded, vec_image, vec_many = vector(4 * quads, dtype), vector(channels, dtype), vector(TOGETHER, dtype)
+    vec_rounds = vector(ROUNDS, wp.int32)
     blocks_across = TILE_SIZE // 8
     votes, row = block_functions(dtype, cuda)
 
@@ -106,8 +157,8 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
         module_options=module_options(dtype),
     )
     def blend_forward(
-        ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), shapes: wp.array(dtype=vec4),
-        ellipses: wp.array(dtype=vec4), features: wp.array(dtype=vec4),
+        ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), corners: wp.array(dtype=wp.uint8),
+        shapes: wp.array(dtype=vec4), ellipses: wp.array(dtype=vec4), features: wp.array(dtype=vec4),
         columns: int, width: int, height: int, alpha_threshold: real,
         image: wp.array(dtype=vec_image), transmittance: wp.array(dtype=real), last: wp.array(dtype=wp.int32),
     ):
@@ -124,13 +175,10 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
         inside = px < width and py < height
         x = real(px) + real(0.5)
         y = real(py) + real(0.5)
-        corner_x = real(left) + real(0.5)
-        corner_y = real(top) + real(0.5)
 
         t = real(1.0)
-        # What an alpha must exceed: nothing does where nothing more is drawn.
         bar = wp.where(inside, alpha_threshold, real(wp.inf))
-        drawn = int(0)
+        drawn = real(0.0)
         sums = vec_padded()
 
         bounds = ranges[tile]
@@ -138,93 +186,96 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
         count = bounds[1] - begin
         final = wp.max(count - 1, 0)
         lanes_below = (wp.uint32(1) << wp.uint32(lane)) - wp.uint32(1)
-        queue_shape = wp.tile_empty(shape=64, dtype=vec4, storage="shared")
-        queue_ellipse = wp.tile_empty(shape=64, dtype=vec4, storage="shared")
-        queue_entry = wp.tile_empty(shape=64, dtype=wp.vec2i, storage="shared")
-        queue_features = wp.tile_empty(shape=wp.static(32 * quads), dtype=vec4, storage="shared")
+        queue = wp.tile_empty(shape=wp.static(QUEUE), dtype=wp.vec2i, storage="shared")
+        batch_shape = wp.tile_empty(shape=32, dtype=vec4, storage="shared")
+        batch_ellipse = wp.tile_empty(shape=32, dtype=vec4, storage="shared")
+        batch_features = wp.tile_empty(shape=wp.static(32 * quads), dtype=vec4, storage="shared")
         head = int(0)
         queued = int(0)
+        ready = int(0)
 
-        # Records are fetched one round ahead of their use.
-        gaussian = int(0)
-        upcoming = int(0)
-        shape = vec4()
-        ellipse = vec4()
+        gaussians = vec_rounds()
+        touched = vec_rounds()
         if count > 0:
-            gaussian = entries[begin + wp.min(lane, final)]
-            upcoming = entries[begin + wp.min(lane + 32, final)]
-            shape = row(shapes, gaussian)
-            ellipse = row(ellipses, gaussian)
-        rounds = (count + 31) // 32
+            for k in range(wp.static(ROUNDS)):
+                at = begin + wp.min(k * 32 + lane, final)
+                gaussians[k] = entries[at]
+                touched[k] = int(corners[at])
+        turns = (count + wp.static(32 * ROUNDS - 1)) // wp.static(32 * ROUNDS)
         turn = int(0)
         alive = int(1)
-        while turn < rounds and alive == 1:
-            place = turn * 32 + lane
-            hit = place < count and g.ellipse_meets_rectangle(
-                shape[0], shape[1], ellipse[0], ellipse[1], ellipse[2], ellipse[3],
-                corner_x, corner_y, real(7.0), real(3.0),
-            )
-            mask = votes(hit, lane)
-            slot = (head + queued + wp.bit_count(mask & lanes_below)) & 63
-            wp.tile_scatter_masked(queue_shape, slot, shape, hit)
-            wp.tile_scatter_masked(queue_ellipse, slot, ellipse, hit)
-            wp.tile_scatter_masked(queue_entry, slot, wp.vec2i(gaussian, place + 1), hit)
-            queued += wp.bit_count(mask)
-            turn += 1
-            gaussian = upcoming
-            shape = row(shapes, gaussian)
-            ellipse = row(ellipses, gaussian)
-            upcoming = entries[begin + wp.min(place + 64, final)]
-            rest = int(0)
-            if turn == rounds:
-                rest = 31
-            while queued + rest >= 32 and queued > 0:
-                ready = wp.min(queued, 32)
-                fetched = vec_padded()
+        while alive == 1:
+            while queued < 32 and turn < turns:
+                start = turn * wp.static(32 * ROUNDS) + lane
+                for k in range(wp.static(ROUNDS)):
+                    place = start + k * 32
+                    hit = place < count and ((touched[k] >> corner) & 1) == 1
+                    mask = votes(hit, lane)
+                    slot = (head + queued + wp.bit_count(mask & lanes_below)) & wp.static(QUEUE - 1)
+                    wp.tile_scatter_masked(queue, slot, wp.vec2i(gaussians[k], place + 1), hit)
+                    queued += wp.bit_count(mask)
+                turn += 1
+                for k in range(wp.static(ROUNDS)):
+                    at = begin + wp.min(start + wp.static(32 * ROUNDS) + k * 32, final)
+                    gaussians[k] = entries[at]
+                    touched[k] = int(corners[at])
+            coming = wp.min(queued, 32)
+            own = wp.tile_extract(queue, (head + lane) & wp.static(QUEUE - 1))
+            shape = vec4()
+            ellipse = vec4()
+            fetched = vec_padded()
+            if lane < coming:
+                shape = row(shapes, own[0])
+                ellipse = row(ellipses, own[0])
                 for e in range(wp.static(quads)):
-                    owner = (e * 32 + lane) // wp.static(quads)
-                    entry = wp.tile_extract(queue_entry, head + owner)
-                    if owner < ready:
-                        quad = row(features, entry[0] * wp.static(quads) + (e * 32 + lane) - owner * wp.static(quads))
+                    quad = row(features, own[0] * wp.static(quads) + e)
+                    for h in range(wp.static(4)):
+                        fetched[e * 4 + h] = quad[h]
+            head = (head + coming) & wp.static(QUEUE - 1)
+            queued = queued - coming
+            # The batch that was fetched before
+            for group in range((ready + wp.static(TOGETHER - 1)) // wp.static(TOGETHER)):
+                alphas = vec_many()
+                places = vec_many()
+                for k in range(wp.static(TOGETHER)):
+                    j = group * wp.static(TOGETHER) + k
+                    s = wp.tile_extract(batch_shape, j)
+                    q = wp.tile_extract(batch_ellipse, j)
+                    dx = s[0] - x
+                    dy = s[1] - y
+                    a = s[2] * wp.exp(wp.min(dx * (q[0] * dx + q[1] * dy) + q[2] * dy * dy, real(0.0)))
+                    a = wp.min(real(ALPHA_MAX), a)
+                    alphas[k] = wp.where(a > bar, a, real(0.0))
+                    places[k] = s[3]
+                following = real(t)
+                for k in range(wp.static(TOGETHER)):
+                    weight = alphas[k] * following
+                    following = following - weight
+                    on = following > real(TRANSMITTANCE_MIN)
+                    drawn = wp.where(on and alphas[k] > real(0.0), places[k], drawn)
+                    t = wp.where(on, following, t)
+                    alphas[k] = wp.where(on, weight, real(0.0))
+                bar = wp.where(following > real(TRANSMITTANCE_MIN), bar, real(wp.inf))
+                for k in range(wp.static(TOGETHER)):
+                    for e in range(wp.static(quads)):
+                        at = (group * wp.static(TOGETHER) + k) * wp.static(quads) + e
+                        quad = wp.tile_extract(batch_features, at)
                         for h in range(wp.static(4)):
-                            fetched[e * 4 + h] = quad[h]
-                for e in range(wp.static(quads)):
-                    wp.tile_scatter_masked(
-                        queue_features, e * 32 + lane,
-                        vec4(fetched[e * 4], fetched[e * 4 + 1], fetched[e * 4 + 2], fetched[e * 4 + 3]), True,
-                    )
-                for group in range((ready + wp.static(TOGETHER - 1)) // wp.static(TOGETHER)):
-                    alphas = vec_many()
-                    weights = vec_many()
-                    for k in range(wp.static(TOGETHER)):
-                        j = group * wp.static(TOGETHER) + k
-                        s = wp.tile_extract(queue_shape, head + j)
-                        q = wp.tile_extract(queue_ellipse, head + j)
-                        a = s[2] * wp.exp(g.splat_exponent(q[0], q[1], q[2], s[0] - x, s[1] - y))
-                        # Rows of the queue that hold nothing yet hold anything.
-                        alphas[k] = wp.where(j < ready, wp.min(real(ALPHA_MAX), a), real(0.0))
-                    for k in range(wp.static(TOGETHER)):
-                        entry = wp.tile_extract(queue_entry, head + group * wp.static(TOGETHER) + k)
-                        weight = alphas[k] * t
-                        following = t - weight
-                        draw = alphas[k] > bar
-                        if draw and following <= real(TRANSMITTANCE_MIN):
-                            bar = real(wp.inf)
-                            draw = False
-                        weights[k] = wp.where(draw, weight, real(0.0))
-                        t = wp.where(draw, following, t)
-                        drawn = wp.where(draw, entry[1], drawn)
-                    for k in range(wp.static(TOGETHER)):
-                        for e in range(wp.static(quads)):
-                            at = (group * wp.static(TOGETHER) + k) * wp.static(quads) + e
-                            quad = wp.tile_extract(queue_features, at)
-                            for h in range(wp.static(4)):
-                                sums[e * 4 + h] += quad[h] * weights[k]
-                head = (head + 32) & 63
-                queued = queued - ready
-                if votes(bar < real(1.0), lane) == wp.uint32(0):
-                    alive = 0
-                    queued = 0
+                            sums[e * 4 + h] += quad[h] * alphas[k]
+            # All have read the batch before it is overwritten.
+            if votes(bar < real(1.0), lane) == wp.uint32(0) or coming == 0:
+                alive = 0
+            ready = coming
+            wp.tile_scatter_masked(batch_shape, lane, vec4(shape[0], shape[1], shape[2], real(own[1])), True)
+            wp.tile_scatter_masked(
+                batch_ellipse, lane, vec4(real(-0.5) * ellipse[0], -ellipse[1], real(-0.5) * ellipse[2], real(0.0)),
+                True,
+            )
+            for e in range(wp.static(quads)):
+                wp.tile_scatter_masked(
+                    batch_features, lane * wp.static(quads) + e,
+                    vec4(fetched[e * 4], fetched[e * 4 + 1], fetched[e * 4 + 2], fetched[e * 4 + 3]), True,
+                )
 
         if inside:
             pixel = py * width + px
@@ -233,6 +284,6 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
                 colors[channel] = sums[channel]
             image[pixel] = colors
             transmittance[pixel] = t
-            last[pixel] = drawn
+            last[pixel] = int(drawn)
 
     return blend_forward

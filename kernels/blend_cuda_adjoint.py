@@ -10,7 +10,16 @@ from functools import cache
 
 import warp as wp
 
-from .blend_cuda import BLOCK_DIM, BLOCKS_PER_TILE, TOGETHER, block_functions, module_options, padded_channels
+from .blend_cuda import (
+    BLOCK_DIM,
+    BLOCKS_PER_TILE,
+    QUEUE,
+    ROUNDS,
+    TOGETHER,
+    block_functions,
+    module_options,
+    padded_channels,
+)
 from .constants import ALPHA_MAX, TILE_SIZE
 from .geometry import geometry, vector
 
@@ -56,6 +65,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
     quads = padded_channels(channels) // 4
     vec_padded, vec_image, vec_many = vector(4 * quads, dtype), vector(channels, dtype), vector(TOGETHER, dtype)
     vec_terms = vector(2 * TOGETHER, dtype)
+    vec_rounds = vector(ROUNDS, wp.int32)
     votes, row = block_functions(dtype, cuda)
     gradient_columns = channels + 6
     staging_columns = gradient_columns + 1 - gradient_columns % 2  # odd, so that lanes fall on different banks
@@ -69,8 +79,8 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
         module_options=module_options(dtype),
     )
     def blend_backward(
-        ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), shapes: wp.array(dtype=vec4),
-        ellipses: wp.array(dtype=vec4), features: wp.array(dtype=vec4),
+        ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), corners: wp.array(dtype=wp.uint8),
+        shapes: wp.array(dtype=vec4), ellipses: wp.array(dtype=vec4), features: wp.array(dtype=vec4),
         columns: int, width: int, height: int, alpha_threshold: real,
         transmittance: wp.array(dtype=real), last: wp.array(dtype=wp.int32),
         image_gradient: wp.array(dtype=vec_image), transmittance_gradient: wp.array(dtype=real),
@@ -99,11 +109,12 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
         corner_y = real(top) + real(0.5)
 
         begin = ranges[tile][0]
-        drawn = int(0)
+        own_drawn = int(0)
         if inside:
-            drawn = last[pixel]
-        most_drawn = wp.tile_max(wp.tile(drawn))
+            own_drawn = last[pixel]
+        most_drawn = wp.tile_max(wp.tile(own_drawn))
         count = most_drawn[0]
+        drawn = real(own_drawn)
         t = transmittance[pixel]
         pixel_gradient = image_gradient[pixel]
         behind = real(0.0)
@@ -115,60 +126,58 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
         block_incoming = wp.tile(incoming, preserve_type=True)
 
         lanes_below = (wp.uint32(1) << wp.uint32(lane)) - wp.uint32(1)
-        queue_shape = wp.tile_empty(shape=64, dtype=vec4, storage="shared")
-        queue_ellipse = wp.tile_empty(shape=64, dtype=vec4, storage="shared")
-        queue_entry = wp.tile_empty(shape=64, dtype=wp.vec2i, storage="shared")
-        queue_features = wp.tile_empty(shape=wp.static(32 * quads), dtype=vec4, storage="shared")
+        queue = wp.tile_empty(shape=wp.static(QUEUE), dtype=wp.vec2i, storage="shared")
+        batch_shape = wp.tile_empty(shape=32, dtype=vec4, storage="shared")
+        batch_ellipse = wp.tile_empty(shape=32, dtype=vec4, storage="shared")
+        batch_features = wp.tile_empty(shape=wp.static(32 * quads), dtype=vec4, storage="shared")
         # (weight, slope) of two Gaussians for each of the 32 pixels; 33 columns keep lanes on different banks
         pixel_terms = wp.tile_empty(shape=wp.static(16 * 33), dtype=vec4, storage="shared")
         head = int(0)
         queued = int(0)
+        ready = int(0)
+        ready_one = wp.vec2i(0, 0)
 
-        rounds = (count + 31) // 32
-        gaussian = int(0)
-        upcoming = int(0)
-        shape = vec4()
-        ellipse = vec4()
+        gaussians = vec_rounds()
+        touched = vec_rounds()
         if count > 0:
-            gaussian = entries[begin + wp.max(count - 1 - lane, 0)]
-            upcoming = entries[begin + wp.max(count - 33 - lane, 0)]
-            shape = row(shapes, gaussian)
-            ellipse = row(ellipses, gaussian)
-        for turn in range(rounds):
-            place = count - 1 - (turn * 32 + lane)
-            hit = place >= 0 and g.ellipse_meets_rectangle(
-                shape[0], shape[1], ellipse[0], ellipse[1], ellipse[2], ellipse[3],
-                corner_x, corner_y, real(7.0), real(3.0),
-            )
-            mask = votes(hit, lane)
-            slot = (head + queued + wp.bit_count(mask & lanes_below)) & 63
-            wp.tile_scatter_masked(queue_shape, slot, shape, hit)
-            wp.tile_scatter_masked(queue_ellipse, slot, ellipse, hit)
-            wp.tile_scatter_masked(queue_entry, slot, wp.vec2i(gaussian, place), hit)
-            queued += wp.bit_count(mask)
-            gaussian = upcoming
-            shape = row(shapes, gaussian)
-            ellipse = row(ellipses, gaussian)
-            upcoming = entries[begin + wp.max(place - 64, 0)]
-            rest = int(0)
-            if turn == rounds - 1:
-                rest = 31
-            while queued + rest >= 32 and queued > 0:
-                ready = wp.min(queued, 32)
-                fetched = vec_padded()
+            for k in range(wp.static(ROUNDS)):
+                at = begin + wp.max(count - 1 - (k * 32 + lane), 0)
+                gaussians[k] = entries[at]
+                touched[k] = int(corners[at])
+        turns = (count + wp.static(32 * ROUNDS - 1)) // wp.static(32 * ROUNDS)
+        turn = int(0)
+        alive = int(1)
+        while alive == 1:
+            while queued < 32 and turn < turns:
+                start = count - 1 - (turn * wp.static(32 * ROUNDS) + lane)
+                for k in range(wp.static(ROUNDS)):
+                    place = start - k * 32
+                    hit = place >= 0 and ((touched[k] >> corner) & 1) == 1
+                    mask = votes(hit, lane)
+                    slot = (head + queued + wp.bit_count(mask & lanes_below)) & wp.static(QUEUE - 1)
+                    wp.tile_scatter_masked(queue, slot, wp.vec2i(gaussians[k], place), hit)
+                    queued += wp.bit_count(mask)
+                turn += 1
+                for k in range(wp.static(ROUNDS)):
+                    at = begin + wp.max(start - wp.static(32 * ROUNDS) - k * 32, 0)
+                    gaussians[k] = entries[at]
+                    touched[k] = int(corners[at])
+            coming = wp.min(queued, 32)
+            own = wp.tile_extract(queue, (head + lane) & wp.static(QUEUE - 1))
+            shape = vec4()
+            ellipse = vec4()
+            fetched = vec_padded()
+            if lane < coming:
+                shape = row(shapes, own[0])
+                ellipse = row(ellipses, own[0])
                 for e in range(wp.static(quads)):
-                    owner = (e * 32 + lane) // wp.static(quads)
-                    entry = wp.tile_extract(queue_entry, head + owner)
-                    if owner < ready:
-                        quad = row(features, entry[0] * wp.static(quads) + (e * 32 + lane) - owner * wp.static(quads))
-                        for h in range(wp.static(4)):
-                            fetched[e * 4 + h] = quad[h]
-                for e in range(wp.static(quads)):
-                    wp.tile_scatter_masked(
-                        queue_features, e * 32 + lane,
-                        vec4(fetched[e * 4], fetched[e * 4 + 1], fetched[e * 4 + 2], fetched[e * 4 + 3]), True,
-                    )
+                    quad = row(features, own[0] * wp.static(quads) + e)
+                    for h in range(wp.static(4)):
+                        fetched[e * 4 + h] = quad[h]
+            head = (head + coming) & wp.static(QUEUE - 1)
+            queued = queued - coming
 
+            if ready > 0:
                 # A lane is a pixel: back to front, one that is not drawn with an alpha of 0.
                 for group in range((ready + wp.static(TOGETHER - 1)) // wp.static(TOGETHER)):
                     alphas = vec_many()
@@ -176,40 +185,41 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                     alongs = vec_many()
                     for k in range(wp.static(TOGETHER)):
                         j = group * wp.static(TOGETHER) + k
-                        s = wp.tile_extract(queue_shape, head + j)
-                        q = wp.tile_extract(queue_ellipse, head + j)
-                        entry = wp.tile_extract(queue_entry, head + j)
-                        unclamped = s[2] * wp.exp(g.splat_exponent(q[0], q[1], q[2], s[0] - x, s[1] - y))
+                        s = wp.tile_extract(batch_shape, j)
+                        q = wp.tile_extract(batch_ellipse, j)
+                        dx = s[0] - x
+                        dy = s[1] - y
+                        unclamped = s[2] * wp.exp(wp.min(dx * (q[0] * dx + q[1] * dy) + q[2] * dy * dy, real(0.0)))
                         a = wp.min(real(ALPHA_MAX), unclamped)
-                        # Rows of the queue that hold nothing yet hold anything.
-                        draw = j < ready and entry[1] < drawn and a > alpha_threshold
+                        draw = s[3] < drawn and a > alpha_threshold
                         alphas[k] = wp.where(draw, a, real(0.0))
                         gains[k] = wp.where(draw and unclamped < real(ALPHA_MAX), a, real(0.0))
                         along = real(0.0)
                         for e in range(wp.static(quads)):
-                            quad = wp.tile_extract(queue_features, j * wp.static(quads) + e)
+                            quad = wp.tile_extract(batch_features, j * wp.static(quads) + e)
                             for h in range(wp.static(4)):
                                 along += quad[h] * incoming[e * 4 + h]
                         alongs[k] = along
-                    own = vec_terms()
+                    own_terms = vec_terms()
                     for k in range(wp.static(TOGETHER)):
                         a = alphas[k]
                         inverse = real(1.0) / (real(1.0) - a)
                         # t * inverse would round each of many faint factors the same way.
                         t += t * (a * inverse)
                         weight = a * t
-                        own[2 * k] = weight
-                        own[2 * k + 1] = gains[k] * (t * alongs[k] - behind * inverse)
+                        own_terms[2 * k] = weight
+                        own_terms[2 * k + 1] = gains[k] * (t * alongs[k] - behind * inverse)
                         behind += weight * alongs[k]
                     for k in range(wp.static(TOGETHER // 2)):
                         wp.tile_scatter_masked(
                             pixel_terms, (group * wp.static(TOGETHER // 2) + k) * 33 + lane,
-                            vec4(own[4 * k], own[4 * k + 1], own[4 * k + 2], own[4 * k + 3]), True,
+                            vec4(own_terms[4 * k], own_terms[4 * k + 1], own_terms[4 * k + 2], own_terms[4 * k + 3]),
+                            True,
                         )
 
                 # A lane is a Gaussian: moments of the slope over the 32 pixels.
-                s = wp.tile_extract(queue_shape, head + lane)
-                q = wp.tile_extract(queue_ellipse, head + lane)
+                s = wp.tile_extract(batch_shape, lane)
+                q = wp.tile_extract(batch_ellipse, lane)
                 is_second = (lane & 1) == 1
                 base = (lane >> 1) * 33
                 feature_sum = vec_padded()
@@ -249,18 +259,18 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                 sums[wp.static(channels)] = real(-0.5) * sum_xx
                 sums[wp.static(channels + 1)] = -sum_xy
                 sums[wp.static(channels + 2)] = real(-0.5) * sum_yy
-                sums[wp.static(channels + 3)] = -(q[0] * sum_x + q[1] * sum_y)
-                sums[wp.static(channels + 4)] = -(q[1] * sum_x + q[2] * sum_y)
+                sums[wp.static(channels + 3)] = real(2.0) * q[0] * sum_x + q[1] * sum_y
+                sums[wp.static(channels + 4)] = q[1] * sum_x + real(2.0) * q[2] * sum_y
                 sums[wp.static(channels + 5)] = sum_0 / s[2]
                 if wp.static(by_rows):
-                    own_entry = wp.tile_extract(queue_entry, head + lane)
                     if lane < ready:
                         for e in range(wp.static(row_quads)):
                             add_row(
-                                gradients, own_entry[0] * wp.static(row_quads) + e,
+                                gradients, ready_one[0] * wp.static(row_quads) + e,
                                 sums[4 * e], sums[4 * e + 1], sums[4 * e + 2], sums[4 * e + 3],
                             )
                 else:
+                    owners = wp.tile(ready_one, preserve_type=True)
                     staging = wp.tile_empty(shape=(32, wp.static(staging_columns)), dtype=real, storage="shared")
                     for column in range(wp.static(gradient_columns)):
                         wp.tile_scatter_masked(staging, lane, column, sums[column], True)
@@ -268,7 +278,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                         flat = e * 32 + lane
                         owner = flat // wp.static(gradient_columns)
                         part = flat - owner * wp.static(gradient_columns)
-                        entry = wp.tile_extract(queue_entry, head + owner)
+                        entry = wp.tile_extract(owners, owner)
                         value = wp.tile_extract(staging, owner, part)
                         if owner < ready:
                             if wp.static(ordered):
@@ -277,7 +287,19 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                             else:
                                 wp.atomic_add(gradients, entry[0] * wp.static(gradient_columns) + part, value)
 
-                head = (head + 32) & 63
-                queued = queued - ready
+            if coming == 0:
+                alive = 0
+            ready = coming
+            ready_one = own
+            wp.tile_scatter_masked(batch_shape, lane, vec4(shape[0], shape[1], shape[2], real(own[1])), True)
+            wp.tile_scatter_masked(
+                batch_ellipse, lane, vec4(real(-0.5) * ellipse[0], -ellipse[1], real(-0.5) * ellipse[2], real(0.0)),
+                True,
+            )
+            for e in range(wp.static(quads)):
+                wp.tile_scatter_masked(
+                    batch_features, lane * wp.static(quads) + e,
+                    vec4(fetched[e * 4], fetched[e * 4 + 1], fetched[e * 4 + 2], fetched[e * 4 + 3]), True,
+                )
 
     return blend_backward

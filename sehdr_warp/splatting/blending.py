@@ -162,8 +162,12 @@ def blend_on_cuda(
             return torch.nn.functional.pad(features, (0, padding))
         return features.clone() if features.data_ptr() % 16 else features  # Rows of four are read at once.
 
+    corners = torch.empty(lists.entry_count, dtype=torch.uint8, device=features.device)
+    listed = lists.ranges, lists.gaussians
+    launch(blend_cuda.corners_kernel(scalar), lists.entry_count, *listed, *records, lists.columns, corners)
+
     def by_gaussian(features):
-        return lists.ranges, lists.gaussians, *records, features.reshape(-1, 4), *frame
+        return *listed, corners, *records, features.reshape(-1, 4), *frame
 
     def launch_blocks(kernel, blocks_per_tile, *arguments):
         block = blend_cuda.BLOCK_DIM
