@@ -155,13 +155,13 @@ def test_an_interrupt_ends_a_pause_and_errors_reach_who_asked():
 
 def test_the_page_pauses_steps_and_says_the_end(tmp_path, logged):
     training = Training(toy_scene(), tmp_path / "run", CONFIG | {"schedule.iterations": 150}, device="cpu")
-    served = threading.Event()
+    served, paused = threading.Event(), threading.Event()
 
     def work():
         with viewed(training, "toy") as steps:
             served.set()
             for _ in steps:
-                pass
+                paused.wait(60)  # The first step's, or a training this short ends while the page opens.
 
     with browser() as chromium:
         page = chromium.new_page(viewport={"width": 440, "height": 300})
@@ -175,6 +175,7 @@ def test_the_page_pauses_steps_and_says_the_end(tmp_path, logged):
         wait(" of 150 ")
         page.click("#pause")
         wait("Resume", "#pause")
+        paused.set()
         page.wait_for_timeout(1100)  # It asks once a second.
         stopped = int(page.text_content("#progress").split()[0])
         page.wait_for_timeout(1100)
