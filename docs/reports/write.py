@@ -89,6 +89,10 @@ def _kernel_tables(result: dict) -> Iterable[str]:
 
 def _step_tables(result: dict) -> Iterable[str]:
     yield markdown_table(result["rows"], COLUMNS["step"])
+    if "parts" in result:
+        yield "## Parts of the recorded step"
+        yield PAGES["step"]["parts"]
+        yield markdown_table(result["parts"], COLUMNS["parts"])
     yield _checks_line(result)
 
 

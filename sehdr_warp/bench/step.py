@@ -9,12 +9,14 @@ from itertools import pairwise
 import torch
 
 from ..scene import Scene
+from ..splatting import rasterize
 from ..splatting.reference import rasterize_reference
 from ..training.config import Config
 from ..training.config_files import load_config, override_config
 from ..training.initialization import choose_response, make_field
 from ..training.trainer import Trainer
 from .kernels import OURS, PLAIN_TORCH, REFERENCE_GAUSSIANS
+from .parts import parts_of_step, work_of
 from .results import check, new_result
 from .splats import Size, make_photo_scene
 from .timing import Variant, forget_peaks, held_memory, peak_memory, summary, time_variants, wait
@@ -32,9 +34,11 @@ INTERVALS = {"cuda": 3, "cpu": 1}
 
 def bench_step(size: Size, device: torch.device, *, presets: Sequence[str], repetitions: int, views: int = 18) -> dict:
     """A result: steps of each preset in the thick of its training (all degrees of the harmonics, densification going
-    on) on synthetic photos; on a GPU recorded, and launched one by one."""
+    on) on synthetic photos; on a GPU recorded, and launched one by one, and the recorded step's `parts`."""
     settings = {"device": str(device), "presets": list(presets), "repetitions": repetitions, "views": views}
     result = new_result("step", device, settings)
+    if device.type == "cuda":
+        result["parts"] = []
     scene = make_photo_scene(size, views, device)
     for preset in presets:
         # No points but the scene's, and growth by a tenth at most: the times are for the count that was asked for.
@@ -49,6 +53,8 @@ def bench_step(size: Size, device: torch.device, *, presets: Sequence[str], repe
             result["checks"] += _checks(preset, small, config, device, PLAIN_TORCH, _plain_torch)
         place = {"preset": preset, "width": size.width, "height": size.height}
         result["rows"] += [place | row for row in _rows(scene, config, device, repetitions)]
+        if device.type == "cuda":
+            result["parts"] += [{"preset": preset} | row for row in _parts(scene, config, device)]
         LOG.info("%s: done", preset)
     return result
 
@@ -126,6 +132,19 @@ def _rows(scene: Scene, config: Config, device: torch.device, repetitions: int) 
         rows.append(row)
         del trainer
     return rows
+
+
+def _parts(scene: Scene, config: Config, device: torch.device) -> list[dict]:
+    """parts_of_step() of the recorded step."""
+    given: list[tuple] = []
+
+    def rasterizer(*arguments, **options):
+        given[:] = [arguments]
+        return rasterize(*arguments, **options)
+
+    make_trainer(scene, override_config(config, {"schedule.recorded": False}), device, rasterizer).step()
+    work = work_of(given[0], 3 * (config.model.harmonics_degree + 1) ** 2)
+    return parts_of_step(step_variant(make_trainer(scene, config, device)), work, device)
 
 
 def _plain_torch(*arguments, capacity=None, deterministic=False, **options):
