@@ -7,7 +7,7 @@ from itertools import cycle
 from pathlib import Path
 
 import numpy as np
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, NullLocator
 
 from sehdr_warp.bench.results import groups
 from sehdr_warp.output.charts import COLORS, RULE
@@ -21,7 +21,8 @@ def plot_kernels(result: dict, path: Path) -> None:
             name: sorted((row["channels"], row["median_ms"]) for row in mine)
             for (name,), mine in groups(here, "implementation").items()
         }
-        labels = {"xlabel": "channels", "ylabel": "forward + backward, ms", "yscale": "log"}
+        most = max(row["median_ms"] for row in here)
+        labels = {"xlabel": "channels", "ylabel": "forward + backward, ms", "ylim": (0, 1.1 * most)}
         panels.append((lines, labels | {"title": f"{count:,} Gaussians, {width} x {height}"}))
     _draw(path, [panels])
 
@@ -96,9 +97,11 @@ def _draw(path: Path, panels: Sequence[Sequence[tuple[dict, dict]]], form: str =
             if points:
                 (named[name],) = axes.plot(*zip(*points, strict=True), form, color=color, markersize=3, label=name)
         axes.set(**labels)
-        if "xticks" in labels:
-            axes.minorticks_off()
-            axes.set_yticks(ticks := decade_ticks(*labels["ylim"]), [f"{tick:g}" for tick in ticks])
+        for axis, limits in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+            if axis.get_scale() == "log":
+                axis.set_minor_locator(NullLocator())
+                if not (axis is axes.xaxis and "xticks" in labels):
+                    axis.set_ticks(ticks := decade_ticks(*limits), [f"{tick:g}" for tick in ticks])
         axes.grid(color=RULE, linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
     if named:

@@ -81,7 +81,8 @@ and a fourth of a load for each more; the adjoint sums once more."""
 
 def part_of(kernel: str) -> str:
     """The part that a kernel, as the profiler names it, belongs to."""
-    return next(part for part, patterns in KERNELS.items() if any(fnmatchcase(kernel, p) for p in patterns))
+    named = kernel.rpartition("__locals__")[2]  # Behind the function that made it
+    return next(part for part, patterns in KERNELS.items() if any(fnmatchcase(named, p) for p in patterns))
 
 
 def parts_of_step(variant: Variant, work: Work, device: torch.device) -> list[dict]:
