@@ -3,9 +3,11 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from sehdr_warp import __version__, cli
 from sehdr_warp.response import response_by_name, response_names
 from sehdr_warp.scene.hdr_files import read_hdr
 from sehdr_warp.scene.images import read_ldr
-from sehdr_warp.training.commands import response_around
+from sehdr_warp.training.commands import _ending, response_around
 from sehdr_warp.training.config_files import config_fields, flag_of, load_config, preset_names
 
 from .refusals import call
@@ -169,6 +171,15 @@ def test_a_training_ends_by_saying_what_to_type_next(run, capsys):
     assert len(lines) == 4 and all(
         f"sehdr-warp {word} {run}" in "".join(lines) for word in ("view", "render", "report", "export")
     )
+
+
+def test_commands_to_type_next_stand_a_folder_with_spaces():
+    run = Path("runs/my castle")
+    summary = {"metrics": [], "iteration": 30, "gaussians": 5, "train_seconds": 1.0, "device": "cpu"}
+    typed = [line.split(":", 1)[1] for line in _ending(run, summary).splitlines()[1:]]
+    for command in "; ".join(typed).split(";"):
+        words = shlex.split(command)
+        assert words[0] == "sehdr-warp" and words[2] == str(run)
 
 
 def test_fields_named_on_the_command_line_override_the_preset_and_stay(capsys):

@@ -1,5 +1,6 @@
 """The report as one HTML file: what was trained, how well, where it fails, with nothing loaded from elsewhere."""
 
+import shlex
 from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
@@ -279,7 +280,7 @@ def _map(run: Any, comparisons: Sequence[Comparison]) -> str:
 
 
 def _footer(run: Any) -> str:
-    path = escape(str(run.path))
+    path = escape(shlex.quote(str(run.path)))
     return (
         f"<footer>\n<p>sehdr-warp {__version__}. Brackets as OpenEXR: <code>sehdr-warp render {path} --out views "
         f"--evs=-4,-2,0,2,4</code></p>\n<p>Radiance is relative, and clipped light is not in the photos.</p>\n</footer>"

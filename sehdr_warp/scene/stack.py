@@ -2,6 +2,7 @@
 
 import logging
 import math
+import shlex
 from collections.abc import Iterator, Sequence
 from itertools import pairwise, starmap
 from pathlib import Path
@@ -69,7 +70,7 @@ def refuse_stack(photos: Sequence[Path], folder: Path) -> None:
         return  # Who reads these photos says what is wrong with them.
     span = f"{shutter(shots[0].seconds)} to {shutter(shots[-1].seconds)}"
     problem = f"its {len(photos)} photos are an exposure stack from one place ({span}), which does not show depth"
-    command = f"`sehdr-warp calibrate {photos[0].parent}`"
+    command = f"`sehdr-warp calibrate {shlex.quote(str(photos[0].parent))} --out camera.csv`"
     remedy = f"take photos from different places; {command} finds the camera's response in the stack"
     raise InputError(folder, problem, remedy)
 

@@ -5,6 +5,7 @@ torch is imported when they run.
 
 import json
 import logging
+import shlex
 from collections.abc import Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
@@ -358,7 +359,8 @@ def _ending(path: Path, summary: dict) -> str:
     told = [figures for line in summary["metrics"] if (figures := figures_told(line))]
     heldout = f", {told[-1]}" if told else ""
     made = f"{summary['iteration']} iterations, {summary['gaussians']} Gaussians{heldout}"
+    run, views, report = (shlex.quote(str(place)) for place in (path, path / "views", path / "report"))
     return f"""{path}: {made}, {summary["train_seconds"]:.1f} s on {summary["device"]}
-look at it:         sehdr-warp view {path}
-exposure brackets:  sehdr-warp render {path} --out {path}/views --evs=-4,-2,0,2,4
-pictures, splats:   sehdr-warp report {path} --out {path}/report;  sehdr-warp export {path} --out scene.ply"""
+look at it:         sehdr-warp view {run}
+exposure brackets:  sehdr-warp render {run} --out {views} --evs=-4,-2,0,2,4
+pictures, splats:   sehdr-warp report {run} --out {report};  sehdr-warp export {run} --out scene.ply"""

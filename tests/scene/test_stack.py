@@ -39,11 +39,12 @@ def write_photos(folder, times, shift=0):
 
 
 def test_a_stack_from_one_place_is_told_before_it_is_matched(tmp_path):
-    folder = write_photos(tmp_path / "stack", (8.0, 0.125, 1.0))
+    folder = write_photos(tmp_path / "my stack", (8.0, 0.125, 1.0))
     with pytest.raises(InputError) as caught:
         load_scene(folder)
     told = str(caught.value)
-    assert "3 photos are an exposure stack from one place (1/8 s to 8 s)" in told and f"calibrate {folder}`" in told
+    assert "3 photos are an exposure stack from one place (1/8 s to 8 s)" in told
+    assert f"`sehdr-warp calibrate '{folder}' --out camera.csv`" in told
 
 
 @pytest.mark.parametrize(
