@@ -180,6 +180,7 @@ def test_commands_to_type_next_stand_a_folder_with_spaces():
     for command in "; ".join(typed).split(";"):
         words = shlex.split(command)
         assert words[0] == "sehdr-warp" and words[2] == str(run)
+    assert "--cameras train --evs" in _ending(run, summary)  # Without held-out views render has none by default.
 
 
 def test_fields_named_on_the_command_line_override_the_preset_and_stay(capsys):

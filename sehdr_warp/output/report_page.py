@@ -65,7 +65,7 @@ def report_page(
             _figure(_wide(training_svg(run.metrics()))),
         ),
         _map(run, comparisons),
-        _footer(run),
+        _footer(run, held_out),
     ]
     main, script = "\n".join(filter(None, sections)), "".join(map(page_file, ("tables.js", "light.js", "report.js")))
     body = f"<main>\n{main}\n</main>\n<script>\n{script}</script>"
@@ -279,11 +279,13 @@ def _map(run: Any, comparisons: Sequence[Comparison]) -> str:
     return _section("Cameras", lead, _figure(drawn))
 
 
-def _footer(run: Any) -> str:
+def _footer(run: Any, held_out: bool) -> str:
+    cameras = "" if held_out else " --cameras train"
     path = escape(shlex.quote(str(run.path)))
     return (
-        f"<footer>\n<p>sehdr-warp {__version__}. Brackets as OpenEXR: <code>sehdr-warp render {path} --out views "
-        f"--evs=-4,-2,0,2,4</code></p>\n<p>Radiance is relative, and clipped light is not in the photos.</p>\n</footer>"
+        f"<footer>\n<p>sehdr-warp {__version__}. Brackets as OpenEXR: <code>sehdr-warp render {path} "
+        f"--out views{cameras} --evs=-4,-2,0,2,4</code></p>\n"
+        "<p>Radiance is relative, and clipped light is not in the photos.</p>\n</footer>"
     )
 
 

@@ -360,7 +360,8 @@ def _ending(path: Path, summary: dict) -> str:
     heldout = f", {told[-1]}" if told else ""
     made = f"{summary['iteration']} iterations, {summary['gaussians']} Gaussians{heldout}"
     run, views, report = (shlex.quote(str(place)) for place in (path, path / "views", path / "report"))
+    cameras = "" if told else " --cameras train"
     return f"""{path}: {made}, {summary["train_seconds"]:.1f} s on {summary["device"]}
 look at it:         sehdr-warp view {run}
-exposure brackets:  sehdr-warp render {run} --out {views} --evs=-4,-2,0,2,4
+exposure brackets:  sehdr-warp render {run} --out {views}{cameras} --evs=-4,-2,0,2,4
 pictures, splats:   sehdr-warp report {run} --out {report};  sehdr-warp export {run} --out scene.ply"""

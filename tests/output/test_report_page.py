@@ -74,6 +74,7 @@ def test_what_is_not_known_is_left_out(tmp_path):
     text = page(tmp_path, truth=False, splits=("train", "train"), metrics=None, unexplained=False)
     assert "What stays unexplained" not in headings(text) and "Error against time" not in headings(text)
     assert "none is held out" in text and 'data-name="Truth"' not in text
+    assert "--out views --cameras train --evs" in text
     assert headings(text)[0] == "Photo and scene" and "Scene and truth" not in text
 
 
