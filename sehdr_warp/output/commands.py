@@ -2,7 +2,7 @@
 
 import json
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
@@ -14,6 +14,7 @@ from ..files import check_absent
 from ..training.commands import ensured_scene, open_run, open_scene
 
 _NOT_OF_VIEWS = {"run", "device", "json", "video", "fps", "transfer", "ev_ramp"}
+_OF_FILMS_TOO = {*_NOT_OF_VIEWS, "cameras", "count", "size", "overwrite", "out"}
 _MOST_STOPS = 30
 
 
@@ -159,7 +160,7 @@ def run_panorama(asked: Panorama) -> None:
 
 
 def run_render(asked: Render) -> None:
-    from .render_views import render_views
+    from .render_views import PATHS, render_views
 
     if asked.out is None and asked.video is None:
         raise UsageError(
@@ -167,6 +168,12 @@ def run_render(asked: Render) -> None:
         )
     if asked.video is None and (asked.ev_ramp is not None or (asked.fps, asked.transfer) != (24.0, "sdr")):
         raise UsageError("--ev-ramp, --fps and --transfer are of a film; name it with --video")
+    lost = [field.name for field in fields(asked) if getattr(asked, field.name) != field.default]
+    lost = ["--" + name.replace("_", "-") for name in lost if name not in _OF_FILMS_TOO]
+    if asked.out is None and lost:
+        raise UsageError(f"{', '.join(lost)}: of pictures, and none are written beside a film without --out")
+    if asked.count != 60 and asked.cameras not in PATHS:
+        raise UsageError(f"--count {asked.count}: of an orbit or interpolation; name one with --cameras")
     written, ramp = [], _ramp(asked.ev_ramp)
     if asked.video is not None:
         from .film import film_library

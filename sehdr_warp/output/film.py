@@ -111,7 +111,8 @@ def write_film(
                 for packet in stream.encode():
                     container.mux(packet)
         except (av.FFmpegError, ValueError) as error:
-            raise SehdrError(f"{out}: cannot be written as a film ({error}); choose another size or .mp4") from error
+            remedy = f"choose {'.mov' if transfer in LOGS else '.mp4'} or another size"
+            raise SehdrError(f"{out}: cannot be written as a film ({error}); {remedy}") from error
     return out
 
 

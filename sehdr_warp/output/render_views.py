@@ -88,7 +88,7 @@ def render_views(
     """
     out = Path(out)
     wanted = evs is not None or exposures is not None
-    if (multipart or ldr_brackets) and not wanted:
+    if (multipart or ldr_brackets or by != "view") and not wanted:
         raise SehdrError("brackets were asked for without exposures; give evs (--evs=-2,0,2) or exposures")
     made = bracket_exposures(run.base_time, evs=evs, exposures=exposures) if wanted else ()
     form, now = (colorspace, pixel, multipart, ldr_brackets, run.response), datetime.now().replace(microsecond=0)
@@ -180,7 +180,8 @@ def select_cameras(run, cameras: str | Path, *, count: int = 60) -> list[tuple[s
     if text in SPLITS:
         named = [(entry.name, entry.camera) for entry in run.cameras if text in (entry.split, "all")]
         if not named:
-            raise SehdrError(f"the run has no {text} views; choose other cameras ({known}, a file)")
+            others = known.replace(f"{text}, ", "")
+            raise SehdrError(f"the run has no {text} views; choose other cameras ({others}, a file)")
     elif text in PATHS:
         seen = [entry.camera for entry in run.cameras if entry.split == "train"]
         path = interpolate(seen, count) if text == "interpolate" else orbit(seen, count, _focus_distance(run, seen))

@@ -82,12 +82,20 @@ def test_refusals(tmp_path, monkeypatch):
     (tmp_path / "mine.mp4").write_text("mine")
     with pytest.raises(InputError, match="exists already"):
         write_film(run, tmp_path / "mine.mp4", cameras)
-    with pytest.raises(SehdrError, match="cannot be written as a film"):
+    with pytest.raises(SehdrError, match="cannot be written as a film .* choose .mp4"):
         write_film(run, tmp_path / "film.txt", cameras)
+    with pytest.raises(SehdrError, match="cannot be written as a film .* choose .mov"):
+        write_film(run, tmp_path / "film.mp4", cameras, transfer="logc3")
     assert [file.name for file in tmp_path.iterdir()] == ["mine.mp4"]
     for asked in (Render(run=tmp_path), Render(run=tmp_path, out=tmp_path, ev_ramp="1:2")):
         with pytest.raises(UsageError, match="--video"):
             run_render(asked)
+
+    alone = {"run": tmp_path, "video": tmp_path / "new.mp4"}
+    with pytest.raises(UsageError, match="--evs, --ldr-brackets: of pictures, and none are written"):
+        run_render(Render(**alone, evs="-4,4", ldr_brackets="jpeg"))
+    with pytest.raises(UsageError, match="--count 240: of an orbit or interpolation"):
+        run_render(Render(**alone, count=240))
 
     def missing():
         raise SehdrError("films need PyAV; run `pip install sehdr-warp[film]`")

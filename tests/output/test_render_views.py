@@ -126,7 +126,9 @@ def test_a_bad_pixel_leaves_nothing_new(tmp_path, multipart):
 def test_options_that_do_nothing_are_refused(tmp_path):
     with pytest.raises(SehdrError, match="without exposures"):
         render_views(AnalyticRun(), tmp_path / "out", multipart=True)
-    with pytest.raises(SehdrError, match="no test views"):
+    with pytest.raises(SehdrError, match="without exposures"):
+        render_views(AnalyticRun(), tmp_path / "out", by="exposure")
+    with pytest.raises(SehdrError, match=r"no test views; choose other cameras \(train, all, "):
         render_views(AnalyticRun([("a", "train")]), tmp_path / "out")
     with pytest.raises(SehdrError, match="'tset' are neither a file nor one of train, test, all, orbit, interpolate"):
         render_views(AnalyticRun(), tmp_path / "out", cameras="tset")
