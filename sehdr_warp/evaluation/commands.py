@@ -108,7 +108,7 @@ def run_score(asked: Score) -> None:
 
 def run_compare(asked: Compare) -> None:
     from ..files import atomic_path, check_absent
-    from ..output.charts import training_chart
+    from ..output.charts import save_picture, training_chart
     from .compare import compare_runs, comparison_csv, comparison_latex, comparison_table
 
     for path in filter(None, (asked.plot, asked.csv, asked.latex)):
@@ -120,6 +120,5 @@ def run_compare(asked: Compare) -> None:
                 file.write_text(text(rows), encoding="utf-8")
     if asked.plot is not None:
         with atomic_path(asked.plot, asked.overwrite) as file:
-            chart = training_chart({row.label: row.curves for row in rows})
-            chart.savefig(file, dpi=140, facecolor="white", format="png")
+            save_picture(training_chart({row.label: row.curves for row in rows}), file, 140)
     print(comparison_table(rows))

@@ -1,7 +1,9 @@
 """Charts of trainings: held-out error against time."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
+from warnings import catch_warnings, filterwarnings
 
 # Hues that the colour-blind tell apart (Okabe and Ito).
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31")
@@ -17,7 +19,15 @@ STYLE: dict[Any, Any] = {
     "xtick.color": QUIET,
     "ytick.color": QUIET,
     "axes.edgecolor": RULE,
+    "text.parse_math": False,  # A dollar sign in a name is one.
 }
+
+
+def save_picture(figure: Any, path: Path, dpi: int) -> None:
+    """Writes a matplotlib Figure as PNG. Letters of a name that no font here has become boxes, without a warning."""
+    with catch_warnings():
+        filterwarnings("ignore", message="Glyph .* missing from font")
+        figure.savefig(path, dpi=dpi, facecolor="white", format="png")
 
 
 def training_points(curve: Sequence[Mapping], key: str) -> list[tuple[float, float]]:
@@ -56,5 +66,6 @@ def training_chart(rows: Mapping[str, Sequence[Sequence[Mapping]]]):
             axes.tick_params(length=0)
             axes.spines[["top", "right", "left"]].set_visible(False)
         if len(rows) > 1:
-            figure.legend(handles.values(), handles.keys(), loc="outside right upper", frameon=False, fontsize=8.5)
+            labels = [f" {label}" if label.startswith("_") else label for label in handles]  # Else they are left out.
+            figure.legend(handles.values(), labels, loc="outside right upper", frameon=False, fontsize=8.5)
         return figure

@@ -15,7 +15,7 @@ from sehdr_warp.scene.exposure import shutter
 
 from ..files import atomic_path, check_absent
 from .camera_paths import evenly
-from .charts import PANELS, QUIET, STYLE, training_chart, training_points
+from .charts import PANELS, QUIET, STYLE, save_picture, training_chart, training_points
 from .comparison import Comparison, compare
 from .report_page import STOPS, report_page
 from .report_page import stops_text as _stops
@@ -76,7 +76,7 @@ def write_report(
         stack.enter_context(atomic_path(paths[0], overwrite)).write_text(page, encoding="utf-8")
         for path, figure in zip(paths[1:], figures, strict=True):
             temporary = stack.enter_context(atomic_path(path, overwrite))
-            figure.savefig(temporary, dpi=160, facecolor="white", format="png")
+            save_picture(figure, temporary, 160)
     return paths
 
 

@@ -3,7 +3,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.output.charts import training_chart
+from sehdr_warp.output.charts import save_picture, training_chart
 from sehdr_warp.output.comparison import Comparison, compare
 from sehdr_warp.output.report import comparison_figure, stops_figure, write_report
 from sehdr_warp.output.tonemap import encode_srgb
@@ -66,6 +66,14 @@ def test_the_chart_has_a_line_for_every_run_and_a_name_for_every_row():
     figure = training_chart({"a and 1 more": [METRICS, METRICS], "c": [only]})
     assert [len(axes.get_lines()) for axes in figure.axes] == [3, 2]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a and 1 more", "c"]
+
+
+def test_names_of_runs_stand_in_a_chart_as_they_are(tmp_path, recwarn):
+    names = [r"$\frac$", "_hidden", "\u65e5\u672c"]
+    figure = training_chart({name: [METRICS] for name in names})
+    assert [text.get_text().strip() for text in figure.legends[0].get_texts()] == names
+    save_picture(figure, tmp_path / "chart.png", 40)
+    assert (tmp_path / "chart.png").stat().st_size and not recwarn.list
 
 
 def test_stops_show_what_the_photo_lost(tmp_path):
