@@ -208,6 +208,7 @@ def test_fields_named_on_the_command_line_override_the_preset_and_stay(capsys):
         ("train --resume --out r", "nothing to resume"),
         ("config defualt", "did you mean default?"),
         ("render nowhere --out r", "nowhere"),
+        ("compare nowhere --plot chart.pdf", "chart.pdf: the chart is a PNG file; name it chart.png"),
         ("eval nowhere", "nowhere"),
     ],
 )

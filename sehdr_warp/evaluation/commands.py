@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
+from ..errors import InputError
 from ..training.commands import ensured_scene, open_run, response_around
 
 
@@ -111,6 +112,8 @@ def run_compare(asked: Compare) -> None:
     from ..output.charts import save_picture, training_chart
     from .compare import compare_runs, comparison_csv, comparison_latex, comparison_table
 
+    if asked.plot is not None and asked.plot.suffix.lower() != ".png":
+        raise InputError(asked.plot, "the chart is a PNG file", f"name it {asked.plot.with_suffix('.png').name}")
     for path in filter(None, (asked.plot, asked.csv, asked.latex)):
         check_absent(path, asked.overwrite)
     rows = compare_runs([open_run(path, "cpu") for path in asked.runs])

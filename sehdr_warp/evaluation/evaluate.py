@@ -150,7 +150,9 @@ class Evaluation:
         for what, image in (("photo", view.codes), ("HDR truth", view.hdr), ("picture", prediction)):
             if image is not None and tuple(image.shape) != size:
                 sizes = f"its {what} is {image.shape[1]} x {image.shape[0]}, its camera {size[1]} x {size[0]}"
-                raise SehdrError(f"view {view.name!r}: {sizes}; take both at one size")
+                reduced = what == "picture" and image.shape[1] < size[1]
+                remedy = "take both at one size" + ": --max-size reduces the truth" * reduced
+                raise SehdrError(f"view {view.name!r}: {sizes}; {remedy}")
         if not bool(torch.isfinite(prediction).all()):
             raise SehdrError(f"view {view.name!r}: the render holds values that are not finite; the training diverged")
         return prediction.float(), self._tensor(view.hdr)

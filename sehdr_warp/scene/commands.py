@@ -1,6 +1,7 @@
 """The command lines of `sehdr-warp scenes`, `responses` and `calibrate`. torch is imported when they run."""
 
 import json
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -67,4 +68,5 @@ def run_calibrate(asked: Calibrate) -> None:
 
     times = None if asked.exposures is None else seconds(asked.exposures, "--exposures")
     calibrate(asked.stack, times=times, channel=asked.channel, out=asked.out, overwrite=asked.overwrite)
-    print(f"{asked.out}: take it with --response {asked.out}; the plot is {asked.out.with_suffix('.png')}")
+    named = shlex.quote(str(asked.out))
+    print(f"{asked.out}: take it with --response {named}; the plot is {asked.out.with_suffix('.png')}")

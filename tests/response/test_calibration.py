@@ -11,6 +11,7 @@ import sehdr_warp as sw
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.response.calibration import calibrate_codes
+from sehdr_warp.scene.commands import Calibrate, run_calibrate
 from sehdr_warp.scene.images import read_ldr
 from sehdr_warp.scene.stack import read_stack
 
@@ -83,6 +84,13 @@ def test_channels_that_differ_are_said_and_the_curve_can_be_read(tmp_path, logge
         sw.calibrate(folder, out=tmp_path / "curve.png")
     assert not list(tmp_path.glob("curve.*"))
     assert stops_off(sw.calibrate(folder, times=times, channel="red"), response_by_name("srgb")) < 0.05
+
+
+def test_the_curve_is_told_as_a_shell_reads_it(tmp_path, capsys):
+    times = (0.25, 1.0, 4.0)
+    folder = write_stack(tmp_path / "stack", photograph(response_by_name("srgb"), light(), times), times)
+    run_calibrate(Calibrate(stack=folder, out=tmp_path / "my camera.csv"))
+    assert f"--response '{tmp_path / 'my camera.csv'}'" in capsys.readouterr().out
 
 
 def test_useless_stacks_get_one_line(tmp_path):
