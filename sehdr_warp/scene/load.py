@@ -17,6 +17,7 @@ from .develop import as_photographed, develop, fitted_lens, with_content
 from .exposure import choose_exposure, made_by_camera, with_exposure_times
 from .images import has_16_bits
 from .linear_photos import CURVES, color_matrix, float_time, one_kind
+from .names import unique_names
 from .read_folders import (
     image_folder,
     is_hdr_gs,
@@ -231,7 +232,7 @@ def _with_splits(shots: list[Shot], capture: Capture, holdout: int | None) -> tu
     shots = [replace(shot, split="test" if i in held else "train") for i, shot in enumerate(shots)]
     if not held:
         return shots, ("no views are held out for testing",)
-    names = [shot.view for shot in shots if shot.split == "test"]
+    names = [name for name, shot in zip(unique_names(shots), shots, strict=True) if shot.split == "test"]
     listed = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
     are = "is" if len(names) == 1 else "are"
     return shots, (f"{len(names)} of {len(shots)} views {are} held out for testing: {listed}",)

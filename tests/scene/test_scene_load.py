@@ -77,6 +77,12 @@ def test_layouts_without_a_protocol_hold_out_the_middle_of_each_block(tmp_path):
     scene = load(tmp_path)
     assert [view.name for view in scene.test_views] == ["r_4"], "not the last of the arc"
     assert "1 of 13 views is held out for testing: r_4" in scene.notes
+    (tmp_path / "images" / "r_4.png").rename(tmp_path / "images" / "r 4 (2).png")
+    told = (tmp_path / "transforms.json").read_text()
+    (tmp_path / "transforms.json").write_text(told.replace("r_4", "r 4 (2)"))
+    scene = load(tmp_path)
+    named = scene.test_views[0].name  # As files, --at camera:NAME and summary.json have it.
+    assert f"1 of 13 views is held out for testing: {named}" in scene.notes and " " not in named
     assert [view.name for view in load(tmp_path, holdout=4).test_views] == ["r_2", "r_6", "r_10"]
     for count, held in ((5, {2}), (6, {4}), (9, {4}), (16, {4, 12}), (4, set())):
         assert _held_out(count, None, None) == held
