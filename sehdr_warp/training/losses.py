@@ -39,6 +39,13 @@ class Target:
         """[H, W, 3] in [0, 1], made of the codes whenever it is asked for."""
         return code_values(one_of(self.codes, self.index))
 
+    def psnr(self, encoded: Tensor) -> float:
+        """dB, of encoded values [H, W, 3] against the photo, where the mask counts."""
+        squared = (encoded.clamp(0, 1) - self.encoded).square().mean(2, keepdim=True)
+        weights = torch.ones_like(squared) if self.mask is None else self.mask
+        mean = (squared * weights).sum() / weights.sum().clamp_min(1e-6)
+        return float(-10 * mean.clamp_min(1e-10).log10())
+
 
 def one_of(stack: Tensor, index: Tensor | None) -> Tensor:
     """A copy of the one of a stack [V, ...] that is at index [1], on its device; without an index the tensor itself."""

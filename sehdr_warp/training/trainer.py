@@ -104,12 +104,12 @@ class Trainer:
 
     @torch.no_grad()
     def psnr(self) -> float:
-        """dB, of the last step's view as the scene shows it now, against its photo."""
+        """dB, of the last step's view as the scene shows it now, against its photo, where the mask counts."""
         view = self._training_views()[self._last_index]
         with self._launching():
             photo = self.field.photograph(view.camera, view.exposure_time, degree=self.degree).encoded
         assert photo is not None
-        return float(-10 * (photo.clamp(0, 1) - view.target.encoded).square().mean().clamp_min(1e-10).log10())
+        return view.target.psnr(photo)
 
     def render(self, camera: Camera) -> RenderedView:
         """The scene as it is now, between steps."""

@@ -1,6 +1,7 @@
 """Losses: forms, one-sidedness where the camera saturated, masks, and which side learns."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -50,6 +51,16 @@ def test_masked_pixels_cost_nothing():
     assert image_loss(a, b, mask, "sum", 0.2) == image_loss(a, changed, mask, "sum", 0.2)
     expected = (a - b)[:, :7].abs().mean()
     assert image_loss(a, b, mask, "sum", 0.0).item() == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_the_psnr_of_a_step_leaves_out_what_the_mask_does():
+    shown, _ = images()
+    target = target_of(shown + 0.1 * (0.5 - shown).sign())
+    mask = torch.ones(12, 14, 1)
+    mask[:, :5] = 0
+    hidden = torch.where(mask > 0, shown, 1 - shown)
+    assert target.psnr(shown) == pytest.approx(20, abs=0.3)
+    assert target.psnr(hidden) < 12 and replace(target, mask=mask).psnr(hidden) == pytest.approx(20, abs=0.3)
 
 
 @pytest.mark.parametrize("bits", [8, 16])
