@@ -2,6 +2,7 @@
 
 import os
 import re
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -184,9 +185,15 @@ def _camera(row: np.ndarray, path: Path, name: str) -> tuple[Lens, np.ndarray]:
 def read_photos(folder: Path, cache: Path | str | None = None) -> Capture:
     """One shot for each photo of the folder, or of its `images/`, that structure from motion could place."""
     places = (place for place in (folder, folder / "images") if place.is_dir())
-    photos = next((found for place in places if (found := list_images(place, PHOTO_SUFFIXES))), [])
+    found = [list_images(place, PHOTO_SUFFIXES) for place in places]
+    # A lone picture beside `images/` is a cover.
+    photos = next((each for each in found if len(each) > 1), next(filter(None, found), []))
     if not photos:
         remedy = "give photos (JPEG, PNG, TIFF, RAW, EXR), a COLMAP set or a transforms.json"
+        with suppress(OSError):
+            inner = [place.name for place in sorted(folder.iterdir()) if place.is_dir()]
+            inner = [name for name in inner if list_images(folder / name, PHOTO_SUFFIXES)]
+            remedy = f"give one of its folders with photos: {', '.join(inner[:5])}" if inner else remedy
         raise InputError(folder, "has no photos and no known layout", remedy)
     kind = one_kind(photos)
     if len(photos) < 2:

@@ -228,3 +228,15 @@ def test_photos_are_averaged_side_by_side(tmp_path):
     code = f"from sehdr_warp.scene import load_scene; load_scene({str(tmp_path)!r}, max_size=24, response='hdr-nerf')"
     environment = os.environ | {"SEHDR_THREADS": "8"}
     subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=120)
+
+
+def test_photos_are_found_beside_a_cover_and_told_of_in_folders(tmp_path):
+    for name in ("day/1.png", "day/2.png", "text/note.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(InputError, match="no photos and no known layout; give one of its folders with photos: day$"):
+        load(tmp_path)
+    (tmp_path / "day").rename(tmp_path / "images")
+    (tmp_path / "cover.jpg").touch()
+    with pytest.raises(InputError, match="images/1.png"):
+        load(tmp_path)
