@@ -8,6 +8,7 @@ import sys
 
 import pytest
 
+from sehdr_warp.errors import InputError
 from sehdr_warp.training.run_folder import RunFolder
 
 from .full_disk import full_disk
@@ -335,3 +336,11 @@ def test_kill_while_a_checkpoint_is_written(trained, tmp_path):
     assert call("render", out, "--out", tmp_path / "views", "--device", "cpu") == 0
     assert call("train", "embedded", "--out", out, "--device", "cpu", "--resume") == 0
     assert [path.name for path in sorted((out / "checkpoints").iterdir()) if path != half] == [whole.name]
+
+
+def test_a_folder_that_is_no_run_is_not_replaced_and_the_remedy_says_so(tmp_path):
+    (tmp_path / "report.html").write_text("mine")
+    with pytest.raises(InputError, match="is not a run .*; choose another folder for the run"):
+        RunFolder(tmp_path).check(resume=False, overwrite=True)
+    with pytest.raises(InputError, match="is not a run .*; give the folder that"):
+        RunFolder(tmp_path).check(resume=True, overwrite=False)

@@ -52,6 +52,7 @@ from .config_files import config_from_dict
 
 _LOCK, _NEW, _READY = ".lock", ".new", ".ready"
 _OWN = "choose another folder, or remove this one yourself"
+_GIVE_RUN = "give the folder that `sehdr-warp train --out` wrote"
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ class RunFolder:
             return False
         if not resume and not overwrite:
             raise InputError(self.path, "exists and is not empty", "choose another, or use --resume or --overwrite")
-        self.require()
+        self.require(_GIVE_RUN if resume else "choose another folder for the run; --overwrite replaces runs alone")
         if self.checkpoints.is_symlink():
             raise InputError(self.checkpoints, "is a link, and what it leads to is not replaced", _OWN)
         if not {"format", "base_time", "response"} <= read_run_json(self.info, _OWN).keys():
@@ -124,7 +125,7 @@ class RunFolder:
             self.unlock()
         return resume
 
-    def require(self) -> None:
+    def require(self, remedy: str = _GIVE_RUN) -> None:
         """Raises InputError if this is not the folder of a training; finishes what a killed process had begun."""
         if any((self.path / name).is_dir() for name in (_NEW, _READY)):
             held = self._lock.is_locked
@@ -137,7 +138,7 @@ class RunFolder:
             if not file.is_file():
                 problem = "is a file, not a run" if self.path.is_file() else "no such folder"
                 problem = f"is not a run (no {file.name})" if self.path.is_dir() else problem
-                raise InputError(self.path, problem, "give the folder that `sehdr-warp train --out` wrote")
+                raise InputError(self.path, problem, remedy)
 
     def begin(
         self,
