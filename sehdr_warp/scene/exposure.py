@@ -84,13 +84,15 @@ def shutter(time: float) -> str:
 
 
 def parse_seconds(value, source: Path, field: str) -> float:
-    """A positive, finite number of seconds from JSON; InputError otherwise."""
+    """A positive, finite number of seconds from JSON, or a text as photographers write it; InputError otherwise."""
     try:
-        seconds = float(value)
-    except (TypeError, ValueError, OverflowError):
+        whole, _, parts = str(value).partition("/")
+        seconds = float(whole) / float(parts or 1)
+    except (TypeError, ValueError, OverflowError, ZeroDivisionError):
         seconds = math.nan
     if not SHORTEST <= seconds <= LONGEST:
-        raise InputError(source, f"exposure time of {field!r:.90} is {value!r:.40}", "state seconds above zero")
+        remedy = 'state seconds above zero, such as 0.008 or "1/125"'
+        raise InputError(source, f"exposure time of {field!r:.90} is {value!r:.40}", remedy)
     return seconds
 
 

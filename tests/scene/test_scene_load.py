@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -56,9 +57,12 @@ def test_one_photo_without_time_is_refused_and_a_list_helps(tmp_path):
         load(tmp_path)
     (tmp_path / "exposures.json").write_text(json.dumps({f"{i:03d}.jpg": 2.0 for i in range(6)}))
     assert {view.exposure_time for view in load(tmp_path).views} == {2.0}
-    (tmp_path / "exposures.json").write_text(json.dumps([{"file": "000.jpg", "exposure_time": 0}]))
-    with pytest.raises(InputError, match=r"exposures.json: exposure time of '000.jpg' is 0"):
-        load(tmp_path)
+    (tmp_path / "exposures.json").write_text(json.dumps({f"{i:03d}.jpg": "1/125" for i in range(6)}))
+    assert {view.exposure_time for view in load(tmp_path).views} == {0.008}
+    for wrong in (0, "1/0", "1/60 s", "/2", True, None, [1]):
+        (tmp_path / "exposures.json").write_text(json.dumps([{"file": "000.jpg", "exposure_time": wrong}]))
+        with pytest.raises(InputError, match=rf"time of .000.jpg. is {re.escape(repr(wrong))}"):
+            load(tmp_path)
 
 
 def test_splits(tmp_path):
