@@ -52,15 +52,18 @@ def test_folders_without_a_scene(tmp_path, capfd):
     (tmp_path / "text").mkdir()
     (tmp_path / "text" / "readme.md").write_text("photos to come")
     (tmp_path / "file").write_text("x")
-    (tmp_path / "one").mkdir()
+    for name, photos in (("one", "a"), ("two", "ab")):
+        (tmp_path / name).mkdir()
+        for photo in photos:
+            Image.fromarray(np.full((8, 8, 3), 90, np.uint8)).save(tmp_path / name / f"{photo}.png")
     write_blender(tmp_path / "blender", count=1)
-    Image.fromarray(np.full((8, 8, 3), 90, np.uint8)).save(tmp_path / "one" / "a.png")
     for name, words in {
         "nowhere": "not found",
         "empty": "empty",
         "text": "no photos",
         "file": "not a folder",
         "one": "only photo",
+        "two": "holds 2 photos: depth and light cannot be told apart",
         "blender": "has 1 view",
     }.items():
         line = train_refused(capfd, tmp_path / name)

@@ -79,6 +79,8 @@ def _compared(runs: Sequence) -> ComparedRuns:
     last = [run.metrics()[-1] | {column: getattr(run, name) for column, name in names.items()} for run in runs]
     figures = {column: [line.get(column) for line in last] for column in COLUMNS}
     label = Path(runs[0].path).name + (f" and {len(runs) - 1} more" if len(runs) > 1 else "")
+    if stopped := sum(run.iterations < run.config.schedule.iterations for run in runs):
+        label += " (not ended)" if len(runs) == 1 else f" ({stopped} not ended)"
     return ComparedRuns(label, runs[0].scene_name, figures, [run.metrics() for run in runs])
 
 

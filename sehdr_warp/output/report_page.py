@@ -91,11 +91,12 @@ def _header(run: Any, scene: Scene) -> str:
     summary, last = run.summary(), next((line for line in reversed(run.metrics()) if "psnr_ldr" in line), {})
     camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
     times = sorted({view.exposure_time for view in scene.train_views or scene.views})
+    span = " to ".join(shutter(time) for time in sorted({times[0], times[-1]}))
     facts = {
         "photos trained on": len(scene.train_views),
         "photos held out": len(scene.test_views),
         "pixels each": f"{camera.width} \N{MULTIPLICATION SIGN} {camera.height}",
-        "exposure": " to ".join(shutter(time) for time in sorted({times[0], times[-1]})).replace(" s to", " to"),
+        "exposure" if run.photo_gains is None else "exposure, gains counted in": span.replace(" s to", " to"),
         "response": escape(str(run.response.name)),
         "Gaussians": f"{run.gaussian_count:,}".replace(",", SPACE),
         "steps": run.iterations,

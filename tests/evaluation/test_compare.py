@@ -48,6 +48,13 @@ def test_runs_that_differ_by_their_seed_share_a_row(tmp_path):
     assert r"26.00 $\pm$ 1.41" in latex and r"room\_1" in latex and latex.count(r"\\") == 3
 
 
+def test_runs_that_have_not_ended_are_marked(tmp_path):
+    stopped, whole = trained(tmp_path / "a"), trained(tmp_path / "b", seed=1)
+    stopped.iterations = 60
+    assert compare_runs([stopped])[0].label == "a (not ended)"
+    assert compare_runs([stopped, whole])[0].label == "a and 1 more (1 not ended)"
+
+
 def test_what_cannot_be_compared_is_one_line(tmp_path):
     one = trained(tmp_path / "a")
     empty = trained(tmp_path / "b", ldr=(), mu=())

@@ -70,6 +70,12 @@ def test_the_page_is_valid_alone_and_complete(tmp_path):
     assert '<rect x="3.8" y="5.8"' in text  # Around the box, by three units of a 32-pixel photo
 
 
+def test_exposures_that_gains_changed_are_marked(tmp_path, monkeypatch):
+    assert "<li>exposure<b>" in page(tmp_path)
+    monkeypatch.setattr(AnalyticRun, "photo_gains", object())
+    assert "<li>exposure, gains counted in<b>" in page(tmp_path / "gains")
+
+
 def test_what_is_not_known_is_left_out(tmp_path):
     text = page(tmp_path, truth=False, splits=("train", "train"), metrics=None, unexplained=False)
     assert "What stays unexplained" not in headings(text) and "Error against time" not in headings(text)
