@@ -235,7 +235,7 @@ def test_photos_are_averaged_side_by_side(tmp_path):
 
 
 def test_photos_are_found_beside_a_cover_and_told_of_in_folders(tmp_path):
-    for name in ("day/1.png", "day/2.png", "text/note.txt"):
+    for name in ("day/1.png", "day/2.png", "day/3.png", "text/note.txt"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     with pytest.raises(InputError, match="no photos and no known layout; give one of its folders with photos: day$"):

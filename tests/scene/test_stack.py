@@ -49,7 +49,13 @@ def test_a_stack_from_one_place_is_told_before_it_is_matched(tmp_path):
 
 @pytest.mark.parametrize(
     ("times", "shift"),
-    [((0.125, 1.0, 8.0), 12), ((1.0, 1.0, 8.0), 0), ((1.0, 1.2, 1.4), 0), ((0.125, None, 8.0), 0), ((None, None), 0)],
+    [
+        ((0.125, 1.0, 8.0), 12),
+        ((1.0, 1.0, 8.0), 0),
+        ((1.0, 1.2, 1.4), 0),
+        ((0.125, None, 8.0), 0),
+        ((None, None, None), 0),
+    ],
 )
 def test_other_photos_are_matched(tmp_path, times, shift):
     with pytest.raises(Matched):
