@@ -165,7 +165,9 @@ def test_existing_run_is_refused_and_resume_continues(run, capsys):
 
 def test_a_training_ends_by_saying_what_to_type_next(run, capsys):
     assert call("train", "--resume", "--out", run, "--device", "cpu") == 0
-    lines = capsys.readouterr().out.splitlines()
+    told = capsys.readouterr()
+    assert "all 30 iterations are done: nothing is left to train" in told.err
+    lines = told.out.splitlines()
     assert lines[0].startswith(f"{run}: 30 iterations, ")
     assert re.search(r", held-out photos [\d.]+ dB, HDR [\d.]+ dB \(mu-law\), [\d.]+ s on cpu", lines[0])
     assert len(lines) == 4 and all(

@@ -189,6 +189,8 @@ def _train(asked: Train, ranks=None) -> None:
         training = Training(
             scene, out, config, device=device, tensorboard=output.tensorboard, data=data, ranks=ranks, **how
         )
+        if training.iteration >= training.total:
+            log.info("all %d iterations are done: nothing is left to train", training.total)
         with viewed(training, str(out)) if output.view else nullcontext(training) as steps:
             follow(steps, training.total)
     run = training.run
