@@ -118,10 +118,10 @@ def parts_of_step(variant: Variant, work: Work, device: torch.device) -> list[di
 
 
 def work_of(arguments: Sequence[Any], harmonics: int) -> Work:
-    """arguments: as drawn_pairs() takes them; harmonics: numbers of a Gaussian's."""
-    pairs, drawn = drawn_pairs(*arguments)
-    means, *_, width, height = arguments
-    return Work(len(means), harmonics, arguments[4].shape[1], pairs, drawn, width * height)
+    """arguments: rasterize()'s, seven tensors, width and height; harmonics: numbers of a Gaussian's."""
+    *splats, width, height = arguments
+    pairs, drawn = drawn_pairs(splats, width, height)
+    return Work(len(splats[0]), harmonics, splats[4].shape[1], pairs, drawn, width * height)
 
 
 def bytes_per_microsecond(device: torch.device) -> float:

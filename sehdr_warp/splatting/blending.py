@@ -148,58 +148,62 @@ def blend_on_cuda(
     features, lists: TileLists, records, image, transmittance, alpha_threshold: float, deterministic: bool
 ) -> Adjoint:
     """Fill image [H, W, C] and transmittance [H, W] by block kernels (also on CPU fibers, where tests ask for them)."""
-    scalar = warp_scalar(features.dtype)
+    scalar, cuda = warp_scalar(features.dtype), features.device.type == "cuda"
     height, width, channels = image.shape
-    padded_channels = blend_cuda.padded_channels(channels)
-    last = torch.empty(height * width, dtype=torch.int32, device=features.device)
-    tile_count = lists.columns * lists.rows
-    frame = lists.columns, width, height, alpha_threshold
-    cuda = features.device.type == "cuda"
-
-    def padded(features):
-        padding = padded_channels - features.shape[1]
-        if padding:
-            return torch.nn.functional.pad(features, (0, padding))
-        return features.clone() if features.data_ptr() % 16 else features  # Rows of four are read at once.
-
-    corners = torch.empty(lists.entry_count, dtype=torch.uint8, device=features.device)
-    listed = lists.ranges, lists.gaussians
-    launch(blend_cuda.corners_kernel(scalar), lists.entry_count, *listed, *records, lists.columns, corners)
-
-    def by_gaussian(features):
-        return *listed, corners, *records, features.reshape(-1, 4), *frame
-
-    def launch_blocks(kernel, blocks_per_tile, *arguments):
-        block = blend_cuda.BLOCK_DIM
-        launch(kernel, tile_count * blocks_per_tile * block, *arguments, block_dim=block)
-
     rows = padded(features)
-    given = *by_gaussian(rows), image, transmittance, last
-    launch_blocks(blend_cuda.forward_kernel(scalar, channels, cuda), blend_cuda.BLOCKS_PER_TILE, *given)
+    corners, last = draw_blocks(rows, lists, records, image, transmittance, alpha_threshold)
     # Padded they are larger, and few are not padded again.
     count, kept = len(features), rows if len(features) <= ONE_SORT else features
-    del rows, given
+    del rows
 
     def backward(image_gradient: Tensor, transmittance_gradient: Tensor | None) -> Tensor:
         if transmittance_gradient is None:
             transmittance_gradient = transmittance.view(-1)[:0]
         kernel = blend_cuda_adjoint.backward_kernel(scalar, channels, deterministic, cuda)
-        corners, sizes = blend_cuda.BLOCKS_PER_TILE, (blend_cuda_adjoint.ROWS, channels + 6)
-        gradients = image_gradient, transmittance_gradient
-        given = *by_gaussian(padded(kept)), transmittance, last, *gradients, *sizes
+        listed, frame = (lists.ranges, lists.gaussians, corners), (lists.columns, width, height, alpha_threshold)
+        gradients, sizes = (image_gradient, transmittance_gradient), (blend_cuda_adjoint.ROWS, channels + 6)
+        given = *listed, *records, padded(kept).reshape(-1, 4), *frame, transmittance, last, *gradients, *sizes
         if not deterministic:
             by_rows = blend_cuda_adjoint.adds_rows(scalar, deterministic, cuda)
             columns = channels + 6
             gathered = transmittance.new_zeros(count, blend_cuda.padded_channels(columns) if by_rows else columns)
-            launch_blocks(kernel, corners, *given, 0, lists.gaussians, gathered)
+            launch_blocks(kernel, lists, blend_cuda.BLOCKS_PER_TILE, *given, 0, lists.gaussians, gathered)
             return gathered
         emission, by_entry = lists.emission, transmittance.new_zeros(lists.entry_count, channels + 6)
         assert emission is not None, "sums in a fixed order need the entries as they were emitted"
-        for corner in range(corners):
-            launch_blocks(kernel, 1, *given, corner, emission.places, by_entry)
+        for corner in range(blend_cuda.BLOCKS_PER_TILE):
+            launch_blocks(kernel, lists, 1, *given, corner, emission.places, by_entry)
         return gather_by_gaussian(emission, by_entry)
 
     return backward
+
+
+def draw_blocks(rows, lists: TileLists, records, image, transmittance, alpha_threshold: float) -> tuple[Tensor, Tensor]:
+    """Fill image [H, W, C] and transmittance [H, W] from padded() features. Returns [M] uint8, bit k where an entry's
+    ellipse touches corner k of its tile, and [H W] int32, 1 + list place of the last Gaussian that a pixel shows."""
+    scalar, (height, width, channels) = warp_scalar(rows.dtype), image.shape
+    corners = torch.empty(lists.entry_count, dtype=torch.uint8, device=rows.device)
+    last = torch.empty(height * width, dtype=torch.int32, device=rows.device)
+    listed = lists.ranges, lists.gaussians
+    launch(blend_cuda.corners_kernel(scalar), lists.entry_count, *listed, *records, lists.columns, corners)
+    kernel = blend_cuda.forward_kernel(scalar, channels, rows.device.type == "cuda")
+    frame = lists.columns, width, height, alpha_threshold
+    given = *listed, corners, *records, rows.reshape(-1, 4), *frame, image, transmittance, last
+    launch_blocks(kernel, lists, blend_cuda.BLOCKS_PER_TILE, *given)
+    return corners, last
+
+
+def launch_blocks(kernel, lists: TileLists, blocks_per_tile: int, *arguments) -> None:
+    """Launches a block kernel over the tiles."""
+    block = blend_cuda.BLOCK_DIM
+    launch(kernel, lists.columns * lists.rows * blocks_per_tile * block, *arguments, block_dim=block)
+
+
+def padded(features: Tensor) -> Tensor:
+    """Features [N, C] with columns for whole rows of four, which block kernels read at once."""
+    if padding := blend_cuda.padded_channels(features.shape[1]) - features.shape[1]:
+        return torch.nn.functional.pad(features, (0, padding))
+    return features.clone() if features.data_ptr() % 16 else features
 
 
 def gather_by_gaussian(emission: Emission, by_entry: Tensor) -> Tensor:

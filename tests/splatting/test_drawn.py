@@ -19,7 +19,7 @@ def test_what_warps_draw_is_counted(device, monkeypatch):
         given = means, log_scales + grown, quaternions, opacities, features
         with monkeypatch.context() as fibers:
             fibers.setattr(wp.config, "enable_cpu_blocks", device == "cpu")
-            pairs, drawn = drawn_pairs(*given, *camera, 40, 24)
+            pairs, drawn = drawn_pairs((*given, *camera), 40, 24)
         each = [rasterize(*(tensor[i : i + 1] for tensor in given), *camera, 40, 24).alpha for i in range(400)]
         colored = torch.stack(each) >= ALPHA_THRESHOLD
         assert pairs == rasterize(*given, *camera, 40, 24).entry_count
