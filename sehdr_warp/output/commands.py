@@ -172,7 +172,7 @@ def run_render(asked: Render) -> None:
     lost = ["--" + name.replace("_", "-") for name in lost if name not in _OF_FILMS_TOO]
     if asked.out is None and lost:
         raise UsageError(f"{', '.join(lost)}: of pictures, and none are written beside a film without --out")
-    if asked.count != 60 and asked.cameras not in PATHS:
+    if asked.count != Render.count and asked.cameras not in PATHS:
         raise UsageError(f"--count {asked.count}: of an orbit or interpolation; name one with --cameras")
     written, ramp = [], _ramp(asked.ev_ramp)
     if asked.video is not None:

@@ -21,7 +21,7 @@ from .sfm import reconstruct
 from .stack import refuse_stack
 
 # From the full size to reduced copies.
-_FEWEST = 3  # Photos that a training makes sense of
+FEWEST_PHOTOS = 3  # That a training makes sense of
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 # HDR-NeRF's synthetic exposures, which HDR-GS's folders do not state (its train_synthetic.py holds them as constants).
 _HDR_GS_SECONDS = (0.125, 0.5, 2.0, 8.0, 32.0)
@@ -199,9 +199,9 @@ def read_photos(folder: Path, cache: Path | str | None = None) -> Capture:
     kind = one_kind(photos)
     if len(photos) < 2:
         raise InputError(photos[0], "is the only photo; one view does not show depth", "add photos from other places")
-    if len(photos) < _FEWEST:
+    if len(photos) < FEWEST_PHOTOS:
         problem = f"holds {len(photos)} photos: depth and light cannot be told apart from so few"
-        raise InputError(folder, problem, f"take {_FEWEST} or more from different places, better 20")
+        raise InputError(folder, problem, f"take {FEWEST_PHOTOS} or more from different places, better 20")
     for photo in photos:
         photo_sizes(photo)
     if kind == "raw":

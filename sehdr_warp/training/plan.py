@@ -15,6 +15,7 @@ from ..parallel import thread_count
 from ..scene import Scene, View, encoded_values
 from ..scene.exposure import made_by_camera
 from ..scene.linear_photos import kind_of
+from ..scene.read_folders import FEWEST_PHOTOS
 from .config import Config, OptimizerConfig
 from .config_files import override_config
 from .densification import gaussian_budget
@@ -42,7 +43,6 @@ REACH = 2.0**16  # Brackets farther from the photos' exposure are black or white
 
 PROBES = 2000  # Places at which overlap and visibility are measured
 FEWEST_POINTS = 100  # With fewer sparse points places along the cameras' rays serve as probes
-FEWEST_PHOTOS = 3
 LEAST_OVERLAP = 0.02
 LEAST_CONTRAST = 1 / 255
 DRIFT = 3.0  # Stops of brightness between photos from which exposure is taken to have changed unsaid
