@@ -2,10 +2,10 @@
 
 The maths is blend_cpu's; what differs is who does what. The adjoint is in blend_cuda_adjoint.py.
 
-Most entries of a 16 x 16 tile miss an 8 x 4 corner of it. `mark_corners` tests every entry's ellipse exactly against
-the corners of its tile, and leaves a bit for each. A warp walks its tile's list 32 entries at a time, ROUNDS of them
-together, and packs those that touch its corner into a queue in shared memory, a ring; they are blended in batches of
-32. In a batch a lane fetches one Gaussian's records and features, and then each lane draws all of them on its pixel.
+Most entries of a 16 x 16 tile miss an 8 x 4 corner of it. `find_lists` of tiles.py tests every entry's ellipse exactly
+against the corners of its tile, and leaves a bit for each. A warp walks its tile's list 32 entries at a time, ROUNDS of
+them together, and packs those that touch its corner into a queue in shared memory, a ring; they are blended in batches
+of 32. In a batch a lane fetches one Gaussian's records and features, and then each lane draws all of them on its pixel.
 
 Lists differ in length by a hundred times, and the longest decide how long a picture takes: a warp that waits for what
 it has just asked for does nothing else. So the next rounds, and the next batch, are on their way while a batch is
@@ -91,55 +91,10 @@ def block_functions(dtype, cuda: bool) -> tuple:
 
 
 @cache
-def corners_kernel(dtype):
-    """mark_corners over entries, for one scalar type: ranges, entries, shapes, ellipses as blend_forward takes them;
-    corners: [M], bit k is set where the entry's ellipse touches corner k of its tile. For an entry of no tile nothing
-    is written."""
-    g = geometry(dtype)
-    real, vec4 = g.real, g.vec4
-    blocks_across = TILE_SIZE // 8
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def mark_corners(
-        ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), shapes: wp.array(dtype=vec4),
-        ellipses: wp.array(dtype=vec4), columns: int,
-        corners: wp.array(dtype=wp.uint8),
-    ):
-        entry = wp.tid()
-        tiles = ranges.shape[0]
-        tile = int(0)
-        high = int(tiles)
-        while tile < high:
-            middle = (tile + high) // 2
-            if ranges[middle][1] <= entry:
-                tile = middle + 1
-            else:
-                high = middle
-        if tile < tiles:
-            gaussian = entries[entry]
-            s = shapes[gaussian]
-            e = ellipses[gaussian]
-            tile_row = tile // columns
-            left = real((tile - tile_row * columns) * wp.static(TILE_SIZE)) + real(0.5)
-            top = real(tile_row * wp.static(TILE_SIZE)) + real(0.5)
-            touched = int(0)
-            for corner in range(wp.static(BLOCKS_PER_TILE)):
-                if g.ellipse_meets_rectangle(
-                    s[0], s[1], e[0], e[1], e[2], e[3],
-                    left + real((corner % wp.static(blocks_across)) * 8),
-                    top + real((corner // wp.static(blocks_across)) * 4), real(7.0), real(3.0),
-                ):
-                    touched = touched | (1 << corner)
-            corners[entry] = wp.uint8(touched)
-
-    return mark_corners
-
-
-@cache
 def forward_kernel(dtype, channels: int, cuda: bool = False):
     """blend_forward over tiles x BLOCKS_PER_TILE x 32 threads. cuda: not to run on the CPU's fibers.
 
-    ranges: [tiles] first and one past the last entry; entries: [M] Gaussians; corners: [M] mark_corners()'s;
+    ranges: [tiles] first and one past the last entry; entries: [M] Gaussians; corners: [M] find_lists()'s;
     shapes: [N] (x, y, opacity, -); ellipses: [N] (conic a, b, c, level);
     features: [N padded_channels / 4] rows of four, flat
     image: [H W] vectors of C; transmittance: [H W]; last: [H W] 1 + list place of the last Gaussian drawn

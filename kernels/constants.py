@@ -3,6 +3,8 @@
 # Edge of a square tile in pixels. A row of 16 float32 is one AVX-512 register, and 16 x 16 balanced list length against
 # list count best.
 TILE_SIZE = 16
+# Width and height in pixels of what a warp of a GPU draws of a tile.
+CORNER = 8, 4
 # Contributions below this opacity are left out: the step of an 8-bit display; for HDR output it can be lowered.
 ALPHA_THRESHOLD = 1.0 / 255.0
 # A single Gaussian never hides everything behind it: 1 / (1 - alpha) stays bounded in the adjoint.

@@ -4,9 +4,9 @@
 over the counts gives every Gaussian its range of entries. Two ways lead to lists in depth order, by stable sorts:
 Gaussians are put in it, `emit_entries` fills their ranges, and a sort of the entries by tile leaves each tile's list in
 the order in which they were emitted (the GPU has least to do); or `emit_keys` fills the ranges of the Gaussians as they
-come, and the entries are sorted once by tile and depth (the host has). `find_ranges` finds where each tile's list
-begins and ends. Adjoints sum what they write for each entry by Gaussian in one order, whatever runs when:
-`gather_entries`.
+come, and the entries are sorted once by tile and depth (the host has). `find_lists` finds where each tile's list
+begins and ends, and which corners of its tile each entry touches. Adjoints sum what they write for each entry by
+Gaussian in one order, whatever runs when: `gather_entries`.
 """
 
 from functools import cache
@@ -14,7 +14,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .constants import FORWARD, TILE_SIZE
+from .constants import CORNER, FORWARD, TILE_SIZE
 from .geometry import geometry
 
 DEPTH_BITS = 30
@@ -232,27 +232,59 @@ def place_entries(
 
 
 @cache
-def ranges_kernel(key, shift: int):
-    """find_ranges for sorted keys, wp.int32 or wp.int64, whose tile is above their lowest `shift` bits.
+def lists_kernel(dtype, key, shift: int):
+    """find_lists for sorted keys, wp.int32 or wp.int64, whose tile is above their lowest `shift` bits, and records of
+    one scalar type. Covers the entries, of which there is one at least.
 
-    ranges: [2 tiles], for each tile the first and one past the last of its entries. Covers [0, tiles + 1). Unused
-    entries carry a tile number beyond all, and belong to no list.
+    ranges: [2 tiles], for each tile the first and one past the last of its entries; corners: [entries], bit k where the
+    ellipse touches corner k of the tile, CORNER pixels, or [0] where none are asked for. Unused entries carry a tile
+    number beyond all: they belong to no list, and their corners are 0.
     """
+    g = geometry(dtype)
+    real, vec4 = g.real, g.vec4
+    across, down = TILE_SIZE // CORNER[0], TILE_SIZE // CORNER[1]
 
     @wp.kernel(module="unique", module_options=FORWARD)
-    def find_ranges(first: int, keys: wp.array(dtype=key), tiles: int, ranges: wp.array(dtype=wp.int32)):
-        tile = first + wp.tid()
-        low = int(0)
-        high = keys.shape[0]
-        while low < high:
-            middle = low + (high - low) // 2
-            if int(keys[middle] >> key(shift)) < tile:
-                low = middle + 1
-            else:
-                high = middle
-        if tile < tiles:
-            ranges[2 * tile] = low
-        if tile > 0:
-            ranges[2 * tile - 1] = low
+    def find_lists(
+        first: int,
+        keys: wp.array(dtype=key), gaussians: wp.array(dtype=wp.int32), shapes: wp.array(dtype=vec4),
+        ellipses: wp.array(dtype=vec4), columns: int, tiles: int,
+        ranges: wp.array(dtype=wp.int32), corners: wp.array(dtype=wp.uint8),
+    ):
+        entry = first + wp.tid()
+        tile = int(keys[entry] >> key(shift))
+        before = int(-1)
+        if entry > 0:
+            before = int(keys[entry - 1] >> key(shift))
+        # Lists begin and end here, those of tiles without entries both.
+        for begun in range(before + 1, wp.min(tile, tiles) + 1):
+            if begun < tiles:
+                ranges[2 * begun] = entry
+            if begun > 0:
+                ranges[2 * begun - 1] = entry
+        if entry == keys.shape[0] - 1:
+            for begun in range(tile + 1, tiles + 1):
+                if begun < tiles:
+                    ranges[2 * begun] = entry + 1
+                if begun > 0:
+                    ranges[2 * begun - 1] = entry + 1
+        touched = int(0)
+        if tile < tiles and corners.shape[0] > 0:
+            gaussian = gaussians[entry]
+            shape = shapes[gaussian]
+            ellipse = ellipses[gaussian]
+            row = tile // columns
+            left = real((tile - row * columns) * wp.static(TILE_SIZE)) + real(0.5)
+            top = real(row * wp.static(TILE_SIZE)) + real(0.5)
+            for corner in range(wp.static(across * down)):
+                if g.ellipse_meets_rectangle(
+                    shape[0], shape[1], ellipse[0], ellipse[1], ellipse[2], ellipse[3],
+                    left + real((corner % wp.static(across)) * wp.static(CORNER[0])),
+                    top + real((corner // wp.static(across)) * wp.static(CORNER[1])),
+                    real(wp.static(CORNER[0] - 1)), real(wp.static(CORNER[1] - 1)),
+                ):
+                    touched = touched | (1 << corner)
+        if corners.shape[0] > 0:
+            corners[entry] = wp.uint8(touched)
 
-    return find_ranges
+    return find_lists

@@ -25,7 +25,7 @@ OTHER = "torch's own"
 KERNELS = {
     "projection": ("project_*_forward",),
     "harmonics": ("evaluate_*", "turns_adjoint_*"),
-    "lists": ("pack_records_*", "key_by_*", "emit_*", "find_ranges_*", "mark_*", "*radix_sort*", "*DeviceScan*"),
+    "lists": ("pack_records_*", "key_by_*", "emit_*", "find_lists_*", "*radix_sort*", "*DeviceScan*"),
     "blend": ("blend_forward_*",),
     "response and fusion": ("encode_*", "interpolate_*", "perceptrons_*", "mix_*", "point_adjoint_*", "unit_adjoint_*"),
     "losses": ("compare_*", "blur_*", "gradient_in_strips_*", "clipped_*", "sum_opacities_*"),

@@ -151,7 +151,7 @@ def blend_on_cuda(
     scalar, cuda = warp_scalar(features.dtype), features.device.type == "cuda"
     height, width, channels = image.shape
     rows = padded(features)
-    corners, last = draw_blocks(rows, lists, records, image, transmittance, alpha_threshold)
+    last = draw_blocks(rows, lists, records, image, transmittance, alpha_threshold)
     # Padded they are larger, and few are not padded again.
     count, kept = len(features), rows if len(features) <= ONE_SORT else features
     del rows
@@ -160,7 +160,7 @@ def blend_on_cuda(
         if transmittance_gradient is None:
             transmittance_gradient = transmittance.view(-1)[:0]
         kernel = blend_cuda_adjoint.backward_kernel(scalar, channels, deterministic, cuda)
-        listed, frame = (lists.ranges, lists.gaussians, corners), (lists.columns, width, height, alpha_threshold)
+        listed, frame = (lists.ranges, lists.gaussians, lists.corners), (lists.columns, width, height, alpha_threshold)
         gradients, sizes = (image_gradient, transmittance_gradient), (blend_cuda_adjoint.ROWS, channels + 6)
         given = *listed, *records, padded(kept).reshape(-1, 4), *frame, transmittance, last, *gradients, *sizes
         if not deterministic:
@@ -178,19 +178,17 @@ def blend_on_cuda(
     return backward
 
 
-def draw_blocks(rows, lists: TileLists, records, image, transmittance, alpha_threshold: float) -> tuple[Tensor, Tensor]:
-    """Fill image [H, W, C] and transmittance [H, W] from padded() features. Returns [M] uint8, bit k where an entry's
-    ellipse touches corner k of its tile, and [H W] int32, 1 + list place of the last Gaussian that a pixel shows."""
-    scalar, (height, width, channels) = warp_scalar(rows.dtype), image.shape
-    corners = torch.empty(lists.entry_count, dtype=torch.uint8, device=rows.device)
+def draw_blocks(rows, lists: TileLists, records, image, transmittance, alpha_threshold: float) -> Tensor:
+    """Fill image [H, W, C] and transmittance [H, W] from padded() features. Returns [H W] int32, 1 + list place of the
+    last Gaussian that a pixel shows."""
+    assert lists.corners is not None, "a GPU's lists tell corners"
+    height, width, channels = image.shape
     last = torch.empty(height * width, dtype=torch.int32, device=rows.device)
-    listed = lists.ranges, lists.gaussians
-    launch(blend_cuda.corners_kernel(scalar), lists.entry_count, *listed, *records, lists.columns, corners)
-    kernel = blend_cuda.forward_kernel(scalar, channels, rows.device.type == "cuda")
-    frame = lists.columns, width, height, alpha_threshold
-    given = *listed, corners, *records, rows.reshape(-1, 4), *frame, image, transmittance, last
+    kernel = blend_cuda.forward_kernel(warp_scalar(rows.dtype), channels, rows.device.type == "cuda")
+    listed, frame = (lists.ranges, lists.gaussians, lists.corners), (lists.columns, width, height, alpha_threshold)
+    given = *listed, *records, rows.reshape(-1, 4), *frame, image, transmittance, last
     launch_blocks(kernel, lists, blend_cuda.BLOCKS_PER_TILE, *given)
-    return corners, last
+    return last
 
 
 def launch_blocks(kernel, lists: TileLists, blocks_per_tile: int, *arguments) -> None:

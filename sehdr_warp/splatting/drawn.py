@@ -27,11 +27,11 @@ def drawn_pairs(splats: Sequence[Tensor], width: int, height: int) -> tuple[int,
     projected = project(*shapes, pose, intrinsics, width=width, height=height, **options)
     means2d, conics, depths, opacities, extents = projected
     records, counts = pack_records(means2d, conics, opacities, extents, ALPHA_THRESHOLD, width, height, features)
-    emission = features.device.type == "cpu"
-    numbered = number_entries(counts, depths, extents, emission=emission)
-    lists = build_tile_lists(records, *numbered, depths, extents, width, height, emission=emission)
+    numbered = number_entries(counts, depths, extents, emission=False)
+    lists = build_tile_lists(records, *numbered, depths, extents, width, height, emission=False)
+    assert lists.corners is not None, "so few Gaussians that one sort makes their lists, which tells corners"
     image, left = features.new_empty(height, width, features.shape[1]), features.new_empty(height, width)
-    corners, last = draw_blocks(padded(features), lists, records, image, left, ALPHA_THRESHOLD)
+    last = draw_blocks(padded(features), lists, records, image, left, ALPHA_THRESHOLD)
     beyond = 0, lists.columns * TILE_SIZE - width, 0, lists.rows * TILE_SIZE - height
     last = torch.nn.functional.pad(last.view(height, width), beyond)
     # Rows of tiles, of their corners, of pixels; then columns of each.
@@ -41,6 +41,6 @@ def drawn_pairs(splats: Sequence[Tensor], width: int, height: int) -> tuple[int,
     tiles = torch.repeat_interleave(torch.arange(len(lengths), device=last.device), lengths)
     places = torch.arange(len(tiles), device=last.device) - (lengths.cumsum(0) - lengths)[tiles]
     entries = lists.ranges[:, 0].long()[tiles] + places
-    touched = (corners[entries, None].int() >> torch.arange(BLOCKS_PER_TILE, device=last.device)) & 1
+    touched = (lists.corners[entries, None].int() >> torch.arange(BLOCKS_PER_TILE, device=last.device)) & 1
     drawn = touched.bool() & (places[:, None] < last[tiles])
     return lists.entry_count, int(drawn.sum())

@@ -127,7 +127,7 @@ def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, emission: b
     starts = (ends - counts).int()
     tiles, gaussians = (torch.empty(2 * room, dtype=torch.int32, device=order.device) for _ in range(2))
     launch(kernel, count * bool(room), *frame, starts, counts, tiles, gaussians, smallest=256)
-    ranges, gaussians, places = lists_by_tile(tiles, gaussians, room, columns * rows, emission)
+    ranges, gaussians, _, places = lists_by_tile(tiles, gaussians, room, None, columns, rows, emission)
     by_gaussian = None if places is None else Emission(order.clone(), ends, places)
     return _Lists(directions, columns, ranges, gaussians, by_gaussian)
 

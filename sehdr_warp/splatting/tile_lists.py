@@ -41,6 +41,8 @@ class TileLists:
 
     ranges: [tiles, 2] first and one past the last entry of each tile.
     gaussians: [M] the Gaussian of each entry, by tile and then front to back.
+    corners: [M] uint8, bit k where the entry's ellipse touches corner k of its tile; None on the CPU, where none is
+        asked for.
     emission: how the entries stood by Gaussian; None where it was not asked for.
     width, height: of the image in pixels; columns, rows: tiles across and down.
     overflow: scalar bool, whether a given capacity was too small for all entries; None without a capacity.
@@ -49,6 +51,7 @@ class TileLists:
 
     ranges: Tensor
     gaussians: Tensor
+    corners: Tensor | None
     emission: Emission | None
     width: int
     height: int
@@ -114,14 +117,15 @@ def build_tile_lists(
     if order is None:
         touched = *records, extents, depths, columns, rows
         keys, gaussians = sort_keys(*emit_keys(*touched, ends, room), room, tile_count)
-        ranges = find_ranges(keys, tile_count)
+        ranges, corners = find_lists(keys, gaussians, records, columns, rows)
     else:
         touched = order, *records, extents, columns, rows
         tiles, gaussians = emit_entries(*touched, ends, room)
-        ranges, gaussians, places = lists_by_tile(tiles, gaussians, room, tile_count, emission)
+        given = tiles, gaussians, room, records, columns, rows, emission
+        ranges, gaussians, corners, places = lists_by_tile(*given)
         by_gaussian = None if places is None else Emission(order.clone(), ends, places)
         total = total.clone()
-    return TileLists(ranges, gaussians, by_gaussian, width, height, overflow, total)
+    return TileLists(ranges, gaussians, corners, by_gaussian, width, height, overflow, total)
 
 
 def pack_records(
@@ -198,24 +202,28 @@ def emit_keys(shapes, ellipses, extents, depths, columns: int, rows: int, ends, 
     return keys, gaussians
 
 
-def lists_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: bool):
-    """A stable sort of emit_entries()'s by tile: the tiles' ranges as find_ranges() gives them, Gaussians [M], and
-    where each entry stood before [M] or None."""
-    by_device = _count_by_tile if tiles.device.type == "cpu" else _sort_by_tile
-    return by_device(tiles, gaussians, entry_count, tile_count, emission)
+def lists_by_tile(tiles, gaussians, entry_count: int, records, columns: int, rows: int, emission: bool):
+    """A stable sort of emit_entries()'s by tile: the tiles' ranges and Gaussians [M]; corners [M], or None on the CPU
+    and without records; where each entry stood before [M], or None. Ranges and corners are find_lists()'s."""
+    if tiles.device.type == "cpu":
+        ranges, gaussians, places = _count_by_tile(tiles, gaussians, entry_count, columns * rows, emission)
+        return ranges, gaussians, None, places
+    return _sort_by_tile(tiles, gaussians, entry_count, records, columns, rows, emission)
 
 
-def _sort_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: bool):
-    bits = tile_count.bit_length()
-    if not emission:
-        _sort_pairs(tiles, gaussians, entry_count, bits)
-        return find_ranges(tiles[:entry_count], tile_count), gaussians[:entry_count].clone(), None
-    places = torch.empty(2 * entry_count, dtype=torch.int32, device=tiles.device)
-    torch.arange(entry_count, dtype=torch.int32, device=tiles.device, out=places[:entry_count])
-    _sort_pairs(tiles, places, entry_count, bits)
-    places = places[:entry_count].clone()
-    ranges = find_ranges(tiles[:entry_count], tile_count)
-    return ranges, gaussians[:entry_count][places] if entry_count else gaussians, places
+def _sort_by_tile(tiles, gaussians, entry_count: int, records, columns: int, rows: int, emission: bool):
+    bits, places = (columns * rows).bit_length(), None
+    if emission:
+        places = torch.empty(2 * entry_count, dtype=torch.int32, device=tiles.device)
+        torch.arange(entry_count, dtype=torch.int32, device=tiles.device, out=places[:entry_count])
+    _sort_pairs(tiles, gaussians if places is None else places, entry_count, bits)
+    if places is None:
+        gaussians = gaussians[:entry_count].clone()
+    else:
+        places = places[:entry_count].clone()
+        gaussians = gaussians[:entry_count][places] if entry_count else gaussians
+    ranges, corners = find_lists(tiles[:entry_count], gaussians, records, columns, rows)
+    return ranges, gaussians, corners, places
 
 
 def _count_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission: bool):
@@ -245,13 +253,20 @@ def sort_keys(keys, gaussians, entry_count: int, tile_count: int):
     return keys[:entry_count], gaussians[:entry_count]
 
 
-def find_ranges(tiles, tile_count: int):
-    """[tiles, 2] int32: first and one past the last entry of each tile in the sorted list; alike for none. tiles:
-    int32, or int64 as sort_keys() gives them."""
-    ranges = torch.empty(tile_count, 2, dtype=torch.int32, device=tiles.device)
-    kind = (wp.int64, kernels.DEPTH_BITS) if tiles.dtype == torch.int64 else (wp.int32, 0)
-    launch(kernels.ranges_kernel(*kind), tile_count + 1, tiles, tile_count, ranges.view(-1))
-    return ranges
+def find_lists(tiles, gaussians, records, columns: int, rows: int):
+    """[tiles, 2] int32, first and one past the last of each tile in the sorted list, alike for none; and [M] uint8, the
+    corners of its tile that each entry touches, or None without records. tiles: int32, or int64 as sort_keys() gives
+    them."""
+    ranges = torch.empty(columns * rows, 2, dtype=torch.int32, device=tiles.device)
+    corners = torch.empty(0 if records is None else len(tiles), dtype=torch.uint8, device=tiles.device)
+    if len(tiles):
+        kind = (wp.int64, kernels.DEPTH_BITS) if tiles.dtype == torch.int64 else (wp.int32, 0)
+        read = (torch.empty(0, 4, device=tiles.device),) * 2 if records is None else records
+        kernel = kernels.lists_kernel(warp_scalar(read[0].dtype), *kind)
+        launch(kernel, len(tiles), tiles, gaussians, *read, columns, columns * rows, ranges.view(-1), corners)
+    else:
+        ranges.zero_()
+    return ranges, None if records is None else corners
 
 
 class _Memory:

@@ -12,7 +12,7 @@ from sehdr_warp.splatting.tile_lists import (
     depth_order,
     emit_entries,
     emit_keys,
-    find_ranges,
+    find_lists,
     number_entries,
     sort_keys,
 )
@@ -74,7 +74,8 @@ def test_an_entry_counted_too_much_is_no_tiles_and_one_too_few_costs_its_own_gau
     assert int(unused.sum()) == 2 and set(gaussians[unused].tolist()) == {int(records[0][first])}
     dropped = int(counts[: second + 1].sum()) - 1
     assert torch.equal(tiles[~unused], torch.cat([true_tiles[:dropped], true_tiles[dropped + 1 :]]))
-    ranges = find_ranges(tiles.sort().values, COLUMNS * ROWS)
+    ordered = tiles.sort(stable=True)
+    ranges, _ = find_lists(ordered.values, gaussians[ordered.indices], records[1:3], COLUMNS, ROWS)
     assert int((ranges[:, 1] - ranges[:, 0]).sum()) == len(tiles) - 2
 
 
@@ -87,12 +88,34 @@ def test_one_sort_makes_the_lists_of_two(device, spare):
     room = lists.entry_count + spare
     given = *records, extents, depths, COLUMNS, ROWS, counts.cumsum(0), room
     keys, gaussians = sort_keys(*emit_keys(*given), room, COLUMNS * ROWS)
-    ranges = find_ranges(keys, COLUMNS * ROWS)
+    ranges, corners = find_lists(keys, gaussians, records, COLUMNS, ROWS)
     if spare < 0:
         assert int(ranges[-1, 1]) == room and int(keys.max() >> DEPTH_BITS) < COLUMNS * ROWS
         return
     assert torch.equal(gaussians[: lists.entry_count], lists.gaussians)
     assert torch.equal(ranges, lists.ranges)
+    assert lists.corners is None or torch.equal(corners[: lists.entry_count], lists.corners)
+
+
+def test_corners_are_those_that_an_ellipse_touches(device):
+    """Beside what all pixels of a corner see of a Gaussian, drawn alone."""
+    scene = random_scene(count=40, width=32, height=32, spread=0.8, seed=3).to(torch.float32, device)
+    records, counts, depths, extents = packed(scene)
+    numbered = number_entries(counts, depths, extents, emission=False)
+    lists = build_tile_lists(records, *numbered, depths, extents, 32, 32, emission=False)
+    columns, rows = torch.meshgrid(torch.arange(32.0, device=device), torch.arange(32.0, device=device), indexing="xy")
+    (x, y, *_), (a, b, c, level) = (record[lists.gaussians.long()].t()[..., None, None] for record in records)
+    dx, dy = columns + 0.5 - x, rows + 0.5 - y
+    seen = a * dx * dx + 2 * b * dx * dy + c * dy * dy <= level
+    lengths = (lists.ranges[:, 1] - lists.ranges[:, 0]).long()
+    tiles = torch.repeat_interleave(torch.arange(4, device=device), lengths)
+    # Rows of tiles, of corners, of pixels; then columns of each.
+    by_corner = seen.view(-1, 2, 4, 4, 2, 2, 8).any(6).any(3)[torch.arange(len(tiles)), tiles // 2, :, tiles % 2]
+    told = (lists.corners[:, None].int() >> torch.arange(8, device=device)) & 1
+    assert len(tiles) == lists.entry_count > 40 and 0.1 < told.float().mean() < 0.9
+    # An ellipse may pass between the pixels of a corner that it touches.
+    assert not (by_corner.reshape(-1, 8) & ~told.bool()).any()
+    assert (by_corner.reshape(-1, 8) == told.bool()).float().mean() > 0.95
 
 
 def kept_bytes(holder):
@@ -114,7 +137,9 @@ def test_lists_keep_no_more_memory_than_they_use(device, emission, spare):
     total_and_overflow = 8 + (spare is not None)
     by_gaussian = entries + 3 * 500 if emission else 0
     one_sort = 0 if emission else 4 * entries + 8 * 500 - 8
-    assert kept_bytes(lists) == 4 * (2 * COLUMNS * ROWS + entries + by_gaussian) + total_and_overflow + one_sort
+    corners = 0 if lists.corners is None else entries
+    total = 4 * (2 * COLUMNS * ROWS + entries + by_gaussian) + corners + total_and_overflow + one_sort
+    assert kept_bytes(lists) == total
 
 
 @pytest.mark.parametrize("emission", [True, False])
@@ -126,10 +151,12 @@ def test_entries_counted_by_chunks_are_those_sorted(monkeypatch, count, chunks, 
     # Some belong to no tile, and some tiles have none.
     given = [torch.randint(3, tiles + 1, (2 * count,), generator=generator, dtype=torch.int32)]
     given.append(torch.randint(1000, (2 * count,), generator=generator, dtype=torch.int32))
-    both = [
-        function(*(tensor.clone() for tensor in given), count, tiles, emission)
-        for function in (tile_lists._count_by_tile, tile_lists._sort_by_tile)
-    ]
-    for ours, sorted_ones in zip(*both, strict=True):
+    records = torch.zeros(1000, 4), torch.full((1000, 4), -1.0)
+    counted = tile_lists._count_by_tile(*(tensor.clone() for tensor in given), count, tiles, emission)
+    copies = (tensor.clone() for tensor in given)
+    ranges, ones, corners, places = tile_lists._sort_by_tile(*given, count, records, tiles, 1, emission)
+    alike, *_, without, _ = tile_lists._sort_by_tile(*copies, count, None, tiles, 1, emission)
+    assert torch.equal(alike, ranges) and without is None and len(corners) == count
+    for ours, sorted_ones in zip(counted, (ranges, ones, places), strict=True):
         assert (ours is None) == (sorted_ones is None)
         assert ours is None or torch.equal(ours, sorted_ones[: len(ours)])
