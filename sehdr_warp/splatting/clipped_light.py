@@ -5,7 +5,7 @@ from torch import Tensor
 
 from ..kernels.clipped_light import clipped_light_kernel, clipped_logarithms_kernel
 from .clipped_residual import CODES, WHITE
-from .launching import launch, warp_scalar
+from .launching import launch, times, warp_scalar
 
 
 def clipped_light_energy(
@@ -39,16 +39,18 @@ class _ClippedLight(torch.autograd.Function):
         energies, slopes, logarithms = (torch.empty_like(image) for _ in range(3))
         if index is None:
             codes, index = codes[None], torch.zeros(1, dtype=torch.int64, device=codes.device)
-        scalar, numbers = warp_scalar(image.dtype), (*image.shape[:2], smoothness, lift)
+        # The mean is in the weights: it costs no launch, here and for the gradient.
+        weights = smoothness / image.numel(), lift / image.numel()
+        scalar, numbers = warp_scalar(image.dtype), (*image.shape[:2], *weights)
         photos, mask = codes.contiguous().view(len(codes), -1), None if mask is None else mask.contiguous().view(-1)
         found = image, photos, index, mask, WHITE[codes.dtype], white, logarithms
         launch(clipped_logarithms_kernel(scalar, CODES[codes.dtype]), image.numel(), *found)
         launch(clipped_light_kernel(scalar), image.numel(), image, logarithms, *numbers, energies, slopes)
         ctx.save_for_backward(slopes)
-        return energies.mean()
+        return energies.sum()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, by_energy):
         (slopes,) = ctx.saved_tensors
-        return slopes * (by_energy / slopes.numel()), None, None, None, None, None, None
+        return times(slopes, by_energy), None, None, None, None, None, None
