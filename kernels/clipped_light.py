@@ -59,17 +59,13 @@ def clipped_light_kernel(dtype):
             total = real(0.0)
             clipped = int(0)
             pixels = int(0)
-            # Of known length, so that a GPU asks for all before it waits for any.
-            for down in range(wp.static(-REACH), wp.static(REACH + 1)):
-                for right in range(wp.static(-REACH), wp.static(REACH + 1)):
-                    y = row + down
-                    x = column + right
-                    if y >= 0 and y < height and x >= 0 and x < width:
-                        near = logarithms[i + 3 * (down * width + right)]
-                        pixels += 1
-                        if near >= real(0.0):
-                            clipped += 1
-                            total += near
+            for y in range(wp.max(row - wp.static(REACH), 0), wp.min(row + wp.static(REACH + 1), height)):
+                for x in range(wp.max(column - wp.static(REACH), 0), wp.min(column + wp.static(REACH + 1), width)):
+                    near = logarithms[i + 3 * ((y - row) * width + x - column)]
+                    pixels += 1
+                    if near >= real(0.0):
+                        clipped += 1
+                        total += near
             away = v - total / real(clipped)
             edge = real(1.0) - real(clipped) / real(pixels)
             energy = real(0.5) * smoothness * away * away - lift * edge * v
