@@ -17,6 +17,7 @@ ROUNDS = 4  # Of the rough look
 NEGLIGIBLE = 0.01  # Of light: what differs by less is left as it is
 NONE = 0.0, 0.0  # Falloff
 LENS = 0.05  # Focal lengths that differ by less, as a part, are one lens: structure from motion finds each anew
+FLAT = 0.1  # Of the largest spread of cameras: along an axis where they differ by less, places tell nothing
 FEWEST_OF_LENS = 3  # Photos that tell a falloff
 
 
@@ -36,16 +37,16 @@ class PhotoGains:
         return float(np.log2(list(self.gains.values())).std(0).max()) if self.gains else 0.0
 
     def following(self, views: Sequence[View]) -> "PhotoGains":
-        """These gains of photos with only that part of their exposure that follows the times they state: that a wrong
-        curve makes."""
+        """These gains of photos with only that part of their exposure that follows the times they state, that a wrong
+        curve makes, or the places of their cameras: surfaces that are brighter from one side look like it."""
         values = np.log([self.gains[view.name] for view in views])
-        times = np.log([view.exposure_time for view in views])
-        times -= times.mean()
-        along = times * (times @ values[:, 1]) / max(float(times @ times), 1e-6)
+        told = np.column_stack([np.log([view.exposure_time for view in views]), _places(views)])
+        told -= told.mean(0)
+        along = told @ np.linalg.lstsq(told, values[:, 1], rcond=1e-3)[0]
         return _of([view.name for view in views], values + (along - values[:, 1])[:, None], self.falloff)
 
     def stops_beside(self, views: Sequence[View]) -> float:
-        """Deviation of that part of the photos' exposure which does not follow the times they state."""
+        """Deviation of that part of the photos' exposure which follows neither the times they state nor places."""
         ours, along = (
             np.log2([gains.gains[view.name][1] for view in views]) for gains in (self, self.following(views))
         )
@@ -91,6 +92,13 @@ class PhotoGains:
         codes = codes_of(response.encode(decoded / np.maximum(light, 0.05)), 16)
         codes[view.codes == view.levels] = 65535
         return replace(view, exposure_time=time, codes=codes)
+
+
+def _places(views: Sequence[View]) -> np.ndarray:
+    """[V, up to 3] where cameras are, of spread 1 at most, along axes that they plainly differ along."""
+    places = np.array([view.camera.position for view in views])
+    axes, spread, _ = np.linalg.svd(places - places.mean(0), full_matrices=False)
+    return axes[:, spread > FLAT * max(spread[0], 1e-9)]
 
 
 def start_gains(views: Sequence[View], response: Response) -> PhotoGains:

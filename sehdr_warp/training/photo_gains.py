@@ -22,11 +22,12 @@ LEAST_DISAGREEMENT = 0.12
 less, and gains explain them well."""
 LEFT, LEFT_OF_FALLOFF = 0.9, 0.85
 """Part of the photos' disagreement that may be left when they are evened."""
-LEAST_BESIDE = 0.05  # Stops of drift, of what does not follow stated times, from which they are put right
+LEAST_BESIDE = 0.05  # Stops of drift, of what follows neither stated times nor places, from which times are put right
 LEFT_OF_OTHERS, LEFT_OF_TINT = 0.95, 0.75
 """The same of what gains that half of the points tell leave of how photos disagree at the other half: in exposure over
-stated times, beside what follows them, and in white balance, by colors. EXIF rounds times and sensitivities, and
-cameras tone each photo by itself; what shines, and a wrong curve, explain nothing at other points."""
+stated times, beside what follows them or where cameras are, and in white balance, by colors. EXIF rounds times and
+sensitivities, and cameras tone each photo by itself; what shines, and a wrong curve, explain nothing at other points.
+Ground that is brighter from one side explains much, by gains that grow along a flight: harmonics hold it."""
 ENOUGH = 0.4  # Part of the pixels that are matched from which photos are alike enough as they are
 FEWEST = 100  # Points that a fit needs
 
@@ -97,15 +98,15 @@ def _believed(
 
 
 def _drifts(gains: PhotoGains, views: Sequence[View]) -> bool:
-    """Whether gains are large enough to be asked about, beside what follows the stated times."""
+    """Whether gains are large enough to be asked about, beside what follows the stated times or the places."""
     return gains.stops_beside(views) >= LEAST_BESIDE or gains.tint >= LEAST_TINT
 
 
 def _left_of_others(
     views: Sequence[View], found: tuple[np.ndarray, np.ndarray], response: Response
 ) -> tuple[float, float]:
-    """Parts of the disagreement at half of the points that gains of the other half leave: what of their exposure does
-    not follow the stated times, and their white balance by colors."""
+    """Parts of the disagreement at half of the points that gains of the other half leave: what of their exposure
+    follows neither the stated times nor the places, and their white balance by colors."""
     points, seen = found[0], found[1][: len(views)]
     halves, left = (slice(0, None, 2), slice(1, None, 2)), []
     for this, other in (halves, halves[::-1]):

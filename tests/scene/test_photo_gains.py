@@ -84,14 +84,20 @@ def test_gains_and_falloff_are_found(gains, points):
     assert left_of_falloff(*known, found) < 0.15 and left_of_falloff(*known, wrong) > 0.8
 
 
-def test_what_follows_stated_times_is_told_apart(gains):
-    """A wrong curve makes gains of the times themselves; what a camera rounds is beside them."""
-    views = [replace(v, exposure_time=2.0**k) for k, v in enumerate(photographed({}, {}).train_views)]
-    along = PhotoGains({v.name: (v.exposure_time**0.4,) * 3 for v in views})
-    assert along.stops > 0.5 and along.stops_beside(views) == pytest.approx(0, abs=1e-9)
-    off = np.array([0.1, -0.2, 0.2, -0.2, 0.1])  # Of no slope over times
+@pytest.mark.parametrize("told", ["times", "places"])
+def test_what_follows_stated_times_or_places_is_told_apart(told):
+    """A wrong curve makes gains of the times themselves, what is brighter from one side those of places; what a camera
+    rounds is beside them."""
+    views = [replace(v, exposure_time=2.0 ** (k % 4)) for k, v in enumerate(photographed({}, {}).train_views)]
+    stops = [np.log2(v.exposure_time) if told == "times" else v.camera.position @ [1.5, 3, 0] for v in views]
+    shared = 2 ** (0.4 * np.array(stops))
+    along = PhotoGains({v.name: (gain, gain, gain) for v, gain in zip(views, shared, strict=True)})
+    assert along.stops > 0.2 and along.stops_beside(views) == pytest.approx(0, abs=1e-9)
+    off = np.array([0.1, -0.2, 0.2, -0.2, 0.1])
+    columns = np.array([(1, *v.camera.position[:2], np.log2(v.exposure_time)) for v in views])
+    off -= columns @ np.linalg.lstsq(columns, off, rcond=None)[0]  # Of no slope over either
     both = PhotoGains({v.name: tuple(2**e * np.array(along.gains[v.name])) for v, e in zip(views, off, strict=True)})
-    assert both.stops_beside(views) == pytest.approx(off.std())
+    assert both.stops_beside(views) == pytest.approx(off.std()) and off.std() > 0.05
     shared = np.array(list(both.following(views).gains.values())) / list(along.gains.values())
     np.testing.assert_allclose(shared, shared[0, 0])
 

@@ -79,6 +79,17 @@ def test_times_that_a_camera_rounds_are_put_right(device):
     np.testing.assert_allclose(found, (off - off.mean())[:, None].repeat(3, 1), atol=0.03)
 
 
+def test_a_wall_that_is_brighter_from_one_side_is_no_drift(device):
+    """Half of the points tell gains by which the other half agree, but harmonics hold such light, in new views too."""
+
+    def light_at(position, rays):
+        ahead = rays[..., :2] / rays[..., 2:]
+        return 0.5 * texture(position[:2] + ahead * WALL) * 2 ** (2 * ahead[..., :1] - ahead[..., 1:])
+
+    gains, _, decision = find_gains(photographed(light_at, TIMES), CONFIG, LINEAR, device)
+    assert gains is None and "do not contradict" in decision.reason
+
+
 def test_no_gains_are_fitted_where_a_rough_look_finds_none(device, monkeypatch):
     """A wrong curve makes gains that follow the stated times, which the look leaves out."""
     monkeypatch.setattr(gains_of_a_training, "fit_gains", lambda *_: pytest.fail("fitted"))
