@@ -38,9 +38,9 @@ def common_focus(cameras: Sequence[Camera]) -> np.ndarray | None:
 def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[Camera]:
     """A closed path of `count` cameras about the common focus of the given ones, upright, all looking at it.
 
-    Where the given cameras go round the focus, a circle of their mean radius and height; else an oval within their
-    spread (azimuth and elevation about the focus, at the mean distance), which shows nothing that no photo saw. Size
-    and intrinsics are those of the middle camera. focus_distance: of the focus ahead where the optical axes are
+    Where the given cameras go round the focus, a circle of their mean radius and height; else an oval along the arc
+    that they stand on, as wide as they scatter about it, which shows nothing that no photo saw. Size and intrinsics
+    are those of the middle camera. focus_distance: of the focus ahead where the optical axes are
     parallel; world units, positive.
 
     Raises SehdrError without cameras or for a count outside 1 to 100 000.
@@ -64,14 +64,22 @@ def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[
         azimuth = turn
         ring, height = np.full(count, horizontal.mean()), np.full(count, (offsets @ up).mean())
     else:
-        elevations = np.arctan2(offsets @ up, horizontal)
         # An ellipse whose points have the photos' spread: a cosine's variance is a half.
         azimuth = azimuths.mean() + np.sqrt(2) * azimuths.std() * np.sin(turn)
-        elevation = elevations.mean() + np.sqrt(2) * elevations.std() * np.cos(turn)
-        distance = np.linalg.norm(offsets, axis=1).mean()
+        elevation, scatter = _along(azimuths, np.arctan2(offsets @ up, horizontal), azimuth)
+        elevation = elevation + np.sqrt(2) * scatter * np.cos(turn)
+        distance = _along(azimuths, np.linalg.norm(offsets, axis=1), azimuth)[0]
         ring, height = distance * np.cos(elevation), distance * np.sin(elevation)
     directions = np.cos(azimuth)[:, None] * back + np.sin(azimuth)[:, None] * right
     return [_moved(middle, _look_at(p, focus, up)) for p in focus + ring[:, None] * directions + height[:, None] * up]
+
+
+def _along(azimuths: np.ndarray, values: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, float]:
+    """Values of cameras as a smooth course over their azimuths, read at others, and how far they scatter about it: who
+    walks an arc goes up and down with the ground. Never beyond the values that are given."""
+    degree = min(2, (len(values) - 1) // 3) if np.ptp(azimuths) > 1e-6 else 0
+    course = np.polynomial.Polynomial.fit(azimuths, values, degree)
+    return np.clip(course(at), values.min(), values.max()), float(np.std(values - course(azimuths)))
 
 
 def mean_up(cameras: Sequence[Camera], fallback: Camera | None = None) -> np.ndarray:

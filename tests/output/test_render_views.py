@@ -178,6 +178,20 @@ def test_orbit_looks_at_the_focus_smoothly(degrees):
     assert np.ptp(azimuth) > 300 if degrees == 360 else np.abs(azimuth).max() < 30
 
 
+def test_orbit_follows_an_arc_that_goes_up_and_down():
+    # A hand-held walk over a mound and around a corner: higher and farther away in the middle.
+    angles = np.radians(np.linspace(-34, 34, 10))
+    heights, distances = 0.6 - 9 * (angles - 0.1) ** 2 / 4, 12 - 5 * angles**2
+    given = [
+        camera(position=(d * np.sin(a), -h, -d * np.cos(a))) for a, h, d in zip(angles, heights, distances, strict=True)
+    ]
+    for view in orbit(given, 48, 1):
+        x, y, z = view.position
+        near = np.argsort(np.abs(angles - np.arctan2(x, -z)))[:2]
+        assert heights[near].min() - 0.05 < -y < heights[near].max() + 0.05
+        assert distances[near].min() - 0.1 < np.hypot(x, z) < distances[near].max() + 0.1
+
+
 def test_orbit_of_parallel_cameras_uses_the_depth_seen():
     run = AnalyticRun()
     run.cameras = [
