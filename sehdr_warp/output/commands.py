@@ -224,7 +224,9 @@ def run_report(asked: Report) -> None:
 
 
 def run_export(asked: Export) -> None:
-    if asked.out.suffix.lower() == ".html":
+    from ..splats import check_suffix
+
+    if check_suffix(asked.out, ".html") == ".html":
         from .scene_page import write_scene_page
 
         if asked.cameras or (asked.file.kind, asked.file.exposure, asked.file.degree) != (None, None, None):

@@ -23,12 +23,12 @@ _OTHER = {
 }
 
 
-def check_suffix(path: Path | str) -> str:
-    """The suffix of a splat file, in lower case; InputError for one that is not read and written."""
+def check_suffix(path: Path | str, *others: str) -> str:
+    """The suffix of a splat file, in lower case; InputError for one that is not read and written, nor of the others."""
     suffix = Path(path).suffix.lower()
-    if suffix not in SUFFIXES:
+    if suffix not in (*SUFFIXES, *others):
         why = f"{suffix} is not read or written here: it {_OTHER[suffix]}" if suffix in _OTHER else "is no splat file"
-        raise InputError(path, why, f"use one of {' '.join(SUFFIXES)}")
+        raise InputError(path, why, f"use one of {' '.join((*SUFFIXES, *others))}")
     return suffix
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.field.baking import field_of
+from sehdr_warp.output.commands import Export, run_export
 from sehdr_warp.output.export import export
 from sehdr_warp.scene import load_cameras
 from sehdr_warp.splats import read_gaussians, write_gaussians
@@ -28,6 +29,13 @@ def test_suffix_and_kind_decide(tmp_path, run, logged):
     assert "b.ply: 50 Gaussians, harmonics of degree 3, scene-linear radiance" in logged
     assert "kept: 120.0 dB of the scene at 0 EV, 120.0 dB at -4 EV, in 3 views" in logged
     assert sum(line.startswith("kept:") for line in logged) == 3
+
+
+def test_a_wrong_suffix_is_told_all_that_export_writes(tmp_path):
+    with pytest.raises(InputError, match=r"scene: is no splat file; use one of \.ply .* \.glb \.html$"):
+        run_export(Export(run=tmp_path, out=tmp_path / "scene"))
+    with pytest.raises(InputError, match=r"holds 8 bits .* \.html$"):
+        run_export(Export(run=tmp_path, out=tmp_path / "scene.splat"))
 
 
 def test_exposure_of_display_colors(tmp_path, run, logged):
