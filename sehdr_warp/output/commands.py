@@ -1,6 +1,7 @@
 """The command lines of `sehdr-warp render`, `report` and `export`. torch is imported when they run."""
 
 import json
+import logging
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -12,6 +13,8 @@ from ..arguments import positive
 from ..errors import InputError, UsageError
 from ..files import check_absent
 from ..training.commands import ensured_scene, open_run, open_scene
+
+log = logging.getLogger(__name__)
 
 _NOT_OF_VIEWS = {"run", "device", "json", "video", "fps", "transfer", "ev_ramp"}
 _OF_FILMS_TOO = {*_NOT_OF_VIEWS, "cameras", "count", "size", "overwrite", "out"}
@@ -174,7 +177,7 @@ def run_render(asked: Render) -> None:
         raise UsageError(f"{', '.join(lost)}: of pictures, and none are written beside a film without --out")
     if asked.count != Render.count and asked.cameras not in PATHS:
         raise UsageError(f"--count {asked.count}: of an orbit or interpolation; name one with --cameras")
-    written, ramp = [], _ramp(asked.ev_ramp)
+    written, ramp, film = [], _ramp(asked.ev_ramp), ""
     if asked.video is not None:
         from .film import film_library
 
@@ -192,10 +195,13 @@ def run_render(asked: Render) -> None:
             cameras = [framed(camera, *read_size(asked.size)) for camera in cameras]
         options = {"fps": positive("--fps", asked.fps), "transfer": asked.transfer, "ev_ramp": ramp}
         written.append(write_film(run, asked.video, cameras, **options, overwrite=asked.overwrite))
+        if len(cameras) == 1:
+            log.warning("%s: '%s' is one camera, so one frame; --cameras orbit is a path", asked.video, asked.cameras)
+        film = f"{asked.video}: {len(cameras)} frame{'s' * (len(cameras) > 1)}, {len(cameras) / asked.fps:.3g} s"
     if asked.json:
         print(json.dumps({"files": [str(path) for path in written]}))
     elif asked.out is None:
-        print(asked.video)
+        print(film)
     else:
         print(f"{asked.out}: {len(written)} files")
 

@@ -57,6 +57,7 @@ LOGS = {
     "acescct": ("ACEScct", "ACEScg"),
 }
 """Curve and primaries of each logarithm, as colour-science names them. H.273 has no code points for them."""
+_FASTSTART = (".mp4", ".mov", ".m4v")
 TRANSFERS |= dict.fromkeys(LOGS, Transfer("prores_ks", "yuv444p10le", {"profile": "4444"}, 2, 2, 1))
 
 
@@ -92,9 +93,10 @@ def write_film(
     look = None
     if transfer == "sdr" and not exposed and ev_ramp[0] == ev_ramp[1]:
         look = shared_tone_map(run, cameras)
+    options = {"movflags": "faststart"} if out.suffix.lower() in _FASTSTART else {}
     with atomic_path(out, overwrite) as temporary:
         try:
-            with av.open(str(temporary), "w", options={"movflags": "faststart"}) as container:
+            with av.open(str(temporary), "w", options=options) as container:
                 stream = container.add_stream(kind.codec, rate=Fraction(fps).limit_denominator(1001))
                 stream.width, stream.height, stream.pix_fmt = width, height, kind.pixels
                 stream.options = kind.options

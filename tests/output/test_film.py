@@ -77,6 +77,18 @@ def test_a_ramp_runs_through_the_stops(tmp_path):
             _ramp(bad)
 
 
+def test_a_film_says_how_long_it_is(tmp_path, monkeypatch, capsys, caplog):
+    run = smooth_run()[0]
+    monkeypatch.setattr("sehdr_warp.output.commands.open_scene", lambda *_: run)
+    run_render(Render(run=tmp_path, video=tmp_path / "a.mkv", cameras="orbit", count=12, fps=24))
+    assert capsys.readouterr().out == f"{tmp_path / 'a.mkv'}: 12 frames, 0.5 s\n"
+    assert not caplog.records  # Nor has the library a word about options of other containers.
+    run.cameras = run.cameras[2:4]
+    run_render(Render(run=tmp_path, video=tmp_path / "b.mp4"))
+    assert capsys.readouterr().out == f"{tmp_path / 'b.mp4'}: 1 frame, 0.0417 s\n"
+    assert "'test' is one camera, so one frame; --cameras orbit is a path" in caplog.text
+
+
 def test_refusals(tmp_path, monkeypatch):
     run, cameras = smooth_run()
     (tmp_path / "mine.mp4").write_text("mine")
