@@ -53,16 +53,18 @@ def with_exposure_times(shots: list[Shot], source: Path) -> tuple[list[Shot], bo
     differ in sensitivity or aperture keep their ratio of recorded light. With none at all, each is 1 second.
     Raises InputError for a time that is not positive and finite, and where only some photos state one.
     """
-    stated, notes = [shot.exposure_time for shot in shots], []
+    stated, strange, notes = [shot.exposure_time for shot in shots], [], []
     if None in stated:
-        listed = _listed_times(shots, source)
+        listed, strange = _listed_times(shots, source)
         stated = [listed.get(s.image.name) if time is None else time for time, s in zip(stated, shots, strict=True)]
     if set(stated) == {None}:
         stated, notes = _exif_times(shots)
+    notes = [*strange, *notes]
     times = [float(time) for time in stated if time is not None]
     for shot, time in zip(shots, stated, strict=True):
         if time is None and times:
             problem = f"exposure time is absent in {len(shots) - len(times)} of {len(shots)} images"
+            problem += "".join(f" ({note})" for note in strange)
             raise InputError(shot.image, problem, "state all in exposures.json, or strip them all")
         if time is not None and not SHORTEST <= time <= LONGEST:
             raise InputError(shot.image, f"exposure time {time} s is not in {SHORTEST} to {LONGEST}", _REMEDY)
@@ -96,12 +98,13 @@ def parse_seconds(value, source: Path, field: str) -> float:
     return seconds
 
 
-def _listed_times(shots: list[Shot], source: Path) -> dict[str, float]:
-    """exposures.json: {"file name": seconds} or a list of {"file": ..., "exposure_time": seconds}."""
+def _listed_times(shots: list[Shot], source: Path) -> tuple[dict[str, float], list[str]]:
+    """exposures.json, {"file name": seconds} or a list of {"file": ..., "exposure_time": seconds}; and a note, if it
+    names what is not there."""
     places = (folder / "exposures.json" for folder in (shots[0].image.parent, source))
     path = next((place for place in places if place.is_file()), None)
     if path is None:
-        return {}
+        return {}, []
     try:
         values = json.loads(read_bytes(path, 1 << 24))
         if isinstance(values, list):
@@ -110,7 +113,12 @@ def _listed_times(shots: list[Shot], source: Path) -> dict[str, float]:
     except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as error:
         problem = f"is not a table of exposure times ({error!r:.80})"
         raise InputError(path, problem, 'write {"file name": seconds, ...}') from None
-    return {Path(str(name)).name: parse_seconds(value, path, str(name)) for name, value in entries}
+    listed = {Path(str(name)).name: parse_seconds(value, path, str(name)) for name, value in entries}
+    folders = {shot.image.parent for shot in shots} | {source}
+    strange = [name for name in listed if not any((folder / name).exists() for folder in folders)]
+    named = ", ".join(strange[:3]) + (" ..." if len(strange) > 3 else "")
+    note = f"{path.name}: {len(strange)} of its {len(listed)} names belong to no photo: {named}"
+    return listed, [note] * bool(strange)
 
 
 def _exif_times(shots: list[Shot]) -> tuple[list[float | None], list[str]]:

@@ -65,6 +65,22 @@ def test_one_photo_without_time_is_refused_and_a_list_helps(tmp_path):
             load(tmp_path)
 
 
+def test_listed_times_of_no_photo_are_named(tmp_path):
+    write_colmap(tmp_path, name="{:03d}.jpg")
+    stated, table = {f"{i:03d}.jpg": 0.01 for i in range(6)}, tmp_path / "exposures.json"
+    table.write_text(json.dumps(stated))
+    assert not [note for note in load(tmp_path).notes if "exposures.json" in note]
+    table.write_text(json.dumps(stated | {"000.JPG.bak": 0.01}))
+    assert "exposures.json: 1 of its 7 names belong to no photo: 000.JPG.bak" in load(tmp_path).notes
+    table.write_text(json.dumps({name.replace("5.jpg", "5.jpeg"): time for name, time in stated.items()}))
+    with pytest.raises(
+        InputError, match=r"absent in 1 of 6 images \(exposures.json: 1 .* no photo: 005.jpeg\); state all"
+    ):
+        load(tmp_path)
+    table.write_text(json.dumps({f"shot{i}.jpg": 0.01 for i in range(6)}))
+    assert [note for note in load(tmp_path).notes if "6 of its 6 names" in note and "shot2.jpg ..." in note]
+
+
 def test_splits(tmp_path):
     write_colmap(tmp_path, 9)
     assert [view.name for view in load(tmp_path).test_views] == ["000", "008"]
