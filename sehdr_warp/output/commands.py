@@ -149,6 +149,8 @@ class Panorama(_OfRun):
     """Give directions that no photo saw the light around them; alpha tells them still."""
     colorspace: str = "rec709"
     """Primaries, always scene-linear: rec709, acescg, aces2065-1, rec2020, display-p3 or dci-p3."""
+    white: float | None = None
+    """Value of the photos' white in the file, such as 1, which suits a dome light; without, it holds radiance."""
     pixel: Literal["half", "float"] = "half"
     """Pixel type of an EXR file."""
     device: str | None = None

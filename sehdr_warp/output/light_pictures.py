@@ -2,6 +2,7 @@
 
 import base64
 import io
+import math
 import zlib
 from collections.abc import Mapping
 from html import escape
@@ -14,6 +15,7 @@ import torch
 from PIL import Image
 
 from sehdr_warp import __version__
+from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import View
 
 from ..field.sensor_colors import rec709_of
@@ -29,6 +31,16 @@ def display_gain(response: Any) -> float:
     for an sRGB or linear camera."""
     grey = float(response.decode(encode_srgb(np.array([MIDDLE_GREY])).astype(np.float64))[0])
     return MIDDLE_GREY / grey if grey > 0 else 1.0
+
+
+def exposure_of_white(run: Any, white: float | None) -> float:
+    """Seconds that radiance is multiplied by so that a file shows the photos' white as `white`; 1 for None.
+
+    Raises SehdrError for a white outside 0.001 to 10000."""
+    exposure = 1.0 if white is None else white * run.base_time * display_gain(run.response)
+    if not (math.isfinite(exposure) and exposure > 0 and (white is None or 1e-3 <= white <= 1e4)):
+        raise SehdrError(f"white {white} is not between 0.001 and 10000; 1 shows the photos' white as 1")
+    return exposure
 
 
 def curve_table(response: Any) -> str:

@@ -16,6 +16,7 @@ from .camera_paths import mean_up
 from .colorspace import from_rec709
 from .exr import Part, as_data, exr_header, rgb_channels, write_multipart_exr
 from .images import as_array
+from .light_pictures import exposure_of_white
 from .radiance_file import write_radiance
 from .render_views import provenance
 
@@ -51,6 +52,7 @@ def write_panorama(
     axes: str = "upright",
     fill: bool = False,
     colorspace: str = "rec709",
+    white: float | None = None,
     pixel: str = "half",
     overwrite: bool = False,
 ) -> Path:
@@ -68,6 +70,8 @@ def write_panorama(
             the scene's coordinates.
         fill: what no photo saw gets the light around it, smoothly, as far as A is below 1; A tells it still.
         colorspace: primaries of the file.
+        white: what the file shows the photos' white as, by an exposure that `expTime` (of .hdr EXPOSURE) states; None
+            leaves radiance.
         pixel: "half" (float where half would overflow) or "float".
         overwrite: replace a file that exists.
 
@@ -83,6 +87,7 @@ def write_panorama(
             raise SehdrError(f"{name} {value!r} is not one of {', '.join(known)}")
     if size < 16 or size % 2 or size > _LARGEST:
         raise SehdrError(f"size {size} cannot be; give an even number of pixels from 16 to {_LARGEST}")
+    exposure = exposure_of_white(run, white)
     check_absent(path, overwrite)
     cameras = {entry.name: entry.camera for entry in run.cameras}
     seen = [entry.camera for entry in run.cameras if entry.split == "train"]
@@ -98,15 +103,15 @@ def write_panorama(
     if fill:
         hdr = hdr + (1 - alpha[..., None]) * filled(hdr, alpha, directions, weight)
     log.info("%s: %.0f %% of all directions seen", path.name, 100 * weight[alpha > _SEEN].sum() / weight.sum())
-    hdr = from_rec709(hdr, colorspace)
+    hdr = exposure * from_rec709(hdr, colorspace)
     if path.suffix.lower() == ".hdr":
-        write_radiance(path, hdr, overwrite=overwrite)
+        write_radiance(path, hdr, exposure=exposure, overwrite=overwrite)
         return path
     data = {"distance.Z": distance}
     if found.confidence is not None:
         data["confidence"] = as_array(found.confidence)
     facts = {**provenance(run), "position": json.dumps(position.tolist()), "axes": axes}
-    header = exr_header(colorspace, 1.0, None, datetime.now().replace(microsecond=0), facts)
+    header = exr_header(colorspace, exposure, None, datetime.now().replace(microsecond=0), facts)
     header |= {"sehdr:mapToWorld": json.dumps(to_world.tolist()), "envmap": envmap(layout)}
     # In a part of their own: Mitsuba takes a map with a fifth channel for no map at all.
     parts = [Part(rgb_channels(hdr) | {"A": alpha}, header, "rgba"), Part(data, as_data(header), "data")]

@@ -1,7 +1,6 @@
 """Pictures of a trained scene: HDR files, previews and exposure brackets, for any set of cameras."""
 
 import logging
-import math
 from collections import deque
 from collections.abc import Iterator, Sequence
 from datetime import datetime
@@ -21,7 +20,7 @@ from .camera_paths import evenly, interpolate, orbit
 from .colorspace import from_rec709
 from .exr import Part, rgb_channels, write_multipart_exr
 from .images import as_array, quantize, write_picture
-from .light_pictures import display_gain
+from .light_pictures import exposure_of_white
 from .names import safe_names
 from .ocio import ocio_view
 from .passes import data_parts, read_passes
@@ -93,13 +92,10 @@ def render_views(
     made = bracket_exposures(run.base_time, evs=evs, exposures=exposures) if wanted else ()
     form, now = (colorspace, pixel, multipart, ldr_brackets, run.response), datetime.now().replace(microsecond=0)
     brackets = Brackets(made, run.base_time, *form, now, provenance(run), by)
-    shown = run.base_time * display_gain(run.response)
-    exposure = 1.0 if white is None else white * shown
-    if not (math.isfinite(exposure) and exposure > 0 and (white is None or 1e-3 <= white <= 1e4)):
-        raise SehdrError(f"white {white} is not between 0.001 and 10000; 1 shows the photos' white as 1")
+    exposure = exposure_of_white(run, white)
     if (ocio is None) != (view is None):
         raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")
-    look = None if ocio is None or view is None else ocio_view(ocio, view, shown)
+    look = None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
     passes = read_passes(passes) if passes else ()
     views = select_cameras(run, cameras, count=count)
     if size is not None:

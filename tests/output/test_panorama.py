@@ -54,6 +54,23 @@ def test_a_map_has_openexrs_orientation(tmp_path, run):
     assert np.ptp(image[0], axis=0).max() < 1e-4
 
 
+@pytest.mark.parametrize("suffix", [".exr", ".hdr"])
+def test_white_is_an_exposure_that_the_file_states(tmp_path, run, suffix):
+    for name, white in (("plain", None), ("exposed", 4.0)):
+        write_panorama(run, tmp_path / f"{name}{suffix}", at=(0, 0, 0), size=64, white=white, pixel="float")
+    if suffix == ".hdr":
+        radiance, again = (read_hdr(tmp_path / f"{name}.hdr") for name in ("plain", "exposed"))
+        head = (tmp_path / "exposed.hdr").read_bytes()[:100].decode("latin-1")
+        assert float(head.split("\nEXPOSURE=")[1].split()[0]) == pytest.approx(2)
+        np.testing.assert_allclose(again, radiance, rtol=0.01, atol=0.01)
+    else:
+        (radiance, _, _), (shown, _, header) = (read(tmp_path / f"{name}.exr") for name in ("plain", "exposed"))
+        assert header["expTime"] == pytest.approx(4 * run.base_time) == 2
+        np.testing.assert_allclose(shown, radiance * header["expTime"], rtol=1e-6)
+    with pytest.raises(SehdrError, match="white 0.0 is not between"):
+        write_panorama(run, tmp_path / f"none{suffix}", white=0.0)
+
+
 def test_upright_maps_look_ahead_with_up_above(tmp_path, run):
     """The cameras look along +Z with -Y up, as COLMAP's often do."""
     write_panorama(run, tmp_path / "env.exr", at="camera:1", size=128)

@@ -217,7 +217,10 @@ def test_what_a_training_writes_meanwhile_is_shown(tmp_path, logged):
 @pytest.mark.skipif(sys.platform == "win32", reason="sends SIGINT")
 def test_the_command_serves_and_ends_cleanly(tmp_path):
     train(toy_scene(), tmp_path / "run", {"schedule.iterations": 5, "plan.enabled": False}, device="cpu")
-    command = [sys.executable, "-m", "sehdr_warp", "view", str(tmp_path / "run"), "--port", "18300", "--device", "cpu"]
+    # Tests that run in a shell's background have SIGINT ignored, and children inherit that.
+    code = "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    code += "runpy.run_module('sehdr_warp', run_name='__main__', alter_sys=True)"
+    command = [sys.executable, "-c", code, "view", str(tmp_path / "run"), "--port", "18300", "--device", "cpu"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)
     url = process.stdout.readline().split()[0]
     connection = http.client.HTTPConnection(url.removeprefix("http://").strip("/"), timeout=30)
