@@ -20,11 +20,11 @@ from functools import cache
 
 import warp as wp
 
-from .constants import ALPHA_MAX, TILE_SIZE, TRANSMITTANCE_MIN
+from .constants import ALPHA_MAX, CORNER, TILE_SIZE, TRANSMITTANCE_MIN
 from .geometry import geometry, vector
 
 BLOCK_DIM = 32
-BLOCKS_PER_TILE = (TILE_SIZE // 8) * (TILE_SIZE // 4)
+BLOCKS_PER_TILE = (TILE_SIZE // CORNER[0]) * (TILE_SIZE // CORNER[1])
 TOGETHER = 8  # Gaussians whose alphas are worked out before the first of them is drawn; divides 32
 ROUNDS = 4  # Of 32 entries, that are looked at together
 QUEUE = 64 * ROUNDS  # Room for those of ROUNDS and for 31 that were left: a power of 2
@@ -104,7 +104,7 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
     quads = padded_channels(channels) // 4
     vec_padded, vec_image, vec_many = vector(4 * quads, dtype), vector(channels, dtype), vector(TOGETHER, dtype)
     vec_rounds = vector(ROUNDS, wp.int32)
-    blocks_across = TILE_SIZE // 8
+    blocks_across = TILE_SIZE // CORNER[0]
     votes, row = block_functions(dtype, cuda)
 
     @wp.kernel(

@@ -20,7 +20,7 @@ from .blend_cuda import (
     module_options,
     padded_channels,
 )
-from .constants import ALPHA_MAX, TILE_SIZE
+from .constants import ALPHA_MAX, CORNER, TILE_SIZE
 from .geometry import geometry, vector
 
 ROWS = 4  # of pixels of one warp
@@ -69,7 +69,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
     votes, row = block_functions(dtype, cuda)
     gradient_columns = channels + 6
     staging_columns = gradient_columns + 1 - gradient_columns % 2  # odd, so that lanes fall on different banks
-    blocks_across = TILE_SIZE // 8
+    blocks_across = TILE_SIZE // CORNER[0]
     by_rows = adds_rows(dtype, ordered, cuda)
     row_quads = padded_channels(gradient_columns) // 4
     vec_row = vector(4 * row_quads, dtype)

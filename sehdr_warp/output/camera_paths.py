@@ -40,8 +40,8 @@ def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[
 
     Where the given cameras go round the focus, a circle of their mean radius and height; else an oval along the arc
     that they stand on, as wide as they scatter about it, which shows nothing that no photo saw. Size and intrinsics
-    are those of the middle camera. focus_distance: of the focus ahead where the optical axes are
-    parallel; world units, positive.
+    are those of the middle camera. focus_distance: of the focus ahead where the optical axes are parallel; world units,
+    positive.
 
     Raises SehdrError without cameras or for a count outside 1 to 100 000.
     """
