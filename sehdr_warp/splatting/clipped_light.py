@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from ..kernels.clipped_light import clipped_light_kernel, clipped_logarithms_kernel
-from .clipped_residual import CODES, WHITE
+from .code_residual import CODES, WHITE
 from .launching import launch, times, warp_scalar
 
 
@@ -25,7 +25,7 @@ def clipped_light_energy(
     around them are not clipped. There the blur of Gaussians takes from lights: without a lift, the smaller a light the
     darker it would get. Derivatives are with the means as they are: the light of each follows that of the others.
 
-    image: [H, W, 3] exposures, float32 or float64. codes, index: as of clipped_residual(). white: the exposure that the
+    image: [H, W, 3] exposures, float32 or float64. codes, index: as of code_residual(). white: the exposure that the
     photo shows as white; light below it counts as white. smoothness, lift: weights, at least 0. mask: [H, W, 1], of the
     image's type; where it is 0 a pixel is as if it were not clipped.
     """

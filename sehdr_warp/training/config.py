@@ -95,7 +95,8 @@ class LossConfig(_Table):
     hdr_weight: Weight = 0.0
     """weight of the HDR color against HDR truth in the mu-law, where a view has it (HDR-GS: 0.6)"""
     clipping: bool = True
-    """a clipped pixel only says `at least`, a black one only `at most`; off: both are plain values"""
+    """a clipped pixel only says `at least`, a black one only `at most`; where exposures are compared, in the last part
+    of a training a code that stands for much light says no more than that; off: all are plain values"""
     clipped_smoothness: Weight = 0.001
     """weight of how far the log light of a clipped pixel is from the mean of those around it, squared, where exposures
     are compared"""

@@ -9,7 +9,7 @@ from torch import Tensor
 from ..field.radiance_field import Photograph, RadianceField
 from ..response import Response, ToneMapper
 from ..splatting.clipped_light import clipped_light_energy
-from ..splatting.clipped_residual import CodeScale, clipped_residual, code_values
+from ..splatting.code_residual import CodeScale, code_residual, code_values
 from ..splatting.ssim import image_distance, ssim
 from ..splatting.training_step import mean_opacity
 from .config import LossConfig
@@ -17,6 +17,9 @@ from .config import LossConfig
 CODE = 1 / 255  # One step of an 8-bit photo
 MU = 5000.0  # Of the mu-law in which HDR images are compared
 KNEE = 8.0  # The code of 255 at white / mu in the mu-law of photos: light below counts as light, above as its logarithm
+INTERVALS_FROM = 0.85
+"""Of a training, the part after which codes that stand for much light are intervals: where they were from the start,
+clipped light would have fewer pixels around it that hold it."""
 ANCHOR = 0.5  # What anchor_loss wants the unit exposure encoded as: the middle of the encoded range
 
 
@@ -57,21 +60,32 @@ def code_scale(
 ) -> CodeScale:
     """How photos are compared: in the mu-law of the exposures that the response decodes, or without one as encoded.
 
-    largest: code, 255 or 65535. clipping: it says `at least white less half a code`, and 0 says `at most half
-    a code`; the half, of 8 bits for 16 too, keeps a response that never quite reaches white from being pulled up.
-    Of exposures a code is worth the middle of what it stands for, which near white may be stops of light.
+    largest: code, 255 or 65535. clipping: it says `at least white less half a code`, and 0 says `at most half a code`;
+    the half, of 8 bits for 16 too, keeps a response that never quite reaches white from being pulled up. Of exposures a
+    code is worth the middle of what it stands for, which near white may be stops of light: with clipping, an exposure
+    anywhere within is as good once the scale is widened, but for the finest step of 8 bits at its ends: fine codes stay
+    values.
     """
+    mu, white = (0.0, 1.0) if response is None else (mu_of_knee(response), response.white)
+
+    def compared(encoded: Tensor) -> Tensor:
+        return encoded if response is None else mu_law(response.decode(encoded), white, mu)
+
     values = torch.arange(largest + 1, dtype=torch.float64) / largest
-    if response is None:
-        return CodeScale(values.to(device, dtype), half_codes=(CODE / 2, CODE / 2) if clipping else None)
-    mu, halves = mu_of_knee(response), None
+    worth, between = compared(values), compared(values[:-1] + 0.5 / largest)
+    if response is not None:
+        worth[1:-1] = (between[1:] + between[:-1]) / 2
+    table, wide = torch.stack([worth, worth, worth], 1), None
     if clipping:
-        exposures = (float(response.decode(value)) for value in (1.0, 1.0 - CODE / 2, CODE / 2, 0.0))
-        white, below, above, black = (math.log1p(mu * x / response.white) / math.log1p(mu) for x in exposures)
-        halves = white - below, above - black
-    table, between = (mu_law(response.decode(at), response.white, mu) for at in (values, values[:-1] + 0.5 / largest))
-    table[1:-1] = (between[1:] + between[:-1]) / 2
-    return CodeScale(table.to(device, dtype), mu, response.white, halves)
+        table[0, 1], table[-1, 2] = -math.inf, math.inf
+        table[0, 2], table[-1, 1] = compared(values.new_tensor([CODE / 2, 1 - CODE / 2]))
+        if response is not None:
+            finest = compared((torch.arange(255) + 0.5).double() / 255).diff().min()
+            ends = torch.stack([between[:-1] + finest, between[1:] - finest], 1)
+            wide = table.clone()
+            wide[1:-1, 1:] = torch.where(ends[:, :1] < ends[:, 1:], ends, table[1:-1, 1:])
+            wide = wide.to(device, dtype)
+    return CodeScale(table.to(device, dtype), mu, white, wide)
 
 
 def image_loss(prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str, weight: float) -> Tensor:
@@ -88,11 +102,11 @@ def image_loss(prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str
 
 
 def ldr_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor:
-    """L_LDR, on the target's scale, and where the camera saturated only as far as the photo can tell; where exposures
-    are compared, the light that it does not tell is as smooth as it can be."""
+    """L_LDR, on the target's scale, as far as the photo can tell; where exposures are compared, the light of clipped
+    pixels, which it does not tell, is as smooth as it can be."""
     image = photo.light if target.scale.mu else photo.encoded
     assert image is not None
-    seen, truth = clipped_residual(image, target.codes, target.scale, target.index)
+    seen, truth = code_residual(image, target.codes, target.scale, target.index)
     loss = image_loss(seen, truth, target.mask, config.form, config.ssim_weight)
     smoothness, lift = config.clipped_smoothness, config.clipped_lift
     if target.scale.mu and config.clipping and (smoothness or lift):

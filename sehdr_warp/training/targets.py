@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..field.radiance_field import CameraTensors
 from ..response import Response
 from ..scene import Scene, View
-from ..splatting.clipped_residual import CodeScale, code_tensor
+from ..splatting.code_residual import CodeScale, code_tensor
 from .config import LossConfig
 from .losses import Target, code_scale, one_of
 
@@ -137,7 +137,7 @@ class PhotoSource(Sequence[TrainingView]):
 
     def __init__(self, views: Sequence[View], base_time: float, device, truth: bool, deep: bool, scale: CodeScale):
         self.views, self.base_time, self.device = views, base_time, device
-        self.truth, self._deep, self._scale = truth, deep, scale
+        self.truth, self._deep, self.scale = truth, deep, scale
 
     def __len__(self) -> int:
         return len(self.views)
@@ -151,7 +151,7 @@ class PhotoSource(Sequence[TrainingView]):
             for array in ((None if view.mask is None else view.mask[..., None]), (view.hdr if self.truth else None))
         )
         truth = None if radiance is None else radiance * self.base_time
-        target = Target(code_tensor(self.codes(index), self.device), self._scale, mask, truth)
+        target = Target(code_tensor(self.codes(index), self.device), self.scale, mask, truth)
         return TrainingView(CameraTensors.of(view.camera, self.device), view.exposure_time, target)
 
     def codes(self, index: int) -> np.ndarray:

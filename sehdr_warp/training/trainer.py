@@ -1,6 +1,5 @@
 """The training loop's state and its single step. What happens around steps is train.py's business."""
 
-import operator
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -15,6 +14,7 @@ from ..field.radiance_field import RadianceField, RenderedView
 from ..response.learned import EXACT_BELOW
 from ..scene import Camera, Scene
 from ..splatting import GraphRecorder, HarmonicsGradients, Rendering
+from ..splatting.code_residual import CodeScale
 from ..splatting.memory import bytes_asked_for
 from ..splatting.tile_lists import ONE_SORT
 from ..splatting.training_step import differentiate
@@ -25,8 +25,9 @@ from .config import Config
 from .densification import SEED_STEP, make_densification
 from .graph_capacity import GraphCapacity
 from .initialization import make_matcher, scene_extent
-from .losses import compares_light, data_loss, needed_colours, regularised
+from .losses import INTERVALS_FROM, compares_light, data_loss, needed_colours, regularised
 from .matching import Matcher
+from .photo_order import PhotoOrder
 from .photo_stream import PhotoStream, held_views
 from .ranks import Ranks
 from .targets import TrainingView, ViewStack, largest_truth, photo_source
@@ -72,8 +73,9 @@ class Trainer:
         self._encoded = not compares_light(config.loss, field)
         self._largest_truth = largest_truth(scene, config.loss) * field.base_time
         self._stack: ViewStack | PhotoStream | Sequence[TrainingView] | None = None
-        self._order: list[int] = []
-        self._order_generator = torch.Generator().manual_seed(config.seed)
+        self._scale = CodeScale(torch.empty(0))  # What codes are worth
+        self._fine = True  # Whether they are values still, however much light they stand for
+        self._order = PhotoOrder(len(self._views), config.seed, self.rank, self.batch)
         self._generator = torch.Generator(device=self.device).manual_seed(config.seed)
         self._index = torch.zeros(1, dtype=torch.int64, device=self.device)
         recorded = self.device.type == "cuda" and config.schedule.recorded
@@ -133,7 +135,7 @@ class Trainer:
         self.densification.photos = self.photos
         self.iteration += self.photos
         views, gaussians = self._training_views(), self.field.gaussians
-        index = self._next_index(len(views))
+        index = self._order.next()
         if self._reserves and not self._rows:
             self._make_room()
         rows, watched = gaussians.reserved, self.densification.needs_gradients(self.iteration)
@@ -147,7 +149,7 @@ class Trainer:
         if self._can_record(views, kind):
             self._loss, self._shown = self._replay(views, index, watched, kind)
             if isinstance(views, PhotoStream):
-                views.used(self._following())
+                views.used(self._order.following())
         else:
             with self._launching():
                 self._loss, self._shown = self._step(lambda: self._gradients(views[index], watched), self._apply)
@@ -341,10 +343,11 @@ class Trainer:
             "optimizer": adam.optimizer_tensors(self.optimizer, self.batch),
             "densification": self.densification.state(self.field.gaussians.count),
             "average": self._averaging.state(),
-            "generators": {"order": self._order_generator.get_state(), "device": self._generator.get_state()},
         }
+        order, left = self._order.state()
+        parts["generators"] = {"order": order, "device": self._generator.get_state()}
         tensors = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
-        return tensors, {"iteration": self.iteration, "order": list(self._order), "skipped_steps": self.skipped_steps}
+        return tensors, {"iteration": self.iteration, "order": left, "skipped_steps": self.skipped_steps}
 
     def load_state(self, tensors: dict[str, Tensor], values: dict) -> None:
         """Takes up what state() gave; the field's Gaussians must already be those of the state."""
@@ -357,13 +360,10 @@ class Trainer:
             for total in statistics.values():
                 total.zero_()
         generators = adam.under(tensors, "generators.")
-        self._order_generator.set_state(generators["order"].cpu())
+        self._order.load_state(generators["order"], values["order"])
         if self._generator.get_state().numel() == generators["device"].numel():
             self._generator.set_state(generators["device"].cpu())
         self.iteration = values["iteration"]
-        self._order = [operator.index(place) for place in values["order"]]
-        if not all(0 <= place < len(self._views) for place in self._order):
-            raise ValueError(f"the order of the photos names others than the {len(self._views)} there are")
         self._capacity.tally[0] = values["skipped_steps"]
 
     def _training_views(self) -> ViewStack | PhotoStream | Sequence[TrainingView]:
@@ -372,20 +372,11 @@ class Trainer:
             light = self.field.response if compares_light(loss, self.field) else None
             source = photo_source(*given, truth=loss.uses_hdr, clipping=loss.clipping, light=light)
             self._stack = held_views(source, self.config.schedule.photos, self._recorder is not None)
+            self._scale = source.scale
+        if self._fine and self.iteration > INTERVALS_FROM * self.config.schedule.iterations:
+            self._fine = False
+            self._scale.widen()
         return self._stack
-
-    def _next_index(self, count: int) -> int:
-        """Every photo once in random order, then again in another; one for each rank, of which this one's is given."""
-        chosen = []
-        for _ in range(self.batch):
-            if not self._order:
-                self._order = torch.randperm(count, generator=self._order_generator).tolist()
-            chosen.append(self._order.pop())
-        return chosen[self.rank]
-
-    def _following(self) -> int | None:
-        """The photo of the next step; None where the order is not drawn yet."""
-        return self._order[-1 - self.rank] if self.rank < len(self._order) else None
 
 
 @dataclass(frozen=True)

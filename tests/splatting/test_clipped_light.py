@@ -6,7 +6,7 @@ import torch
 
 from sehdr_warp.kernels.clipped_light import REACH
 from sehdr_warp.splatting.clipped_light import clipped_light_energy
-from sehdr_warp.splatting.clipped_residual import code_tensor
+from sehdr_warp.splatting.code_residual import code_tensor
 
 from .scenes import relative_error
 

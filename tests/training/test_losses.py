@@ -9,7 +9,7 @@ import torch
 
 from sehdr_warp.field.radiance_field import Photograph
 from sehdr_warp.response import response_by_name
-from sehdr_warp.splatting.clipped_residual import code_tensor
+from sehdr_warp.splatting.code_residual import code_tensor
 from sehdr_warp.splatting.ssim import ssim
 from sehdr_warp.training.config import LossConfig
 from sehdr_warp.training.losses import CODE, Target, code_scale, image_loss, ldr_loss, linear_loss, mu_law, mu_of_knee
@@ -103,11 +103,24 @@ def test_clipped_light_is_lifted_beside_what_does_not_clip():
 def test_a_code_is_worth_the_middle_of_what_it_stands_for():
     response = response_by_name("hdr-nerf")
     scale = code_scale(255, response, "cpu", dtype=torch.float64)
-    light = response.white * torch.expm1(scale.table * math.log1p(scale.mu)) / scale.mu
+    light = response.white * torch.expm1(scale.table[:, 0] * math.log1p(scale.mu)) / scale.mu
     least, most = (float(response.decode((254 + half) / 255)) for half in (-0.5, 0.5))
     # The curve is so flat there that the code stands for one and a half stops.
     assert light[254].item() == pytest.approx(math.sqrt(least * most), rel=1e-3)
     assert light[128].item() == pytest.approx(float(response.decode(128 / 255)), rel=1e-3)
+
+
+@pytest.mark.parametrize("clipping", [True, False])
+def test_light_anywhere_within_what_a_code_stands_for_is_as_good_once_it_is_an_interval(clipping):
+    response = response_by_name("hdr-nerf")
+    places = torch.linspace(253.6, 254.4, 8, dtype=torch.float64).view(1, -1, 1).expand(1, -1, 3)
+    light = response.decode(places / 255).requires_grad_()
+    target = target_of(torch.full((1, 8, 3), 254 / 255).double(), response, clipping=clipping)
+    for wide in (False, clipping):
+        loss = ldr_loss(Photograph(light, light, light, None, light), target, LossConfig(clipped_smoothness=0.0))
+        (slopes,) = torch.autograd.grad(loss, light)
+        assert (loss.item() < 1e-12) == wide and bool((slopes == 0).all()) == wide
+        target.scale.widen()
 
 
 def test_without_clipping_an_overshoot_costs():
@@ -126,10 +139,13 @@ def test_exposures_are_compared_where_the_scale_says_so():
     assert abs(ldr_loss(photo, target_of(encoded.encoded.double(), response), LossConfig()).item() - plain) > 0.01
 
 
-def test_gradients_of_the_photo_loss():
+@pytest.mark.parametrize("wide", [False, True])
+def test_gradients_of_the_photo_loss(wide):
     response = response_by_name("hdr-nerf")
     generator = torch.Generator().manual_seed(4)
     target = target_of(torch.rand(4, 5, 3, generator=generator, dtype=torch.float64), response)
+    if wide:
+        target.scale.widen()
     light = (torch.rand(4, 5, 3, generator=generator, dtype=torch.float64) + 0.1).requires_grad_()
 
     def loss(x):

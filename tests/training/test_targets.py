@@ -1,6 +1,7 @@
 """Training views, stacked so that a step can take one by a number on the device."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -61,7 +62,15 @@ def test_a_scale_has_black_at_0_and_white_at_1(device, deep):
     view = dataclasses.replace(view, codes=view.codes.astype(np.uint16)) if deep else view
     for light in (None, response_by_name("srgb")):
         scale = views_of((view,), device, light=light)[0].target.scale
-        assert len(scale.table) == (65536 if deep else 256)
-        assert scale.table[0] == 0 and scale.table[-1].item() == pytest.approx(1, abs=2e-3)
-        assert bool((scale.table.diff() > 0).all()) and min(scale.half_codes) > 0
-    assert views_of((view,), device, clipping=False)[0].target.scale.half_codes is None
+        for wide in (False, light is not None and not deep):
+            worth, least, most = scale.table.unbind(1)
+            assert len(worth) == (65536 if deep else 256)
+            assert worth[0] == 0 and worth[-1].item() == pytest.approx(1, abs=2e-3)
+            assert bool((worth.diff() > 0).all()) and least[0] == -math.inf and most[-1] == math.inf
+            assert bool((least <= worth).all() and (worth <= most).all()) and most[0] > 0 and least[-1] < worth[-1]
+            # Codes of the dark stand for more light than others, and not for that of the next.
+            assert bool((least < most)[1:20].any()) == wide and bool((least < most)[1:20].all()) == wide
+            assert bool((most[1:-2] < least[2:-1]).all())
+            scale.widen()
+    worth, least, most = views_of((view,), device, clipping=False)[0].target.scale.table.unbind(1)
+    assert torch.equal(least, worth) and torch.equal(most, worth)

@@ -166,6 +166,17 @@ def test_steps_that_compare_light_do_not_encode_it_and_report_the_same(scene):
     assert trainers[0].psnr() == trainers[1].psnr() > 0
 
 
+def test_wide_codes_are_intervals_in_the_last_part_alone(scene):
+    config = quick(length=20)
+    trainer = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), torch.device("cpu")))
+    widths = []
+    for _ in range(20):
+        trainer.step()
+        table = trainer._scale.table[1:-1]
+        widths.append(float((table[:, 2] - table[:, 1]).max()))
+    assert max(widths[:17]) == 0 < min(widths[17:])
+
+
 @pytest.mark.parametrize("variant", ["default", "gradient"])
 def test_gradients_by_harmonics_as_factors_make_the_same_steps(scene, device, variant):
     config = override_config(VARIANTS[variant], {"schedule.harmonics_every": 2})

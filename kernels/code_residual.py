@@ -5,15 +5,17 @@ from functools import cache
 import warp as wp
 
 from .constants import FORWARD
+from .geometry import vector
 
 
 @cache
-def clipped_residual_kernel(dtype, code, mu_law: bool):
+def code_residual_kernel(dtype, code, mu_law: bool):
     """The kernel for one scalar type and one type of codes, wp.uint8 or wp.uint16.
 
     mu_law: the image becomes gain log(1 + scale x); otherwise it is compared as it is.
     """
     real = dtype
+    vec3 = vector(3, dtype)
 
     @wp.func
     def log1p(x: real) -> real:
@@ -27,37 +29,34 @@ def clipped_residual_kernel(dtype, code, mu_law: bool):
         return result
 
     @wp.kernel(module="unique", module_options=FORWARD | {"fuse_fp": False})
-    def clipped_residual(
+    def code_residual(
         first: int,
         image: wp.array(dtype=real), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64),
-        table: wp.array(dtype=real),
-        scale: real, gain: real, white: int, black: int, below_white: real, above_black: real,
+        table: wp.array(dtype=vec3), scale: real, gain: real,
         seen: wp.array(dtype=real), slopes: wp.array(dtype=real), truth: wp.array(dtype=real),
     ):
-        """truth: what the table holds for the codes of photo index[0]. seen: of the image; where the code is `white`
-        the truth, less what is missing to truth - below_white; where it is `black` the truth, plus what is beyond
-        truth + above_black. slopes: the derivatives of seen by image."""
+        """table: what each code is worth, the least and the most that it stands for. truth: what the codes of photo
+        index[0] are worth. seen: the truth, plus what the image is above the most, or less what it is below the least.
+        slopes: the derivatives of seen by image."""
         i = first + wp.tid()
-        found = int(codes[wp.int32(index[0]), i])
-        goal = table[found]
+        row = table[int(codes[wp.int32(index[0]), i])]
         value = image[i]
         slope = real(1.0)
         if wp.static(mu_law):
             x = value * scale
             value = gain * log1p(x)
             slope = gain * scale / (real(1.0) + x)
-        if found == white:
-            missing = value - (goal - below_white)
-            value = goal + wp.min(missing, real(0.0))
-            if missing > real(0.0):
-                slope = real(0.0)
-        elif found == black:
-            beyond = value - (goal + above_black)
-            value = goal + wp.max(beyond, real(0.0))
-            if beyond < real(0.0):
+        # What is not a number is in no branch, and stays, as does what is beside a code that stands for one value.
+        if row[1] < row[2]:
+            if value < row[1]:
+                value = row[0] + (value - row[1])
+            elif value > row[2]:
+                value = row[0] + (value - row[2])
+            elif value >= row[1]:
+                value = row[0]
                 slope = real(0.0)
         seen[i] = value
         slopes[i] = slope
-        truth[i] = goal
+        truth[i] = row[0]
 
-    return clipped_residual
+    return code_residual
