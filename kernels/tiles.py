@@ -30,7 +30,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
     real, vec2, vec3, vec4 = g.real, g.vec2, g.vec3, g.vec4
     reals, reals2d = wp.array(dtype=real), wp.array2d(dtype=real)
     ints, int64s = wp.array(dtype=wp.int32), wp.array(dtype=wp.int64)
-    vec2s, vec4s = wp.array(dtype=vec2), wp.array(dtype=vec4)
+    vec2s, vec4s, bools = wp.array(dtype=vec2), wp.array(dtype=vec4), wp.array(dtype=wp.bool)
     size = float(TILE_SIZE)
     # Without fused multiply-adds: who counts and who emits must decide alike; a compiler fuses each its own way.
     options = FORWARD | {"fuse_fp": False}
@@ -105,10 +105,11 @@ def tile_kernels(dtype) -> SimpleNamespace:
         columns: int, rows: int,
         ends: int64s,
         capacity: int,
-        tiles: ints, gaussians: ints,
+        tiles: ints, gaussians: ints, overflow: bools,
     ):
         """ends: the running sum of the counts: Gaussian `place` fills the entries before ends[place] and `capacity`,
-        with columns * rows, no tile at all, where there are fewer tiles than were counted. All fill so what is left."""
+        with columns * rows, no tile at all, where there are fewer tiles than were counted. All fill so what is left.
+        overflow: [1], whether more were counted than there is room for; or None."""
         place = first + wp.tid()
         i = order[place]
         extent = extents[i]
@@ -132,6 +133,8 @@ def tile_kernels(dtype) -> SimpleNamespace:
             gaussians[entry] = i
             entry += 1
         count = order.shape[0]
+        if overflow and place == 0:
+            overflow[0] = ends[count - 1] > wp.int64(capacity)
         entry = int(wp.min(ends[count - 1], wp.int64(capacity))) + place
         while entry < capacity:
             tiles[entry] = columns * rows
@@ -145,7 +148,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
         columns: int, rows: int,
         ends: int64s,
         capacity: int,
-        keys: int64s, gaussians: ints,
+        keys: int64s, gaussians: ints, overflow: bools,
     ):
         """As emit_entries, of Gaussians as they come. keys: the tile above DEPTH_BITS of the depth, whose order is that
         of positive numbers."""
@@ -173,6 +176,8 @@ def tile_kernels(dtype) -> SimpleNamespace:
             gaussians[entry] = i
             entry += 1
         count = depths.shape[0]
+        if overflow and i == 0:
+            overflow[0] = ends[count - 1] > wp.int64(capacity)
         entry = int(wp.min(ends[count - 1], wp.int64(capacity))) + i
         while entry < capacity:
             keys[entry] = wp.int64(columns * rows) << wp.int64(DEPTH_BITS)

@@ -111,16 +111,18 @@ def build_tile_lists(
     columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
     tile_count, count = columns * rows, len(depths)
     total = ends[-1] if count else ends.new_zeros(())
-    overflow = None if capacity is None else total > capacity
+    overflow = None
+    if capacity is not None:  # Written as Gaussians are entered, if there are any: to compare is a launch.
+        overflow = (torch.empty if count else torch.zeros)((), dtype=torch.bool, device=ends.device)
     room = checked_room(int(total) if capacity is None else capacity, count, columns, rows)
     by_gaussian = None
     if order is None:
         touched = *records, extents, depths, columns, rows
-        keys, gaussians = sort_keys(*emit_keys(*touched, ends, room), room, tile_count)
+        keys, gaussians = sort_keys(*emit_keys(*touched, ends, room, overflow), room, tile_count)
         ranges, corners = find_lists(keys, gaussians, records, columns, rows)
     else:
         touched = order, *records, extents, columns, rows
-        tiles, gaussians = emit_entries(*touched, ends, room)
+        tiles, gaussians = emit_entries(*touched, ends, room, overflow)
         given = tiles, gaussians, room, records, columns, rows, emission
         ranges, gaussians, corners, places = lists_by_tile(*given)
         by_gaussian = None if places is None else Emission(order.clone(), ends, places)
@@ -176,21 +178,21 @@ def checked_room(room: int, count: int, columns: int, rows: int) -> int:
     return room
 
 
-def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends, room: int):
+def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends, room: int, overflow=None):
     """One entry for each tile that each Gaussian touches, front to back: tiles and Gaussians, each [2 room], of which
     the first halves are filled; the sort needs the rest. Entries that there is room for and that are not used belong
-    to tile columns * rows."""
+    to tile columns * rows. overflow: scalar bool, is told whether there are more than there is room for."""
     tiles, gaussians = (torch.empty(2 * room, dtype=torch.int32, device=order.device) for _ in range(2))
     if not len(order):
         tiles[:room], gaussians[:room] = columns * rows, 0
     elif room:
         kernel = tile_kernels(warp_scalar(shapes.dtype)).emit_entries
         touched = order, shapes, ellipses, extents, columns, rows
-        launch(kernel, len(order), *touched, ends, room, tiles, gaussians)
+        launch(kernel, len(order), *touched, ends, room, tiles, gaussians, overflow)
     return tiles, gaussians
 
 
-def emit_keys(shapes, ellipses, extents, depths, columns: int, rows: int, ends, room: int):
+def emit_keys(shapes, ellipses, extents, depths, columns: int, rows: int, ends, room: int, overflow=None):
     """As emit_entries, of Gaussians as they come: int64 keys, the tile above those of the depth, and Gaussians."""
     keys = torch.empty(2 * room, dtype=torch.int64, device=ends.device)
     gaussians = torch.empty(2 * room, dtype=torch.int32, device=ends.device)
@@ -198,7 +200,7 @@ def emit_keys(shapes, ellipses, extents, depths, columns: int, rows: int, ends, 
         keys[:room], gaussians[:room] = columns * rows << kernels.DEPTH_BITS, 0
     elif room:
         touched = shapes, ellipses, extents, depths, columns, rows
-        launch(tile_kernels(wp.float32).emit_keys, len(depths), *touched, ends, room, keys, gaussians)
+        launch(tile_kernels(wp.float32).emit_keys, len(depths), *touched, ends, room, keys, gaussians, overflow)
     return keys, gaussians
 
 

@@ -118,6 +118,16 @@ def test_corners_are_those_that_an_ellipse_touches(device):
     assert (by_corner.reshape(-1, 8) == told.bool()).float().mean() > 0.95
 
 
+@pytest.mark.parametrize("emission", [False, True])
+@pytest.mark.parametrize("count", [0, 1, 500])
+def test_overflow_is_more_entries_than_room(device, emission, count):
+    scene = packed(random_scene(count=count, width=16 * COLUMNS, height=16 * ROWS, seed=3).to(torch.float32, device))
+    entries = built(*scene, emission=emission).entry_count
+    for room in {max(1, entries + spare) for spare in (-1, 0, 1)}:
+        lists = built(*scene, room, emission=emission)
+        assert bool(lists.overflow) == (entries > room) and lists.total == entries
+
+
 def kept_bytes(holder):
     """Of the memory behind a dataclass's tensors, and of the dataclasses in it."""
     values = [getattr(holder, field.name) for field in fields(holder)]
