@@ -217,26 +217,6 @@ def harmonics_adam_kernel(count: int):
 
 
 @wp.kernel(module="unique", module_options=FORWARD)
-def sum_opacities(
-    first: int,
-    logits: wp.array(dtype=wp.float32), weight: float, live: wp.array(dtype=wp.int32),
-    sums: wp.array(dtype=wp.float32), slopes: wp.array(dtype=wp.float32),
-):
-    """sums: [T], T threads' shares of `weight` times the mean of the sigmoids; slopes: [N] of that by the logits. live:
-    [1], of how many it is the mean, or [0] for all."""
-    thread = first + wp.tid()
-    part = weight / float(logits.shape[0])
-    if live.shape[0] > 0:
-        part = weight / float(live[0])
-    total = float(0.0)
-    for i in range(thread, logits.shape[0], sums.shape[0]):
-        opacity = 1.0 / (1.0 + wp.exp(-logits[i]))
-        total += opacity
-        slopes[i] = opacity * (1.0 - opacity) * part
-    sums[thread] = total * part
-
-
-@wp.kernel(module="unique", module_options=FORWARD)
 def add_gradient_statistics(
     first: int,
     gradients: wp.array(dtype=wp.vec2), radii: wp.array(dtype=wp.float32), usable: wp.array(dtype=wp.float32),

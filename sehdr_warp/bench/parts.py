@@ -25,10 +25,11 @@ OTHER = "torch's own"
 KERNELS = {
     "projection": ("project_*_forward",),
     "harmonics": ("evaluate_*", "turns_adjoint_*"),
+    "activations": ("activate_*",),
     "lists": ("pack_records_*", "key_by_*", "emit_*", "find_lists_*", "*radix_sort*", "*DeviceScan*"),
     "blend": ("blend_forward_*",),
     "response and fusion": ("encode_*", "interpolate_*", "perceptrons_*", "mix_*", "point_adjoint_*", "unit_adjoint_*"),
-    "losses": ("compare_*", "blur_*", "gradient_in_strips_*", "clipped_*", "code_residual_*", "sum_opacities_*"),
+    "losses": ("compare_*", "blur_*", "gradient_in_strips_*", "clipped_*", "code_residual_*"),
     "blend, adjoint": ("blend_backward_*",),
     "projection, adjoint": ("project_*_backward",),
     "optimizer": ("update_*", "find_nonfinite_*", "judge_step_*"),

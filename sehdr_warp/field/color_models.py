@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import hardtanh
 
 from ..response import Response
+from ..splatting.activations import bounded_exponential
 
 EXPOSURE_FLOOR = 1e-6  # Of the linear model: keeps logarithms finite, 100 times below 8-bit black in sRGB
 LOG_EXPOSURE_LIMIT = 40.0  # Either way: exp stays finite in float32, even squared and summed over a pixel
@@ -26,11 +27,13 @@ class ColorModel:
         """[N, 3] start values of the harmonics' constant part from encoded values [N, 3] in [0, 1]."""
         return np.log(response.start_exposures(_within(encoded)))
 
-    def colors(self, value: Tensor) -> tuple[Tensor, Tensor | None]:
-        """What is blended, from the harmonics' sum, [N, 3] each; and its logarithm where it is at hand."""
-        # clamp(), but for the derivative, which is one operation in place of four.
-        logarithm = hardtanh(value, -LOG_EXPOSURE_LIMIT, LOG_EXPOSURE_LIMIT)
-        return logarithm.exp(), logarithm
+    def colors(self, value: Tensor) -> Tensor:
+        """What is blended, from the harmonics' sum, [N, 3] each."""
+        return bounded_exponential(value, LOG_EXPOSURE_LIMIT)
+
+    def logarithms(self, value: Tensor, color: Tensor) -> Tensor:
+        """Of the colors that colors() made of the values, [N, 3] each."""
+        return hardtanh(value, -LOG_EXPOSURE_LIMIT, LOG_EXPOSURE_LIMIT)
 
 
 class LinearModel(ColorModel):
@@ -42,7 +45,10 @@ class LinearModel(ColorModel):
         return response.start_exposures(_within(encoded))
 
     def colors(self, value):
-        return value.clamp_min(EXPOSURE_FLOOR), None
+        return value.clamp_min(EXPOSURE_FLOOR)
+
+    def logarithms(self, value, color):
+        return color.log()
 
 
 class DisplayModel(ColorModel):
@@ -55,7 +61,7 @@ class DisplayModel(ColorModel):
         return _within(encoded) - 0.5
 
     def colors(self, value):
-        return value.add(0.5).clamp_min(0), None
+        return value.add(0.5).clamp_min(0)
 
 
 def color_model(name: str) -> ColorModel:

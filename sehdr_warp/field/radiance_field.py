@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from ..response import Response
 from ..scene import Camera
 from ..splatting import Rendering, rasterize, rasterize_directions, spherical_harmonics
+from ..splatting.activations import weighed_opacities
 from .color_models import color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
@@ -46,6 +47,7 @@ class Photograph:
     light: exposure of this photo, which the response encoded; None where colors are encoded before they are composited.
     by_harmonics: where they are factored, has after a backward pass the gradient [N, 3] by what each Gaussian's
         harmonics are in this direction.
+    opacity_cost: opacity_weight times the mean opacity, a scalar; None without a weight.
     """
 
     encoded: Tensor | None
@@ -54,6 +56,7 @@ class Photograph:
     rendering: Rendering
     light: Tensor | None = None
     by_harmonics: tuple[Tensor, ...] | list[Tensor] = ()
+    opacity_cost: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -125,21 +128,26 @@ class RadianceField(nn.Module):
         capacity: int | None = None,
         encode: bool = True,
         factored: bool = False,
+        opacity_weight: float = 0.0,
     ) -> Photograph:
         """A photo of exposure_time seconds, harmonics up to `degree`; also: which of "exposure" and "base" are wanted;
         capacity: as rasterize() takes it; encode: False leaves a photo that has an exposure at that; factored: the
-        harmonics' coefficients get no gradient, and that by their values is in by_harmonics."""
+        harmonics' coefficients get no gradient, and that by their values is in by_harmonics; opacity_weight: what the
+        opacities, which are made for the photo, cost at that."""
+        gaussians, opacities, cost = self.gaussians, None, None
+        if opacity_weight:
+            opacities, cost = weighed_opacities(gaussians.opacity_logits, opacity_weight, gaussians.live)
         ratio = exposure_time / self.base_time
         values = self._values(camera.position, degree, factored)
         kept: list[Tensor] = []
         if factored:
             values.register_hook(kept.append)  # As retain_grad(), without a copy.
         if self.color_model.encoded:
-            rendering = self._rasterize(camera, self.color_model.colors(values)[0], capacity)
+            rendering = self._rasterize(camera, self.color_model.colors(values), capacity, opacities)
             image = rendering.image
             if ratio != 1.0:
                 image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
-            return Photograph(image, None, None, rendering, None, kept)
+            return Photograph(image, None, None, rendering, None, kept, cost)
         base, fused = self._exposures(values)
         sets = {"fused": fused}
         if self.tone_map == "gaussian":
@@ -148,7 +156,7 @@ class RadianceField(nn.Module):
         if "base" in also and self.fusion is not None:
             sets["base"] = base
         features = torch.cat(list(sets.values()), dim=1) if len(sets) > 1 else next(iter(sets.values()))
-        rendering = self._rasterize(camera, features, capacity)
+        rendering = self._rasterize(camera, features, capacity, opacities)
         # Not split where it is one: the split's derivative would be a copy.
         parts = rendering.image.split(3, dim=2) if len(sets) > 1 else (rendering.image,)
         images = dict(zip(sets, parts, strict=True))
@@ -157,7 +165,7 @@ class RadianceField(nn.Module):
             # Most photos of a set have its base time.
             light = exposure if isinstance(ratio, float) and ratio == 1 else images["fused"] * ratio
             encoded = self.response.encode_extended(light) if encode else None
-        return Photograph(encoded, exposure, images.get("base", exposure), rendering, light, kept)
+        return Photograph(encoded, exposure, images.get("base", exposure), rendering, light, kept, cost)
 
     @torch.no_grad()
     def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:
@@ -166,7 +174,7 @@ class RadianceField(nn.Module):
         pose = tensors.world_to_camera
         depth = self.gaussians.means @ pose[2, :3, None] + pose[2, 3]
         encoded, values = self.color_model.encoded, self._values(tensors.position, degree)
-        colors = self.color_model.colors(values)[0] if encoded else self._exposures(values)[1]
+        colors = self.color_model.colors(values) if encoded else self._exposures(values)[1]
         rendering = self._rasterize(tensors, torch.cat([colors, depth], dim=1))
         colors, depth = rendering.image[..., :3], rendering.image[..., 3]
         if encoded:
@@ -187,7 +195,7 @@ class RadianceField(nn.Module):
         (pixels) and pixel_angle (radians) as rasterize_directions() takes them."""
         gaussians = self.gaussians
         encoded, values = self.color_model.encoded, self._values(position, degree)
-        colors = self.color_model.colors(values)[0] if encoded else self._exposures(values)[1]
+        colors = self.color_model.colors(values) if encoded else self._exposures(values)[1]
         features = [colors, (gaussians.means - position).norm(dim=1, keepdim=True)]
         if self.confidence is not None:
             features.append(self.confidence[:, None])
@@ -246,15 +254,19 @@ class RadianceField(nn.Module):
 
     def _exposures(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Exposures at the base time of each Gaussian's base color and of its HDR color, [N, 3] each."""
-        base, logarithm = self.color_model.colors(values)
+        base = self.color_model.colors(values)
         if self.fusion is None:
             return base, base
-        return base, self.fusion(base.log() if logarithm is None else logarithm) * self.base_time
+        return base, self.fusion(self.color_model.logarithms(values, base)) * self.base_time
 
-    def _rasterize(self, camera: CameraTensors, features: Tensor, capacity: int | None = None) -> Rendering:
+    def _rasterize(
+        self, camera: CameraTensors, features: Tensor, capacity: int | None = None, opacities: Tensor | None = None
+    ) -> Rendering:
+        """opacities: [N], where they are made already."""
         gaussians = self.gaussians
+        opacities = gaussians.opacities() if opacities is None else opacities
         return self.rasterizer(
-            *(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacities(), features),
+            *(gaussians.means, gaussians.log_scales, gaussians.quaternions, opacities, features),
             *(camera.world_to_camera, camera.intrinsics, camera.width, camera.height),
             antialiased=self.antialiased,
             capacity=capacity,

@@ -9,10 +9,8 @@ from torch import Tensor
 
 from ..kernels import training_step as kernels
 from .harmonics import HarmonicsGradients
-from .launching import launch, one, times
+from .launching import launch, one
 from .threads import torch_threads
-
-MEAN_THREADS = 1 << 14
 
 
 @torch.no_grad()
@@ -172,30 +170,6 @@ def _rate(rate: Tensor | float, like: Tensor) -> Tensor:
 def _numbers(betas: tuple[float, float]) -> tuple[float, ...]:
     """What Adam's kernels know of the decays."""
     return *(1 - beta for beta in betas), *(math.log(beta) for beta in betas)
-
-
-def mean_opacity(logits: Tensor, weight: float = 1.0, live: Tensor | None = None) -> Tensor:
-    """weight times the mean of the sigmoids of [N] float32 logits, N >= 1, differentiable once; on a GPU in a third of
-    the time that torch takes for it. live: [1] int32 on the device, how many there are, where those behind them have a
-    sigmoid of 0."""
-    if logits.device.type == "cuda":
-        return _MeanOpacity.apply(logits, weight, live)
-    opacities = torch.sigmoid(logits)
-    return weight * (opacities.mean() if live is None else opacities.sum() / live[0])
-
-
-class _MeanOpacity(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, logits, weight, live):
-        sums, slopes = logits.new_empty(min(len(logits), MEAN_THREADS)), torch.empty_like(logits)
-        launch(kernels.sum_opacities, len(sums), logits.detach(), weight, _live(live, logits), sums, slopes)
-        ctx.save_for_backward(slopes)
-        return sums.sum()
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, upstream):
-        return times(ctx.saved_tensors[0], upstream), None, None
 
 
 @torch.no_grad()

@@ -11,7 +11,6 @@ from ..response import Response, ToneMapper
 from ..splatting.clipped_light import clipped_light_energy
 from ..splatting.code_residual import CodeScale, code_residual, code_values
 from ..splatting.ssim import image_distance, ssim
-from ..splatting.training_step import mean_opacity
 from .config import LossConfig
 
 CODE = 1 / 255  # One step of an 8-bit photo
@@ -185,8 +184,7 @@ def data_loss(
     return loss
 
 
-def regularised(loss: Tensor, field: RadianceField, config: LossConfig) -> Tensor:
-    """The loss and what the Gaussians themselves cost, whatever the view: the opacities."""
-    if config.opacity_weight > 0:
-        loss = loss + mean_opacity(field.gaussians.opacity_logits, config.opacity_weight, field.gaussians.live)
-    return loss
+def regularised(loss: Tensor, photo: Photograph) -> Tensor:
+    """The loss and what the Gaussians themselves cost, whatever the view: the opacities, where photograph() was given
+    a weight for them."""
+    return loss if photo.opacity_cost is None else loss + photo.opacity_cost

@@ -237,7 +237,8 @@ class Trainer:
         target, camera, time, field = view.target, view.camera, view.exposure_time, self.field
         also = needed_colours(self.config.loss, target.exposure_truth is not None)
         options = {"degree": self.degree, "also": also, "capacity": capacity, "encode": self._encoded}
-        photo = field.photograph(camera, time, **options, factored=self._factored)
+        options |= {"factored": self._factored, "opacity_weight": self.config.loss.opacity_weight}
+        photo = field.photograph(camera, time, **options)
         by_harmonics = photo.by_harmonics
         # What the backward pass does not read, or only its first part does, must not stay until the end of the step.
         kept = {"means2d", "extents"} if watched else set()
@@ -245,11 +246,10 @@ class Trainer:
         rendering = replace(photo.rendering, **dict.fromkeys(unread))
         if watched:
             rendering.means2d.retain_grad()
-        loss = data_loss(field, photo, target, self.config.loss, self._largest_truth)
+        loss = regularised(data_loss(field, photo, target, self.config.loss, self._largest_truth), photo)
         image = photo.encoded if self._encoded else photo.light
         assert image is not None
         del photo, target, view
-        loss = regularised(loss, field, self.config.loss)
         differentiate(loss)
         harmonics = None
         if self._factored:

@@ -15,6 +15,7 @@ from sehdr_warp.bench.step import bench_step
         ("project_d287a562_cuda_kernel_backward", "projection, adjoint"),
         ("backward_kernel__locals__blend_backward_64b9232b_cuda_kernel_forward", "blend, adjoint"),
         ("void cub::_V_3::detail::radix_sort::DeviceRadixSortOnesweepKernel<int>", "lists"),
+        ("opacities_kernel__locals__activate_opacities_3c9e86f4_cuda_kernel_forward", "activations"),
         ("update_harmonics_by_adam_973af1cd_cuda_kernel_forward", "optimizer"),
         ("void at::native::vectorized_elementwise_kernel<4, at::native::exp_kernel_cuda>", parts.OTHER),
     ],

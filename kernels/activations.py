@@ -1,0 +1,101 @@
+"""What a Gaussian's parameters become before it is drawn, exposures and opacities: one launch each way, where torch
+would make four and five of it."""
+
+from functools import cache
+
+import warp as wp
+
+from .constants import FORWARD
+
+
+@cache
+def exposures_kernel(dtype):
+    """exposures = exp of values held within [-bound, bound]; one that is not a number stays so. Covers the numbers."""
+    real = dtype
+
+    @wp.kernel(module="unique", module_options=FORWARD)
+    def activate_exposures(
+        first: int,
+        values: wp.array(dtype=real), bound: real, exposures: wp.array(dtype=real),
+    ):
+        place = first + wp.tid()
+        value = values[place]
+        # Not clamped, which would make a number of what is none.
+        held = wp.where(value > bound, bound, wp.where(value < -bound, -bound, value))
+        exposures[place] = wp.exp(held)
+
+    return activate_exposures
+
+
+@cache
+def exposures_adjoint_kernel(dtype):
+    """value_gradients [N C], flat, of exposure_gradients [N, C] of any strides; 0 from the bounds on."""
+    real = dtype
+
+    @wp.kernel(module="unique", module_options=FORWARD)
+    def activate_exposures_adjoint(
+        first: int,
+        values: wp.array(dtype=real), bound: real, exposures: wp.array(dtype=real),
+        exposure_gradients: wp.array2d(dtype=real), value_gradients: wp.array(dtype=real),
+    ):
+        place = first + wp.tid()
+        i = place // exposure_gradients.shape[1]
+        gradient = exposure_gradients[i, place - i * exposure_gradients.shape[1]] * exposures[place]
+        value = values[place]
+        value_gradients[place] = wp.where(value >= bound or value <= -bound, real(0.0), gradient)
+
+    return activate_exposures_adjoint
+
+
+@cache
+def opacities_kernel(dtype):
+    """opacities: [N] sigmoids of the logits; shares: [T], what each of T threads has of `weight` times their mean.
+    live: [1], of how many it is the mean, those behind them having an opacity of 0; or None for all. Covers [0, T)."""
+    real = dtype
+
+    @wp.kernel(module="unique", module_options=FORWARD)
+    def activate_opacities(
+        first: int,
+        logits: wp.array(dtype=real), weight: real, live: wp.array(dtype=wp.int32),
+        opacities: wp.array(dtype=real), shares: wp.array(dtype=real),
+    ):
+        thread = first + wp.tid()
+        part = weight / real(logits.shape[0])
+        if live:
+            part = weight / real(live[0])
+        total = real(0.0)
+        for i in range(thread, logits.shape[0], shares.shape[0]):
+            opacity = real(1.0) / (real(1.0) + wp.exp(-logits[i]))
+            total += opacity
+            opacities[i] = opacity
+        shares[thread] = total * part
+
+    return activate_opacities
+
+
+@cache
+def opacities_adjoint_kernel(dtype):
+    """logit_gradients [N] of opacity_gradients [N] and mean_gradient [1], by the opacities and by `weight` times their
+    mean; either may be None. live: as of opacities_kernel()."""
+    real = dtype
+
+    @wp.kernel(module="unique", module_options=FORWARD)
+    def activate_opacities_adjoint(
+        first: int,
+        opacities: wp.array(dtype=real), weight: real, live: wp.array(dtype=wp.int32),
+        opacity_gradients: wp.array(dtype=real), mean_gradient: wp.array(dtype=real),
+        logit_gradients: wp.array(dtype=real),
+    ):
+        i = first + wp.tid()
+        gradient = real(0.0)
+        if opacity_gradients:
+            gradient = opacity_gradients[i]
+        if mean_gradient:
+            part = weight / real(opacities.shape[0])
+            if live:
+                part = weight / real(live[0])
+            gradient += part * mean_gradient[0]
+        opacity = opacities[i]
+        logit_gradients[i] = gradient * opacity * (real(1.0) - opacity)
+
+    return activate_opacities_adjoint

@@ -1,0 +1,74 @@
+"""What a Gaussian's parameters become before it is drawn, as torch operations (kernels/activations.py)."""
+
+import torch
+from torch import Tensor
+from torch.nn.functional import hardtanh
+
+from ..kernels.activations import (
+    exposures_adjoint_kernel,
+    exposures_kernel,
+    opacities_adjoint_kernel,
+    opacities_kernel,
+)
+from .launching import launch, warp_scalar
+
+MEAN_THREADS = 1 << 14
+
+
+def bounded_exponential(values: Tensor, bound: float) -> Tensor:
+    """The exponential of [N, C] values, float32 or float64, held within [-bound, bound], from where on the derivative
+    is 0; differentiable once. One that is not a number stays so."""
+    if values.device.type == "cuda":
+        return _BoundedExponential.apply(values, bound)
+    # clamp(), but for the derivative, which is one operation in place of four.
+    return hardtanh(values, -bound, bound).exp()
+
+
+class _BoundedExponential(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, values, bound):
+        values = values.detach().contiguous()
+        made = torch.empty_like(values)
+        launch(exposures_kernel(warp_scalar(values.dtype)), values.numel(), values.view(-1), bound, made.view(-1))
+        ctx.bound = bound
+        ctx.save_for_backward(values, made)
+        return made
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, upstream):
+        values, made = ctx.saved_tensors
+        result = torch.empty_like(values)
+        kernel, given = exposures_adjoint_kernel(warp_scalar(values.dtype)), (values.view(-1), ctx.bound, made.view(-1))
+        launch(kernel, values.numel(), *given, upstream, result.view(-1))
+        return result, None
+
+
+def weighed_opacities(logits: Tensor, weight: float, live: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """The sigmoids of [N] logits, float32 or float64, N >= 1, and `weight` times their mean, a scalar; differentiable
+    once. live: [1] int32 on the device, how many there are, where those behind them have a sigmoid of 0."""
+    if logits.device.type == "cuda":
+        return _Opacities.apply(logits, weight, live)
+    opacities = torch.sigmoid(logits)
+    return opacities, weight * (opacities.mean() if live is None else opacities.sum() / live[0])
+
+
+class _Opacities(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, logits, weight, live):
+        logits = logits.detach().contiguous()
+        opacities, shares = torch.empty_like(logits), logits.new_empty(min(len(logits), MEAN_THREADS))
+        launch(opacities_kernel(warp_scalar(logits.dtype)), len(shares), logits, weight, live, opacities, shares)
+        ctx.weight, ctx.live = weight, live
+        ctx.save_for_backward(opacities)
+        ctx.set_materialize_grads(False)
+        return opacities, shares.sum()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, by_opacities, by_mean):
+        (opacities,) = ctx.saved_tensors
+        result = torch.empty_like(opacities)
+        kernel, given = opacities_adjoint_kernel(warp_scalar(opacities.dtype)), (opacities, ctx.weight, ctx.live)
+        launch(kernel, len(opacities), *given, by_opacities, by_mean, result)
+        return result, None, None
