@@ -245,7 +245,12 @@ def _panorama_tables(result: dict) -> Iterable[str]:
 
 
 def _captures_tables(result: dict) -> Iterable[str]:
-    yield markdown_table(result["rows"], COLUMNS["captures"])
+    table, figures = [], ("psnr", "psnr_fitted", "ssim", "lpips", "seconds", "memory", "gaussians")
+    for rows in groups(result["rows"], "capture", "method").values():
+        means = {name: fmean(row[name] for row in rows) for name in figures}
+        spread = stdev(row["psnr"] for row in rows) if len(rows) > 1 else None
+        table.append(rows[0] | means | {"gaussians": round(means["gaussians"]), "seeds": len(rows), "spread": spread})
+    yield markdown_table(table, COLUMNS["captures"])
 
 
 def _response_tables(result: dict) -> Iterable[str]:
