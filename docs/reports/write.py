@@ -249,7 +249,8 @@ def _captures_tables(result: dict) -> Iterable[str]:
     for rows in groups(result["rows"], "capture", "method").values():
         means = {name: fmean(row[name] for row in rows) for name in figures}
         spread = stdev(row["psnr"] for row in rows) if len(rows) > 1 else None
-        table.append(rows[0] | means | {"gaussians": round(means["gaussians"]), "seeds": len(rows), "spread": spread})
+        counts = {"gaussians": round(means["gaussians"]), "seeds": len(rows), "spread": spread}
+        table.append({**rows[0], **means, **counts})
     yield markdown_table(table, COLUMNS["captures"])
 
 
