@@ -143,9 +143,23 @@ def _quality_tables(result: dict) -> Iterable[str]:
             for key, here in groups(members, *fields).items()
         ]
         yield _pivot(means, {"scene": "", "exposure": "d"}, "method", "dB", ".2f")
+        yield from _whole_by_seed(members)
     shared = max(row["shared_by"] for row in rows)
     if shared > 1:
         yield f"{shared} trainings shared a device: seconds and renders / s are those of a shared one."
+
+
+def _whole_by_seed(rows: Sequence[Mapping]) -> Iterable[str]:
+    """The mean over scenes and exposures of each seed that has them all, where several have."""
+    places, table = groups(rows, "scene", "exposure").keys(), []
+    for (method, seed), mine in sorted(groups(rows, "method", "seed").items()):
+        if groups(mine, "scene", "exposure").keys() == places:
+            away = [row["to_bound"] for row in mine if row["to_bound"] is not None]
+            line = {"method": method, "seed": seed, "gt-max dB": fmean(row["gt_max"] for row in mine)}
+            table.append(line | {"to U": fmean(away) if away else None})
+    if len({line["seed"] for line in table}) > 1:
+        yield "Means over all scenes and exposures, by seed:"
+        yield markdown_table(table, {"method": "", "seed": "d", "gt-max dB": ".2f", "to U": "+.2f"})
 
 
 SHORT = {"method": "", "HDR dB": ".1f", "photos dB": ".1f", "lost": ""}
@@ -217,15 +231,32 @@ def _seeds_tables(result: dict) -> Iterable[str]:
     trained, lost = len(result["rows"]), sum(line["lost"] for line in table)
     yield f"{trained} trainings lost {lost} of {sum(row['lights_count'] for row in result['rows'])} lights."
     yield markdown_table(table, PAGES["seeds"]["columns"])
+    # Sets that are not part of the project have seeds of their own.
+    own = [row for row in result["rows"] if not row["scene"].startswith("room_")]
+    values = [fmean(row["gt_max"] for row in rows) for rows in groups(own, "seed").values()]
+    yield (
+        f"The mean over the {len(groups(own, 'scene'))} scenes of the project, of {len(values)} seeds: "
+        f"{fmean(values):.2f} dB, deviation {stdev(values):.2f}, the worst {fmean(values) - min(values):.2f} below."
+    )
 
 
 def _readings_tables(result: dict) -> Iterable[str]:
-    columns = PAGES["readings"]["columns"]
-    for truth in (False, True):
-        rows = [row for row in result["rows"] if row["sees_truth"] is truth]
-        yield f"## {'With' if truth else 'Without'} truth"
-        rows = [row | {"reads": PAGES["readings"]["reads"].get(row["method"], "")} for row in rows]
-        yield markdown_table(sorted(rows, key=lambda row: (row["scene"], -row["gt_max"])), columns)
+    page, table = PAGES["readings"], []
+    for (method, truth), rows in groups(result["rows"], "method", "sees_truth").items():
+        line = {"method": method, "truth": "with" if truth else "without", "reads": page["reads"][method]}
+        line |= {row["scene"]: row["gt_max"] for row in rows}
+        table.append(
+            line | {name: fmean(row[name] for row in rows) for name in ("gt_max", "self_max", "aligned", "ldr")}
+        )
+    table.sort(key=lambda line: (line["truth"] == "with", -line["gt_max"]))
+    yield markdown_table(table, page["columns"])
+    for truth, published in page["published"].items():
+        least = {}
+        for protocol in ("gt_max", "self_max", "aligned"):
+            mine = [line for line in table if line["truth"] == truth]
+            found = min(mine, key=lambda line: abs(line[protocol] - published))
+            least[protocol] = f"`{found['method']}` under {protocol.replace('_', '-')} ({found[protocol]:.1f} dB)"
+        yield f"Nearest to the published {published} dB, {truth} truth: {', '.join(least.values())}."
 
 
 def _bits_tables(result: dict) -> Iterable[str]:

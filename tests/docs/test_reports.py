@@ -80,3 +80,23 @@ def test_what_is_no_result_is_named(tmp_path):
     (tmp_path / "results" / "step.json").write_text("{}")
     with pytest.raises(InputError, match="is no result"):
         write_reports(tmp_path)
+
+
+def test_means_over_the_whole_are_told_by_seed(tmp_path):
+    rows = []
+    for method, seed, decibels in (("default", 0, (30, 28)), ("default", 1, (31, 29)), ("truth", 0, (33, 32))):
+        made = plan_jobs(["embedded"], [method], exposures=(1, 2), seeds=(seed,), responses=("known",), iterations=10)
+        rows += [row_of(made_up(job, float(psnr))) for job, psnr in zip(made, decibels, strict=True)]
+    rows += [row_of(made_up(plan_jobs(["embedded"], ["default"], seeds=(2,), iterations=10)[0], 20.0))]
+    machine = {"cpu": "stub", "cores": 2, "gpu": None, "versions": {"torch": "2"}}
+    result = {"command": "-", "machine": machine, "date": "2026-01-01", "rows": rows, "notes": []}
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "quality.json").write_text(json.dumps(result))
+    write_reports(tmp_path)
+    told = (tmp_path / "quality.md").read_text().split("by seed:")[1]
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in told.splitlines() if line.startswith("| ")]
+    assert cells[2:] == [
+        ["default", "0", "29.00", "-3.50"],
+        ["default", "1", "30.00", "-"],
+        ["truth", "0", "32.50", "-"],
+    ]
