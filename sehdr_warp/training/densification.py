@@ -25,6 +25,7 @@ SHORTEST_RESET = 300
 """Where resets would come closer together they are left out: opacities would not recover in between."""
 SPARE = 1.17  # Rows in multiples of the Gaussians: changes that add a twentieth each fill them in three
 MOST_GROWTH = 1.0  # A change adds at most as many as there are: each then shares with one other in the mean
+PAIRS = 1 << 24  # Of Gaussians and cameras whose distances are held at once
 SEED_STEP = 1_000_003  # Seeds of trainings are this far apart in the seeds of their noise, one for each iteration
 
 
@@ -188,12 +189,14 @@ class Relocation(Densification):
     to the budget; some of the moved and the new are born where the photos are explained worst; noise on the positions
     of the faint ones explores. No opacity resets, no gradient statistics.
 
-    A start with more Gaussians than the budget keeps its count: they move, and none are added.
+    Those that are too wide for the camera next to them count as dead too. A start with more Gaussians than the budget
+    keeps its count: they move, and none are added.
     """
 
-    def __init__(self, config: Config, extent: float, pixels: int):
+    def __init__(self, config: Config, extent: float, pixels: int, places: Tensor | None = None):
         super().__init__(config, extent, pixels)
         self.most = gaussian_budget(self.options, pixels)
+        self.places = places
 
     @torch.no_grad()
     def change(self, iteration: int, gaussians: Gaussians, optimizer, generator, births: Births | None = None) -> bool:
@@ -202,7 +205,7 @@ class Relocation(Densification):
         count, part = gaussians.count, self.options.births
         added = self.next_count(iteration, count) - count
         opacities = gaussians.opacities()
-        dead = opacities <= self.options.prune_opacity
+        dead = (opacities <= self.options.prune_opacity) | self._veils(gaussians)
         # The device alone knows how many die: it numbers the places to be filled, those of the dead and then the new.
         numbers = dead.cumsum(0)
         gone = numbers[-1]
@@ -249,6 +252,16 @@ class Relocation(Densification):
                 seed=(self.config.seed * SEED_STEP + iteration) % 2**31,
             )
 
+    def _veils(self, gaussians: Gaussians) -> Tensor:
+        """[N] whether each is wider than `prune_angle` allows before the nearest camera."""
+        means = gaussians.means
+        if self.places is None or not len(self.places):
+            return torch.zeros(len(means), dtype=torch.bool, device=means.device)
+        exact = "donot_use_mm_for_euclid_dist"
+        parts = means.split(max(1, PAIRS // len(self.places)))
+        nearest = torch.cat([torch.cdist(part, self.places, compute_mode=exact).amin(1) for part in parts])
+        return gaussians.log_scales.amax(1) > torch.log(self.options.prune_angle * nearest)
+
     def _fill(self, gaussians, optimizer, generator, weights, ranks, number: Tensor, most: int) -> None:
         """Puts into the places that have a rank [N], from 0 on, copies of Gaussians drawn by weights [N], which share
         what they are with them. number: of ranks, at most `most`."""
@@ -273,10 +286,11 @@ class Relocation(Densification):
                 moment.masked_fill_(which.view(-1, *[1] * (moment.ndim - 1)), 0)
 
 
-def make_densification(config: Config, extent: float, pixels: int) -> Densification:
-    """The strategy that config.densification.strategy names."""
-    strategies = {"relocation": Relocation, "gradient": GradientDensification}
-    return strategies[config.densification.strategy](config, extent, pixels)
+def make_densification(config: Config, extent: float, pixels: int, places: Tensor | None = None) -> Densification:
+    """The strategy that config.densification.strategy names; places: [V, 3] of the training cameras."""
+    if config.densification.strategy == "gradient":
+        return GradientDensification(config, extent, pixels)
+    return Relocation(config, extent, pixels, places)
 
 
 def gaussian_budget(options: DensificationConfig, pixels: int) -> int:

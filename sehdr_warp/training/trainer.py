@@ -65,7 +65,8 @@ class Trainer:
         self.extent = scene_extent(scene)
         self.optimizer = adam.make_optimizer(field, config, self.extent, self.batch)
         pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
-        self.densification = make_densification(config, self.extent, pixels)
+        places = torch.tensor([view.camera.position.tolist() for view in scene.train_views], device=self.device)
+        self.densification = make_densification(config, self.extent, pixels, places)
         self._averaging = Averaging(config, self.densification.stop)
         self._views = scene.train_views
         self._matcher = matcher or cache(partial(make_matcher, scene, field.response, self.device))

@@ -29,6 +29,7 @@ FIELDS = [
     ("relocation", "optimizer.opacity_logits", 0.1),
     ("relocation", "optimizer.harmonics_rest", 0.01),
     ("relocation", "densification.prune_opacity", 0.3),
+    ("relocation", "densification.prune_angle", 0.02),
     ("gradient", "densification.prune_opacity", 0.3),
     ("gradient", "densification.grow_gradient", 5e-3),
     ("gradient", "densification.grow_scale", 1.0),
