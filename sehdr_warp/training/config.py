@@ -142,9 +142,9 @@ class DensificationConfig(_Table):
     """fainter ones are taken away (relocation: are moved)"""
     prune_scale: Positive = 0.1
     """gradient: larger than this part of the scene is taken away after the first reset"""
-    prune_angle: Positive = 0.25
+    prune_angle: Weight = 0.0
     """relocation: one whose standard deviation exceeds this part of its distance from the nearest training camera is
-    moved: it veils what that camera sees, and its projection is no longer exact"""
+    moved: it veils what cameras see that look all around; 0: none"""
     reset_every: Iteration = 3000
     """gradient: iterations between resets of the opacities"""
     growth: Part = 0.05

@@ -189,8 +189,8 @@ class Relocation(Densification):
     to the budget; some of the moved and the new are born where the photos are explained worst; noise on the positions
     of the faint ones explores. No opacity resets, no gradient statistics.
 
-    Those that are too wide for the camera next to them count as dead too. A start with more Gaussians than the budget
-    keeps its count: they move, and none are added.
+    Those that are too wide for the camera next to them can count as dead too. A start with more Gaussians than the
+    budget keeps its count: they move, and none are added.
     """
 
     def __init__(self, config: Config, extent: float, pixels: int, places: Tensor | None = None):
@@ -255,7 +255,7 @@ class Relocation(Densification):
     def _veils(self, gaussians: Gaussians) -> Tensor:
         """[N] whether each is wider than `prune_angle` allows before the nearest camera."""
         means = gaussians.means
-        if self.places is None or not len(self.places):
+        if self.places is None or not self.options.prune_angle:
             return torch.zeros(len(means), dtype=torch.bool, device=means.device)
         exact = "donot_use_mm_for_euclid_dist"
         parts = means.split(max(1, PAIRS // len(self.places)))

@@ -6,27 +6,26 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from operator import attrgetter
 
-import numpy as np
 import torch
 
 from ..errors import InputError
 from ..field.exposure import exposure_times, is_seconds
 from ..parallel import thread_count
-from ..scene import Scene, View, encoded_values
-from ..scene.exposure import made_by_camera
-from ..scene.linear_photos import kind_of
+from ..scene import Scene
 from ..scene.read_folders import FEWEST_PHOTOS
 from .config import Config, OptimizerConfig
 from .config_files import override_config
 from .densification import gaussian_budget
-from .initialization import base_time, focus_distance, pixels_of, points_on_rays, start_count
+from .initialization import base_time, start_count
 from .machine import pick_device
+from .scene_facts import SceneFacts, measure_scene
 from .targets import largest_truth
 
 PASSES = 300  # Steps on each photo. A second look at the same photos teaches less and less, and in the end their noise
 FEWEST_ITERATIONS = 4000
 CPU_SECONDS = 60.0  # What a training on a CPU may take, as far as CPU_FEWEST allows
 CPU_FEWEST = 1000
+WIDEST = 0.25  # densification.prune_angle where cameras look all around
 CPU_BUDGET = 60.0  # Of densification, where time is short: twice as many Gaussians gain less than twice the steps
 RATES_FOR = 30_000  # The steps that 3DGS made its learning rates for
 HASTE, MOST_HASTE = 0.22, 2.5  # Shorter trainings learn faster by this power of what is missing, so much at most
@@ -40,44 +39,12 @@ EXCHANGE_SECONDS, NUMBER_SECONDS = 1.5e-4, 2.3e-11
 """What two H200 take beyond that to agree and to begin an exchange, and for each number of the gradients."""
 START_SECONDS = 10.0  # What more processes take to start, about
 REACH = 2.0**16  # Brackets farther from the photos' exposure are black or white in all pixels of 8 bits
-
-PROBES = 2000  # Places at which overlap and visibility are measured
-FEWEST_POINTS = 100  # With fewer sparse points places along the cameras' rays serve as probes
 LEAST_OVERLAP = 0.02
 LEAST_CONTRAST = 1 / 255
 DRIFT = 3.0  # Stops of brightness between photos from which exposure is taken to have changed unsaid
-MOST_PIXELS = 250_000  # Of a photo, looked at
-MOST_VIEWS = 64  # Photos that codes are read from, evenly spread; geometry is of all
 
 Choice = tuple[dict[str, object], str, str]
 """What a rule decides: fields of the config and their values, the choice in words, and the figures it rests on."""
-
-
-@dataclass(frozen=True)
-class SceneFacts:
-    """Figures of a scene's training views; parts are of 1.
-
-    pixels: of all photos together. from_camera: whether a camera made the files. truths: photos with HDR truth.
-    points: sparse points. seen: mean number of photos whose field of view holds a probe.
-    overlap: part of the probes, or of places along the cameras' rays if that is more, that two photos show.
-    clipped, black: part of the pixels with a channel at white, with all at 0. contrast: deviation of all codes.
-    light_known: the photos hold light itself: RAW, linear, float. unclipped: they are float pictures, with all of it.
-    drift: stops, about, between the darkest and the brightest photo's median where no exposure times are known; else 0.
-    """
-
-    photos: int
-    pixels: int
-    from_camera: bool
-    truths: int
-    points: int
-    seen: float
-    overlap: float
-    clipped: float
-    black: float
-    contrast: float
-    drift: float
-    light_known: bool = False
-    unclipped: bool = False
 
 
 @dataclass(frozen=True)
@@ -174,44 +141,6 @@ def apply_plan(scene: Scene, config: Config, device: torch.device) -> tuple[Conf
         return plan.config, plan
     check_fields(scene, config)
     return config, None
-
-
-def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
-    """The facts of a scene with at least one training view; takes a second or so, draws its probes from a seed."""
-    views = scene.train_views
-    rng = np.random.default_rng(seed)
-    probes = drawn = points_on_rays(views, PROBES, focus_distance(views), rng)
-    if len(scene.points) >= FEWEST_POINTS:
-        count = min(PROBES, len(scene.points))
-        probes = np.asarray(scene.points)[rng.choice(len(scene.points), count, replace=False)]
-    shown, drawn = (np.array([pixels_of(points, view)[2] for view in views]).sum(0) for points in (probes, drawn))
-    figures = np.array([_codes(view) for view in views[:: -(-len(views) // MOST_VIEWS)]])
-    clipped, black, mean, square, _ = map(float, figures.mean(0))
-    return SceneFacts(
-        photos=len(views),
-        pixels=sum(view.camera.width * view.camera.height for view in views),
-        from_camera=made_by_camera([view.source for view in views]),
-        truths=sum(view.hdr is not None for view in views),
-        points=len(scene.points),
-        seen=float(shown[shown > 0].mean()) if shown.any() else 0.0,
-        overlap=max(float((count >= 2).mean()) for count in (shown, drawn)),
-        clipped=clipped,
-        black=black,
-        contrast=float(np.sqrt(max(square - mean**2, 0.0))),
-        drift=0.0 if scene.exposure_times_known else float(np.ptp(figures[:, -1])),
-        light_known=scene.light_known,
-        unclipped=scene.light_known and all(view.source and kind_of(view.source) == "float" for view in views),
-    )
-
-
-def _codes(view: View) -> tuple[float, float, float, float, float]:
-    """Parts of the pixels that are clipped and black, the means of the encoded values and of their squares, and the
-    median's light in stops, by a gamma of 2.2; of a photo of more than MOST_PIXELS, on a grid."""
-    step = max(1, round((view.camera.width * view.camera.height / MOST_PIXELS) ** 0.5))
-    image = encoded_values(view.codes[::step, ::step])
-    clipped, black = (image >= 254.5 / 255).any(2).mean(), (image <= 0.5 / 255).all(2).mean()
-    median = 2.2 * math.log2(max(float(np.median(image)), 0.5 / 255))
-    return clipped, black, image.mean(dtype=np.float64), np.square(image, dtype=np.float64).mean(), median
 
 
 def gain_of_ranks(count: int, gaussians: int, pixels: int, photos: int, device: torch.device) -> str:
@@ -323,6 +252,9 @@ def _densification(facts: SceneFacts, config: Config, device: torch.device) -> C
     if options.strategy == "relocation":
         start = max(facts.points, start_count(config, facts.pixels))
         choice = f"relocation grows to at most {most}" if start < most else "relocation without growth"
+        if facts.around:
+            fields["densification.prune_angle"] = WIDEST
+            reason += "; the cameras look all around from within, where wide Gaussians would veil them"
         return fields, choice, f"{reason}; {start} to start with"
     # Relocation has this budget by itself; densification by gradients stops nowhere.
     most = min(options.max_gaussians, max(most, 2 * facts.points))

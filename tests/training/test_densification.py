@@ -187,7 +187,8 @@ def test_relocation_moves_what_veils_a_camera(rooms, monkeypatch):
     log_scales = torch.stack([widths.log(), *2 * [torch.full((8,), -5.0)]], 1)
     optimizer = adam(gaussians)
     gaussians.overwrite({"means": means, "log_scales": log_scales, "opacity_logits": torch.zeros(8)})
-    assert not relocation(places, growth=0.0, births=0.0).change(600, gaussians, optimizer, torch.Generator())
+    strategy = relocation(places, prune_angle=0.25, growth=0.0, births=0.0)
+    assert not strategy.change(600, gaussians, optimizer, torch.Generator())
     # More than a quarter of 0.9 from the first camera, and of 2.9 from the second; not of the others.
     moved = (gaussians.means.detach() != means).any(1)
     assert moved.tolist() == [True, False, False, False, False, False, True, False]
