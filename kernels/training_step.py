@@ -163,23 +163,24 @@ def find_nonfinite(
 @cache
 def harmonics_adam_kernel(count: int):
     """update_by_adam of coefficients of harmonics, [3 N count], whose gradients nobody stored: they are as
-    harmonics.coefficient_adjoint_kernel() multiplies them out. Covers [0, stride): a thread takes NUMBERS, `stride`
-    apart, and asks for the memory of all before it waits for any."""
+    harmonics.coefficient_adjoint_kernel() multiplies them out. Of `turns` parts, NUMBERS * stride numbers each, the
+    one whose turn it is. Covers [0, stride): a thread takes NUMBERS, `stride` apart, and asks for the memory of all
+    before it waits for any."""
     numbers, whole_numbers = vector(NUMBERS, wp.float32), vector(NUMBERS, wp.int32)
 
     @wp.kernel(module="unique", module_options=FORWARD)
     def update_harmonics_by_adam(
         first: int,
         basis: wp.array3d(dtype=wp.float32), value_gradients: wp.array3d(dtype=wp.float32), start: int, stride: int,
-        step: wp.array(dtype=wp.float32), rate: wp.array(dtype=wp.float32), skipped: wp.array(dtype=wp.float32),
+        turns: int, step: wp.array(dtype=wp.float32), rate: wp.array(dtype=wp.float32), skipped: wp.array(dtype=wp.float32),
         live: wp.array(dtype=wp.int32),
         first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
         parameters: wp.array(dtype=wp.float32), first_moments: wp.array(dtype=wp.float32),
         second_moments: wp.array(dtype=wp.float32),
     ):
-        thread = first + wp.tid()
+        place = (int(step[0]) % turns) * wp.static(NUMBERS) * stride + first + wp.tid()
         final = counted(parameters, live, wp.static(3 * count)) - 1
-        if skipped[0] == 0.0 and thread <= final:
+        if skipped[0] == 0.0 and place <= final:
             owners = whole_numbers()
             rows = whole_numbers()
             channels = whole_numbers()
@@ -188,7 +189,7 @@ def harmonics_adam_kernel(count: int):
             squares = numbers()
             values = numbers()
             for k in range(wp.static(NUMBERS)):
-                i = wp.min(thread + k * stride, final)
+                i = wp.min(place + k * stride, final)
                 means[k] = first_moments[i]
                 squares[k] = second_moments[i]
                 values[k] = parameters[i]
@@ -202,12 +203,13 @@ def harmonics_adam_kernel(count: int):
                     seen = basis[view, wp.min(rows[k], degrees - 1), owners[k]]
                     by_value = value_gradients[view, owners[k], channels[k]]
                     gradients[k] += wp.where(rows[k] < degrees, seen, 0.0) * by_value
-            length = rate[0] / bias_correction(first_decay_log, step[0])
-            enlarged = 1.0 / wp.sqrt(bias_correction(second_decay_log, step[0]))
+            made = wp.ceil(step[0] / float(turns))
+            length = rate[0] / bias_correction(first_decay_log, made)
+            enlarged = 1.0 / wp.sqrt(bias_correction(second_decay_log, made))
             for k in range(wp.static(NUMBERS)):
                 mean = means[k] + first_gain * (gradients[k] - means[k])
                 square = squares[k] + second_gain * (gradients[k] * gradients[k] - squares[k])
-                i = thread + k * stride
+                i = place + k * stride
                 if i <= final:
                     first_moments[i] = mean
                     second_moments[i] = square

@@ -12,6 +12,7 @@ from .gaussians import PARAMETER_NAMES
 
 FIRST_COEFFICIENT = {"harmonics_dc": 0, "harmonics_rest": 1}
 """Of the groups that hold coefficients of harmonics."""
+TURNS = 2  # Parts of the higher ones, four fifths of all numbers, that step in turn: as good, and a third of Adam's time
 BETAS = 0.9, 0.999
 EPSILON = 1e-15  # 3DGS: gradients of a single Gaussian are tiny, and must not drown in Adam's usual 1e-8
 
@@ -75,5 +76,6 @@ class Adam:
             elif harmonics is not None:
                 state, rate = (first, second, step, skipped), {"rate": group["lr"]}
                 start = FIRST_COEFFICIENT[group["name"]]
-                harmonics_adam_step(values, start, harmonics, *state, **rate, **options, live=live)
+                turns = TURNS if start else 1
+                harmonics_adam_step(values, start, harmonics, *state, **rate, **options, live=live, turns=turns)
         adam_steps(own, skipped, **options, live=live)

@@ -148,15 +148,18 @@ def harmonics_adam_step(
     betas: tuple[float, float],
     epsilon: float,
     live: Tensor | None = None,
+    turns: int = 1,
 ) -> None:
     """adam_steps() of coefficients of harmonics [N, K, 3] from number `start` on, whose gradients are multiplied out
-    where they are used."""
+    where they are used. turns: parts of the coefficients, which step in turn, one at each call; whose turn it is and
+    how many it had is told by `step`."""
     if not parameter.numel():
         return
     numbers = step, _rate(rate, skipped), skipped, _live(live, skipped), *_numbers(betas), epsilon
     changed = parameter.view(-1), first_moment.view(-1), second_moment.view(-1)
-    kernel, stride = kernels.harmonics_adam_kernel(parameter.shape[1]), -(-parameter.numel() // kernels.NUMBERS)
-    launch(kernel, stride, gradients.basis, gradients.by_values, start, stride, *numbers, *changed)
+    kernel = kernels.harmonics_adam_kernel(parameter.shape[1])
+    stride = -(-parameter.numel() // (kernels.NUMBERS * turns))
+    launch(kernel, stride, gradients.basis, gradients.by_values, start, stride, turns, *numbers, *changed)
 
 
 def _live(live: Tensor | None, like: Tensor) -> Tensor:

@@ -127,3 +127,26 @@ def test_adam_multiplies_the_factors_of_two_views_out(device, degree):
         kept = factored[0].clone()
         harmonics_adam_step(factored[0], start, gradients, *factored[1:], one, one, **options)
         assert torch.equal(kept, factored[0])
+
+
+def test_parts_of_the_coefficients_step_in_turn(device):
+    coefficients, means, camera = (tensor.float().to(device) for tensor in inputs())
+    by_values = torch.randn(1, 20, 3, generator=torch.Generator().manual_seed(1)).to(device)
+    gradients = HarmonicsGradients(by_values, camera[None], means, 3)
+    options = {"rate": 0.01, "betas": (0.9, 0.999), "epsilon": 1e-15}
+    start = coefficients[:, 1:].contiguous()
+    whole, parts = ([start.clone(), *(torch.zeros_like(start) for _ in range(2))] for _ in range(2))
+    never = torch.zeros((), device=device)
+    changed = []
+    for number in (1.0, 2.0, 3.0, 4.0):
+        before, step = parts[0].clone(), torch.tensor(number, device=device)
+        harmonics_adam_step(parts[0], 1, gradients, *parts[1:], step, never, **options, turns=2)
+        changed.append(parts[0] != before)
+    assert torch.equal(changed[1], ~changed[0]) and 0.4 < changed[0].float().mean() < 0.6
+    assert torch.equal(changed[2], changed[0]) and torch.equal(changed[3], changed[1])
+    # Two steps of each, by the same gradients.
+    for number in (1.0, 2.0):
+        step = torch.tensor(number, device=device)
+        harmonics_adam_step(whole[0], 1, gradients, *whole[1:], step, never, **options)
+    for a, b in zip(whole, parts, strict=True):
+        assert torch.allclose(a, b, rtol=1e-5, atol=1e-7)
