@@ -10,6 +10,7 @@ import warp as wp
 from .constants import FORWARD
 from .geometry import vector
 
+AT_ONCE = 6  # Tensors whose rows one launch copies or clears
 OPAQUE = 1.0 - 1.0e-6  # Logits stay finite
 SMALLEST = 1.0e-3  # Times which a Gaussian may become smaller at once
 
@@ -19,15 +20,15 @@ _vec3 = vector(3, wp.float32)
 @wp.kernel(module="unique", module_options=FORWARD)
 def share_opacities(
     first: int,
-    copies: wp.array(dtype=wp.int64), sums: wp.array2d(dtype=wp.float64), least: float,
+    copies: wp.array(dtype=wp.int32), sums: wp.array2d(dtype=wp.float64), least: float,
     logits: wp.array(dtype=wp.float32), log_scales: wp.array(dtype=_vec3),
 ):
     """Makes each Gaussian with copies the n-th part of itself, n one more than they are but at most the rows of sums.
     sums: row n - 1 times the powers of an opacity, from the first on, is the denominator of equation 9. least: opacity
     that remains."""
     i = first + wp.tid()
-    if copies[i] > wp.int64(0):
-        parts = int(wp.min(copies[i] + wp.int64(1), wp.int64(sums.shape[0])))
+    if copies[i] > 0:
+        parts = wp.min(copies[i] + 1, sums.shape[0])
         whole = wp.float64(1.0) / (wp.float64(1.0) + wp.exp(-wp.float64(logits[i])))
         whole = wp.min(whole, wp.float64(OPAQUE))
         part = wp.float64(1.0) - wp.pow(wp.float64(1.0) - whole, wp.float64(1.0) / wp.float64(parts))
@@ -44,15 +45,94 @@ def share_opacities(
 
 
 @wp.kernel(module="unique", module_options=FORWARD)
+def number_places(
+    first: int,
+    dead: wp.array(dtype=wp.bool), numbers: wp.array(dtype=wp.int64), places: wp.array(dtype=wp.int32),
+):
+    """places: of the dead and then of the new rows behind them, from 0 on; -1 for the living. numbers: running count of
+    the dead. Covers the places."""
+    i = first + wp.tid()
+    count = dead.shape[0]
+    place = int(-1)
+    if i >= count:
+        place = int(numbers[count - 1]) + i - count
+    elif dead[i]:
+        place = int(numbers[i]) - 1
+    places[i] = place
+
+
+@wp.kernel(module="unique", module_options=FORWARD)
+def count_copies(
+    first: int,
+    chosen: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.float64), begin: wp.array(dtype=wp.int64),
+    end: wp.array(dtype=wp.int64), copies: wp.array(dtype=wp.int32), changed: wp.array(dtype=wp.bool),
+):
+    """Adds to copies, and marks in changed, what is chosen for the places from begin[0] to end[0]; nothing where the
+    total[0] of the weights it was drawn by is 0. Covers chosen, by one range: several may choose the same."""
+    i = first + wp.tid()
+    if total[0] > wp.float64(0.0) and wp.int64(i) < end[0] - begin[0]:
+        source = int(chosen[i])
+        wp.atomic_add(copies, source, 1)
+        changed[source] = True
+
+
+_rows = wp.array2d(dtype=wp.float32)
+
+
+@wp.func
+def copy_row(given: _rows, source: int, values: _rows, row: int):
+    for column in range(values.shape[1]):
+        values[row, column] = given[source, column]
+
+
+@wp.kernel(module="unique", module_options=FORWARD)
 def copy_rows(
     first: int,
-    sources: wp.array(dtype=wp.int64), given: wp.array2d(dtype=wp.float32), values: wp.array2d(dtype=wp.float32),
+    places: wp.array(dtype=wp.int32), begin: wp.array(dtype=wp.int64), end: wp.array(dtype=wp.int64),
+    chosen: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.float64),
+    given_a: _rows, given_b: _rows, given_c: _rows, given_d: _rows, given_e: _rows, given_f: _rows,
+    values_a: _rows, values_b: _rows, values_c: _rows, values_d: _rows, values_e: _rows, values_f: _rows,
+    changed: wp.array(dtype=wp.bool),
 ):
-    """values[i] = given[sources[i]] where that is not negative; a thread for each number. given may be values, where no
-    row is both read and written."""
-    place = first + wp.tid()
-    i = place // values.shape[1]
-    column = place - i * values.shape[1]
-    source = int(sources[i])
-    if source >= 0:
-        values[i, column] = given[source, column]
+    """Fills the rows whose place, less begin[0], is k from 0 on and below end[0] with row k of what is given, or with
+    chosen, not [0], with row chosen[k], but then not where total[0] is 0; they are marked in changed, if not [0]. given
+    may be values, where no row is both read and written. A thread for each row."""
+    row = first + wp.tid()
+    place = wp.int64(places[row])
+    if place < begin[0] or place >= end[0]:
+        return
+    source = int(place - begin[0])
+    if chosen.shape[0] > 0:
+        if not (total[0] > wp.float64(0.0)):
+            return
+        source = int(chosen[source])
+    copy_row(given_a, source, values_a, row)
+    copy_row(given_b, source, values_b, row)
+    copy_row(given_c, source, values_c, row)
+    copy_row(given_d, source, values_d, row)
+    copy_row(given_e, source, values_e, row)
+    copy_row(given_f, source, values_f, row)
+    if changed.shape[0] > 0:
+        changed[row] = True
+
+
+@wp.func
+def clear_row(values: _rows, row: int):
+    for column in range(values.shape[1]):
+        values[row, column] = 0.0
+
+
+@wp.kernel(module="unique", module_options=FORWARD)
+def clear_rows(
+    first: int,
+    which: wp.array(dtype=wp.bool), a: _rows, b: _rows, c: _rows, d: _rows, e: _rows, f: _rows,
+):
+    """Zeroes the rows that are marked. A thread for each."""
+    row = first + wp.tid()
+    if which[row]:
+        clear_row(a, row)
+        clear_row(b, row)
+        clear_row(c, row)
+        clear_row(d, row)
+        clear_row(e, row)
+        clear_row(f, row)

@@ -35,7 +35,8 @@ def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
         *(tiles.count_tiles, tiles.place_entries, distance.blur_columns, distance.blur_derivatives, distance.gradient),
         *(lists.gather_entries, harmonics.harmonics_adjoint_kernel(real, 0, True)),
         *(training_step.judge_step, training_step.add_position_noise),
-        *(relocation.share_opacities, relocation.copy_rows),
+        *(relocation.number_places, relocation.count_copies, relocation.share_opacities, relocation.copy_rows),
+        relocation.clear_rows,
     ]
 
 

@@ -7,6 +7,7 @@ append / overwrite, which carry Adam's state.
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -14,7 +15,7 @@ from torch import Tensor
 from ..field.gaussians import PARAMETER_NAMES, Gaussians
 from ..field.spare_rows import moments_of
 from ..splatting import Rendering
-from ..splatting.relocation import copy_rows, share_opacities
+from ..splatting.relocation import Drawn, clear_rows, copy_rows, count_copies, number_places, share_opacities
 from ..splatting.training_step import add_gradient_statistics, add_position_noise
 from .config import Config, DensificationConfig
 
@@ -206,29 +207,22 @@ class Relocation(Densification):
         added = self.next_count(iteration, count) - count
         opacities = gaussians.opacities()
         dead = (opacities <= self.options.prune_opacity) | self._veils(gaussians)
-        # The device alone knows how many die: it numbers the places to be filled, those of the dead and then the new.
-        numbers = dead.cumsum(0)
-        gone = numbers[-1]
-        new = torch.arange(added, device=dead.device)
-        places = torch.cat([torch.where(dead, numbers - 1, -1), gone + new])
+        # The device alone knows how many die: the places to be filled are those of the dead and then the new.
+        places, gone = number_places(dead, added)
         gaussians.resize(count + added, optimizer)
-        born = torch.zeros_like(gone)
+        values, changed = list(gaussians.tensors().values()), torch.zeros_like(places, dtype=torch.bool)
+        born = none = torch.zeros_like(gone)
         if births is not None and part:
             wanted = (part * (gone + added).double()).long()
             if room := _room(wanted, int(part * (count + added))):
                 rows, born = births(wanted, room)
-                sources = torch.where(places < born, places, -1)
-                for name, values in gaussians.tensors().items():
-                    copy_rows(values, sources, rows[name])
-                self._forget(gaussians, optimizer, sources >= 0)
-        alive = torch.cat([torch.where(dead, 0.0, opacities), torch.zeros_like(new, dtype=opacities.dtype)])
-        moved = torch.where((places >= born) & (places < gone), places - born, -1)
-        self._fill(gaussians, optimizer, generator, alive, moved, (gone - born).clamp_min(0), count)
+                copy_rows(values, [rows[name] for name in PARAMETER_NAMES], places, none, born, changed=changed)
+        fill = partial(self._fill, gaussians, generator, places, changed)
+        fill(opacities.masked_fill(dead, 0), born, gone, count)
         if added > 0:
             first = torch.maximum(gone, born)
-            grown = torch.where(places >= first, places - first, -1)
-            shown = torch.where(grown < 0, gaussians.opacities(), 0.0)
-            self._fill(gaussians, optimizer, generator, shown, grown, gone + added - first, added)
+            fill(gaussians.opacities().masked_fill_(places >= first, 0), first, gone + added, added)
+        clear_rows([m for p in gaussians.parameters() for m in moments_of(optimizer, p).values()], changed)
         return added > 0
 
     def next_count(self, iteration: int, count: int) -> int:
@@ -262,28 +256,19 @@ class Relocation(Densification):
         nearest = torch.cat([torch.cdist(part, self.places, compute_mode=exact).amin(1) for part in parts])
         return gaussians.log_scales.amax(1) > torch.log(self.options.prune_angle * nearest)
 
-    def _fill(self, gaussians, optimizer, generator, weights, ranks, number: Tensor, most: int) -> None:
-        """Puts into the places that have a rank [N], from 0 on, copies of Gaussians drawn by weights [N], which share
-        what they are with them. number: of ranks, at most `most`."""
-        room = _room(number, most)
+    def _fill(self, gaussians, generator, places, changed, weights, begin: Tensor, end: Tensor, most: int) -> None:
+        """Puts into the places from begin to end, at most `most`, copies of Gaussians drawn by weights, which share what
+        they are with them and are marked in changed."""
+        room = _room((end - begin).clamp_min(0), most)
         if not room:
             return
-        chosen, possible = _draw(weights, room, generator), weights.any()
-        used = (torch.arange(room, device=chosen.device) < number) & possible
-        copies = torch.zeros_like(ranks).index_add_(0, chosen, used.long())
+        drawn = _draw(weights, room, generator)
+        copies = count_copies(drawn, begin, end, changed)
         least = self.options.prune_opacity
         share_opacities(gaussians.opacity_logits.detach(), gaussians.log_scales.detach(), copies, least=least)
-        sources = torch.where((ranks >= 0) & possible, chosen[ranks.clamp(0, room - 1)], -1)
-        for values in gaussians.tensors().values():
-            copy_rows(values, sources, values)
+        values = list(gaussians.tensors().values())
         # In the authors' code the moved ones keep their Adam state, and only those that share lose it.
-        self._forget(gaussians, optimizer, copies > 0)
-
-    def _forget(self, gaussians: Gaussians, optimizer, which: Tensor) -> None:
-        """Zeroes the optimizer's state of those that a mask [N] names; nothing waits for the device."""
-        for name in PARAMETER_NAMES:
-            for moment in moments_of(optimizer, getattr(gaussians, name)).values():
-                moment.masked_fill_(which.view(-1, *[1] * (moment.ndim - 1)), 0)
+        copy_rows(values, values, places, begin, end, drawn=drawn)
 
 
 def make_densification(config: Config, extent: float, pixels: int, places: Tensor | None = None) -> Densification:
@@ -320,10 +305,10 @@ def _room(number: Tensor, most: int) -> int:
     return min(most, int(number)) if number.device.type == "cpu" else most
 
 
-def _draw(weights: Tensor, count: int, generator) -> Tensor:
-    """[count] indices drawn in proportion to weights, with replacement; by bisection, for any number of weights."""
+def _draw(weights: Tensor, count: int, generator) -> Drawn:
+    """Rows drawn in proportion to weights, with replacement; by bisection, for any number of weights."""
     steps = weights.double().cumsum(0)
     uniform = torch.rand(count, generator=generator, device=weights.device, dtype=torch.float64)
     # Not 0, which the first would be drawn by, whatever it weighs.
-    uniform = uniform.clamp_min(torch.finfo(torch.float64).tiny)
-    return torch.searchsorted(steps, uniform * steps[-1]).clamp_max(len(weights) - 1)
+    uniform = uniform.clamp_min_(torch.finfo(torch.float64).tiny)
+    return Drawn(torch.searchsorted(steps, uniform * steps[-1]).clamp_max_(len(weights) - 1), steps[-1])
