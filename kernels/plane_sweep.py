@@ -158,3 +158,67 @@ def sweep(
                 best = in_order(best, counted, unlike / total)
                 counted += 1
     costs[n, i - n * count] = better_half(best, counted)
+
+
+@wp.kernel(module="unique", module_options=FORWARD)
+def trust_depths(
+    first: int,
+    costs: wp.array2d(dtype=wp.float32), planes: wp.array(dtype=wp.float32),
+    worst: float, factor: float, slack: float, few: int, widest: float,
+    depths: wp.array(dtype=wp.float32),
+):
+    """depths[n]: where costs[n, d] of the depths planes[d], three at least, farthest first, are least, or 0.
+
+    Costs below factor times the least, plus slack, are as good. They are trusted where the least is below worst and
+    they span fewer than `few` planes: the depth is then that of a parabola through the least and those beside it; or
+    depths within a factor of `widest`: then the middle of these.
+    """
+    n = first + wp.tid()
+    count = planes.shape[0]
+    least = float(wp.inf)
+    best = int(0)
+    for d in range(count):
+        if costs[n, d] < least:
+            least = costs[n, d]
+            best = d
+    depth = float(0.0)
+    if least < worst:
+        begin = int(best)
+        end = int(best)
+        for d in range(count):
+            if costs[n, d] < factor * least + slack:
+                begin = wp.min(begin, d)
+                end = wp.max(end, d)
+        near = 1.0 / planes[end]
+        far = 1.0 / planes[begin]
+        if end - begin < few:
+            middle = wp.clamp(best, 1, count - 2)
+            before, at, after = costs[n, middle - 1], costs[n, middle], costs[n, middle + 1]
+            shift = wp.clamp(0.5 * (before - after) / wp.max(before - 2.0 * at + after, 1.0e-6), -0.5, 0.5)
+            beside = wp.where(shift > 0.0, middle + 1, middle - 1)
+            depth = 1.0 / wp.lerp(1.0 / planes[middle], 1.0 / planes[beside], wp.abs(shift))
+        elif near < widest * far:
+            # Anywhere within a thing of one color is as good: its middle is meant.
+            depth = 2.0 / (near + far)
+    depths[n] = depth
+
+
+@wp.kernel(module="unique", module_options=FORWARD)
+def place_matches(
+    first: int,
+    photos: wp.array(dtype=wp.vec4ub), offsets: wp.array(dtype=wp.int64), sizes: wp.array2d(dtype=wp.int32),
+    intrinsics: wp.array(dtype=wp.vec4), poses: wp.array(dtype=wp.mat44),
+    pixels: wp.array2d(dtype=wp.int32), depths: wp.array(dtype=wp.float32),
+    points: wp.array(dtype=wp.vec3), colors: wp.array(dtype=wp.vec3), footprints: wp.array(dtype=wp.float32),
+):
+    """The points, in the world that poses [V] lead to, of pixels [N, 3] at depths [N]; their colors in [0, 1]; what a
+    pixel covers there. Photos as in sweep."""
+    n = first + wp.tid()
+    view, column, row = pixels[n, 0], pixels[n, 1], pixels[n, 2]
+    lens, depth = intrinsics[view], depths[n]
+    x = (float(column) + 0.5 - lens[2]) / lens[0]
+    y = (float(row) + 0.5 - lens[3]) / lens[1]
+    points[n] = wp.transform_point(poses[view], depth * wp.vec3(x, y, 1.0))
+    color = color_at(photos, offsets[view] + wp.int64(row * sizes[view, 0] + column))
+    colors[n] = wp.vec3(color[0], color[1], color[2]) / 255.0
+    footprints[n] = depth / lens[0]

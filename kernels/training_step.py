@@ -172,7 +172,8 @@ def harmonics_adam_kernel(count: int):
     def update_harmonics_by_adam(
         first: int,
         basis: wp.array3d(dtype=wp.float32), value_gradients: wp.array3d(dtype=wp.float32), start: int, stride: int,
-        turns: int, step: wp.array(dtype=wp.float32), rate: wp.array(dtype=wp.float32), skipped: wp.array(dtype=wp.float32),
+        turns: int,
+        step: wp.array(dtype=wp.float32), rate: wp.array(dtype=wp.float32), skipped: wp.array(dtype=wp.float32),
         live: wp.array(dtype=wp.int32),
         first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
         parameters: wp.array(dtype=wp.float32), first_moments: wp.array(dtype=wp.float32),

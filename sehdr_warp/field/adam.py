@@ -12,7 +12,7 @@ from .gaussians import PARAMETER_NAMES
 
 FIRST_COEFFICIENT = {"harmonics_dc": 0, "harmonics_rest": 1}
 """Of the groups that hold coefficients of harmonics."""
-TURNS = 2  # Parts of the higher ones, four fifths of all numbers, that step in turn: as good, and a third of Adam's time
+TURNS = 2  # Parts of the higher ones, three quarters of all numbers, that step in turn: as good, and sooner done
 BETAS = 0.9, 0.999
 EPSILON = 1e-15  # 3DGS: gradients of a single Gaussian are tiny, and must not drown in Adam's usual 1e-8
 

@@ -10,7 +10,17 @@ from typing import Any
 
 import warp as wp
 
-from ..kernels import blend_cpu, harmonics, plane_sweep_cpu, relocation, ssim, tiles, training_step
+from ..kernels import (
+    blend_cpu,
+    harmonics,
+    plane_sweep,
+    plane_sweep_cpu,
+    relocation,
+    ssim,
+    tiles,
+    training_step,
+    unexplained,
+)
 from ..kernels.constants import ALPHA_THRESHOLD
 from ..kernels.project import projection_kernel
 from .blending import halvings
@@ -30,13 +40,14 @@ def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
     kind = real, channels, halvings(ALPHA_THRESHOLD)
     blend = [] if channels is None else [blend_cpu.backward_kernel(*kind), blend_cpu.forward_kernel(*kind)]
     return [
-        *(plane_sweep_cpu.sweep_rows, *blend, projection_kernel(real, antialiased), distance.compare),
+        *(plane_sweep_cpu.sweep_rows, plane_sweep.trust_depths, plane_sweep.place_matches),
+        *(*blend, projection_kernel(real, antialiased), distance.compare),
         *(harmonics.harmonics_kernel(real, 0), lists.pack_records, lists.key_by_depth, lists.emit_entries),
         *(tiles.count_tiles, tiles.place_entries, distance.blur_columns, distance.blur_derivatives, distance.gradient),
         *(lists.gather_entries, harmonics.harmonics_adjoint_kernel(real, 0, True)),
         *(training_step.judge_step, training_step.add_position_noise),
         *(relocation.number_places, relocation.count_copies, relocation.share_opacities, relocation.copy_rows),
-        relocation.clear_rows,
+        *(relocation.clear_rows, unexplained.error_weights_kernel(wp.uint8), unexplained.drawn_pixels),
     ]
 
 

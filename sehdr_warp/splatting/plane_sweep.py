@@ -63,3 +63,28 @@ def matching_costs(photos: PhotoSet, pixels: Tensor, depths: Tensor) -> Tensor:
     else:
         launch(plane_sweep.sweep, depths.numel(), photos.codes, *others, *asked)
     return costs
+
+
+@torch.no_grad()
+def trusted_depths(
+    costs: Tensor, planes: Tensor, *, worst: float, margin: tuple[float, float], few: int, widest: float
+) -> Tensor:
+    """[N] depths by costs [N, D] of planes [D], D >= 3, farthest first; 0 where none is to be trusted.
+
+    A depth is, where the least cost is below worst, and costs below margin[0] times it plus margin[1] are those of
+    fewer than `few` planes, or of depths within a factor of `widest`.
+    """
+    depths = torch.empty(len(costs), device=costs.device)
+    launch(plane_sweep.trust_depths, len(costs), costs, planes, worst, *margin, few, widest, depths)
+    return depths
+
+
+@torch.no_grad()
+def matched_points(photos: PhotoSet, poses: Tensor, pixels: Tensor, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """What pixels [N, 3] show at depths [N]: points [N, 3], by poses [V, 4, 4] from the views' axes to the world's;
+    colors [N, 3] in [0, 1]; footprints [N], what a pixel covers there. All float32."""
+    points, colors = (depths.new_empty(len(depths), 3) for _ in range(2))
+    footprints = torch.empty_like(depths)
+    given = photos.codes, photos.offsets, photos.sizes, photos.intrinsics, poses, pixels.contiguous(), depths
+    launch(plane_sweep.place_matches, len(depths), *given, points, colors, footprints)
+    return points, colors, footprints

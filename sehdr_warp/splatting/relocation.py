@@ -57,7 +57,7 @@ def copy_rows(
     drawn: "Drawn | None" = None,
     changed: Tensor | None = None,
 ) -> None:
-    """Fills the rows whose place is begin + k, below end, with row k of what is given, or with the k-th drawn, in place.
+    """Fills the rows whose place is begin + k, below end, with row k of what is given, or the k-th drawn, in place.
 
     values: [N, ...] each, given: [M, ...] each, contiguous float32; given may be values, where no row is both read and
     written. places: [N] int32, negative for rows that stay; begin, end: int64 scalars. changed: [N] bool, is told.

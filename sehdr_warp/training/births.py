@@ -12,6 +12,7 @@ from ..field.radiance_field import RadianceField
 from ..response import Response
 from ..splats.arrays import HARMONIC_0
 from ..splatting.plane_sweep import BORDER
+from ..splatting.unexplained import unexplained_pixels
 from .matching import Matcher
 from .targets import TrainingView
 
@@ -38,7 +39,11 @@ def born_rows(
     is the one at `index`. wanted: int64 [], how many at most, which is not above room. The same seed gives the same.
     """
     room = min(room, MOST) if min(matcher.size(index)) > 2 * BORDER else 0
-    pixels, drawn = _unexplained(shown.clamp(0, 1), matcher, view, index, room, np.random.default_rng(seed))
+    uniform, target = torch.from_numpy(np.random.default_rng(seed).random(room)), view.target
+    if shown.device.type == "cuda":
+        uniform = uniform.pin_memory().to(shown.device, non_blocking=True)
+    drawn_by = shown, target.codes, target.index, target.mask, uniform, index, matcher.size(index)
+    pixels, drawn = unexplained_pixels(*drawn_by, least=LEAST_ERROR)
     found, known = matcher.match_each(pixels)
     known &= drawn & (torch.arange(room, device=known.device) < wanted)
     starts = _starts(field.color_model, field.response, found.colors.device)
@@ -63,25 +68,3 @@ def _starts(model: ColorModel, response: Response, device: torch.device) -> Tens
     """[256, 3] start values of the harmonics' constant part, for each code of a photo."""
     levels = np.arange(256, dtype=np.float32)[:, None].repeat(3, 1) / np.float32(255)
     return torch.from_numpy(model.start(levels, response)).to(device)
-
-
-def _unexplained(
-    photo: Tensor, matcher: Matcher, view: TrainingView, index: int, count: int, rng
-) -> tuple[Tensor, Tensor]:
-    """[count, 3] pixels of a photo, as the matcher takes them, and [count] whether each is one that is meant."""
-    error = (photo - view.target.encoded).abs().mean(2, keepdim=True)
-    if view.target.mask is not None:
-        error = error * view.target.mask
-    steps = torch.where(error > LEAST_ERROR, error, 0.0).square().double().flatten().cumsum(0)
-    uniform = torch.from_numpy(rng.random(count))
-    if steps.device.type == "cuda":
-        uniform = uniform.pin_memory().to(steps.device, non_blocking=True)
-    place = torch.searchsorted(steps, uniform * steps[-1]).clamp_max(len(steps) - 1)
-    width, height = view.camera.width, view.camera.height
-    across, down = matcher.size(index)
-    column = ((place % width + 0.5) * (across / width)).long()
-    row = ((place // width + 0.5) * (down / height)).long()
-    pixels = torch.stack([torch.full_like(place, index), column, row], 1).int()
-    meant = matcher.inside(pixels) & (steps[-1] > 0)
-    inside = column.clamp(BORDER, across - BORDER - 1), row.clamp(BORDER, down - BORDER - 1)
-    return torch.stack([torch.full_like(place, index), *inside], 1).int(), meant

@@ -257,8 +257,8 @@ class Relocation(Densification):
         return gaussians.log_scales.amax(1) > torch.log(self.options.prune_angle * nearest)
 
     def _fill(self, gaussians, generator, places, changed, weights, begin: Tensor, end: Tensor, most: int) -> None:
-        """Puts into the places from begin to end, at most `most`, copies of Gaussians drawn by weights, which share what
-        they are with them and are marked in changed."""
+        """Puts into the places from begin to end, at most `most`, copies of Gaussians drawn by weights, which share
+        what they are with them and are marked in changed."""
         room = _room((end - begin).clamp_min(0), most)
         if not room:
             return

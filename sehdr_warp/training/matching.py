@@ -11,7 +11,7 @@ from torch import Tensor
 from ..parallel import made_ahead
 from ..response import Response
 from ..scene import Camera, View, codes_of
-from ..splatting.plane_sweep import BORDER, NEIGHBORS, PhotoSet, matching_costs
+from ..splatting.plane_sweep import BORDER, NEIGHBORS, PhotoSet, matched_points, matching_costs, trusted_depths
 
 LARGEST_SIDE = 800  # Photos are matched at this size at most: depths need no more pixels
 PLANES = 48, 256  # Fewest and most depths that are tried; within these they are a pixel of parallax apart
@@ -59,8 +59,6 @@ class Matcher:
         self.device = torch.device(device)
         neighbors = _neighbors(cameras, cameras)
         self._photos = PhotoSet.of(self._images, cameras, neighbors, device)
-        self.sizes = self._photos.sizes
-        """[V, 2] int32: width and height at which the photos are matched."""
         poses = np.stack([camera.camera_to_world for camera in cameras])
         self._poses = torch.tensor(poses, dtype=torch.float32, device=device)
         self._set_depths(np.geomspace(focus * RANGE[1], focus * RANGE[0], PLANES[1]))
@@ -82,11 +80,6 @@ class Matcher:
         chances = made_ahead(lambda photo: _chances(*photo), photos, len(self._images))
         chosen = [_one_for_each_square(chance, side, rng, index) for index, chance in enumerate(chances)]
         return torch.from_numpy(np.concatenate(chosen).astype(np.int32)).to(self.device)
-
-    def inside(self, pixels: Tensor) -> Tensor:
-        """[N] whether pixels [N, 3] are far enough from the borders of their photos to be matched."""
-        column_and_row, sizes = pixels[:, 1:], self.sizes[pixels[:, 0].long()]
-        return ((column_and_row >= BORDER) & (column_and_row < sizes - BORDER)).all(1)
 
     def size(self, index: int) -> tuple[int, int]:
         """Width and height at which a photo is matched."""
@@ -119,34 +112,12 @@ class Matcher:
         return torch.cat(parts) if parts else self._depths[:0]
 
     def _matches(self, pixels: Tensor, depth: Tensor) -> Matches:
-        view, column, row = pixels.long().unbind(1)
-        fx, fy, cx, cy = self._photos.intrinsics[view].unbind(1)
-        local = (
-            torch.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, torch.ones_like(depth)], 1) * depth[:, None]
-        )
-        pose = self._poses[view]
-        points = (pose[:, :3, :3] @ local[:, :, None])[:, :, 0] + pose[:, :3, 3]
-        place = self._photos.offsets[view] + row * self.sizes[view, 0] + column
-        colors = self._photos.codes[place, :3].float() / 255
-        return Matches(points, colors, depth / fx, view)
+        return Matches(*matched_points(self._photos, self._poses, pixels, depth), pixels[:, 0].long())
 
     def _depth(self, pixels: Tensor) -> Tensor:
         """[N] depths of pixels, between planes; 0 where none is to be trusted."""
         costs = matching_costs(self._photos, pixels, self._depths.expand(len(pixels), -1))
-        planes, place = costs.shape[1], torch.arange(costs.shape[1], device=costs.device)
-        least = costs.min(1)
-        close = costs < MARGIN[0] * least.values[:, None] + MARGIN[1]
-        first, last = torch.where(close, place, planes).amin(1), torch.where(close, place, -1).amax(1)
-        near, far = (1 / self._depths)[last.clamp_min(0)], (1 / self._depths)[first.clamp_max(planes - 1)]
-        narrow = (last - first < FEW) | (near < WIDEST * far)
-        middle = least.indices.clamp(1, planes - 2)
-        before, at, after = (costs.gather(1, (middle + k)[:, None])[:, 0] for k in (-1, 0, 1))
-        shift = (0.5 * (before - after) / (before - 2 * at + after).clamp_min(1e-6)).clamp(-0.5, 0.5)
-        neighbor = torch.where(shift > 0, middle + 1, middle - 1)
-        between = torch.lerp(1 / self._depths[middle], 1 / self._depths[neighbor], shift.abs())
-        # Anywhere within a thing of one color is as good: its middle is meant.
-        inverse = torch.where(last - first < FEW, between, 0.5 * (near + far))
-        return torch.where((least.values < WORST_COST) & narrow, 1 / inverse, 0.0)
+        return trusted_depths(costs, self._depths, worst=WORST_COST, margin=MARGIN, few=FEW, widest=WIDEST)
 
 
 def _as_if(ratio: float, response: Response) -> np.ndarray | None:

@@ -6,7 +6,7 @@ import torch
 
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.camera import look_at
-from sehdr_warp.splatting.plane_sweep import PhotoSet, matching_costs
+from sehdr_warp.splatting.plane_sweep import PhotoSet, matched_points, matching_costs, trusted_depths
 
 SIZES = [(23, 17), (20, 20), (31, 12)]
 NEIGHBORS = np.array([[1, 2], [0, 2], [0, -1]])
@@ -70,3 +70,56 @@ def test_impossible_depths_cost_what_is_not_seen(photos, device, depth):
         )
     )
     assert 0 <= cost <= 0.25 or cost == 0.5
+
+
+TRUST = {"worst": 0.05, "margin": (1.3, 0.004), "few": 6, "widest": 1.2}
+
+
+def trusted(costs, planes):
+    """The depth of one row of costs, as the words of trusted_depths() have it."""
+    best = int(costs.argmin())
+    if not costs[best] < TRUST["worst"]:
+        return 0.0
+    close = np.flatnonzero(costs < TRUST["margin"][0] * costs[best] + TRUST["margin"][1])
+    far, near = 1 / planes[close[0]], 1 / planes[close[-1]]
+    if np.ptp(close) < TRUST["few"]:
+        k = np.clip(best, 1, len(costs) - 2)
+        a, b, c = costs[k - 1], costs[k], costs[k + 1]
+        shift = np.clip(0.5 * (a - c) / max(a - 2 * b + c, 1e-6), -0.5, 0.5)
+        return 1 / ((1 - abs(shift)) / planes[k] + abs(shift) / planes[k + (1 if shift > 0 else -1)])
+    return 2 / (near + far) if near < TRUST["widest"] * far else 0.0
+
+
+def test_depths_are_trusted_where_costs_are_sure(device):
+    rng = np.random.default_rng(0)
+    planes = 1 / np.linspace(1 / 9.0, 1 / 2.0, 40)
+    costs = rng.uniform(0.06, 0.25, (600, 40))
+    for row in costs:  # A valley in each, narrow or wide, at any place, of any depth.
+        place, width = rng.integers(0, 40), rng.integers(1, 12)
+        valley = slice(max(0, place - width), place + width)
+        row[valley] = rng.choice([0.0, 0.02, 0.049, 0.055]) + 0.001 * (np.arange(40)[valley] - place) ** 2
+    costs[0], costs[1] = 0.5, np.inf
+    costs = costs.astype(np.float32)
+    given = (torch.tensor(values, dtype=torch.float32, device=device) for values in (costs, planes))
+    found = trusted_depths(*given, **TRUST).cpu().numpy()
+    expected = np.array([trusted(row, planes) for row in costs])
+    assert 0.2 < (expected > 0).mean() < 0.9 and found[0] == found[1] == 0
+    np.testing.assert_allclose(found, expected, rtol=2e-3)
+
+
+def test_matches_are_where_cameras_see_them(photos, device):
+    images, cameras = photos
+    given = PhotoSet.of(images, cameras, NEIGHBORS, device)
+    poses = torch.tensor(np.stack([camera.camera_to_world for camera in cameras]), dtype=torch.float32, device=device)
+    pixels = torch.tensor([[0, 9, 5], [2, 14, 7]], dtype=torch.int32, device=device)
+    depths = torch.tensor([3.0, 0.7], device=device)
+    points, colors, footprints = (values.cpu().numpy() for values in matched_points(given, poses, pixels, depths))
+    for (view, column, row), depth, point, color, footprint in zip(
+        pixels.tolist(), depths.tolist(), points, colors, footprints, strict=True
+    ):
+        camera = cameras[view]
+        x, y, z = (camera.world_to_camera @ [*point, 1])[:3]
+        fx, fy, cx, cy = camera.intrinsics
+        np.testing.assert_allclose([fx * x / z + cx, fy * y / z + cy, z], [column + 0.5, row + 0.5, depth], rtol=1e-4)
+        np.testing.assert_allclose(color, images[view][row, column] / 255, rtol=1e-6)
+        np.testing.assert_allclose(footprint, depth / fx, rtol=1e-6)

@@ -34,7 +34,7 @@ def test_spare_rows_change_nothing_of_a_training(scene, device, variant, monkeyp
     for name, expected in plain.field.gaussians.tensors().items():
         # Not in every bit: torch takes the last of a tensor's numbers, and a GPU sums, otherwise.
         apart = (roomy.field.gaussians.tensors()[name] - expected).abs() > 1e-4 + 1e-3 * expected.abs()
-        assert apart.float().mean() < 0.02, name
+        assert apart.float().mean() < 0.05, name
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")

@@ -1,0 +1,44 @@
+"""Pixels drawn where a picture does not explain its photo, on either device without waiting for it
+(kernels/unexplained.py)."""
+
+import torch
+from torch import Tensor
+
+from ..kernels import unexplained as kernels
+from .code_residual import CODES, WHITE
+from .launching import launch
+from .plane_sweep import BORDER
+
+
+@torch.no_grad()
+def unexplained_pixels(
+    shown: Tensor,
+    codes: Tensor,
+    index: Tensor | None,
+    mask: Tensor | None,
+    uniform: Tensor,
+    view: int,
+    size: tuple[int, int],
+    *,
+    least: float,
+) -> tuple[Tensor, Tensor]:
+    """Pixels drawn by the square of their error, where it is above least: [K, 3] int32 (view, column, row) of the photo
+    at another size (width, height), each BORDER from its edge; and [K] bool, whether each is meant.
+
+    shown: [H, W, 3] encoded, float32; what is beyond [0, 1] counts as its end. codes, index: as of code_residual().
+    mask: [H, W, 1] float32, times which errors count. uniform: [K] float64 in [0, 1), which the draws are of.
+    """
+    height, width, _ = shown.shape
+    if index is None:
+        codes, index = codes[None], torch.zeros(1, dtype=torch.int64, device=codes.device)
+    weights = torch.empty(height * width, dtype=torch.float64, device=shown.device)
+    photos, mask = codes.contiguous().view(len(codes), -1), None if mask is None else mask.contiguous().view(-1)
+    told = shown.contiguous().view(-1, 3), photos, index, float(WHITE[codes.dtype]), mask, least
+    launch(kernels.error_weights_kernel(CODES[codes.dtype]), len(weights), *told, weights)
+    steps = weights.cumsum(0)
+    places = torch.searchsorted(steps, uniform * steps[-1]).clamp_max_(len(steps) - 1)
+    pixels = torch.empty(len(places), 3, dtype=torch.int32, device=shown.device)
+    meant = torch.empty(len(places), dtype=torch.bool, device=shown.device)
+    resized = size[0] / width, size[1] / height, *size, BORDER
+    launch(kernels.drawn_pixels, len(places), places, steps[-1], width, view, *resized, pixels, meant)
+    return pixels, meant
