@@ -15,6 +15,7 @@ SHARPNESS, CENTRE = 100.0, 0.995  # 3DGS-MCMC, equation 8: noise is for Gaussian
 AT_ONCE = 4  # Parameters of one launch of Adam
 CHECKED_AT_ONCE = 12  # Tensors of one launch that looks for what is not finite
 NUMBERS = 4  # That one thread of the harmonics' Adam takes
+TURN = 1024  # Coefficients side by side that step together, where they step in turn
 NOTHING = 16.0  # The exponent from which on a Gaussian's noise is a ten-millionth, and is not drawn
 
 _g = geometry(wp.float32)
@@ -160,11 +161,17 @@ def find_nonfinite(
         found[0] = wp.inf
 
 
+@wp.func
+def place_in_turn(k: int, turn: int, turns: int) -> int:
+    """Of the numbers, TURN in each turn, the k-th of those whose turn it is."""
+    return k + (k // wp.static(TURN) * (turns - 1) + turn) * wp.static(TURN)
+
+
 @cache
 def harmonics_adam_kernel(count: int):
     """update_by_adam of coefficients of harmonics, [3 N count], whose gradients nobody stored: they are as
-    harmonics.coefficient_adjoint_kernel() multiplies them out. Of `turns` parts, NUMBERS * stride numbers each, the
-    one whose turn it is. Covers [0, stride): a thread takes NUMBERS, `stride` apart, and asks for the memory of all
+    harmonics.coefficient_adjoint_kernel() multiplies them out. TURN of them step after each other in `turns` turns.
+    Covers [0, stride): a thread takes NUMBERS, `stride` apart of those whose turn it is, and asks for the memory of all
     before it waits for any."""
     numbers, whole_numbers = vector(NUMBERS, wp.float32), vector(NUMBERS, wp.int32)
 
@@ -179,9 +186,10 @@ def harmonics_adam_kernel(count: int):
         parameters: wp.array(dtype=wp.float32), first_moments: wp.array(dtype=wp.float32),
         second_moments: wp.array(dtype=wp.float32),
     ):
-        place = (int(step[0]) % turns) * wp.static(NUMBERS) * stride + first + wp.tid()
+        thread = first + wp.tid()
+        turn = int(step[0]) % turns
         final = counted(parameters, live, wp.static(3 * count)) - 1
-        if skipped[0] == 0.0 and place <= final:
+        if skipped[0] == 0.0 and place_in_turn(thread, turn, turns) <= final:
             owners = whole_numbers()
             rows = whole_numbers()
             channels = whole_numbers()
@@ -190,7 +198,7 @@ def harmonics_adam_kernel(count: int):
             squares = numbers()
             values = numbers()
             for k in range(wp.static(NUMBERS)):
-                i = wp.min(place + k * stride, final)
+                i = wp.min(place_in_turn(thread + k * stride, turn, turns), final)
                 means[k] = first_moments[i]
                 squares[k] = second_moments[i]
                 values[k] = parameters[i]
@@ -210,7 +218,7 @@ def harmonics_adam_kernel(count: int):
             for k in range(wp.static(NUMBERS)):
                 mean = means[k] + first_gain * (gradients[k] - means[k])
                 square = squares[k] + second_gain * (gradients[k] * gradients[k] - squares[k])
-                i = place + k * stride
+                i = place_in_turn(thread + k * stride, turn, turns)
                 if i <= final:
                     first_moments[i] = mean
                     second_moments[i] = square

@@ -12,15 +12,18 @@ from .gaussians import PARAMETER_NAMES
 
 FIRST_COEFFICIENT = {"harmonics_dc": 0, "harmonics_rest": 1}
 """Of the groups that hold coefficients of harmonics."""
-TURNS = 2  # Parts of the higher ones, three quarters of all numbers, that step in turn: as good, and sooner done
 BETAS = 0.9, 0.999
 EPSILON = 1e-15  # 3DGS: gradients of a single Gaussian are tiny, and must not drown in Adam's usual 1e-8
 
 
 class Adam:
-    """Steps of splatting.training_step; groups, of `params` and `lr`, and state are laid out as torch.optim.Adam's."""
+    """Steps of splatting.training_step; groups, of `params` and `lr`, and state are laid out as torch.optim.Adam's.
 
-    def __init__(self, groups: list[dict], betas: tuple[float, float] = BETAS):
+    turns: parts of the harmonics above degree 0 that step in turn, where their gradients come as factors.
+    """
+
+    def __init__(self, groups: list[dict], betas: tuple[float, float] = BETAS, turns: int = 1):
+        self.turns = turns
         self.param_groups = [{"betas": betas, "eps": EPSILON} | group for group in groups]
         self.state: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict)
 
@@ -76,6 +79,6 @@ class Adam:
             elif harmonics is not None:
                 state, rate = (first, second, step, skipped), {"rate": group["lr"]}
                 start = FIRST_COEFFICIENT[group["name"]]
-                turns = TURNS if start else 1
+                turns = self.turns if start else 1
                 harmonics_adam_step(values, start, harmonics, *state, **rate, **options, live=live, turns=turns)
         adam_steps(own, skipped, **options, live=live)

@@ -158,7 +158,8 @@ def harmonics_adam_step(
     numbers = step, _rate(rate, skipped), skipped, _live(live, skipped), *_numbers(betas), epsilon
     changed = parameter.view(-1), first_moment.view(-1), second_moment.view(-1)
     kernel = kernels.harmonics_adam_kernel(parameter.shape[1])
-    stride = -(-parameter.numel() // (kernels.NUMBERS * turns))
+    in_turn = parameter.numel() if turns == 1 else -(-parameter.numel() // (kernels.TURN * turns)) * kernels.TURN
+    stride = -(-in_turn // kernels.NUMBERS)
     launch(kernel, stride, gradients.basis, gradients.by_values, start, stride, turns, *numbers, *changed)
 
 

@@ -18,6 +18,9 @@ from ..splatting import HarmonicsGradients
 from ..splatting.training_step import judge_step, norms
 from .config import Config
 
+TURNS = 2  # Parts of the higher harmonics, three quarters of all numbers, that a GPU steps in turn: memory is slow
+IN_TURN_FROM = 4000  # Steps of a training that is as good by that: shorter ones lack them
+
 
 def make_optimizer(field: RadianceField, config: Config, extent: float, batch: int = 1) -> Adam:
     """One named group for each parameter of the Gaussians, one for the fusion, one for a learned response. On a GPU
@@ -34,7 +37,8 @@ def make_optimizer(field: RadianceField, config: Config, extent: float, batch: i
     for group in groups:
         rate = group["lr"] * math.sqrt(batch)
         group["lr"] = torch.tensor(rate, device=device) if device.type == "cuda" else rate
-    return Adam(groups, betas=(BETAS[0] ** batch, BETAS[1] ** batch))
+    turns = TURNS if config.schedule.iterations >= IN_TURN_FROM * batch else 1
+    return Adam(groups, betas=(BETAS[0] ** batch, BETAS[1] ** batch), turns=turns)
 
 
 def means_rate(config: Config, extent: float, iteration: int, batch: int = 1) -> float:

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.field import adam
 from sehdr_warp.scene import codes_of
 from sehdr_warp.training.config_files import override_config
 from sehdr_warp.training.initialization import choose_response, make_field
@@ -179,8 +178,7 @@ def test_wide_codes_are_intervals_in_the_last_part_alone(scene):
 
 
 @pytest.mark.parametrize("variant", ["default", "gradient"])
-def test_gradients_by_harmonics_as_factors_make_the_same_steps(scene, device, variant, monkeypatch):
-    monkeypatch.setattr(adam, "TURNS", 1)
+def test_gradients_by_harmonics_as_factors_make_the_same_steps(scene, device, variant):
     config = override_config(VARIANTS[variant], {"schedule.harmonics_every": 2})
     fields = [make_field(scene, config, choose_response(scene, config), device) for _ in range(2)]
     for field, factored in zip(fields, (True, False), strict=True):
