@@ -26,6 +26,7 @@ from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
 from sehdr_warp.scene.hdr_files import read_hdr
 from sehdr_warp.synth.expose import ladder_of
 from sehdr_warp.training.config_files import load_config
+from sehdr_warp.training.plan import WIDEST
 from sehdr_warp.training.run import load_run
 from sehdr_warp.training.train import train
 
@@ -65,7 +66,8 @@ def main(
     result["command"] = (
         "PYTHONPATH=. python docs/reports/panorama.py --work panorama_work --json docs/reports/results/panorama.json"
     )
-    config = load_config("truth", {"schedule.iterations": iterations})
+    # As the plan of photos has it where cameras look all around; on truth there is no plan.
+    config = load_config("truth", {"schedule.iterations": iterations, "densification.prune_angle": WIDEST})
     kept = (work / "run" / "summary.json").is_file()
     run = load_run(work / "run", device=device) if kept else train(scene, work / "run", config, device=device)
     at = (float(PLACE[0]), float(PLACE[1]), float(PLACE[2]))
