@@ -20,7 +20,7 @@ from functools import cache
 
 import warp as wp
 
-from .constants import ALPHA_MAX, CORNER, TILE_SIZE, TRANSMITTANCE_MIN
+from .constants import ALPHA_MAX, CORNER, FORWARD, TILE_SIZE, TRANSMITTANCE_MIN
 from .geometry import geometry, vector
 
 BLOCK_DIM = 32
@@ -33,6 +33,25 @@ QUEUE = 64 * ROUNDS  # Room for those of ROUNDS and for 31 that were left: a pow
 def padded_channels(channels: int) -> int:
     """Feature rows are read four at a time."""
     return (channels + 3) // 4 * 4
+
+
+@cache
+def pad_rows_kernel(dtype):
+    """The kernel for one scalar type; covers the numbers of the rows."""
+    real = dtype
+
+    @wp.kernel(module="unique", module_options=FORWARD)
+    def pad_rows(first: int, features: wp.array2d(dtype=real), rows: wp.array2d(dtype=real)):
+        """rows [N, P]: those of features [N, C], and zeros behind them."""
+        i = first + wp.tid()
+        row = i // rows.shape[1]
+        column = i - row * rows.shape[1]
+        value = real(0.0)
+        if column < features.shape[1]:
+            value = features[row, column]
+        rows[row, column] = value
+
+    return pad_rows
 
 
 def module_options(dtype) -> dict:

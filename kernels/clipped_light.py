@@ -48,11 +48,10 @@ def clipped_light_kernel(dtype):
     ):
         """For each clipped value of image [H, W, 3], flat, with v its logarithm and m the mean of those of the n
         clipped values of the channel within REACH, itself one, in N pixels: smoothness / 2 (v - m)^2 less
-        lift (1 - n / N) v. slopes: its derivative by the value, with m as it is. 0 elsewhere."""
+        lift (1 - n / N) v is added to the energies, and its derivative by the value, with m as it is, to the slopes,
+        which may be None."""
         i = first + wp.tid()
         v = logarithms[i]
-        energy = real(0.0)
-        slope = real(0.0)
         if v >= real(0.0):
             row = i // (3 * width)
             column = i // 3 - width * row
@@ -68,10 +67,8 @@ def clipped_light_kernel(dtype):
                         total += near
             away = v - total / real(clipped)
             edge = real(1.0) - real(clipped) / real(pixels)
-            energy = real(0.5) * smoothness * away * away - lift * edge * v
-            if v > real(0.0):
-                slope = (smoothness * away - lift * edge) / image[i]
-        energies[i] = energy
-        slopes[i] = slope
+            energies[i] = energies[i] + (real(0.5) * smoothness * away * away - lift * edge * v)
+            if slopes and v > real(0.0):
+                slopes[i] = slopes[i] + (smoothness * away - lift * edge) / image[i]
 
     return clipped_light

@@ -48,7 +48,8 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
     much for that, take STRIP rows or pixels a thread: gradient covers [0, rows * ceil(W / STRIP) * C); the vertical
     blurs, which write the zeros on both sides too, [0, ceil(rows / STRIP) * (W C + 2 RADIUS C)), blur_derivatives that
     for each of its three planes.
-    distance: for a weighted sum of |a - b| and 1 - SSIM in place of the SSIM; the weights are read with it alone.
+    distance: for a weighted sum of |a - b| and 1 - SSIM in place of the SSIM. With it alone weights are read, and
+    slopes, the derivatives of `a` by what is differentiated by, or None for 1.
     """
     real, run = dtype, wp.types.vector(length=lanes, dtype=dtype)
     taps, radius = wp.constant(2 * RADIUS + 1), wp.constant(RADIUS)
@@ -267,7 +268,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
         blurred: wp.array3d(dtype=run), a: wp.array2d(dtype=run), b: wp.array2d(dtype=run),
         weights: wp.array(dtype=real),
         length: int, channels: int,
-        scale: wp.array(dtype=real),
+        scale: wp.array(dtype=real), slopes: wp.array2d(dtype=run),
         distance_weight: real, dissimilarity_weight: real,
         adjoint_a: wp.array2d(dtype=run),
     ):
@@ -288,7 +289,10 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
             side = run(real(0.0))
             for k in range(wp.static(lanes)):
                 side[k] = wp.where(d[k] > real(0.0), real(1.0), wp.where(d[k] < real(0.0), real(-1.0), real(0.0)))
-            adjoint_a[y, i] = (side * distance_weight - (sd + moments) * dissimilarity_weight) * scale[0]
+            by_a = (side * distance_weight - (sd + moments) * dissimilarity_weight) * scale[0]
+            if slopes:
+                by_a = wp.cw_mul(by_a, slopes[y, i])
+            adjoint_a[y, i] = by_a
         else:
             adjoint_a[y, i] = (sd + moments) * scale[0]
 
@@ -298,7 +302,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
         blurred: wp.array3d(dtype=run), a: wp.array2d(dtype=run), b: wp.array2d(dtype=run),
         weights: wp.array(dtype=real),
         length: int, channels: int,
-        scale: wp.array(dtype=real),
+        scale: wp.array(dtype=real), slopes: wp.array2d(dtype=run),
         distance_weight: real, dissimilarity_weight: real,
         adjoint_a: wp.array2d(dtype=run),
     ):
@@ -316,6 +320,8 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
                 if wp.static(distance):
                     side = wp.where(x > z, real(1.0), wp.where(x < z, real(-1.0), real(0.0)))
                     by_a = side * distance_weight - by_a * dissimilarity_weight
+                    if slopes:
+                        by_a *= slopes[y, i][0]
                 adjoint_a[y, i] = run(by_a * scale[0])
 
     if lanes == 1:

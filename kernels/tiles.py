@@ -152,7 +152,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
             capacity: int,
             keys: wp.array(dtype=key), gaussians: ints, overflow: bools,
         ):
-            """As emit_entries, of Gaussians as they come. keys: the tile above depth_bits, up to DEPTH_BITS, of the depth,
+            """As emit_entries, of Gaussians as they come. keys: the tile above depth_bits, at most DEPTH_BITS, of the
             whose order is that of positive numbers."""
             i = first + wp.tid()
             extent = extents[i]

@@ -199,8 +199,11 @@ def launch_blocks(kernel, lists: TileLists, blocks_per_tile: int, *arguments) ->
 
 def padded(features: Tensor) -> Tensor:
     """Features [N, C] with columns for whole rows of four, which block kernels read at once."""
-    if padding := blend_cuda.padded_channels(features.shape[1]) - features.shape[1]:
-        return torch.nn.functional.pad(features, (0, padding))
+    count, channels = features.shape
+    if channels != (columns := blend_cuda.padded_channels(channels)):
+        rows = features.new_empty(count, columns)
+        launch(blend_cuda.pad_rows_kernel(warp_scalar(rows.dtype)), rows.numel(), features, rows)
+        return rows
     return features.clone() if features.data_ptr() % 16 else features
 
 

@@ -32,20 +32,27 @@ def clipped_light_energy(
     return _ClippedLight.apply(image, codes, index, mask, white, smoothness, lift)
 
 
+def add_clipped_light(image, codes, index, mask, white, smoothness, lift, energies, slopes) -> None:
+    """Adds clipped_light_energy()'s terms to energies, and their derivatives by the image, contiguous, to slopes, both
+    [H, W, 3]; slopes may be None."""
+    logarithms = torch.empty_like(image)
+    if index is None:
+        codes, index = codes[None], torch.zeros(1, dtype=torch.int64, device=codes.device)
+    # The mean is in the weights: it costs no launch, here and for the gradient.
+    weights = smoothness / image.numel(), lift / image.numel()
+    scalar, numbers = warp_scalar(image.dtype), (*image.shape[:2], *weights)
+    photos, mask = codes.contiguous().view(len(codes), -1), None if mask is None else mask.contiguous().view(-1)
+    found = image, photos, index, mask, WHITE[codes.dtype], white, logarithms
+    launch(clipped_logarithms_kernel(scalar, CODES[codes.dtype]), image.numel(), *found)
+    launch(clipped_light_kernel(scalar), image.numel(), image, logarithms, *numbers, energies, slopes)
+
+
 class _ClippedLight(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, codes, index, mask, white, smoothness, lift):
         image = image.detach().contiguous()
-        energies, slopes, logarithms = (torch.empty_like(image) for _ in range(3))
-        if index is None:
-            codes, index = codes[None], torch.zeros(1, dtype=torch.int64, device=codes.device)
-        # The mean is in the weights: it costs no launch, here and for the gradient.
-        weights = smoothness / image.numel(), lift / image.numel()
-        scalar, numbers = warp_scalar(image.dtype), (*image.shape[:2], *weights)
-        photos, mask = codes.contiguous().view(len(codes), -1), None if mask is None else mask.contiguous().view(-1)
-        found = image, photos, index, mask, WHITE[codes.dtype], white, logarithms
-        launch(clipped_logarithms_kernel(scalar, CODES[codes.dtype]), image.numel(), *found)
-        launch(clipped_light_kernel(scalar), image.numel(), image, logarithms, *numbers, energies, slopes)
+        energies, slopes = torch.zeros_like(image), torch.zeros_like(image)
+        add_clipped_light(image, codes, index, mask, white, smoothness, lift, energies, slopes)
         ctx.save_for_backward(slopes)
         return energies.sum()
 

@@ -63,6 +63,12 @@ def code_residual(image: Tensor, codes: Tensor, scale: CodeScale, index: Tensor 
     image: [H, W, 3] float32 or float64. codes: code_tensor()'s of the photo, [H, W, 3], or of a stack of photos
     [V, H, W, 3] that has it at index [1], int64. All on one device. Raises ValueError otherwise.
     """
+    check_codes(image, codes, scale, index)
+    return _CodeResidual.apply(image, codes, scale, index)
+
+
+def check_codes(image: Tensor, codes: Tensor, scale: CodeScale, index: Tensor | None) -> None:
+    """Raises ValueError for what code_residual() does not take."""
     shape = image.shape if index is None else (codes.shape[0], *image.shape)
     levels = WHITE.get(codes.dtype, 0) + 1
     if codes.shape != shape or (levels, 3) != scale.table.shape or scale.table.dtype != image.dtype:
@@ -70,20 +76,24 @@ def code_residual(image: Tensor, codes: Tensor, scale: CodeScale, index: Tensor 
             f"codes are {codes.dtype} {list(codes.shape)} with a table of {scale.table.dtype} {list(scale.table.shape)}"
         )
         raise ValueError(f"{given}, expected uint8 or int16 {list(shape)} with three {image.dtype} for each code")
-    return _CodeResidual.apply(image, codes, scale, index)
+
+
+def residual(image: Tensor, codes: Tensor, scale: CodeScale, index: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """code_residual()'s two of a contiguous image, and the derivatives of the first by it, [H, W, 3], with no graph."""
+    seen, slopes, truth = (torch.empty_like(image) for _ in range(3))
+    if index is None:
+        codes, index = codes[None], torch.zeros(1, dtype=torch.int64, device=codes.device)
+    law = (scale.mu / scale.white, 1 / math.log1p(scale.mu)) if scale.mu else (0.0, 0.0)
+    kernel = code_residual_kernel(warp_scalar(image.dtype), CODES[codes.dtype], scale.mu > 0)
+    photos = codes.contiguous().view(len(codes), -1)
+    launch(kernel, image.numel(), image, photos, index, scale.table, *law, seen, slopes, truth)
+    return seen, truth, slopes
 
 
 class _CodeResidual(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, codes, scale, index):
-        image = image.detach().contiguous()
-        seen, slopes, truth = (torch.empty_like(image) for _ in range(3))
-        if index is None:
-            codes, index = codes[None], torch.zeros(1, dtype=torch.int64, device=codes.device)
-        law = (scale.mu / scale.white, 1 / math.log1p(scale.mu)) if scale.mu else (0.0, 0.0)
-        kernel = code_residual_kernel(warp_scalar(image.dtype), CODES[codes.dtype], scale.mu > 0)
-        photos = codes.contiguous().view(len(codes), -1)
-        launch(kernel, image.numel(), image, photos, index, scale.table, *law, seen, slopes, truth)
+        seen, truth, slopes = residual(image.detach().contiguous(), codes, scale, index)
         ctx.save_for_backward(slopes)
         ctx.mark_non_differentiable(truth)
         ctx.set_materialize_grads(False)  # of truth there is none, and no zeros are wanted in its place

@@ -48,21 +48,39 @@ class _Distance(torch.autograd.Function):
     def forward(ctx, a, b, distance_weight, dissimilarity_weight):
         _check(a, b)
         a, b = a.detach().contiguous(), b.detach().contiguous()
-        weights = distance_weight / a.numel(), dissimilarity_weight / a.numel()
-        terms, derivatives = _compare(a, b, weights)
-        if ctx.needs_input_grad[0]:
-            # Made at once: it takes a fifth of the memory of what it is made of.
-            ctx.save_for_backward(_gradient(a, b, derivatives, one(a), weights))
-        if a.device.type == "cuda":
-            return terms.sum()
-        with torch_threads(a.device):  # Each row is one thread's.
-            rows = terms.flatten(1).sum(1)
-        return rows.sum()
+        terms, gradient = distance_terms(a, b, distance_weight, dissimilarity_weight, ctx.needs_input_grad[0])
+        ctx.save_for_backward(*(() if gradient is None else (gradient,)))
+        return total(terms)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, upstream):
         return times(ctx.saved_tensors[0], upstream), None, None, None
+
+
+def distance_terms(
+    a: Tensor,
+    b: Tensor,
+    distance_weight: float,
+    dissimilarity_weight: float,
+    wanted: bool,
+    slopes: Tensor | None = None,
+) -> tuple[Tensor, Tensor | None]:
+    """[H, W, C] each: what image_distance() of contiguous images is the sum of, and if wanted its derivatives by what
+    `a` has the slopes by, all [H, W, C], or by `a` itself."""
+    weights = distance_weight / a.numel(), dissimilarity_weight / a.numel()
+    terms, derivatives = _compare(a, b, weights)
+    # Made at once: it takes a fifth of the memory of what it is made of.
+    return terms, _gradient(a, b, derivatives, one(a), weights, slopes) if wanted else None
+
+
+def total(terms: Tensor) -> Tensor:
+    """The sum of [H, W, C], a scalar; on the CPU the same whatever the number of threads."""
+    if terms.device.type == "cuda":
+        return terms.sum()
+    with torch_threads(terms.device):  # Each row is one thread's.
+        rows = terms.flatten(1).sum(1)
+    return rows.sum()
 
 
 class _Similarity(torch.autograd.Function):
@@ -111,13 +129,15 @@ def _compare(a: Tensor, b: Tensor, weights: tuple[float, float] | None = None) -
     return similarity, derivatives
 
 
-def _gradient(a, b, derivatives, scale: Tensor, weights: tuple[float, float] | None = None) -> Tensor:
-    """scale times the gradient by `a`, [H, W, C], of the sum of what _compare() gives."""
+def _gradient(
+    a, b, derivatives, scale: Tensor, weights: tuple[float, float] | None = None, slopes: Tensor | None = None
+) -> Tensor:
+    """scale, and with weights slopes, times the gradient by `a`, [H, W, C], of the sum of what _compare() gives."""
     runs = _Runs(a, weights)
     result = torch.empty_like(a)
     blurred = runs.view(runs.padded(3))
     runs.launch(runs.kernels.blur_derivatives, [runs.view(derivatives)], [blurred], blurs=3)
-    scaled = scale, *runs.weights_of_both, runs.view(result)
+    scaled = scale, None if slopes is None else runs.view(slopes), *runs.weights_of_both, runs.view(result)
     runs.launch(runs.kernels.gradient, [blurred, runs.view(a), runs.view(b)], scaled, strips=True)
     return result
 

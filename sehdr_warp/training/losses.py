@@ -10,6 +10,7 @@ from ..field.radiance_field import Photograph, RadianceField
 from ..response import Response, ToneMapper
 from ..splatting.clipped_light import clipped_light_energy
 from ..splatting.code_residual import CodeScale, code_residual, code_values
+from ..splatting.photo_loss import photo_loss
 from ..splatting.ssim import image_distance, ssim
 from .config import LossConfig
 
@@ -90,7 +91,7 @@ def code_scale(
 def image_loss(prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str, weight: float) -> Tensor:
     """L1 + weight (1 - SSIM) ("sum", SeHDR's equation 11) or (1 - weight) L1 + weight (1 - SSIM) ("blend", 3DGS), of
     [H, W, 3]; pixels outside of the mask [H, W, 1] count nothing in L1 and as equal in SSIM."""
-    distance_weight = 1.0 if form == "sum" else 1 - weight
+    distance_weight = _distance_weight(form, weight)
     if mask is None and weight:
         return image_distance(prediction, truth, distance_weight, weight)
     if mask is None:
@@ -100,17 +101,28 @@ def image_loss(prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str
     return difference + weight * (1 - ssim(prediction, truth)) if weight else difference
 
 
+def _distance_weight(form: str, weight: float) -> float:
+    return 1.0 if form == "sum" else 1 - weight
+
+
 def ldr_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor:
     """L_LDR, on the target's scale, as far as the photo can tell; where exposures are compared, the light of clipped
     pixels, which it does not tell, is as smooth as it can be."""
     image = photo.light if target.scale.mu else photo.encoded
     assert image is not None
-    seen, truth = code_residual(image, target.codes, target.scale, target.index)
-    loss = image_loss(seen, truth, target.mask, config.form, config.ssim_weight)
-    smoothness, lift = config.clipped_smoothness, config.clipped_lift
-    if target.scale.mu and config.clipping and (smoothness or lift):
-        told = target.codes, target.scale.white, target.index, target.mask
-        loss = loss + clipped_light_energy(image, *told, smoothness=smoothness, lift=lift)
+    codes, scale, index, weight = target.codes, target.scale, target.index, config.ssim_weight
+    extends = target.scale.mu and config.clipping
+    clipped = {
+        "smoothness": config.clipped_smoothness if extends else 0.0,
+        "lift": config.clipped_lift if extends else 0.0,
+    }
+    if target.mask is None and weight:
+        weights = {"distance_weight": _distance_weight(config.form, weight), "dissimilarity_weight": weight}
+        return photo_loss(image, codes, scale, index, **weights, **clipped)
+    seen, truth = code_residual(image, codes, scale, index)
+    loss = image_loss(seen, truth, target.mask, config.form, weight)
+    if any(clipped.values()):
+        loss = loss + clipped_light_energy(image, codes, scale.white, index, target.mask, **clipped)
     return loss
 
 
