@@ -27,7 +27,7 @@ KERNELS = {
     "harmonics": ("evaluate_*", "turns_adjoint_*"),
     "activations": ("activate_*",),
     "lists": ("pack_records_*", "key_by_*", "emit_*", "find_lists_*", "*radix_sort*", "*DeviceScan*"),
-    "blend": ("blend_forward_*",),
+    "blend": ("blend_forward_*", "pad_rows_*"),
     "response and fusion": ("encode_*", "interpolate_*", "perceptrons_*", "mix_*", "point_adjoint_*", "unit_adjoint_*"),
     "losses": ("compare_*", "blur_*", "gradient_in_strips_*", "clipped_*", "code_residual_*"),
     "blend, adjoint": ("blend_backward_*",),

@@ -36,9 +36,9 @@ class _PhotoLoss(torch.autograd.Function):
     def forward(ctx, image, codes, scale, index, weights, clipped):
         image = image.detach().contiguous()
         seen, truth, slopes = residual(image, codes, scale, index)
-        terms, gradient = distance_terms(seen, truth, *weights, ctx.needs_input_grad[0], slopes)
+        terms, gradient = distance_terms(seen, truth, *weights, wanted=ctx.needs_input_grad[0], slopes=slopes)
         if any(clipped):
-            add_clipped_light(image, codes, index, None, scale.white, *clipped, terms, gradient)
+            add_clipped_light(image, codes, index, None, scale.white, *clipped, energies=terms, slopes=gradient)
         ctx.save_for_backward(*(() if gradient is None else (gradient,)))
         return total(terms)
 
