@@ -4,9 +4,8 @@
 over the counts gives every Gaussian its range of entries. Two ways lead to lists in depth order, by stable sorts:
 Gaussians are put in it, `emit_entries` fills their ranges, and a sort of the entries by tile leaves each tile's list in
 the order in which they were emitted (the GPU has least to do); or `emit_keys` fills the ranges of the Gaussians as they
-come, and the entries are sorted once by tile and as much of the depth as fits (the host has). `find_lists` finds where
-each tile's list begins and ends, orders what the sort left alike, and finds which corners of its tile each entry
-touches. Adjoints sum what they write for each entry by
+come, and the entries are sorted once by tile and depth (the host has). `find_lists` finds where each tile's list
+begins and ends, and which corners of its tile each entry touches. Adjoints sum what they write for each entry by
 Gaussian in one order, whatever runs when: `gather_entries`.
 """
 
@@ -20,13 +19,13 @@ from .geometry import geometry
 
 DEPTH_BITS = 30
 DEPTH_OFFSET = (127 - 40) << 23
-"""Keys tell float32 depths apart by bits that differ between 2^-40 and 2^88: all of these, or the highest of them."""
+"""Of the bits of a float32 depth those count that differ between 2^-40 and 2^88: a pass of the sort less. Nearer and
+farther ones are alike."""
 
 
 @cache
 def tile_kernels(dtype) -> SimpleNamespace:
-    """pack_records, key_by_depth, emit_entries, gather_entries, and by type of the keys emit_keys, for one scalar
-    type."""
+    """pack_records, key_by_depth, emit_entries, emit_keys and gather_entries for one scalar type."""
     g = geometry(dtype)
     real, vec2, vec3, vec4 = g.real, g.vec2, g.vec3, g.vec4
     reals, reals2d = wp.array(dtype=real), wp.array2d(dtype=real)
@@ -142,52 +141,48 @@ def tile_kernels(dtype) -> SimpleNamespace:
             gaussians[entry] = 0
             entry += count
 
-    def emit_keys_of(key):
-        @wp.kernel(module="unique", module_options=options)
-        def emit_keys(
-            first: int,
-            shapes: vec4s, ellipses: vec4s, extents: vec2s, depths: wp.array(dtype=wp.float32),
-            columns: int, rows: int, depth_bits: int,
-            ends: int64s,
-            capacity: int,
-            keys: wp.array(dtype=key), gaussians: ints, overflow: bools,
-        ):
-            """As emit_entries, of Gaussians as they come. keys: the tile above depth_bits, at most DEPTH_BITS, of the
-            whose order is that of positive numbers."""
-            i = first + wp.tid()
-            extent = extents[i]
-            entry = int(0)
-            if i > 0:
-                entry = int(wp.min(ends[i - 1], wp.int64(capacity)))
-            end = int(wp.min(ends[i], wp.int64(capacity)))
-            bits = wp.cast(depths[i], wp.int32) - wp.static(DEPTH_OFFSET)
-            depth = key(wp.clamp(bits, 0, wp.static((1 << DEPTH_BITS) - 1)) >> (wp.static(DEPTH_BITS) - depth_bits))
-            shift = key(depth_bits)
-            if extent[0] > real(0.0) and end > entry:
-                shape = shapes[i]
-                ellipse = ellipses[i]
-                across = tile_span(shape[0], extent[0], columns)
-                down = tile_span(shape[1], extent[1], rows)
-                for row in range(down[0], down[1]):
-                    for column in range(across[0], across[1]):
-                        if entry < end and tile_is_touched(shape, ellipse, column, row):
-                            keys[entry] = (key(row * columns + column) << shift) | depth
-                            gaussians[entry] = i
-                            entry += 1
-            while entry < end:
-                keys[entry] = key(columns * rows) << shift
-                gaussians[entry] = i
-                entry += 1
-            count = depths.shape[0]
-            if overflow and i == 0:
-                overflow[0] = ends[count - 1] > wp.int64(capacity)
-            entry = int(wp.min(ends[count - 1], wp.int64(capacity))) + i
-            while entry < capacity:
-                keys[entry] = key(columns * rows) << shift
-                gaussians[entry] = 0
-                entry += count
-
-        return emit_keys
+    @wp.kernel(module="unique", module_options=options)
+    def emit_keys(
+        first: int,
+        shapes: vec4s, ellipses: vec4s, extents: vec2s, depths: wp.array(dtype=wp.float32),
+        columns: int, rows: int,
+        ends: int64s,
+        capacity: int,
+        keys: int64s, gaussians: ints, overflow: bools,
+    ):
+        """As emit_entries, of Gaussians as they come. keys: the tile above DEPTH_BITS of the depth, whose order is that
+        of positive numbers."""
+        i = first + wp.tid()
+        extent = extents[i]
+        entry = int(0)
+        if i > 0:
+            entry = int(wp.min(ends[i - 1], wp.int64(capacity)))
+        end = int(wp.min(ends[i], wp.int64(capacity)))
+        bits = wp.cast(depths[i], wp.int32) - wp.static(DEPTH_OFFSET)
+        depth = wp.int64(wp.clamp(bits, 0, wp.static((1 << DEPTH_BITS) - 1)))
+        if extent[0] > real(0.0) and end > entry:
+            shape = shapes[i]
+            ellipse = ellipses[i]
+            across = tile_span(shape[0], extent[0], columns)
+            down = tile_span(shape[1], extent[1], rows)
+            for row in range(down[0], down[1]):
+                for column in range(across[0], across[1]):
+                    if entry < end and tile_is_touched(shape, ellipse, column, row):
+                        keys[entry] = (wp.int64(row * columns + column) << wp.int64(DEPTH_BITS)) | depth
+                        gaussians[entry] = i
+                        entry += 1
+        while entry < end:
+            keys[entry] = wp.int64(columns * rows) << wp.int64(DEPTH_BITS)
+            gaussians[entry] = i
+            entry += 1
+        count = depths.shape[0]
+        if overflow and i == 0:
+            overflow[0] = ends[count - 1] > wp.int64(capacity)
+        entry = int(wp.min(ends[count - 1], wp.int64(capacity))) + i
+        while entry < capacity:
+            keys[entry] = wp.int64(columns * rows) << wp.int64(DEPTH_BITS)
+            gaussians[entry] = 0
+            entry += count
 
     @wp.kernel(module="unique", module_options=options)
     def gather_entries(
@@ -210,8 +205,8 @@ def tile_kernels(dtype) -> SimpleNamespace:
             rows[i, column] = total
 
     return SimpleNamespace(
-        pack_records=pack_records, key_by_depth=key_by_depth, emit_entries=emit_entries, gather_entries=gather_entries,
-        emit_keys={key: emit_keys_of(key) for key in (wp.int32, wp.int64)},
+        pack_records=pack_records, key_by_depth=key_by_depth, emit_entries=emit_entries, emit_keys=emit_keys,
+        gather_entries=gather_entries,
     )
 
 
@@ -242,12 +237,10 @@ def place_entries(
 
 
 @cache
-def lists_kernel(dtype, key):
+def lists_kernel(dtype, key, shift: int):
     """find_lists for sorted keys, wp.int32 or wp.int64, whose tile is above their lowest `shift` bits, and records of
     one scalar type. Covers the entries, of which there is one at least.
 
-    depths: of the Gaussians, to order entries by whose keys are alike, and as they are where depths are too; None where
-    they are in order. ordered: [entries], the Gaussians then; or None.
     ranges: [2 tiles], for each tile the first and one past the last of its entries; corners: [entries], bit k where the
     ellipse touches corner k of the tile, CORNER pixels, or [0] where none are asked for. Unused entries carry a tile
     number beyond all: they belong to no list, and their corners are 0.
@@ -256,36 +249,14 @@ def lists_kernel(dtype, key):
     real, vec4 = g.real, g.vec4
     across, down = TILE_SIZE // CORNER[0], TILE_SIZE // CORNER[1]
 
-    @wp.func
-    def place_among_alike(
-        keys: wp.array(dtype=key), gaussians: wp.array(dtype=wp.int32), depths: wp.array(dtype=real),
-        entry: int, final: int,
-    ) -> int:
-        mine = keys[entry]
-        begin = int(entry)
-        while begin > 0 and keys[wp.max(begin - 1, 0)] == mine:
-            begin -= 1
-        end = int(entry)
-        while end < final and keys[wp.min(end + 1, final)] == mine:
-            end += 1
-        place = int(begin)
-        if end > begin:
-            depth = depths[gaussians[entry]]
-            for other in range(begin, end + 1):
-                there = depths[gaussians[other]]
-                if there < depth or (there == depth and other < entry):
-                    place += 1
-        return place
-
     @wp.kernel(module="unique", module_options=FORWARD)
     def find_lists(
         first: int,
         keys: wp.array(dtype=key), gaussians: wp.array(dtype=wp.int32), shapes: wp.array(dtype=vec4),
-        ellipses: wp.array(dtype=vec4), depths: wp.array(dtype=real), columns: int, tiles: int, shift: int,
-        ranges: wp.array(dtype=wp.int32), corners: wp.array(dtype=wp.uint8), ordered: wp.array(dtype=wp.int32),
+        ellipses: wp.array(dtype=vec4), columns: int, tiles: int,
+        ranges: wp.array(dtype=wp.int32), corners: wp.array(dtype=wp.uint8),
     ):
         entry = first + wp.tid()
-        final = keys.shape[0] - 1
         tile = int(keys[entry] >> key(shift))
         before = int(-1)
         if entry > 0:
@@ -296,20 +267,15 @@ def lists_kernel(dtype, key):
                 ranges[2 * begun] = entry
             if begun > 0:
                 ranges[2 * begun - 1] = entry
-        if entry == final:
+        if entry == keys.shape[0] - 1:
             for begun in range(tile + 1, tiles + 1):
                 if begun < tiles:
                     ranges[2 * begun] = entry + 1
                 if begun > 0:
                     ranges[2 * begun - 1] = entry + 1
-        gaussian = gaussians[entry]
-        place = entry
-        if depths:
-            if tile < tiles:
-                place = place_among_alike(keys, gaussians, depths, entry, final)
-            ordered[place] = gaussian
         touched = int(0)
         if tile < tiles and corners.shape[0] > 0:
+            gaussian = gaussians[entry]
             shape = shapes[gaussian]
             ellipse = ellipses[gaussian]
             row = tile // columns
@@ -324,6 +290,6 @@ def lists_kernel(dtype, key):
                 ):
                     touched = touched | (1 << corner)
         if corners.shape[0] > 0:
-            corners[place] = wp.uint8(touched)
+            corners[entry] = wp.uint8(touched)
 
     return find_lists

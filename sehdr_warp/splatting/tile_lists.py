@@ -18,9 +18,6 @@ from .threads import torch_threads
 LARGEST_CAPACITY = 2**31 - 1  # Entries are counted in int32
 ONE_SORT = 1 << 18
 """Up to so many Gaussians lists are made by one sort on a GPU, which then waits for the host rather than for memory."""
-LEAST_DEPTH_BITS = 18
-"""Beside the tile in a key of 31 bits, of those that tell depths apart: so many do down to steps of 2^-11, beside up to
-8191 tiles. With fewer, many entries of a list are alike for the sort."""
 SMALLEST_CHUNK = 1 << 14  # Of entries, that are worth handing to another thread
 
 
@@ -122,7 +119,7 @@ def build_tile_lists(
     if order is None:
         touched = *records, extents, depths, columns, rows
         keys, gaussians = sort_keys(*emit_keys(*touched, ends, room, overflow), room, tile_count)
-        ranges, gaussians, corners = find_lists(keys, gaussians, records, columns, rows, depths)
+        ranges, corners = find_lists(keys, gaussians, records, columns, rows)
     else:
         touched = order, *records, extents, columns, rows
         tiles, gaussians = emit_entries(*touched, ends, room, overflow)
@@ -195,24 +192,15 @@ def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends
     return tiles, gaussians
 
 
-def key_layout(tile_count: int) -> tuple[torch.dtype, int]:
-    """The type of emit_keys()'s keys for so many tiles, and how many bits of the depth are below the tile. int32 where
-    that is enough: a sort makes four passes then, not five, of less memory, and ends where it began."""
-    bits = 31 - tile_count.bit_length()
-    return (torch.int32, bits) if bits >= LEAST_DEPTH_BITS else (torch.int64, kernels.DEPTH_BITS)
-
-
 def emit_keys(shapes, ellipses, extents, depths, columns: int, rows: int, ends, room: int, overflow=None):
-    """As emit_entries, of Gaussians as they come: keys of key_layout(), and Gaussians."""
-    kind, bits = key_layout(columns * rows)
-    keys = torch.empty(2 * room, dtype=kind, device=ends.device)
+    """As emit_entries, of Gaussians as they come: int64 keys, the tile above those of the depth, and Gaussians."""
+    keys = torch.empty(2 * room, dtype=torch.int64, device=ends.device)
     gaussians = torch.empty(2 * room, dtype=torch.int32, device=ends.device)
     if not len(depths):
-        keys[:room], gaussians[:room] = columns * rows << bits, 0
+        keys[:room], gaussians[:room] = columns * rows << kernels.DEPTH_BITS, 0
     elif room:
-        kernel = tile_kernels(wp.float32).emit_keys[wp.dtype_from_torch(kind)]
-        touched = shapes, ellipses, extents, depths, columns, rows, bits
-        launch(kernel, len(depths), *touched, ends, room, keys, gaussians, overflow)
+        touched = shapes, ellipses, extents, depths, columns, rows
+        launch(tile_kernels(wp.float32).emit_keys, len(depths), *touched, ends, room, keys, gaussians, overflow)
     return keys, gaussians
 
 
@@ -236,7 +224,7 @@ def _sort_by_tile(tiles, gaussians, entry_count: int, records, columns: int, row
     else:
         places = places[:entry_count].clone()
         gaussians = gaussians[:entry_count][places] if entry_count else gaussians
-    ranges, _, corners = find_lists(tiles[:entry_count], gaussians, records, columns, rows)
+    ranges, corners = find_lists(tiles[:entry_count], gaussians, records, columns, rows)
     return ranges, gaussians, corners, places
 
 
@@ -262,27 +250,25 @@ def _taken(values: Tensor, places: Tensor) -> Tensor:
 
 
 def sort_keys(keys, gaussians, entry_count: int, tile_count: int):
-    """Stable sort of emit_keys()'s by tile and the keys' depth: keys [M] and Gaussians [M], in the same memory."""
-    _sort_pairs(keys, gaussians, entry_count, key_layout(tile_count)[1] + tile_count.bit_length())
+    """Stable sort of emit_keys()'s by tile and depth: keys [M] and Gaussians [M], in the same memory."""
+    _sort_pairs(keys, gaussians, entry_count, kernels.DEPTH_BITS + tile_count.bit_length())
     return keys[:entry_count], gaussians[:entry_count]
 
 
-def find_lists(tiles, gaussians, records, columns: int, rows: int, depths: Tensor | None = None):
-    """[tiles, 2] int32, first and one past the last of each tile in the sorted list, alike for none; the Gaussians [M];
-    and [M] uint8, the corners of its tile that each entry touches, or None without records. tiles: int32; or with
-    depths, of all Gaussians, sort_keys()'s keys, and the Gaussians are put in order where these are alike."""
+def find_lists(tiles, gaussians, records, columns: int, rows: int):
+    """[tiles, 2] int32, first and one past the last of each tile in the sorted list, alike for none; and [M] uint8, the
+    corners of its tile that each entry touches, or None without records. tiles: int32, or int64 as sort_keys() gives
+    them."""
     ranges = torch.empty(columns * rows, 2, dtype=torch.int32, device=tiles.device)
     corners = torch.empty(0 if records is None else len(tiles), dtype=torch.uint8, device=tiles.device)
-    ordered = gaussians if depths is None else torch.empty_like(gaussians)
     if len(tiles):
+        kind = (wp.int64, kernels.DEPTH_BITS) if tiles.dtype == torch.int64 else (wp.int32, 0)
         read = (torch.empty(0, 4, device=tiles.device),) * 2 if records is None else records
-        kernel = kernels.lists_kernel(warp_scalar(read[0].dtype), wp.dtype_from_torch(tiles.dtype))
-        shift, found = 0 if depths is None else key_layout(columns * rows)[1], (ranges.view(-1), corners)
-        given = tiles, gaussians, *read, depths, columns, columns * rows, shift
-        launch(kernel, len(tiles), *given, *found, None if depths is None else ordered)
+        kernel = kernels.lists_kernel(warp_scalar(read[0].dtype), *kind)
+        launch(kernel, len(tiles), tiles, gaussians, *read, columns, columns * rows, ranges.view(-1), corners)
     else:
         ranges.zero_()
-    return ranges, ordered, None if records is None else corners
+    return ranges, None if records is None else corners
 
 
 class _Memory:

@@ -5,6 +5,7 @@ from dataclasses import fields
 import pytest
 import torch
 
+from sehdr_warp.kernels.tiles import DEPTH_BITS
 from sehdr_warp.splatting import tile_lists
 from sehdr_warp.splatting.tile_lists import (
     build_tile_lists,
@@ -12,7 +13,6 @@ from sehdr_warp.splatting.tile_lists import (
     emit_entries,
     emit_keys,
     find_lists,
-    key_layout,
     number_entries,
     sort_keys,
 )
@@ -75,54 +75,26 @@ def test_an_entry_counted_too_much_is_no_tiles_and_one_too_few_costs_its_own_gau
     dropped = int(counts[: second + 1].sum()) - 1
     assert torch.equal(tiles[~unused], torch.cat([true_tiles[:dropped], true_tiles[dropped + 1 :]]))
     ordered = tiles.sort(stable=True)
-    ranges, *_ = find_lists(ordered.values, gaussians[ordered.indices], records[1:3], COLUMNS, ROWS)
+    ranges, _ = find_lists(ordered.values, gaussians[ordered.indices], records[1:3], COLUMNS, ROWS)
     assert int((ranges[:, 1] - ranges[:, 0]).sum()) == len(tiles) - 2
 
 
-def as_they_are(depths):
-    return depths
-
-
-def in_quarters(depths):
-    """Many at one depth: ties keep the order of indices."""
-    return (depths * 4).round().clamp_min(1) / 4
-
-
-def within_a_step(depths):
-    """All nearer to each other than what the keys of a sort tell apart, some at one depth."""
-    return 3 + (depths - depths.min()) / (depths.max() - depths.min()) * 2.0**-15
-
-
-def beyond_the_keys(depths):
-    """Farther than what the keys tell apart at all."""
-    return depths * 2.0**90
-
-
-@pytest.mark.parametrize("least_bits", [0, 32], ids=["short keys", "long keys"])
-@pytest.mark.parametrize("placed", [as_they_are, in_quarters, within_a_step, beyond_the_keys])
 @pytest.mark.parametrize("spare", [0, 7, -1000])
-def test_one_sort_makes_the_lists_of_two(device, spare, placed, least_bits, monkeypatch):
-    monkeypatch.setattr(tile_lists, "LEAST_DEPTH_BITS", least_bits)
-    records, counts, depths, extents = dense(device, 4000)
-    depths = placed(depths)
+def test_one_sort_makes_the_lists_of_two(device, spare):
+    records, counts, depths, extents = dense(device)
+    # Many at one depth: ties keep the order of indices.
+    depths = (depths * 4).round().clamp_min(1) / 4
     lists = built(records, counts, depths, extents)
     room = lists.entry_count + spare
     given = *records, extents, depths, COLUMNS, ROWS, counts.cumsum(0), room
     keys, gaussians = sort_keys(*emit_keys(*given), room, COLUMNS * ROWS)
-    ranges, gaussians, corners = find_lists(keys, gaussians, records, COLUMNS, ROWS, depths)
+    ranges, corners = find_lists(keys, gaussians, records, COLUMNS, ROWS)
     if spare < 0:
-        shift = key_layout(COLUMNS * ROWS)[1]
-        assert int(ranges[-1, 1]) == room and int(keys.max() >> shift) < COLUMNS * ROWS
+        assert int(ranges[-1, 1]) == room and int(keys.max() >> DEPTH_BITS) < COLUMNS * ROWS
         return
     assert torch.equal(gaussians[: lists.entry_count], lists.gaussians)
     assert torch.equal(ranges, lists.ranges)
     assert lists.corners is None or torch.equal(corners[: lists.entry_count], lists.corners)
-
-
-def test_keys_are_short_where_they_tell_depths_apart():
-    assert key_layout(25 * 25) == (torch.int32, 21)
-    assert key_layout(8191)[0] == torch.int32 and key_layout(8192)[0] == torch.int64
-    assert max(count << bits for count, bits in ((k, key_layout(k)[1]) for k in (1, 624, 625, 8191))) < 2**31
 
 
 def test_corners_are_those_that_an_ellipse_touches(device):
@@ -174,7 +146,7 @@ def test_lists_keep_no_more_memory_than_they_use(device, emission, spare):
     assert torch.equal(lists.gaussians[: exact.entry_count], exact.gaussians)
     total_and_overflow = 8 + (spare is not None)
     by_gaussian = entries + 3 * 500 if emission else 0
-    one_sort = 0 if emission else 8 * 500 - 8
+    one_sort = 0 if emission else 4 * entries + 8 * 500 - 8
     corners = 0 if lists.corners is None else entries
     total = 4 * (2 * COLUMNS * ROWS + entries + by_gaussian) + corners + total_and_overflow + one_sort
     assert kept_bytes(lists) == total
