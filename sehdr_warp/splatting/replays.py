@@ -113,7 +113,7 @@ class _Recording:
             draw(records, numbered, self.room)
             del records, numbered
         records, numbered = self._counter.record(None, count)
-        self._ends = numbered[1]
+        self._total = numbered[1][-1:]
         self.adjoint: Adjoint = self._drawer.record(None, lambda: draw(records, numbered, self.room))
         """Of the picture played last; one launch, which needs no recording."""
 
@@ -121,13 +121,14 @@ class _Recording:
         """Image, transmittance and the number of pairs, of which those beyond the room are not drawn."""
         torch._foreach_copy_(list(self._given), list(given))  # pyright: ignore[reportPrivateImportUsage]
         self._counter.replay()
-        self._pairs.copy_(self._ends[-1:], non_blocking=True)
+        self._pairs.copy_(self._total, non_blocking=True)
         self._counted.record(self._stream)
         self._drawer.replay()
-        picture = self._image.clone(), self._transmittance.clone()
-        given.extents.copy_(self._given.extents)
+        drawn = [self._image, self._transmittance, self._given.extents]
+        image, transmittance = torch.empty_like(self._image), torch.empty_like(self._transmittance)
+        torch._foreach_copy_([image, transmittance, given.extents], drawn)  # pyright: ignore[reportPrivateImportUsage]
         self._counted.synchronize()
-        return *picture, int(self._pairs)
+        return image, transmittance, int(self._pairs)
 
 
 @dataclass
