@@ -36,18 +36,19 @@ def padded_channels(channels: int) -> int:
 
 
 @cache
-def pad_rows_kernel(dtype):
-    """The kernel for one scalar type; covers the numbers of the rows."""
+def pad_rows_kernel(dtype, channels: int):
+    """The kernel for one scalar type and features [N, channels]; covers the numbers of the rows."""
     real = dtype
+    columns = padded_channels(channels)
 
     @wp.kernel(module="unique", module_options=FORWARD)
     def pad_rows(first: int, features: wp.array2d(dtype=real), rows: wp.array2d(dtype=real)):
-        """rows [N, P]: those of features [N, C], and zeros behind them."""
+        """rows [N, columns]: those of features, and zeros behind them."""
         i = first + wp.tid()
-        row = i // rows.shape[1]
-        column = i - row * rows.shape[1]
+        row = i // wp.static(columns)
+        column = i - row * wp.static(columns)
         value = real(0.0)
-        if column < features.shape[1]:
+        if column < wp.static(channels):
             value = features[row, column]
         rows[row, column] = value
 

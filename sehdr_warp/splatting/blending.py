@@ -202,7 +202,7 @@ def padded(features: Tensor) -> Tensor:
     count, channels = features.shape
     if channels != (columns := blend_cuda.padded_channels(channels)):
         rows = features.new_empty(count, columns)
-        launch(blend_cuda.pad_rows_kernel(warp_scalar(rows.dtype)), rows.numel(), features, rows)
+        launch(blend_cuda.pad_rows_kernel(warp_scalar(rows.dtype), channels), rows.numel(), features, rows)
         return rows
     return features.clone() if features.data_ptr() % 16 else features
 
