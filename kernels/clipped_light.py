@@ -5,9 +5,27 @@ from functools import cache
 import warp as wp
 
 from .constants import FORWARD
+from .geometry import vector
+from .patches import BLOCK_DIM, CHANNELS, ROWS, TURNS, patch_functions
 
 REACH = 3  # Pixels to each side that a clipped pixel is compared with
 NOT_CLIPPED = -1.0  # In the place of a logarithm, which is 0 or more
+
+
+@cache
+def _terms_function(dtype):
+    real = dtype
+
+    @wp.func
+    def terms_of(v: real, total: real, clipped: real, pixels: int, smoothness: real, lift: real):
+        """Of a clipped value with logarithm v, whose `clipped` clipped neighbors of `pixels`, with itself, have the
+        `total`: with their mean m, smoothness / 2 (v - m)^2 - lift (1 - clipped / pixels) v and, with m as it is, its
+        derivative by v."""
+        away = v - total / clipped
+        lifted = lift * (real(1.0) - clipped / real(pixels))
+        return real(0.5) * smoothness * away * away - lifted * v, smoothness * away - lifted
+
+    return terms_of
 
 
 @cache
@@ -39,36 +57,109 @@ def clipped_logarithms_kernel(dtype, code):
 def clipped_light_kernel(dtype):
     """The kernel for one scalar type."""
     real = dtype
+    terms_of = _terms_function(dtype)
 
     @wp.kernel(module="unique", module_options=FORWARD)
     def clipped_light(
         first: int,
         image: wp.array(dtype=real), logarithms: wp.array(dtype=real), height: int, width: int,
-        smoothness: real, lift: real, energies: wp.array(dtype=real), slopes: wp.array(dtype=real),
+        smoothness: real, lift: real, terms: wp.array(dtype=real), slopes: wp.array(dtype=real),
     ):
-        """For each clipped value of image [H, W, 3], flat, with v its logarithm and m the mean of those of the n
-        clipped values of the channel within REACH, itself one, in N pixels: smoothness / 2 (v - m)^2 less
-        lift (1 - n / N) v is added to the energies, and its derivative by the value, with m as it is, to the slopes,
-        which may be None."""
+        """For each clipped value of image [H, W, 3], flat, the first of terms_of() with the values of its channel
+        within REACH is added to terms [H W 3], and its derivative by the value to the slopes, which may be None."""
         i = first + wp.tid()
         v = logarithms[i]
         if v >= real(0.0):
             row = i // (3 * width)
             column = i // 3 - width * row
             total = real(0.0)
-            clipped = int(0)
+            clipped = real(0.0)
             pixels = int(0)
             for y in range(wp.max(row - wp.static(REACH), 0), wp.min(row + wp.static(REACH + 1), height)):
                 for x in range(wp.max(column - wp.static(REACH), 0), wp.min(column + wp.static(REACH + 1), width)):
                     near = logarithms[i + 3 * ((y - row) * width + x - column)]
                     pixels += 1
                     if near >= real(0.0):
-                        clipped += 1
+                        clipped += real(1.0)
                         total += near
-            away = v - total / real(clipped)
-            edge = real(1.0) - real(clipped) / real(pixels)
-            energies[i] = energies[i] + (real(0.5) * smoothness * away * away - lift * edge * v)
+            energy, by_v = terms_of(v, total, clipped, pixels, smoothness, lift)
+            terms[i] = terms[i] + energy
             if slopes and v > real(0.0):
-                slopes[i] = slopes[i] + (smoothness * away - lift * edge) / image[i]
+                slopes[i] = slopes[i] + by_v / image[i]
 
     return clipped_light
+
+
+@cache
+def clipped_light_patch_kernel(dtype, code):
+    """Both of the above in one launch on CUDA, over patches_of() x BLOCK_DIM threads (patches.py)."""
+    real = dtype
+    vec3, around = vector(3, dtype), vector(ROWS + 2 * REACH, dtype)
+    functions = patch_functions(REACH)
+    reach, patch_of, column_of, value_of = functions.reach, functions.patch_of, functions.column_of, functions.value_of
+    terms_of = _terms_function(dtype)
+    options = {"module_options": FORWARD | {"max_unroll": 32}, "launch_bounds": BLOCK_DIM, "grid_stride": False}
+
+    @wp.kernel(module="unique", **options)
+    def clipped_light_in_patches(
+        image: wp.array(dtype=real), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64),
+        mask: wp.array(dtype=real), white_code: int, white: real, height: int, width: int,
+        smoothness: real, lift: real, terms: wp.array(dtype=real), slopes: wp.array(dtype=real),
+    ):
+        """terms: [patches]; a patch's energy is added to its term."""
+        block = wp.tid() // wp.static(BLOCK_DIM)
+        thread = wp.tid() - block * wp.static(BLOCK_DIM)
+        top, left, _ = patch_of(block, width, 3)
+        photo = wp.int32(index[0])
+        # Of columns: logarithms, how many there are, and the logarithm in their middle
+        sums = wp.tile_empty(shape=(ROWS, reach), dtype=vec3, storage="shared")
+        x, channel = column_of(thread, left, 0)
+        logarithms = around()
+        counts = around()
+        near = wp.clamp(x, 0, width - 1)
+        for row in range(wp.static(ROWS + 2 * REACH)):
+            y = top + row - wp.static(REACH)
+            # All are read before one is looked at: a branch would wait for each.
+            pixel = wp.clamp(y, 0, height - 1) * width + near
+            clipped = int(codes[photo, pixel * 3 + channel]) == white_code and x == near and y >= 0 and y < height
+            if mask:
+                clipped = clipped and mask[pixel] > real(0.0)
+            counts[row] = wp.where(clipped, real(1.0), real(0.0))
+            logarithms[row] = image[pixel * 3 + channel]
+        for row in range(wp.static(ROWS + 2 * REACH)):
+            v = real(NOT_CLIPPED)
+            if counts[row] > real(0.0):
+                v = wp.log(wp.max(logarithms[row], white) / white)
+            is_number = v >= real(0.0)
+            counts[row] = wp.where(is_number, real(1.0), real(0.0))
+            logarithms[row] = wp.where(is_number, v, real(0.0))
+        for row in range(wp.static(ROWS)):
+            here = row + wp.static(REACH)
+            own = wp.where(counts[here] > real(0.0), logarithms[here], real(NOT_CLIPPED))
+            of_column = vec3(real(0.0), real(0.0), own)
+            for k in range(wp.static(2 * REACH + 1)):
+                of_column += vec3(logarithms[row + k], counts[row + k], real(0.0))
+            wp.tile_scatter_masked(sums, row, thread, of_column, thread < wp.static(reach))
+        energy = real(0.0)
+        for turn in range(wp.static(TURNS)):
+            row, at = value_of(thread, turn)
+            x, channel = column_of(at, left + wp.static(REACH), 0)
+            y = top + row
+            if y < height and x < width:
+                i = (y * width + x) * 3 + channel
+                v = wp.tile_extract(sums, row, at + wp.static(CHANNELS * REACH))[2]
+                if v >= real(0.0):
+                    found = vec3()
+                    for k in range(wp.static(2 * REACH + 1)):
+                        found += wp.tile_extract(sums, row, at + wp.static(CHANNELS) * k)
+                    down = wp.min(y + wp.static(REACH + 1), height) - wp.max(y - wp.static(REACH), 0)
+                    across = wp.min(x + wp.static(REACH + 1), width) - wp.max(x - wp.static(REACH), 0)
+                    term, by_v = terms_of(v, found[0], found[1], down * across, smoothness, lift)
+                    energy += term
+                    if slopes and v > real(0.0):
+                        slopes[i] = slopes[i] + by_v / image[i]
+        of_patch = wp.tile_extract(wp.tile_sum(wp.tile(energy)), 0)
+        if thread == 0:
+            terms[block] = terms[block] + of_patch
+
+    return clipped_light_in_patches

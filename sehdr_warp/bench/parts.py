@@ -29,7 +29,7 @@ KERNELS = {
     "lists": ("pack_records_*", "key_by_*", "emit_*", "find_lists_*", "*radix_sort*", "*DeviceScan*"),
     "blend": ("blend_forward_*", "pad_rows_*"),
     "response and fusion": ("encode_*", "interpolate_*", "perceptrons_*", "mix_*", "point_adjoint_*", "unit_adjoint_*"),
-    "losses": ("compare_*", "blur_*", "gradient_in_strips_*", "clipped_*", "code_residual_*"),
+    "losses": ("compare_*", "gradient_in_*", "clipped_*", "code_residual_*"),
     "blend, adjoint": ("blend_backward_*",),
     "projection, adjoint": ("project_*_backward",),
     "optimizer": ("update_*", "find_nonfinite_*", "judge_step_*"),

@@ -3,7 +3,8 @@
 import torch
 from torch import Tensor
 
-from ..kernels.clipped_light import clipped_light_kernel, clipped_logarithms_kernel
+from ..kernels.clipped_light import clipped_light_kernel, clipped_light_patch_kernel, clipped_logarithms_kernel
+from . import patches
 from .code_residual import CODES, WHITE
 from .launching import launch, times, warp_scalar
 
@@ -32,29 +33,33 @@ def clipped_light_energy(
     return _ClippedLight.apply(image, codes, index, mask, white, smoothness, lift)
 
 
-def add_clipped_light(image, codes, index, mask, white, smoothness, lift, energies, slopes) -> None:
-    """Adds clipped_light_energy()'s terms to energies, and their derivatives by the image, contiguous, to slopes, both
-    [H, W, 3]; slopes may be None."""
-    logarithms = torch.empty_like(image)
+def add_clipped_light(image, codes, index, mask, white, smoothness, lift, terms, slopes) -> None:
+    """Adds what clipped_light_energy() is the total() of to terms, and its derivatives by the image, contiguous, to
+    slopes, [H, W, 3], which may be None."""
     if index is None:
         codes, index = codes[None], torch.zeros(1, dtype=torch.int64, device=codes.device)
-    # The mean is in the weights: it costs no launch, here and for the gradient.
-    weights = smoothness / image.numel(), lift / image.numel()
-    scalar, numbers = warp_scalar(image.dtype), (*image.shape[:2], *weights)
     photos, mask = codes.contiguous().view(len(codes), -1), None if mask is None else mask.contiguous().view(-1)
-    found = image, photos, index, mask, WHITE[codes.dtype], white, logarithms
-    launch(clipped_logarithms_kernel(scalar, CODES[codes.dtype]), image.numel(), *found)
-    launch(clipped_light_kernel(scalar), image.numel(), image, logarithms, *numbers, energies, slopes)
+    given = image, photos, index, mask, WHITE[codes.dtype], white
+    # The mean is in the weights: it costs no launch, here and for the gradient.
+    numbers = *image.shape[:2], smoothness / image.numel(), lift / image.numel()
+    scalar, code = warp_scalar(image.dtype), CODES[codes.dtype]
+    if patches.in_patches(image.device):
+        kernel = clipped_light_patch_kernel(scalar, code)
+        patches.launch_patches(kernel, image, *given, *numbers, terms, slopes)
+        return
+    logarithms = torch.empty_like(image)
+    launch(clipped_logarithms_kernel(scalar, code), image.numel(), *given, logarithms)
+    launch(clipped_light_kernel(scalar), image.numel(), image, logarithms, *numbers, terms, slopes)
 
 
 class _ClippedLight(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, codes, index, mask, white, smoothness, lift):
         image = image.detach().contiguous()
-        energies, slopes = torch.zeros_like(image), torch.zeros_like(image)
-        add_clipped_light(image, codes, index, mask, white, smoothness, lift, energies, slopes)
+        terms, slopes = patches.new_terms(image).zero_(), torch.zeros_like(image)
+        add_clipped_light(image, codes, index, mask, white, smoothness, lift, terms, slopes)
         ctx.save_for_backward(slopes)
-        return energies.sum()
+        return patches.total(terms)
 
     @staticmethod
     @torch.autograd.function.once_differentiable

@@ -7,7 +7,8 @@ from torch import Tensor
 from .clipped_light import add_clipped_light
 from .code_residual import CodeScale, check_codes, residual
 from .launching import times
-from .ssim import distance_terms, total
+from .patches import total
+from .ssim import distance_terms
 
 
 def photo_loss(
@@ -38,7 +39,7 @@ class _PhotoLoss(torch.autograd.Function):
         seen, truth, slopes = residual(image, codes, scale, index)
         terms, gradient = distance_terms(seen, truth, *weights, wanted=ctx.needs_input_grad[0], slopes=slopes)
         if any(clipped):
-            add_clipped_light(image, codes, index, None, scale.white, *clipped, energies=terms, slopes=gradient)
+            add_clipped_light(image, codes, index, None, scale.white, *clipped, terms=terms, slopes=gradient)
         ctx.save_for_backward(*(() if gradient is None else (gradient,)))
         return total(terms)
 

@@ -1,12 +1,13 @@
-"""Structural similarity of two images as a differentiable torch operation (kernels/ssim.py)."""
+"""Structural similarity of two images as a differentiable torch operation (kernels/ssim.py, kernels/ssim_cuda.py)."""
 
 import torch
 from torch import Tensor
 
-from ..kernels.ssim import RADIUS, STRIP, ssim_kernels, window
+from ..kernels.ssim import RADIUS, ssim_kernels, window
+from ..kernels.ssim_cuda import ssim_patch_kernels
+from . import patches
 from .checks import check_tensors
 from .launching import constant, launch, one, times, warp_scalar
-from .threads import torch_threads
 
 CPU_LANES = 16  # Numbers that one step of the CPU kernels takes: one AVX-512 register of float32
 STEPS_PER_THREAD = 4096  # Smallest share of such steps that is worth handing to another thread: about 0.1 ms of work
@@ -50,7 +51,7 @@ class _Distance(torch.autograd.Function):
         a, b = a.detach().contiguous(), b.detach().contiguous()
         terms, gradient = distance_terms(a, b, distance_weight, dissimilarity_weight, ctx.needs_input_grad[0])
         ctx.save_for_backward(*(() if gradient is None else (gradient,)))
-        return total(terms)
+        return patches.total(terms)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -66,21 +67,12 @@ def distance_terms(
     wanted: bool,
     slopes: Tensor | None = None,
 ) -> tuple[Tensor, Tensor | None]:
-    """[H, W, C] each: what image_distance() of contiguous images is the sum of, and if wanted its derivatives by what
-    `a` has the slopes by, all [H, W, C], or by `a` itself."""
+    """What image_distance() of contiguous images is the total() of, and if wanted its derivatives by what `a` has the
+    slopes by, all [H, W, C], or by `a` itself."""
     weights = distance_weight / a.numel(), dissimilarity_weight / a.numel()
     terms, derivatives = _compare(a, b, weights)
     # Made at once: it takes a fifth of the memory of what it is made of.
     return terms, _gradient(a, b, derivatives, one(a), weights, slopes) if wanted else None
-
-
-def total(terms: Tensor) -> Tensor:
-    """The sum of [H, W, C], a scalar; on the CPU the same whatever the number of threads."""
-    if terms.device.type == "cuda":
-        return terms.sum()
-    with torch_threads(terms.device):  # Each row is one thread's.
-        rows = terms.flatten(1).sum(1)
-    return rows.sum()
 
 
 class _Similarity(torch.autograd.Function):
@@ -118,28 +110,52 @@ def _check(a: Tensor, b: Tensor) -> None:
 
 def _compare(a: Tensor, b: Tensor, weights: tuple[float, float] | None = None) -> tuple[Tensor, Tensor]:
     """The similarity [H, W, C] and its derivatives [3, H, W C] by the windowed moments. weights: of |a - b| and of the
-    dissimilarity, whose sum [H, W, C] then stands in the similarity's place."""
-    runs = _Runs(a, weights)
-    similarity, derivatives = torch.empty_like(a), a.new_empty(3, runs.rows, runs.length)
-    moments = runs.view(runs.padded(4))
-    images = runs.view(a), runs.view(b)
-    runs.launch(runs.kernels.blur_columns, images, [moments], blurs=1)
-    compared = *images, *runs.weights_of_both, runs.view(similarity), runs.view(derivatives)
-    runs.launch(runs.kernels.compare, [moments], compared)
-    return similarity, derivatives
+    dissimilarity, whose sum's terms then stand in the similarity's place."""
+    values = torch.empty_like(a) if weights is None else patches.new_terms(a)
+    derivatives = a.new_empty(3, a.shape[0], a.shape[1] * a.shape[2])
+    if patches.in_patches(a.device):
+        results = (None, values) if weights else (values.flatten(1), None)
+        images = a.flatten(1), b.flatten(1)
+        _launch_patches("compare", a, weights, *images, *(weights or (0.0, 0.0)), *results, derivatives)
+    else:
+        _compare_in_runs(a, b, weights, values, derivatives)
+    return values, derivatives
 
 
 def _gradient(
     a, b, derivatives, scale: Tensor, weights: tuple[float, float] | None = None, slopes: Tensor | None = None
 ) -> Tensor:
     """scale, and with weights slopes, times the gradient by `a`, [H, W, C], of the sum of what _compare() gives."""
-    runs = _Runs(a, weights)
     result = torch.empty_like(a)
-    blurred = runs.view(runs.padded(3))
-    runs.launch(runs.kernels.blur_derivatives, [runs.view(derivatives)], [blurred], blurs=3)
-    scaled = scale, None if slopes is None else runs.view(slopes), *runs.weights_of_both, runs.view(result)
-    runs.launch(runs.kernels.gradient, [blurred, runs.view(a), runs.view(b)], scaled, strips=True)
+    if patches.in_patches(a.device):
+        given = derivatives, a.flatten(1), b.flatten(1), scale, None if slopes is None else slopes.flatten(1)
+        _launch_patches("gradient", a, weights, *given, *(weights or (0.0, 0.0)), result.flatten(1))
+    else:
+        _gradient_in_runs(a, b, derivatives, scale, weights, slopes, result)
     return result
+
+
+def _launch_patches(name: str, image: Tensor, weights: tuple[float, float] | None, *arguments) -> None:
+    kernel = getattr(ssim_patch_kernels(warp_scalar(image.dtype), weights is not None), name)
+    taps = constant(tuple(window()), image.dtype, image.device)
+    patches.launch_patches(kernel, image, taps, *image.shape[1:], *arguments)
+
+
+def _compare_in_runs(a, b, weights, similarity, derivatives) -> None:
+    runs = _Runs(a, weights)
+    moments = runs.view(runs.padded(4))
+    images = runs.view(a), runs.view(b)
+    runs.launch(runs.kernels.blur_columns, images, [moments])
+    compared = *images, *runs.weights_of_both, runs.view(similarity), runs.view(derivatives)
+    runs.launch(runs.kernels.compare, [moments], compared)
+
+
+def _gradient_in_runs(a, b, derivatives, scale, weights, slopes, result) -> None:
+    runs = _Runs(a, weights)
+    blurred = runs.view(runs.padded(3))
+    runs.launch(runs.kernels.blur_derivatives, [runs.view(derivatives)], [blurred])
+    scaled = scale, None if slopes is None else runs.view(slopes), *runs.weights_of_both, runs.view(result)
+    runs.launch(runs.kernels.gradient, [blurred, runs.view(a), runs.view(b)], scaled)
 
 
 class _Runs:
@@ -149,19 +165,17 @@ class _Runs:
         self.rows, width, self.channels = image.shape
         self.length = width * self.channels
         self.like = image
-        self.lanes = CPU_LANES if image.device.type == "cpu" and self.length >= CPU_LANES else 1
+        self.lanes = CPU_LANES if self.length >= CPU_LANES else 1
         self.kernels = ssim_kernels(warp_scalar(image.dtype), self.lanes, weights is not None)
         self.weights_of_both = weights or (0.0, 0.0)
         self.weights = constant(tuple(window()), image.dtype, image.device)
 
     def padded(self, count: int) -> Tensor:
-        """[count, rows, ...] uninitialised rows with the zeros that the horizontal blur finds beyond the border; with
-        one lane the kernels that fill the rows write those too."""
+        """[count, rows, ...] uninitialised rows with the zeros that the horizontal blur finds beyond the border."""
         margin = RADIUS * self.channels
         buffer = self.like.new_empty(count, self.rows, self.length + 2 * margin)
-        if self.lanes > 1:
-            buffer[..., :margin] = 0
-            buffer[..., -margin:] = 0
+        buffer[..., :margin] = 0
+        buffer[..., -margin:] = 0
         return buffer
 
     def view(self, tensor: Tensor) -> Tensor:
@@ -171,13 +185,7 @@ class _Runs:
         strides = (length,) if len(rows) == 1 else (rows[1] * length, length)
         return tensor.as_strided((*rows, length - self.lanes + 1, self.lanes), (*strides, 1, 1))
 
-    def launch(self, kernel, inputs, results, *, blurs: int = 0, strips: bool = False) -> None:
-        """Launch a kernel over the whole image. With one lane: blurs: it blurs columns of so many planes, and writes
-        the zeros beyond the image; strips: it takes several pixels at once."""
-        rows, blocks = self.rows, -(-self.length // self.lanes)
-        if self.lanes == 1 and blurs:
-            rows, blocks = blurs * -(-rows // STRIP), blocks + 2 * RADIUS * self.channels
-        elif self.lanes == 1 and strips:
-            blocks = -(-self.length // self.channels // STRIP) * self.channels
+    def launch(self, kernel, inputs, results) -> None:
+        """Launch a kernel over the whole image."""
         arguments = *inputs, self.weights, self.length, self.channels, *results
-        launch(kernel, rows * blocks, *arguments, smallest=STEPS_PER_THREAD)
+        launch(kernel, self.rows * -(-self.length // self.lanes), *arguments, smallest=STEPS_PER_THREAD)

@@ -5,7 +5,9 @@ from importlib import import_module
 import pytest
 import torch
 import torch.nn.functional as F
+import warp as wp
 
+from sehdr_warp.splatting import patches
 from sehdr_warp.splatting.ssim import image_distance, ssim, ssim_map
 
 SHAPES = [(32, 48, 3), (37, 29, 3), (5, 4, 3), (1, 1, 1), (1, 40, 2), (40, 1, 3), (11, 11, 1), (16, 9, 27), (3, 2, 9)]
@@ -41,16 +43,22 @@ def relative_error(value, truth):
     return float((value.double() - truth).norm() / truth.norm())
 
 
-@pytest.fixture(params=["runs", "single"])
-def lanes(request, monkeypatch):
-    """Both kernel widths on the CPU: runs of 16, and the one-number steps that a GPU takes."""
+@pytest.fixture(params=["runs", "single", "patches"])
+def kernels(request, monkeypatch, device):
+    """All kernels on the CPU: runs of 16, those of narrow images, and those of a GPU, on fibers."""
+    module = import_module("sehdr_warp.splatting.ssim")
     if request.param == "single":
-        monkeypatch.setattr(import_module("sehdr_warp.splatting.ssim"), "CPU_LANES", 1)
+        monkeypatch.setattr(module, "CPU_LANES", 1)
+    elif request.param == "patches" and device == "cpu":
+        monkeypatch.setattr(patches, "in_patches", lambda device: True)
+        monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    elif device != "cpu" and request.param != "patches":
+        pytest.skip("kernels of the CPU")
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-5), (torch.float64, 1e-12)])
-def test_values_and_gradients_equal_the_convolution(shape, dtype, tolerance, device, lanes):
+def test_values_and_gradients_equal_the_convolution(shape, dtype, tolerance, device, kernels):
     a, b = images(shape, device)
     a.requires_grad_(), b.requires_grad_()
     expected_map = conv_ssim(a, b)
@@ -67,7 +75,7 @@ def test_values_and_gradients_equal_the_convolution(shape, dtype, tolerance, dev
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-5), (torch.float64, 1e-12)])
-def test_the_distance_is_the_weighted_sum(shape, dtype, tolerance, device, lanes):
+def test_the_distance_is_the_weighted_sum(shape, dtype, tolerance, device, kernels):
     a, b = images(shape, device)
     a.view(-1)[1::5] = b.view(-1)[1::5]  # where they are equal, |a - b| pulls neither way
     a.requires_grad_()

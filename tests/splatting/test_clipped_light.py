@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 from sehdr_warp.kernels.clipped_light import REACH
+from sehdr_warp.splatting import patches
 from sehdr_warp.splatting.clipped_light import clipped_light_energy
 from sehdr_warp.splatting.code_residual import code_tensor
 
@@ -13,12 +15,23 @@ from .scenes import relative_error
 WHITE, WEIGHTS = 1.3, {"smoothness": 0.7, "lift": 0.2}
 
 
+@pytest.fixture(params=["values", "patches"])
+def kernels(request, monkeypatch, device):
+    """The kernels of the device; on the CPU those of a GPU too, on fibers."""
+    if request.param == "patches" and device == "cpu":
+        monkeypatch.setattr(patches, "in_patches", lambda device: True)
+        monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    elif device != "cpu" and request.param != "patches":
+        pytest.skip("kernels of the CPU")
+
+
 def clipped_photo(bits=8):
-    """Light [12, 17, 3] around white, a photo's codes with a clipped disk, a clipped corner and a clipped speck."""
+    """Light [40, 37, 3] around white, a photo's codes with clipped disks, a clipped corner and a clipped speck."""
     generator = torch.Generator().manual_seed(3)
-    light = WHITE * torch.exp(torch.randn(12, 17, 3, generator=generator, dtype=torch.float64))
-    y, x = np.mgrid[:12, :17]
-    clipped = ((y - 6) ** 2 + (x - 9) ** 2 < 12) | (y + x < 4) | ((y == 1) & (x == 15))
+    light = WHITE * torch.exp(torch.randn(40, 37, 3, generator=generator, dtype=torch.float64))
+    y, x = np.mgrid[:40, :37]
+    clipped = ((y - 6) ** 2 + (x - 9) ** 2 < 12) | ((y - 31) ** 2 + (x - 32) ** 2 < 20)
+    clipped |= (y + x < 4) | ((y == 1) & (x == 15))
     codes = np.where(clipped[..., None] & np.array([True, True, False]), 2**bits - 1, 100)
     codes[5:8, 8:11, 2] = 2**bits - 1
     return light, codes.astype(np.uint16 if bits == 16 else np.uint8)
@@ -39,7 +52,7 @@ def reference(light, codes, mask=None, means_of=None):
 
 @pytest.mark.parametrize("bits", [8, 16])
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
-def test_values_and_gradients_are_those_of_torch(device, bits, dtype, bound):
+def test_values_and_gradients_are_those_of_torch(device, kernels, bits, dtype, bound):
     light, codes = clipped_photo(bits)
     wanted = light.clone().requires_grad_()
     expected = reference(wanted, codes)
@@ -53,7 +66,7 @@ def test_values_and_gradients_are_those_of_torch(device, bits, dtype, bound):
     assert torch.equal(clipped_light_energy(ours, stack, WHITE, **WEIGHTS, index=index), energy)
 
 
-def test_gradient_is_that_of_finite_differences(device):
+def test_gradient_is_that_of_finite_differences(device, kernels):
     light, codes = clipped_photo()
     image = light.to(device).requires_grad_()
     clipped_light_energy(image, code_tensor(codes, device), WHITE, **WEIGHTS).backward()
@@ -67,9 +80,9 @@ def test_gradient_is_that_of_finite_differences(device):
         assert image.grad[tuple(place)].item() == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-5, abs=1e-11)
 
 
-def test_masked_pixels_are_not_clipped(device):
+def test_masked_pixels_are_not_clipped(device, kernels):
     light, codes = clipped_photo()
-    mask = torch.ones(12, 17, 1, dtype=torch.float64)
+    mask = torch.ones(40, 37, 1, dtype=torch.float64)
     mask[4:7] = 0
     photo = code_tensor(codes, device)
     energy = clipped_light_energy(light.to(device), photo, WHITE, **WEIGHTS, mask=mask.to(device))
@@ -78,7 +91,7 @@ def test_masked_pixels_are_not_clipped(device):
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
-def test_extreme_light_leaves_numbers(device, scale):
+def test_extreme_light_leaves_numbers(device, kernels, scale):
     light, codes = clipped_photo()
     image = (light * scale).to(device, torch.float32).requires_grad_()
     energy = clipped_light_energy(image, code_tensor(codes, device), WHITE, **WEIGHTS)

@@ -1,0 +1,53 @@
+"""Patches of an image [H, W, C] that blocks of threads own on CUDA, and the columns around them.
+
+What a value sums of those of its channel around it is summed by columns first: each thread takes a column of numbers
+from memory, which lie beside those of its neighbors, and leaves its sums in shared memory, where each value finds
+those of its row. A patch's columns reach `radius` pixels beyond it on all sides. A patch has three channels at most.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+ROWS, COLUMNS, CHANNELS = 8, 32, 3  # Of a patch; its columns are pixels
+BLOCK_DIM = 128  # At least what a patch reaches of a row
+TURNS = ROWS * COLUMNS * CHANNELS // BLOCK_DIM  # In which threads take the values of a patch
+
+
+def patches_of(height: int, width: int, channels: int) -> int:
+    """Patches that an image takes."""
+    return -(-height // ROWS) * -(-width // COLUMNS) * -(-channels // CHANNELS)
+
+
+@cache
+def patch_functions(radius: int) -> SimpleNamespace:
+    """reach: numbers of a row that a patch reaches. The rest find places in images of `channels` with W = width."""
+
+    @wp.func
+    def patch_of(block: int, width: int, channels: int):
+        """The top row, left pixel and first channel of a block's patch."""
+        across = (width + wp.static(COLUMNS - 1)) // wp.static(COLUMNS)
+        groups = (channels + wp.static(CHANNELS - 1)) // wp.static(CHANNELS)
+        patch = block // groups
+        row = patch // across
+        left = (patch - row * across) * wp.static(COLUMNS)
+        return row * wp.static(ROWS), left, (block - patch * groups) * wp.static(CHANNELS)
+
+    @wp.func
+    def column_of(thread: int, left: int, channel: int):
+        """Pixel and channel of the column that a thread takes; both may be beyond the image."""
+        pixel = thread // wp.static(CHANNELS)
+        return left + pixel - wp.static(radius), channel + thread - pixel * wp.static(CHANNELS)
+
+    @wp.func
+    def value_of(thread: int, turn: int):
+        """Row in the patch of the value that a thread takes in one of TURNS, and where its sums begin there: those of
+        what is k pixels behind are CHANNELS k behind."""
+        place = turn * wp.static(BLOCK_DIM) + thread
+        row = place // wp.static(COLUMNS * CHANNELS)
+        return row, place - row * wp.static(COLUMNS * CHANNELS)
+
+    reach = (COLUMNS + 2 * radius) * CHANNELS
+    assert reach <= BLOCK_DIM
+    return SimpleNamespace(reach=reach, patch_of=patch_of, column_of=column_of, value_of=value_of)
