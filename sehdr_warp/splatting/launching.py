@@ -44,7 +44,7 @@ def launch(
     *arguments: Any,
     gradients: Sequence[Tensor | None] | None = None,
     ranges: list[tuple[int, int]] | None = None,
-    smallest: int = 4096,
+    smallest: int = 1024,
     block_dim: int | None = None,
 ) -> None:
     """Launch a kernel over `dim` threads; no tape records it, and nothing waits for it.

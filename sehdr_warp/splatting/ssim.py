@@ -10,7 +10,7 @@ from .checks import check_tensors
 from .launching import constant, launch, one, times, warp_scalar
 
 CPU_LANES = 16  # Numbers that one step of the CPU kernels takes: one AVX-512 register of float32
-STEPS_PER_THREAD = 4096  # Smallest share of such steps that is worth handing to another thread: about 0.1 ms of work
+STEPS_PER_THREAD = 1024  # Smallest share of such steps that is worth handing to another thread: about 0.1 ms of work
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:

@@ -88,7 +88,7 @@ def _wait_for_calls() -> None:
         _calls.get()()
 
 
-def even_ranges(count: int, smallest: int = 4096) -> list[tuple[int, int]]:
+def even_ranges(count: int, smallest: int = 1024) -> list[tuple[int, int]]:
     """[first, last) ranges that cover `count` items, two for each thread; one, or each of at least `smallest`: to begin
     one takes the interpreter's lock, for which all threads wait."""
     pieces = max(1, min(thread_count() * 2, count // smallest))
