@@ -14,6 +14,7 @@ from ..splatting.reference import rasterize_reference
 from ..training.config import Config
 from ..training.config_files import load_config, override_config
 from ..training.initialization import choose_response, make_field
+from ..training.machine import torch_settings
 from ..training.trainer import Trainer
 from .kernels import OURS, PLAIN_TORCH, REFERENCE_GAUSSIANS
 from .parts import parts_of_step, work_of
@@ -97,7 +98,8 @@ def step_variant(trainer: Trainer) -> Variant:
 def time_step(trainer: Trainer, repetitions: int) -> dict:
     """With memory: on a GPU all that is held, on the CPU what the step adds."""
     variant, device = step_variant(trainer), trainer.device
-    timing = time_variants({"step": variant}, device, repetitions=repetitions)["step"]
+    with torch_settings(trainer.config.deterministic):
+        timing = time_variants({"step": variant}, device, repetitions=repetitions)["step"]
     return timing | {"peak_memory_bytes": held_memory(device) or peak_memory(variant, device)}
 
 
@@ -128,7 +130,11 @@ def _rows(scene: Scene, config: Config, device: torch.device, repetitions: int) 
         trainer = make_trainer(scene, override_config(config, {"schedule.recorded": name == OURS}), device)
         row = {"implementation": name, "gaussians": trainer.field.gaussians.count}
         row |= (_time_row_of_steps if device.type == "cuda" else time_step)(trainer, repetitions)
-        row |= {"ours_over_this": rows[0]["median_ms"] / row["median_ms"]} if rows else _amortized(trainer)
+        if rows:
+            row["ours_over_this"] = rows[0]["median_ms"] / row["median_ms"]
+        else:
+            with torch_settings(config.deterministic):
+                row |= _amortized(trainer)
         rows.append(row)
         del trainer
     return rows
