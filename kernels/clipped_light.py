@@ -107,9 +107,7 @@ def clipped_light_patch_kernel(dtype, code):
         smoothness: real, lift: real, terms: wp.array(dtype=real), slopes: wp.array(dtype=real),
     ):
         """terms: [patches]; a patch's energy is added to its term."""
-        block = wp.tid() // wp.static(BLOCK_DIM)
-        thread = wp.tid() - block * wp.static(BLOCK_DIM)
-        top, left, _ = patch_of(block, width, 3)
+        block, thread, top, left, _ = patch_of(wp.tid(), width, 3)
         photo = wp.int32(index[0])
         # Of columns: logarithms, how many there are, and the logarithm in their middle
         sums = wp.tile_empty(shape=(ROWS, reach), dtype=vec3, storage="shared")
@@ -142,9 +140,7 @@ def clipped_light_patch_kernel(dtype, code):
             wp.tile_scatter_masked(sums, row, thread, of_column, thread < wp.static(reach))
         energy = real(0.0)
         for turn in range(wp.static(TURNS)):
-            row, at = value_of(thread, turn)
-            x, channel = column_of(at, left + wp.static(REACH), 0)
-            y = top + row
+            row, at, y, x, channel = value_of(thread, turn, top, left, 0)
             if y < height and x < width:
                 i = (y * width + x) * 3 + channel
                 v = wp.tile_extract(sums, row, at + wp.static(CHANNELS * REACH))[2]

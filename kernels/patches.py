@@ -22,31 +22,37 @@ def patches_of(height: int, width: int, channels: int) -> int:
 
 @cache
 def patch_functions(radius: int) -> SimpleNamespace:
-    """reach: numbers of a row that a patch reaches. The rest find places in images of `channels` with W = width."""
+    """reach: numbers of a row that a patch reaches. patch_of, column_of and value_of say what a thread takes."""
 
     @wp.func
-    def patch_of(block: int, width: int, channels: int):
-        """The top row, left pixel and first channel of a block's patch."""
+    def patch_of(index: int, width: int, channels: int):
+        """Of a thread's index: its block, its place there, and the top row, left pixel and first channel of its patch
+        of an image [H, width, channels]."""
+        block = index // wp.static(BLOCK_DIM)
         across = (width + wp.static(COLUMNS - 1)) // wp.static(COLUMNS)
         groups = (channels + wp.static(CHANNELS - 1)) // wp.static(CHANNELS)
         patch = block // groups
         row = patch // across
         left = (patch - row * across) * wp.static(COLUMNS)
-        return row * wp.static(ROWS), left, (block - patch * groups) * wp.static(CHANNELS)
+        channel = (block - patch * groups) * wp.static(CHANNELS)
+        return block, index - block * wp.static(BLOCK_DIM), row * wp.static(ROWS), left, channel
 
     @wp.func
     def column_of(thread: int, left: int, channel: int):
-        """Pixel and channel of the column that a thread takes; both may be beyond the image."""
+        """Pixel and channel of the column that a thread sums; both may be beyond the image."""
         pixel = thread // wp.static(CHANNELS)
         return left + pixel - wp.static(radius), channel + thread - pixel * wp.static(CHANNELS)
 
     @wp.func
-    def value_of(thread: int, turn: int):
-        """Row in the patch of the value that a thread takes in one of TURNS, and where its sums begin there: those of
-        what is k pixels behind are CHANNELS k behind."""
+    def value_of(thread: int, turn: int, top: int, left: int, channel: int):
+        """The value that a thread takes in one of TURNS: its row in the patch, and where its sums begin there, those of
+        what is k pixels behind being CHANNELS k behind; and its row, pixel and channel, which may be beyond the image.
+        """
         place = turn * wp.static(BLOCK_DIM) + thread
         row = place // wp.static(COLUMNS * CHANNELS)
-        return row, place - row * wp.static(COLUMNS * CHANNELS)
+        at = place - row * wp.static(COLUMNS * CHANNELS)
+        pixel = at // wp.static(CHANNELS)
+        return row, at, top + row, left + pixel, channel + at - pixel * wp.static(CHANNELS)
 
     reach = (COLUMNS + 2 * radius) * CHANNELS
     assert reach <= BLOCK_DIM

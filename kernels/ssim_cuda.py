@@ -68,9 +68,7 @@ def ssim_patch_kernels(dtype, distance: bool = False) -> SimpleNamespace:
         distance_weight: real, dissimilarity_weight: real,
         similarity: wp.array2d(dtype=real), sums: wp.array(dtype=real), derivatives: wp.array3d(dtype=real),
     ):
-        block = wp.tid() // wp.static(BLOCK_DIM)
-        thread = wp.tid() - block * wp.static(BLOCK_DIM)
-        top, left, channel = patch_of(block, width, channels)
+        block, thread, top, left, channel = patch_of(wp.tid(), width, channels)
         taps = window_of(weights)
         moments = wp.tile_empty(shape=(ROWS, reach), dtype=vec4, storage="shared")
         across, own = column_of(thread, left, channel)
@@ -87,9 +85,7 @@ def ssim_patch_kernels(dtype, distance: bool = False) -> SimpleNamespace:
             wp.tile_scatter_masked(moments, row, thread, of_column, thread < wp.static(reach))
         total = real(0.0)
         for turn in range(wp.static(TURNS)):
-            row, at = value_of(thread, turn)
-            across, own = column_of(at, left + wp.static(RADIUS), channel)
-            y = top + row
+            row, at, y, across, own = value_of(thread, turn, top, left, channel)
             if y < a.shape[0] and across < width and own < channels:
                 i = across * channels + own
                 m = vec4()
@@ -117,9 +113,7 @@ def ssim_patch_kernels(dtype, distance: bool = False) -> SimpleNamespace:
         distance_weight: real, dissimilarity_weight: real,
         adjoint_a: wp.array2d(dtype=real),
     ):
-        block = wp.tid() // wp.static(BLOCK_DIM)
-        thread = wp.tid() - block * wp.static(BLOCK_DIM)
-        top, left, channel = patch_of(block, width, channels)
+        _, thread, top, left, channel = patch_of(wp.tid(), width, channels)
         taps = window_of(weights)
         blurs = wp.tile_empty(shape=(ROWS, reach), dtype=vec3, storage="shared")
         across, own = column_of(thread, left, channel)
@@ -130,9 +124,7 @@ def ssim_patch_kernels(dtype, distance: bool = False) -> SimpleNamespace:
             of_column = vec3(sd[row], ss[row], dd[row])
             wp.tile_scatter_masked(blurs, row, thread, of_column, thread < wp.static(reach))
         for turn in range(wp.static(TURNS)):
-            row, at = value_of(thread, turn)
-            across, own = column_of(at, left + wp.static(RADIUS), channel)
-            y = top + row
+            row, at, y, across, own = value_of(thread, turn, top, left, channel)
             if y < a.shape[0] and across < width and own < channels:
                 i = across * channels + own
                 by = vec3()

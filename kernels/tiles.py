@@ -98,91 +98,62 @@ def tile_kernels(dtype) -> SimpleNamespace:
         keys[i] = key
         places[i] = i
 
-    @wp.kernel(module="unique", module_options=options)
-    def emit_entries(
-        first: int,
-        order: ints, shapes: vec4s, ellipses: vec4s, extents: vec2s,
-        columns: int, rows: int,
-        ends: int64s,
-        capacity: int,
-        tiles: ints, gaussians: ints, overflow: bools,
-    ):
-        """ends: the running sum of the counts: Gaussian `place` fills the entries before ends[place] and `capacity`,
-        with columns * rows, no tile at all, where there are fewer tiles than were counted. All fill so what is left.
-        overflow: [1], whether more were counted than there is room for; or None."""
-        place = first + wp.tid()
-        i = order[place]
-        extent = extents[i]
-        entry = int(0)
-        if place > 0:
-            entry = int(wp.min(ends[place - 1], wp.int64(capacity)))
-        end = int(wp.min(ends[place], wp.int64(capacity)))
-        if extent[0] > real(0.0) and end > entry:
-            shape = shapes[i]
-            ellipse = ellipses[i]
-            across = tile_span(shape[0], extent[0], columns)
-            down = tile_span(shape[1], extent[1], rows)
-            for row in range(down[0], down[1]):
-                for column in range(across[0], across[1]):
-                    if entry < end and tile_is_touched(shape, ellipse, column, row):
-                        tiles[entry] = row * columns + column
-                        gaussians[entry] = i
-                        entry += 1
-        while entry < end:
-            tiles[entry] = columns * rows
-            gaussians[entry] = i
-            entry += 1
-        count = order.shape[0]
-        if overflow and place == 0:
-            overflow[0] = ends[count - 1] > wp.int64(capacity)
-        entry = int(wp.min(ends[count - 1], wp.int64(capacity))) + place
-        while entry < capacity:
-            tiles[entry] = columns * rows
-            gaussians[entry] = 0
-            entry += count
+    def emission(key, by_depth: bool):
+        bits = DEPTH_BITS if by_depth else 0
 
-    @wp.kernel(module="unique", module_options=options)
-    def emit_keys(
-        first: int,
-        shapes: vec4s, ellipses: vec4s, extents: vec2s, depths: wp.array(dtype=wp.float32),
-        columns: int, rows: int,
-        ends: int64s,
-        capacity: int,
-        keys: int64s, gaussians: ints, overflow: bools,
-    ):
-        """As emit_entries, of Gaussians as they come. keys: the tile above DEPTH_BITS of the depth, whose order is that
-        of positive numbers."""
-        i = first + wp.tid()
-        extent = extents[i]
-        entry = int(0)
-        if i > 0:
-            entry = int(wp.min(ends[i - 1], wp.int64(capacity)))
-        end = int(wp.min(ends[i], wp.int64(capacity)))
-        bits = wp.cast(depths[i], wp.int32) - wp.static(DEPTH_OFFSET)
-        depth = wp.int64(wp.clamp(bits, 0, wp.static((1 << DEPTH_BITS) - 1)))
-        if extent[0] > real(0.0) and end > entry:
-            shape = shapes[i]
-            ellipse = ellipses[i]
-            across = tile_span(shape[0], extent[0], columns)
-            down = tile_span(shape[1], extent[1], rows)
-            for row in range(down[0], down[1]):
-                for column in range(across[0], across[1]):
-                    if entry < end and tile_is_touched(shape, ellipse, column, row):
-                        keys[entry] = (wp.int64(row * columns + column) << wp.int64(DEPTH_BITS)) | depth
-                        gaussians[entry] = i
-                        entry += 1
-        while entry < end:
-            keys[entry] = wp.int64(columns * rows) << wp.int64(DEPTH_BITS)
-            gaussians[entry] = i
-            entry += 1
-        count = depths.shape[0]
-        if overflow and i == 0:
-            overflow[0] = ends[count - 1] > wp.int64(capacity)
-        entry = int(wp.min(ends[count - 1], wp.int64(capacity))) + i
-        while entry < capacity:
-            keys[entry] = wp.int64(columns * rows) << wp.int64(DEPTH_BITS)
-            gaussians[entry] = 0
-            entry += count
+        @wp.kernel(module="unique", module_options=options)
+        def emit_entries(
+            first: int,
+            order: ints, shapes: vec4s, ellipses: vec4s, extents: vec2s, depths: wp.array(dtype=wp.float32),
+            columns: int, rows: int,
+            ends: int64s,
+            capacity: int,
+            keys: wp.array(dtype=key), gaussians: ints, overflow: bools,
+        ):
+            """ends: the running sum of the counts: Gaussian `place` fills the entries before ends[place] and
+            `capacity`, with columns * rows, no tile at all, where there are fewer tiles than were counted. All fill so
+            what is left. overflow: [1], whether more were counted than there is room for; or None.
+            keys: tiles, of Gaussians in their order; or by_depth, of Gaussians as they come, tiles above DEPTH_BITS of
+            the depth, whose order is that of positive numbers. Without by_depth depths are None, with it the order."""
+            place = first + wp.tid()
+            i = place
+            depth = key(0)
+            if wp.static(by_depth):
+                depth_bits = wp.cast(depths[i], wp.int32) - wp.static(DEPTH_OFFSET)
+                depth = key(wp.clamp(depth_bits, 0, wp.static((1 << DEPTH_BITS) - 1)))
+            else:
+                i = order[place]
+            no_tile = key(columns * rows) << key(wp.static(bits))
+            extent = extents[i]
+            entry = int(0)
+            if place > 0:
+                entry = int(wp.min(ends[place - 1], wp.int64(capacity)))
+            end = int(wp.min(ends[place], wp.int64(capacity)))
+            if extent[0] > real(0.0) and end > entry:
+                shape = shapes[i]
+                ellipse = ellipses[i]
+                across = tile_span(shape[0], extent[0], columns)
+                down = tile_span(shape[1], extent[1], rows)
+                for row in range(down[0], down[1]):
+                    for column in range(across[0], across[1]):
+                        if entry < end and tile_is_touched(shape, ellipse, column, row):
+                            keys[entry] = (key(row * columns + column) << key(wp.static(bits))) | depth
+                            gaussians[entry] = i
+                            entry += 1
+            while entry < end:
+                keys[entry] = no_tile
+                gaussians[entry] = i
+                entry += 1
+            count = ends.shape[0]
+            if overflow and place == 0:
+                overflow[0] = ends[count - 1] > wp.int64(capacity)
+            entry = int(wp.min(ends[count - 1], wp.int64(capacity))) + place
+            while entry < capacity:
+                keys[entry] = no_tile
+                gaussians[entry] = 0
+                entry += count
+
+        return emit_entries
 
     @wp.kernel(module="unique", module_options=options)
     def gather_entries(
@@ -205,8 +176,8 @@ def tile_kernels(dtype) -> SimpleNamespace:
             rows[i, column] = total
 
     return SimpleNamespace(
-        pack_records=pack_records, key_by_depth=key_by_depth, emit_entries=emit_entries, emit_keys=emit_keys,
-        gather_entries=gather_entries,
+        pack_records=pack_records, key_by_depth=key_by_depth, gather_entries=gather_entries,
+        emit_entries=emission(wp.int32, by_depth=False), emit_keys=emission(wp.int64, by_depth=True),
     )
 
 

@@ -187,7 +187,7 @@ def emit_entries(order, shapes, ellipses, extents, columns: int, rows: int, ends
         tiles[:room], gaussians[:room] = columns * rows, 0
     elif room:
         kernel = tile_kernels(warp_scalar(shapes.dtype)).emit_entries
-        touched = order, shapes, ellipses, extents, columns, rows
+        touched = order, shapes, ellipses, extents, None, columns, rows
         launch(kernel, len(order), *touched, ends, room, tiles, gaussians, overflow)
     return tiles, gaussians
 
@@ -199,7 +199,7 @@ def emit_keys(shapes, ellipses, extents, depths, columns: int, rows: int, ends, 
     if not len(depths):
         keys[:room], gaussians[:room] = columns * rows << kernels.DEPTH_BITS, 0
     elif room:
-        touched = shapes, ellipses, extents, depths, columns, rows
+        touched = None, shapes, ellipses, extents, depths, columns, rows
         launch(tile_kernels(wp.float32).emit_keys, len(depths), *touched, ends, room, keys, gaussians, overflow)
     return keys, gaussians
 
