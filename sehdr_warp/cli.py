@@ -90,9 +90,9 @@ def command_options() -> dict[str, type]:
 
 
 def _run(words: list[str]) -> None:
-    # torch's OpenMP threads spin while they wait, which on a processor shared with other programs costs a training on
-    # the CPU most of its time; read once, when torch is loaded.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    from .process import calm_threads
+
+    calm_threads()
     if shutil.get_terminal_size().columns < LEAST_COLUMNS:  # No table fits, and to try takes minutes.
         os.environ["COLUMNS"] = str(LEAST_COLUMNS)
     from .console import show_logs

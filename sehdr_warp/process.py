@@ -71,6 +71,14 @@ def prepare() -> None:
     threading.excepthook = lambda told: None if interrupted() else thread_hook(told)
 
 
+def calm_threads() -> None:
+    """OpenMP's threads, torch's and ours, spin no longer for work than from one launch of a step to the next: as long
+    as they do by themselves, on a processor shared with other programs, costs a training most of its time. Read once,
+    when torch is loaded."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.setdefault("GOMP_SPINCOUNT", "2000")
+
+
 def collect_late() -> None:
     """Garbage is looked for only once libraries are loaded, and not in them: they leave next to none, and to look makes
     a quarter of the time that they take. For programs of our own, once in a process: another's garbage is its own."""

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from sehdr_warp.process import collect_late
+from sehdr_warp.process import calm_threads, collect_late
 
 collect_late()
-# As the command line does, and for its reason; before anything loads torch.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+calm_threads()  # Before anything loads torch.
 # Tests run side by side: threads of linear algebra would wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 

@@ -24,7 +24,7 @@ from ..kernels import (
 from ..kernels.constants import ALPHA_THRESHOLD
 from ..kernels.project import projection_kernel
 from .blending import halvings
-from .launching import is_fused, load_on_cpu
+from .loading import is_fused, load_on_cpu
 from .ssim import CPU_LANES
 
 log = logging.getLogger(__name__)

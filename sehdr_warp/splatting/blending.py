@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -15,6 +14,8 @@ from ..parallel import thread_count
 from .launching import launch, warp_scalar
 from .tile_lists import ONE_SORT, Emission, TileLists
 
+PIECES_PER_THREAD = 16
+"""Of the image, on the CPU: some take longer than their entries tell."""
 Adjoint = Callable[[Tensor, Tensor | None], Tensor]
 """The backward pass: from the gradients by image and transmittance (None for 0) to those by Gaussian, [N, C + 6 or
 more]: features, conic a b c, x, y, opacity, and what fills up a row."""
@@ -134,14 +135,16 @@ def halvings(alpha_threshold: float) -> int:
     return max(1, math.ceil(math.log2(-math.log(alpha_threshold) / 0.7)))
 
 
-def balanced_pieces(lists: TileLists) -> list[tuple[int, int]]:
-    """Ranges of tiles that hold about the same number of entries each, a few for every thread."""
+def balanced_pieces(lists: TileLists) -> Tensor:
+    """[K + 1] int32: where ranges of tiles begin that hold about the same number of entries each, and where the last
+    one ends."""
     tile_count = lists.ranges.shape[0]
     work = (lists.ranges[:, 1] - lists.ranges[:, 0]).add(16).cumsum(0).double()  # 16: a tile costs something in itself
-    pieces = min(thread_count() * 4, tile_count)
-    goals = torch.arange(1, pieces, dtype=torch.float64) * (float(work[-1]) / pieces)
-    bounds = sorted({0, *torch.searchsorted(work, goals).tolist(), tile_count})
-    return list(pairwise(bounds))
+    pieces = min(thread_count() * PIECES_PER_THREAD, tile_count)
+    goals = torch.arange(pieces + 1, dtype=torch.float64) * (float(work[-1]) / pieces)
+    bounds = torch.searchsorted(work, goals, out_int32=True)
+    bounds[0], bounds[-1] = 0, tile_count
+    return bounds
 
 
 def blend_on_cuda(

@@ -23,7 +23,7 @@ import warp as wp
 from torch import Tensor
 
 from .launching import launch
-from .threads import torch_threads
+from .threads import torch_threads, whole
 
 P = ParamSpec("P")
 
@@ -75,7 +75,7 @@ class Program:
             given = [gradients.get(place) for place in places]
             read = zip(inputs, given, strict=False)
             shared = any(gradient is not None and len(tensor) != dim for tensor, gradient in read)
-            launch(kernel, dim, *kept, gradients=given, ranges=[(0, dim)] if shared and isinstance(dim, int) else None)
+            launch(kernel, dim, *kept, gradients=given, ranges=whole(dim) if shared and isinstance(dim, int) else None)
 
         self.tape.record_func(adjoint, arrays=[])
 
@@ -86,15 +86,17 @@ class Program:
 
 def zeros_for(tensors: Sequence[Tensor], needed: Sequence[bool], leaves: Sequence[bool]) -> list[Tensor | None]:
     """For each tensor that needs a gradient zeros to add it to, for others None. leaves: which of them are leaves."""
-    made: list[Tensor | None] = [None] * len(tensors)
-    wanted = [place for place, need in enumerate(needed) if need]
-    # On a GPU leaves, whose gradients stay, have them in one memory; others' are soon let go, each by itself.
-    together = [p for p in wanted if leaves[p] and tensors[p].device.type != "cpu"]
-    with torch_threads(tensors[0].device):
-        for group in (together, *([p] for p in wanted if p not in together)):
-            for place, zeros in zip(group, _zeros_like([tensors[p] for p in group]), strict=True):
-                made[place] = zeros
-    return made
+    made: dict[int, Tensor] = {}
+    device = tensors[0].device
+    if device.type != "cpu":
+        # Leaves, whose gradients stay, have them in one memory; others' are soon let go, each by itself.
+        kept = [place for place, need in enumerate(needed) if need and leaves[place]]
+        made.update(zip(kept, _zeros_together([tensors[place] for place in kept]), strict=False))
+    with torch_threads(device):
+        for place, need in enumerate(needed):
+            if need and place not in made:
+                made[place] = torch.zeros_like(tensors[place], memory_format=torch.contiguous_format)
+    return [made.get(place) for place in range(len(tensors))]
 
 
 def readable(gradient: Tensor | None) -> Tensor | None:
@@ -104,12 +106,12 @@ def readable(gradient: Tensor | None) -> Tensor | None:
     return gradient.contiguous()
 
 
-def _zeros_like(tensors: list[Tensor]) -> list[Tensor]:
-    """Contiguous zeros of the tensors' shapes; where all are of one type and contiguous in one memory, filled by a
-    single launch."""
-    together = len({tensor.dtype for tensor in tensors}) == 1 and all(tensor.is_contiguous() for tensor in tensors)
-    if len(tensors) < 2 or not together:
-        return [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in tensors]
+def _zeros_together(tensors: list[Tensor]) -> list[Tensor]:
+    """Zeros of the tensors' shapes, filled by a single launch; none where they are not several of one type, each
+    contiguous."""
+    alike = len({tensor.dtype for tensor in tensors}) == 1 and all(tensor.is_contiguous() for tensor in tensors)
+    if len(tensors) < 2 or not alike:
+        return []
     # Each starts at a multiple of 64 numbers, as memory of its own would.
     rooms = [-(-tensor.numel() // 64) * 64 for tensor in tensors]
     whole, starts = tensors[0].new_zeros(sum(rooms)), accumulate(rooms, initial=0)

@@ -73,10 +73,9 @@ def whole_number(name: str, value: Any, least: int, most: int) -> int:
     return number
 
 
-@torch.no_grad()
 def check_opacities(opacities: Tensor) -> None:
     """Raises ValueError for opacities on the CPU that are finite and outside of [0, 1]."""
     if opacities.device.type == "cpu" and opacities.numel():
-        low, high = (float(value) for value in opacities.aminmax())
+        low, high = (float(value) for value in opacities.detach().aminmax())
         if -math.inf < low < -1e-6 or math.inf > high > 1 + 1e-6:
             raise ValueError(f"opacities are from {low:g} to {high:g}, expected 0 to 1; give logits through a sigmoid")

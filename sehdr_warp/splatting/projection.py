@@ -8,6 +8,7 @@ from torch import Tensor
 from ..kernels.project import projection_kernel
 from .bridge import readable, zeros_for
 from .launching import launch, warp_scalar
+from .threads import whole
 
 
 def project(
@@ -79,6 +80,6 @@ class _Projection(torch.autograd.Function):
         count, unread = given[0].shape[0], (None,) * len(upstream)
         gradients = *made, *(None,) * len(numbers), *map(readable, upstream)
         # All Gaussians add to the camera's gradients: on the CPU one thread must.
-        alone = [(0, count)] if any(needed[4:]) else None
+        alone = whole(count) if any(needed[4:]) else None
         launch(kernel, count, *given, *numbers, *unread, gradients=gradients, ranges=alone)
         return None, *made

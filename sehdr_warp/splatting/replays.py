@@ -98,7 +98,9 @@ class _Recording:
 
         def count():
             records, counts = pack_records(means2d, conics, opacities, extents, threshold, width, height, features)
-            return records, number_entries(counts, depths, extents, emission=False)
+            numbered = number_entries(counts, depths, extents, emission=False)
+            self._pairs.copy_(numbered[1][-1:], non_blocking=True)
+            return records, numbered
 
         def draw(records, numbered, room: int) -> Adjoint:
             order, ends = numbered
@@ -113,7 +115,6 @@ class _Recording:
             draw(records, numbered, self.room)
             del records, numbered
         records, numbered = self._counter.record(None, count)
-        self._total = numbered[1][-1:]
         self.adjoint: Adjoint = self._drawer.record(None, lambda: draw(records, numbered, self.room))
         """Of the picture played last; one launch, which needs no recording."""
 
@@ -121,7 +122,6 @@ class _Recording:
         """Image, transmittance and the number of pairs, of which those beyond the room are not drawn."""
         torch._foreach_copy_(list(self._given), list(given))  # pyright: ignore[reportPrivateImportUsage]
         self._counter.replay()
-        self._pairs.copy_(self._total, non_blocking=True)
         self._counted.record(self._stream)
         self._drawer.replay()
         drawn = [self._image, self._transmittance, self._given.extents]

@@ -162,7 +162,7 @@ class _Blend(torch.autograd.Function):
             *(lists.ranges, lists.gaussians, lists.directions.view(-1, 3), *drawn, *ctx.frame),
             *(transmittance, ends, places, by_image.contiguous().view(-1, channels), by_transmittance.contiguous()),
             rows,
-            ranges=[(first * _PIXELS, last * _PIXELS) for first, last in even_ranges(ctx.pixels // _PIXELS, 1)],
+            ranges=even_ranges(ctx.pixels // _PIXELS, 1) * _PIXELS,
         )
         if emission is not None:
             rows = gather_by_gaussian(emission, rows)

@@ -1,107 +1,109 @@
 """Warp's CPU launches spread over threads.
 
-Warp runs a CPU kernel as one serial loop and releases the interpreter's lock while it does, so independent ranges of
-one launch run side by side from a thread pool (launching.py). No range writes what another writes, so results do not
-depend on the number of threads.
+Warp runs a CPU kernel as one serial loop, so independent ranges of one launch run side by side, on the OpenMP threads
+that torch has, with nothing of it in the interpreter (kernels/shared_ranges.py). No range writes what another writes,
+so results do not depend on the number of threads.
 """
 
-import threading
-from collections.abc import Callable, Iterable, Iterator
+import ctypes
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from itertools import pairwise
-from queue import SimpleQueue
+from functools import cache, lru_cache
+from pathlib import Path
 from typing import Any
 
 import torch
+import warp as wp
+from torch import Tensor
 
+from ..kernels import shared_ranges
 from ..parallel import thread_count
+from .loading import recorded_launch
 
-# Calls that wait for a thread, and how many threads wait for calls. A thread pool's futures would cost a launch on 16
-# threads a millisecond, all of it with the interpreter's lock.
-_calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
-_started = 0
-_starting = threading.Lock()
+RANGES_PER_THREAD = 8
+"""Threads do not end together: whoever is done earlier takes another one."""
 
 
-def run_parallel(task: Callable[[Any], object], items: Iterable[Any]) -> None:
-    """Call task(item) for every item, on this thread and helpers, and return when all are done.
+def share(function: Any, bounds: ctypes.Structure, structures: Sequence[ctypes.Structure], ranges: Tensor) -> None:
+    """Run a compiled kernel of the CPU over ranges, from each of [K] int32 up to the next; returns when all are done.
 
-    An exception ends its thread's share; those at work finish the rest, then one of the exceptions is raised here. A
-    task may itself call run_parallel.
-    """
-    items = list(items)
-    helpers = min(thread_count(), len(items)) - 1
-    pending = iter(items)  # advancing a list's iterator is atomic under the interpreter's lock, as is list.pop()
+    bounds: Warp's, of one dimension; structures: the parameters, beginning with where a range begins, and for an
+    adjoint their gradients."""
+    size, places = ctypes.sizeof(structures[0]), [ctypes.addressof(part) for part in structures]
+    if size > shared_ranges.LARGEST:
+        raise ValueError(f"a kernel has {size} bytes of parameters; ranges are shared with {shared_ranges.LARGEST}")
+    count, threads = len(ranges) - 1, thread_count()
+    kernel = ctypes.cast(function, ctypes.c_void_p)
+    given, gradients = (*places, 0)[:2]
+    work = shared_ranges.Work(kernel, ctypes.addressof(bounds), given, gradients, size, ranges.data_ptr(), count)
+    once = _share_ranges()
 
-    def work() -> None:
-        for item in pending:
-            task(item)
+    def take_part(fork: int = 0) -> None:
+        arguments = shared_ranges.Arguments(ctypes.addressof(work), fork, threads)
+        once.hooks.forward(ctypes.byref(once.params[0]), ctypes.byref(arguments))
 
-    if helpers < 1:
-        work()
-        return
-    leave, ended = [None] * helpers, SimpleQueue()
-
-    def help_out() -> None:
+    if min(count, threads) < 2:
+        take_part()
+    elif fork := _fork():
+        take_part(fork)
+    else:
+        helpers = [_helpers(threads - 1).submit(take_part) for _ in range(threads - 1)]
         try:
-            leave.pop()
-        except IndexError:  # All is done.
-            return
-        error = None
+            take_part()
+        finally:
+            # No thread may still be at work when the caller goes on; one that has not begun finds nothing left to do.
+            wait([helper for helper in helpers if not helper.cancel()])
+
+
+@cache
+def _share_ranges() -> Any:
+    """share_ranges() as Warp launches it once."""
+    return recorded_launch(shared_ranges.share_ranges, 1, [0, 0, 0], wp.get_device("cpu"))
+
+
+@cache
+def _fork() -> int:
+    """The place of GOMP_parallel() in the OpenMP library that torch has loaded; 0 where there is none, as on Windows.
+    Other libraries than GNU's have it too, for its sake."""
+    for library in (Path(torch.__file__).parent / "lib").glob("libtorch_cpu.*"):
         try:
-            work()
-        except BaseException as raised:  # noqa: BLE001 - the caller's thread raises it
-            error = raised
-        ended.put(error)
-
-    begun = helpers
-    try:
-        _start(helpers)
-        for _ in range(helpers):
-            _calls.put(help_out)
-        work()
-    finally:
-        # No thread may still be at work when the caller goes on. A helper that has not begun finds nothing left to do,
-        # and where this is itself a helper, to wait for it could be to wait for oneself.
-        while leave:
-            try:
-                leave.pop()
-                begun -= 1
-            except IndexError:  # The last one has just begun.
-                break
-        errors = [ended.get() for _ in range(begun)]
-    for error in filter(None, errors):
-        raise error
+            return ctypes.cast(ctypes.CDLL(str(library)).GOMP_parallel, ctypes.c_void_p).value or 0
+        except (OSError, AttributeError):
+            continue
+    return 0
 
 
-def _start(count: int) -> None:
-    """As many threads that wait for calls, at least."""
-    global _started
-    with _starting:
-        for number in range(_started, count):
-            threading.Thread(target=_wait_for_calls, name=f"sehdr-warp {number}", daemon=True).start()
-        _started = max(_started, count)
+@cache
+def _helpers(count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count, thread_name_prefix="sehdr-warp")
 
 
-def _wait_for_calls() -> None:
-    while True:
-        _calls.get()()
+def even_ranges(count: int, smallest: int = 1024) -> Tensor:
+    """[K + 1] int32: where ranges begin that cover `count` items, and where the last one ends. A few for each thread,
+    each of at least `smallest` items, or else one."""
+    return _even_ranges(count, max(1, min(thread_count() * RANGES_PER_THREAD, count // smallest)))
 
 
-def even_ranges(count: int, smallest: int = 1024) -> list[tuple[int, int]]:
-    """[first, last) ranges that cover `count` items, two for each thread; one, or each of at least `smallest`: to begin
-    one takes the interpreter's lock, for which all threads wait."""
-    pieces = max(1, min(thread_count() * 2, count // smallest))
-    bounds = [count * k // pieces for k in range(pieces + 1)]
-    return [(a, b) for a, b in pairwise(bounds) if b > a]
+def whole(count: int) -> Tensor:
+    """The one range of all `count` items, for what one thread must do."""
+    return _even_ranges(count, 1)
+
+
+@lru_cache
+def _even_ranges(count: int, pieces: int) -> Tensor:
+    return torch.arange(pieces + 1).mul(count).div(pieces, rounding_mode="floor").int()
 
 
 @contextmanager
 def torch_threads(device: torch.device) -> Iterator[None]:
     """torch on all threads of the CPU too, where there are some: for what no thread's share decides, each number by
     itself and no sums."""
+    if device.type != "cpu":
+        yield
+        return
     before, count = torch.get_num_threads(), thread_count()
-    if device.type != "cpu" or count <= max(before, 3):
+    if count <= max(before, 3):
         yield
         return
     torch.set_num_threads(count)

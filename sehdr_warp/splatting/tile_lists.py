@@ -233,7 +233,7 @@ def _count_by_tile(tiles, gaussians, entry_count: int, tile_count: int, emission
     tiles, gaussians = tiles[:entry_count], gaussians[:entry_count]
     chunks = max(1, min(2 * thread_count(), entry_count // SMALLEST_CHUNK))
     counts = torch.zeros(chunks, tile_count + 1, dtype=torch.int32)
-    size, spans = -(-entry_count // chunks), [(chunk, chunk + 1) for chunk in range(chunks)]
+    size, spans = -(-entry_count // chunks), torch.arange(chunks + 1, dtype=torch.int32)
     launch(kernels.count_tiles, chunks, tiles, size, counts, ranges=spans)
     by_tile = counts.t().reshape(-1)
     starts = (by_tile.cumsum(0) - by_tile).int().view(tile_count + 1, chunks).t().contiguous()

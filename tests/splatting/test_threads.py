@@ -1,11 +1,20 @@
-"""Work spread over threads: all of it is done once, whoever asks, and exceptions come back."""
+"""A launch's ranges on the threads of a CPU: each is done once, whoever asks, with OpenMP and without."""
 
 import threading
-import time
+from itertools import pairwise
 
 import pytest
+import torch
+import warp as wp
 
 from sehdr_warp.splatting import threads
+from sehdr_warp.splatting.launching import launch
+
+
+@wp.kernel(enable_backward=True)
+def add_squares(first: int, values: wp.array[float], sums: wp.array[float]):
+    i = first + wp.tid()
+    sums[i] += values[i] * values[i]
 
 
 @pytest.fixture(autouse=True)
@@ -13,55 +22,69 @@ def three_threads(monkeypatch):
     monkeypatch.setenv("SEHDR_THREADS", "3")
 
 
-def finishes(task) -> bool:
-    """Whether task() returns within seconds; a dead-lock must not hold up the tests."""
-    thread = threading.Thread(target=task, daemon=True)
-    thread.start()
-    thread.join(20)
-    return not thread.is_alive()
+@pytest.fixture(params=["OpenMP", "helpers"])
+def means(request, monkeypatch):
+    """How threads are had: torch's OpenMP, where it has one, or helpers of our own."""
+    if request.param == "helpers":
+        monkeypatch.setattr(threads, "_fork", lambda: 0)
+    elif not threads._fork():
+        pytest.skip("torch has no OpenMP here")
 
 
-def test_a_task_may_spread_its_own_work():
-    done = []
-
-    def outer(i):
-        threads.run_parallel(lambda j: done.append((i, j)), range(6))
-
-    assert finishes(lambda: threads.run_parallel(outer, range(8)))
-    assert sorted(done) == [(i, j) for i in range(8) for j in range(6)]
+def squares(count: int, ranges: torch.Tensor | None = None) -> bool:
+    """Whether each of `count` values is squared once."""
+    values, sums = torch.arange(count).float(), torch.zeros(count)
+    launch(add_squares, count, values, sums, ranges=ranges, smallest=1)
+    return torch.equal(sums, values * values)
 
 
-def test_several_threads_may_spread_work_at_once():
-    done = []
-    callers = [
-        threading.Thread(target=lambda: threads.run_parallel(done.append, range(50)), daemon=True) for _ in range(4)
-    ]
+@pytest.mark.parametrize("count", [1, 2, 5, 1000])
+def test_every_item_is_done_once(means, count):
+    assert all(squares(count) for _ in range(50))
+
+
+def test_more_ranges_than_threads_and_empty_ones(means):
+    assert squares(100, torch.tensor([0, 0, 1, 1, 1, 7, 50, 50, 99, 100, 100], dtype=torch.int32))
+
+
+def test_adjoints_are_shared_too(means):
+    values, sums = torch.arange(3000).float(), torch.zeros(3000)
+    by_values = torch.zeros(3000)
+    gradients = [by_values, torch.ones(3000)]
+    launch(add_squares, 3000, values, sums, gradients=gradients, smallest=1)
+    assert torch.equal(by_values, 2 * values)
+
+
+def test_more_threads_than_processors(means, monkeypatch):
+    monkeypatch.setenv("SEHDR_THREADS", "16")
+    assert all(squares(10_000) for _ in range(50))
+
+
+def test_several_threads_may_share_at_once(means):
+    right = []
+    callers = [threading.Thread(target=lambda: right.append([squares(500) for _ in range(50)])) for _ in range(4)]
     for caller in callers:
         caller.start()
     for caller in callers:
-        caller.join(20)
-    assert sorted(done) == sorted(list(range(50)) * 4)
+        caller.join(60)
+    assert right == [[True] * 50] * 4
 
 
-@pytest.mark.parametrize(("guilty", "left"), [("caller", 9), ("helpers", 8)])
-def test_an_exception_comes_back_after_the_rest_is_done(guilty, left):
-    done, together, caller = [], threading.Barrier(3), threading.get_ident()
-
-    def task(i):
-        if i < 3:  # one for each thread
-            together.wait(20)
-        if (threading.get_ident() == caller) == (guilty == "caller"):
-            raise KeyError("the task's own")
-        time.sleep(0.01)
-        done.append(i)
-
-    with pytest.raises(KeyError, match="the task's own"):
-        threads.run_parallel(task, range(10))
-    assert len(done) == left
+def test_a_kernel_of_too_many_parameters_is_refused(monkeypatch):
+    monkeypatch.setattr(threads.shared_ranges, "LARGEST", 64)
+    with pytest.raises(ValueError, match="bytes of parameters; ranges are shared with 64"):
+        squares(10)
 
 
 @pytest.mark.parametrize("count", [0, 1, 1023, 1024, 2049, 20_000, 100_000])
 def test_ranges_cover_every_item_once(count):
-    ranges = threads.even_ranges(count)
-    assert [i for first, last in ranges for i in range(first, last)] == list(range(count))
-    assert len(ranges) <= 1 or min(last - first for first, last in ranges) >= 1024
+    ranges = threads.even_ranges(count).tolist()
+    assert ranges[0] == 0
+    assert ranges[-1] == count
+    assert ranges == sorted(ranges)
+    assert len(ranges) <= 2 or min(b - a for a, b in pairwise(ranges)) >= 1024
+
+
+def test_many_items_make_ranges_for_all_threads():
+    assert len(threads.even_ranges(1 << 20)) - 1 == 3 * threads.RANGES_PER_THREAD
+    assert len(threads.whole(1 << 20)) == 2

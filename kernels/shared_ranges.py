@@ -1,0 +1,76 @@
+"""A launch's ranges worked through by a team of threads on the CPU, with nothing of it in the interpreter.
+
+Work names a CPU kernel and its packed parameters, which begin with `first`, and the ranges that are to be done. Each
+thread of the team keeps parameters of its own and takes the next range until none is left. The team is OpenMP's, as
+torch has loaded it; without one whoever calls is a team of one, and callers may come together.
+"""
+
+import ctypes
+
+import warp as wp
+
+LARGEST = 4096
+"""Bytes of a kernel's parameters."""
+
+
+class Work(ctypes.Structure):
+    """Places in memory: the compiled kernel, its bounds (of one dimension), its parameters and for an adjoint their
+    gradients, else 0; bytes of the parameters; count of ranges, which
+    begin at each of [count + 1] int32 and end at the next; the next one that nobody has."""
+
+    _fields_ = (
+        ("kernel", ctypes.c_void_p), ("bounds", ctypes.c_void_p), ("given", ctypes.c_void_p),
+        ("gradients", ctypes.c_void_p), ("size", ctypes.c_uint64), ("ranges", ctypes.c_void_p),
+        ("count", ctypes.c_int64), ("next", ctypes.c_int64),
+    )  # fmt: skip
+
+
+class Arguments(ctypes.Structure):
+    """share_ranges()'s, as Warp packs them."""
+
+    _fields_ = ("work", ctypes.c_uint64), ("fork", ctypes.c_uint64), ("threads", ctypes.c_int32)
+
+
+SHARE = f"""
+    struct Work {{
+        void *kernel, *bounds, *given, *gradients;
+        uint64_t size;
+        const int32_t* ranges;
+        int64_t count, next;
+    }};
+    auto take_part = [](void* told) {{
+        typedef wp::launch_bounds_t<1> Bounds;
+        Work& work = *(Work*)told;
+        alignas(16) char given[{LARGEST}];
+        __builtin_memcpy(given, work.given, work.size);
+        Bounds bounds = *(Bounds*)work.bounds;
+        for (;;) {{
+            const int64_t taken = __atomic_fetch_add(&work.next, 1, __ATOMIC_RELAXED);
+            if (taken >= work.count)
+                return;
+            const int32_t first = work.ranges[taken], count = work.ranges[taken + 1] - first;
+            *(int32_t*)given = first;
+            bounds.shape[0] = count;
+            bounds.size = count;
+            if (work.gradients)
+                ((void (*)(Bounds*, void*, void*))work.kernel)(&bounds, given, work.gradients);
+            else
+                ((void (*)(Bounds*, void*))work.kernel)(&bounds, given);
+        }}
+    }};
+    typedef void (*Fork)(void (*)(void*), void*, unsigned, unsigned);
+    if (fork)
+        ((Fork)fork)(take_part, (void*)work, threads, 0);
+    else
+        take_part((void*)work);
+"""
+
+
+@wp.func_native(SHARE)
+def share(work: wp.uint64, fork: wp.uint64, threads: wp.int32): ...
+
+
+@wp.kernel(enable_backward=False)
+def share_ranges(work: wp.uint64, fork: wp.uint64, threads: wp.int32):
+    """Does what the Work at a place in memory tells. fork: of GOMP_parallel(), or 0."""
+    share(work, fork, threads)
