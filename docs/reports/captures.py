@@ -75,8 +75,8 @@ def compare(
     rows, response = [], choose_response(scene, config)
 
     def add(method: str, render, count: int, seconds: float) -> None:
-        figures = [_figures(render(view), view, response, metric, device) for view in scene.test_views]
-        means = {name: float(np.mean([row[name] for row in figures])) for name in figures[0]}
+        seen = [figures(render(view), view, response, metric, device) for view in scene.test_views]
+        means = {name: float(np.mean([row[name] for row in seen])) for name in seen[0]}
         memory = torch.cuda.max_memory_allocated(device)
         rows.append(place | {"method": method, "gaussians": count, "seconds": seconds, "memory": memory} | means)
         LOG.info("%s", rows[-1])
@@ -110,14 +110,15 @@ def photographed(run: Run, view: View) -> torch.Tensor:
 
 
 @torch.no_grad()
-def _figures(image, view: View, response: Response, metric, device) -> dict[str, float]:
+def figures(image, view: View, response: Response, metric, device) -> dict[str, float]:
+    """Of an image [H, W, 3], encoded, beside a photo."""
     photo, mask = _photo(view, device)
     image = torch.lerp(photo, image.float().clamp(0, 1), mask[..., None])
-    figures = {"psnr": psnr(image, photo, mask), "ssim": ssim(image, photo, mask)}
+    found = {"psnr": psnr(image, photo, mask), "ssim": ssim(image, photo, mask)}
     light = response.decode(image)
     exposed = (torch.lerp(photo, response.encode(light * 2**stops), mask[..., None]) for stops in STOPS)
-    figures["psnr_fitted"] = max(psnr(shown.clamp(0, 1), photo, mask) for shown in exposed)
-    return figures | ({"lpips": metric(image, photo)} if metric else {})
+    found["psnr_fitted"] = max(psnr(shown.clamp(0, 1), photo, mask) for shown in exposed)
+    return found | ({"lpips": metric(image, photo)} if metric else {})
 
 
 def _photo(view: View, device) -> tuple[torch.Tensor, torch.Tensor]:
@@ -127,8 +128,9 @@ def _photo(view: View, device) -> tuple[torch.Tensor, torch.Tensor]:
     return photo, mask.float()
 
 
-class _Gsplat:
-    """Gaussians as gsplat's examples hold them, and their render."""
+class Gsplat:
+    """Gaussians as gsplat's examples hold them, and their render. loop_seconds: of their training, without its
+    start."""
 
     def __init__(self, start: Gaussians, device: str) -> None:
         tensors = {
@@ -141,7 +143,7 @@ class _Gsplat:
         }
         self.splats = torch.nn.ParameterDict({k: torch.nn.Parameter(v.detach().to(device)) for k, v in tensors.items()})
         self.device = device
-        self.degree = 3
+        self.degree, self.loop_seconds = 3, 0.0
 
     def count(self) -> int:
         return len(self.splats["means"])
@@ -166,7 +168,7 @@ class _Gsplat:
         return self.render(view.camera, self.degree)[0]
 
 
-def train_gsplat(scene: Scene, strategy: str, config, budget: int, device: str) -> _Gsplat:
+def train_gsplat(scene: Scene, strategy: str, config, budget: int, device: str) -> Gsplat:
     """Trains as simple_trainer.py's `default` and `mcmc` do, from the points that our training starts from."""
     from gsplat import DefaultStrategy, MCMCStrategy  # pyright: ignore[reportMissingImports]
 
@@ -175,7 +177,7 @@ def train_gsplat(scene: Scene, strategy: str, config, budget: int, device: str) 
     points, colors = start_points(scene, config, matcher, rng)
     points, colors = (torch.tensor(values, dtype=torch.float32) for values in (points, colors))
     opacity, scale = (0.5, 0.1) if strategy == "mcmc" else (0.1, 1.0)
-    model = _Gsplat(Gaussians.from_points(points, colors - 0.5, 3, opacity=opacity, scale=scale), device)
+    model = Gsplat(Gaussians.from_points(points, colors - 0.5, 3, opacity=opacity, scale=scale), device)
     extent, iterations = scene_extent(scene), config.schedule.iterations
 
     def scaled(step: int) -> int:
@@ -193,17 +195,21 @@ def train_gsplat(scene: Scene, strategy: str, config, budget: int, device: str) 
         rule = DefaultStrategy(refine_stop_iter=scaled(15_000), reset_every=scaled(3000), **steps)
         state = rule.initialize_state(scene_scale=extent)
     rule.check_sanity(model.splats, adam)
-    photos = [_photo(view, device) for view in scene.train_views]
-    order = torch.randperm(len(photos)).tolist()
+    views = scene.train_views
+    codes = [torch.tensor(view.codes, device=device) for view in views]
+    masks = [None if view.mask is None else torch.tensor(view.mask, device=device)[..., None] for view in views]
+    order = torch.randperm(len(views)).tolist()
+    torch.cuda.synchronize(device)
+    started = time.perf_counter()
     for step in range(iterations):
-        if step % len(photos) == 0:
-            order = torch.randperm(len(photos)).tolist()
-        index = order[step % len(photos)]
-        image, info = model.render(scene.train_views[index].camera, min(step // scaled(1000), 3))
+        if step % len(views) == 0:
+            order = torch.randperm(len(views)).tolist()
+        index = order[step % len(views)]
+        image, info = model.render(views[index].camera, min(step // scaled(1000), 3))
         if strategy == "default":
             rule.step_pre_backward(model.splats, adam, state, step, info)
-        photo, mask = photos[index]
-        loss = image_distance(torch.lerp(photo, image, mask[..., None]), photo, 0.8, 0.2)
+        photo, mask = codes[index].float() / views[index].levels, masks[index]
+        loss = image_distance(image if mask is None else torch.lerp(photo, image, mask), photo, 0.8, 0.2)
         if strategy == "mcmc":
             loss = loss + 0.01 * model.splats["opacities"].sigmoid().mean() + 0.01 * model.splats["scales"].exp().mean()
         loss.backward()
@@ -218,6 +224,8 @@ def train_gsplat(scene: Scene, strategy: str, config, budget: int, device: str) 
             if model.count() >= budget:
                 rule.refine_stop_iter = min(rule.refine_stop_iter, step)
             rule.step_post_backward(model.splats, adam, state, step, info, packed=False)
+    torch.cuda.synchronize(device)
+    model.loop_seconds = time.perf_counter() - started
     return model
 
 

@@ -107,6 +107,16 @@ def _scale_tables(result: dict) -> Iterable[str]:
     yield _checks_line(result)
 
 
+def _workers_tables(result: dict) -> Iterable[str]:
+    yield markdown_table(result["rows"], COLUMNS["workers"])
+    if result["checks"]:
+        yield _checks_line(result)
+
+
+def _large_tables(result: dict) -> Iterable[str]:
+    yield markdown_table(result["rows"], COLUMNS["large"])
+
+
 def _checks_line(result: dict) -> str:
     passed = sum(check["passed"] for check in result["checks"])
     return f"{passed} of {len(result['checks'])} correctness checks passed."
@@ -346,6 +356,9 @@ TABLES: dict[str, Callable[[dict], Iterable[str]]] = {
     "kernels": _kernel_tables,
     "step": _step_tables,
     "scale": _scale_tables,
+    "cores": _workers_tables,
+    "gpus": _workers_tables,
+    "large": _large_tables,
     "response": _response_tables,
     "stability": _stability_tables,
     "trust": _trust_tables,

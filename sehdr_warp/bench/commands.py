@@ -87,6 +87,24 @@ class Scale(Timed):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Workers(Timed):
+    """Time training steps on more and more threads of the CPU, or on more and more GPUs."""
+
+    sizes: str | None = None
+    """Gaussians@WIDTHxHEIGHT, separated by commas; by default 1M@1600x1200 on GPUs, 20k@200x200 and 100k@800x800 on the
+    CPU."""
+
+    def measure(self):
+        from .splats import parse_size
+        from .workers import bench_workers
+
+        timing = self.timing()
+        default = {"cuda": "1M@1600x1200", "cpu": "20k@200x200,100k@800x800"}
+        sizes = [parse_size(item) for item in (self.sizes or default[timing["device"].type]).split(",")]
+        return bench_workers(sizes, **timing)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Quality(Output):
     """Train methods on scenes with HDR truth and compare; finished trainings in --out never run again. LPIPS is judged
     where SEHDR_LPIPS names a folder with its weights."""
@@ -169,6 +187,7 @@ class Bench:
         Annotated[Kernels, tyro.conf.subcommand("kernels")]
         | Annotated[Step, tyro.conf.subcommand("step")]
         | Annotated[Scale, tyro.conf.subcommand("scale")]
+        | Annotated[Workers, tyro.conf.subcommand("workers")]
         | Annotated[Quality, tyro.conf.subcommand("quality")]
         | Annotated[Responses, tyro.conf.subcommand("response")]
     )

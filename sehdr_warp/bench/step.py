@@ -15,6 +15,7 @@ from ..training.config import Config
 from ..training.config_files import load_config, override_config
 from ..training.initialization import choose_response, make_field
 from ..training.machine import torch_settings
+from ..training.ranks import Ranks
 from ..training.trainer import Trainer
 from .kernels import OURS, PLAIN_TORCH, REFERENCE_GAUSSIANS
 from .parts import parts_of_step, work_of
@@ -67,9 +68,15 @@ def thick_of_training(config: Config) -> int:
     return -(-(config.scaled(ready) + 1) // every) * every
 
 
-def make_trainer(scene: Scene, config: Config, device: torch.device, rasterizer: Callable | None = None) -> Trainer:
+def make_trainer(
+    scene: Scene,
+    config: Config,
+    device: torch.device,
+    rasterizer: Callable | None = None,
+    ranks: Ranks | None = None,
+) -> Trainer:
     """A trainer in the thick of its training, with opacities spread as training spreads them. rasterizer: in place of
-    ours."""
+    ours. ranks: that train together, each of which makes the same."""
     field = make_field(scene, config, choose_response(scene, config), device)
     field.rasterizer = rasterizer or field.rasterizer
     generator = torch.Generator().manual_seed(config.seed)
@@ -79,7 +86,7 @@ def make_trainer(scene: Scene, config: Config, device: torch.device, rasterizer:
         field.gaussians.opacity_logits.copy_(torch.logit(opacities))
         # Off the surface by part of their size: a training has something to mend.
         field.gaussians.means.add_(0.3 * field.gaussians.log_scales.exp() * jitter.to(device))
-    trainer = Trainer(scene, config, field)
+    trainer = Trainer(scene, config, field, ranks=ranks)
     trainer.iteration = thick_of_training(config)
     return trainer
 
@@ -89,7 +96,7 @@ def step_variant(trainer: Trainer) -> Variant:
     first = thick_of_training(trainer.config)
 
     def between_changes():
-        if trainer.iteration + 1 >= first + trainer.config.scaled(trainer.config.densification.every):
+        if trainer.iteration + trainer.batch >= first + trainer.config.scaled(trainer.config.densification.every):
             trainer.iteration = first
 
     return Variant(trainer.step, prepare=between_changes)
@@ -134,7 +141,7 @@ def _rows(scene: Scene, config: Config, device: torch.device, repetitions: int) 
             row["ours_over_this"] = rows[0]["median_ms"] / row["median_ms"]
         else:
             with torch_settings(config.deterministic):
-                row |= _amortized(trainer)
+                row |= amortized(trainer, trainer.step)
         rows.append(row)
         del trainer
     return rows
@@ -157,15 +164,16 @@ def _plain_torch(*arguments, capacity=None, deterministic=False, **options):
     return rasterize_reference(*arguments, **options)
 
 
-def _amortized(trainer: Trainer) -> dict:
+def amortized(trainer: Trainer, step: Callable[[], object]) -> dict:
     """The mean step over whole densification intervals, changes of the count included."""
     trainer.iteration = thick_of_training(trainer.config) - 1
-    trainer.step()  # the first change prepares what the others use
-    steps = INTERVALS[trainer.device.type] * trainer.config.scaled(trainer.config.densification.every)
+    step()  # the first change prepares what the others use
+    photos = INTERVALS[trainer.device.type] * trainer.config.scaled(trainer.config.densification.every)
+    steps = -(-photos // trainer.batch)
     wait(trainer.device)
     started = time.perf_counter()
     for _ in range(steps):
-        trainer.step()
+        step()
     wait(trainer.device)
     mean = (time.perf_counter() - started) * 1e3 / steps
     return {"amortized_ms": mean, "amortized_steps": steps, "gaussians_after": trainer.field.gaussians.count}

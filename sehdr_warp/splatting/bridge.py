@@ -101,7 +101,9 @@ def zeros_for(tensors: Sequence[Tensor], needed: Sequence[bool], leaves: Sequenc
 
 def readable(gradient: Tensor | None) -> Tensor | None:
     """A gradient as kernels read it: any rows, but a vector in one piece."""
-    if gradient is None or gradient.ndim < 2 or gradient.is_contiguous() or gradient[0].is_contiguous():
+    if gradient is None or gradient.ndim < 2 or gradient.is_contiguous():
+        return gradient
+    if gradient.stride(1) == 1 if gradient.ndim == 2 else gradient[0].is_contiguous():
         return gradient
     return gradient.contiguous()
 
