@@ -9,6 +9,8 @@ import ctypes
 
 import warp as wp
 
+from .constants import FORWARD
+
 LARGEST = 4096
 """Bytes of a kernel's parameters."""
 
@@ -70,7 +72,7 @@ SHARE = f"""
 def share(work: wp.uint64, fork: wp.uint64, threads: wp.int32): ...
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(module="unique", module_options=FORWARD)
 def share_ranges(work: wp.uint64, fork: wp.uint64, threads: wp.int32):
     """Does what the Work at a place in memory tells. fork: of GOMP_parallel(), or 0."""
     share(work, fork, threads)

@@ -16,6 +16,7 @@ from ..kernels import (
     plane_sweep,
     plane_sweep_cpu,
     relocation,
+    shared_ranges,
     ssim,
     tiles,
     training_step,
@@ -40,7 +41,7 @@ def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
     kind = real, channels, halvings(ALPHA_THRESHOLD)
     blend = [] if channels is None else [blend_cpu.backward_kernel(*kind), blend_cpu.forward_kernel(*kind)]
     return [
-        *(plane_sweep_cpu.sweep_rows, plane_sweep.trust_depths, plane_sweep.place_matches),
+        *(shared_ranges.share_ranges, plane_sweep_cpu.sweep_rows, plane_sweep.trust_depths, plane_sweep.place_matches),
         *(*blend, projection_kernel(real, antialiased), distance.compare),
         *(harmonics.harmonics_kernel(real, 0), lists.pack_records, lists.key_by_depth, lists.emit_entries),
         *(tiles.count_tiles, tiles.place_entries, distance.blur_columns, distance.blur_derivatives, distance.gradient),
