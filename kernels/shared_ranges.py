@@ -16,9 +16,9 @@ LARGEST = 4096
 
 
 class Work(ctypes.Structure):
-    """Places in memory: the compiled kernel, its bounds (of one dimension), its parameters and for an adjoint their
-    gradients, else 0; bytes of the parameters; count of ranges, which
-    begin at each of [count + 1] int32 and end at the next; the next one that nobody has."""
+    """kernel, bounds, given, gradients: places of the compiled kernel, Warp's bounds of one dimension, the parameters,
+    and for an adjoint their gradients, else 0. size: of the parameters, bytes. ranges: place of [count + 1] int32, of
+    which each is where a range begins and the one before ends. next: the first range that nobody has."""
 
     _fields_ = (
         ("kernel", ctypes.c_void_p), ("bounds", ctypes.c_void_p), ("given", ctypes.c_void_p),

@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 import torch.multiprocessing as processes
 
+from ..errors import SehdrError
 from ..files import read_json, write_json
 from ..parallel import thread_count
 from ..training.config import Config
@@ -28,7 +29,6 @@ WARM_UP = 20
 """Steps of GPUs that are not timed: launched, recorded, and some replayed."""
 STEPS = 10
 """For each repetition asked for, of GPUs: one after the other without a pause, as in a training."""
-
 BOUND = 1e-12
 """Of what losses on threads may differ: by less than float32 can tell."""
 
@@ -75,7 +75,11 @@ def time_ranks(size: Size, count: int, device_type: str, repetitions: int) -> di
     """Times by photo of steps on so many devices, each with a process of its own."""
     with tempfile.TemporaryDirectory(prefix="sehdr-warp-") as folder:
         arguments = count, Path(folder), size, device_type, repetitions
-        processes.start_processes(_rank, arguments, count, start_method="spawn")
+        try:
+            processes.start_processes(_rank, arguments, count, start_method="spawn")
+        except (processes.ProcessRaisedException, processes.ProcessExitedException) as error:
+            reason = str(error).strip().splitlines()[-1]
+            raise SehdrError(f"a training of {size} by {count} processes ended early: {reason}") from error
         return read_json(Path(folder) / "timing.json")
 
 

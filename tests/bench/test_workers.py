@@ -6,6 +6,7 @@ import pytest
 
 from sehdr_warp.bench import workers
 from sehdr_warp.bench.splats import Size
+from sehdr_warp.errors import SehdrError
 
 from ..refusals import call
 
@@ -37,6 +38,11 @@ def test_ranks_are_timed_by_photo(monkeypatch, count):
     timing = workers.time_ranks(Size(300, 40, 32), count, "cpu", 1)
     assert timing["photo_ms"] > 0 and timing["amortized_ms"] > 0
     assert timing["repetitions"] == workers.STEPS
+
+
+def test_what_ends_a_process_is_told_in_a_line():
+    with pytest.raises(SehdrError, match="a training of .* by 1 processes ended early: .*nosuch"):
+        workers.time_ranks(Size(300, 40, 32), 1, "nosuch", 1)
 
 
 def test_counts_double_up_to_what_there_is():
