@@ -39,6 +39,7 @@ from sehdr_warp.training.train import train
 
 LOG = logging.getLogger("captures")
 STRATEGIES = ("default", "mcmc")
+WARM_UP = 5
 STOPS = np.linspace(-1, 1, 41).tolist()  # Of exposures that are tried
 
 
@@ -129,8 +130,8 @@ def _photo(view: View, device) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 class Gsplat:
-    """Gaussians as gsplat's examples hold them, and their render. loop_seconds: of their training, without its
-    start."""
+    """Gaussians as gsplat's examples hold them, and their render. loop_seconds: of their training's steps but
+    for the first part of WARM_UP."""
 
     def __init__(self, start: Gaussians, device: str) -> None:
         tensors = {
@@ -199,9 +200,11 @@ def train_gsplat(scene: Scene, strategy: str, config, budget: int, device: str) 
     codes = [torch.tensor(view.codes, device=device) for view in views]
     masks = [None if view.mask is None else torch.tensor(view.mask, device=device)[..., None] for view in views]
     order = torch.randperm(len(views)).tolist()
-    torch.cuda.synchronize(device)
-    started = time.perf_counter()
+    started = 0.0
     for step in range(iterations):
+        if step == iterations // WARM_UP:
+            torch.cuda.synchronize(device)
+            started = time.perf_counter()
         if step % len(views) == 0:
             order = torch.randperm(len(views)).tolist()
         index = order[step % len(views)]

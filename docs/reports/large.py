@@ -10,16 +10,17 @@ import logging
 import shutil
 import tempfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 import tyro
-from captures import figures, photographed, train_gsplat
+from captures import WARM_UP, figures, photographed, train_gsplat
 
 from sehdr_warp.bench.results import finish, new_result
 from sehdr_warp.bench.splats import Size, make_photo_scene, parse_size
-from sehdr_warp.bench.timing import forget_peaks, held_memory
+from sehdr_warp.bench.timing import forget_peaks, held_memory, wait
 from sehdr_warp.scene import Scene
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.train import Training
@@ -49,7 +50,12 @@ def compare(size: Size, photos: int, iterations: int, device: str = "cuda:0") ->
     rows: list[dict] = []
 
     def add(method: str, render, count: int, seconds: float, memory: int) -> None:
-        row = place | {"method": method, "gaussians": count, "step_ms": seconds * 1e3 / iterations, "memory": memory}
+        row = place | {
+            "method": method,
+            "gaussians": count,
+            "step_ms": seconds * 1e3 / (iterations - iterations // WARM_UP),
+            "memory": memory,
+        }
         seen = [figures(render(view), view, run.model.response, None, device) for view in scene.test_views]
         row |= {name: float(np.mean([each[name] for each in seen])) for name in ("psnr", "ssim")}
         rows.append(row | {"over_ours": row["step_ms"] / rows[0]["step_ms"] if rows else 1.0})
@@ -58,12 +64,15 @@ def compare(size: Size, photos: int, iterations: int, device: str = "cuda:0") ->
     forget_peaks(torch.device(device))
     scratch = Path(tempfile.mkdtemp())
     training = Training(scene, scratch / "run", config, device=device)
-    begun = training.seconds
-    memory = 0
-    for _ in training:
-        memory = held_memory(torch.device(device)) or 0
+    begun, memory = 0.0, 0
+    for step in training:
+        if step.iteration == iterations // WARM_UP:
+            training.timed(partial(wait, training.device))
+            begun = training.seconds
+        memory = held_memory(training.device) or 0
     run = training.run
     add("sehdr-warp", lambda view: photographed(run, view), run.gaussian_count, training.seconds - begun, memory)
+    rows[0]["tests"] = [[line["iteration"], line["psnr_ldr"]] for line in training.folder.read_metrics()]
     shutil.rmtree(scratch)
     del training
     forget_peaks(torch.device(device))

@@ -10,6 +10,7 @@ import warp as wp
 from sehdr_warp.bench.splats import Size, make_photo_scene
 from sehdr_warp.bench.step import make_trainer
 from sehdr_warp.kernels.plane_sweep_cpu import sweep_rows
+from sehdr_warp.kernels.shared_ranges import share_ranges
 from sehdr_warp.splatting import ahead, launching
 from sehdr_warp.training.config_files import load_config
 
@@ -61,6 +62,6 @@ def test_a_training_launches_what_was_compiled_ahead():
     for iteration in (0, changing):  # The first step, and one that changes the Gaussians
         trainer.iteration = iteration
         trainer.step()
-    launched = {kernel for kernel, *_ in launching._of_thread.launches} | {sweep_rows}
+    launched = {kernel for kernel, *_ in launching._of_thread.launches} | {sweep_rows, share_ranges}
     assert launched.issuperset(ahead.training_kernels(3, antialiased=False))
     assert launched.issuperset(ahead.training_kernels(None, antialiased=False))
