@@ -72,9 +72,9 @@ def prepare() -> None:
 
 
 def calm_threads() -> None:
-    """OpenMP's threads, torch's and ours, spin no longer for work than from one launch of a step to the next: as long
-    as they do by themselves, on a processor shared with other programs, costs a training most of its time. Read once,
-    when torch is loaded."""
+    """Has OpenMP's threads, torch's and ours, wait awake for no longer than from one launch to the next. By themselves
+    they wait so long that a training on a processor shared with other programs takes most of its time for it. Before
+    torch is loaded."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 

@@ -39,7 +39,7 @@ from sehdr_warp.training.train import train
 
 LOG = logging.getLogger("captures")
 STRATEGIES = ("default", "mcmc")
-WARM_UP = 5
+WARM_UP = 5  # Of so many parts of a training the first is not in loop_seconds: kernels load, photos are matched
 STOPS = np.linspace(-1, 1, 41).tolist()  # Of exposures that are tried
 
 
@@ -130,8 +130,8 @@ def _photo(view: View, device) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 class Gsplat:
-    """Gaussians as gsplat's examples hold them, and their render. loop_seconds: of their training's steps but
-    for the first part of WARM_UP."""
+    """Gaussians as gsplat's examples hold them, and their render. loop_seconds: of all but the first steps of
+    their training."""
 
     def __init__(self, start: Gaussians, device: str) -> None:
         tensors = {

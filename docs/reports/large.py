@@ -9,6 +9,7 @@ for both. gsplat (1.5.3) is trained as in captures.py.
 import logging
 import shutil
 import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,11 +22,14 @@ from captures import WARM_UP, figures, photographed, train_gsplat
 from sehdr_warp.bench.results import finish, new_result
 from sehdr_warp.bench.splats import Size, make_photo_scene, parse_size
 from sehdr_warp.bench.timing import forget_peaks, held_memory, wait
+from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Scene
+from sehdr_warp.training.config import Config
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.train import Training
 
 LOG = logging.getLogger("large")
+RESPONSE = "srgb"
 HELD_OUT = 8
 """Of so many photos one is held out."""
 
@@ -43,44 +47,47 @@ def compare(size: Size, photos: int, iterations: int, device: str = "cuda:0") ->
     """A row for each of ours and gsplat's."""
     scene = _scene(size, photos, device)
     fixed = {"densification.max_gaussians": size.gaussians, "densification.budget": 0, "model.initial_density": 0}
-    fixed |= {"response.name": "srgb", "plan.enabled": False, "schedule.iterations": iterations}
+    fixed |= {"response.name": RESPONSE, "plan.enabled": False, "schedule.iterations": iterations}
     config = load_config("default", fixed)
     place = {"photos": f"{len(scene.train_views)} + {len(scene.test_views)}", "iterations": iterations}
     place |= {"width": size.width, "height": size.height}
     rows: list[dict] = []
-
-    def add(method: str, render, count: int, seconds: float, memory: int) -> None:
-        row = place | {
-            "method": method,
-            "gaussians": count,
-            "step_ms": seconds * 1e3 / (iterations - iterations // WARM_UP),
-            "memory": memory,
-        }
-        seen = [figures(render(view), view, run.model.response, None, device) for view in scene.test_views]
-        row |= {name: float(np.mean([each[name] for each in seen])) for name in ("psnr", "ssim")}
+    for train in (_train, _train_gsplat):
+        forget_peaks(torch.device(device))
+        row = place | train(scene, config, device)
+        row["step_ms"] = row.pop("seconds") * 1e3 / (iterations - iterations // WARM_UP)
         rows.append(row | {"over_ours": row["step_ms"] / rows[0]["step_ms"] if rows else 1.0})
         LOG.info("%s", rows[-1])
+    return rows
 
-    forget_peaks(torch.device(device))
-    scratch = Path(tempfile.mkdtemp())
+
+def _train(scene: Scene, config: Config, device: str) -> dict:
+    scratch, begun, memory = Path(tempfile.mkdtemp()), 0.0, 0
     training = Training(scene, scratch / "run", config, device=device)
-    begun, memory = 0.0, 0
     for step in training:
-        if step.iteration == iterations // WARM_UP:
+        if step.iteration == step.total // WARM_UP:
             training.timed(partial(wait, training.device))
             begun = training.seconds
         memory = held_memory(training.device) or 0
-    run = training.run
-    add("sehdr-warp", lambda view: photographed(run, view), run.gaussian_count, training.seconds - begun, memory)
-    rows[0]["tests"] = [[line["iteration"], line["psnr_ldr"]] for line in training.folder.read_metrics()]
+    row = {"method": "sehdr-warp", "gaussians": training.run.gaussian_count, "seconds": training.seconds - begun}
+    row["tests"] = [[line["iteration"], line["psnr_ldr"]] for line in training.folder.read_metrics()]
+    row |= {"memory": memory} | _means(lambda view: photographed(training.run, view), scene, device)
     shutil.rmtree(scratch)
-    del training
-    forget_peaks(torch.device(device))
+    return row
+
+
+def _train_gsplat(scene: Scene, config: Config, device: str) -> dict:
     torch.manual_seed(0)
-    trained = train_gsplat(scene, "mcmc", config, size.gaussians, device)
-    memory = torch.cuda.max_memory_allocated(device)
-    add("gsplat mcmc", trained, trained.count(), trained.loop_seconds, memory)
-    return rows
+    trained = train_gsplat(scene, "mcmc", config, config.densification.max_gaussians, device)
+    row = {"method": "gsplat mcmc", "gaussians": trained.count(), "seconds": trained.loop_seconds}
+    row["memory"] = torch.cuda.max_memory_allocated(device)
+    return row | _means(trained, scene, device)
+
+
+def _means(render: Callable, scene: Scene, device: str) -> dict[str, float]:
+    response = response_by_name(RESPONSE)
+    seen = [figures(render(view), view, response, None, device) for view in scene.test_views]
+    return {name: float(np.mean([each[name] for each in seen])) for name in ("psnr", "ssim")}
 
 
 def _scene(size: Size, photos: int, device: str) -> Scene:
