@@ -114,9 +114,11 @@ def _workers_tables(result: dict) -> Iterable[str]:
 
 
 def _large_tables(result: dict) -> Iterable[str]:
+    rows: list[Mapping] = []
     for ours, theirs in groups(result["rows"], "gaussians", "width", "height").values():
-        ours["level_at"] = next((iteration for iteration, psnr in ours["tests"] if psnr >= theirs["psnr"]), None)
-    yield markdown_table(result["rows"], COLUMNS["large"] | {"no worse from=level_at": "d"})
+        level = next((iteration for iteration, psnr in ours["tests"] if psnr >= theirs["psnr"]), None)
+        rows += [{**ours, "level_at": level}, theirs]
+    yield markdown_table(rows, COLUMNS["large"] | {"no worse from=level_at": "d"})
 
 
 def _checks_line(result: dict) -> str:

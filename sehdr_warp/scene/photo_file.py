@@ -103,6 +103,11 @@ class PhotoFile:
 _files: weakref.WeakSet[PhotoFile] = weakref.WeakSet()
 
 
+def _file_of(array: np.ndarray) -> PhotoFile | None:
+    """The file that an array lies in."""
+    return next((file for file in _files if file.place(array) is not None), None)
+
+
 def taken(told: tuple) -> Any:
     """What another process of this user put into its file by share(); arrays stay in the file."""
     finder = _Unpickler(io.BytesIO())
@@ -122,7 +127,7 @@ class _Pickler(pickle.Pickler):
     def persistent_id(self, obj: Any) -> Any:
         if type(obj) is not np.ndarray or obj.nbytes < _LARGE or obj.dtype.hasobject:
             return None
-        file = next((file for file in _files if file.place(obj) is not None), self.photos)
+        file = _file_of(obj) or self.photos
         return file.told(file.keep(obj))
 
 
@@ -160,7 +165,7 @@ class PhotoKeeper:
             self._decide(self.count * sum(array.nbytes for array in arrays.values()))
         if self.file is None:
             return view
-        return replace(view, **{name: self.file.keep(array) for name, array in arrays.items()})
+        return replace(view, **{name: a if _file_of(a) else self.file.keep(a) for name, a in arrays.items()})
 
     def _decide(self, size: int) -> None:
         free, self.note = available_memory(), ""

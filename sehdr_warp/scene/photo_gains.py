@@ -1,13 +1,16 @@
 """What a camera changed between photos and no file states: exposure, white balance, and falloff towards the corners."""
 
+import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ..parallel import made_ahead
 from ..response import Response
 from .exposure import exif_lens
+from .photo_file import PhotoKeeper
 from .types import Scene, View, codes_of, encoded_values
 
 FAINT, BRIGHT = 10 / 255, 245 / 255  # Encoded values within tell light; beyond, noise or less than all of it
@@ -19,6 +22,8 @@ NONE = 0.0, 0.0  # Falloff
 LENS = 0.05  # Focal lengths that differ by less, as a part, are one lens: structure from motion finds each anew
 FLAT = 0.1  # Of the largest spread of cameras: along an axis where they differ by less, places tell nothing
 FEWEST_OF_LENS = 3  # Photos that tell a falloff
+BAND_ROWS, AT_ONCE = 16, 8  # Rows of a photo, and photos, that are evened at one time
+_log = logging.getLogger("sehdr_warp.scene")
 
 
 @dataclass(frozen=True)
@@ -75,21 +80,39 @@ class PhotoGains:
         and the falloff are taken from its codes, which have 16 bits then. White stays `at least white`."""
         if scene.evened:
             return scene
-        return replace(scene, views=tuple(self._view(view, response) for view in scene.views), evened=True)
+        # 16 bits are twice what the photos took.
+        keeper = PhotoKeeper("auto", len(scene.views), sum(view.codes.size // 3 for view in scene.views))
+        evened = made_ahead(lambda view: self._view(view, response), scene.views, AT_ONCE)
+        views = tuple(keeper.kept(view) for view in evened)
+        if keeper.note:
+            _log.info("%s", keeper.note)
+        return replace(scene, views=views, evened=True)
 
-    def light(self, view: View) -> np.ndarray:
-        """[H, W, 3] what the light of a photo was multiplied by."""
-        height, width = view.codes.shape[:2]
-        radius = _radius(view, *np.ogrid[:height, :width])[..., None]
+    def light(self, view: View, rows: slice = slice(None)) -> np.ndarray:
+        """[rows, W, 3] what the light of a photo was multiplied by."""
+        row, column = np.ogrid[: view.codes.shape[0], : view.codes.shape[1]]
+        radius = _radius(view, row[rows], column)[..., None]
         return np.exp(-_power(radius, *self.falloff.get(view.name, NONE))) * self.gains.get(view.name, (1.0, 1.0, 1.0))
 
     def _view(self, view: View, response: Response) -> View:
-        largest = max(self.gains.get(view.name, (1.0,)))
-        time, light = view.exposure_time * largest, self.light(view) / largest
-        if light.min() > 1 - NEGLIGIBLE:
+        gain = np.array(self.gains.get(view.name, (1.0, 1.0, 1.0)))
+        time, falls = view.exposure_time * gain.max(), view.name in self.falloff
+        # In bands: of a large photo the light alone is eight times its codes.
+        bands = [slice(row, row + BAND_ROWS) for row in range(0, len(view.codes), BAND_ROWS)]
+        least = min((self.light(view, rows) / gain.max()).min() for rows in (bands if falls else bands[:1]))
+        if least > 1 - NEGLIGIBLE:
             return replace(view, exposure_time=time)
-        decoded = response.decode(np.arange(view.levels + 1) / view.levels)[view.codes]
-        codes = codes_of(response.encode(decoded / np.maximum(light, 0.05)), 16)
+        codes, table = np.empty(view.codes.shape, np.uint16), response.decode(np.arange(view.levels + 1) / view.levels)
+
+        def evened(light: np.ndarray, by: np.ndarray) -> np.ndarray:
+            return codes_of(response.encode(light / np.maximum(by / gain.max(), 0.05)), 16)
+
+        if falls:
+            for rows in bands:
+                codes[rows] = evened(table[view.codes[rows]], self.light(view, rows))
+        else:  # What becomes of a code is alike all over the photo.
+            for channel, tables in enumerate(evened(np.repeat(table[:, None], 3, 1), gain).T):
+                codes[..., channel] = tables[view.codes[..., channel]]
         codes[view.codes == view.levels] = 65535
         return replace(view, exposure_time=time, codes=codes)
 

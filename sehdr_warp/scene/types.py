@@ -107,7 +107,8 @@ def encoded_values(codes: np.ndarray) -> np.ndarray:
 def codes_of(image: np.ndarray, bits: int | None = None) -> np.ndarray:
     """Codes of encoded values in [0, 1], rounded: uint8 or uint16 by bits (8, 16), or by whether 8 bits hold them."""
     image = np.clip(image, 0.0, 1.0)
-    small = np.rint(image * 255)
-    if bits == 8 or (bits is None and np.abs(image * 255 - small).max(initial=0.0) < 1e-3):
-        return small.astype(np.uint8)
+    if bits != 16:
+        small = np.rint(image * 255)
+        if bits == 8 or np.abs(image * 255 - small).max(initial=0.0) < 1e-3:
+            return small.astype(np.uint8)
     return np.rint(image * 65535).astype(np.uint16)

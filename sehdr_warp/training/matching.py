@@ -1,7 +1,7 @@
 """Points of the surfaces that photos show, found by comparing photos: a plane sweep for pixels chosen one by one."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -125,6 +125,15 @@ def _as_if(ratio: float, response: Response) -> np.ndarray | None:
     if response.learnable or abs(np.log2(ratio)) <= ALIKE:
         return None
     return codes_of(response.encode(response.decode(np.linspace(0, 1, 256)) / ratio), 8)
+
+
+def at_matching_size(view: View) -> View:
+    """A photo that is larger than those that are matched, at their size and of 8 bits; another as it is. A mask stays
+    as large as it was."""
+    if max(view.camera.width, view.camera.height) <= LARGEST_SIDE:
+        return view
+    codes, camera = _matchable(view, None)
+    return replace(view, codes=codes, camera=camera, hdr=None)
 
 
 def _matchable(view: View, table: np.ndarray | None) -> tuple[np.ndarray, Camera]:

@@ -1,18 +1,21 @@
 """Whether a camera changed exposure, white balance or falloff unsaid, by the points that its photos share."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 
+from ..parallel import made_ahead
 from ..response import Response
 from ..scene import Scene, View
 from ..scene.photo_gains import PhotoGains, disagreement, fit_gains, left_of_falloff, rough_gains, start_gains
 from .config import Config
 from .initialization import make_matcher
-from .matching import Matcher
+from .matching import Matcher, at_matching_size
 from .plan import Decision
 
+MOST_AT_ONCE = 8  # Photos that are made small side by side
 POINTS, FEW_POINTS = 1500, 500  # That are looked for, and for a rough look
 LEAST_STOPS, LEAST_TINT, LEAST_CORNERS = 0.15, 0.1, 0.15
 """Drift of exposure, drift of white balance alone, and part of the light that corners lack, from which photos are
@@ -61,24 +64,26 @@ def find_gains(
         reason = "do not contradict the stated times" if stated else f"differ by less than {least}"
         return None, matcher, Decision("photo-gains", {}, "none", f"matched points {reason}")
 
-    matcher = make(scene)
+    # Photos are matched small: thousands of large ones would be read, evened and held again and again.
+    small = replace(scene, views=tuple(made_ahead(at_matching_size, views, MOST_AT_ONCE)))
+    matcher = make(small)
     if stated:
         few = points_of(matcher, FEW_POINTS)
         rough = rough_gains(views, *few, response)
         falls = rough.corners >= LEAST_CORNERS and left_of_falloff(views, *few, response, rough) < 1
         if not falls and not _drifts(rough, views):
             return none(matcher)
-    found, guess = points_of(matcher), start_gains(views, response)
+    found, guess = points_of(matcher), start_gains(small.views, response)
     if not stated and len(found[0]) < ENOUGH * POINTS and guess.stops > LEAST_STOPS:
-        found = max(found, points_of(make(guess.even(scene, response))), key=lambda found: len(found[0]))
+        found = max(found, points_of(make(guess.even(small, response))), key=lambda found: len(found[0]))
     if len(found[0]) < FEWEST:
         return none(matcher)
     parts = _believed(fit_gains(views, others, *found, response), views, found, response, stated)
     if not any(parts.values()):
         return none(matcher)
-    matcher = make(fit_gains(views, others, *found, response).parts(**parts).even(scene, response))
+    matcher = make(fit_gains(views, others, *found, response).parts(**parts).even(small, response))
     gains = fit_gains(views, others, *points_of(matcher), response).parts(**parts)
-    return gains, make(gains.even(scene, response)), _decided(gains, parts, stated)
+    return gains, make(gains.even(small, response)), _decided(gains, parts, stated)
 
 
 def _believed(

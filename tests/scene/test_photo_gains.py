@@ -7,9 +7,10 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.response import response_by_name
-from sehdr_warp.scene import Camera, Scene, View, codes_of
+from sehdr_warp.scene import Camera, Scene, View, codes_of, photo_file
 from sehdr_warp.scene.camera import look_at
 from sehdr_warp.scene.photo_gains import (
+    BAND_ROWS,
     PhotoGains,
     disagreement,
     fit_gains,
@@ -181,3 +182,33 @@ def test_white_stays_white_and_black_black(gains):
     scene = replace(scene, views=(replace(scene.views[0], codes=codes), *scene.views[1:]))
     (first, *_) = PhotoGains(gains, everywhere(FALLOFF)).even(scene, SRGB).views
     assert first.codes.dtype == np.uint16 and (first.codes[:8] == 65535).all() and (first.codes[-8:] == 0).all()
+
+
+@pytest.mark.parametrize("falloff", [None, FALLOFF])
+def test_photos_are_evened_row_by_row_as_by_their_light(gains, falloff):
+    tall = np.random.default_rng(5).integers(0, 256, (3 * BAND_ROWS + 5, 20, 3), dtype=np.uint8)
+    camera = Camera(20, len(tall), 60.0, 60.0, 10.0, len(tall) / 2, np.eye(4))
+    view = View("p_0", tall, camera, 2.0, "train")
+    found = PhotoGains(gains, {} if falloff is None else {"p_0": falloff})
+    (evened,) = found.even(Scene("tall", "hand-made", (view,), np.zeros((0, 3)), np.zeros((0, 3))), SRGB).views
+    largest = max(gains["p_0"])
+    light = SRGB.decode(view.image.astype(np.float64)) / (found.light(view) / largest)
+    expected = codes_of(SRGB.encode(light), 16)
+    expected[tall == 255] = 65535
+    assert evened.exposure_time == 2.0 * largest
+    assert np.abs(evened.codes.astype(int) - expected).max() <= 1
+
+
+def test_photos_that_do_not_fit_into_memory_are_evened_into_a_file(gains, monkeypatch, caplog):
+    scene = photographed(gains, everywhere(FALLOFF))
+    in_memory = PhotoGains(gains, everywhere(FALLOFF)).even(scene, SRGB)
+    monkeypatch.setattr(photo_file, "available_memory", lambda: 0)
+    with caplog.at_level("INFO"):
+        on_disk = PhotoGains(gains, everywhere(FALLOFF)).even(scene, SRGB)
+    assert "they are read from a nameless file" in caplog.text
+    files = {photo_file._file_of(view.codes) for view in on_disk.views}
+    assert len(files) == 1 and None not in files
+    assert all(np.array_equal(a.codes, b.codes) for a, b in zip(on_disk.views, in_memory.views, strict=True))
+    # Photos that are left as they are stay in the file where they were.
+    again = PhotoGains({}).even(replace(on_disk, evened=False), SRGB)
+    assert all(a.codes is b.codes for a, b in zip(again.views, on_disk.views, strict=True))

@@ -7,8 +7,10 @@ import pytest
 
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import codes_of
+from sehdr_warp.scene.photo_gains import PhotoGains
 from sehdr_warp.training import photo_gains as gains_of_a_training
 from sehdr_warp.training.config_files import load_config
+from sehdr_warp.training.matching import LARGEST_SIDE, at_matching_size
 from sehdr_warp.training.photo_gains import evens, find_gains
 from sehdr_warp.training.run import load_run
 from sehdr_warp.training.train import Training
@@ -145,3 +147,32 @@ def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
     for value, known, asked in (("never", False, False), ("unstated", True, False), ("unstated", False, True)):
         config = load_config("default", {"model.photo_gains": value})
         assert evens(replace(scene, exposure_times_known=known), config, LINEAR) == asked
+
+
+def test_large_photos_are_matched_and_evened_small(monkeypatch):
+    """Full-size copies of a large set, evened again and again, would take more memory than there is."""
+    (scene, _), sizes, even = drifting(), [], PhotoGains._view
+    factor = LARGEST_SIDE // 64 + 4
+    large = tuple(
+        replace(
+            view,
+            codes=view.codes.repeat(factor, 0).repeat(factor, 1),
+            camera=view.camera.resized(64 * factor, 64 * factor),
+        )
+        for view in scene.views
+    )
+
+    def watched(gains, view, response):
+        sizes.append(max(view.codes.shape))
+        return even(gains, view, response)
+
+    monkeypatch.setattr(PhotoGains, "_view", watched)
+    gains, matcher, _ = find_gains(replace(scene, views=large), CONFIG, LINEAR, "cpu")
+    assert gains is not None and max(large[0].codes.shape) > LARGEST_SIDE
+    assert sizes and max(sizes) <= LARGEST_SIDE
+    assert max(matcher.size(0)) <= LARGEST_SIDE
+
+
+def test_photos_of_matching_size_stay_as_they_are():
+    view = drifting()[0].views[0]
+    assert at_matching_size(view) is view
