@@ -96,16 +96,17 @@ class PhotoGains:
 
     def _view(self, view: View, response: Response) -> View:
         gain = np.array(self.gains.get(view.name, (1.0, 1.0, 1.0)))
-        time, falls = view.exposure_time * gain.max(), view.name in self.falloff
+        largest, falls = float(gain.max()), view.name in self.falloff
+        time = view.exposure_time * largest
         # In bands: of a large photo the light alone is eight times its codes.
         bands = [slice(row, row + BAND_ROWS) for row in range(0, len(view.codes), BAND_ROWS)]
-        least = min((self.light(view, rows) / gain.max()).min() for rows in (bands if falls else bands[:1]))
+        least = min((self.light(view, rows) / largest).min() for rows in (bands if falls else bands[:1]))
         if least > 1 - NEGLIGIBLE:
             return replace(view, exposure_time=time)
         codes, table = np.empty(view.codes.shape, np.uint16), response.decode(np.arange(view.levels + 1) / view.levels)
 
         def evened(light: np.ndarray, by: np.ndarray) -> np.ndarray:
-            return codes_of(response.encode(light / np.maximum(by / gain.max(), 0.05)), 16)
+            return codes_of(response.encode(light / np.maximum(by / largest, 0.05)), 16)
 
         if falls:
             for rows in bands:
