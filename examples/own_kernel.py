@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 import sehdr_warp as sw
-from sehdr_warp.splatting import Program
+from sehdr_warp.rasterizer import Program
 
 
 @wp.kernel

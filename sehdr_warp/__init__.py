@@ -27,7 +27,7 @@ _HOMES = {
     "response": ("Response", "response_by_name", "response_names"),
     "scene": ("Camera", "Scene", "View", "embedded_scenes", "load_cameras", "load_scene"),
     "scene.stack": ("calibrate",),
-    "splatting": ("Rendering", "differentiable", "rasterize", "rasterize_directions", "spherical_harmonics", "ssim"),
+    "rasterizer": ("Rendering", "differentiable", "rasterize", "rasterize_directions", "spherical_harmonics", "ssim"),
     "training.config": ("Config",),
     "training.config_files": ("load_config", "preset_names"),
     "training.initialization": ("match_points",),

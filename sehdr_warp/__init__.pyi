@@ -9,10 +9,10 @@ from .output.export import export
 from .output.panorama import write_panorama
 from .output.render_views import render_views
 from .output.report import write_report
+from .rasterizer import Rendering, differentiable, rasterize, rasterize_directions, spherical_harmonics, ssim
 from .response import Response, response_by_name, response_names
 from .scene import Camera, Scene, View, embedded_scenes, load_cameras, load_scene
 from .scene.stack import calibrate
-from .splatting import Rendering, differentiable, rasterize, rasterize_directions, spherical_harmonics, ssim
 from .training.config import Config
 from .training.config_files import load_config, preset_names
 from .training.initialization import match_points

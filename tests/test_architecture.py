@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "sehdr_warp"
 
-# What each room may import of the others: training -> field -> response -> splatting -> kernels, and below them all
+# What each room may import of the others: training -> model -> response -> rasterizer -> kernels, and below them all
 # what any room may use. Rooms that read a trained scene take it as an object with named methods.
 ANY = {"errors", "quiet", "arguments", "files", "console", "apart", "parallel", "caches"}
 ALLOWED = {
@@ -24,27 +24,28 @@ ALLOWED = {
     "files": {"errors"},
     "arguments": {"errors"},
     "splats": ANY,
-    "splatting": ANY | {"kernels"},
-    "compat": {"splatting"},
-    "response": ANY | {"splatting"},
+    "rasterizer": ANY | {"kernels"},
+    "compat": {"rasterizer"},
+    "response": ANY | {"rasterizer"},
     "scene": ANY | {"response", "splats"},
-    "field": ANY | {"scene", "response", "splatting", "splats"},
-    "output": ANY | {"scene", "response", "splats", "field.exposure", "field.baking", "field.sensor_colors"},
+    "model": ANY | {"scene", "response", "rasterizer", "splats"},
+    "output": ANY | {"scene", "response", "splats", "model.exposure", "model.baking", "model.sensor_colors"},
     "viewer": ANY | {"scene", "output"},
-    "evaluation": ANY | {"scene", "splatting.ssim", "field.baking", "output.names", "output.charts", "output.panorama"},
+    "evaluation": ANY
+    | {"scene", "rasterizer.ssim", "model.baking", "output.names", "output.charts", "output.panorama"},
     "training": ANY
-    | {"scene", "response", "field", "splatting", "splats", "evaluation.metrics", "evaluation.protocols"},
-    "synth": ANY | {"scene", "response", "output.exr", "output.images", "field.exposure"},
+    | {"scene", "response", "model", "rasterizer", "splats", "evaluation.metrics", "evaluation.protocols"},
+    "synth": ANY | {"scene", "response", "output.exr", "output.images", "model.exposure"},
     "check": ANY
-    | {"bench.results", "bench.splats", "kernels.constants", "scene", "response", "field", "splatting", "training"},
+    | {"bench.results", "bench.splats", "kernels.constants", "scene", "response", "model", "rasterizer", "training"},
     "bench": ANY
     | {
         "synth.expose",
         "kernels.constants",
         "scene",
         "response",
-        "field",
-        "splatting",
+        "model",
+        "rasterizer",
         "training",
         "output",
         "evaluation",
@@ -53,7 +54,7 @@ ALLOWED = {
 # Packages that only some rooms may import.
 ONLY_IN = {
     "torch": ALLOWED.keys() - ANY - {"kernels", "splats", "scene", "synth"},
-    "warp": {"kernels", "splatting"},
+    "warp": {"kernels", "rasterizer"},
 }
 LARGEST_FILE = 400
 

@@ -25,10 +25,10 @@ from sehdr_warp.bench.results import finish, new_result
 from sehdr_warp.bench.timing import forget_peaks
 from sehdr_warp.evaluation.metrics import psnr, ssim
 from sehdr_warp.evaluation.perceptual import load_lpips
-from sehdr_warp.field.gaussians import Gaussians
+from sehdr_warp.model.gaussians import Gaussians
+from sehdr_warp.rasterizer.ssim import image_distance
 from sehdr_warp.response import Response
 from sehdr_warp.scene import Scene, View, load_scene
-from sehdr_warp.splatting.ssim import image_distance
 from sehdr_warp.training.config import REFERENCE_ITERATIONS
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.densification import gaussian_budget

@@ -19,7 +19,7 @@ from scenes.generator.render import _sensor, load_mitsuba
 from scenes.generator.stage import Stage
 from sehdr_warp.bench.results import finish, new_result
 from sehdr_warp.evaluation.metrics import mu_law
-from sehdr_warp.field.baking import sphere_directions
+from sehdr_warp.model.baking import sphere_directions
 from sehdr_warp.output.panorama import latlong, solid_angles, write_panorama
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from ..kernels.constants import LOW_PASS
-from ..splatting import Rendering
+from ..rasterizer import Rendering
 from .splats import SplatScene
 
 GSPLAT = "gsplat"

@@ -7,10 +7,10 @@ from itertools import product
 import torch
 
 from ..kernels.constants import TILE_SIZE
-from ..splatting.rasterization import rasterize
-from ..splatting.recording import GraphRecorder
-from ..splatting.reference import rasterize_reference
-from ..splatting.replays import LAUNCHED_FIRST, forget
+from ..rasterizer.rasterization import rasterize
+from ..rasterizer.recording import GraphRecorder
+from ..rasterizer.reference import rasterize_reference
+from ..rasterizer.replays import LAUNCHED_FIRST, forget
 from .gsplat_peer import BOUND, GSPLAT, gsplat_renderer, note_missing
 from .results import check, new_result
 from .splats import NAMES, Size, SplatScene, make_splat_scene

@@ -10,7 +10,7 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 from ..quiet import silent_stderr
-from ..splatting.drawn import drawn_pairs
+from ..rasterizer.drawn import drawn_pairs
 from .timing import Variant
 
 STEPS = 20

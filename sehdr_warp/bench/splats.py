@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from ..errors import SehdrError
-from ..field.gaussians import Gaussians
-from ..field.radiance_field import RadianceField
+from ..model.gaussians import Gaussians
+from ..model.radiance_field import RadianceField
 from ..response import response_by_name
 from ..scene import Camera, Scene, View, codes_of, look_at
 

@@ -8,9 +8,9 @@ from itertools import pairwise
 
 import torch
 
+from ..rasterizer import rasterize
+from ..rasterizer.reference import rasterize_reference
 from ..scene import Scene
-from ..splatting import rasterize
-from ..splatting.reference import rasterize_reference
 from ..training.config import Config
 from ..training.config_files import load_config, override_config
 from ..training.initialization import choose_response, make_field

@@ -14,7 +14,7 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 from ..quiet import silent_stderr
-from ..splatting.memory import held_by_warp
+from ..rasterizer.memory import held_by_warp
 
 LEAST_REPETITIONS = 3
 BUDGET = 10.0

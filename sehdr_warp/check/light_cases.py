@@ -6,13 +6,13 @@ from functools import partial
 import numpy as np
 import torch
 
-from ..field.color_models import EXPOSURE_FLOOR
-from ..field.fusion import NeuralExposureFusion
-from ..field.radiance_field import Photograph
+from ..model.color_models import EXPOSURE_FLOOR
+from ..model.fusion import NeuralExposureFusion
+from ..model.radiance_field import Photograph
+from ..rasterizer import ssim
+from ..rasterizer.clipped_light import clipped_light_energy
 from ..response import Response, response_by_name
 from ..response.table import TabulatedResponse
-from ..splatting import ssim
-from ..splatting.clipped_light import clipped_light_energy
 from ..training.config import LossConfig
 from ..training.losses import CODE, Target, code_scale, ldr_loss
 from .case import ROUNDINGS, UNIT, Case, Reading, compare, count, not_finite

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR, TRANSMITTANCE_MIN
-from ..splatting import rasterize, spherical_harmonics, ssim_map
-from ..splatting.reference import blend_reference, project_reference, rasterize_reference
+from ..rasterizer import rasterize, spherical_harmonics, ssim_map
+from ..rasterizer.reference import blend_reference, project_reference, rasterize_reference
 from .case import ROUNDINGS, UNIT, Case, Reading, as_float32, compare, count, not_finite
 
 NAMES = ("means", "log_scales", "quaternions", "opacities", "features", "world_to_camera", "intrinsics")

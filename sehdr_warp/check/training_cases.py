@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ..bench.splats import EXPOSURE_TIME, Size, make_photo_scene
-from ..field.radiance_field import RadianceField
+from ..model.radiance_field import RadianceField
 from ..response import response_by_name
 from ..scene import Scene
 from ..training.config import Config

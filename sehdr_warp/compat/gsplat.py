@@ -6,7 +6,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from ..splatting import rasterize, spherical_harmonics
+from ..rasterizer import rasterize, spherical_harmonics
 
 ONE_VALUE = {
     **dict.fromkeys(("sparse_grad", "absgrad", "distributed", "segmented", "with_ut", "with_eval3d"), False),

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..errors import InputError
-from ..field.baking import sphere_directions
+from ..model.baking import sphere_directions
 from ..output.panorama import latlong, solid_angles
 from ..scene import Camera
 from ..scene.hdr_files import read_exr_channels

@@ -9,7 +9,7 @@ import math
 import torch
 from torch import Tensor
 
-from ..splatting.ssim import ssim_map
+from ..rasterizer.ssim import ssim_map
 
 # A photo's pixel is clipped if any channel reaches this code of 255: JPEG blurs 255 by a few codes.
 CLIPPED_CODE = 250
@@ -59,7 +59,7 @@ def decibels(mean_squared_error: float, peak: float = 1.0) -> float:
 
 
 def ssim(prediction: Tensor, truth: Tensor, mask: Tensor | None = None, *, peak: float = 1.0) -> float:
-    """Structural similarity (splatting.ssim), averaged over pixels and channels; a mask weights the average only.
+    """Structural similarity (rasterizer.ssim), averaged over pixels and channels; a mask weights the average only.
 
     Border pixels count, as in the code of 3DGS and HDR-GS; HDR-NeRF's script uses a uniform 7 x 7 window without them.
     """

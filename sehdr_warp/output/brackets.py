@@ -15,8 +15,8 @@ import numpy as np
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera
 
-from ..field.exposure import Exposure, Items, read_exposures
 from ..files import atomic_folder, atomic_path, write_json
+from ..model.exposure import Exposure, Items, read_exposures
 from .colorspace import color_space, from_rec709
 from .exr import Part, check_finite, exr_header, rgb_channels, stored_pixel_type, write_exr, write_multipart_exr
 from .images import exposure_exif, quantize, write_picture

@@ -252,7 +252,7 @@ def run_convert(asked: Convert) -> None:
 
 
 def _export(source: Path, out: Path, asked: _SplatFile, **options) -> None:
-    from ..field.exposure import exposure_times
+    from ..model.exposure import exposure_times
     from ..splats import check_suffix
     from .export import export
 

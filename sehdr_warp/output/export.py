@@ -13,8 +13,8 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.exposure import shutter
 
-from ..field.baking import agreement, gaussians_of, refine
 from ..files import atomic_path, check_absent
+from ..model.baking import agreement, gaussians_of, refine
 from ..splats import check_suffix, color_model_of, write_gaussians
 
 log = logging.getLogger(__name__)

@@ -18,7 +18,7 @@ from sehdr_warp import __version__
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import View
 
-from ..field.sensor_colors import rec709_of
+from ..model.sensor_colors import rec709_of
 from .images import as_array, quantize
 from .tonemap import encode_srgb
 

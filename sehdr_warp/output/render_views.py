@@ -13,8 +13,8 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera, load_cameras
 from sehdr_warp.scene.images import MAX_PIXELS
 
-from ..field.exposure import Items
 from ..files import atomic_folder, atomic_path
+from ..model.exposure import Items
 from .brackets import Brackets, bracket_exposures
 from .camera_paths import evenly, interpolate, orbit
 from .colorspace import from_rec709

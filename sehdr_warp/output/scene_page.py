@@ -16,8 +16,8 @@ import numpy as np
 
 from sehdr_warp.errors import InputError
 
-from ..field.baking import gaussians_of
 from ..files import atomic_path, check_absent
+from ..model.baking import gaussians_of
 from ..splats.arrays import HARMONIC_0
 from .camera_paths import facts_of_cameras
 from .light_pictures import curve_table, display_gain, page_file, whole_page

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from ..errors import SehdrError
-from ..splatting.interpolation import interpolate
+from ..rasterizer.interpolation import interpolate
 from .curve import HALF_CODE, Response
 
 # Added to exposures before the logarithm: a hundredth of 8-bit black in sRGB.

@@ -63,7 +63,7 @@ def run_responses(asked: Responses) -> None:
 
 
 def run_calibrate(asked: Calibrate) -> None:
-    from ..field.exposure import seconds
+    from ..model.exposure import seconds
     from .stack import calibrate
 
     times = None if asked.exposures is None else seconds(asked.exposures, "--exposures")

@@ -33,8 +33,8 @@ class Synth:
 
 
 def run_synth(asked: Synth) -> None:
-    from ..field.exposure import read_exposures
     from ..files import check_absent
+    from ..model.exposure import read_exposures
     from ..response import response_by_name
     from ..scene import load_scene
     from .expose import SensorNoise, exposure_ladder, write_photo_set

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from ..field.gaussians import Gaussians
+from ..model.gaussians import Gaussians
 from .config import Config
 
 SAMPLES = 10  # Of a span, at even steps: neighbors differ too little to be worth the time

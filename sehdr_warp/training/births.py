@@ -7,12 +7,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..field.color_models import ColorModel
-from ..field.radiance_field import RadianceField
+from ..model.color_models import ColorModel
+from ..model.radiance_field import RadianceField
+from ..rasterizer.plane_sweep import BORDER
+from ..rasterizer.unexplained import unexplained_pixels
 from ..response import Response
 from ..splats.arrays import HARMONIC_0
-from ..splatting.plane_sweep import BORDER
-from ..splatting.unexplained import unexplained_pixels
 from .matching import Matcher
 from .targets import TrainingView
 

@@ -216,7 +216,7 @@ def _check_truth(data: Mapping, config) -> None:
 
 def _kernels_ahead(config):
     """Compiles what a training by this config will launch, as far as it can be told."""
-    from ..splatting.ahead import loaded_ahead, training_kernels
+    from ..rasterizer.ahead import loaded_ahead, training_kernels
 
     plain = config.model.tone_map == "pixel" and not config.fusion.enabled
     kernels = training_kernels(3 if plain else None, config.model.antialiased)

@@ -12,11 +12,11 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ..field.gaussians import PARAMETER_NAMES, Gaussians
-from ..field.spare_rows import moments_of
-from ..splatting import Rendering
-from ..splatting.relocation import Drawn, clear_rows, copy_rows, count_copies, number_places, share_opacities
-from ..splatting.training_step import add_gradient_statistics, add_position_noise
+from ..model.gaussians import PARAMETER_NAMES, Gaussians
+from ..model.spare_rows import moments_of
+from ..rasterizer import Rendering
+from ..rasterizer.relocation import Drawn, clear_rows, copy_rows, count_copies, number_places, share_opacities
+from ..rasterizer.training_step import add_gradient_statistics, add_position_noise
 from .config import Config, DensificationConfig
 
 SPLIT_SHRINK = 1.6  # The two halves of a split are this much smaller (3DGS: 0.8 times the number of halves)

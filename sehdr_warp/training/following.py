@@ -5,9 +5,9 @@ from pathlib import Path
 
 import torch
 
-from ..field.radiance_field import RadianceField
+from ..model.radiance_field import RadianceField
+from ..rasterizer.memory import memory_told
 from ..scene import Scene
-from ..splatting.memory import memory_told
 from .checkpoint import Checkpoint
 from .config import Config
 from .initialization import sizes_of

@@ -7,7 +7,7 @@ import torch
 
 from ..evaluation.metrics import psnr
 from ..evaluation.protocols import normalise, tone_map
-from ..field.radiance_field import RadianceField
+from ..model.radiance_field import RadianceField
 from ..scene import View
 
 log = logging.getLogger(__name__)

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 
 from ..errors import InputError, SehdrError
-from ..field.baking import field_of, gaussians_of
-from ..field.color_models import color_model
-from ..field.exposure import exposure_times
-from ..field.fusion import NeuralExposureFusion
-from ..field.gaussians import Gaussians
-from ..field.radiance_field import RadianceField
+from ..model.baking import field_of, gaussians_of
+from ..model.color_models import color_model
+from ..model.exposure import exposure_times
+from ..model.fusion import NeuralExposureFusion
+from ..model.gaussians import Gaussians
+from ..model.radiance_field import RadianceField
 from ..response import Response, ToneMapper, response_by_name
 from ..scene import Scene, View
 from ..scene.load import best_response, photos_to_judge

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..field.radiance_field import Photograph, RadianceField
+from ..model.radiance_field import Photograph, RadianceField
+from ..rasterizer.clipped_light import clipped_light_energy
+from ..rasterizer.code_residual import CodeScale, code_residual, code_values
+from ..rasterizer.photo_loss import photo_loss
+from ..rasterizer.ssim import image_distance, ssim
 from ..response import Response, ToneMapper
-from ..splatting.clipped_light import clipped_light_energy
-from ..splatting.code_residual import CodeScale, code_residual, code_values
-from ..splatting.photo_loss import photo_loss
-from ..splatting.ssim import image_distance, ssim
 from .config import LossConfig
 
 CODE = 1 / 255  # One step of an 8-bit photo

@@ -9,9 +9,9 @@ from PIL import Image
 from torch import Tensor
 
 from ..parallel import made_ahead
+from ..rasterizer.plane_sweep import BORDER, NEIGHBORS, PhotoSet, matched_points, matching_costs, trusted_depths
 from ..response import Response
 from ..scene import Camera, View, codes_of
-from ..splatting.plane_sweep import BORDER, NEIGHBORS, PhotoSet, matched_points, matching_costs, trusted_depths
 
 LARGEST_SIDE = 800  # Photos are matched at this size at most: depths need no more pixels
 PLANES = 48, 256  # Fewest and most depths that are tried; within these they are a pixel of parallax apart

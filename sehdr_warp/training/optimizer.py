@@ -11,11 +11,11 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
-from ..field.adam import BETAS, FIRST_COEFFICIENT, Adam
-from ..field.gaussians import PARAMETER_NAMES
-from ..field.radiance_field import RadianceField
-from ..splatting import HarmonicsGradients
-from ..splatting.training_step import judge_step, norms
+from ..model.adam import BETAS, FIRST_COEFFICIENT, Adam
+from ..model.gaussians import PARAMETER_NAMES
+from ..model.radiance_field import RadianceField
+from ..rasterizer import HarmonicsGradients
+from ..rasterizer.training_step import judge_step, norms
 from .config import Config
 
 TURNS = 2  # Parts of the higher harmonics, three quarters of all numbers, that a GPU steps in turn: memory is slow

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..field.radiance_field import CameraTensors
+from ..model.radiance_field import CameraTensors
 from .losses import Target, one_of
 from .targets import PhotoSource, TrainingView, ViewStack
 

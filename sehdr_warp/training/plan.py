@@ -9,7 +9,7 @@ from operator import attrgetter
 import torch
 
 from ..errors import InputError
-from ..field.exposure import exposure_times, is_seconds
+from ..model.exposure import exposure_times, is_seconds
 from ..parallel import thread_count
 from ..scene import Scene
 from ..scene.read_folders import FEWEST_PHOTOS

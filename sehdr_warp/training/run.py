@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from ..errors import InputError, SehdrError
-from ..field.baking import field_of
-from ..field.confidence import Evidence, gather_evidence
-from ..field.gaussians import PARAMETER_NAMES, Gaussians
-from ..field.radiance_field import RadianceField, RenderedView, Surroundings
-from ..field.sensor_colors import rec709_of
+from ..model.baking import field_of
+from ..model.confidence import Evidence, gather_evidence
+from ..model.gaussians import PARAMETER_NAMES, Gaussians
+from ..model.radiance_field import RadianceField, RenderedView, Surroundings
+from ..model.sensor_colors import rec709_of
 from ..response import Response
 from ..scene import Camera, Scene, load_cameras
 from ..scene.photo_gains import PhotoGains

@@ -28,9 +28,9 @@ from filelock import FileLock, Timeout
 from torch import Tensor
 
 from ..errors import InputError, SehdrError
-from ..field.confidence import Evidence
-from ..field.radiance_field import RadianceField
 from ..files import atomic_folder, atomic_path, make_parents, read_json, remove_stale, write_json, writing
+from ..model.confidence import Evidence
+from ..model.radiance_field import RadianceField
 from ..response import Response
 from ..scene import Camera, Scene
 from ..scene.images import MAX_PIXELS

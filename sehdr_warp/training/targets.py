@@ -9,10 +9,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from ..errors import InputError
-from ..field.radiance_field import CameraTensors
+from ..model.radiance_field import CameraTensors
+from ..rasterizer.code_residual import CodeScale, code_tensor
 from ..response import Response
 from ..scene import Scene, View
-from ..splatting.code_residual import CodeScale, code_tensor
 from .config import LossConfig
 from .losses import Target, code_scale, one_of
 

@@ -14,12 +14,12 @@ from typing import Any
 import torch
 
 from ..errors import InputError, SehdrError
-from ..field.radiance_field import RenderedView
-from ..field.unexplained import MOST_NAMED, told, unexplained_regions
+from ..model.radiance_field import RenderedView
+from ..model.unexplained import MOST_NAMED, told, unexplained_regions
+from ..rasterizer.memory import memory_told
 from ..response import Response
 from ..scene import Camera, Scene
 from ..scene.photo_gains import PhotoGains
-from ..splatting.memory import memory_told
 from .checkpoint import first_not_finite
 from .config import Config
 from .config_files import as_config, config_fields, override_config

@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 from ..errors import SehdrError
-from ..field.radiance_field import RadianceField, RenderedView
+from ..model.radiance_field import RadianceField, RenderedView
+from ..rasterizer import GraphRecorder, HarmonicsGradients, Rendering
+from ..rasterizer.code_residual import CodeScale
+from ..rasterizer.memory import bytes_asked_for
+from ..rasterizer.tile_lists import ONE_SORT
+from ..rasterizer.training_step import differentiate
 from ..response.learned import EXACT_BELOW
 from ..scene import Camera, Scene
-from ..splatting import GraphRecorder, HarmonicsGradients, Rendering
-from ..splatting.code_residual import CodeScale
-from ..splatting.memory import bytes_asked_for
-from ..splatting.tile_lists import ONE_SORT
-from ..splatting.training_step import differentiate
 from . import optimizer as adam
 from .averaging import Averaging
 from .births import born_rows

@@ -15,7 +15,7 @@ from sehdr_warp.bench.results import build, finish, machine_line, markdown_table
 from sehdr_warp.bench.splats import Size, make_splat_scene, parse_size
 from sehdr_warp.bench.timing import Variant, peak_memory, time_variants
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.splatting import rasterize
+from sehdr_warp.rasterizer import rasterize
 
 from ..refusals import call, refused
 

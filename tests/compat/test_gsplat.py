@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sehdr_warp.compat.gsplat import rasterization
-from sehdr_warp.splatting import rasterize, spherical_harmonics
+from sehdr_warp.rasterizer import rasterize, spherical_harmonics
 
 WIDTH, HEIGHT, COUNT = 40, 30, 200
 

@@ -18,9 +18,9 @@ from plyfile import PlyData, PlyElement
 from scipy.io import savemat
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.field.confidence import Evidence
-from sehdr_warp.field.gaussians import Gaussians
 from sehdr_warp.files import LIST
+from sehdr_warp.model.confidence import Evidence
+from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.output.exr import Part, write_exr, write_multipart_exr
 from sehdr_warp.output.usd_cameras import usd_cameras
 from sehdr_warp.response import response_by_name

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from sehdr_warp.rasterizer.plane_sweep import PhotoSet, matched_points, matching_costs, trusted_depths
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.camera import look_at
-from sehdr_warp.splatting.plane_sweep import PhotoSet, matched_points, matching_costs, trusted_depths
 
 SIZES = [(23, 17), (20, 20), (31, 12)]
 NEIGHBORS = np.array([[1, 2], [0, 2], [0, -1]])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.field.baking import field_of
+from sehdr_warp.model.baking import field_of
 from sehdr_warp.output.commands import Export, run_export
 from sehdr_warp.output.export import export
 from sehdr_warp.scene import load_cameras

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.field.baking import field_of
+from sehdr_warp.model.baking import field_of
 from sehdr_warp.output.panorama import cube, filled, latlong, solid_angles, write_panorama
 from sehdr_warp.output.radiance_file import write_radiance
 from sehdr_warp.scene.hdr_files import read_exr_channels, read_hdr

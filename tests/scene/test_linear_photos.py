@@ -7,8 +7,8 @@ import torch
 from PIL import Image
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.field.baking import field_of
-from sehdr_warp.field.sensor_colors import rec709_of
+from sehdr_warp.model.baking import field_of
+from sehdr_warp.model.sensor_colors import rec709_of
 from sehdr_warp.output.exr import rgb_channels, write_exr
 from sehdr_warp.output.images import write_picture
 from sehdr_warp.output.radiance_file import write_radiance

@@ -71,7 +71,7 @@ def test_every_field_is_documented_and_read(path, item):
     # In config.py only what follows the declarations counts as reading.
     sources = [
         p.read_text().split("    def scaled")[-1]
-        for room in ("training", "field")
+        for room in ("training", "model")
         for p in (PACKAGE / room).glob("*.py")
     ]
     assert any(name in source for source in sources for name in names), f"{path} is never read"

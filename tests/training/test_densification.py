@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from sehdr_warp.field.gaussians import PARAMETER_NAMES, Gaussians
-from sehdr_warp.splatting import rasterize
-from sehdr_warp.splatting.relocation import relocation_sums
+from sehdr_warp.model.gaussians import PARAMETER_NAMES, Gaussians
+from sehdr_warp.rasterizer import rasterize
+from sehdr_warp.rasterizer.relocation import relocation_sums
 from sehdr_warp.training import densification
 from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.densification import GradientDensification, _draw, make_densification, rotate

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sehdr_warp.splatting.training_step import judge_step
+from sehdr_warp.rasterizer.training_step import judge_step
 from sehdr_warp.training.graph_capacity import KEPT, LEAST_ROOM, ROOM, GraphCapacity
 
 MANY = 10 * LEAST_ROOM

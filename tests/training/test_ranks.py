@@ -13,7 +13,7 @@ import torch
 from torch.multiprocessing import ProcessExitedException
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.splatting import HarmonicsGradients
+from sehdr_warp.rasterizer import HarmonicsGradients
 from sehdr_warp.training.densification import make_densification
 from sehdr_warp.training.optimizer import FlatGradients, load_optimizer_tensors, make_optimizer, optimizer_tensors
 from sehdr_warp.training.plan import gain_of_ranks

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.field.color_models import color_model
-from sehdr_warp.field.radiance_field import Photograph
+from sehdr_warp.model.color_models import color_model
+from sehdr_warp.model.radiance_field import Photograph
+from sehdr_warp.rasterizer.ssim import ssim
 from sehdr_warp.response import ToneMapper, response_by_name
-from sehdr_warp.splatting.ssim import ssim
 from sehdr_warp.training.config import Config, LossConfig, ResponseConfig
 from sehdr_warp.training.config_files import load_config, override_config, preset_names
 from sehdr_warp.training.initialization import choose_response, make_field

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from sehdr_warp.field.gaussians import Gaussians
-from sehdr_warp.field.radiance_field import RadianceField
+from sehdr_warp.model.gaussians import Gaussians
+from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
 from sehdr_warp.training.config import REFERENCE_ITERATIONS, Config

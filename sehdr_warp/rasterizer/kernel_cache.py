@@ -1,0 +1,66 @@
+"""Warp's cache of compiled kernels: a folder that can be written to, and files in it that are as they were compiled.
+
+Warp loads what it finds there, and a damaged object ends the process that does. A file of the cache is never changed
+once it has its name, so their hashes are kept, and a module with another one is compiled again.
+"""
+
+import atexit
+import logging
+import os
+import re
+import shutil
+import sys
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+
+import warp as wp
+
+from ..caches import usable, user_cache
+from ..errors import SehdrError
+from ..files import LIST, atomic_path, hash_line, listed
+
+_log = logging.getLogger("sehdr_warp.rasterizer")
+# Named by their content; neither what is being compiled nor what Warp compiles anew in its place.
+_MODULE = re.compile(r"wp_.*_[0-9a-f]{7}")
+
+
+def choose() -> None:
+    """Gives Warp a cache that can be used; before wp.init()."""
+    stated = os.environ.get("WARP_CACHE_PATH")
+    if wp.config.kernel_cache_dir or (stated is None and not sys.platform.startswith("linux")):
+        return
+    folder = user_cache("warp") if stated is None else Path(stated)
+    if folder is None or not usable(folder):
+        wp.config.kernel_cache_dir = tempfile.mkdtemp(prefix="sehdr-kernels-")
+        atexit.register(shutil.rmtree, wp.config.kernel_cache_dir, ignore_errors=True)
+        _log.warning("%s cannot be written to; kernels are compiled for this process alone", folder or "~/.cache")
+
+
+def check() -> None:
+    """Discards what is damaged; after wp.init(), before the first launch."""
+    cache = Path(wp.config.kernel_cache_dir or "")
+    now, before = _lines(cache), listed(cache)
+    names = {line[66:] for line in now}
+    damaged = {os.fsdecode(line[66:]).partition("/")[0] for line in before - now if line[66:] in names}
+    for module in damaged:
+        shutil.rmtree(cache / module, ignore_errors=True)
+    if damaged:
+        _log.warning("%d damaged modules of the kernel cache are compiled again", len(damaged))
+    if damaged or now != before:
+        _keep(cache)
+    atexit.register(_keep, cache)
+
+
+def _lines(cache: Path) -> set[bytes]:
+    found = set()
+    for module in (path for path in cache.glob("wp_*") if _MODULE.fullmatch(path.name)):
+        for file in module.iterdir():
+            with suppress(OSError):  # Another process may be at work here.
+                found.add(hash_line(file, f"{module.name}/{file.name}"))
+    return found
+
+
+def _keep(cache: Path) -> None:
+    with suppress(OSError, SehdrError), atomic_path(cache / LIST, ours=True) as beside:
+        beside.write_bytes(b"".join(line + b"\n" for line in sorted(_lines(cache))))

@@ -1,0 +1,113 @@
+"""Confidence: what a photo leaves in doubt, and what gathers on the Gaussians that are seen in it."""
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.model.confidence import (
+    CLIPPED_STOPS,
+    LEAST_SEEN,
+    MOST_STOPS,
+    PARTLY_CLIPPED_STOPS,
+    Evidence,
+    gather_evidence,
+    pixel_uncertainty,
+)
+from sehdr_warp.model.gaussians import Gaussians
+from sehdr_warp.model.radiance_field import CameraTensors, RadianceField
+from sehdr_warp.response import response_by_name
+from sehdr_warp.scene import Camera, View, codes_of
+
+SRGB = response_by_name("srgb")
+CAMERA = Camera(20, 12, 15.0, 15.0, 10.0, 6.0, np.eye(4))
+
+
+def doubt(photo, exposure):
+    stops, clipped = pixel_uncertainty(torch.tensor([[photo]]), torch.tensor([[exposure]]), SRGB)
+    return float(stops), float(clipped)
+
+
+def test_doubt_of_single_pixels():
+    grey = float(SRGB.encode(torch.tensor(0.25)))
+    exact, clipped = doubt([grey] * 3, [0.25] * 3)
+    rounding = np.log2(np.subtract(*SRGB.decode(np.array([grey + 0.5 / 255, grey - 0.5 / 255]))) / 0.25 + 1)
+    assert exact == pytest.approx(rounding / 4, rel=0.02) and clipped == 0
+    assert doubt([grey] * 3, [1.0, 0.25, 0.25])[0] == pytest.approx(exact + 2 / 3, abs=1e-4)
+    assert doubt([1.0] * 3, [8.0] * 3) == (pytest.approx(CLIPPED_STOPS), 1.0)
+    assert doubt([1.0] * 3, [SRGB.white / 4] * 3)[0] == pytest.approx(CLIPPED_STOPS + 2, abs=1e-4)
+    stops, clipped = doubt([1.0, grey, grey], [8.0, 0.25, 0.25])
+    assert stops == pytest.approx((PARTLY_CLIPPED_STOPS + 2 * exact) / 3, abs=1e-5)
+    assert clipped == pytest.approx(1 / 3)
+    assert doubt([0.0] * 3, [0.0] * 3)[0] == pytest.approx(1.0)
+    assert doubt([0.0] * 3, [0.3] * 3)[0] == pytest.approx(MOST_STOPS + 1)
+
+
+def wall(x, exposure):
+    """One opaque Gaussian, 2 in front of CAMERA's kind, that fills the pixels about x; all harmonics but the first are
+    0."""
+    points = torch.tensor([[x, 0.0, 2.0]])
+    gaussians = Gaussians.from_points(points, torch.full((1, 3), float(np.log(exposure))), 0, opacity=0.99)
+    gaussians.log_scales.data.fill_(np.log(0.05))
+    return gaussians
+
+
+def field(device="cpu"):
+    """A Gaussian left of the middle, one right of it, and one behind the camera."""
+    left, right, behind = wall(-0.4, 0.25), wall(0.4, 3.0), wall(0.0, 1.0)
+    behind.means.data[:, 2] = -2
+    left.append(right.tensors())
+    left.append(behind.tensors())
+    return RadianceField(left, SRGB, base_time=0.5).to(device)
+
+
+def view(model, mask=None):
+    photo = model.render_ldr(CAMERA).cpu().numpy()
+    return View("v", codes_of(photo, 8), CAMERA, 0.5, "train", mask)
+
+
+def test_weighted_sums_are_those_of_the_blend(device):
+    model = field(device)
+    images = torch.rand(12, 20, 2, generator=torch.Generator().manual_seed(0)).to(device)
+    sums = model.weighted_sums(CameraTensors.of(CAMERA, device), images)
+    for index in range(3):
+        alone = torch.zeros(3, 3, device=device)
+        alone[index] = 1.0
+        weights = model._rasterize(CameraTensors.of(CAMERA, device), alone).image[..., 0]
+        torch.testing.assert_close(sums[index], (weights[..., None] * images).sum((0, 1)), rtol=1e-4, atol=1e-4)
+    assert sums[2].abs().max() == 0 < sums[:2].min()
+
+
+def test_clipped_and_unseen_gaussians_are_doubted(device):
+    model = field(device)
+    evidence = gather_evidence(model, [view(model)])
+    left, right, behind = evidence.confidence().tolist()
+    assert left > 0.9 and 0.4 < right < 0.75 and behind == 0
+    assert evidence.clipped[0] < 0.01 and evidence.clipped[1] > 0.5
+    assert evidence.seen[2] == 0 < evidence.seen[0]
+    half = gather_evidence(model, [view(model, np.repeat(np.arange(20)[None] >= 10, 12, 0).astype(np.float32))])
+    assert half.confidence()[0] == 0 and float(half.confidence()[1]) == pytest.approx(right, abs=0.02)
+
+
+def test_truth_is_not_clipped():
+    model = field()
+    truth = View("v", codes_of(np.ones((12, 20, 3))), CAMERA, 0.5, "train", None, model.render(CAMERA).hdr.numpy())
+    confidence = gather_evidence(model, [truth], truth=True).confidence()
+    assert confidence[:2].min() > 0.99
+    assert gather_evidence(model, [truth]).confidence()[1] < 0.6
+
+
+def test_confidence_of_evidence():
+    evidence = Evidence(torch.tensor([0.0, LEAST_SEEN, 1e6]), torch.tensor([0.0, 1.0, 1.0]), torch.zeros(3))
+    torch.testing.assert_close(evidence.confidence(), torch.tensor([0.0, 0.25, 0.5]))
+
+
+def test_the_map_is_the_mean_of_what_is_seen(device):
+    model = field(device)
+    assert model.render_confidence(CAMERA) is None
+    model.confidence = torch.tensor([0.9, 0.2, 1.0], device=device)
+    shown = model.render_confidence(CAMERA)
+    assert shown.shape == (12, 20)
+    alpha = model.render(CAMERA).alpha
+    assert float(shown[6, 7]) == pytest.approx(0.9, abs=1e-4) and float(shown[6, 12]) == pytest.approx(0.2, abs=1e-4)
+    assert bool((shown[alpha <= 1e-3] == 0).all()) and bool((alpha <= 1e-3).any())
+    assert not [name for name in model.state_dict() if "confidence" in name]

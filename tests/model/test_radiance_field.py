@@ -1,0 +1,106 @@
+"""The field: colour models, tone maps, brackets, exposures, and what a render of them means."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.model.exposure import exposure_times
+from sehdr_warp.model.fusion import NeuralExposureFusion
+from sehdr_warp.model.gaussians import Gaussians
+from sehdr_warp.model.radiance_field import CameraTensors, RadianceField
+from sehdr_warp.rasterizer import rasterize
+from sehdr_warp.response import response_by_name
+from sehdr_warp.scene import Camera
+
+TIME = 0.25
+SRGB = response_by_name("srgb")
+CAMERA = Camera(32, 24, 30.0, 30.0, 16.0, 12.0, np.eye(4))
+
+
+def wall(exposure, radiance="log", depth=3.0, **options):
+    """One opaque Gaussian, so large and so near that it fills the image with one exposure."""
+    value = math.log(exposure) if radiance == "log" else exposure
+    gaussians = Gaussians.from_points(torch.tensor([[0.0, 0.0, depth]]), torch.full((1, 3), value), 0, opacity=0.99)
+    gaussians.overwrite({"log_scales": torch.full((1, 3), 4.0), "opacity_logits": torch.full((1,), 12.0)})
+    return RadianceField(gaussians, SRGB, base_time=TIME, radiance=radiance, **options)
+
+
+def photograph(field, time=TIME, **options):
+    return field.photograph(CameraTensors.of(CAMERA, "cpu"), time, **options)
+
+
+@pytest.mark.parametrize("radiance", ["log", "linear"])
+@pytest.mark.parametrize("tone_map", ["pixel", "gaussian"])
+def test_a_wall_has_the_radiance_it_was_given(radiance, tone_map):
+    field = wall(0.2, radiance, tone_map=tone_map)
+    view = field.render(CAMERA)
+    centre, coverage = view.hdr[12, 16], float(view.alpha[12, 16])
+    torch.testing.assert_close(centre, torch.full((3,), 0.2 / TIME * coverage), rtol=1e-4, atol=0)
+    assert float(view.depth[12, 16]) == pytest.approx(3.0, rel=1e-4) and coverage > 0.98
+    for time in (TIME / 2, TIME, 2 * TIME):
+        expected = float(SRGB.encode(torch.tensor(0.2 * time / TIME * coverage)))
+        tolerance = 1e-4 if tone_map == "pixel" else 0.01
+        assert float(photograph(field, time).encoded.detach()[12, 16, 0]) == pytest.approx(expected, abs=tolerance)
+
+
+def test_display_colours_are_encoded_values():
+    field = wall(0.6 - 0.5, "display")
+    coverage = float(field.render(CAMERA).alpha[12, 16])
+    assert float(photograph(field).encoded.detach()[12, 16, 1]) == pytest.approx(0.6 * coverage, rel=1e-4)
+    decoded = float(SRGB.decode(torch.tensor(0.6 * coverage))) / TIME
+    assert float(field.render(CAMERA).hdr[12, 16, 1]) == pytest.approx(decoded, rel=1e-4)
+    brighter = float(SRGB.encode(torch.tensor(decoded * TIME * 1.5)))
+    assert float(photograph(field, 1.5 * TIME).encoded.detach()[12, 16, 1]) == pytest.approx(brighter, abs=1e-4)
+
+
+def test_ldr_is_limited_and_training_goes_on_beyond_white():
+    field = wall(9.0)
+    assert float(field.render_ldr(CAMERA).max()) == 1.0
+    photo = photograph(field).encoded
+    assert float(photo.detach()[12, 16, 0]) > 1.0
+    photo.sum().backward()
+    assert float(field.gaussians.harmonics_dc.grad.min()) > 0
+
+
+def test_black_pixels_have_finite_gradients():
+    field = wall(0.2)
+    field.gaussians.overwrite({"log_scales": torch.full((1, 3), -3.0)})
+    photo = photograph(field)
+    assert (photo.encoded == 0).any()
+    photo.encoded.sum().backward()
+    gradients = {name: p.grad for name, p in field.gaussians.named_parameters() if p.numel()}
+    assert gradients["harmonics_dc"].any() and all(torch.isfinite(gradient).all() for gradient in gradients.values())
+
+
+def fusion_of():
+    times = exposure_times(TIME, ("1/8x", "1x", "8x"))
+    return NeuralExposureFusion(SRGB, times, TIME, width=8, radiance_scale=1 / TIME)
+
+
+@pytest.mark.parametrize("tone_map,channels", [("pixel", 6), ("gaussian", 9)])
+def test_brackets_share_one_rasterisation(tone_map, channels):
+    calls = []
+
+    def counted(*arguments, **options):
+        calls.append(arguments[4].shape[1])
+        return rasterize(*arguments, **options)
+
+    field = wall(0.2, tone_map=tone_map, fusion=fusion_of(), rasterizer=counted)
+    photo = photograph(field, also=frozenset({"base", "exposure"}))
+    assert calls == [channels]
+    assert photo.encoded.shape == photo.exposure.shape == photo.base.shape == (24, 32, 3)
+
+
+def test_fused_radiance_is_neefs():
+    fusion = fusion_of()
+    field = wall(0.2, fusion=fusion)
+    with torch.no_grad():
+        expected = fusion(torch.full((1, 3), math.log(0.2)))[0]
+    photo = photograph(field, also=frozenset({"base", "exposure"}))
+    coverage = float(photo.rendering.alpha.detach()[12, 16])
+    torch.testing.assert_close(photo.exposure.detach()[12, 16], expected * TIME * coverage, rtol=1e-4, atol=0)
+    torch.testing.assert_close(photo.base.detach()[12, 16], torch.full((3,), 0.2 * coverage), rtol=1e-4, atol=0)
+    (photo.exposure.sum()).backward()
+    assert all(p.grad is not None for p in fusion.parameters())

@@ -1,0 +1,121 @@
+"""Any Warp kernel becomes a differentiable torch operation."""
+
+import gc
+import weakref
+
+import pytest
+import torch
+import warp as wp
+
+from sehdr_warp.rasterizer import differentiable
+
+
+@wp.kernel
+def square_kernel(values: wp.array(dtype=wp.vec3), squared: wp.array(dtype=wp.vec3)):
+    i = wp.tid()
+    squared[i] = wp.cw_mul(values[i], values[i])
+
+
+@wp.kernel
+def scale_kernel(
+    first: int, values: wp.array(dtype=wp.vec3), gain: wp.array(dtype=wp.float32), scaled: wp.array(dtype=wp.vec3)
+):
+    i = first + wp.tid()
+    scaled[i] = gain[0] * values[i]
+
+
+ALIVE: list[weakref.ref] = []
+"""The tapes of the programs that have run."""
+
+
+@differentiable
+def scale_and_square(program, values, gain):
+    scaled = program.write(values.shape)
+    squared = program.write(values.shape)
+    program.launch(scale_kernel, len(values), [values, gain], [scaled])
+    program.launch(square_kernel, len(values), [scaled], [squared])
+    ALIVE.append(weakref.ref(program.tape))
+    return scaled, squared
+
+
+def leaves(device):
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randn(50, 3, generator=generator).to(device).requires_grad_()
+    return values, torch.tensor([1.7], device=device, requires_grad=True)
+
+
+def test_gradients_flow_through_the_tape(device):
+    values, gain = leaves(device)
+    scaled, squared = scale_and_square(values, gain)
+    (2.0 * scaled + squared).sum().backward()
+    torch.testing.assert_close(values.grad, 2.0 * gain + 2.0 * gain**2 * values)
+    torch.testing.assert_close(gain.grad, (2.0 * values + 2.0 * gain * values**2).sum().reshape(1))
+
+
+def test_memory_is_shared_not_copied(device):
+    values, _ = leaves(device)
+    seen = []
+
+    @differentiable
+    def look(program, tensor):
+        seen.append(tensor.data_ptr())
+        return program.write(tensor.shape)
+
+    result = look(values)
+    assert seen == [values.data_ptr()]
+    assert result.device == values.device
+
+
+def test_the_gradient_that_torch_hands_in_is_left_alone(device):
+    values, gain = leaves(device)
+    scaled, _ = scale_and_square(values, gain)
+    scaled.retain_grad()
+    (3.0 * scaled).sum().backward()
+    torch.testing.assert_close(scaled.grad, torch.full_like(scaled, 3.0))
+
+
+def test_differentiating_twice_is_refused(device):
+    values, gain = leaves(device)
+    loss = scale_and_square(values, gain)[0].sum()
+    loss.backward(retain_graph=True)
+    with pytest.raises(RuntimeError, match="already differentiated"):
+        loss.backward()
+
+
+def test_gradients_of_gradients_are_refused(device):
+    values, gain = leaves(device)
+    gradient = torch.autograd.grad(scale_and_square(values, gain)[0].square().sum(), values, create_graph=True)[0]
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        (gradient + values).square().sum().backward()
+
+
+@pytest.mark.parametrize("differentiated", [False, True], ids=["dropped", "differentiated"])
+def test_memory_goes_with_the_result_without_the_garbage_collector(device, differentiated):
+    values, gain = leaves(device)
+    ALIVE.clear()
+    gc.disable()
+    try:
+        for _ in range(3):
+            result = scale_and_square(values, gain)
+            if differentiated:
+                result[0].sum().backward()
+            del result
+        assert [tape() for tape in ALIVE] == [None] * 3
+    finally:
+        gc.enable()
+
+
+def test_runs_on_a_side_stream():
+    if not torch.cuda.is_available():
+        pytest.skip("streams are CUDA's")
+    values, gain = leaves("cuda:0")
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        busy = torch.randn(4000, 4000, device="cuda:0")
+        for _ in range(20):
+            busy = busy @ busy * 1e-3
+        moved = values * 2.0 + busy[0, 0] * 0.0
+        scaled, _ = scale_and_square(moved.nan_to_num(), gain)
+    torch.cuda.synchronize()
+    torch.testing.assert_close(scaled, 2.0 * gain * values)

@@ -1,0 +1,85 @@
+"""What does not fit the public operations is answered in one line that names it."""
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.rasterizer import rasterize, spherical_harmonics, ssim
+
+from .scenes import random_scene
+
+
+def arguments(**changes):
+    names = ("means", "log_scales", "quaternions", "opacities", "features", "world_to_camera", "intrinsics")
+    given = dict(zip((*names, "width", "height"), random_scene(count=5).arguments, strict=True))
+    return given | {name: change(given.get(name)) for name, change in changes.items()}
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "kind", "message"),
+    [
+        ("means", lambda t: t.detach().numpy(), TypeError, r"means is a numpy.ndarray, expected a torch tensor \[N"),
+        ("means", lambda t: t[0, 0], ValueError, r"means has shape \[\], expected \[N, 3\]"),
+        ("log_scales", lambda t: t[:-1], ValueError, r"log_scales has shape \[4, 3\], expected \[N, 3\] with N = 5"),
+        ("quaternions", lambda t: t[:, :3], ValueError, r"quaternions has shape \[5, 3\], expected \[N, 4\]"),
+        ("opacities", lambda t: t.float(), ValueError, "opacities is torch.float32 on cpu, but means is torch.float64"),
+        ("opacities", lambda t: t.detach() + 5, ValueError, "opacities are from 5.* expected 0 to 1; give logits"),
+        ("features", lambda t: t[:, :0], ValueError, r"features has shape \[5, 0\], expected \[N, C\] with C >= 1"),
+        ("features", lambda t: t.to("meta"), ValueError, "features is torch.float64 on meta, but means is .* on cpu"),
+        ("means", lambda t: t.half(), ValueError, "means is torch.float16, expected torch.float32 or torch.float64"),
+        ("intrinsics", lambda t: [1.0] * 4, TypeError, r"intrinsics is a builtins.list, expected a torch tensor \[4\]"),
+        ("width", lambda _: 70.0, TypeError, "width is 70.0, expected a whole number"),
+        ("height", lambda _: 0, ValueError, "height 0 is not in 1.."),
+        ("capacity", lambda _: 2**31, ValueError, "capacity 2147483648 is not in 1.."),
+        ("near", lambda _: 0.0, ValueError, "near 0.0 is not"),
+        ("near", lambda _: float("nan"), ValueError, "near nan is not"),
+        ("low_pass", lambda _: -0.1, ValueError, "low_pass -0.1 is not"),
+        ("alpha_threshold", lambda _: float("nan"), ValueError, "alpha_threshold nan is not"),
+    ],
+)
+def test_misfits_of_a_render_are_named(name, change, kind, message):
+    with pytest.raises(kind, match=message) as caught:
+        rasterize(**arguments(**{name: change}))
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_whole_numbers_of_numpy_are_sizes():
+    assert rasterize(**arguments(width=np.int64)).image.shape == (50, 70, 3)
+
+
+@pytest.mark.parametrize(
+    ("degree", "change", "kind", "message"),
+    [
+        (4, {}, ValueError, "degree 4 is not in 0..3"),
+        (1.0, {}, TypeError, "degree is 1.0, expected a whole number"),
+        (3, {}, ValueError, "needs 16 coefficients, not 4"),
+        (1, {"constant": torch.ones(4, 1, 3)}, ValueError, r"coefficients\[0\] has shape \[4, 1, 3\]"),
+        (1, {"rest": torch.ones(5, 3, 3, dtype=torch.float64)}, ValueError, r"coefficients\[1\] is torch.float64"),
+        (1, {"means": np.ones((5, 3))}, TypeError, "means is a numpy.ndarray"),
+        (1, {"camera": torch.zeros(2)}, ValueError, r"camera_position has shape \[2\], expected \[3\]"),
+    ],
+)
+def test_misfits_of_harmonics_are_named(degree, change, kind, message):
+    given = {"constant": torch.ones(5, 1, 3), "rest": torch.ones(5, 3, 3)}
+    given |= {"means": torch.ones(5, 3), "camera": torch.zeros(3)} | change
+    with pytest.raises(kind, match=message):
+        spherical_harmonics(degree, (given["constant"], given["rest"]), given["means"], given["camera"])
+    if not change and degree == 3:
+        with pytest.raises(TypeError, match=r"coefficients is a numpy.ndarray, expected a torch tensor \[N, K, 3\]"):
+            spherical_harmonics(1, np.ones((5, 4, 3)), given["means"], given["camera"])
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "kind", "message"),
+    [
+        (torch.zeros(4, 4), torch.zeros(4, 4), ValueError, r"a has shape \[4, 4\], expected \[H, W, C\]"),
+        (torch.zeros(0, 5, 3), torch.zeros(0, 5, 3), ValueError, "with a pixel at least"),
+        (torch.zeros(4, 4, 3), torch.zeros(4, 5, 3), ValueError, r"b has shape \[4, 5, 3\], .* H = 4, W = 4, C = 3"),
+        (torch.zeros(4, 4, 3), torch.zeros(4, 4, 3).double(), ValueError, "b is torch.float64 on cpu, but a is"),
+        (torch.zeros(4, 4, 3).int(), torch.zeros(4, 4, 3).int(), ValueError, "a is torch.int32, expected torch"),
+        (np.zeros((4, 4, 3)), torch.zeros(4, 4, 3), TypeError, "a is a numpy.ndarray"),
+    ],
+)
+def test_misfits_of_similarity_are_named(a, b, kind, message):
+    with pytest.raises(kind, match=message):
+        ssim(a, b)

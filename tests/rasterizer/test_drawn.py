@@ -1,0 +1,31 @@
+"""What the block kernels have to do is counted as they do it."""
+
+import torch
+import warp as wp
+
+from sehdr_warp.bench.splats import Size, make_splat_scene
+from sehdr_warp.kernels.constants import ALPHA_THRESHOLD
+from sehdr_warp.rasterizer import rasterize
+from sehdr_warp.rasterizer.drawn import drawn_pairs
+
+
+def test_what_warps_draw_is_counted(device, monkeypatch):
+    scene = make_splat_scene(Size(400, 40, 24), 3, device)
+    means, log_scales, quaternions, opacities, features = scene.leaves
+    camera = scene.world_to_camera, scene.intrinsics
+
+    def counted(opacities, grown=0.0):
+        """What is counted, and the warps that have a pixel which a Gaussian colors, were it alone."""
+        given = means, log_scales + grown, quaternions, opacities, features
+        with monkeypatch.context() as fibers:
+            fibers.setattr(wp.config, "enable_cpu_blocks", device == "cpu")
+            pairs, drawn = drawn_pairs((*given, *camera), 40, 24)
+        each = [rasterize(*(tensor[i : i + 1] for tensor in given), *camera, 40, 24).alpha for i in range(400)]
+        colored = torch.stack(each) >= ALPHA_THRESHOLD
+        assert pairs == rasterize(*given, *camera, 40, 24).entry_count
+        return drawn, int(colored.view(400, 6, 4, 5, 8).any(4).any(2).sum())
+
+    faint, alone = counted(0.05 * opacities)
+    assert alone <= faint < 1.1 * alone
+    opaque, alone = counted(torch.full_like(opacities, 0.9999), grown=1.5)
+    assert opaque < alone / 3  # The others are behind the last that a pixel of the warp shows.

@@ -1,0 +1,185 @@
+"""Extreme numbers of Gaussians, images and lists, and what happens when memory runs out."""
+
+import math
+import resource
+import subprocess
+import sys
+import textwrap
+
+import pytest
+import torch
+
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.rasterizer import memory, rasterize
+from sehdr_warp.rasterizer.memory import OutOfMemory, bytes_asked_for
+
+from .scenes import random_scene
+
+
+def splat(device, means, sigma, opacity, features, width, height, focal=None):
+    """Round Gaussians of standard deviation `sigma` [N] before a camera at the origin: rendering and its leaves."""
+    count = len(means)
+    leaves = [
+        torch.as_tensor(means, dtype=torch.float32),
+        torch.as_tensor(sigma, dtype=torch.float32).log().reshape(-1, 1).expand(count, 3),
+        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        torch.as_tensor(opacity, dtype=torch.float32).expand(count),
+        torch.as_tensor(features, dtype=torch.float32),
+    ]
+    leaves = [leaf.to(device).clone().requires_grad_() for leaf in leaves]
+    focal = focal or float(width)
+    camera = torch.tensor([focal, focal, width / 2, height / 2], device=device)
+    return lambda **options: rasterize(*leaves, torch.eye(4, device=device), camera, width, height, **options), leaves
+
+
+def finite_gradients(rendering, leaves) -> bool:
+    (rendering.image.sum() + rendering.alpha.sum()).backward()
+    return all(torch.isfinite(leaf.grad).all() for leaf in leaves)
+
+
+@pytest.mark.parametrize("count", [0, 3])
+@pytest.mark.parametrize("size", [(1, 1), (640, 480)])
+def test_nothing_to_draw_on_any_image(device, count, size):
+    means = torch.tensor([[0.0, 0.0, -3.0]]).repeat(count, 1)
+    draw, leaves = splat(device, means, torch.ones(count), 0.5, torch.ones(count, 3), *size)
+    for options in ({}, {"capacity": 1}):
+        rendering = draw(**options)
+        assert rendering.image.shape == (size[1], size[0], 3)
+        assert not rendering.image.any() and not rendering.alpha.any() and not rendering.visible.any()
+        assert finite_gradients(rendering, leaves)
+
+
+def test_a_single_pixel(device):
+    draw, leaves = splat(device, [[0.0, 0.0, 2.0]], [0.5], 0.5, [[3.0]], 1, 1)
+    rendering = draw()
+    # The centre falls on the pixel's own: alpha is the opacity.
+    assert rendering.image.item() == pytest.approx(1.5, rel=1e-5)
+    assert finite_gradients(rendering, leaves)
+
+
+def test_one_gaussian_over_a_whole_8k_image(device):
+    """7680 x 4320 (an eighth of its height on the CPU), every tile of it: one entry a tile."""
+    width, height = 7680, 4320 if device.startswith("cuda") else 540
+    draw, leaves = splat(device, [[0.0, 0.0, 1.0]], [40.0], 0.25, [[2.0]], width, height)
+    rendering = draw()
+    assert rendering.entry_count == math.ceil(width / 16) * math.ceil(height / 16)
+    assert float((rendering.image - 0.5).abs().max().detach()) < 1e-3
+    assert finite_gradients(rendering, leaves)
+    # d image / d opacity is the feature times the falloff, and d alpha / d opacity the falloff itself.
+    assert float(leaves[3].grad) == pytest.approx(3.0 * width * height, rel=1e-3)
+
+
+def test_very_many_gaussians_in_one_tile(device):
+    """All in one tile: as many entries as Gaussians, the front ones hide the rest."""
+    count = 1_000_000 if device.startswith("cuda") else 300_000  # More than one sort takes
+    generator = torch.Generator().manual_seed(0)
+    depth = 2.0 + torch.arange(count) / count
+    spread = (torch.rand(count, 2, generator=generator) - 0.5) * 16 / 64 * depth[:, None]
+    means = torch.cat([spread, depth[:, None]], dim=1)[torch.randperm(count, generator=generator)]
+    draw, leaves = splat(device, means, torch.full((count,), 0.02), 0.5, means[:, 2:], 16, 16, focal=64.0)
+    rendering = draw()
+    assert rendering.entry_count == count
+    assert float(rendering.alpha.detach().min()) > 0.99
+    assert float((rendering.image[..., 0] / rendering.alpha).detach().max()) < 2.01  # the nearest of depths 2 to 3
+    assert finite_gradients(rendering, leaves)
+    counted = leaves[4].grad[:, 0] > 0
+    assert 0 < int(counted.sum()) < count // 100
+
+
+def test_a_capacity_too_small_for_one_big_splat(device):
+    draw, leaves = splat(device, [[0.0, 0.0, 1.0]], [40.0], 0.5, [[1.0]], 320, 160)
+    rendering = draw(capacity=7)
+    assert rendering.overflow and rendering.entry_count == 7
+    drawn = (rendering.alpha > 0).sum()
+    assert int(drawn) == 7 * 256
+    assert finite_gradients(rendering, leaves)
+
+
+@pytest.mark.parametrize(
+    ("error", "asked"),
+    [
+        (MemoryError("Unable to allocate 1.50 GiB for an array"), "1.50 GiB"),
+        (MemoryError(), "some memory"),
+        (
+            RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 4294967296 bytes."),
+            "4.00 GiB",
+        ),
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB. GPU 0 has"), "20.00 MiB"),
+        (RuntimeError("Failed to allocate 4096 bytes on device 'cuda:0'"), "4096 bytes"),
+        (RuntimeError("CUDA error: an illegal memory access was encountered"), None),
+        (ValueError("size"), None),
+    ],
+)
+def test_failed_allocations_are_told_from_other_errors(error, asked):
+    assert bytes_asked_for(error) == asked
+
+
+def test_a_failed_allocation_says_the_sizes(device, monkeypatch):
+    scene = random_scene(count=5).to(torch.float32, device)
+
+    errors = [torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 3.00 GiB. GPU 0"), RuntimeError("a defect")]
+
+    def fails(*arguments, **options):
+        raise errors.pop(0)
+
+    monkeypatch.setattr("sehdr_warp.rasterizer.rasterization.project", fails)
+    with pytest.raises(OutOfMemory) as caught:
+        rasterize(*scene.arguments)
+    with pytest.raises(RuntimeError, match="a defect"):  # other errors pass
+        rasterize(*scene.arguments)
+    assert str(caught.value) == (
+        f"out of memory on {device}: 3.00 GiB could not be allocated with 5 Gaussians, an image of 70 x 50, "
+        "3 channels; " + memory.REMEDY
+    )
+    assert isinstance(caught.value, SehdrError)
+
+
+@pytest.mark.skipif(not hasattr(resource, "RLIMIT_AS"), reason="no limit on address space here")
+def test_running_out_on_the_cpu_is_one_line():
+    """A process of its own with 4 GB more than it has after start, of which each thread takes 72 MB: an 8K image of 48
+    channels needs 6.4 GB."""
+    code = """
+        import resource, torch
+        from sehdr_warp.rasterizer import rasterize
+        rows = lambda n, *row: torch.tensor([row]).repeat(n, 1)
+        arguments = (rows(1, 0.0, 0.0, 2.0), rows(1, 0.0, 0.0, 0.0), rows(1, 1.0, 0.0, 0.0, 0.0), torch.tensor([0.5]))
+        used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (used + (4 << 30), -1))
+        camera = torch.eye(4), torch.tensor([100.0, 100.0, 8.0, 8.0])
+        try:
+            rasterize(*arguments, torch.ones(1, 48), *camera, 7680, 4320)
+        except Exception as error:
+            print(type(error).__name__, error)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith(
+        "OutOfMemory out of memory on cpu: 5.93 GiB could not be allocated with 1 Gaussians, an"
+    )
+    assert "7680 x 4320, 48 channels; use fewer" in done.stdout
+    assert len(done.stdout.splitlines()) == 1
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_running_out_on_the_gpu_is_one_line_and_the_next_render_works():
+    scene = random_scene(count=50, channels=48, width=7680, height=4320).to(torch.float32, "cuda:0")
+    small = random_scene(count=50).to(torch.float32, "cuda:0")
+    torch.cuda.empty_cache()
+    total = torch.cuda.get_device_properties(0).total_memory
+    torch.cuda.set_per_process_memory_fraction((torch.cuda.memory_reserved(0) + (1 << 30)) / total, 0)
+    try:
+        with pytest.raises(
+            OutOfMemory, match=r"out of memory on cuda:0: .* 50 Gaussians, an image of 7680 x 4320, 48 ch"
+        ):
+            rasterize(*scene.arguments)
+        assert torch.isfinite(rasterize(*small.arguments).image).all()
+    finally:
+        torch.cuda.set_per_process_memory_fraction(1.0, 0)
+
+
+def test_no_kernel_is_compiled_where_its_compiler_would_end_the_process(monkeypatch):
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (1 << 20, limits[1]))
+    with pytest.raises(MemoryError, match="compiler of kernels"):
+        memory.check_room_to_compile()
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (1 << 50, limits[1]))
+    memory.check_room_to_compile()

@@ -1,0 +1,47 @@
+"""Warp's cache: what is damaged is found and goes, what is sound stays, and a place that cannot be used is no end."""
+
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+from sehdr_warp.rasterizer import kernel_cache
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setattr(kernel_cache.atexit, "register", lambda *_, **__: None)
+    for module in ("wp_blend_0a1b2c3", "wp_sort_0123456", "wp_sort_0123456_p1_t2"):
+        (tmp_path / module).mkdir()
+        for end in (".o", ".meta"):
+            (tmp_path / module / f"{module}{end}").write_text(module + end)
+    kernel_cache.check()
+    return tmp_path
+
+
+def modules(cache):
+    return sorted(path.name for path in cache.glob("wp_*"))
+
+
+@pytest.mark.parametrize("damage", ["", "half", "wp_blend_0a1b2c3.O"])
+@pytest.mark.parametrize("end", [".o", ".meta"])
+def test_damaged_modules_go_and_are_told_once(cache, caplog, damage, end):
+    kernel_cache.check()
+    assert len(modules(cache)) == 3 and not caplog.text
+    (cache / "wp_blend_0a1b2c3" / f"wp_blend_0a1b2c3{end}").write_text(damage)
+    kernel_cache.check()
+    assert modules(cache) == ["wp_sort_0123456", "wp_sort_0123456_p1_t2"]
+    kernel_cache.check()
+    assert caplog.text.count("1 damaged modules of the kernel cache are compiled again") == 1
+
+
+@pytest.mark.parametrize("place", ["/dev/null", "/proc/none", "a\0b"])
+def test_a_place_that_cannot_be_used_is_done_without(monkeypatch, caplog, place):
+    made = []
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", None)
+    monkeypatch.setattr(kernel_cache.os, "environ", {"WARP_CACHE_PATH": place})
+    monkeypatch.setattr(kernel_cache.atexit, "register", lambda *given, **_: made.append(given[1]))
+    kernel_cache.choose()
+    assert made == [wp.config.kernel_cache_dir] and "for this process alone" in caplog.text
+    Path(made[0]).rmdir()

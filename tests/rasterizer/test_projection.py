@@ -1,0 +1,81 @@
+"""The projection as a torch operation; what it computes is compared in test_rasterize.py."""
+
+import gc
+import weakref
+
+import pytest
+import torch
+
+from sehdr_warp.rasterizer.projection import project
+
+from .scenes import random_scene
+
+OPTIONS = {"near": 0.01, "low_pass": 0.3, "alpha_threshold": 1 / 255, "antialiased": False}
+
+
+def seen(device="cpu", **sizes):
+    """The tensors that a projection takes, and what it returns."""
+    scene = random_scene(**sizes).to(device=device)
+    given = *scene.tensors[:4], *scene.tensors[5:]
+    return given, project(*given, width=scene.width, height=scene.height, **OPTIONS)
+
+
+def test_gradients_of_any_strides_are_read(device):
+    weights = torch.tensor([2.0, 3.0, 5.0], dtype=torch.float64, device=device)
+    found = []
+    for expanded in (True, False):
+        given, (means2d, conics, depths, opacities, _) = seen(device)
+        # The derivatives of a sum are one number that is there once, those of a product as many as there are.
+        loss = means2d.sum() + (conics * weights).sum() + depths.sum() + opacities.sum()
+        if not expanded:
+            ones = torch.ones_like
+            loss = (means2d * ones(means2d)).sum() + (conics * weights).sum()
+            loss = loss + (depths * ones(depths)).sum() + (opacities * ones(opacities)).sum()
+        loss.backward()
+        found.append([tensor.grad for tensor in given])
+    for ours, theirs in zip(*found, strict=True):
+        assert ours.abs().sum() > 0
+        torch.testing.assert_close(ours, theirs)
+
+
+def test_only_what_asks_for_a_gradient_has_one(device):
+    given, (means2d, *_) = seen(device)
+    by_scales, by_pose = torch.autograd.grad(means2d.square().sum(), (given[0], given[4]))
+    assert by_scales.shape == given[0].shape and by_pose.shape == (4, 4)
+    assert all(tensor.grad is None for tensor in given)
+    with torch.no_grad():
+        assert not seen(device)[1][0].requires_grad
+    assert not seen(device)[1][4].requires_grad
+
+
+def test_the_cameras_gradient_is_of_all_gaussians(device):
+    """However many threads share them: each adds to the same numbers."""
+    given, (means2d, *_, extents) = seen(device, count=40_000, size=0.01)
+    means2d.sum().backward()
+    visible = (extents[:, 0] > 0).sum()
+    assert visible > 20_000
+    by_lens = given[5].grad
+    assert by_lens is not None
+    torch.testing.assert_close(by_lens[2:], visible.double().expand(2))
+
+
+def test_differentiating_twice_is_refused(device):
+    _, (means2d, *_) = seen(device)
+    loss = means2d.sum()
+    loss.backward(retain_graph=True)
+    with pytest.raises(RuntimeError, match="already differentiated"):
+        loss.backward()
+
+
+@pytest.mark.parametrize("differentiated", [False, True], ids=["dropped", "differentiated"])
+def test_memory_goes_without_the_garbage_collector(device, differentiated):
+    gc.disable()
+    try:
+        given, results = seen(device)
+        alive = [weakref.ref(tensor) for tensor in results]
+        if differentiated:
+            results[0].sum().backward()
+        del given, results
+        assert [tensor() for tensor in alive] == [None] * 5
+    finally:
+        gc.enable()

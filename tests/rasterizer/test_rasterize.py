@@ -1,0 +1,158 @@
+"""The whole splat against its plain torch reference and against finite differences, on every device."""
+
+import pytest
+import torch
+
+from sehdr_warp.rasterizer import rasterize
+from sehdr_warp.rasterizer.reference import rasterize_reference
+
+from .scenes import finite_differences, random_like, random_scene, relative_error
+
+NAMES = ("means", "log_scales", "quaternions", "opacities", "features", "world_to_camera", "intrinsics")
+# Largest relative error in norm: value, gradient.
+BOUNDS = {torch.float64: (1e-12, 1e-11), torch.float32: (1e-5, 1e-4)}
+
+
+def backward(rendering):
+    """A loss that weighs every pixel of image and alpha differently."""
+    loss = (rendering.image * random_like(rendering.image, 3)).sum()
+    loss = loss + (rendering.alpha * random_like(rendering.alpha, 4)).sum()
+    loss.backward()
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
+@pytest.mark.parametrize("channels", [1, 3, 9])
+@pytest.mark.parametrize("antialiased", [False, True], ids=["plain", "antialiased"])
+def test_matches_the_reference(device, dtype, channels, antialiased):
+    if antialiased and channels != 3:
+        pytest.skip("antialiasing does not look at the channels")
+    scene = random_scene(channels=channels)
+    ours, truth = scene.to(dtype, device), scene.to(torch.float64)
+    rendering = rasterize(*ours.arguments, antialiased=antialiased)
+    reference = rasterize_reference(*truth.arguments, antialiased=antialiased)
+    value_bound, gradient_bound = BOUNDS[dtype]
+    assert relative_error(rendering.image, reference.image) < value_bound
+    assert relative_error(rendering.alpha, reference.alpha) < value_bound
+    assert torch.equal(rendering.visible.cpu(), reference.visible)
+    backward(rendering)
+    backward(reference)
+    for name, tensor, true in zip(NAMES, ours.tensors, truth.tensors):
+        assert relative_error(tensor.grad, true.grad) < gradient_bound, name
+
+
+def test_transmittance_keeps_its_digits_where_little_is_left(device):
+    scene = random_scene(count=600, channels=1, width=44, height=26, spread=1.6, seed=2).to(torch.float32, device)
+    with torch.no_grad():
+        ours = rasterize(*scene.arguments)
+        truth = rasterize_reference(*scene.to(torch.float64).arguments).transmittance
+    faint = truth < 1e-3
+    assert faint.sum() > 500
+    # 1 - alpha would be wrong by 8e-5 here.
+    assert relative_error(ours.transmittance[faint], truth[faint]) < 3e-5
+    assert torch.equal(ours.alpha, 1 - ours.transmittance)
+
+
+@pytest.mark.parametrize("which", range(len(NAMES)), ids=NAMES)
+def test_gradients_match_finite_differences(device, which):
+    # Few, wide Gaussians and a tiny threshold keep every pixel away from the cut-offs, where no derivative exists.
+    scene = random_scene(count=12, channels=2, width=18, height=17, spread=0.8, size=0.6, seed=1)
+    scene.tensors[0] = scene.tensors[0].clone()
+    scene.tensors[0][:, 2] = scene.tensors[0][:, 2].abs() * 0.3 + 2.0
+    scene.tensors[3] = scene.tensors[3] * 0.4
+
+    def loss(*tensors, dtype=torch.float64):
+        moved = [t.to(device=device, dtype=dtype) for t in tensors]
+        rendering = rasterize(*moved, scene.width, scene.height, alpha_threshold=1e-12)
+        return (rendering.image * random_like(rendering.image, 5)).sum() + rendering.alpha.square().sum()
+
+    numeric = finite_differences(loss, scene.tensors, which)
+    for dtype, bound in ((torch.float64, 1e-8), (torch.float32, 1e-4)):
+        tensors = [t.detach().clone().requires_grad_() for t in scene.tensors]
+        loss(*tensors, dtype=dtype).backward()
+        assert relative_error(tensors[which].grad, numeric) < bound
+
+
+def test_cpu_results_do_not_depend_on_the_number_of_threads(monkeypatch):
+    results = []
+    for threads in ("1", "2", "5"):
+        monkeypatch.setenv("SEHDR_THREADS", threads)
+        scene = random_scene(count=300).to(torch.float32)
+        rendering = rasterize(*scene.arguments)
+        backward(rendering)
+        results.append([rendering.image, rendering.alpha, *(t.grad for t in scene.tensors)])
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+
+
+def test_means2d_carries_the_densification_signal(device):
+    scene = random_scene().to(torch.float32, device)
+    rendering = rasterize(*scene.arguments)
+    rendering.means2d.retain_grad()
+    backward(rendering)
+    gradient = rendering.means2d.grad
+    assert gradient.shape == (150, 2)
+    assert (gradient[rendering.visible].abs().sum(1) > 0).any()
+    assert (gradient[~rendering.visible] == 0).all()
+
+
+def test_tensors_that_need_no_gradient_get_none(device):
+    scene = random_scene().to(torch.float32, device)
+    for tensor in scene.tensors[:4] + scene.tensors[5:]:
+        tensor.requires_grad_(False)
+    rasterize(*scene.arguments).image.sum().backward()
+    assert scene.tensors[4].grad is not None
+    assert all(tensor.grad is None for tensor in scene.tensors[:4])
+    with torch.no_grad():
+        assert not rasterize(*scene.arguments).image.requires_grad
+
+
+def test_gaussians_that_a_capacity_leaves_out_get_no_gradient(device):
+    scene = random_scene().to(torch.float32, device)
+    rendering = rasterize(*scene.arguments, capacity=1)
+    backward(rendering)
+    assert rendering.overflow
+    assert int((scene.tensors[4].grad != 0).any(1).sum()) == 1
+    assert int((scene.tensors[0].grad != 0).any(1).sum()) == 1
+
+
+def test_a_capacity_changes_nothing_when_it_is_enough_and_says_so_when_not(device):
+    scene = random_scene().to(torch.float32, device)
+    exact = rasterize(*scene.arguments)
+    roomy = rasterize(*scene.arguments, capacity=exact.entry_count + 100)
+    assert exact.overflow is None and not roomy.overflow
+    assert torch.equal(exact.image, roomy.image)
+    cramped = rasterize(*scene.arguments, capacity=exact.entry_count - 1)
+    assert cramped.overflow
+    for rendering in (roomy, cramped):
+        rendering.image.sum().backward()
+        assert all(torch.isfinite(t.grad).all() for t in scene.tensors)
+
+
+def test_many_faint_gaussians_keep_their_gradients(device):
+    """10^4 factors of 1 - 1e-4 lost three digits of every gradient while the adjoint divided by them one by one."""
+    scene = random_scene(count=10_000, channels=1, width=3, height=2, spread=0.1)
+    scene.tensors[1][:] = 0.0
+    scene.tensors[3][:] = 1e-4
+    scene.tensors[0][:, 2] = torch.linspace(2.0, 6.0, 10_000, dtype=torch.float64)
+    ours, truth = scene.to(torch.float32, device), scene.to(torch.float32).to(torch.float64)
+    rasterize(*ours.arguments, alpha_threshold=1e-6).image.sum().backward()
+    rasterize_reference(*truth.arguments, alpha_threshold=1e-6).image.sum().backward()
+    for which in (3, 4):
+        assert relative_error(ours.tensors[which].grad, truth.tensors[which].grad) < 2e-5
+
+
+def test_deterministic_gradients_repeat_bit_for_bit_and_are_the_others(device):
+    scene = random_scene(count=3000, channels=5, width=120, height=70, spread=2.0, seed=3).to(torch.float32, device)
+
+    def drawn(deterministic=True, capacity=None):
+        for tensor in scene.tensors:
+            tensor.grad = None
+        rendering = rasterize(*scene.arguments, deterministic=deterministic, capacity=capacity)
+        backward(rendering)
+        return [rendering.image, *(tensor.grad for tensor in scene.tensors[:5])]
+
+    first = drawn()
+    for again in (drawn(), drawn(), drawn(capacity=100_000)):
+        assert all(torch.equal(a, b) for a, b in zip(first, again))
+    for ours, other in zip(first, drawn(deterministic=False)):
+        assert relative_error(ours, other) < 1e-5

@@ -1,0 +1,161 @@
+"""Calls of rasterize() that are replayed: what they return is what launched calls do, and stays."""
+
+import pytest
+import torch
+
+from sehdr_warp.rasterizer import rasterize, replays, tile_lists
+
+from .scenes import random_like, random_scene, relative_error
+
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
+CALLS = replays.LAUNCHED_FIRST + 3
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_recorded():
+    replays.forget()
+
+
+def launched(*arguments, **options):
+    """rasterize() with room for all pairs, which is never replayed."""
+    return rasterize(*arguments, capacity=100_000, **options)
+
+
+def scene_of(count=300, channels=3):
+    return random_scene(count=count, channels=channels).to(torch.float32, "cuda:0")
+
+
+def recordings():
+    return sum(kind.made for kind in replays._kinds.values())
+
+
+def values_and_gradients(splat, scene, *, by_alpha=True, **options):
+    for tensor in scene.tensors:
+        tensor.grad = None
+    seen = splat(*scene.arguments, **options)
+    seen.means2d.retain_grad()
+    loss = (seen.image * random_like(seen.image, 1)).sum()
+    if by_alpha:
+        loss = loss + (seen.alpha * random_like(seen.alpha, 2)).sum()
+    if seen.depth is not None:
+        loss = loss + (seen.depth * random_like(seen.depth, 3)).sum()
+    loss.backward()
+    gradients = [tensor.grad for tensor in (*scene.tensors, seen.means2d) if tensor.grad is not None]
+    return [tensor.detach().clone() for tensor in (seen.image, seen.alpha, seen.depths, seen.radii, *gradients)]
+
+
+def assert_alike(ours, truth):
+    for mine, true in zip(ours, truth, strict=True):
+        assert relative_error(mine, true) < 1e-5
+
+
+@needs_gpu
+@pytest.mark.parametrize("options", [{}, {"by_alpha": False}, {"depth": True, "antialiased": True}])
+def test_replays_follow_their_arguments_and_their_need_of_room(options):
+    for count, channels in ((300, 3), (150, 9), (300, 3)):
+        scene = scene_of(count, channels)
+        for growth in (0.0, 0.4, 1.5):
+            with torch.no_grad():
+                scene.tensors[1] += growth
+            for _ in range(CALLS):
+                ours = values_and_gradients(rasterize, scene, **options)
+                with torch.no_grad():
+                    scene.tensors[0] += 0.01
+            with torch.no_grad():
+                scene.tensors[0] -= 0.01
+            assert_alike(ours, values_and_gradients(launched, scene, **options))
+    assert recordings()
+
+
+@needs_gpu
+def test_pictures_stay_and_backward_passes_come_in_any_order():
+    scene = scene_of()
+    shifts = [0.02 * call for call in range(CALLS + replays.TOGETHER)]
+
+    def seen(splat, shift):
+        return splat(scene.tensors[0] + shift, *scene.arguments[1:]).image
+
+    images = [seen(rasterize, shift) for shift in shifts]
+    truths = [seen(launched, shift) for shift in shifts]
+    assert recordings() == replays.TOGETHER
+    for place in (*range(1, len(shifts), 2), *range(0, len(shifts), 2)):
+        pair = [
+            torch.autograd.grad((i * random_like(i, place)).sum(), scene.tensors[:5])
+            for i in (images[place], truths[place])
+        ]
+        assert_alike(*pair)
+    assert_alike(images, truths)
+
+
+@needs_gpu
+@pytest.mark.parametrize("one_sort", [1 << 18, 0])
+def test_without_gradients_pictures_stay_too(one_sort, monkeypatch):
+    monkeypatch.setattr(tile_lists, "ONE_SORT", one_sort)
+    scene = scene_of()
+    with torch.no_grad():
+        images = [
+            rasterize(*scene.arguments[:4], scene.tensors[4] * k, *scene.arguments[5:]).image for k in range(1, 9)
+        ]
+        truth = launched(*scene.arguments).image
+    assert recordings() == 1 and not images[-1].requires_grad
+    assert_alike([image / k for k, image in enumerate(images, 1)], [truth] * 8)
+
+
+@needs_gpu
+def test_gradients_add_up_over_calls_and_cameras():
+    scene = scene_of()
+    cameras = torch.stack([scene.tensors[5]] * 2), torch.stack([scene.tensors[6]] * 2)
+
+    def summed(splat):
+        for tensor in scene.tensors:
+            tensor.grad = None
+        for _ in range(CALLS):
+            image = splat(*scene.tensors[:5], *cameras, scene.width, scene.height).image
+            (image * random_like(image, 1)).sum().backward()
+        return [tensor.grad.clone() for tensor in scene.tensors[:5]]
+
+    assert_alike(summed(rasterize), summed(launched))
+
+
+@needs_gpu
+def test_a_feature_that_is_not_finite_is_culled_in_a_replay_as_well():
+    scene = scene_of()
+    for value in (1.0, float("nan")):
+        with torch.no_grad():
+            scene.tensors[4][7] = value
+        for _ in range(CALLS):
+            seen = rasterize(*scene.arguments)
+    assert recordings() and not seen.visible[7] and seen.visible.any() and bool(seen.image.isfinite().all())
+
+
+def test_calls_are_recorded_after_some_and_hold_what_they_were_given():
+    kind, made = replays._Kind(), iter("abcdefgh")
+    assert [kind.take(lambda pairs: next(made)) for _ in range(replays.LAUNCHED_FIRST)] == [
+        None
+    ] * replays.LAUNCHED_FIRST
+    leases = [replays._Lease(kind.idle, kind.take(lambda pairs: next(made))) for _ in range(replays.TOGETHER)]
+    assert kind.take(lambda pairs: next(made)) is None, "all are held"
+    del leases[1]
+    assert kind.take(lambda pairs: next(made)) == "b"
+    kind.grow(70)
+    kind.grow(50)
+    del leases
+    assert kind.idle == [], "too small, they are let go"
+    assert kind.take(lambda pairs: pairs) == 70
+
+
+def test_what_cannot_be_recorded_is_launched():
+    kind, asked = replays._Kind(), []
+
+    def record(pairs):
+        asked.append(pairs)
+        raise torch.OutOfMemoryError("no memory")
+
+    assert not any(kind.take(record) for _ in range(replays.LAUNCHED_FIRST + 5)) and len(asked) == 1
+
+
+def test_only_the_latest_kinds_are_remembered():
+    kinds = [replays._kind((n,)) for n in range(replays.KINDS)]
+    assert replays._kind((0,)) is kinds[0]
+    replays._kind((replays.KINDS,))
+    assert replays._kind((0,)) is kinds[0] and replays._kind((1,)) is not kinds[1]

@@ -1,0 +1,172 @@
+"""The lists of the tiles: every entry that was counted is written, whatever the two kernels make of a border case."""
+
+from dataclasses import fields
+
+import pytest
+import torch
+
+from sehdr_warp.kernels.tiles import DEPTH_BITS
+from sehdr_warp.rasterizer import tile_lists
+from sehdr_warp.rasterizer.tile_lists import (
+    build_tile_lists,
+    depth_order,
+    emit_entries,
+    emit_keys,
+    find_lists,
+    number_entries,
+    sort_keys,
+)
+
+from .scenes import packed, random_scene
+
+COLUMNS, ROWS, UNWRITTEN = 20, 15, -7
+
+
+def dense(device, count=20000):
+    """Records, counts, depths and extents of a scene dense enough that many ellipses end just at a tile's border."""
+    return packed(random_scene(count=count, width=16 * COLUMNS, height=16 * ROWS).to(torch.float32, device))
+
+
+def counted(*scene):
+    """What emit_entries() reads, and the counts in that order."""
+    records, counts, depths, extents = dense(*scene)
+    order = depth_order(depths, extents)
+    return (order, *records, extents, COLUMNS, ROWS), counts[order]
+
+
+def built(records, counts, depths, extents, capacity=None, *, emission=True):
+    numbered = number_entries(counts, depths, extents, emission=emission)
+    size = 16 * COLUMNS, 16 * ROWS
+    return build_tile_lists(records, *numbered, depths, extents, *size, capacity, emission=emission)
+
+
+def emit(records, counts, monkeypatch):
+    """Tiles and Gaussians of the entries, in memory that holds what no tile and no Gaussian is."""
+    empty = torch.empty
+    monkeypatch.setattr(torch, "empty", lambda *a, **k: empty(*a, **k).fill_(UNWRITTEN))
+    room = int(counts.sum())
+    tiles, gaussians = emit_entries(*records, counts.cumsum(0), room)
+    monkeypatch.undo()
+    return tiles[:room], gaussians[:room]
+
+
+def test_each_counted_tile_is_emitted_once(device, monkeypatch):
+    records, counts = counted(device)
+    assert int(counts.sum()) > 200_000
+    tiles, gaussians = emit(records, counts, monkeypatch)
+    assert int(tiles.min()) >= 0 and int(tiles.max()) < COLUMNS * ROWS
+    assert torch.equal(gaussians, records[0].repeat_interleave(counts))
+    pairs = gaussians.long() * COLUMNS * ROWS + tiles
+    assert len(pairs.unique()) == len(pairs)
+
+
+def test_an_entry_counted_too_much_is_no_tiles_and_one_too_few_costs_its_own_gaussian_only(device, monkeypatch):
+    records, counts = counted(device, 500)
+    true_tiles, _ = emit(records, counts, monkeypatch)
+    first, second = counts.nonzero()[[3, 40], 0].tolist()
+    assert int(counts[second]) > 1
+    wrong = counts.clone()
+    wrong[first] += 2
+    wrong[second] -= 1
+    tiles, gaussians = emit(records, wrong, monkeypatch)
+    assert torch.equal(gaussians, records[0].repeat_interleave(wrong))
+    unused = tiles == COLUMNS * ROWS
+    assert int(unused.sum()) == 2 and set(gaussians[unused].tolist()) == {int(records[0][first])}
+    dropped = int(counts[: second + 1].sum()) - 1
+    assert torch.equal(tiles[~unused], torch.cat([true_tiles[:dropped], true_tiles[dropped + 1 :]]))
+    ordered = tiles.sort(stable=True)
+    ranges, _ = find_lists(ordered.values, gaussians[ordered.indices], records[1:3], COLUMNS, ROWS)
+    assert int((ranges[:, 1] - ranges[:, 0]).sum()) == len(tiles) - 2
+
+
+@pytest.mark.parametrize("spare", [0, 7, -1000])
+def test_one_sort_makes_the_lists_of_two(device, spare):
+    records, counts, depths, extents = dense(device)
+    # Many at one depth: ties keep the order of indices.
+    depths = (depths * 4).round().clamp_min(1) / 4
+    lists = built(records, counts, depths, extents)
+    room = lists.entry_count + spare
+    given = *records, extents, depths, COLUMNS, ROWS, counts.cumsum(0), room
+    keys, gaussians = sort_keys(*emit_keys(*given), room, COLUMNS * ROWS)
+    ranges, corners = find_lists(keys, gaussians, records, COLUMNS, ROWS)
+    if spare < 0:
+        assert int(ranges[-1, 1]) == room and int(keys.max() >> DEPTH_BITS) < COLUMNS * ROWS
+        return
+    assert torch.equal(gaussians[: lists.entry_count], lists.gaussians)
+    assert torch.equal(ranges, lists.ranges)
+    assert lists.corners is None or torch.equal(corners[: lists.entry_count], lists.corners)
+
+
+def test_corners_are_those_that_an_ellipse_touches(device):
+    """Beside what all pixels of a corner see of a Gaussian, drawn alone."""
+    scene = random_scene(count=40, width=32, height=32, spread=0.8, seed=3).to(torch.float32, device)
+    records, counts, depths, extents = packed(scene)
+    numbered = number_entries(counts, depths, extents, emission=False)
+    lists = build_tile_lists(records, *numbered, depths, extents, 32, 32, emission=False)
+    columns, rows = torch.meshgrid(torch.arange(32.0, device=device), torch.arange(32.0, device=device), indexing="xy")
+    (x, y, *_), (a, b, c, level) = (record[lists.gaussians.long()].t()[..., None, None] for record in records)
+    dx, dy = columns + 0.5 - x, rows + 0.5 - y
+    seen = a * dx * dx + 2 * b * dx * dy + c * dy * dy <= level
+    lengths = (lists.ranges[:, 1] - lists.ranges[:, 0]).long()
+    tiles = torch.repeat_interleave(torch.arange(4, device=device), lengths)
+    # Rows of tiles, of corners, of pixels; then columns of each.
+    by_corner = seen.view(-1, 2, 4, 4, 2, 2, 8).any(6).any(3)[torch.arange(len(tiles)), tiles // 2, :, tiles % 2]
+    told = (lists.corners[:, None].int() >> torch.arange(8, device=device)) & 1
+    assert len(tiles) == lists.entry_count > 40 and 0.1 < told.float().mean() < 0.9
+    # An ellipse may pass between the pixels of a corner that it touches.
+    assert not (by_corner.reshape(-1, 8) & ~told.bool()).any()
+    assert (by_corner.reshape(-1, 8) == told.bool()).float().mean() > 0.95
+
+
+@pytest.mark.parametrize("emission", [False, True])
+@pytest.mark.parametrize("count", [0, 1, 500])
+def test_overflow_is_more_entries_than_room(device, emission, count):
+    scene = packed(random_scene(count=count, width=16 * COLUMNS, height=16 * ROWS, seed=3).to(torch.float32, device))
+    entries = built(*scene, emission=emission).entry_count
+    for room in {max(1, entries + spare) for spare in (-1, 0, 1)}:
+        lists = built(*scene, room, emission=emission)
+        assert bool(lists.overflow) == (entries > room) and lists.total == entries
+
+
+def kept_bytes(holder):
+    """Of the memory behind a dataclass's tensors, and of the dataclasses in it."""
+    values = [getattr(holder, field.name) for field in fields(holder)]
+    tensors = [value for value in values if isinstance(value, torch.Tensor)]
+    inner = [value for value in values if hasattr(value, "__dataclass_fields__")]
+    return sum(tensor.untyped_storage().nbytes() for tensor in tensors) + sum(kept_bytes(value) for value in inner)
+
+
+@pytest.mark.parametrize("spare", [None, 7])
+@pytest.mark.parametrize("emission", [False, True])
+def test_lists_keep_no_more_memory_than_they_use(device, emission, spare):
+    scene = dense(device, 500)
+    exact = built(*scene, emission=emission)
+    lists = exact if spare is None else built(*scene, exact.entry_count + spare, emission=emission)
+    entries = exact.entry_count + (spare or 0)
+    assert torch.equal(lists.gaussians[: exact.entry_count], exact.gaussians)
+    total_and_overflow = 8 + (spare is not None)
+    by_gaussian = entries + 3 * 500 if emission else 0
+    one_sort = 0 if emission else 4 * entries + 8 * 500 - 8
+    corners = 0 if lists.corners is None else entries
+    total = 4 * (2 * COLUMNS * ROWS + entries + by_gaussian) + corners + total_and_overflow + one_sort
+    assert kept_bytes(lists) == total
+
+
+@pytest.mark.parametrize("emission", [True, False])
+@pytest.mark.parametrize("count, chunks", [(0, 1), (1, 3), (5000, 7)])
+def test_entries_counted_by_chunks_are_those_sorted(monkeypatch, count, chunks, emission):
+    monkeypatch.setattr(tile_lists, "SMALLEST_CHUNK", max(1, count // chunks))
+    monkeypatch.setenv("SEHDR_THREADS", str(chunks))
+    generator, tiles = torch.Generator().manual_seed(count), 40
+    # Some belong to no tile, and some tiles have none.
+    given = [torch.randint(3, tiles + 1, (2 * count,), generator=generator, dtype=torch.int32)]
+    given.append(torch.randint(1000, (2 * count,), generator=generator, dtype=torch.int32))
+    records = torch.zeros(1000, 4), torch.full((1000, 4), -1.0)
+    counted = tile_lists._count_by_tile(*(tensor.clone() for tensor in given), count, tiles, emission)
+    copies = (tensor.clone() for tensor in given)
+    ranges, ones, corners, places = tile_lists._sort_by_tile(*given, count, records, tiles, 1, emission)
+    alike, *_, without, _ = tile_lists._sort_by_tile(*copies, count, None, tiles, 1, emission)
+    assert torch.equal(alike, ranges) and without is None and len(corners) == count
+    for ours, sorted_ones in zip(counted, (ranges, ones, places), strict=True):
+        assert (ours is None) == (sorted_ones is None)
+        assert ours is None or torch.equal(ours, sorted_ones[: len(ours)])

@@ -1,0 +1,49 @@
+"""Pixels are drawn where a picture differs from its photo, and nowhere else."""
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.rasterizer.code_residual import code_tensor
+from sehdr_warp.rasterizer.unexplained import unexplained_pixels
+
+SIZE = 24, 18  # At which pixels are told, of a photo of 12 x 9
+
+
+def drawn(shown, codes, device, *, index=None, mask=None, count=4000):
+    uniform = torch.from_numpy(np.random.default_rng(0).random(count)).to(device)
+    given = shown.to(device), code_tensor(codes, device), index, mask, uniform, 3, SIZE
+    pixels, meant = (values.cpu() for values in unexplained_pixels(*given, least=0.02))
+    assert (pixels[:, 0] == 3).all() and pixels[:, 1:].min() >= 2
+    assert pixels[:, 1].max() < SIZE[0] - 2 and pixels[:, 2].max() < SIZE[1] - 2
+    return pixels[:, 1:], meant
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_draws_follow_the_squares_of_errors(device, dtype):
+    white = np.iinfo(dtype).max
+    codes = np.full((2, 9, 12, 3), white // 2, dtype)
+    shown = torch.full((9, 12, 3), (white // 2) / white)
+    shown[4, 3] += 0.3
+    shown[6, 8] += 0.1
+    shown[2, 2] += 0.015
+    codes[1, 7, 9], shown[7, 9] = white, 40.0
+    pixels, meant = drawn(shown, codes, device, index=torch.tensor([1], device=device))
+    assert meant.all()
+    assert {tuple(pixel) for pixel in pixels.tolist()} == {(7, 9), (17, 13)}
+    part = (pixels == torch.tensor([7, 9])).all(1).float().mean()
+    assert abs(float(part) - 0.9) < 0.02
+
+
+def test_masked_errors_and_those_at_the_border_are_not_meant(device):
+    codes, shown = np.zeros((9, 12, 3), np.uint8), torch.zeros(9, 12, 3)
+    shown[4, 3], shown[0, 0], shown[5, 5] = 0.5, 0.5, 0.5
+    mask = torch.ones(9, 12, 1, device=device)
+    mask[5, 5] = 0
+    pixels, meant = drawn(shown, codes, device, mask=mask)
+    assert 0.4 < meant.float().mean() < 0.6
+    assert {tuple(pixel) for pixel in pixels[meant].tolist()} == {(7, 9)}
+
+
+def test_where_all_is_explained_nothing_is_meant(device):
+    assert not drawn(torch.zeros(9, 12, 3), np.zeros((9, 12, 3), np.uint8), device)[1].any()
