@@ -123,12 +123,24 @@ def test_the_site_lists_every_page():
     assert [page.name for page in GUIDE if page.name not in listed] == []
 
 
-def test_pages_stay_short():
-    """A guide of at most 12,000 words, a README of 500, a picture of 250 kB."""
-    words = {page.name: len(page.read_text().split()) for page in PAGES}
-    assert sum(words[page.name] for page in GUIDE) <= 12_000
-    assert words["README.md"] <= 500 and words["CONTRIBUTING.md"] <= 600
-    assert max(path.stat().st_size for path in (ROOT / "docs" / "images").iterdir()) <= 250_000
+# Words on one page. A page that outgrows its budget is split by topic or shortened.
+WORD_BUDGETS = {"README.md": 700, "CONTRIBUTING.md": 1500, "CHANGELOG.md": 5000}
+GUIDE_PAGE_WORDS = 2200
+IMAGE_BYTES = 250_000
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_page_keeps_its_word_budget(page):
+    count = len(page.read_text().split())
+    budget = WORD_BUDGETS.get(page.name, GUIDE_PAGE_WORDS)
+    remedy = "shorten it, move a topic to a page of its own (list that in mkdocs.yml), or raise the budget here"
+    assert count <= budget, f"{page.relative_to(ROOT)} has {count} of at most {budget} words: {remedy}"
+
+
+@pytest.mark.parametrize("image", sorted((ROOT / "docs" / "images").iterdir()), ids=lambda image: image.name)
+def test_image_keeps_its_size(image):
+    size = image.stat().st_size
+    assert size <= IMAGE_BYTES, f"{image.relative_to(ROOT)} has {size} of at most {IMAGE_BYTES} bytes: compress it"
 
 
 def test_the_readme_quotes_the_reports():
