@@ -28,11 +28,11 @@ _HOMES = {
     "scene": ("Camera", "Scene", "View", "embedded_scenes", "load_cameras", "load_scene"),
     "scene.stack": ("calibrate",),
     "rasterizer": ("Rendering", "differentiable", "rasterize", "rasterize_directions", "spherical_harmonics", "ssim"),
-    "training.config": ("Config",),
-    "training.config_files": ("load_config", "preset_names"),
+    "runs.config": ("Config",),
+    "runs.config_files": ("load_config", "preset_names"),
     "training.initialization": ("match_points",),
     "training.plan": ("Plan", "make_plan"),
-    "training.run": ("Run", "Splats", "load_run", "load_splats"),
+    "runs.run": ("Run", "Splats", "load_run", "load_splats"),
     "training.train": ("Step", "Training", "train"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

@@ -11,13 +11,13 @@ from .output.render_views import render_views
 from .output.report import write_report
 from .rasterizer import Rendering, differentiable, rasterize, rasterize_directions, spherical_harmonics, ssim
 from .response import Response, response_by_name, response_names
+from .runs.config import Config
+from .runs.config_files import load_config, preset_names
+from .runs.run import Run, Splats, load_run, load_splats
 from .scene import Camera, Scene, View, embedded_scenes, load_cameras, load_scene
 from .scene.stack import calibrate
-from .training.config import Config
-from .training.config_files import load_config, preset_names
 from .training.initialization import match_points
 from .training.plan import Plan, make_plan
-from .training.run import Run, Splats, load_run, load_splats
 from .training.train import Step, Training, train
 
 __all__ = [

@@ -11,8 +11,8 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "sehdr_warp"
 
-# What each room may import of the others: training -> model -> response -> rasterizer -> kernels, and below them all
-# what any room may use. Rooms that read a trained scene take it as an object with named methods.
+# What each room may import of the others: training -> runs -> model -> response -> rasterizer -> kernels, and below
+# them all what any room may use.
 ANY = {"errors", "quiet", "arguments", "files", "console", "apart", "parallel", "caches"}
 ALLOWED = {
     "kernels": set(),
@@ -29,15 +29,26 @@ ALLOWED = {
     "response": ANY | {"rasterizer"},
     "scene": ANY | {"response", "splats"},
     "model": ANY | {"scene", "response", "rasterizer", "splats"},
-    "output": ANY | {"scene", "response", "splats", "model.exposure", "model.baking", "model.sensor_colors"},
-    "viewer": ANY | {"scene", "output"},
+    "output": ANY | {"runs", "scene", "response", "splats", "model.exposure", "model.baking", "model.sensor_colors"},
+    "viewer": ANY | {"runs", "scene", "output"},
     "evaluation": ANY
-    | {"scene", "rasterizer.ssim", "model.baking", "output.names", "output.charts", "output.panorama"},
+    | {"runs", "scene", "rasterizer.ssim", "model.baking", "output.names", "output.charts", "output.panorama"},
+    "runs": ANY | {"scene", "response", "model", "splats", "output.notebook"},
     "training": ANY
-    | {"scene", "response", "model", "rasterizer", "splats", "evaluation.metrics", "evaluation.protocols"},
+    | {"runs", "scene", "response", "model", "rasterizer", "splats", "evaluation.metrics", "evaluation.protocols"},
     "synth": ANY | {"scene", "response", "output.exr", "output.images", "model.exposure"},
     "check": ANY
-    | {"bench.results", "bench.splats", "kernels.constants", "scene", "response", "model", "rasterizer", "training"},
+    | {
+        "bench.results",
+        "bench.splats",
+        "kernels.constants",
+        "scene",
+        "response",
+        "model",
+        "rasterizer",
+        "runs",
+        "training",
+    },
     "bench": ANY
     | {
         "synth.expose",
@@ -46,6 +57,7 @@ ALLOWED = {
         "response",
         "model",
         "rasterizer",
+        "runs",
         "training",
         "output",
         "evaluation",
@@ -128,9 +140,7 @@ def test_every_file_says_what_it_is():
         assert ast.get_docstring(ast.parse(path.read_text())), f"{path} has no docstring"
 
 
-@pytest.mark.parametrize(
-    "module", ["sehdr_warp", "sehdr_warp.cli", "sehdr_warp.scene", "sehdr_warp.training.config_files"]
-)
+@pytest.mark.parametrize("module", ["sehdr_warp", "sehdr_warp.cli", "sehdr_warp.scene", "sehdr_warp.runs.config_files"])
 def test_light_modules_leave_torch_and_warp_alone(module):
     code = f"import sys, {module}; print([name for name in ('torch', 'warp') if name in sys.modules])"
     assert (

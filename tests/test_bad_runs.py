@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.training.run_folder import RunFolder
+from sehdr_warp.runs.run_folder import RunFolder
 
 from .full_disk import full_disk
 from .refusals import call, refused

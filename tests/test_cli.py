@@ -14,10 +14,10 @@ import pytest
 
 from sehdr_warp import __version__, cli
 from sehdr_warp.response import response_by_name, response_names
+from sehdr_warp.runs.config_files import config_fields, flag_of, load_config, preset_names
 from sehdr_warp.scene.hdr_files import read_hdr
 from sehdr_warp.scene.images import read_ldr
 from sehdr_warp.training.commands import _ending, response_around
-from sehdr_warp.training.config_files import config_fields, flag_of, load_config, preset_names
 
 from .refusals import call
 

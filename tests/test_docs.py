@@ -15,7 +15,7 @@ from packaging.requirements import Requirement
 import sehdr_warp
 from sehdr_warp import cli
 from sehdr_warp.arguments import flags, subcommands
-from sehdr_warp.training.config_files import GONE, config_fields
+from sehdr_warp.runs.config_files import GONE, config_fields
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])

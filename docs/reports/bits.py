@@ -24,10 +24,10 @@ from sehdr_warp.bench.results import finish, new_result
 from sehdr_warp.evaluation.evaluate import evaluate
 from sehdr_warp.files import write_json
 from sehdr_warp.response import Response, response_by_name
+from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.scene import Scene, codes_of, load_scene
 from sehdr_warp.scene.linear_photos import linear_codes
 from sehdr_warp.synth.expose import SensorNoise, exposure_ladder, noisy
-from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.train import train
 
 LOG = logging.getLogger("bits")

@@ -28,13 +28,13 @@ from sehdr_warp.evaluation.perceptual import load_lpips
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.rasterizer.ssim import image_distance
 from sehdr_warp.response import Response
+from sehdr_warp.runs.config import REFERENCE_ITERATIONS
+from sehdr_warp.runs.config_files import load_config
+from sehdr_warp.runs.run import Run
 from sehdr_warp.scene import Scene, View, load_scene
-from sehdr_warp.training.config import REFERENCE_ITERATIONS
-from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.densification import gaussian_budget
 from sehdr_warp.training.initialization import choose_response, make_matcher, scene_extent, start_points
 from sehdr_warp.training.plan import make_plan
-from sehdr_warp.training.run import Run
 from sehdr_warp.training.train import train
 
 LOG = logging.getLogger("captures")

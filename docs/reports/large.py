@@ -23,9 +23,9 @@ from sehdr_warp.bench.results import finish, new_result
 from sehdr_warp.bench.splats import Size, make_photo_scene, parse_size
 from sehdr_warp.bench.timing import forget_peaks, held_memory, wait
 from sehdr_warp.response import response_by_name
+from sehdr_warp.runs.config import Config
+from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.scene import Scene
-from sehdr_warp.training.config import Config
-from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.train import Training
 
 LOG = logging.getLogger("large")

@@ -22,12 +22,12 @@ from sehdr_warp.evaluation.metrics import mu_law
 from sehdr_warp.model.baking import sphere_directions
 from sehdr_warp.output.panorama import latlong, solid_angles, write_panorama
 from sehdr_warp.response import response_by_name
+from sehdr_warp.runs.config_files import load_config
+from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
 from sehdr_warp.scene.hdr_files import read_hdr
 from sehdr_warp.synth.expose import ladder_of
-from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.plan import WIDEST
-from sehdr_warp.training.run import load_run
 from sehdr_warp.training.train import train
 
 LOG = logging.getLogger("panorama")

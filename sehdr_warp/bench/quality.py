@@ -24,10 +24,10 @@ from ..evaluation.metrics import REGIONS
 from ..evaluation.protocols import PROTOCOLS
 from ..files import read_json, write_json
 from ..response import response_by_name
+from ..runs.config import REFERENCE_ITERATIONS, Config
+from ..runs.config_files import config_from_dict, load_config, override_config, preset_names
 from ..scene import Scene, embedded_folder, is_embedded, load_scene
 from ..synth.expose import expose, exposure_ladder
-from ..training.config import REFERENCE_ITERATIONS, Config
-from ..training.config_files import config_from_dict, load_config, override_config, preset_names
 from ..training.train import train
 from .timing import Variant, forget_peaks, time_variants
 

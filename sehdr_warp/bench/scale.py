@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ..rasterizer.memory import held_by_warp
-from ..training.config_files import load_config
+from ..runs.config_files import load_config
 from .gsplat_peer import BOUND, GSPLAT, gsplat_renderer, note_missing, rasterize_with_gsplat
 from .kernels import OURS, against_float64, against_gsplat, render, splat_variant
 from .results import check, groups, new_result

@@ -10,9 +10,9 @@ import torch
 
 from ..rasterizer import rasterize
 from ..rasterizer.reference import rasterize_reference
+from ..runs.config import Config
+from ..runs.config_files import load_config, override_config
 from ..scene import Scene
-from ..training.config import Config
-from ..training.config_files import load_config, override_config
 from ..training.initialization import choose_response, make_field
 from ..training.machine import torch_settings
 from ..training.ranks import Ranks

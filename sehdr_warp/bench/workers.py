@@ -14,8 +14,8 @@ import torch.multiprocessing as processes
 from ..errors import SehdrError
 from ..files import read_json, write_json
 from ..parallel import thread_count
-from ..training.config import Config
-from ..training.config_files import load_config
+from ..runs.config import Config
+from ..runs.config_files import load_config
 from ..training.machine import torch_settings
 from ..training.ranks import GO, Ranks, device_of_rank, joined
 from .results import check, new_result

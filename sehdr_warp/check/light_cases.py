@@ -13,7 +13,7 @@ from ..rasterizer import ssim
 from ..rasterizer.clipped_light import clipped_light_energy
 from ..response import Response, response_by_name
 from ..response.table import TabulatedResponse
-from ..training.config import LossConfig
+from ..runs.config import LossConfig
 from ..training.losses import CODE, Target, code_scale, ldr_loss
 from .case import ROUNDINGS, UNIT, Case, Reading, compare, count, not_finite
 

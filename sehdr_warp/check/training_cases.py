@@ -11,9 +11,9 @@ import torch
 from ..bench.splats import EXPOSURE_TIME, Size, make_photo_scene
 from ..model.radiance_field import RadianceField
 from ..response import response_by_name
+from ..runs.config import Config
+from ..runs.config_files import load_config
 from ..scene import Scene
-from ..training.config import Config
-from ..training.config_files import load_config
 from ..training.initialization import make_field
 from ..training.losses import data_loss, regularised
 from ..training.targets import training_views

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from ..model.gaussians import Gaussians
-from .config import Config
+from ..runs.config import Config
 
 SAMPLES = 10  # Of a span, at even steps: neighbors differ too little to be worth the time
 SPANS = 5  # From which a mean begins: what is older would weigh less than a hundredth

@@ -16,7 +16,7 @@ import tyro
 from tyro.conf import Positional
 
 from ..errors import InputError, SehdrError, UsageError
-from . import config_files as configs
+from ..runs import config_files as configs
 
 log = logging.getLogger(__name__)
 _READ_BY = ("exposure_index", "max_size", "holdout")  # What load_scene takes besides the path and the response
@@ -154,8 +154,8 @@ def _run_as_rank(words: list[str]) -> None:
 
 
 def _train(asked: Train, ranks=None) -> None:
+    from ..runs.run_folder import RunFolder
     from .machine import pick_device
-    from .run_folder import RunFolder
 
     output, resumed = asked.output, None
     out, how = output.out, {"resume": output.resume, "overwrite": output.overwrite}
@@ -233,7 +233,7 @@ def run_presets(asked: Presets) -> None:
 
 def run_config(asked: ShowConfig) -> None:
     """Prints a config."""
-    from .run_folder import RunFolder
+    from ..runs.run_folder import RunFolder
 
     folder = RunFolder(asked.which)
     config = folder.read_config() if folder.config.is_file() else configs.load_config(asked.which)
@@ -242,17 +242,17 @@ def run_config(asked: ShowConfig) -> None:
 
 def open_run(path: Path, device: str | None):
     """The run in a folder, on the device that a command line names."""
+    from ..runs.run import load_run
     from .machine import pick_device
-    from .run import load_run
 
     return load_run(path, device=pick_device(device))
 
 
 def open_scene(path: Path, device: str | None):
     """The run in a folder or the Gaussians in a file, on the device that a command line names."""
+    from ..runs.run import load_splats
     from ..splats import SUFFIXES
     from .machine import pick_device
-    from .run import load_splats
 
     splats = path.is_file() or path.suffix.lower() in SUFFIXES
     return load_splats(path, device=pick_device(device)) if splats else open_run(path, device)
@@ -260,7 +260,7 @@ def open_scene(path: Path, device: str | None):
 
 def ensured_scene(run, data: str | None):
     """The scene of read_scene, after the run's confidence was measured on it."""
-    from .run import ensure_confidence
+    from ..runs.run import ensure_confidence
 
     scene = read_scene(run, data)
     ensure_confidence(run, scene)
@@ -283,7 +283,7 @@ def response_around(folder: Path):
     """What load_scene takes as the response, to develop photos like the run in whose folder this one lies; None where
     that is no run's."""
     from ..response import Response
-    from .run_folder import RunFolder
+    from ..runs.run_folder import RunFolder
 
     for place in map(RunFolder, folder.resolve().parents):
         if place.info.is_file() and place.checkpoints.is_dir():

@@ -17,7 +17,7 @@ from ..model.spare_rows import moments_of
 from ..rasterizer import Rendering
 from ..rasterizer.relocation import Drawn, clear_rows, copy_rows, count_copies, number_places, share_opacities
 from ..rasterizer.training_step import add_gradient_statistics, add_position_noise
-from .config import Config, DensificationConfig
+from ..runs.config import Config, DensificationConfig
 
 SPLIT_SHRINK = 1.6  # The two halves of a split are this much smaller (3DGS: 0.8 times the number of halves)
 SHORTEST_INTERVAL = 20

@@ -7,14 +7,14 @@ import torch
 
 from ..model.radiance_field import RadianceField
 from ..rasterizer.memory import memory_told
+from ..runs.checkpoint import Checkpoint
+from ..runs.config import Config
+from ..runs.run import field_from_checkpoint
 from ..scene import Scene
-from .checkpoint import Checkpoint
-from .config import Config
 from .initialization import sizes_of
 from .machine import interruptible, torch_settings
 from .plan import gain_of_ranks
 from .ranks import END, GO, WAIT, Ranks
-from .run import field_from_checkpoint
 from .trainer import Trainer
 
 

@@ -12,15 +12,14 @@ import torch
 from ..errors import InputError, SehdrError
 from ..model.baking import field_of, gaussians_of
 from ..model.color_models import color_model
-from ..model.exposure import exposure_times
-from ..model.fusion import NeuralExposureFusion
 from ..model.gaussians import Gaussians
 from ..model.radiance_field import RadianceField
 from ..response import Response, ToneMapper, response_by_name
+from ..runs.config import Config
+from ..runs.run import assemble_field
 from ..scene import Scene, View
 from ..scene.load import best_response, photos_to_judge
 from ..splats import read_gaussians
-from .config import Config
 from .densification import gaussian_budget
 from .matching import Matcher
 
@@ -175,25 +174,6 @@ def make_matcher(scene: Scene, response: Response, device: torch.device | str) -
     depths = np.concatenate(depths)
     focus = float(np.median(depths)) if len(depths) >= FEWEST_POINTS else focus_distance(views)
     return Matcher(views, response, focus, device)
-
-
-def assemble_field(gaussians: Gaussians, config: Config, response: Response, base_time: float) -> RadianceField:
-    """Gaussians, response and a freshly seeded fusion as the config says."""
-    fusion, options = None, config.fusion
-    if options.enabled:
-        scale = 1.0 / base_time if options.radiance_scale == "base" else 1.0
-        times = exposure_times(base_time, options.exposures)
-        fusion = NeuralExposureFusion(response, times, base_time, radiance_scale=scale, seed=config.seed)
-    return RadianceField(
-        gaussians,
-        response,
-        base_time=base_time,
-        radiance=config.model.radiance,
-        tone_map=config.model.tone_map,
-        fusion=fusion,
-        antialiased=config.model.antialiased,
-        deterministic=config.deterministic,
-    )
 
 
 def check_views(scene: Scene) -> None:

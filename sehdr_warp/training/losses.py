@@ -12,7 +12,7 @@ from ..rasterizer.code_residual import CodeScale, code_residual, code_values
 from ..rasterizer.photo_loss import photo_loss
 from ..rasterizer.ssim import image_distance, ssim
 from ..response import Response, ToneMapper
-from .config import LossConfig
+from ..runs.config import LossConfig
 
 CODE = 1 / 255  # One step of an 8-bit photo
 MU = 5000.0  # Of the mu-law in which HDR images are compared

@@ -16,7 +16,8 @@ from ..model.gaussians import PARAMETER_NAMES
 from ..model.radiance_field import RadianceField
 from ..rasterizer import HarmonicsGradients
 from ..rasterizer.training_step import judge_step, norms
-from .config import Config
+from ..runs.checkpoint import under
+from ..runs.config import Config
 
 TURNS = 2  # Parts of the higher harmonics, three quarters of all numbers, that a GPU steps in turn: memory is slow
 IN_TURN_FROM = 4000  # Steps of a training that is as good by that: shorter ones lack them
@@ -160,11 +161,6 @@ def load_optimizer_tensors(optimizer: Adam, tensors: dict[str, Tensor], batch: i
                 for key, value in state.items()
             }
             optimizer.state[parameter]["step"] /= batch
-
-
-def under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Those whose names begin so, by the rest of their names."""
-    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
 
 
 def _named(optimizer: Adam) -> Iterator[tuple[str, Tensor]]:

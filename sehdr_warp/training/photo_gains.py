@@ -8,9 +8,9 @@ import torch
 
 from ..parallel import made_ahead
 from ..response import Response
+from ..runs.config import Config
 from ..scene import Scene, View
 from ..scene.photo_gains import PhotoGains, disagreement, fit_gains, left_of_falloff, rough_gains, start_gains
-from .config import Config
 from .initialization import make_matcher
 from .matching import Matcher, at_matching_size
 from .plan import Decision

@@ -11,10 +11,10 @@ import torch
 from ..errors import InputError
 from ..model.exposure import exposure_times, is_seconds
 from ..parallel import thread_count
+from ..runs.config import Config, OptimizerConfig
+from ..runs.config_files import override_config
 from ..scene import Scene
 from ..scene.read_folders import FEWEST_PHOTOS
-from .config import Config, OptimizerConfig
-from .config_files import override_config
 from .densification import gaussian_budget
 from .initialization import base_time, start_count
 from .machine import pick_device

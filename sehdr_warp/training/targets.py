@@ -12,8 +12,8 @@ from ..errors import InputError
 from ..model.radiance_field import CameraTensors
 from ..rasterizer.code_residual import CodeScale, code_tensor
 from ..response import Response
+from ..runs.config import LossConfig
 from ..scene import Scene, View
-from .config import LossConfig
 from .losses import Target, code_scale, one_of
 
 _TRUTH_REMEDY = "take a scene with HDR truth, or a preset that needs none"

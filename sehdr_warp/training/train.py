@@ -18,11 +18,13 @@ from ..model.radiance_field import RenderedView
 from ..model.unexplained import MOST_NAMED, told, unexplained_regions
 from ..rasterizer.memory import memory_told
 from ..response import Response
+from ..runs.checkpoint import first_not_finite
+from ..runs.config import Config
+from ..runs.config_files import as_config, config_fields, override_config
+from ..runs.run import Run, as_rec709, field_from_checkpoint, load_run, photo_gains
+from ..runs.run_folder import RunFolder
 from ..scene import Camera, Scene
 from ..scene.photo_gains import PhotoGains
-from .checkpoint import first_not_finite
-from .config import Config
-from .config_files import as_config, config_fields, override_config
 from .following import hand_on, told_of_ranks
 from .held_out import evaluate_views, figures_told, warn_of_fall
 from .initialization import choose_response, make_field, make_matcher, sizes_of
@@ -30,8 +32,6 @@ from .machine import interruptible, machine_figures, pick_device, summary_writer
 from .photo_gains import evens, find_gains
 from .plan import apply_plan
 from .ranks import END, GO, WAIT, Ranks
-from .run import Run, as_rec709, field_from_checkpoint, load_run, photo_gains
-from .run_folder import RunFolder
 from .targets import check_truth
 from .trainer import Trainer
 

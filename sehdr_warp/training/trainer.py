@@ -17,11 +17,12 @@ from ..rasterizer.memory import bytes_asked_for
 from ..rasterizer.tile_lists import ONE_SORT
 from ..rasterizer.training_step import differentiate
 from ..response.learned import EXACT_BELOW
+from ..runs.checkpoint import under
+from ..runs.config import Config
 from ..scene import Camera, Scene
 from . import optimizer as adam
 from .averaging import Averaging
 from .births import born_rows
-from .config import Config
 from .densification import SEED_STEP, make_densification
 from .graph_capacity import GraphCapacity
 from .initialization import make_matcher, scene_extent
@@ -352,15 +353,15 @@ class Trainer:
 
     def load_state(self, tensors: dict[str, Tensor], values: dict) -> None:
         """Takes up what state() gave; the field's Gaussians must already be those of the state."""
-        adam.load_optimizer_tensors(self.optimizer, adam.under(tensors, "optimizer."), self.batch)
-        statistics = {name: value.to(self.device) for name, value in adam.under(tensors, "densification.").items()}
+        adam.load_optimizer_tensors(self.optimizer, under(tensors, "optimizer."), self.batch)
+        statistics = {name: value.to(self.device) for name, value in under(tensors, "densification.").items()}
         self.densification.load_state(statistics)
-        means = {name: value.to(self.device) for name, value in adam.under(tensors, "average.").items()}
+        means = {name: value.to(self.device) for name, value in under(tensors, "average.").items()}
         self._averaging.load_state(means)
         if self.ranks is not None and not self.ranks.leads:  # The sum over the ranks counts them once.
             for total in statistics.values():
                 total.zero_()
-        generators = adam.under(tensors, "generators.")
+        generators = under(tensors, "generators.")
         self._order.load_state(generators["order"], values["order"])
         if self._generator.get_state().numel() == generators["device"].numel():
             self._generator.set_state(generators["device"].cpu())

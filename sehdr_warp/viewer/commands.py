@@ -33,7 +33,7 @@ def run_view(asked: View) -> None:
     from functools import cache
 
     from ..errors import InputError, UsageError
-    from ..training.run import Run
+    from ..runs.run import Run
     from .server import Server, Viewer
     from .watching import Watch
 

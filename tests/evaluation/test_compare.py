@@ -13,7 +13,7 @@ from sehdr_warp.evaluation.compare import compare_runs, comparison_csv, comparis
 from sehdr_warp.evaluation.evaluate import evaluate
 from sehdr_warp.evaluation.table import format_table
 from sehdr_warp.output.exr import write_exr
-from sehdr_warp.training.config import Config
+from sehdr_warp.runs.config import Config
 
 from .test_evaluate import VIEWS, radiance, run, scene, view
 

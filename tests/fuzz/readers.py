@@ -24,6 +24,9 @@ from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.output.exr import Part, write_exr, write_multipart_exr
 from sehdr_warp.output.usd_cameras import usd_cameras
 from sehdr_warp.response import response_by_name
+from sehdr_warp.runs.config_files import load_config
+from sehdr_warp.runs.run import assemble_field, load_run
+from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene import load_cameras, load_scene
 from sehdr_warp.scene.colmap_model import read_ply_points
 from sehdr_warp.scene.exposure import exif_exposure
@@ -35,10 +38,6 @@ from sehdr_warp.scene.read_folders import read_colmap, read_hdr_nerf_real, read_
 from sehdr_warp.scene.read_transforms import read_hdr_nerf, read_transforms
 from sehdr_warp.splats import USD_SUFFIXES, GaussianArrays, read_gaussians, write_gaussians
 from sehdr_warp.synth.expose import RadianceView
-from sehdr_warp.training.config_files import load_config
-from sehdr_warp.training.initialization import assemble_field
-from sehdr_warp.training.run import load_run
-from sehdr_warp.training.run_folder import RunFolder
 from sehdr_warp.training.train import Training
 from sehdr_warp.training.trainer import Trainer
 from tests.make_scenes import pattern, write_blender, write_colmap, write_llff, write_reinhard

@@ -10,7 +10,7 @@ import torch
 from sehdr_warp.model.confidence import gather_evidence
 from sehdr_warp.model.radiance_field import CameraTensors
 from sehdr_warp.model.unexplained import unexplained_regions
-from sehdr_warp.training.config_files import load_config
+from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.training.train import train
 
 from ..training.wall_and_lamp import HALF, LAMP, wall_and_lamp

@@ -7,9 +7,9 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.baking import field_of
 from sehdr_warp.output.commands import Export, run_export
 from sehdr_warp.output.export import export
+from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import load_cameras
 from sehdr_warp.splats import read_gaussians, write_gaussians
-from sehdr_warp.training.run import Splats, load_splats
 
 from ..splats.test_splat_files import gaussians
 from .helpers import Entry, camera

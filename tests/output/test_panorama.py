@@ -9,9 +9,9 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.baking import field_of
 from sehdr_warp.output.panorama import cube, filled, latlong, solid_angles, write_panorama
 from sehdr_warp.output.radiance_file import write_radiance
+from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene.hdr_files import read_exr_channels, read_hdr
 from sehdr_warp.splats import GaussianArrays
-from sehdr_warp.training.run import Splats
 
 from .helpers import Entry, camera
 

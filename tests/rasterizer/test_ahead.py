@@ -12,7 +12,7 @@ from sehdr_warp.bench.step import make_trainer
 from sehdr_warp.kernels.plane_sweep_cpu import sweep_rows
 from sehdr_warp.kernels.shared_ranges import share_ranges
 from sehdr_warp.rasterizer import ahead, launching
-from sehdr_warp.training.config_files import load_config
+from sehdr_warp.runs.config_files import load_config
 
 
 def make_kernel(factor):

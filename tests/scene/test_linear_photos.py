@@ -13,13 +13,13 @@ from sehdr_warp.output.exr import rgb_channels, write_exr
 from sehdr_warp.output.images import write_picture
 from sehdr_warp.output.radiance_file import write_radiance
 from sehdr_warp.response import response_by_name
+from sehdr_warp.runs.config_files import load_config
+from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.linear_photos import color_matrix, linear_codes, raw_codes, raw_exposure
 from sehdr_warp.scene.sfm import _device, _write_photos
 from sehdr_warp.synth.expose import SensorNoise, noisy
-from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.plan import make_plan
-from sehdr_warp.training.run import Splats
 
 from ..output.helpers import camera
 from ..splats.test_splat_files import gaussians

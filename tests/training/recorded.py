@@ -1,6 +1,6 @@
 """Whole trainings on a GPU, with recorded steps and with launched ones."""
 
-from sehdr_warp.training.config_files import override_config
+from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.training.initialization import choose_response, make_field
 from sehdr_warp.training.train import evaluate_views
 from sehdr_warp.training.trainer import Trainer

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from sehdr_warp.runs.checkpoint import Checkpoint
+from sehdr_warp.runs.config_files import load_config
+from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.training.averaging import SPANS, Averaging
-from sehdr_warp.training.checkpoint import Checkpoint
-from sehdr_warp.training.config_files import load_config
-from sehdr_warp.training.run_folder import RunFolder
 from sehdr_warp.training.train import Training, train
 
 from .toy import QUICK, load_unscaled

@@ -6,8 +6,8 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.training.config_files import load_config
-from sehdr_warp.training.run import ensure_confidence, load_run
+from sehdr_warp.runs.config_files import load_config
+from sehdr_warp.runs.run import ensure_confidence, load_run
 from sehdr_warp.training.train import train
 
 

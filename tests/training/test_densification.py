@@ -9,8 +9,8 @@ import torch
 from sehdr_warp.model.gaussians import PARAMETER_NAMES, Gaussians
 from sehdr_warp.rasterizer import rasterize
 from sehdr_warp.rasterizer.relocation import relocation_sums
+from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.training import densification
-from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.densification import GradientDensification, _draw, make_densification, rotate
 
 EXTENT = 2.0

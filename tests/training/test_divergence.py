@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.training.run_folder import RunFolder
+from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
 

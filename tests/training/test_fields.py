@@ -5,7 +5,7 @@ from functools import cache
 import pytest
 import torch
 
-from sehdr_warp.training.config_files import override_config
+from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.training.initialization import choose_response, make_field
 from sehdr_warp.training.machine import torch_settings
 from sehdr_warp.training.trainer import Trainer

@@ -9,8 +9,8 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.model.baking import field_of
 from sehdr_warp.model.color_models import color_model
 from sehdr_warp.response import response_by_name
+from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.splats import write_gaussians
-from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.initialization import (
     base_time,
     choose_response,

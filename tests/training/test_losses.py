@@ -11,7 +11,7 @@ from sehdr_warp.model.radiance_field import Photograph
 from sehdr_warp.rasterizer.code_residual import code_tensor
 from sehdr_warp.rasterizer.ssim import ssim
 from sehdr_warp.response import response_by_name
-from sehdr_warp.training.config import LossConfig
+from sehdr_warp.runs.config import LossConfig
 from sehdr_warp.training.losses import CODE, Target, code_scale, image_loss, ldr_loss, linear_loss, mu_law, mu_of_knee
 
 

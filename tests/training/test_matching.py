@@ -10,8 +10,8 @@ import torch
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.rasterizer.plane_sweep import BORDER
 from sehdr_warp.response import response_by_name
+from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.training.births import born_rows
-from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.initialization import make_field, make_matcher, start_count, start_points
 from sehdr_warp.training.targets import training_views
 from sehdr_warp.training.train import train

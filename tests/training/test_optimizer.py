@@ -5,7 +5,7 @@ from math import nan
 import pytest
 import torch
 
-from sehdr_warp.training.config_files import load_config
+from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.training.optimizer import guarded_step, make_optimizer
 
 from .toy import toy_field

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sehdr_warp.rasterizer.memory import OutOfMemory
-from sehdr_warp.training.config_files import load_config
+from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
 

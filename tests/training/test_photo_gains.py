@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from sehdr_warp.response import response_by_name
+from sehdr_warp.runs.config_files import load_config
+from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene import codes_of
 from sehdr_warp.scene.photo_gains import PhotoGains
 from sehdr_warp.training import photo_gains as gains_of_a_training
-from sehdr_warp.training.config_files import load_config
 from sehdr_warp.training.matching import LARGEST_SIDE, at_matching_size
 from sehdr_warp.training.photo_gains import evens, find_gains
-from sehdr_warp.training.run import load_run
 from sehdr_warp.training.train import Training
 
 from .wall_and_lamp import WALL, photographed, texture, wall_and_lamp

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from sehdr_warp.runs.config_files import override_config
+from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene.photo_file import PhotoKeeper
-from sehdr_warp.training.config_files import override_config
 from sehdr_warp.training.initialization import choose_response, make_field
 from sehdr_warp.training.photo_stream import PhotoStream
-from sehdr_warp.training.run_folder import RunFolder
 from sehdr_warp.training.targets import photo_source
 from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.runs.config_files import load_config, override_config
+from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene import Camera, codes_of, look_at
-from sehdr_warp.training.config_files import load_config, override_config
 from sehdr_warp.training.plan import RULES, WIDEST, Decision, apply_plan, cpu_step_seconds, make_plan
-from sehdr_warp.training.run_folder import RunFolder
 from sehdr_warp.training.scene_facts import measure_scene
 from sehdr_warp.training.train import train
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.training.checkpoint import Checkpoint
+from sehdr_warp.runs.checkpoint import Checkpoint
+from sehdr_warp.runs.run import field_from_checkpoint, load_run
+from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.training.initialization import choose_response, make_field
-from sehdr_warp.training.run import field_from_checkpoint, load_run
-from sehdr_warp.training.run_folder import RunFolder
 from sehdr_warp.training.train import Training, train
 from sehdr_warp.training.trainer import Trainer
 

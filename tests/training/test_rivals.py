@@ -12,8 +12,8 @@ from sehdr_warp.model.color_models import color_model
 from sehdr_warp.model.radiance_field import Photograph
 from sehdr_warp.rasterizer.ssim import ssim
 from sehdr_warp.response import ToneMapper, response_by_name
-from sehdr_warp.training.config import Config, LossConfig, ResponseConfig
-from sehdr_warp.training.config_files import load_config, override_config, preset_names
+from sehdr_warp.runs.config import Config, LossConfig, ResponseConfig
+from sehdr_warp.runs.config_files import load_config, override_config, preset_names
 from sehdr_warp.training.initialization import choose_response, make_field
 from sehdr_warp.training.losses import Target, anchor_loss, code_scale, data_loss, hdr_loss
 from sehdr_warp.training.targets import largest_truth

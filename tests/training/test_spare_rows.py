@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.training import densification, graph_capacity, trainer
-from sehdr_warp.training.config_files import override_config
 from sehdr_warp.training.initialization import choose_response, make_field
 
 from .toy import VARIANTS

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.runs.config_files import override_config
+from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene import codes_of
-from sehdr_warp.training.config_files import override_config
 from sehdr_warp.training.initialization import choose_response, make_field
-from sehdr_warp.training.run import load_run
 from sehdr_warp.training.train import Training, evaluate_views, train
 from sehdr_warp.training.trainer import Trainer
 

@@ -8,9 +8,9 @@ import torch
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.response import response_by_name
+from sehdr_warp.runs.config import REFERENCE_ITERATIONS, Config
+from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
-from sehdr_warp.training.config import REFERENCE_ITERATIONS, Config
-from sehdr_warp.training.config_files import load_config
 
 EXPOSURE_TIME = 0.25
 NUMBERS = (

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene.hdr_files import read_hdr
-from sehdr_warp.training.run_folder import RunFolder
 from tests.fuzz.mutate import NUMBERS, VALUES
 from tests.make_scenes import write_colmap
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from sehdr_warp.files import LIST, foreign
-from sehdr_warp.training.run_folder import RunFolder
+from sehdr_warp.runs.run_folder import RunFolder
 
 from .harness import COMMANDS, SEED, TRAIN, VIEW, browse, call, files_in
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from sehdr_warp import cli
-from sehdr_warp.training.run import load_run
+from sehdr_warp.runs.run import load_run
 from sehdr_warp.viewer.frames import Rendering
 from sehdr_warp.viewer.server import Server, Viewer
 

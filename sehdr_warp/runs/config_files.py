@@ -23,7 +23,7 @@ from .config import Config, ConfigError
 
 _LARGEST_FILE = 1 << 20
 _REMEDY = "`sehdr-warp config` lists every field with its meaning"
-_GONE = tomllib.loads((resources.files("sehdr_warp.training") / "gone.toml").read_text(encoding="utf-8"))
+_GONE = tomllib.loads((resources.files("sehdr_warp.runs") / "gone.toml").read_text(encoding="utf-8"))
 GONE: dict[str, str] = {path: advice for advice, paths in _GONE.items() for path in paths}
 """Fields of earlier versions, each with what to do now."""
 

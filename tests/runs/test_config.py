@@ -7,8 +7,8 @@ import pytest
 
 import sehdr_warp
 from sehdr_warp.errors import InputError
-from sehdr_warp.training.config import Config
-from sehdr_warp.training.config_files import (
+from sehdr_warp.runs.config import Config
+from sehdr_warp.runs.config_files import (
     GONE,
     config_as_toml,
     config_fields,
@@ -71,7 +71,7 @@ def test_every_field_is_documented_and_read(path, item):
     # In config.py only what follows the declarations counts as reading.
     sources = [
         p.read_text().split("    def scaled")[-1]
-        for room in ("training", "model")
+        for room in ("runs", "training", "model")
         for p in (PACKAGE / room).glob("*.py")
     ]
     assert any(name in source for source in sources for name in names), f"{path} is never read"

@@ -9,8 +9,8 @@ import torch
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.files import _beside
-from sehdr_warp.training.checkpoint import read_checkpoint
-from sehdr_warp.training.run_folder import RunFolder
+from sehdr_warp.runs.checkpoint import read_checkpoint
+from sehdr_warp.runs.run_folder import RunFolder
 
 
 @pytest.fixture

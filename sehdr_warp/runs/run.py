@@ -2,7 +2,6 @@
 
 import logging
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,8 @@ from torch import Tensor
 from ..errors import InputError, SehdrError
 from ..model.baking import field_of
 from ..model.confidence import Evidence, gather_evidence
+from ..model.exposure import exposure_times
+from ..model.fusion import NeuralExposureFusion
 from ..model.gaussians import PARAMETER_NAMES, Gaussians
 from ..model.radiance_field import RadianceField, RenderedView, Surroundings
 from ..model.sensor_colors import rec709_of
@@ -19,10 +20,8 @@ from ..response import Response
 from ..scene import Camera, Scene, load_cameras
 from ..scene.photo_gains import PhotoGains
 from ..splats import read_gaussians
-from .checkpoint import Checkpoint
+from .checkpoint import Checkpoint, under
 from .config import Config
-from .initialization import assemble_field
-from .optimizer import under
 from .run_folder import CameraEntry, RunFolder
 
 log = logging.getLogger(__name__)
@@ -162,8 +161,9 @@ class Run(_Rendered):
         self.photo_gains = photo_gains(info)
 
     def _repr_html_(self) -> str:
-        # By name: no room below output may know it, but a notebook asks the run itself.
-        return import_module("sehdr_warp.output.notebook").run_html(self)
+        from ..output.notebook import run_html  # A notebook asks the run itself for its HTML.
+
+        return run_html(self)
 
     def clipped_share(self) -> Tensor | None:
         if self.model.confidence is None:
@@ -236,6 +236,25 @@ def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) ->
         problem = f"its tensors do not fit the config ({error})"
         raise InputError(checkpoint.path, problem, "the run is damaged: train again") from None
     return field
+
+
+def assemble_field(gaussians: Gaussians, config: Config, response: Response, base_time: float) -> RadianceField:
+    """Gaussians, response and a freshly seeded fusion as the config says."""
+    fusion, options = None, config.fusion
+    if options.enabled:
+        scale = 1.0 / base_time if options.radiance_scale == "base" else 1.0
+        times = exposure_times(base_time, options.exposures)
+        fusion = NeuralExposureFusion(response, times, base_time, radiance_scale=scale, seed=config.seed)
+    return RadianceField(
+        gaussians,
+        response,
+        base_time=base_time,
+        radiance=config.model.radiance,
+        tone_map=config.model.tone_map,
+        fusion=fusion,
+        antialiased=config.model.antialiased,
+        deterministic=config.deterministic,
+    )
 
 
 def ensure_confidence(run: Run, scene: Scene) -> None:

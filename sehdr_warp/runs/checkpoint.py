@@ -104,6 +104,11 @@ def first_not_finite(tensors: dict[str, Tensor]) -> str | None:
     return next((name for name, tensor in floats if not bool(tensor.isfinite().all())), None)
 
 
+def under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Those whose names begin so, by the rest of their names."""
+    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+
+
 def read_values(path: Path, kind: type[BaseModel], remedy: str = REMEDY) -> dict:
     """The values in a file of this version's format, checked to be of a kind."""
     values = read_run_json(path, remedy)
