@@ -15,9 +15,10 @@ import pytest
 from sehdr_warp import __version__, cli
 from sehdr_warp.response import response_by_name, response_names
 from sehdr_warp.runs.config_files import config_fields, flag_of, load_config, preset_names
+from sehdr_warp.runs.open import enclosing_run_response
 from sehdr_warp.scene.hdr_files import read_hdr
 from sehdr_warp.scene.images import read_ldr
-from sehdr_warp.training.commands import _ending, response_around
+from sehdr_warp.training.commands import _ending
 
 from .refusals import call
 
@@ -343,8 +344,8 @@ def test_score_parts_photos_into_the_regions_of_eval(run, tmp_path, capsys):
     wanted, options = shares("eval", run, "--device", "cpu"), ("--truth", "embedded", "--max-size", 48)
     assert wanted == shares("score", inside / "hdr", *options) == shares("score", outside / "hdr", *options)
     assert wanted != shares("score", inside / "hdr", *options, "--response", "srgb")
-    assert response_around(outside / "hdr") is None
-    assert getattr(response_around(inside / "hdr"), "name", None) == "hdr-nerf"
+    assert enclosing_run_response(outside / "hdr") is None
+    assert getattr(enclosing_run_response(inside / "hdr"), "name", None) == "hdr-nerf"
 
 
 def test_export_writes_files_that_render_and_convert(run, tmp_path, capsys):

@@ -31,7 +31,7 @@ class Timed(Output):
     """Timed runs of each variant; slow ones have fewer on the CPU."""
 
     def timing(self) -> dict:
-        from ..training.train import pick_device
+        from ..runs.device import pick_device
 
         return {"device": pick_device(self.device), "repetitions": positive("--repetitions", self.repetitions)}
 

@@ -22,7 +22,7 @@ def run_check(command: Check) -> None:
     """Raises SehdrError if a bound failed, after everything was written."""
     from ..bench.results import new_result
     from ..files import check_absent, write_json
-    from ..training.train import pick_device
+    from ..runs.device import pick_device
     from .catalogue import choose_cases, run_cases
 
     if command.json is not None:

@@ -10,7 +10,7 @@ import tyro
 from tyro.conf import Positional
 
 from ..errors import InputError
-from ..training.commands import ensured_scene, open_run, response_around
+from ..runs.open import enclosing_run_response, load_run_photos_with_confidence, open_run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +84,7 @@ def run_evaluate(asked: Evaluate) -> None:
 
     def figures():
         run = open_run(asked.run, asked.device)
-        return evaluate(run, ensured_scene(run, asked.data), lpips_weights=asked.lpips)
+        return evaluate(run, load_run_photos_with_confidence(run, asked.data), lpips_weights=asked.lpips)
 
     asked.tell(figures)
 
@@ -95,7 +95,7 @@ def run_score(asked: Score) -> None:
     from .score import score_folder
 
     def figures():
-        response = asked.response or response_around(asked.folder)
+        response = asked.response or enclosing_run_response(asked.folder)
         if response is None:
             capture = read_capture(asked.truth)
             bent = capture.alpha == "background" or not all(shot.lens.is_pinhole for shot in capture.shots)

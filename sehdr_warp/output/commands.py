@@ -12,7 +12,7 @@ from tyro.conf import Positional
 from ..arguments import positive
 from ..errors import InputError, UsageError
 from ..files import check_absent
-from ..training.commands import ensured_scene, open_run, open_scene
+from ..runs.open import load_run_photos_with_confidence, open_run, open_scene
 
 log = logging.getLogger(__name__)
 
@@ -226,7 +226,7 @@ def run_report(asked: Report) -> None:
 
     check_absent(asked.out / "report.html", asked.overwrite)
     run = open_run(asked.run, asked.device)
-    scene = ensured_scene(run, asked.data)
+    scene = load_run_photos_with_confidence(run, asked.data)
     for path in write_report(run, scene, asked.out, overwrite=asked.overwrite, evaluation=evaluate(run, scene)):
         print(path)
 

@@ -1,4 +1,4 @@
-"""The command lines of `sehdr-warp train`, `presets` and `config`, and what other commands need of a run.
+"""The command lines of `sehdr-warp train`, `presets` and `config`.
 
 torch is imported when they run.
 """
@@ -7,7 +7,7 @@ import json
 import logging
 import shlex
 from collections.abc import Mapping
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -15,11 +15,11 @@ from typing import Annotated, ClassVar
 import tyro
 from tyro.conf import Positional
 
-from ..errors import InputError, SehdrError, UsageError
+from ..errors import SehdrError, UsageError
 from ..runs import config_files as configs
+from ..runs.open import LOAD_OPTIONS, load_photos
 
 log = logging.getLogger(__name__)
-_READ_BY = ("exposure_index", "max_size", "holdout")  # What load_scene takes besides the path and the response
 
 
 @dataclass(frozen=True)
@@ -154,8 +154,8 @@ def _run_as_rank(words: list[str]) -> None:
 
 
 def _train(asked: Train, ranks=None) -> None:
+    from ..runs.device import pick_device
     from ..runs.run_folder import RunFolder
-    from .machine import pick_device
 
     output, resumed = asked.output, None
     out, how = output.out, {"resume": output.resume, "overwrite": output.overwrite}
@@ -175,7 +175,7 @@ def _train(asked: Train, ranks=None) -> None:
     if out is not None:
         _check_truth(data, config)
     with nullcontext() if out is None or device.type != "cpu" else _kernels_ahead(config):
-        scene = _load(data, response=options.name, **given)
+        scene = load_photos(data, response=options.name, **given)
         if out is None:
             from .plan import make_plan
 
@@ -240,64 +240,6 @@ def run_config(asked: ShowConfig) -> None:
     print(json.dumps(config.model_dump()) if asked.json else configs.config_as_toml(config, asked.diff))
 
 
-def open_run(path: Path, device: str | None):
-    """The run in a folder, on the device that a command line names."""
-    from ..runs.run import load_run
-    from .machine import pick_device
-
-    return load_run(path, device=pick_device(device))
-
-
-def open_scene(path: Path, device: str | None):
-    """The run in a folder or the Gaussians in a file, on the device that a command line names."""
-    from ..runs.run import load_splats
-    from ..splats import SUFFIXES
-    from .machine import pick_device
-
-    splats = path.is_file() or path.suffix.lower() in SUFFIXES
-    return load_splats(path, device=pick_device(device)) if splats else open_run(path, device)
-
-
-def ensured_scene(run, data: str | None):
-    """The scene of read_scene, after the run's confidence was measured on it."""
-    from ..runs.run import ensure_confidence
-
-    scene = read_scene(run, data)
-    ensure_confidence(run, scene)
-    return scene
-
-
-def read_scene(run, data: str | None):
-    """The scene a run was trained on, read again in the same way. data: where the photos are, if they have moved."""
-    from ..scene import is_embedded
-
-    place = data or run.data.get("path")
-    if place is None:
-        raise SehdrError(f"{run.path}: does not say where its photos are; give --data")
-    if data is None and not is_embedded(place) and not Path(place).is_dir():
-        raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
-    return _load({**run.data, "path": place}, response=_developing(run.config, run.response))
-
-
-def response_around(folder: Path):
-    """What load_scene takes as the response, to develop photos like the run in whose folder this one lies; None where
-    that is no run's."""
-    from ..response import Response
-    from ..runs.run_folder import RunFolder
-
-    for place in map(RunFolder, folder.resolve().parents):
-        if place.info.is_file() and place.checkpoints.is_dir():
-            with suppress(InputError):  # Another program's run.json.
-                return _developing(place.read_config(), Response.from_dict(place.read_info()["response"]))
-    return None
-
-
-def _developing(config, response):
-    """The response that a run's photos were developed by: a learned one was not known then, and linear codes became
-    others."""
-    return config.response.name if config.response.name in ("learned", "linear") else response
-
-
 def _data(asked: Train, resumed) -> dict:
     """What load_scene takes: as it is given, or else as the RunFolder that is resumed has it."""
     from ..scene import is_embedded
@@ -305,7 +247,7 @@ def _data(asked: Train, resumed) -> dict:
     path = asked.data
     if path is not None and not is_embedded(path):
         path = str(Path(path).absolute())
-    given = {"path": path} | {name: getattr(asked.scene, name) for name in _READ_BY}
+    given = {"path": path} | {name: getattr(asked.scene, name) for name in LOAD_OPTIONS}
     if resumed is not None:
         known = resumed.read_info()["data"]
         given = {name: known.get(name) if value is None else value for name, value in given.items()}
@@ -329,16 +271,6 @@ def _config(asked: Train, resumed):
     config = configs.load_config(options.preset or "default", named, flags)
     kept = {*config.plan.keep, *(path for path in named if not path.startswith("plan."))}
     return configs.override_config(config, {"plan.keep": sorted(kept)})
-
-
-def _load(data: Mapping, **response):
-    """The scene, developed with a response, as load_scene takes it; its notes go to the log."""
-    from ..scene import load_scene
-
-    scene = load_scene(data["path"], **{name: data.get(name) for name in _READ_BY}, **response)
-    for note in scene.notes:
-        log.info("%s", note)
-    return scene
 
 
 def _cost(config) -> str:

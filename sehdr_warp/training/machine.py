@@ -10,27 +10,12 @@ from typing import Any
 
 import torch
 
-from ..errors import InputError, SehdrError
+from ..errors import SehdrError
 from ..parallel import thread_count
 
 SWITCH_SECONDS = (
     2e-4  # A thread that waits for the interpreter asks for it after so long, where Python's 5 ms are a kernel
 )
-
-
-def pick_device(device: str | torch.device | None) -> torch.device:
-    """The device a user named, by default the first GPU or else the CPU; raises InputError if it is not there."""
-    if device is None:
-        return torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
-    if not str(device).startswith(("cpu", "cuda")):
-        raise InputError(f"device {device}", "is neither a CPU nor a CUDA GPU", "use cpu or cuda:N")
-    try:
-        made = torch.device(device)
-        torch.empty(0, device=made)
-    except (RuntimeError, AssertionError) as error:
-        problem = f"cannot be used ({str(error).splitlines()[0]})"
-        raise InputError(f"device {device}", problem, "use cpu, or cuda:N of a GPU that torch sees") from None
-    return torch.device("cuda", made.index or 0) if made.type == "cuda" else made
 
 
 def machine_figures(device: torch.device) -> dict:

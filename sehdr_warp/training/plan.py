@@ -13,11 +13,11 @@ from ..model.exposure import exposure_times, is_seconds
 from ..parallel import thread_count
 from ..runs.config import Config, OptimizerConfig
 from ..runs.config_files import override_config
+from ..runs.device import pick_device
 from ..scene import Scene
 from ..scene.read_folders import FEWEST_PHOTOS
 from .densification import gaussian_budget
 from .initialization import base_time, start_count
-from .machine import pick_device
 from .scene_facts import SceneFacts, measure_scene
 from .targets import largest_truth
 

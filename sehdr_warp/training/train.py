@@ -21,6 +21,7 @@ from ..response import Response
 from ..runs.checkpoint import first_not_finite
 from ..runs.config import Config
 from ..runs.config_files import as_config, config_fields, override_config
+from ..runs.device import pick_device
 from ..runs.run import Run, as_rec709, field_from_checkpoint, load_run, photo_gains
 from ..runs.run_folder import RunFolder
 from ..scene import Camera, Scene
@@ -28,7 +29,7 @@ from ..scene.photo_gains import PhotoGains
 from .following import hand_on, told_of_ranks
 from .held_out import evaluate_views, figures_told, warn_of_fall
 from .initialization import choose_response, make_field, make_matcher, sizes_of
-from .machine import interruptible, machine_figures, pick_device, summary_writer, torch_settings
+from .machine import interruptible, machine_figures, summary_writer, torch_settings
 from .photo_gains import evens, find_gains
 from .plan import apply_plan
 from .ranks import END, GO, WAIT, Ranks

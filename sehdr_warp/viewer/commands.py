@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from ..training.commands import open_scene, read_scene
+from ..runs.open import load_run_photos, open_scene
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ def run_view(asked: View) -> None:
     def photos(index: int) -> dict:
         if not isinstance(watch.shown[index].run, Run):
             raise InputError(asked.runs[index], "is a file of Gaussians, without photos", "view the run it came from")
-        return {view.name: view for view in read_scene(watch.shown[index], asked.data).views}
+        return {view.name: view for view in load_run_photos(watch.shown[index], asked.data).views}
 
     watch.start()
     with Server(Viewer(watch.shown, photos), asked.host, asked.port) as server:

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sehdr_warp.runs.open import open_scene
 from sehdr_warp.scene import look_at
-from sehdr_warp.training.commands import open_scene
 from sehdr_warp.training.train import train
 from sehdr_warp.viewer.server import MOST_BODY, MOST_VIEWS, Server
 from sehdr_warp.viewer.watching import Watch

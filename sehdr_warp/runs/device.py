@@ -1,0 +1,27 @@
+"""Choose the torch device that a user names."""
+
+import torch
+
+from ..errors import InputError
+
+
+def pick_device(device: str | torch.device | None) -> torch.device:
+    """Return the device that a user names, by default the first GPU, or the CPU if there is none.
+
+    Args:
+        device: "cpu", "cuda", "cuda:N", a torch device, or None.
+
+    Raises:
+        InputError: If torch cannot use the device.
+    """
+    if device is None:
+        return torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
+    if not str(device).startswith(("cpu", "cuda")):
+        raise InputError(f"device {device}", "is neither a CPU nor a CUDA GPU", "use cpu or cuda:N")
+    try:
+        chosen = torch.device(device)
+        torch.empty(0, device=chosen)
+    except (RuntimeError, AssertionError) as error:
+        problem = f"cannot be used ({str(error).splitlines()[0]})"
+        raise InputError(f"device {device}", problem, "use cpu, or cuda:N of a GPU that torch sees") from None
+    return torch.device("cuda", chosen.index or 0) if chosen.type == "cuda" else chosen

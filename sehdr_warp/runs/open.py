@@ -1,0 +1,118 @@
+"""Open what a command line names: a run, a file of Gaussians, and the photos that a run was trained on.
+
+torch is imported when a function is called, so that the command line can import this module at no cost.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import InputError, SehdrError
+
+if TYPE_CHECKING:
+    from ..response import Response
+    from ..scene import Scene
+    from .config import Config
+    from .run import Run, Splats
+
+log = logging.getLogger(__name__)
+
+LOAD_OPTIONS = ("exposure_index", "max_size", "holdout")
+"""Arguments of load_scene, besides path and response, that a run saves so that its photos can be loaded again."""
+
+
+def open_run(path: Path, device: str | None) -> Run:
+    """Load the run in a folder.
+
+    Args:
+        path: Folder of the run.
+        device: "cpu" or "cuda:N"; None for the first GPU, or the CPU if there is none.
+
+    Raises:
+        InputError: If the folder is not a run, or the device is missing.
+    """
+    from .device import pick_device
+    from .run import load_run
+
+    return load_run(path, device=pick_device(device))
+
+
+def open_scene(path: Path, device: str | None) -> Run | Splats:
+    """Load the run in a folder, or the Gaussians in a PLY, glTF or OpenUSD file; arguments as of open_run."""
+    from ..splats import SUFFIXES
+    from .device import pick_device
+    from .run import load_splats
+
+    if path.is_file() or path.suffix.lower() in SUFFIXES:
+        return load_splats(path, device=pick_device(device))
+    return open_run(path, device)
+
+
+def load_photos(data: Mapping[str, Any], **options: Any) -> Scene:
+    """Load the scene that saved arguments of load_scene describe, and log its notes.
+
+    Args:
+        data: "path" and any of LOAD_OPTIONS.
+        options: Further arguments of load_scene, such as response.
+    """
+    from ..scene import load_scene
+
+    scene = load_scene(data["path"], **{name: data.get(name) for name in LOAD_OPTIONS}, **options)
+    for note in scene.notes:
+        log.info("%s", note)
+    return scene
+
+
+def load_run_photos(run: Run, data: str | None) -> Scene:
+    """Load the photos of a run in the same way as for its training.
+
+    Args:
+        run: The trained run.
+        data: Where the photos are now, if they have moved.
+
+    Raises:
+        SehdrError: If the run does not say where its photos are, and data is None.
+        InputError: If the photos are no longer there.
+    """
+    from ..scene import is_embedded
+
+    place = data or run.data.get("path")
+    if place is None:
+        raise SehdrError(f"{run.path}: does not say where its photos are; give --data")
+    if data is None and not is_embedded(place) and not Path(place).is_dir():
+        raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
+    return load_photos({**run.data, "path": place}, response=_response_for_loading(run.config, run.response))
+
+
+def load_run_photos_with_confidence(run: Run, data: str | None) -> Scene:
+    """Load the photos of a run as load_run_photos does, and measure the run's confidence if it has none."""
+    from .run import ensure_confidence
+
+    scene = load_run_photos(run, data)
+    ensure_confidence(run, scene)
+    return scene
+
+
+def enclosing_run_response(folder: Path) -> Response | str | None:
+    """Return the response to load photos with that belong to the run around a folder; None if no run is around it."""
+    from ..response import Response
+    from .run_folder import RunFolder
+
+    for place in map(RunFolder, folder.resolve().parents):
+        if place.info.is_file() and place.checkpoints.is_dir():
+            with suppress(InputError):  # A run.json of another program.
+                return _response_for_loading(place.read_config(), Response.from_dict(place.read_info()["response"]))
+    return None
+
+
+def _response_for_loading(config: Config, response: Response) -> Response | str:
+    """Return the response to load a run's photos with.
+
+    A learned response is not known at load time, and linear photos were encoded anew when they were loaded: for both
+    the name alone reproduces what the training loaded.
+    """
+    return config.response.name if config.response.name in ("learned", "linear") else response
