@@ -26,8 +26,8 @@ from .types import View
 
 _LARGE = 1 << 14  # Arrays of fewer bytes are pickled
 _ALIGNED = 64
-_ARRAYS = "codes", "mask", "hdr"
-_LEAST, _MOST_BYTES = 1 << 30, 22  # Of a file, and of a pixel in it: 16-bit codes, a mask, truth
+_ARRAYS = "codes", "mask", "hdr", "light_above_white"
+_LEAST, _MOST_BYTES = 1 << 30, 28  # Of a file, and of a pixel in it: 16-bit codes, a mask, truth, light above white
 SHARE = 0.5
 """Of the free memory, photos of a scene stay in it up to so much."""
 

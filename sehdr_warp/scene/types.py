@@ -26,6 +26,10 @@ class View:
         mask: [H, W] float32 in [0, 1], 1 where the pixel counts; None means all count.
         hdr: [H, W, 3] float32 scene-linear truth (radiance, not multiplied by the exposure time); None without truth.
         source: the file the photo came from.
+        light_above_white: [H, W, 3] float16, the light of clipped pixels that the photo's file states beside its codes
+            (by a gain map, for example), as a multiple of the exposure that the code of white stands for; at least 1
+            where it is known, 0 elsewhere. None if the file states none.
+        light_above_white_deviation: standard deviation of the natural logarithm of light_above_white.
 
     Raises:
         ValueError: for codes of another type or shape; codes_of makes them of encoded values.
@@ -39,12 +43,17 @@ class View:
     mask: np.ndarray | None = None
     hdr: np.ndarray | None = None
     source: Path | None = None
+    light_above_white: np.ndarray | None = None
+    light_above_white_deviation: float = 0.0
 
     def __post_init__(self):
         codes = self.codes
         if getattr(codes, "dtype", None) not in (np.uint8, np.uint16) or codes.ndim != 3 or codes.shape[2] != 3:
             found = f"{getattr(codes, 'dtype', type(codes).__name__)} {list(getattr(codes, 'shape', ()))}"
             raise ValueError(f"codes of view {self.name} are {found}, not uint8 or uint16 [H, W, 3]; see codes_of")
+        if self.light_above_white is not None and self.light_above_white.shape != codes.shape:
+            found = list(self.light_above_white.shape)
+            raise ValueError(f"light_above_white of view {self.name} is {found}, its codes are {list(codes.shape)}")
 
     @property
     def levels(self) -> int:
