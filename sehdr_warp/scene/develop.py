@@ -14,9 +14,10 @@ from ..parallel import made_ahead
 from .camera import Camera
 from .capture import Capture, Shot, reinhard_gamma
 from .hdr_files import hdr_size, read_hdr
-from .images import EncodedImage, read_mask
+from .images import EncodedImage
 from .lens import Lens, Undistortion, area_average
 from .linear_photos import float_codes, kind_of, linear_codes
+from .masks import mask_note, read_mask
 from .names import unique_names
 from .photo_file import PhotoKeeper
 from .photos import photo_sizes, read_photo
@@ -44,7 +45,8 @@ def develop(capture: Capture, response: "Response", max_size: int | None = None,
     shots = ((shot, names[i]) for i, shot in told("reading views", capture.shots))
     views = [keeper.kept(view) for view in made_ahead(lambda given: developer.view(*given), shots, most)]
     deque(with_content(((view.codes, view.mask) for view in views if view.split == "train"), capture.folder), maxlen=0)
-    stated = *capture.cloud, capture.times_known, (*capture.notes, *([keeper.note] if keeper.note else []))
+    notes = *capture.notes, *mask_note(list(developer.mask_shares.values())), *([keeper.note] if keeper.note else [])
+    stated = *capture.cloud, capture.times_known, notes
     return Scene(capture.name, capture.format, tuple(views), *stated, response=response)
 
 
@@ -94,6 +96,7 @@ class _Developer:
         self.max_size, self.response, self.alpha = max_size, response, alpha
         self._tables: dict[int, np.ndarray] = {}
         self._last: tuple[Lens, Undistortion] | None = None
+        self.mask_shares: dict[str, float | None] = {}  # By view: the mean of its mask file
         self._alone = threading.Lock()  # For what photos share; responses work on all cores by themselves
 
     def view(self, shot: Shot, name: str) -> View:
@@ -120,13 +123,16 @@ class _Developer:
 
         hdr = None if shot.hdr is None else warped(_read_truth(shot.hdr, lens, camera, undistortion is not None))
         stated = camera, shot.seconds, shot.split or "train"
+        stored = None if shot.mask is None else _fitted_mask(shot.mask, lens, oriented)
+        self.mask_shares[name] = None if stored is None else float(stored.mean())
         if shot.derived and hdr is not None:  # HDR-NeRF's photo of the truth, at the final size.
-            return View(name, codes_of(reinhard_gamma(hdr * shot.seconds), 8), *stated, None, hdr, shot.image)
+            mask = None if stored is None else warped(stored)
+            return View(name, codes_of(reinhard_gamma(hdr * shot.seconds), 8), *stated, mask, hdr, shot.image)
         encoded = as_photographed(shot, oriented=oriented)
         codes, alpha = encoded.pixels, encoded.alpha
         masks = [] if undistortion is None or undistortion.inside is None else [_shrunk(undistortion.inside, camera)]
-        if shot.mask is not None:
-            masks.append(warped(_fitted_mask(shot.mask, lens, oriented)))
+        if stored is not None:
+            masks.append(warped(stored))
         if alpha is not None and self.alpha == "mask":
             masks.append(warped(alpha))
             alpha = None

@@ -21,7 +21,7 @@ SHORTEST, LONGEST = 1e-12, 1e12
 _REMEDY = "correct it, or state every image's seconds in exposures.json"
 
 
-def choose_exposure(shots: tuple[Shot, ...], index: int | None, source: Path) -> tuple[list[Shot], list[str]]:
+def choose_exposure(shots: Sequence[Shot], index: int | None, source: Path) -> tuple[list[Shot], list[str]]:
     """One shot of each view, and notes.
 
     index: the exposure's number in the file names; None takes the middle one (of an even count the longer).

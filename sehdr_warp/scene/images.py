@@ -81,12 +81,6 @@ def has_16_bits(path: Path) -> bool:
         return image.mode.startswith("I") or bool(_low_byte_tiles(image))
 
 
-def read_mask(path: Path, *, oriented: bool = False) -> np.ndarray:
-    """[H, W] float32 in [0, 1] from grey, color (its mean) or transparent (its alpha); 1 counts."""
-    image = read_ldr(path, oriented=oriented, mask=True)
-    return image.alpha if image.alpha is not None else (image.pixels.mean(axis=2) / image.levels).astype(np.float32)
-
-
 def open_image(path: Path, *, mask: bool = False) -> ImageFile.ImageFile:
     """The image with its header read and its pixels not; InputError where it is missing, none, too large, one of
     several pictures in its file, or not of grey or RGB. Of a stereo pair or a photo with a gain map (MPO) it is the

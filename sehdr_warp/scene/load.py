@@ -17,6 +17,7 @@ from .develop import as_photographed, develop, fitted_lens, with_content
 from .exposure import choose_exposure, made_by_camera, with_exposure_times
 from .images import has_16_bits
 from .linear_photos import CURVES, color_matrix, float_time, one_kind
+from .masks import assign_masks
 from .names import unique_names
 from .read_folders import (
     image_folder,
@@ -114,7 +115,8 @@ def read_capture(
     capture = _read(folder, cache)
     if not capture.shots:
         raise InputError(folder, "has no views", "check the data folder")
-    shots, notes = choose_exposure(capture.shots, exposure_index, folder)
+    shots, masks = assign_masks(capture.shots, folder)
+    shots, notes = choose_exposure(shots, exposure_index, folder)
     kind, more = one_kind([shot.image for shot in shots if not shot.derived] or [Path("derived")]), []
     if kind == "float" and all(shot.exposure_time is None for shot in shots):
         time = float_time([shot.image for shot in shots])
@@ -131,7 +133,7 @@ def read_capture(
     for shot in shots:
         if not shot.derived:
             fitted_lens(shot)
-    notes = (*capture.notes, *notes, *more, *split)
+    notes = (*capture.notes, *masks, *notes, *more, *split)
     name = str(path) if is_embedded(path) else folder.resolve().name
     told = {"notes": notes, "name": name, "folder": folder, "times_known": times_known, "kind": kind}
     return replace(capture, shots=tuple(shots), **told)

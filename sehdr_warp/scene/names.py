@@ -1,13 +1,11 @@
 """The order of file names, files beside each other, and names of views."""
 
 import itertools
-import os
 import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..files import contained
 from .capture import Shot
 
 
@@ -31,17 +29,20 @@ def sibling(path: Path, suffixes: tuple[str, ...]) -> Path | None:
         return None
 
 
-def mask_of(folder: Path, name: str, source: Path) -> Path | None:
-    """The mask of the image called `name`: `masks/<name>.png` (COLMAP's habit) or `masks/<stem>.png`."""
-    masks = (f"{name}.png", str(Path(name).with_suffix(".png")))
-    places = (contained(folder / "masks", mask, source) for mask in masks)
-    return next((place for place in places if os.path.isfile(place)), None)
+def without_mask_ending(stem: str) -> str:
+    """Return a stem without the ending by which tools mark masks (`_mask`, `-mask`, `.mask`), if it has one."""
+    return re.sub(r"(?<=.)[_.-]masks?$", "", stem, flags=re.IGNORECASE)
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """The image files directly in a folder, hidden ones left out, in natural order."""
-    files = (file for file in folder.iterdir() if file.suffix.lower() in suffixes and not file.name.startswith("."))
-    return sorted((file for file in files if file.is_file()), key=lambda file: natural_key(file.name))
+    """List the image files directly in a folder in natural order.
+
+    Hidden files are left out, and masks beside their photo (`IMG_1_mask.png` beside `IMG_1.jpg`).
+    """
+    files = [file for file in folder.iterdir() if file.suffix.lower() in suffixes and not file.name.startswith(".")]
+    names = {name for file in files for name in (file.name, file.stem)}
+    photos = (file for file in files if (key := without_mask_ending(file.stem)) == file.stem or key not in names)
+    return sorted((file for file in photos if file.is_file()), key=lambda file: natural_key(file.name))
 
 
 def unique_names(shots: Sequence[Shot]) -> list[str]:

@@ -15,7 +15,7 @@ from .exposure import parse_seconds
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 from .lens import Lens
 from .linear_photos import color_matrix, one_kind
-from .names import list_images, mask_of, natural_key, sibling, view_and_exposure
+from .names import list_images, natural_key, sibling, view_and_exposure
 from .photos import photo_sizes
 from .sfm import reconstruct
 from .stack import refuse_stack
@@ -50,8 +50,7 @@ def read_colmap(folder: Path) -> Capture:
         else:
             beside = (sibling(folder / name / image.name, HDR_SUFFIXES) for name in ("hdr", "exr"))
             hdr = next((file for file in beside if file), None)
-        mask = mask_of(folder, entry.name, source)
-        shots.append(Shot(image.stem, image, entry.lens, entry.world_to_camera, mask=mask, hdr=hdr))
+        shots.append(Shot(image.stem, image, entry.lens, entry.world_to_camera, hdr=hdr))
     if not shots:
         problem = f"none of the model's {len(absent)} images is here (the first is {absent[0]!r:.90})"
         raise InputError(images, problem, _REMEDY)
@@ -213,8 +212,7 @@ def read_photos(folder: Path, cache: Path | str | None = None) -> Capture:
         if (image := placed.get(i)) is None:
             lost.append(photo.name)
             continue
-        mask = mask_of(folder, photo.name, folder)
-        shots.append(Shot(photo.stem, photo, image.lens, image.world_to_camera, mask=mask, oriented=True))
+        shots.append(Shot(photo.stem, photo, image.lens, image.world_to_camera, oriented=True))
     notes = ()
     if lost:
         notes = (f"{len(lost)} of {len(photos)} photos could not be placed and were left out: {', '.join(lost[:5])}",)

@@ -31,8 +31,8 @@ from sehdr_warp.scene import load_cameras, load_scene
 from sehdr_warp.scene.colmap_model import read_ply_points
 from sehdr_warp.scene.exposure import exif_exposure
 from sehdr_warp.scene.hdr_files import hdr_size, read_exr_channels, read_hdr
-from sehdr_warp.scene.images import read_mask
 from sehdr_warp.scene.linear_photos import color_matrix, raw_exposure
+from sehdr_warp.scene.masks import read_mask
 from sehdr_warp.scene.photos import photo_sizes, read_photo
 from sehdr_warp.scene.read_folders import read_colmap, read_hdr_nerf_real, read_llff
 from sehdr_warp.scene.read_transforms import read_hdr_nerf, read_transforms

@@ -13,8 +13,9 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.camera import limited_size
 from sehdr_warp.scene.hdr_files import hdr_size, read_hdr
-from sehdr_warp.scene.images import exif_of, image_sizes, open_image, read_ldr, read_mask
+from sehdr_warp.scene.images import exif_of, image_sizes, open_image, read_ldr
 from sehdr_warp.scene.lens import area_average
+from sehdr_warp.scene.masks import read_mask
 
 RNG = np.random.default_rng(1)
 

@@ -1,0 +1,150 @@
+"""Masks: which mask file belongs to which photo, and what its values mean."""
+
+import os
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..files import contained
+from .capture import Shot
+from .images import LDR_SUFFIXES, PHOTO_SUFFIXES, read_ldr
+from .names import natural_key, sibling, without_mask_ending
+
+MASK_FOLDERS = ("masks", "mask")
+_MOST_NAMED = 3
+_REMEDY = "name each like its photo, such as masks/IMG_1.png or masks/IMG_1.jpg.png"
+
+
+def assign_masks(shots: Sequence[Shot], folder: Path) -> tuple[list[Shot], list[str]]:
+    """Give each photo without a mask the mask file that is named like it, in any layout.
+
+    Masks lie in `masks/` or `mask/` of the data folder, under the photo's path below the data folder or below the
+    folder of all photos, with any picture suffix after or instead of the photo's (`masks/cam0/1.jpg.png`,
+    `masks/cam0/1.png`), or under its file name alone if no two photos share that. An ending `_mask`, `-mask` or `.mask`
+    of the stem is ignored. Files with such an ending beside the photos are masks as well. In sets of several exposures,
+    a mask that is named like the view serves all its exposures.
+
+    Args:
+        shots: the photos; a mask that the set states itself stays.
+        folder: the data folder.
+
+    Returns:
+        The photos with their masks, and a note for each mask folder with files that fit no photo.
+
+    Raises:
+        InputError: if a mask is a link that leads out of the data folder.
+    """
+    bases = _bases([shot.image for shot in shots], folder)
+    shared = Counter(
+        key for image, view in {(s.image, s.view) for s in shots} for key in {image.name, image.stem, view}
+    )
+    places = [place for name in MASK_FOLDERS if (place := folder / name).is_dir()]
+    files = {place: {file: _key(file, place) for file in _files_below(place)} for place in places}
+    index = [{key: file for file, key in reversed(keys.items())} for keys in files.values()]
+    beside = {parent: _masks_beside(parent) for parent in {shot.image.parent for shot in shots}}
+    masked, used = [], set()
+    for shot in shots:
+        keys = _photo_keys(shot, bases, shared)
+        near = beside[shot.image.parent]
+        tables = [*((masks, keys) for masks in index), (near, [shot.image.name, shot.image.stem])]
+        mask = shot.mask or next((masks[key] for masks, names in tables for key in names if key in masks), None)
+        if mask is not None and shot.mask is None:
+            mask = contained(folder, mask.relative_to(folder).as_posix(), folder)
+        used.add(mask)
+        masked.append(replace(shot, mask=mask))
+    notes = []
+    for place, keys in files.items():
+        # A mask of a photo that the set leaves out is named with that photo, not here.
+        strange = [file for file, key in keys.items() if file not in used and not _is_photo(key, bases)]
+        names = [file.relative_to(place).as_posix() for file in strange]
+        if names:
+            listed = ", ".join(names[:_MOST_NAMED]) + (" ..." if len(names) > _MOST_NAMED else "")
+            count = "1 file that fits" if len(names) == 1 else f"{len(names)} files that fit"
+            notes.append(f"{place.name}/ holds {count} no photo: {listed}; {_REMEDY}")
+    return masked, notes
+
+
+def read_mask(path: Path, *, oriented: bool = False) -> np.ndarray:
+    """Read a mask of grey, of color (its mean) or of transparency (its alpha) values.
+
+    Masks of two values, one of which is 0, count as COLMAP counts them: every value above 0 keeps the pixel. This
+    covers 0 and 1, label colors and palettes. Others are weights relative to white.
+
+    Args:
+        path: the file.
+        oriented: turn the pixels as the EXIF orientation says.
+
+    Returns:
+        [H, W] float32 in [0, 1]; 1 keeps the pixel.
+
+    Raises:
+        InputError: as read_ldr raises it.
+    """
+    image = read_ldr(path, oriented=oriented, mask=True)
+    if image.alpha is not None:
+        values = image.alpha * np.float32(image.levels)
+    else:
+        values = image.pixels.mean(axis=2, dtype=np.float32)
+    largest, two = float(values.max()), (values == 0) | (values == values.max())
+    if largest <= 1 or (float(values.min()) == 0 and two.all()):
+        return (values > 0).astype(np.float32)
+    white = 255 if largest <= 255 else image.levels  # Also of 8-bit values in a 16-bit file.
+    return values / np.float32(white)
+
+
+def mask_note(shares: Sequence[float | None]) -> list[str]:
+    """Describe how many photos have a mask and what share of their pixels is left out.
+
+    Args:
+        shares: the mean of each photo's mask, None for a photo without one.
+
+    Returns:
+        One line, or none if no photo has a mask.
+    """
+    masked = [share for share in shares if share is not None]
+    if not masked:
+        return []
+    out = 100 * (1 - sum(masked) / len(masked))
+    return [f"masks: {len(masked)} of {len(shares)} photos have one; they leave out {out:.1f} % of their pixels"]
+
+
+def _bases(images: Sequence[Path], folder: Path) -> list[Path]:
+    """List the folders that names of masks may be relative to: that of all photos, and those above it."""
+    common = Path(os.path.commonpath([image.parent for image in images]))
+    above = [place for place in common.parents if place.is_relative_to(folder)]
+    return [common, *above]
+
+
+def _photo_keys(shot: Shot, bases: Sequence[Path], shared: Counter) -> list[str]:
+    """List the names without suffix under which the masks of a photo are looked for, the most exact first."""
+    image = shot.image
+    paths = [image.relative_to(base) for base in bases if image.is_relative_to(base)]
+    keys = [key for path in paths for key in (path.as_posix(), path.with_suffix("").as_posix())]
+    keys += [path.with_name(shot.view).as_posix() for path in paths] + [f"{shot.split}/{shot.view}"]
+    return keys + [key for key in (image.name, image.stem, shot.view) if shared[key] == 1]
+
+
+def _key(mask: Path, place: Path) -> str:
+    """Return the path of a mask below its folder, without its suffix and an ending that only says what it is."""
+    return without_mask_ending(mask.relative_to(place).with_suffix("").as_posix())
+
+
+def _files_below(place: Path) -> list[Path]:
+    files = (file for file in place.rglob("*") if file.suffix.lower() in LDR_SUFFIXES and not file.name.startswith("."))
+    return sorted((file for file in files if file.is_file()), key=lambda file: natural_key(file.as_posix()))
+
+
+def _masks_beside(parent: Path) -> dict[str, Path]:
+    """Map photos' names or stems to the masks that lie in the photos' own folder."""
+    if not parent.is_dir():
+        return {}
+    files = (file for file in parent.iterdir() if file.suffix.lower() in LDR_SUFFIXES)
+    return {key: file for file in files if (key := without_mask_ending(file.stem)) != file.stem}
+
+
+def _is_photo(key: str, bases: Sequence[Path]) -> bool:
+    """Whether a photo of this name, with or without suffix, lies in one of the folders."""
+    return any((base / key).is_file() or sibling(base / f"{key}.png", PHOTO_SUFFIXES) for base in bases)

@@ -1,0 +1,165 @@
+"""Masks in every layout: found by name, read by value, counted in a note."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sehdr_warp.scene import Camera
+from sehdr_warp.scene.masks import mask_note, read_mask
+from sehdr_warp.scene.read_folders import read_llff
+from tests.make_scenes import (
+    RadianceView,
+    arc_poses,
+    load,
+    pattern,
+    write_blender,
+    write_colmap,
+    write_llff,
+    write_reinhard,
+)
+
+HALF = np.repeat(np.array([[0], [255]], np.uint8), 24, axis=0).repeat(64, axis=1)
+"""[48, 64]: the upper half is left out."""
+
+
+def write_mask(path, mask=HALF):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(mask).save(path)
+
+
+def shares(scene):
+    return [1.0 if view.mask is None else round(float(view.mask.mean()), 2) for view in scene.views]
+
+
+def masks_said(scene):
+    return [note for note in scene.notes if "mask" in note]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "masks/{}.png.png",
+        "masks/{}.png",
+        "masks/{}.jpg",
+        "masks/{}.PNG",
+        "masks/{}_mask.png",
+        "masks/{}.mask.png",
+        "mask/{}.png",
+        "masks/images/{}.png",
+        "images/{}_mask.png",
+    ],
+)
+@pytest.mark.parametrize("layout", [write_colmap, write_llff])
+def test_names_of_masks(tmp_path, layout, name):
+    layout(tmp_path)
+    for i in range(6):
+        write_mask(tmp_path / name.format(f"{i:03d}"))
+    scene = load(tmp_path, holdout=0)
+    assert shares(scene) == [0.5] * 6
+    assert masks_said(scene) == ["masks: 6 of 6 photos have one; they leave out 50.0 % of their pixels"]
+
+
+def test_masks_of_photos_in_folders_of_same_names(tmp_path):
+    write_colmap(tmp_path, name="cam{0}/0000.png")
+    write_mask(tmp_path / "masks" / "cam1" / "0000.png")
+    scene = load(tmp_path, holdout=0)
+    assert shares(scene) == [1.0, 0.5, 1.0, 1.0, 1.0, 1.0]
+    write_mask(tmp_path / "masks" / "0000.png")  # It could be any camera's.
+    scene = load(tmp_path, holdout=0)
+    assert shares(scene) == [1.0, 0.5, 1.0, 1.0, 1.0, 1.0]
+    assert "masks/ holds 1 file that fits no photo: 0000.png; name each like its photo" in masks_said(scene)[0]
+
+
+def test_masks_that_fit_no_photo_are_named(tmp_path):
+    write_colmap(tmp_path)
+    for i in range(5):
+        write_mask(tmp_path / "masks" / f"frame{i}.png")
+    write_mask(tmp_path / "masks" / "000.png")
+    (tmp_path / "images" / "unregistered.png").write_bytes((tmp_path / "images" / "000.png").read_bytes())
+    write_mask(tmp_path / "masks" / "unregistered.png")  # Its photo is there, and is named elsewhere.
+    strange, counted = masks_said(load(tmp_path, holdout=0))
+    assert strange.startswith("masks/ holds 5 files that fit no photo: frame0.png, frame1.png, frame2.png ...; name")
+    assert counted.startswith("masks: 1 of 6 photos have one; they leave out 50.0 %")
+
+
+def test_masks_of_transforms(tmp_path):
+    write_blender(tmp_path, size=(64, 48))
+    for i in range(3):
+        write_mask(tmp_path / "masks" / f"r_{i}.png")
+    write_mask(tmp_path / "masks" / "images" / "r_3.png")
+    assert shares(load(tmp_path, holdout=0)) == [0.5] * 4 + [1.0] * 2
+
+
+def test_masks_of_hdr_nerf_by_view_and_by_exposure(tmp_path):
+    views = [
+        RadianceView(f"r_{i}", Camera(64, 48, 50, 50, 32, 24, pose), pattern(64, 48, i) / 100.0, split)
+        for split in ("train", "test")
+        for i, pose in enumerate(arc_poses(3))
+    ]
+    write_reinhard(tmp_path, views, [0.5, 1.0, 2.0])
+    write_mask(tmp_path / "masks" / "train" / "r_0.png")
+    write_mask(tmp_path / "masks" / "test" / "r_1_1.png")
+    write_mask(tmp_path / "masks" / "r_2.png")  # It could be of train or of test.
+    scene = load(tmp_path)
+    assert {view.name for view in scene.views if view.mask is not None} == {"train_r_0", "r_1"}
+    assert "fits no photo: r_2.png" in masks_said(scene)[0]
+
+
+def test_masks_of_bare_photos_beside_them_are_no_photos(tmp_path):
+    write_llff(tmp_path)
+    for i in range(6):
+        write_mask(tmp_path / "images" / f"{i:03d}_mask.png")
+    Image.fromarray(HALF).save(tmp_path / "images" / "gas_mask.png")  # A photo of one.
+    from sehdr_warp.scene.names import list_images
+
+    assert [file.name for file in list_images(tmp_path / "images", (".png",))] == [
+        *(f"{i:03d}.png" for i in range(6)),
+        "gas_mask.png",
+    ]
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [
+        HALF // 255,
+        HALF // 2,
+        HALF.astype(np.uint16) * 257,
+        HALF.astype(np.uint16),
+        HALF > 0,
+        np.dstack([HALF // 255, HALF * 0, HALF * 0]),
+        np.dstack([HALF * 0, HALF * 0, HALF * 0, HALF]),
+    ],
+    ids=["0 and 1", "0 and 127", "16 bits", "8 bits in 16", "one bit", "label color", "alpha"],
+)
+def test_two_values_are_read_as_colmap_reads_them(tmp_path, mask):
+    write_mask(tmp_path / "mask.png", mask)
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), HALF / 255)
+
+
+def test_weights_and_masks_of_one_value(tmp_path):
+    for values, expected in (([0, 51, 255], [0, 0.2, 1]), ([51, 255, 255], [0.2, 1, 1]), ([0] * 3, [0] * 3),
+                             ([1] * 3, [1] * 3), ([255] * 3, [1] * 3), ([102] * 3, [0.4] * 3)):  # fmt: skip
+        write_mask(tmp_path / "mask.png", np.array([values], np.uint8))
+        np.testing.assert_allclose(read_mask(tmp_path / "mask.png")[0], expected, atol=1e-6)
+
+
+def test_a_mask_that_leads_out_of_the_set_is_refused(tmp_path):
+    from sehdr_warp import InputError
+
+    write_colmap(tmp_path / "set")
+    write_mask(tmp_path / "secret.png")
+    (tmp_path / "set" / "masks").mkdir()
+    (tmp_path / "set" / "masks" / "000.png").symlink_to(tmp_path / "secret.png")
+    with pytest.raises(InputError, match="outside the data folder"):
+        load(tmp_path / "set")
+
+
+def test_note_without_masks():
+    assert mask_note([None, None]) == []
+
+
+def test_masks_of_the_tankard(shared):
+    capture = read_llff(shared / "data" / "tankard_turntable")
+    assert len(capture.shots) == 69
+    scene = load(shared / "data" / "tankard_turntable", max_size=100)
+    assert "masks: 69 of 69 photos have one" in " ".join(scene.notes)
