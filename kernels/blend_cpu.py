@@ -21,8 +21,8 @@ whatever the channel count: T, and R = the part of the loss's derivative that ar
 
 Front to back, R would be formed by subtraction, which loses the dim Gaussians behind bright ones.
 
-Each tile writes the gradients of its list entries to rows of their own, and `gather_entries` sums a Gaussian's rows in
-a fixed order: results do not depend on the number of threads.
+Each tile writes the gradients of its list intersections to rows of their own, and `gather_intersections` sums a
+Gaussian's rows in a fixed order: results do not depend on the number of threads.
 """
 
 from functools import cache
@@ -114,7 +114,7 @@ def forward_kernel(dtype, channels: int, halvings: int):
     """blend_forward over tiles, from `first` on: see the module's description.
 
     halvings: see row_functions
-    ranges: [tiles] first and one past the last entry; entries: [M] Gaussians
+    ranges: [tiles] first and one past the last entry; intersections: [M] Gaussians
     shapes: [N] (x, y, opacity, half-height); ellipses: [N] (conic a, b, c, level); features: [N, C]
     columns: tiles across; width, height: of the image; iota: one row, 0 to 7
     transmittance, accumulated, last: scratch of [tiles, 32] rows, [tiles, C, 32] rows and [tiles, 32] rows, 16 a half
@@ -126,7 +126,7 @@ def forward_kernel(dtype, channels: int, halvings: int):
     @wp.kernel(module="unique", module_options=_options(dtype))
     def blend_forward(
         first: int,
-        ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), shapes: wp.array(dtype=vec4),
+        ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32), shapes: wp.array(dtype=vec4),
         ellipses: wp.array(dtype=vec4), features: wp.array2d(dtype=real),
         columns: int, width: int, height: int, alpha_threshold: real,
         iota: wp.array(dtype=row), transmittance: wp.array2d(dtype=row), accumulated: wp.array3d(dtype=row),
@@ -148,7 +148,7 @@ def forward_kernel(dtype, channels: int, halvings: int):
         k = bounds[0]
         alive = bool(True)
         while k < bounds[1] and alive:
-            i = entries[k]
+            i = intersections[k]
             shape = shapes[i]
             ellipse = ellipses[i]
             x = shape[0] - real(x0) - real(0.5)
@@ -200,12 +200,12 @@ def forward_kernel(dtype, channels: int, halvings: int):
 def backward_kernel(dtype, channels: int, halvings: int):
     """The adjoint of forward_kernel, whose arguments it shares.
 
-    emission: [M] each entry's row in entry_gradients
+    unsorted: [M] each entry's row in intersection_gradients
     last: as the forward left it; image_gradient: [H W, C]; left_over_gradient: [H W]
     transmittance: as the forward left it, and used up
     behind: scratch of [tiles, 32] rows; incoming: of [tiles, C, 32]; weights, slopes: of [tiles, 16]; sums: of
         [tiles, C + 6]
-    entry_gradients: [M, C + 6], in the order of emission: features, conic a b c, x, y, opacity
+    intersection_gradients: [M, C + 6], in the order of unsorted: features, conic a b c, x, y, opacity
     """
     row, spread, step, exponential, halves = row_functions(dtype, halvings)
     real, vec4, size, lanes = dtype, vector(4, dtype), TILE_SIZE, LANES
@@ -213,13 +213,13 @@ def backward_kernel(dtype, channels: int, halvings: int):
     @wp.kernel(module="unique", module_options=_options(dtype))
     def blend_backward(
         first: int,
-        ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), emission: wp.array(dtype=wp.int32),
+        ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32), unsorted: wp.array(dtype=wp.int32),
         shapes: wp.array(dtype=vec4), ellipses: wp.array(dtype=vec4), features: wp.array2d(dtype=real),
         columns: int, width: int, height: int, alpha_threshold: real,
         iota: wp.array(dtype=row), last: wp.array2d(dtype=row), image_gradient: wp.array2d(dtype=real),
         left_over_gradient: wp.array(dtype=real), transmittance: wp.array2d(dtype=row),
         behind: wp.array2d(dtype=row), incoming: wp.array3d(dtype=row), weights: wp.array2d(dtype=row),
-        slopes: wp.array2d(dtype=row), sums: wp.array2d(dtype=row), entry_gradients: wp.array2d(dtype=real),
+        slopes: wp.array2d(dtype=row), sums: wp.array2d(dtype=row), intersection_gradients: wp.array2d(dtype=real),
     ):
         tile = first + wp.tid()
         bounds = ranges[tile]
@@ -249,11 +249,11 @@ def backward_kernel(dtype, channels: int, halvings: int):
         drawn = int(wp.max(furthest))
         for k in range(bounds[0] + drawn, bounds[1]):
             for column in range(wp.static(channels + 6)):
-                entry_gradients[emission[k], column] = real(0.0)
+                intersection_gradients[unsorted[k], column] = real(0.0)
 
         for step_back in range(drawn):
             k = bounds[0] + drawn - 1 - step_back
-            i = entries[k]
+            i = intersections[k]
             shape = shapes[i]
             ellipse = ellipses[i]
             x = shape[0] - real(x0) - real(0.5)
@@ -261,7 +261,7 @@ def backward_kernel(dtype, channels: int, halvings: int):
             top = wp.max(int(wp.ceil(y - shape[3])), 0)
             bottom = wp.min(int(wp.floor(y + shape[3])) + 1, size)
             place = spread(real(k - bounds[0]) + real(0.5))
-            target = emission[k]
+            target = unsorted[k]
             for column in range(wp.static(channels + 6)):
                 sums[tile, column] = spread(real(0.0))
             reached = halves(x, ellipse)
@@ -315,18 +315,18 @@ def backward_kernel(dtype, channels: int, halvings: int):
                 sums[tile, wp.static(channels + 4)] = sums[tile, wp.static(channels + 4)] + wp.cw_mul(sy, dx)
                 sums[tile, wp.static(channels + 5)] = sums[tile, wp.static(channels + 5)] + syy
             for channel in range(wp.static(channels)):
-                entry_gradients[target, channel] = wp.dot(sums[tile, channel], ones)
+                intersection_gradients[target, channel] = wp.dot(sums[tile, channel], ones)
             sum_0 = wp.dot(sums[tile, wp.static(channels)], ones)
             sum_x = wp.dot(sums[tile, wp.static(channels + 1)], ones)
             sum_y = wp.dot(sums[tile, wp.static(channels + 2)], ones)
             sum_xx = wp.dot(sums[tile, wp.static(channels + 3)], ones)
             sum_xy = wp.dot(sums[tile, wp.static(channels + 4)], ones)
             sum_yy = wp.dot(sums[tile, wp.static(channels + 5)], ones)
-            entry_gradients[target, wp.static(channels)] = real(-0.5) * sum_xx
-            entry_gradients[target, wp.static(channels + 1)] = -sum_xy
-            entry_gradients[target, wp.static(channels + 2)] = real(-0.5) * sum_yy
-            entry_gradients[target, wp.static(channels + 3)] = -(ellipse[0] * sum_x + ellipse[1] * sum_y)
-            entry_gradients[target, wp.static(channels + 4)] = -(ellipse[1] * sum_x + ellipse[2] * sum_y)
-            entry_gradients[target, wp.static(channels + 5)] = sum_0 / shape[2]
+            intersection_gradients[target, wp.static(channels)] = real(-0.5) * sum_xx
+            intersection_gradients[target, wp.static(channels + 1)] = -sum_xy
+            intersection_gradients[target, wp.static(channels + 2)] = real(-0.5) * sum_yy
+            intersection_gradients[target, wp.static(channels + 3)] = -(ellipse[0] * sum_x + ellipse[1] * sum_y)
+            intersection_gradients[target, wp.static(channels + 4)] = -(ellipse[1] * sum_x + ellipse[2] * sum_y)
+            intersection_gradients[target, wp.static(channels + 5)] = sum_0 / shape[2]
 
     return blend_backward

@@ -2,10 +2,11 @@
 
 The maths is blend_cpu's; what differs is who does what. The adjoint is in blend_cuda_adjoint.py.
 
-Most entries of a 16 x 16 tile miss an 8 x 4 corner of it. `find_lists` of tiles.py tests every entry's ellipse exactly
-against the corners of its tile, and leaves a bit for each. A warp walks its tile's list 32 entries at a time, ROUNDS of
-them together, and packs those that touch its corner into a queue in shared memory, a ring; they are blended in batches
-of 32. In a batch a lane fetches one Gaussian's records and features, and then each lane draws all of them on its pixel.
+Most intersections of a 16 x 16 tile miss an 8 x 4 corner of it. `find_lists` of tiles.py tests every entry's ellipse
+exactly against the corners of its tile, and leaves a bit for each. A warp walks its tile's list 32 intersections at a
+time, ROUNDS of them together, and packs those that touch its corner into a queue in shared memory, a ring; they are
+blended in batches of 32. In a batch a lane fetches one Gaussian's records and features, and then each lane draws all of
+them on its pixel.
 
 Lists differ in length by a hundred times, and the longest decide how long a picture takes: a warp that waits for what
 it has just asked for does nothing else. So the next rounds, and the next batch, are on their way while a batch is
@@ -26,7 +27,7 @@ from .geometry import geometry, vector
 BLOCK_DIM = 32
 BLOCKS_PER_TILE = (TILE_SIZE // CORNER[0]) * (TILE_SIZE // CORNER[1])
 TOGETHER = 8  # Gaussians whose alphas are worked out before the first of them is drawn; divides 32
-ROUNDS = 4  # Of 32 entries, that are looked at together
+ROUNDS = 4  # Of 32 intersections, that are looked at together
 QUEUE = 64 * ROUNDS  # Room for those of ROUNDS and for 31 that were left: a power of 2
 
 
@@ -114,7 +115,7 @@ def block_functions(dtype, cuda: bool) -> tuple:
 def forward_kernel(dtype, channels: int, cuda: bool = False):
     """blend_forward over tiles x BLOCKS_PER_TILE x 32 threads. cuda: not to run on the CPU's fibers.
 
-    ranges: [tiles] first and one past the last entry; entries: [M] Gaussians; corners: [M] find_lists()'s;
+    ranges: [tiles] first and one past the last entry; intersections: [M] Gaussians; corners: [M] find_lists()'s;
     shapes: [N] (x, y, opacity, -); ellipses: [N] (conic a, b, c, level);
     features: [N padded_channels / 4] rows of four, flat
     image: [H W] vectors of C; transmittance: [H W]; last: [H W] 1 + list place of the last Gaussian drawn
@@ -132,7 +133,7 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
         module_options=module_options(dtype),
     )
     def blend_forward(
-        ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), corners: wp.array(dtype=wp.uint8),
+        ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32), corners: wp.array(dtype=wp.uint8),
         shapes: wp.array(dtype=vec4), ellipses: wp.array(dtype=vec4), features: wp.array(dtype=vec4),
         columns: int, width: int, height: int, alpha_threshold: real,
         image: wp.array(dtype=vec_image), transmittance: wp.array(dtype=real), last: wp.array(dtype=wp.int32),
@@ -174,7 +175,7 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
         if count > 0:
             for k in range(wp.static(ROUNDS)):
                 at = begin + wp.min(k * 32 + lane, final)
-                gaussians[k] = entries[at]
+                gaussians[k] = intersections[at]
                 touched[k] = int(corners[at])
         turns = (count + wp.static(32 * ROUNDS - 1)) // wp.static(32 * ROUNDS)
         turn = int(0)
@@ -192,7 +193,7 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
                 turn += 1
                 for k in range(wp.static(ROUNDS)):
                     at = begin + wp.min(start + wp.static(32 * ROUNDS) + k * 32, final)
-                    gaussians[k] = entries[at]
+                    gaussians[k] = intersections[at]
                     touched[k] = int(corners[at])
             coming = wp.min(queued, 32)
             own = wp.tile_extract(queue, (head + lane) & wp.static(QUEUE - 1))

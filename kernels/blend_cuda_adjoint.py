@@ -79,7 +79,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
         module_options=module_options(dtype),
     )
     def blend_backward(
-        ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), corners: wp.array(dtype=wp.uint8),
+        ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32), corners: wp.array(dtype=wp.uint8),
         shapes: wp.array(dtype=vec4), ellipses: wp.array(dtype=vec4), features: wp.array(dtype=vec4),
         columns: int, width: int, height: int, alpha_threshold: real,
         transmittance: wp.array(dtype=real), last: wp.array(dtype=wp.int32),
@@ -142,7 +142,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
         if count > 0:
             for k in range(wp.static(ROUNDS)):
                 at = begin + wp.max(count - 1 - (k * 32 + lane), 0)
-                gaussians[k] = entries[at]
+                gaussians[k] = intersections[at]
                 touched[k] = int(corners[at])
         turns = (count + wp.static(32 * ROUNDS - 1)) // wp.static(32 * ROUNDS)
         turn = int(0)
@@ -160,7 +160,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                 turn += 1
                 for k in range(wp.static(ROUNDS)):
                     at = begin + wp.max(start - wp.static(32 * ROUNDS) - k * 32, 0)
-                    gaussians[k] = entries[at]
+                    gaussians[k] = intersections[at]
                     touched[k] = int(corners[at])
             coming = wp.min(queued, 32)
             own = wp.tile_extract(queue, (head + lane) & wp.static(QUEUE - 1))

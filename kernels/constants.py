@@ -12,9 +12,9 @@ ALPHA_MAX = 0.999
 # A pixel is finished before its transmittance would fall to this value.
 TRANSMITTANCE_MIN = 1.0e-4
 # Variance in square pixels added to every projected Gaussian: the pixel's own footprint.
-LOW_PASS = 0.3
+EPS2D = 0.3
 # Points nearer than this to the camera plane are culled, in scene units.
-NEAR = 0.01
+NEAR_PLANE = 0.01
 # The linearised projection (J) uses view rays up to this fraction of the field of view beyond the image's border.
 FRUSTUM_MARGIN = 0.3
 # exp(+-LOG_SCALE_MAX) bounds the scales so that squares of them stay finite in float32.

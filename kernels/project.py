@@ -4,8 +4,8 @@ One thread takes one Gaussian to the camera, linearises the perspective at its c
 the inverse of the 2D covariance (the conic), the depth, the opacity and the half-extent of the region in which the
 Gaussian still counts. Everything but the extents is differentiable; Warp generates the adjoint.
 
-The covariance is formed as a Gram matrix, M M^T + low_pass I with M = J W R diag(scale), and its determinant as
-|m0 x m1|^2 + low_pass (|m0|^2 + |m1|^2) + low_pass^2 over M's rows (Cauchy-Binet): no term is ever subtracted, so a
+The covariance is formed as a Gram matrix, M M^T + eps2d I with M = J W R diag(scale), and its determinant as
+|m0 x m1|^2 + eps2d (|m0|^2 + |m1|^2) + eps2d^2 over M's rows (Cauchy-Binet): no term is ever subtracted, so a
 needle of any aspect ratio keeps a positive determinant.
 """
 
@@ -42,7 +42,7 @@ def projection_kernel(dtype, antialiased: bool):
         means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quaternions: wp.array(dtype=vec4),
         opacities: wp.array(dtype=real), world_to_camera: wp.array(dtype=mat44),
         intrinsics: wp.array(dtype=vec4),
-        width: int, height: int, near: real, low_pass: real, alpha_threshold: real,
+        width: int, height: int, near_plane: real, eps2d: real, alpha_threshold: real,
         means2d: wp.array(dtype=vec2), conics: wp.array(dtype=vec3), depths: wp.array(dtype=real),
         opacities2d: wp.array(dtype=real), extents: wp.array(dtype=vec2),
     ):
@@ -58,7 +58,7 @@ def projection_kernel(dtype, antialiased: bool):
         )
         centre = rotation * means[i] + vec3(pose[0, 3], pose[1, 3], pose[2, 3])
         depth = centre[2]
-        in_front = depth > near
+        in_front = depth > near_plane
         z = wp.where(in_front, depth, real(1.0))
         inverse_z = real(1.0) / z
         x_ratio = wp.where(in_front, centre[0], real(0.0)) * inverse_z
@@ -85,12 +85,12 @@ def projection_kernel(dtype, antialiased: bool):
         spread = jacobian * axes
         m0 = vec3(spread[0, 0] * scale_x, spread[0, 1] * scale_y, spread[0, 2] * scale_z)
         m1 = vec3(spread[1, 0] * scale_x, spread[1, 1] * scale_y, spread[1, 2] * scale_z)
-        variance_x = wp.dot(m0, m0) + low_pass
-        variance_y = wp.dot(m1, m1) + low_pass
+        variance_x = wp.dot(m0, m0) + eps2d
+        variance_y = wp.dot(m1, m1) + eps2d
         covariance = wp.dot(m0, m1)
         area = wp.cross(m0, m1)
         determinant = wp.dot(area, area)
-        blurred = determinant + low_pass * (wp.dot(m0, m0) + wp.dot(m1, m1)) + low_pass * low_pass
+        blurred = determinant + eps2d * (wp.dot(m0, m0) + wp.dot(m1, m1)) + eps2d * eps2d
 
         opacity = opacities[i]
         if wp.static(antialiased):

@@ -39,7 +39,7 @@ def projection_kernel(dtype, antialiased: bool):
         first: int,
         means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quaternions: wp.array(dtype=vec4),
         opacities: wp.array(dtype=real), position: wp.array(dtype=vec3),
-        near: real, footprint: real, smoothing: real, alpha_threshold: real,
+        near_plane: real, footprint: real, smoothing: real, alpha_threshold: real,
         caps: wp.array(dtype=vec4), across: wp.array(dtype=vec3), along: wp.array(dtype=vec3),
         opacities2d: wp.array(dtype=real), distances: wp.array(dtype=real),
     ):
@@ -48,7 +48,7 @@ def projection_kernel(dtype, antialiased: bool):
         i = first + wp.tid()
         offset = means[i] - position[0]
         distance = wp.length(offset)
-        usable = distance > near
+        usable = distance > near_plane
         n = offset / wp.where(usable, distance, real(1.0))
         # Two axes of the tangent plane, from the coordinate axis that n is farthest from.
         helper = vec3(real(1.0), real(0.0), real(0.0))
@@ -72,15 +72,15 @@ def projection_kernel(dtype, antialiased: bool):
         area = wp.cross(m0, m1)
         bare = wp.dot(area, area)
         trained = bare + footprint * energy + footprint * footprint
-        low_pass = footprint + smoothing
-        blurred = bare + low_pass * energy + low_pass * low_pass
+        eps2d = footprint + smoothing
+        blurred = bare + eps2d * energy + eps2d * eps2d
         opacity = opacities[i]
         if wp.static(antialiased):
             opacity = opacity * wp.sqrt(wp.max(bare / blurred, tiny))
         else:
             opacity = opacity * wp.sqrt(trained / blurred)
-        v00 = wp.dot(m0, m0) + low_pass
-        v11 = wp.dot(m1, m1) + low_pass
+        v00 = wp.dot(m0, m0) + eps2d
+        v11 = wp.dot(m1, m1) + eps2d
         v01 = wp.dot(m0, m1)
         usable = usable and blurred > tiny and wp.isfinite(blurred) and opacity > alpha_threshold
         if usable:
@@ -165,7 +165,7 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def blend(
         first: int,
-        ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), directions: wp.array(dtype=vec3),
+        ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32), directions: wp.array(dtype=vec3),
         caps: wp.array(dtype=vec4), across: wp.array(dtype=vec3), along: wp.array(dtype=vec3),
         opacities: wp.array(dtype=real), features: wp.array(dtype=features_type),
         columns: int, width: int, height: int, alpha_threshold: real,
@@ -182,7 +182,7 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
             end = bounds[0]
             k = bounds[0]
             while k < bounds[1]:
-                i = entries[k]
+                i = intersections[k]
                 k += 1
                 cap = caps[i]
                 a = wp.dot(across[i], d)
@@ -204,7 +204,7 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def blend_adjoint(
         first: int,
-        ranges: wp.array(dtype=wp.vec2i), entries: wp.array(dtype=wp.int32), directions: wp.array(dtype=vec3),
+        ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32), directions: wp.array(dtype=vec3),
         caps: wp.array(dtype=vec4), across: wp.array(dtype=vec3), along: wp.array(dtype=vec3),
         opacities: wp.array(dtype=real), features: wp.array(dtype=features_type),
         columns: int, width: int, height: int, alpha_threshold: real,
@@ -224,7 +224,7 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
             k = ends[pixel]
             while k > begin:
                 k -= 1
-                i = entries[k]
+                i = intersections[k]
                 cap = caps[i]
                 forward = cap[0] * d[0] + cap[1] * d[1] + cap[2] * d[2]
                 a = wp.dot(across[i], d)

@@ -1,12 +1,12 @@
 """Which Gaussian touches which tile, front to back.
 
-`pack_records` counts the tiles that each Gaussian's ellipse really touches (not its bounding box), and a prefix sum
-over the counts gives every Gaussian its range of entries. Two ways lead to lists in depth order, by stable sorts:
-Gaussians are put in it, `emit_entries` fills their ranges, and a sort of the entries by tile leaves each tile's list in
-the order in which they were emitted (the GPU has least to do); or `emit_keys` fills the ranges of the Gaussians as they
-come, and the entries are sorted once by tile and depth (the host has). `find_lists` finds where each tile's list
-begins and ends, and which corners of its tile each entry touches. Adjoints sum what they write for each entry by
-Gaussian in one order, whatever runs when: `gather_entries`.
+`pack_gaussians` counts the tiles that each Gaussian's ellipse really touches (not its bounding box), and a prefix sum
+over the counts gives every Gaussian its range of intersections. Two ways lead to lists in depth order, by stable sorts:
+Gaussians are put in it, `emit_intersections` fills their ranges, and a sort of the intersections by tile leaves each
+tile's list in the order in which they were emitted (the GPU has least to do); or `emit_keys` fills the ranges of the
+Gaussians as they come, and the intersections are sorted once by tile and depth (the host has). `find_lists` finds where
+each tile's list begins and ends, and which corners of its tile each entry touches. Adjoints sum what they write for
+each entry by Gaussian in one order, whatever runs when: `gather_intersections`.
 """
 
 from functools import cache
@@ -25,7 +25,7 @@ farther ones are alike."""
 
 @cache
 def tile_kernels(dtype) -> SimpleNamespace:
-    """pack_records, key_by_depth, emit_entries, emit_keys and gather_entries for one scalar type."""
+    """pack_gaussians, key_by_depth, emit_intersections, emit_keys and gather_intersections for one scalar type."""
     g = geometry(dtype)
     real, vec2, vec3, vec4 = g.real, g.vec2, g.vec3, g.vec4
     reals, reals2d = wp.array(dtype=real), wp.array2d(dtype=real)
@@ -50,7 +50,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
         )
 
     @wp.kernel(module="unique", module_options=options)
-    def pack_records(
+    def pack_gaussians(
         first: int,
         means2d: vec2s, conics: wp.array(dtype=vec3), opacities: reals, features: reals2d,
         channels: int, alpha_threshold: real, columns: int, rows: int,
@@ -98,21 +98,21 @@ def tile_kernels(dtype) -> SimpleNamespace:
         keys[i] = key
         places[i] = i
 
-    def emission(key, by_depth: bool):
+    def unsorted(key, by_depth: bool):
         bits = DEPTH_BITS if by_depth else 0
 
         @wp.kernel(module="unique", module_options=options)
-        def emit_entries(
+        def emit_intersections(
             first: int,
             order: ints, shapes: vec4s, ellipses: vec4s, extents: vec2s, depths: wp.array(dtype=wp.float32),
             columns: int, rows: int,
             ends: int64s,
-            capacity: int,
+            max_intersections: int,
             keys: wp.array(dtype=key), gaussians: ints, overflow: bools,
         ):
-            """ends: the running sum of the counts: Gaussian `place` fills the entries before ends[place] and
-            `capacity`, with columns * rows, no tile at all, where there are fewer tiles than were counted. All fill so
-            what is left. overflow: [1], whether more were counted than there is room for; or None.
+            """ends: the running sum of the counts: Gaussian `place` fills the intersections before ends[place] and
+            `max_intersections`, with columns * rows, no tile at all, where there are fewer tiles than were counted. All
+            fill so what is left. overflow: [1], whether more were counted than there is room for; or None.
             keys: tiles, of Gaussians in their order; or by_depth, of Gaussians as they come, tiles above DEPTH_BITS of
             the depth, whose order is that of positive numbers. Without by_depth depths are None, with it the order."""
             place = first + wp.tid()
@@ -127,8 +127,8 @@ def tile_kernels(dtype) -> SimpleNamespace:
             extent = extents[i]
             entry = int(0)
             if place > 0:
-                entry = int(wp.min(ends[place - 1], wp.int64(capacity)))
-            end = int(wp.min(ends[place], wp.int64(capacity)))
+                entry = int(wp.min(ends[place - 1], wp.int64(max_intersections)))
+            end = int(wp.min(ends[place], wp.int64(max_intersections)))
             if extent[0] > real(0.0) and end > entry:
                 shape = shapes[i]
                 ellipse = ellipses[i]
@@ -146,24 +146,24 @@ def tile_kernels(dtype) -> SimpleNamespace:
                 entry += 1
             count = ends.shape[0]
             if overflow and place == 0:
-                overflow[0] = ends[count - 1] > wp.int64(capacity)
-            entry = int(wp.min(ends[count - 1], wp.int64(capacity))) + place
-            while entry < capacity:
+                overflow[0] = ends[count - 1] > wp.int64(max_intersections)
+            entry = int(wp.min(ends[count - 1], wp.int64(max_intersections))) + place
+            while entry < max_intersections:
                 keys[entry] = no_tile
                 gaussians[entry] = 0
                 entry += count
 
-        return emit_entries
+        return emit_intersections
 
     @wp.kernel(module="unique", module_options=options)
-    def gather_entries(
+    def gather_intersections(
         first: int,
-        order: ints, ends: int64s, entry_gradients: reals2d,
+        order: ints, ends: int64s, intersection_gradients: reals2d,
         columns: int,
         rows: reals2d,
     ):
-        """rows[order[place]]: the sum of entry_gradients [M, columns] over the entries of Gaussian `place`, in their
-        order, which end at ends[place]."""
+        """rows[order[place]]: the sum of intersection_gradients [M, columns] over the intersections of Gaussian
+        `place`, in their order, which end at ends[place]."""
         place = first + wp.tid()
         begin = int(0)
         if place > 0:
@@ -172,25 +172,25 @@ def tile_kernels(dtype) -> SimpleNamespace:
         for column in range(columns):
             total = real(0.0)
             for entry in range(begin, int(ends[place])):
-                total += entry_gradients[entry, column]
+                total += intersection_gradients[entry, column]
             rows[i, column] = total
 
     return SimpleNamespace(
-        pack_records=pack_records, key_by_depth=key_by_depth, gather_entries=gather_entries,
-        emit_entries=emission(wp.int32, by_depth=False), emit_keys=emission(wp.int64, by_depth=True),
+        pack_gaussians=pack_gaussians, key_by_depth=key_by_depth, gather_intersections=gather_intersections,
+        emit_intersections=unsorted(wp.int32, by_depth=False), emit_keys=unsorted(wp.int64, by_depth=True),
     )
 
 
 @wp.kernel(module="unique", module_options=FORWARD)
 def count_tiles(first: int, tiles: wp.array(dtype=wp.int32), size: int, counts: wp.array2d(dtype=wp.int32)):
-    """counts[c, t], of zeros: how many entries of chunk c, `size` of them, are tile t's. Covers [0, chunks)."""
+    """counts[c, t], of zeros: how many intersections of chunk c, `size` of them, are tile t's. Covers [0, chunks)."""
     chunk = first + wp.tid()
     for entry in range(chunk * size, wp.min((chunk + 1) * size, tiles.shape[0])):
         counts[chunk, tiles[entry]] = counts[chunk, tiles[entry]] + 1
 
 
 @wp.kernel(module="unique", module_options=FORWARD)
-def place_entries(
+def place_intersections(
     first: int,
     tiles: wp.array(dtype=wp.int32), given: wp.array(dtype=wp.int32), size: int, starts: wp.array2d(dtype=wp.int32),
     gaussians: wp.array(dtype=wp.int32), places: wp.array(dtype=wp.int32),
@@ -210,11 +210,11 @@ def place_entries(
 @cache
 def lists_kernel(dtype, key, shift: int):
     """find_lists for sorted keys, wp.int32 or wp.int64, whose tile is above their lowest `shift` bits, and records of
-    one scalar type. Covers the entries, of which there is one at least.
+    one scalar type. Covers the intersections, of which there is one at least.
 
-    ranges: [2 tiles], for each tile the first and one past the last of its entries; corners: [entries], bit k where the
-    ellipse touches corner k of the tile, CORNER pixels, or [0] where none are asked for. Unused entries carry a tile
-    number beyond all: they belong to no list, and their corners are 0.
+    ranges: [2 tiles], for each tile the first and one past the last of its intersections; corners: [intersections], bit
+    k where the ellipse touches corner k of the tile, CORNER pixels, or [0] where none are asked for. Unused
+    intersections carry a tile number beyond all: they belong to no list, and their corners are 0.
     """
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4
@@ -232,7 +232,7 @@ def lists_kernel(dtype, key, shift: int):
         before = int(-1)
         if entry > 0:
             before = int(keys[entry - 1] >> key(shift))
-        # Lists begin and end here, those of tiles without entries both.
+        # Lists begin and end here, those of tiles without intersections both.
         for begun in range(before + 1, wp.min(tile, tiles) + 1):
             if begun < tiles:
                 ranges[2 * begun] = entry

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from ..kernels.constants import LOW_PASS
+from ..kernels.constants import EPS2D
 from ..rasterizer import Rendering
 from .splats import SplatScene
 
@@ -28,16 +28,16 @@ def note_missing(result: dict, device: torch.device) -> bool:
 
 def rasterize_with_gsplat(
     means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics, width: int, height: int, *,
-    low_pass: float = LOW_PASS, antialiased: bool = False, capacity: int | None = None, deterministic: bool = False,
+    eps2d: float = EPS2D, antialiased: bool = False, max_intersections: int | None = None, deterministic: bool = False,
 ) -> Rendering:  # fmt: skip
-    """rasterize() by gsplat, also with intrinsics as gsplat takes them, [1, 3, 3]. capacity and deterministic mean
-    nothing there; there is no transmittance, and densification by gradients cannot watch its centers."""
+    """rasterize() by gsplat, also with intrinsics as gsplat takes them, [1, 3, 3]. max_intersections and deterministic
+    mean nothing there; there is no transmittance, and densification by gradients cannot watch its centers."""
     from gsplat import rasterization  # pyright: ignore[reportMissingImports]
 
     matrix = intrinsics if intrinsics.ndim == 3 else _matrix(intrinsics)
     image, _, info = rasterization(
         means, quaternions, log_scales.exp(), opacities, features, world_to_camera[None], matrix, width, height,
-        packed=False, rasterize_mode="antialiased" if antialiased else "classic", eps2d=low_pass,
+        packed=False, rasterize_mode="antialiased" if antialiased else "classic", eps2d=eps2d,
     )  # fmt: skip
     # gsplat 1.5 gives two radii, its forerunners one.
     radii = info["radii"][0].float()

@@ -7,10 +7,10 @@ from itertools import product
 import torch
 
 from ..kernels.constants import TILE_SIZE
+from ..rasterizer.cuda_graphs import CudaGraphRunner
+from ..rasterizer.graph_cache import WARMUP_CALLS, forget
 from ..rasterizer.rasterization import rasterize
-from ..rasterizer.recording import GraphRecorder
 from ..rasterizer.reference import rasterize_reference
-from ..rasterizer.replays import LAUNCHED_FIRST, forget
 from .gsplat_peer import BOUND, GSPLAT, gsplat_renderer, note_missing
 from .results import check, new_result
 from .splats import NAMES, Size, SplatScene, make_splat_scene
@@ -73,7 +73,7 @@ def _checks(scene: SplatScene, peer: bool) -> list[dict]:
     if scene.device.type == "cuda":
         cpu, recorded = _image_and_gradients(scene.to("cpu")), _recorded(scene, scene.cotangent())()
         # The last of as many calls as are launched before a picture of this size is replayed.
-        called = [_image_and_gradients(scene) for _ in range(LAUNCHED_FIRST + 2)][-1]
+        called = [_image_and_gradients(scene) for _ in range(WARMUP_CALLS + 2)][-1]
         for name, ours in ((OURS, called), (RECORDED, recorded)):
             made += _compared(name, "the CPU's kernels", ours, cpu)
     return [*made, against_gsplat(scene)] if peer else made
@@ -100,17 +100,17 @@ def _difference(value: torch.Tensor, other: torch.Tensor) -> float:
 def _recorded(scene: SplatScene, cotangent: torch.Tensor | None) -> Callable[[], list[torch.Tensor]]:
     """A replay: of [image], or with a cotangent of [image, gradients of the leaves]."""
     with torch.no_grad():
-        capacity = rasterize(*scene.arguments).entry_count * 5 // 4
+        max_intersections = rasterize(*scene.arguments).intersection_count * 5 // 4
 
     def forward():
         with torch.set_grad_enabled(cotangent is not None):
-            image = rasterize(*scene.arguments, capacity=capacity).image
+            image = rasterize(*scene.arguments, max_intersections=max_intersections).image
         if cotangent is None:
             return [image]
         return [image.detach(), *torch.autograd.grad(image, scene.leaves, cotangent)]
 
     forward()  # loads the kernels, which a recording cannot
-    recorder = GraphRecorder(scene.device)
+    recorder = CudaGraphRunner(scene.device)
     return lambda: recorder.run("render", forward)
 
 
@@ -118,7 +118,7 @@ def _from_the_start(variant: Variant) -> Variant:
     """As many calls as end in a replay, none of them recorded before: memory of recordings counts."""
 
     def calls() -> None:
-        for _ in range(LAUNCHED_FIRST + 2):
+        for _ in range(WARMUP_CALLS + 2):
             variant.once()
 
     return Variant(calls, prepare=forget)
@@ -126,7 +126,7 @@ def _from_the_start(variant: Variant) -> Variant:
 
 def _rows(scene: SplatScene, peer: bool, repetitions: int) -> list[dict]:
     with torch.no_grad():
-        entries = rasterize(*scene.arguments).entry_count
+        entries = rasterize(*scene.arguments).intersection_count
     renderers = {OURS: lambda: render(scene)}
     if peer:
         renderers[GSPLAT] = gsplat_renderer(scene)

@@ -10,7 +10,7 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 from ..quiet import silent_stderr
-from ..rasterizer.drawn import drawn_pairs
+from ..rasterizer.workload import count_blended_pairs
 from .timing import Variant
 
 STEPS = 20
@@ -121,7 +121,7 @@ def parts_of_step(variant: Variant, work: Work, device: torch.device) -> list[di
 def work_of(arguments: Sequence[Any], harmonics: int) -> Work:
     """arguments: rasterize()'s, seven tensors, width and height; harmonics: numbers of a Gaussian's."""
     *splats, width, height = arguments
-    pairs, drawn = drawn_pairs(splats, width, height)
+    pairs, drawn = count_blended_pairs(splats, width, height)
     return Work(len(splats[0]), harmonics, splats[4].shape[1], pairs, drawn, width * height)
 
 

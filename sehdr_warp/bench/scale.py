@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..rasterizer.memory import held_by_warp
+from ..rasterizer.memory import warp_memory_bytes
 from ..runs.config_files import load_config
 from .gsplat_peer import BOUND, GSPLAT, gsplat_renderer, note_missing, rasterize_with_gsplat
 from .kernels import OURS, against_float64, against_gsplat, render, splat_variant
@@ -101,7 +101,7 @@ def _splat_rows(size: Size, channels: int, device, peer: bool, repetitions: int,
     rows = []
     for who, timing in time_variants(variants, device, repetitions=repetitions).items():
         # Warp's own scratch stays from the largest call so far, so for ours this is an upper bound.
-        memory = peak_memory(variants[who], device) + (held_by_warp(device) if who == OURS else 0)
+        memory = peak_memory(variants[who], device) + (warp_memory_bytes(device) if who == OURS else 0)
         rows.append({"implementation": who, "what": "splat"} | timing | {"peak_memory_bytes": memory})
     return rows
 

@@ -160,7 +160,7 @@ def _parts(scene: Scene, config: Config, device: torch.device) -> list[dict]:
     return parts_of_step(step_variant(make_trainer(scene, config, device)), work, device)
 
 
-def _plain_torch(*arguments, capacity=None, deterministic=False, **options):
+def _plain_torch(*arguments, max_intersections=None, deterministic=False, **options):
     return rasterize_reference(*arguments, **options)
 
 

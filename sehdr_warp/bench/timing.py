@@ -14,7 +14,7 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 from ..quiet import silent_stderr
-from ..rasterizer.memory import held_by_warp
+from ..rasterizer.memory import warp_memory_bytes
 
 LEAST_REPETITIONS = 3
 BUDGET = 10.0
@@ -100,7 +100,7 @@ def forget_peaks(device: torch.device) -> None:
 
 def held_memory(device: torch.device) -> int | None:
     """The most that torch and Warp held at once on a GPU since forget_peaks(), bytes; None on the CPU."""
-    return torch.cuda.max_memory_allocated(device) + held_by_warp(device) if device.type == "cuda" else None
+    return torch.cuda.max_memory_allocated(device) + warp_memory_bytes(device) if device.type == "cuda" else None
 
 
 def peak_memory(variant: Variant, device: torch.device) -> int:

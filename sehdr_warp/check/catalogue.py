@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from ..errors import SehdrError
-from ..rasterizer.threads import one_torch_thread
+from ..rasterizer.warp_launch.threads import one_torch_thread
 from .case import Case
 from .light_cases import LIGHT_CASES
 from .splat_cases import POISON_CASES, SPLAT_CASES

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR, TRANSMITTANCE_MIN
+from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE, TRANSMITTANCE_MIN
 from ..rasterizer import rasterize, spherical_harmonics, ssim_map
 from ..rasterizer.reference import blend_reference, project_reference, rasterize_reference
 from .case import ROUNDINGS, UNIT, Case, Reading, as_float32, compare, count, not_finite
@@ -40,7 +40,12 @@ class Splats:
         self.world_to_camera = torch.eye(4, dtype=torch.float64)
         focal = 0.9 * max(width, height)
         self.intrinsics = torch.tensor([focal, focal, width / 2 + 0.3, height / 2 - 0.2], dtype=torch.float64)
-        self.options = {"near": NEAR, "low_pass": LOW_PASS, "alpha_threshold": ALPHA_THRESHOLD, "antialiased": False}
+        self.options = {
+            "near_plane": NEAR_PLANE,
+            "eps2d": EPS2D,
+            "alpha_threshold": ALPHA_THRESHOLD,
+            "antialiased": False,
+        }
         if scales is not None:
             self.log_scales[:] = torch.tensor(scales, dtype=torch.float64).log()
         if radiance is not None:
@@ -150,7 +155,7 @@ def _on_borders() -> Splats:
 def _near_plane(device):
     """What is behind the near plane is culled exactly."""
     splats = Splats(16, spread=0.001)
-    near = torch.tensor(NEAR, dtype=torch.float32).item()
+    near = torch.tensor(NEAR_PLANE, dtype=torch.float32).item()
     # Float32's own roundings of a depth are 1e-9 here: nearer than 1e-6 there is no telling before from behind.
     steps = torch.tensor([-1e3, -1.0, -0.01, -1e-6, 1e-6, 1e-4, 1e-3, 1e-2], dtype=torch.float64)
     splats.means[:8, 2], splats.means[8:, 2] = near + steps, 3.0

@@ -93,8 +93,8 @@ def rasterization(
         opacities = torch.where(depths <= far_plane, opacities, 0.0)
     lenses = torch.stack([Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]], dim=1)
     rendering = rasterize(
-        means, scales.log(), quats, opacities, colors, viewmats, lenses, width, height, near=near_plane,
-        low_pass=eps2d, antialiased=rasterize_mode == "antialiased", depth="D" in render_mode, background=backgrounds,
+        means, scales.log(), quats, opacities, colors, viewmats, lenses, width, height, near_plane=near_plane,
+        eps2d=eps2d, antialiased=rasterize_mode == "antialiased", depth="D" in render_mode, background=backgrounds,
     )  # fmt: skip
     alphas = rendering.alpha[..., None]
     shown = [rendering.image] if "RGB" in render_mode else []

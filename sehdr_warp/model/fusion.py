@@ -13,9 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import SehdrError
+from ..rasterizer.cuda_graphs import is_capturing
 from ..rasterizer.exposure_fusion import fuse_exposures, fusion_weights
 from ..rasterizer.interpolation import interpolate
-from ..rasterizer.recording import is_recording
 from ..response.curve import Response
 from .exposure import bracket_log_radiance, exposure_times
 
@@ -98,7 +98,7 @@ class NeuralExposureFusion(nn.Module):
         grid = torch.arange(-1, NODES + 1, dtype=like.dtype, device=like.device) * step + self._low
         encoded = self._encode(grid[:, None].expand(-1, 3))
         # What is made while a step is recorded has no content before the first replay, and dies with the recording.
-        if not self.response.learnable and not is_recording(like.device):
+        if not self.response.learnable and not is_capturing(like.device):
             self._kept_nodes[key] = encoded
         return encoded
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ..rasterizer import Rendering, rasterize, rasterize_directions, spherical_harmonics
-from ..rasterizer.activations import weighed_opacities
+from ..rasterizer.activations import opacities_with_penalty
 from ..response import Response
 from ..scene import Camera
 from .color_models import color_model
@@ -125,25 +125,25 @@ class RadianceField(nn.Module):
         *,
         degree: int | None = None,
         also: frozenset[str] = frozenset(),
-        capacity: int | None = None,
+        max_intersections: int | None = None,
         encode: bool = True,
         factored: bool = False,
         opacity_weight: float = 0.0,
     ) -> Photograph:
         """A photo of exposure_time seconds, harmonics up to `degree`; also: which of "exposure" and "base" are wanted;
-        capacity: as rasterize() takes it; encode: False leaves a photo that has an exposure at that; factored: the
-        harmonics' coefficients get no gradient, and that by their values is in by_harmonics; opacity_weight: what the
-        opacities, which are made for the photo, cost at that."""
+        max_intersections: as rasterize() takes it; encode: False leaves a photo that has an exposure at that; factored:
+        the harmonics' coefficients get no gradient, and that by their values is in by_harmonics; opacity_weight: what
+        the opacities, which are made for the photo, cost at that."""
         gaussians, opacities, cost = self.gaussians, None, None
         if opacity_weight:
-            opacities, cost = weighed_opacities(gaussians.opacity_logits, opacity_weight, gaussians.live)
+            opacities, cost = opacities_with_penalty(gaussians.opacity_logits, opacity_weight, gaussians.live)
         ratio = exposure_time / self.base_time
         values = self._values(camera.position, degree, factored)
         kept: list[Tensor] = []
         if factored:
             values.register_hook(kept.append)  # As retain_grad(), without a copy.
         if self.color_model.encoded:
-            rendering = self._rasterize(camera, self.color_model.colors(values), capacity, opacities)
+            rendering = self._rasterize(camera, self.color_model.colors(values), max_intersections, opacities)
             image = rendering.image
             if ratio != 1.0:
                 image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
@@ -156,7 +156,7 @@ class RadianceField(nn.Module):
         if "base" in also and self.fusion is not None:
             sets["base"] = base
         features = torch.cat(list(sets.values()), dim=1) if len(sets) > 1 else next(iter(sets.values()))
-        rendering = self._rasterize(camera, features, capacity, opacities)
+        rendering = self._rasterize(camera, features, max_intersections, opacities)
         # Not split where it is one: the split's derivative would be a copy.
         parts = rendering.image.split(3, dim=2) if len(sets) > 1 else (rendering.image,)
         images = dict(zip(sets, parts, strict=True))
@@ -260,7 +260,11 @@ class RadianceField(nn.Module):
         return base, self.fusion(self.color_model.logarithms(values, base)) * self.base_time
 
     def _rasterize(
-        self, camera: CameraTensors, features: Tensor, capacity: int | None = None, opacities: Tensor | None = None
+        self,
+        camera: CameraTensors,
+        features: Tensor,
+        max_intersections: int | None = None,
+        opacities: Tensor | None = None,
     ) -> Rendering:
         """opacities: [N], where they are made already."""
         gaussians = self.gaussians
@@ -269,7 +273,7 @@ class RadianceField(nn.Module):
             *(gaussians.means, gaussians.log_scales, gaussians.quaternions, opacities, features),
             *(camera.world_to_camera, camera.intrinsics, camera.width, camera.height),
             antialiased=self.antialiased,
-            capacity=capacity,
+            max_intersections=max_intersections,
             deterministic=self.deterministic,
         )
 

@@ -1,14 +1,14 @@
 """torch <-> Warp: differentiable splatting and the bridge that makes torch operations of Warp programs."""
 
 from .bridge import Program, differentiable
+from .cuda_graphs import CudaGraphRunner
 from .harmonics import HarmonicsGradients, spherical_harmonics
 from .rasterization import Rendering, rasterize
-from .recording import GraphRecorder
 from .sphere import rasterize_directions
 from .ssim import ssim, ssim_map
 
 __all__ = [
-    "GraphRecorder",
+    "CudaGraphRunner",
     "HarmonicsGradients",
     "Program",
     "Rendering",

@@ -10,7 +10,7 @@ from ..kernels.activations import (
     opacities_adjoint_kernel,
     opacities_kernel,
 )
-from .launching import launch, warp_scalar
+from .warp_launch.launching import launch, warp_scalar
 
 MEAN_THREADS = 1 << 14
 
@@ -44,7 +44,7 @@ class _BoundedExponential(torch.autograd.Function):
         return result, None
 
 
-def weighed_opacities(logits: Tensor, weight: float, live: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def opacities_with_penalty(logits: Tensor, weight: float, live: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """The sigmoids of [N] logits, float32 or float64, N >= 1, and `weight` times their mean, a scalar; differentiable
     once. live: [1] int32 on the device, how many there are, where those behind them have a sigmoid of 0."""
     if logits.device.type == "cuda":

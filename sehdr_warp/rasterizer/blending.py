@@ -11,17 +11,17 @@ from ..kernels import blend_cpu, blend_cuda, blend_cuda_adjoint
 from ..kernels.constants import TILE_SIZE
 from ..kernels.tiles import tile_kernels
 from ..parallel import thread_count
-from .launching import launch, warp_scalar
-from .tile_lists import ONE_SORT, Emission, TileLists
+from .tile_lists import ONE_SORT, TileLists, UnsortedIntersections
+from .warp_launch.launching import launch, warp_scalar
 
 PIECES_PER_THREAD = 16
-"""Of the image, on the CPU: some take longer than their entries tell."""
+"""Of the image, on the CPU: some take longer than their intersections tell."""
 Adjoint = Callable[[Tensor, Tensor | None], Tensor]
 """The backward pass: from the gradients by image and transmittance (None for 0) to those by Gaussian, [N, C + 6 or
 more]: features, conic a b c, x, y, opacity, and what fills up a row."""
 
 
-class Picture(NamedTuple):
+class BlendResult(NamedTuple):
     """image [H, W, C], transmittance [H, W], and how to differentiate them; with no graph behind them."""
 
     image: Tensor
@@ -41,10 +41,10 @@ def blend(
 ) -> tuple[Tensor, Tensor]:
     """Blend features [N, C] over the tile lists: image [H, W, C] and the transmittance left [H, W].
 
-    Differentiable once with respect to means2d [N, 2], conics [N, 3], opacities [N] and features. Which entries count
-    is decided by the lists and by alpha_threshold, and taken as given in the derivative.
+    Differentiable once with respect to means2d [N, 2], conics [N, 3], opacities [N] and features. Which intersections
+    count is decided by the lists and by alpha_threshold, and taken as given in the derivative.
 
-    records: pack_records()'s of these means2d, conics and opacities, and of alpha_threshold.
+    records: pack_gaussians()'s of these means2d, conics and opacities, and of alpha_threshold.
     deterministic: on a GPU gradients are summed in a fixed order, as the CPU always does: slower, and the gradients of
     every (Gaussian, tile) pair take memory.
     """
@@ -54,17 +54,17 @@ def blend(
     backend = blend_on_cuda if rows.device.type == "cuda" else blend_on_cpu
     # The adjoint keeps one of them, and must not keep what torch makes a result of: it would keep itself.
     given = rows, lists, records, image.detach(), transmittance.detach(), alpha_threshold, deterministic
-    return differentiated(means2d, conics, opacities, features, Picture(image, transmittance, backend(*given)))
+    return with_gradient(means2d, conics, opacities, features, BlendResult(image, transmittance, backend(*given)))
 
 
-def differentiated(means2d, conics, opacities, features, picture: Picture) -> tuple[Tensor, Tensor]:
+def with_gradient(means2d, conics, opacities, features, picture: BlendResult) -> tuple[Tensor, Tensor]:
     """A picture's image and transmittance, as functions of what it was drawn from."""
     return _Blend.apply(means2d, conics, opacities, features, picture)
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means2d, conics, opacities, features, picture: Picture):
+    def forward(ctx, means2d, conics, opacities, features, picture: BlendResult):
         ctx.sizes, ctx.adjoint = picture.image.shape, picture.adjoint
         ctx.set_materialize_grads(False)
         return picture.image, picture.transmittance
@@ -93,8 +93,8 @@ def blend_on_cpu(
     features, lists: TileLists, records, image, left_over, alpha_threshold: float, deterministic: bool
 ) -> Adjoint:
     """Fill image [H, W, C] and left_over [H, W], the transmittance: balanced pieces of tiles, a thread each."""
-    scalar, emission = warp_scalar(features.dtype), lists.emission
-    assert emission is not None, "sums in a fixed order need the entries as they were emitted"
+    scalar, unsorted = warp_scalar(features.dtype), lists.unsorted
+    assert unsorted is not None, "sums in a fixed order need the intersections as they were emitted"
     height, width, channels = image.shape
     kind = scalar, channels, halvings(alpha_threshold)
     tile_count, pieces = lists.columns * lists.rows, balanced_pieces(lists)
@@ -117,15 +117,15 @@ def blend_on_cpu(
         if left_over_gradient is None:
             left_over_gradient = torch.zeros_like(left_over)
         scratch = rows(count), rows(channels, count), rows(TILE_SIZE), rows(TILE_SIZE), rows(channels + 6)
-        entry_gradients = features.new_empty(lists.entry_count, channels + 6)
+        intersection_gradients = features.new_empty(lists.intersection_count, channels + 6)
         launch(
             blend_cpu.backward_kernel(*kind),
             tile_count,
-            *(lists.ranges, lists.gaussians, emission.places, *records, *frame, last),
-            *(image_gradient.view(-1, channels), left_over_gradient, transmittance, *scratch, entry_gradients),
+            *(lists.ranges, lists.gaussians, unsorted.places, *records, *frame, last),
+            *(image_gradient.view(-1, channels), left_over_gradient, transmittance, *scratch, intersection_gradients),
             ranges=pieces,
         )
-        return gather_by_gaussian(emission, entry_gradients)
+        return gather_by_gaussian(unsorted, intersection_gradients)
 
     return backward
 
@@ -136,8 +136,8 @@ def halvings(alpha_threshold: float) -> int:
 
 
 def balanced_pieces(lists: TileLists) -> Tensor:
-    """[K + 1] int32: where ranges of tiles begin that hold about the same number of entries each, and where the last
-    one ends."""
+    """[K + 1] int32: where ranges of tiles begin that hold about the same number of intersections each, and where the
+    last one ends."""
     tile_count = lists.ranges.shape[0]
     work = (lists.ranges[:, 1] - lists.ranges[:, 0]).add(16).cumsum(0).double()  # 16: a tile costs something in itself
     pieces = min(thread_count() * PIECES_PER_THREAD, tile_count)
@@ -154,7 +154,7 @@ def blend_on_cuda(
     scalar, cuda = warp_scalar(features.dtype), features.device.type == "cuda"
     height, width, channels = image.shape
     rows = padded(features)
-    last = draw_blocks(rows, lists, records, image, transmittance, alpha_threshold)
+    last = blend_blocks(rows, lists, records, image, transmittance, alpha_threshold)
     # Padded they are larger, and few are not padded again.
     count, kept = len(features), rows if len(features) <= ONE_SORT else features
     del rows
@@ -172,16 +172,16 @@ def blend_on_cuda(
             gathered = transmittance.new_zeros(count, blend_cuda.padded_channels(columns) if by_rows else columns)
             launch_blocks(kernel, lists, blend_cuda.BLOCKS_PER_TILE, *given, 0, lists.gaussians, gathered)
             return gathered
-        emission, by_entry = lists.emission, transmittance.new_zeros(lists.entry_count, channels + 6)
-        assert emission is not None, "sums in a fixed order need the entries as they were emitted"
+        unsorted, by_intersection = lists.unsorted, transmittance.new_zeros(lists.intersection_count, channels + 6)
+        assert unsorted is not None, "sums in a fixed order need the intersections as they were emitted"
         for corner in range(blend_cuda.BLOCKS_PER_TILE):
-            launch_blocks(kernel, lists, 1, *given, corner, emission.places, by_entry)
-        return gather_by_gaussian(emission, by_entry)
+            launch_blocks(kernel, lists, 1, *given, corner, unsorted.places, by_intersection)
+        return gather_by_gaussian(unsorted, by_intersection)
 
     return backward
 
 
-def draw_blocks(rows, lists: TileLists, records, image, transmittance, alpha_threshold: float) -> Tensor:
+def blend_blocks(rows, lists: TileLists, records, image, transmittance, alpha_threshold: float) -> Tensor:
     """Fill image [H, W, C] and transmittance [H, W] from padded() features. Returns [H W] int32, 1 + list place of the
     last Gaussian that a pixel shows."""
     assert lists.corners is not None, "a GPU's lists tell corners"
@@ -210,16 +210,16 @@ def padded(features: Tensor) -> Tensor:
     return features.clone() if features.data_ptr() % 16 else features
 
 
-def gather_by_gaussian(emission: Emission, by_entry: Tensor) -> Tensor:
-    """[N, columns]: for each Gaussian the sum of its rows of by_entry [M, columns], front tile to last.
+def gather_by_gaussian(unsorted: UnsortedIntersections, by_intersection: Tensor) -> Tensor:
+    """[N, columns]: for each Gaussian the sum of its rows of by_intersection [M, columns], front tile to last.
 
-    by_entry: rows in the order in which entries were before the sort by tile.
+    by_intersection: rows in the order in which intersections were before the sort by tile.
     """
-    entry_count, columns = by_entry.shape
-    count = emission.order.shape[0]
-    gathered = by_entry.new_zeros(count, columns)
-    if entry_count:
-        ends = emission.ends.clamp(0, entry_count)  # beyond a capacity there are no rows
-        kernel = tile_kernels(warp_scalar(by_entry.dtype)).gather_entries
-        launch(kernel, count, emission.order, ends, by_entry, columns, gathered)
+    intersection_count, columns = by_intersection.shape
+    count = unsorted.order.shape[0]
+    gathered = by_intersection.new_zeros(count, columns)
+    if intersection_count:
+        ends = unsorted.ends.clamp(0, intersection_count)  # beyond a max_intersections there are no rows
+        kernel = tile_kernels(warp_scalar(by_intersection.dtype)).gather_intersections
+        launch(kernel, count, unsorted.order, ends, by_intersection, columns, gathered)
     return gathered

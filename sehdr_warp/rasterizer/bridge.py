@@ -22,8 +22,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from .launching import launch
-from .threads import torch_threads, whole
+from .warp_launch.launching import launch
+from .warp_launch.threads import torch_threads, whole
 
 P = ParamSpec("P")
 
@@ -84,7 +84,7 @@ class Program:
         return self._places.get(id(tensor), -1)
 
 
-def zeros_for(tensors: Sequence[Tensor], needed: Sequence[bool], leaves: Sequence[bool]) -> list[Tensor | None]:
+def zero_gradients(tensors: Sequence[Tensor], needed: Sequence[bool], leaves: Sequence[bool]) -> list[Tensor | None]:
     """For each tensor that needs a gradient zeros to add it to, for others None. leaves: which of them are leaves."""
     made: dict[int, Tensor] = {}
     device = tensors[0].device
@@ -99,7 +99,7 @@ def zeros_for(tensors: Sequence[Tensor], needed: Sequence[bool], leaves: Sequenc
     return [made.get(place) for place in range(len(tensors))]
 
 
-def readable(gradient: Tensor | None) -> Tensor | None:
+def kernel_layout(gradient: Tensor | None) -> Tensor | None:
     """A gradient as kernels read it: any rows, but a vector in one piece."""
     if gradient is None or gradient.ndim < 2 or gradient.is_contiguous():
         return gradient
@@ -145,9 +145,11 @@ class _ProgramFunction(torch.autograd.Function):
         if tape is None:
             raise RuntimeError("this Warp operation was already differentiated once; run its forward pass again")
         ctx.tape = ctx.plain = ctx.gradients = None
-        gradients |= {p: readable(given) for p, given in zip(ctx.places, upstream, strict=True) if given is not None}
+        gradients |= {
+            p: kernel_layout(given) for p, given in zip(ctx.places, upstream, strict=True) if given is not None
+        }
         gradients |= {place: torch.zeros_like(tensor) for place, tensor in ctx.between.items()}
-        results = zeros_for(plain, ctx.needs_input_grad[2:], ctx.leaves)
+        results = zero_gradients(plain, ctx.needs_input_grad[2:], ctx.leaves)
         gradients |= {place: made for place, made in enumerate(results) if made is not None}
         tape.backward()
         return (None, None, *results)

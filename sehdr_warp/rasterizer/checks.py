@@ -62,7 +62,7 @@ def _fit(arguments: Iterable[tuple[Any, tuple[int | str, ...]]]) -> bool:
     return dtype in (torch.float32, torch.float64)
 
 
-def whole_number(name: str, value: Any, least: int, most: int) -> int:
+def integer(name: str, value: Any, least: int, most: int) -> int:
     """The value as an int; TypeError for another kind of number, ValueError for one out of range."""
     try:
         number = operator.index(value)

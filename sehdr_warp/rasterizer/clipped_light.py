@@ -6,7 +6,7 @@ from torch import Tensor
 from ..kernels.clipped_light import clipped_light_kernel, clipped_light_patch_kernel, clipped_logarithms_kernel
 from . import patches
 from .code_residual import CODES, WHITE
-from .launching import launch, times, warp_scalar
+from .warp_launch.launching import launch, scale_gradient, warp_scalar
 
 
 def clipped_light_energy(
@@ -65,4 +65,4 @@ class _ClippedLight(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, by_energy):
         (slopes,) = ctx.saved_tensors
-        return times(slopes, by_energy), None, None, None, None, None, None
+        return scale_gradient(slopes, by_energy), None, None, None, None, None, None

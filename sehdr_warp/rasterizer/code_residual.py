@@ -13,8 +13,8 @@ import warp as wp
 from torch import Tensor
 
 from ..kernels.code_residual import code_residual_kernel
-from .launching import launch, warp_scalar
-from .threads import torch_threads
+from .warp_launch.launching import launch, warp_scalar
+from .warp_launch.threads import torch_threads
 
 CODES = {torch.uint8: wp.uint8, torch.int16: wp.uint16}
 WHITE = {torch.uint8: 255, torch.int16: 65535}  # The largest code, by the type of the tensor that holds it

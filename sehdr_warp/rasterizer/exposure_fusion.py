@@ -5,7 +5,7 @@ from torch import Tensor
 
 from ..kernels.exposure_fusion import POINTS_PER_THREAD, fusion_kernels
 from .checks import check_tensors
-from .launching import launch, sums_are_ordered, warp_scalar
+from .warp_launch.launching import launch, requires_ordered_sums, warp_scalar
 
 MAX_LOG_SIGMA, MAX_DEVIATION = 30.0, 30.0  # Inside these exp(-d^2 / 2) and its gradient are finite in float32
 
@@ -37,7 +37,7 @@ def fuse_exposures(
         outer_bias=(outer_bias, (3, 1, 1)),
     )
     learned = log_sigma, inner, inner_bias, outer, outer_bias
-    if encoded.requires_grad or sums_are_ordered(encoded.device):
+    if encoded.requires_grad or requires_ordered_sums(encoded.device):
         return scale * (fusion_weights(encoded, *learned) * encoded).sum(dim=0)
     return _Fusion.apply(encoded, *learned, scale)
 

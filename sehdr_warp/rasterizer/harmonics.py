@@ -15,8 +15,8 @@ from ..kernels.harmonics import (
     harmonics_kernel,
     turns_adjoint_kernel,
 )
-from .checks import check_tensors, whole_number
-from .launching import launch, warp_scalar
+from .checks import check_tensors, integer
+from .warp_launch.launching import launch, warp_scalar
 
 MAX_DEGREE = 3
 
@@ -49,7 +49,7 @@ def spherical_harmonics(
     else:
         given |= {"coefficients": (coefficients, ("N", "K", 3))}
     check_tensors(**given, camera_position=(camera_position, (3,)))
-    degree = whole_number("degree", degree, 0, MAX_DEGREE)
+    degree = integer("degree", degree, 0, MAX_DEGREE)
     whole = isinstance(coefficients, Tensor)
     constant, rest = (coefficients[:, :1], coefficients[:, 1:]) if whole else coefficients
     if constant.shape[1] + rest.shape[1] < (degree + 1) ** 2:

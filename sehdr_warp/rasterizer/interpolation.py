@@ -5,7 +5,7 @@ from torch import Tensor
 
 from ..kernels import interpolation
 from .checks import check_tensors
-from .launching import launch, sums_are_ordered
+from .warp_launch.launching import launch, requires_ordered_sums
 
 
 def interpolate(table: Tensor, low: float, step: float, positions: Tensor) -> Tensor:
@@ -20,7 +20,7 @@ def interpolate(table: Tensor, low: float, step: float, positions: Tensor) -> Te
     check_tensors(table=(table, ("nodes + 2", "C")), positions=(positions, ("N", "C")))
     if len(table) < 4:
         raise ValueError(f"table has shape {list(table.shape)}, expected [nodes + 2, C] with 2 nodes at least")
-    if table.dtype == torch.float64 or sums_are_ordered(table.device):
+    if table.dtype == torch.float64 or requires_ordered_sums(table.device):
         return _in_torch(table, low, step, positions)
     return _Interpolation.apply(table, low, step, positions)
 

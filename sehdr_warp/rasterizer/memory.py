@@ -37,12 +37,12 @@ def check_room_to_compile() -> None:
         raise MemoryError(f"the compiler of kernels cannot allocate {COMPILER_BYTES >> 20} MiB")
 
 
-def held_by_warp(device: torch.device) -> int:
+def warp_memory_bytes(device: torch.device) -> int:
     """Bytes that Warp itself has allocated on a CUDA device at most so far (sorting's scratch); 0 on the CPU."""
     return wp.get_mempool_used_mem_high(wp.device_from_torch(device)) if device.type == "cuda" else 0
 
 
-def bytes_asked_for(error: BaseException) -> str | None:
+def failed_allocation(error: BaseException) -> str | None:
     """How much memory an error says could not be had, as text ("some memory" where it does not say how much); None if
     the error is about something else."""
     text, kinds = str(error), (MemoryError, torch.OutOfMemoryError)
@@ -60,13 +60,13 @@ def bytes_asked_for(error: BaseException) -> str | None:
 
 
 @contextmanager
-def memory_told(device: torch.device, sizes: Callable[[], tuple[int, ...]]) -> Iterator[None]:
+def oom_context(device: torch.device, sizes: Callable[[], tuple[int, ...]]) -> Iterator[None]:
     """Makes allocations that fail within the block OutOfMemory errors. sizes: Gaussians, width, height and perhaps
     channels by then."""
     try:
         yield
     except (RuntimeError, MemoryError) as error:
-        asked = bytes_asked_for(error)
+        asked = failed_allocation(error)
         if asked is None:
             raise
         gaussians, width, height, *channels = sizes()

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from ..kernels.patches import BLOCK_DIM, patches_of
-from .launching import launch
-from .threads import torch_threads
+from .warp_launch.launching import launch
+from .warp_launch.threads import torch_threads
 
 
 def in_patches(device: torch.device) -> bool:

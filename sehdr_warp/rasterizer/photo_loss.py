@@ -6,9 +6,9 @@ from torch import Tensor
 
 from .clipped_light import add_clipped_light
 from .code_residual import CodeScale, check_codes, residual
-from .launching import times
 from .patches import total
 from .ssim import distance_terms
+from .warp_launch.launching import scale_gradient
 
 
 def photo_loss(
@@ -46,4 +46,4 @@ class _PhotoLoss(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, upstream):
-        return times(ctx.saved_tensors[0], upstream), None, None, None, None, None
+        return scale_gradient(ctx.saved_tensors[0], upstream), None, None, None, None, None

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import plane_sweep, plane_sweep_cpu
-from .launching import launch
+from .warp_launch.launching import launch
 
 BORDER = int(plane_sweep.RADIUS)
 """Pixels nearer to the border than this cannot be matched: a patch would leave the photo."""

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from ..kernels.project import projection_kernel
-from .bridge import readable, zeros_for
-from .launching import launch, warp_scalar
-from .threads import whole
+from .bridge import kernel_layout, zero_gradients
+from .warp_launch.launching import launch, warp_scalar
+from .warp_launch.threads import whole
 
 
 def project(
@@ -21,8 +21,8 @@ def project(
     *,
     width: int,
     height: int,
-    near: float,
-    low_pass: float,
+    near_plane: float,
+    eps2d: float,
     alpha_threshold: float,
     antialiased: bool,
 ) -> tuple[Tensor, ...]:
@@ -37,7 +37,7 @@ def project(
     """
     given = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
     kernel = projection_kernel(warp_scalar(means.dtype), antialiased)
-    task = _Task(kernel, (width, height, near, low_pass, alpha_threshold))
+    task = _Task(kernel, (width, height, near_plane, eps2d, alpha_threshold))
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given):
         return _Projection.apply(task, *given)
     return task.run(given)
@@ -76,9 +76,9 @@ class _Projection(torch.autograd.Function):
         if given is None:
             raise RuntimeError("this projection was already differentiated once; run its forward pass again")
         kernel, numbers = ctx.task
-        made = zeros_for(given, needed, ctx.leaves)
+        made = zero_gradients(given, needed, ctx.leaves)
         count, unread = given[0].shape[0], (None,) * len(upstream)
-        gradients = *made, *(None,) * len(numbers), *map(readable, upstream)
+        gradients = *made, *(None,) * len(numbers), *map(kernel_layout, upstream)
         # All Gaussians add to the camera's gradients: on the CPU one thread must.
         alone = whole(count) if any(needed[4:]) else None
         launch(kernel, count, *given, *numbers, *unread, gradients=gradients, ranges=alone)

@@ -7,13 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR
-from .blending import blend, differentiated
-from .checks import check_opacities, check_tensors, whole_number
-from .memory import memory_told
+from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
+from .blending import blend, with_gradient
+from .checks import check_opacities, check_tensors, integer
+from .graph_cache import Frame, Given, replayed
+from .memory import oom_context
 from .projection import project
-from .replays import Frame, Given, replayed
-from .tile_lists import LARGEST_CAPACITY, build_tile_lists, number_entries, pack_records
+from .tile_lists import MAX_INTERSECTIONS, build_tile_lists, order_intersections, pack_gaussians
 
 LARGEST_SIDE = 1 << 20  # of an image, in pixels
 
@@ -29,9 +29,10 @@ class Rendering:
         means2d: [N, 2] centres in pixels; part of the graph, so means2d.retain_grad() gives densification its signal.
         depths: [N] along the camera's axis, in scene units; 0 where culled.
         extents: [N, 2] half-width and half-height in pixels within which a Gaussian counts; 0 where culled.
-        entry_count: (Gaussian, tile) pairs that there was room for.
-        overflow: scalar bool tensor, whether the given capacity left some of them out; None without a capacity.
-        pair_count: scalar int64 tensor, how many there are; None without a capacity.
+        intersection_count: (Gaussian, tile) pairs that there was room for.
+        overflow: scalar bool tensor, whether the given max_intersections left some of them out; None without a
+        max_intersections.
+        needed_intersections: scalar int64 tensor, how many there are; None without a max_intersections.
         depth: [H, W] blended depths along the camera's axis over zero, where they were asked for; over alpha they are
             the expected depth.
     """
@@ -41,9 +42,9 @@ class Rendering:
     means2d: Tensor
     depths: Tensor
     extents: Tensor
-    entry_count: int
+    intersection_count: int
     overflow: Tensor | None = None
-    pair_count: Tensor | None = None
+    needed_intersections: Tensor | None = None
     depth: Tensor | None = None
 
     @property
@@ -73,13 +74,13 @@ def rasterize(
     width: int,
     height: int,
     *,
-    near: float = NEAR,
-    low_pass: float = LOW_PASS,
+    near_plane: float = NEAR_PLANE,
+    eps2d: float = EPS2D,
     alpha_threshold: float = ALPHA_THRESHOLD,
     antialiased: bool = False,
     background: Tensor | None = None,
     depth: bool = False,
-    capacity: int | None = None,
+    max_intersections: int | None = None,
     deterministic: bool = False,
 ) -> Rendering:
     """Splat Gaussians with any number of feature channels onto cameras' image planes (3DGS, Kerbl et al. 2023).
@@ -102,14 +103,15 @@ def rasterize(
         intrinsics: [4] fx, fy, cx, cy in pixels.
         width: of the image, pixels.
         height: likewise.
-        near: points nearer to the camera plane are culled; > 0.
-        low_pass: variance in square pixels added to each splat; >= 0.
+        near_plane: points nearer to the camera plane are culled; > 0.
+        eps2d: variance in square pixels added to each splat; >= 0.
         alpha_threshold: contributions below it are left out, in (0, 1).
         antialiased: keep a Gaussian's energy under the low pass by lowering its opacity.
         background: [C] what shows through, or with B cameras [B, C].
         depth: also blend depths, Rendering.depth.
-        capacity: room for this many (Gaussian, tile) pairs of a camera, from 1. On a GPU nothing then waits for the
-            device, so that the call can be part of a CUDA graph; Rendering.overflow says whether the room was enough.
+        max_intersections: room for this many (Gaussian, tile) pairs of a camera, from 1. On a GPU nothing then waits
+            for the device, so that the call can be part of a CUDA graph; Rendering.overflow says whether the room was
+            enough.
         deterministic: on a GPU, sum gradients in a fixed order, so that the same input gives the same bits; slower, and
             the gradients of every (Gaussian, tile) pair take memory.
 
@@ -136,22 +138,27 @@ def rasterize(
     if not channels:
         raise ValueError(f"features has shape {list(features.shape)}, expected [N, C] with C >= 1")
     check_opacities(opacities)
-    width = whole_number("width", width, 1, LARGEST_SIDE)
-    height = whole_number("height", height, 1, LARGEST_SIDE)
-    if capacity is not None:
-        capacity = whole_number("capacity", capacity, 1, LARGEST_CAPACITY)
-    if not 0.0 < near < math.inf:
-        raise ValueError(f"near {near} is not a positive number")
-    if not 0.0 <= low_pass < math.inf:
-        raise ValueError(f"low_pass {low_pass} is not a number from 0")
+    width = integer("width", width, 1, LARGEST_SIDE)
+    height = integer("height", height, 1, LARGEST_SIDE)
+    if max_intersections is not None:
+        max_intersections = integer("max_intersections", max_intersections, 1, MAX_INTERSECTIONS)
+    if not 0.0 < near_plane < math.inf:
+        raise ValueError(f"near_plane {near_plane} is not a positive number")
+    if not 0.0 <= eps2d < math.inf:
+        raise ValueError(f"eps2d {eps2d} is not a number from 0")
     if not 0.0 < alpha_threshold < 1.0:
         raise ValueError(f"alpha_threshold {alpha_threshold} is not between 0 and 1")
 
-    launched = capacity is not None or deterministic  # and never replayed
+    launched = max_intersections is not None or deterministic  # and never replayed
 
     def projected(opacities: Tensor, pose: Tensor, lens: Tensor) -> tuple[Tensor, ...]:
         tensors = (tensor.contiguous() for tensor in (means, log_scales, quaternions, opacities, pose, lens))
-        options = {"near": near, "low_pass": low_pass, "alpha_threshold": alpha_threshold, "antialiased": antialiased}
+        options = {
+            "near_plane": near_plane,
+            "eps2d": eps2d,
+            "alpha_threshold": alpha_threshold,
+            "antialiased": antialiased,
+        }
         return project(*tensors, width=width, height=height, **options)
 
     def drawn(features: Tensor, means2d, conics, depths, opacities, extents) -> Rendering:
@@ -164,21 +171,21 @@ def rasterize(
         again = None if launched else replayed(given, Frame(width, height, alpha_threshold), differentiable)
         if again:
             picture, pairs = again
-            image, transmittance = differentiated(*leaves, picture)
+            image, transmittance = with_gradient(*leaves, picture)
             numbers = pairs, None, None
         else:
-            records, counts = pack_records(*given[:3], extents, alpha_threshold, width, height, given.features)
-            emission = features.device.type == "cpu" or deterministic
-            numbered = number_entries(counts, given.depths, extents, emission=emission)
+            records, counts = pack_gaussians(*given[:3], extents, alpha_threshold, width, height, given.features)
+            unsorted = features.device.type == "cpu" or deterministic
+            numbered = order_intersections(counts, given.depths, extents, unsorted=unsorted)
             seen = records, *numbered, given.depths, extents, width, height
-            lists = build_tile_lists(*seen, capacity, emission=emission)
+            lists = build_tile_lists(*seen, max_intersections, unsorted=unsorted)
             image, transmittance = blend(*leaves, lists, records, alpha_threshold, deterministic)
-            numbers = lists.entry_count, lists.overflow, None if capacity is None else lists.total
+            numbers = lists.intersection_count, lists.overflow, None if max_intersections is None else lists.total
         last = image[..., -1] if depth else None
         image = image[..., :-1] if depth else image
         return Rendering(image, transmittance, means2d, depths, extents, *numbers, last)
 
-    with memory_told(means.device, lambda: (len(means), width, height, channels)):
+    with oom_context(means.device, lambda: (len(means), width, height, channels)):
         if cameras:
             count = len(world_to_camera)
             if not count:
@@ -207,9 +214,9 @@ def joined(means2d: Tensor, renderings: list[Rendering]) -> Rendering:
         values = [getattr(rendering, name) for rendering in renderings]
         return None if values[0] is None else torch.stack(values)
 
-    overflow, pairs = stacked("overflow"), stacked("pair_count")
+    overflow, pairs = stacked("overflow"), stacked("needed_intersections")
     return Rendering(
         stacked("image"), stacked("transmittance"), means2d, stacked("depths"), stacked("extents"),
-        sum(rendering.entry_count for rendering in renderings), None if overflow is None else overflow.any(),
+        sum(rendering.intersection_count for rendering in renderings), None if overflow is None else overflow.any(),
         None if pairs is None else pairs.sum(), stacked("depth"),
     )  # fmt: skip

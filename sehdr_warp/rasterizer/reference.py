@@ -11,10 +11,10 @@ import torch
 from ..kernels.constants import (
     ALPHA_MAX,
     ALPHA_THRESHOLD,
+    EPS2D,
     FRUSTUM_MARGIN,
     LOG_SCALE_MAX,
-    LOW_PASS,
-    NEAR,
+    NEAR_PLANE,
     TILE_SIZE,
     TRANSMITTANCE_MIN,
 )
@@ -22,14 +22,14 @@ from .rasterization import Rendering
 
 
 def project_reference(
-    means, log_scales, quaternions, opacities, world_to_camera, intrinsics, width, height, near, low_pass,
+    means, log_scales, quaternions, opacities, world_to_camera, intrinsics, width, height, near_plane, eps2d,
     alpha_threshold, antialiased,
 ):
     """projection.project in torch: means2d, conics, depths, opacities and extents (0 where culled)."""
     fx, fy, cx, cy = intrinsics
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
     centre = means @ rotation.T + translation
-    in_front = centre[:, 2] > near
+    in_front = centre[:, 2] > near_plane
     z = torch.where(in_front, centre[:, 2], 1.0)
     x_ratio = torch.where(in_front, centre[:, 0], 0.0) / z
     y_ratio = torch.where(in_front, centre[:, 1], 0.0) / z
@@ -55,9 +55,9 @@ def project_reference(
     spread = jacobian @ (rotation @ local) * scales[:, None, :]
     covariance = spread @ spread.transpose(1, 2)
     sharp = torch.linalg.cross(spread[:, 0], spread[:, 1]).square().sum(1)
-    covariance = covariance + low_pass * torch.eye(2, dtype=means.dtype, device=means.device)
+    covariance = covariance + eps2d * torch.eye(2, dtype=means.dtype, device=means.device)
     trace = spread.square().sum((1, 2))
-    blurred = sharp + low_pass * trace + low_pass * low_pass
+    blurred = sharp + eps2d * trace + eps2d * eps2d
     if antialiased:
         opacities = opacities * (sharp / blurred).clamp(min=0.0).sqrt().detach()
     conics = torch.stack([covariance[:, 1, 1], -covariance[:, 0, 1], covariance[:, 0, 0]], 1) / blurred[:, None]
@@ -102,7 +102,7 @@ def blend_reference(
 
 def rasterize_reference(
     means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics, width, height,
-    *, near=NEAR, low_pass=LOW_PASS, alpha_threshold=ALPHA_THRESHOLD, antialiased=False,
+    *, near_plane=NEAR_PLANE, eps2d=EPS2D, alpha_threshold=ALPHA_THRESHOLD, antialiased=False,
     transmittance_min=TRANSMITTANCE_MIN,
 ) -> Rendering:
     """rasterize() in plain torch, for float64 truth and for comparison; same arguments, same result.
@@ -110,7 +110,7 @@ def rasterize_reference(
     transmittance_min: a pixel is finished before its transmittance would fall to this value; 0 never stops.
     """
     means2d, conics, depths, opacities, extents = project_reference(
-        means, log_scales, quaternions, opacities, world_to_camera, intrinsics, width, height, near, low_pass,
+        means, log_scales, quaternions, opacities, world_to_camera, intrinsics, width, height, near_plane, eps2d,
         alpha_threshold, antialiased,
     )
     image, transmittance = blend_reference(

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from ..kernels import relocation as kernels
-from .launching import launch
-from .threads import whole
+from .warp_launch.launching import launch
+from .warp_launch.threads import whole
 
 MOST_COPIES = 51
 """A Gaussian is shared by at most this many at once, as in the authors' code: the binomial sums stay exact."""

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..kernels.geometry import vector
 from ..kernels.response_curves import FILMIC, KNEE, NO_TONE, REINHARD, encode_kernel
-from .launching import launch, warp_scalar
+from .warp_launch.launching import launch, warp_scalar
 
 TONES = {"none": NO_TONE, "reinhard": REINHARD, "filmic": FILMIC, "knee": KNEE}
 

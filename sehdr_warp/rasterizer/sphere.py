@@ -5,15 +5,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..kernels.constants import ALPHA_THRESHOLD, LOW_PASS, NEAR, TILE_SIZE
+from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE, TILE_SIZE
 from ..kernels.sphere import BLOCK_TILES, projection_kernel, sphere_kernels
 from .blending import gather_by_gaussian
 from .bridge import Program, differentiable
 from .checks import check_opacities, check_tensors
-from .launching import launch, warp_scalar
-from .memory import memory_told
-from .threads import even_ranges
-from .tile_lists import Emission, checked_room, depth_order, lists_by_tile
+from .memory import oom_context
+from .tile_lists import UnsortedIntersections, check_intersection_count, depth_order, lists_by_tile
+from .warp_launch.launching import launch, warp_scalar
+from .warp_launch.threads import even_ranges
 
 _PIXELS = TILE_SIZE * TILE_SIZE
 
@@ -30,7 +30,7 @@ def rasterize_directions(
     focal_length: float,
     pixel_angle: float = 0.0,
     antialiased: bool = False,
-    near: float = NEAR,
+    near_plane: float = NEAR_PLANE,
     alpha_threshold: float = ALPHA_THRESHOLD,
 ) -> tuple[Tensor, Tensor]:
     """Blend Gaussians along directions from a place: an environment map, or any picture of the sphere.
@@ -52,7 +52,7 @@ def rasterize_directions(
         pixel_angle: of the picture's pixels, radians; where they are larger, Gaussians are smoothed to them and keep
             their energy.
         antialiased: as of rasterize().
-        near: as of rasterize().
+        near_plane: as of rasterize().
         alpha_threshold: as of rasterize().
 
     Returns:
@@ -73,11 +73,16 @@ def rasterize_directions(
     )
     check_opacities(opacities)
     height, width = directions.shape[:2]
-    footprint = LOW_PASS / focal_length**2
-    smoothing = max(LOW_PASS * pixel_angle**2 - footprint, 0.0)
-    with memory_told(means.device, lambda: (len(means), width, height, features.shape[1])):
+    footprint = EPS2D / focal_length**2
+    smoothing = max(EPS2D * pixel_angle**2 - footprint, 0.0)
+    with oom_context(means.device, lambda: (len(means), width, height, features.shape[1])):
         given = (tensor.contiguous() for tensor in (means, log_scales, quaternions, opacities, position))
-        options = {"near": near, "footprint": footprint, "smoothing": smoothing, "alpha_threshold": alpha_threshold}
+        options = {
+            "near_plane": near_plane,
+            "footprint": footprint,
+            "smoothing": smoothing,
+            "alpha_threshold": alpha_threshold,
+        }
         *shapes, opacities, distances = _project(*given, antialiased=antialiased, **options)
         opacities = opacities.masked_fill(~features.isfinite().all(1), 0)
         drawn = *shapes, opacities, features.contiguous()
@@ -88,14 +93,14 @@ def rasterize_directions(
 
 @differentiable
 def _project(
-    program: Program, means: Tensor, *others: Tensor, antialiased: bool, near: float, footprint: float,
+    program: Program, means: Tensor, *others: Tensor, antialiased: bool, near_plane: float, footprint: float,
     smoothing: float, alpha_threshold: float,
 ) -> tuple[Tensor, ...]:  # fmt: skip
     """Caps [N, 4] (direction, angle), across, along [N, 3], opacities, distances [N]; angle 0 where not drawn."""
     count, dtype = len(means), means.dtype
     results = [program.write((count, *shape), dtype) for shape in ((4,), (3,), (3,), ())]
     results.append(program.write((count,), dtype, differentiable=False))
-    given = means, *others, near, footprint, smoothing, alpha_threshold
+    given = means, *others, near_plane, footprint, smoothing, alpha_threshold
     program.launch(projection_kernel(warp_scalar(dtype), antialiased), count, given, results)
     return tuple(results)
 
@@ -108,11 +113,11 @@ class _Lists:
     columns: int
     ranges: Tensor
     gaussians: Tensor
-    emission: Emission | None
+    unsorted: UnsortedIntersections | None
 
 
 @torch.no_grad()
-def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, emission: bool) -> _Lists:
+def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, unsorted: bool) -> _Lists:
     """For each tile the Gaussians whose cap meets its own, by distance."""
     count, (height, width) = len(caps), directions.shape[:2]
     columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
@@ -123,12 +128,12 @@ def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, emission: b
     counts, none = torch.empty_like(order), order[:0]
     launch(kernel, count, *frame, order, counts, none, none, smallest=256)
     ends = counts.cumsum(0)
-    room = checked_room(int(ends[-1]) if count else 0, count, columns, rows)
+    room = check_intersection_count(int(ends[-1]) if count else 0, count, columns, rows)
     starts = (ends - counts).int()
     tiles, gaussians = (torch.empty(2 * room, dtype=torch.int32, device=order.device) for _ in range(2))
     launch(kernel, count * bool(room), *frame, starts, counts, tiles, gaussians, smallest=256)
-    ranges, gaussians, _, places = lists_by_tile(tiles, gaussians, room, None, columns, rows, emission)
-    by_gaussian = None if places is None else Emission(order.clone(), ends, places)
+    ranges, gaussians, _, places = lists_by_tile(tiles, gaussians, room, None, columns, rows, unsorted)
+    by_gaussian = None if places is None else UnsortedIntersections(order.clone(), ends, places)
     return _Lists(directions, columns, ranges, gaussians, by_gaussian)
 
 
@@ -152,10 +157,10 @@ class _Blend(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, by_image, by_transmittance):
         *drawn, transmittance, ends = ctx.saved_tensors
-        lists, emission, (count, channels) = ctx.lists, ctx.lists.emission, drawn[-1].shape
+        lists, unsorted, (count, channels) = ctx.lists, ctx.lists.unsorted, drawn[-1].shape
         # On the CPU each entry has a row, and whole tiles go to a thread: sums keep one order.
-        places = lists.gaussians if emission is None else emission.places
-        rows = by_image.new_zeros(count if emission is None else len(places), channels + 10)
+        places = lists.gaussians if unsorted is None else unsorted.places
+        rows = by_image.new_zeros(count if unsorted is None else len(places), channels + 10)
         launch(
             ctx.kernels.blend_adjoint,
             ctx.pixels,
@@ -164,8 +169,8 @@ class _Blend(torch.autograd.Function):
             rows,
             ranges=even_ranges(ctx.pixels // _PIXELS, 1) * _PIXELS,
         )
-        if emission is not None:
-            rows = gather_by_gaussian(emission, rows)
+        if unsorted is not None:
+            rows = gather_by_gaussian(unsorted, rows)
         by_axis, by_across, by_along, by_opacity, by_features = rows.split((3, 3, 3, 1, channels), dim=1)
         by_caps = torch.nn.functional.pad(by_axis, (0, 1))
         return by_caps, by_across, by_along, by_opacity[:, 0], by_features, None, None

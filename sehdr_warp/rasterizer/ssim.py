@@ -7,7 +7,7 @@ from ..kernels.ssim import RADIUS, ssim_kernels, window
 from ..kernels.ssim_cuda import ssim_patch_kernels
 from . import patches
 from .checks import check_tensors
-from .launching import constant, launch, one, times, warp_scalar
+from .warp_launch.launching import constant, launch, one, scale_gradient, warp_scalar
 
 CPU_LANES = 16  # Numbers that one step of the CPU kernels takes: one AVX-512 register of float32
 STEPS_PER_THREAD = 1024  # Smallest share of such steps that is worth handing to another thread: about 0.1 ms of work
@@ -56,7 +56,7 @@ class _Distance(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, upstream):
-        return times(ctx.saved_tensors[0], upstream), None, None, None
+        return scale_gradient(ctx.saved_tensors[0], upstream), None, None, None
 
 
 def distance_terms(

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from ..kernels import training_step as kernels
 from .harmonics import HarmonicsGradients
-from .launching import launch, one
-from .threads import torch_threads
+from .warp_launch.launching import launch, one
+from .warp_launch.threads import torch_threads
 
 
 @torch.no_grad()

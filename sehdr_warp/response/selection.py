@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from ..errors import SehdrError
-from ..rasterizer.threads import one_torch_thread
+from ..rasterizer.warp_launch.threads import one_torch_thread
 from .analytic import analytic_response
 from .curve import Response
 from .names import DESCRIPTIONS

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..model.color_models import ColorModel
 from ..model.radiance_field import RadianceField
 from ..rasterizer.plane_sweep import BORDER
-from ..rasterizer.unexplained import unexplained_pixels
+from ..rasterizer.residual_sampling import sample_residual_pixels
 from ..response import Response
 from ..splats.arrays import HARMONIC_0
 from .matching import Matcher
@@ -43,7 +43,7 @@ def born_rows(
     if shown.device.type == "cuda":
         uniform = uniform.pin_memory().to(shown.device, non_blocking=True)
     drawn_by = shown, target.codes, target.index, target.mask, uniform, index, matcher.size(index)
-    pixels, drawn = unexplained_pixels(*drawn_by, least=LEAST_ERROR)
+    pixels, drawn = sample_residual_pixels(*drawn_by, least=LEAST_ERROR)
     found, known = matcher.match_each(pixels)
     known &= drawn & (torch.arange(room, device=known.device) < wanted)
     starts = _starts(field.color_model, field.response, found.colors.device)

@@ -216,11 +216,11 @@ def _check_truth(data: Mapping, config) -> None:
 
 def _kernels_ahead(config):
     """Compiles what a training by this config will launch, as far as it can be told."""
-    from ..rasterizer.ahead import loaded_ahead, training_kernels
+    from ..rasterizer.precompile import precompiled, training_kernels
 
     plain = config.model.tone_map == "pixel" and not config.fusion.enabled
     kernels = training_kernels(3 if plain else None, config.model.antialiased)
-    return loaded_ahead(kernels, ["scipy.spatial"])  # Half a second, at the first Gaussians' neighbors.
+    return precompiled(kernels, ["scipy.spatial"])  # Half a second, at the first Gaussians' neighbors.
 
 
 def run_presets(asked: Presets) -> None:

@@ -16,7 +16,7 @@ import torch
 from ..errors import InputError, SehdrError
 from ..model.radiance_field import RenderedView
 from ..model.unexplained import MOST_NAMED, told, unexplained_regions
-from ..rasterizer.memory import memory_told
+from ..rasterizer.memory import oom_context
 from ..response import Response
 from ..runs.checkpoint import first_not_finite
 from ..runs.config import Config
@@ -118,7 +118,7 @@ class Training:
         make_writer = summary_writer() if tensorboard else None
         config = as_config(config)
         self.seconds = 0.0
-        with memory_told(self.device, lambda: sizes_of(scene)):
+        with oom_context(self.device, lambda: sizes_of(scene)):
             self.scene = scene
             resumed = self.folder.check(resume=resume, overwrite=overwrite)
             try:
@@ -177,7 +177,7 @@ class Training:
 
     def __iter__(self) -> Iterator[Step]:
         with (
-            memory_told(self.device, lambda: sizes_of(self.scene, self.trainer.field.gaussians.count)),
+            oom_context(self.device, lambda: sizes_of(self.scene, self.trainer.field.gaussians.count)),
             torch_settings(self.config.deterministic),
             interruptible() as interrupted,
             ExitStack() as leaving,

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from ..errors import SehdrError
 from ..model.radiance_field import RadianceField, RenderedView
-from ..rasterizer import GraphRecorder, HarmonicsGradients, Rendering
+from ..rasterizer import CudaGraphRunner, HarmonicsGradients, Rendering
 from ..rasterizer.code_residual import CodeScale
-from ..rasterizer.memory import bytes_asked_for
+from ..rasterizer.memory import failed_allocation
 from ..rasterizer.tile_lists import ONE_SORT
 from ..rasterizer.training_step import differentiate
 from ..response.learned import EXACT_BELOW
@@ -81,9 +81,9 @@ class Trainer:
         self._generator = torch.Generator(device=self.device).manual_seed(config.seed)
         self._index = torch.zeros(1, dtype=torch.int64, device=self.device)
         recorded = self.device.type == "cuda" and config.schedule.recorded
-        self._recorder = GraphRecorder(self.device) if recorded else None
+        self._recorder = CudaGraphRunner(self.device) if recorded else None
         # What follows the exchange of gradients is a recording of its own.
-        self._follower = GraphRecorder(self.device, self._recorder.stream) if self._recorder and ranks else None
+        self._follower = CudaGraphRunner(self.device, self._recorder.stream) if self._recorder and ranks else None
         # Recorded steps work on more rows than there are Gaussians, so that these may become more.
         self._reserves, self._rows = recorded and not config.deterministic, 0
         field.gaussians.release()  # What another training reserved
@@ -238,7 +238,7 @@ class Trainer:
         device."""
         target, camera, time, field = view.target, view.camera, view.exposure_time, self.field
         also = needed_colours(self.config.loss, target.exposure_truth is not None)
-        options = {"degree": self.degree, "also": also, "capacity": capacity, "encode": self._encoded}
+        options = {"degree": self.degree, "also": also, "max_intersections": capacity, "encode": self._encoded}
         options |= {"factored": self._factored, "opacity_weight": self.config.loss.opacity_weight}
         photo = field.photograph(camera, time, **options)
         by_harmonics = photo.by_harmonics
@@ -267,13 +267,17 @@ class Trainer:
         incomplete = rendering.overflow
         if self._flat is not None:
             loss, incomplete, harmonics = self._flat.give()
-        counted = {"tally": self._capacity.tally, "pairs": rendering.pair_count, "live": self.field.gaussians.live}
+        counted = {
+            "tally": self._capacity.tally,
+            "pairs": rendering.needed_intersections,
+            "live": self.field.gaussians.live,
+        }
         made = adam.guarded_step(self.optimizer, loss, incomplete, harmonics, **counted)
         if seen.watched:
             self.densification.observe(rendering, width, height, made)
         self.optimizer.zero_grad()
-        if rendering.pair_count is None:
-            self._capacity.launched(rendering.entry_count)
+        if rendering.needed_intersections is None:
+            self._capacity.launched(rendering.intersection_count)
         return loss
 
     def _flattened(self) -> adam.FlatGradients:
@@ -315,7 +319,7 @@ class Trainer:
                 lambda seen: follower.run(kind, lambda: self._apply(seen)),
             )
         except RuntimeError as error:
-            if bytes_asked_for(error):
+            if failed_allocation(error):
                 raise
             # What a broken recording leaves behind on the device is no ground to go on from.
             raise SehdrError(

@@ -150,7 +150,7 @@ def fake_gsplat(monkeypatch):
         camera = torch.stack([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
         drawn = rasterize(
             means, scales.log(), quats, opacities, colors, viewmats[0], camera, width, height,
-            antialiased=rasterize_mode == "antialiased", low_pass=eps2d,
+            antialiased=rasterize_mode == "antialiased", eps2d=eps2d,
         )  # fmt: skip
         radii = drawn.radii[None, :, None].expand(-1, -1, 2)
         info = {"means2d": drawn.means2d[None], "radii": radii, "depths": drawn.depths[None]}
@@ -164,7 +164,7 @@ def fake_gsplat(monkeypatch):
 def test_gsplat_draws_what_we_draw(monkeypatch):
     fake_gsplat(monkeypatch)
     scene = make_splat_scene(Size(200, 50, 40), 4)
-    options = {"low_pass": 0.1, "antialiased": True}
+    options = {"eps2d": 0.1, "antialiased": True}
     ours, theirs = (
         rasterize(*scene.arguments, **options),
         gsplat_peer.rasterize_with_gsplat(*scene.arguments, **options),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from sehdr_warp.rasterizer.projection import project
-from sehdr_warp.rasterizer.tile_lists import pack_records
+from sehdr_warp.rasterizer.tile_lists import pack_gaussians
 
 WIDTH, HEIGHT = 70, 50
 
@@ -56,7 +56,7 @@ def random_scene(count=150, channels=3, seed=0, width=WIDTH, height=HEIGHT, spre
 
 def projected(scene: SplatInputs, threshold: float = 1 / 255) -> tuple[torch.Tensor, ...]:
     """means2d, conics, depths, opacities and extents of a scene, with no graph behind them."""
-    options = {"near": 0.01, "low_pass": 0.3, "alpha_threshold": threshold, "antialiased": False}
+    options = {"near_plane": 0.01, "eps2d": 0.3, "alpha_threshold": threshold, "antialiased": False}
     tensors = *scene.tensors[:4], *scene.tensors[5:]
     with torch.no_grad():
         return project(*tensors, width=scene.width, height=scene.height, **options)
@@ -65,7 +65,7 @@ def projected(scene: SplatInputs, threshold: float = 1 / 255) -> tuple[torch.Ten
 def packed(scene: SplatInputs, threshold: float = 1 / 255):
     """Records, counts, depths and extents of a scene, as build_tile_lists() takes them."""
     means2d, conics, depths, opacities, extents = projected(scene, threshold)
-    return *pack_records(means2d, conics, opacities, extents, threshold, scene.width, scene.height), depths, extents
+    return *pack_gaussians(means2d, conics, opacities, extents, threshold, scene.width, scene.height), depths, extents
 
 
 def relative_error(value: torch.Tensor, truth: torch.Tensor) -> float:

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from sehdr_warp.rasterizer import activations
-from sehdr_warp.rasterizer.activations import bounded_exponential, weighed_opacities
+from sehdr_warp.rasterizer.activations import bounded_exponential, opacities_with_penalty
 
 from .scenes import finite_differences, random_like, relative_error
 
 BOUND = 2.5
 EXPONENTIALS = [bounded_exponential, activations._BoundedExponential.apply]
-OPACITIES = [weighed_opacities, activations._Opacities.apply]
+OPACITIES = [opacities_with_penalty, activations._Opacities.apply]
 
 
 @pytest.mark.parametrize("function", EXPONENTIALS)

@@ -8,7 +8,7 @@ from torch.profiler import ProfilerActivity, profile
 from sehdr_warp.rasterizer import blending, tile_lists
 from sehdr_warp.rasterizer.blending import blend, blend_on_cuda
 from sehdr_warp.rasterizer.reference import blend_reference
-from sehdr_warp.rasterizer.tile_lists import build_tile_lists, number_entries
+from sehdr_warp.rasterizer.tile_lists import build_tile_lists, order_intersections
 
 from .scenes import packed, projected, random_like, random_scene, relative_error
 
@@ -36,7 +36,7 @@ def leaves_and_lists(scene):
     """What blend() takes: the leaves (means2d, conics, opacities, features), lists and records; and the extents."""
     means2d, conics, _, opacities, _ = projected(scene)
     records, counts, depths, extents = packed(scene)
-    numbered = number_entries(counts, depths, extents)
+    numbered = order_intersections(counts, depths, extents)
     lists = build_tile_lists(records, *numbered, depths, extents, scene.width, scene.height)
     leaves = [tensor.detach().requires_grad_() for tensor in (means2d, conics, opacities, scene.tensors[4])]
     return leaves, [lists, records], extents

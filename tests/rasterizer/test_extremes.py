@@ -11,7 +11,7 @@ import torch
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.rasterizer import memory, rasterize
-from sehdr_warp.rasterizer.memory import OutOfMemory, bytes_asked_for
+from sehdr_warp.rasterizer.memory import OutOfMemory, failed_allocation
 
 from .scenes import random_scene
 
@@ -42,7 +42,7 @@ def finite_gradients(rendering, leaves) -> bool:
 def test_nothing_to_draw_on_any_image(device, count, size):
     means = torch.tensor([[0.0, 0.0, -3.0]]).repeat(count, 1)
     draw, leaves = splat(device, means, torch.ones(count), 0.5, torch.ones(count, 3), *size)
-    for options in ({}, {"capacity": 1}):
+    for options in ({}, {"max_intersections": 1}):
         rendering = draw(**options)
         assert rendering.image.shape == (size[1], size[0], 3)
         assert not rendering.image.any() and not rendering.alpha.any() and not rendering.visible.any()
@@ -62,7 +62,7 @@ def test_one_gaussian_over_a_whole_8k_image(device):
     width, height = 7680, 4320 if device.startswith("cuda") else 540
     draw, leaves = splat(device, [[0.0, 0.0, 1.0]], [40.0], 0.25, [[2.0]], width, height)
     rendering = draw()
-    assert rendering.entry_count == math.ceil(width / 16) * math.ceil(height / 16)
+    assert rendering.intersection_count == math.ceil(width / 16) * math.ceil(height / 16)
     assert float((rendering.image - 0.5).abs().max().detach()) < 1e-3
     assert finite_gradients(rendering, leaves)
     # d image / d opacity is the feature times the falloff, and d alpha / d opacity the falloff itself.
@@ -70,7 +70,7 @@ def test_one_gaussian_over_a_whole_8k_image(device):
 
 
 def test_very_many_gaussians_in_one_tile(device):
-    """All in one tile: as many entries as Gaussians, the front ones hide the rest."""
+    """All in one tile: as many intersections as Gaussians, the front ones hide the rest."""
     count = 1_000_000 if device.startswith("cuda") else 300_000  # More than one sort takes
     generator = torch.Generator().manual_seed(0)
     depth = 2.0 + torch.arange(count) / count
@@ -78,7 +78,7 @@ def test_very_many_gaussians_in_one_tile(device):
     means = torch.cat([spread, depth[:, None]], dim=1)[torch.randperm(count, generator=generator)]
     draw, leaves = splat(device, means, torch.full((count,), 0.02), 0.5, means[:, 2:], 16, 16, focal=64.0)
     rendering = draw()
-    assert rendering.entry_count == count
+    assert rendering.intersection_count == count
     assert float(rendering.alpha.detach().min()) > 0.99
     assert float((rendering.image[..., 0] / rendering.alpha).detach().max()) < 2.01  # the nearest of depths 2 to 3
     assert finite_gradients(rendering, leaves)
@@ -88,8 +88,8 @@ def test_very_many_gaussians_in_one_tile(device):
 
 def test_a_capacity_too_small_for_one_big_splat(device):
     draw, leaves = splat(device, [[0.0, 0.0, 1.0]], [40.0], 0.5, [[1.0]], 320, 160)
-    rendering = draw(capacity=7)
-    assert rendering.overflow and rendering.entry_count == 7
+    rendering = draw(max_intersections=7)
+    assert rendering.overflow and rendering.intersection_count == 7
     drawn = (rendering.alpha > 0).sum()
     assert int(drawn) == 7 * 256
     assert finite_gradients(rendering, leaves)
@@ -111,7 +111,7 @@ def test_a_capacity_too_small_for_one_big_splat(device):
     ],
 )
 def test_failed_allocations_are_told_from_other_errors(error, asked):
-    assert bytes_asked_for(error) == asked
+    assert failed_allocation(error) == asked
 
 
 def test_a_failed_allocation_says_the_sizes(device, monkeypatch):

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-from sehdr_warp.rasterizer import kernel_cache
+from sehdr_warp.rasterizer.warp_launch import kernel_cache
 
 
 @pytest.fixture

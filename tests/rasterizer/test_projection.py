@@ -10,7 +10,7 @@ from sehdr_warp.rasterizer.projection import project
 
 from .scenes import random_scene
 
-OPTIONS = {"near": 0.01, "low_pass": 0.3, "alpha_threshold": 1 / 255, "antialiased": False}
+OPTIONS = {"near_plane": 0.01, "eps2d": 0.3, "alpha_threshold": 1 / 255, "antialiased": False}
 
 
 def seen(device="cpu", **sizes):

@@ -108,7 +108,7 @@ def test_tensors_that_need_no_gradient_get_none(device):
 
 def test_gaussians_that_a_capacity_leaves_out_get_no_gradient(device):
     scene = random_scene().to(torch.float32, device)
-    rendering = rasterize(*scene.arguments, capacity=1)
+    rendering = rasterize(*scene.arguments, max_intersections=1)
     backward(rendering)
     assert rendering.overflow
     assert int((scene.tensors[4].grad != 0).any(1).sum()) == 1
@@ -118,10 +118,10 @@ def test_gaussians_that_a_capacity_leaves_out_get_no_gradient(device):
 def test_a_capacity_changes_nothing_when_it_is_enough_and_says_so_when_not(device):
     scene = random_scene().to(torch.float32, device)
     exact = rasterize(*scene.arguments)
-    roomy = rasterize(*scene.arguments, capacity=exact.entry_count + 100)
+    roomy = rasterize(*scene.arguments, max_intersections=exact.intersection_count + 100)
     assert exact.overflow is None and not roomy.overflow
     assert torch.equal(exact.image, roomy.image)
-    cramped = rasterize(*scene.arguments, capacity=exact.entry_count - 1)
+    cramped = rasterize(*scene.arguments, max_intersections=exact.intersection_count - 1)
     assert cramped.overflow
     for rendering in (roomy, cramped):
         rendering.image.sum().backward()
@@ -144,15 +144,15 @@ def test_many_faint_gaussians_keep_their_gradients(device):
 def test_deterministic_gradients_repeat_bit_for_bit_and_are_the_others(device):
     scene = random_scene(count=3000, channels=5, width=120, height=70, spread=2.0, seed=3).to(torch.float32, device)
 
-    def drawn(deterministic=True, capacity=None):
+    def drawn(deterministic=True, max_intersections=None):
         for tensor in scene.tensors:
             tensor.grad = None
-        rendering = rasterize(*scene.arguments, deterministic=deterministic, capacity=capacity)
+        rendering = rasterize(*scene.arguments, deterministic=deterministic, max_intersections=max_intersections)
         backward(rendering)
         return [rendering.image, *(tensor.grad for tensor in scene.tensors[:5])]
 
     first = drawn()
-    for again in (drawn(), drawn(), drawn(capacity=100_000)):
+    for again in (drawn(), drawn(), drawn(max_intersections=100_000)):
         assert all(torch.equal(a, b) for a, b in zip(first, again))
     for ours, other in zip(first, drawn(deterministic=False)):
         assert relative_error(ours, other) < 1e-5

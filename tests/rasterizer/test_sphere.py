@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sehdr_warp.kernels.constants import ALPHA_MAX, ALPHA_THRESHOLD, LOW_PASS
+from sehdr_warp.kernels.constants import ALPHA_MAX, ALPHA_THRESHOLD, EPS2D
 from sehdr_warp.rasterizer import rasterize, rasterize_directions
 from sehdr_warp.rasterizer.sphere import caps_of
 
@@ -37,14 +37,14 @@ def reference(means, log_scales, quaternions, opacities, features, directions, a
     axes = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix() * np.exp(log_scales)[:, None]
     covariances = axes @ axes.swapaxes(1, 2)
     distances = np.linalg.norm(means, axis=1)
-    footprint = LOW_PASS / FOCAL**2
-    low_pass = max(footprint, LOW_PASS * pixel_angle**2)
+    footprint = EPS2D / FOCAL**2
+    eps2d = max(footprint, EPS2D * pixel_angle**2)
     image, left = np.zeros((*directions.shape[:2], features.shape[1])), np.ones(directions.shape[:2])
     for i in np.argsort(distances):
         n = means[i] / distances[i]
         tangent = np.linalg.svd(n[None])[2][1:]
         bare = tangent @ covariances[i] @ tangent.T / distances[i] ** 2
-        trained, blurred = bare + footprint * np.eye(2), bare + low_pass * np.eye(2)
+        trained, blurred = bare + footprint * np.eye(2), bare + eps2d * np.eye(2)
         before = bare if antialiased else trained
         opacity = opacities[i] * np.sqrt(np.linalg.det(before) / np.linalg.det(blurred))
         forward = directions @ n
@@ -103,7 +103,7 @@ def test_agrees_with_perspective_views(device):
         pose = torch.eye(4, device=device)
         pose[:3, :3] = torch.tensor(turn.as_matrix())
         directions = torch.tensor(rays @ turn.as_matrix(), dtype=torch.float32, device=device)
-        flat = rasterize(*given, pose, lens, side, side, low_pass=1e-6)
+        flat = rasterize(*given, pose, lens, side, side, eps2d=1e-6)
         image, _ = rasterize_directions(*given, torch.zeros(3, device=device), directions, focal_length=1e6)
         assert float((image - flat.image).abs().mean()) < 0.05 * float(flat.image.mean())
 

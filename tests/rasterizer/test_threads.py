@@ -7,8 +7,8 @@ import pytest
 import torch
 import warp as wp
 
-from sehdr_warp.rasterizer import threads
-from sehdr_warp.rasterizer.launching import launch
+from sehdr_warp.rasterizer.warp_launch import threads
+from sehdr_warp.rasterizer.warp_launch.launching import launch
 
 
 @wp.kernel(enable_backward=True)

@@ -10,10 +10,10 @@ from sehdr_warp.rasterizer import tile_lists
 from sehdr_warp.rasterizer.tile_lists import (
     build_tile_lists,
     depth_order,
-    emit_entries,
+    emit_intersections,
     emit_keys,
     find_lists,
-    number_entries,
+    order_intersections,
     sort_keys,
 )
 
@@ -28,24 +28,24 @@ def dense(device, count=20000):
 
 
 def counted(*scene):
-    """What emit_entries() reads, and the counts in that order."""
+    """What emit_intersections() reads, and the counts in that order."""
     records, counts, depths, extents = dense(*scene)
     order = depth_order(depths, extents)
     return (order, *records, extents, COLUMNS, ROWS), counts[order]
 
 
-def built(records, counts, depths, extents, capacity=None, *, emission=True):
-    numbered = number_entries(counts, depths, extents, emission=emission)
+def built(records, counts, depths, extents, max_intersections=None, *, unsorted=True):
+    numbered = order_intersections(counts, depths, extents, unsorted=unsorted)
     size = 16 * COLUMNS, 16 * ROWS
-    return build_tile_lists(records, *numbered, depths, extents, *size, capacity, emission=emission)
+    return build_tile_lists(records, *numbered, depths, extents, *size, max_intersections, unsorted=unsorted)
 
 
 def emit(records, counts, monkeypatch):
-    """Tiles and Gaussians of the entries, in memory that holds what no tile and no Gaussian is."""
+    """Tiles and Gaussians of the intersections, in memory that holds what no tile and no Gaussian is."""
     empty = torch.empty
     monkeypatch.setattr(torch, "empty", lambda *a, **k: empty(*a, **k).fill_(UNWRITTEN))
     room = int(counts.sum())
-    tiles, gaussians = emit_entries(*records, counts.cumsum(0), room)
+    tiles, gaussians = emit_intersections(*records, counts.cumsum(0), room)
     monkeypatch.undo()
     return tiles[:room], gaussians[:room]
 
@@ -85,24 +85,24 @@ def test_one_sort_makes_the_lists_of_two(device, spare):
     # Many at one depth: ties keep the order of indices.
     depths = (depths * 4).round().clamp_min(1) / 4
     lists = built(records, counts, depths, extents)
-    room = lists.entry_count + spare
+    room = lists.intersection_count + spare
     given = *records, extents, depths, COLUMNS, ROWS, counts.cumsum(0), room
     keys, gaussians = sort_keys(*emit_keys(*given), room, COLUMNS * ROWS)
     ranges, corners = find_lists(keys, gaussians, records, COLUMNS, ROWS)
     if spare < 0:
         assert int(ranges[-1, 1]) == room and int(keys.max() >> DEPTH_BITS) < COLUMNS * ROWS
         return
-    assert torch.equal(gaussians[: lists.entry_count], lists.gaussians)
+    assert torch.equal(gaussians[: lists.intersection_count], lists.gaussians)
     assert torch.equal(ranges, lists.ranges)
-    assert lists.corners is None or torch.equal(corners[: lists.entry_count], lists.corners)
+    assert lists.corners is None or torch.equal(corners[: lists.intersection_count], lists.corners)
 
 
 def test_corners_are_those_that_an_ellipse_touches(device):
     """Beside what all pixels of a corner see of a Gaussian, drawn alone."""
     scene = random_scene(count=40, width=32, height=32, spread=0.8, seed=3).to(torch.float32, device)
     records, counts, depths, extents = packed(scene)
-    numbered = number_entries(counts, depths, extents, emission=False)
-    lists = build_tile_lists(records, *numbered, depths, extents, 32, 32, emission=False)
+    numbered = order_intersections(counts, depths, extents, unsorted=False)
+    lists = build_tile_lists(records, *numbered, depths, extents, 32, 32, unsorted=False)
     columns, rows = torch.meshgrid(torch.arange(32.0, device=device), torch.arange(32.0, device=device), indexing="xy")
     (x, y, *_), (a, b, c, level) = (record[lists.gaussians.long()].t()[..., None, None] for record in records)
     dx, dy = columns + 0.5 - x, rows + 0.5 - y
@@ -112,20 +112,20 @@ def test_corners_are_those_that_an_ellipse_touches(device):
     # Rows of tiles, of corners, of pixels; then columns of each.
     by_corner = seen.view(-1, 2, 4, 4, 2, 2, 8).any(6).any(3)[torch.arange(len(tiles)), tiles // 2, :, tiles % 2]
     told = (lists.corners[:, None].int() >> torch.arange(8, device=device)) & 1
-    assert len(tiles) == lists.entry_count > 40 and 0.1 < told.float().mean() < 0.9
+    assert len(tiles) == lists.intersection_count > 40 and 0.1 < told.float().mean() < 0.9
     # An ellipse may pass between the pixels of a corner that it touches.
     assert not (by_corner.reshape(-1, 8) & ~told.bool()).any()
     assert (by_corner.reshape(-1, 8) == told.bool()).float().mean() > 0.95
 
 
-@pytest.mark.parametrize("emission", [False, True])
+@pytest.mark.parametrize("unsorted", [False, True])
 @pytest.mark.parametrize("count", [0, 1, 500])
-def test_overflow_is_more_entries_than_room(device, emission, count):
+def test_overflow_is_more_entries_than_room(device, unsorted, count):
     scene = packed(random_scene(count=count, width=16 * COLUMNS, height=16 * ROWS, seed=3).to(torch.float32, device))
-    entries = built(*scene, emission=emission).entry_count
-    for room in {max(1, entries + spare) for spare in (-1, 0, 1)}:
-        lists = built(*scene, room, emission=emission)
-        assert bool(lists.overflow) == (entries > room) and lists.total == entries
+    intersections = built(*scene, unsorted=unsorted).intersection_count
+    for room in {max(1, intersections + spare) for spare in (-1, 0, 1)}:
+        lists = built(*scene, room, unsorted=unsorted)
+        assert bool(lists.overflow) == (intersections > room) and lists.total == intersections
 
 
 def kept_bytes(holder):
@@ -137,24 +137,24 @@ def kept_bytes(holder):
 
 
 @pytest.mark.parametrize("spare", [None, 7])
-@pytest.mark.parametrize("emission", [False, True])
-def test_lists_keep_no_more_memory_than_they_use(device, emission, spare):
+@pytest.mark.parametrize("unsorted", [False, True])
+def test_lists_keep_no_more_memory_than_they_use(device, unsorted, spare):
     scene = dense(device, 500)
-    exact = built(*scene, emission=emission)
-    lists = exact if spare is None else built(*scene, exact.entry_count + spare, emission=emission)
-    entries = exact.entry_count + (spare or 0)
-    assert torch.equal(lists.gaussians[: exact.entry_count], exact.gaussians)
+    exact = built(*scene, unsorted=unsorted)
+    lists = exact if spare is None else built(*scene, exact.intersection_count + spare, unsorted=unsorted)
+    intersections = exact.intersection_count + (spare or 0)
+    assert torch.equal(lists.gaussians[: exact.intersection_count], exact.gaussians)
     total_and_overflow = 8 + (spare is not None)
-    by_gaussian = entries + 3 * 500 if emission else 0
-    one_sort = 0 if emission else 4 * entries + 8 * 500 - 8
-    corners = 0 if lists.corners is None else entries
-    total = 4 * (2 * COLUMNS * ROWS + entries + by_gaussian) + corners + total_and_overflow + one_sort
+    by_gaussian = intersections + 3 * 500 if unsorted else 0
+    one_sort = 0 if unsorted else 4 * intersections + 8 * 500 - 8
+    corners = 0 if lists.corners is None else intersections
+    total = 4 * (2 * COLUMNS * ROWS + intersections + by_gaussian) + corners + total_and_overflow + one_sort
     assert kept_bytes(lists) == total
 
 
-@pytest.mark.parametrize("emission", [True, False])
+@pytest.mark.parametrize("unsorted", [True, False])
 @pytest.mark.parametrize("count, chunks", [(0, 1), (1, 3), (5000, 7)])
-def test_entries_counted_by_chunks_are_those_sorted(monkeypatch, count, chunks, emission):
+def test_entries_counted_by_chunks_are_those_sorted(monkeypatch, count, chunks, unsorted):
     monkeypatch.setattr(tile_lists, "SMALLEST_CHUNK", max(1, count // chunks))
     monkeypatch.setenv("SEHDR_THREADS", str(chunks))
     generator, tiles = torch.Generator().manual_seed(count), 40
@@ -162,10 +162,10 @@ def test_entries_counted_by_chunks_are_those_sorted(monkeypatch, count, chunks, 
     given = [torch.randint(3, tiles + 1, (2 * count,), generator=generator, dtype=torch.int32)]
     given.append(torch.randint(1000, (2 * count,), generator=generator, dtype=torch.int32))
     records = torch.zeros(1000, 4), torch.full((1000, 4), -1.0)
-    counted = tile_lists._count_by_tile(*(tensor.clone() for tensor in given), count, tiles, emission)
+    counted = tile_lists._count_by_tile(*(tensor.clone() for tensor in given), count, tiles, unsorted)
     copies = (tensor.clone() for tensor in given)
-    ranges, ones, corners, places = tile_lists._sort_by_tile(*given, count, records, tiles, 1, emission)
-    alike, *_, without, _ = tile_lists._sort_by_tile(*copies, count, None, tiles, 1, emission)
+    ranges, ones, corners, places = tile_lists._sort_by_tile(*given, count, records, tiles, 1, unsorted)
+    alike, *_, without, _ = tile_lists._sort_by_tile(*copies, count, None, tiles, 1, unsorted)
     assert torch.equal(alike, ranges) and without is None and len(corners) == count
     for ours, sorted_ones in zip(counted, (ranges, ones, places), strict=True):
         assert (ours is None) == (sorted_ones is None)

@@ -45,7 +45,7 @@ def launch(
     """
     if dim == 0 or (not isinstance(dim, int) and 0 in dim):
         return
-    ranged = starts_at_first(kernel)
+    ranged = takes_range_start(kernel)
     device = next(argument.device for argument in arguments if isinstance(argument, Tensor))
     values = list(arguments)
     if gradients is not None:
@@ -61,7 +61,7 @@ def launch(
 
 
 @cache
-def starts_at_first(kernel: Any) -> bool:
+def takes_range_start(kernel: Any) -> bool:
     """Whether the kernel takes the start of a range, `first`."""
     return kernel.adj.args[0].label == "first"
 
@@ -88,16 +88,17 @@ def constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device
 
 
 def one(like: Tensor) -> Tensor:
-    """The scalar 1 on a tensor's device: where it is what a scalar is differentiated by, times() has nothing to do."""
+    """The scalar 1 on a tensor's device: where it is what a scalar is differentiated by, scale_gradient() has nothing
+    to do."""
     return constant((1.0,), like.dtype, like.device)[0]
 
 
-def times(gradient: Tensor, upstream: Tensor) -> Tensor:
+def scale_gradient(gradient: Tensor, upstream: Tensor) -> Tensor:
     """A gradient times the scalar that is the gradient by what it belongs to."""
     return gradient if upstream.data_ptr() == one(upstream).data_ptr() else gradient * upstream
 
 
-def sums_are_ordered(device: torch.device) -> bool:
+def requires_ordered_sums(device: torch.device) -> bool:
     """Whether sums on a device must be made in a fixed order that atomics of many threads do not keep."""
     return device.type == "cuda" and torch.are_deterministic_algorithms_enabled()
 

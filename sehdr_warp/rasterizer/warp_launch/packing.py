@@ -11,7 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from . import threads
-from .loading import recorded_launch
+from .loading import launch_object
 
 
 class PackedLaunch:
@@ -29,7 +29,7 @@ class PackedLaunch:
             for place, kind in enumerate(self.kinds)
         ]
         options = {"adj_inputs": given[count:], "adjoint": adjoint, "block_dim": block_dim}
-        self.recorded = recorded_launch(kernel, dim, given[:count], wp.device_from_torch(device), **options)
+        self.recorded = launch_object(kernel, dim, given[:count], wp.device_from_torch(device), **options)
         self.dim: int | Sequence[int] | None = None
         # Blocks, on fibers where there is no GPU, are left to Warp.
         self.structures = self._structures() if device.type == "cpu" and block_dim is None else []

@@ -17,9 +17,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ..kernels import shared_ranges
-from ..parallel import thread_count
-from .loading import recorded_launch
+from ...kernels import shared_ranges
+from ...parallel import thread_count
+from .loading import launch_object
 
 RANGES_PER_THREAD = 8
 """Threads do not end together: whoever is done earlier takes another one."""
@@ -59,7 +59,7 @@ def share(function: Any, bounds: ctypes.Structure, structures: Sequence[ctypes.S
 @cache
 def _share_ranges() -> Any:
     """share_ranges() as Warp launches it once."""
-    return recorded_launch(shared_ranges.share_ranges, 1, [0, 0, 0], wp.get_device("cpu"))
+    return launch_object(shared_ranges.share_ranges, 1, [0, 0, 0], wp.get_device("cpu"))
 
 
 @cache

@@ -17,14 +17,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .blending import Adjoint, Picture, blend_on_cuda
-from .launching import stream_handle
-from .recording import GraphRecorder, is_recording
-from .tile_lists import LARGEST_CAPACITY, ONE_SORT, build_tile_lists, number_entries, pack_records
+from .blending import Adjoint, BlendResult, blend_on_cuda
+from .cuda_graphs import CudaGraphRunner, is_capturing
+from .tile_lists import MAX_INTERSECTIONS, ONE_SORT, build_tile_lists, order_intersections, pack_gaussians
+from .warp_launch.launching import stream_handle
 
 LOG = logging.getLogger(__name__)
 
-LAUNCHED_FIRST = 4  # Calls of a kind before it is recorded: a recording costs as much as some twenty of them
+WARMUP_CALLS = 4  # Calls of a kind before it is recorded: a recording costs as much as some twenty of them
 KINDS = 3  # Kinds of calls that are remembered, the latest
 TOGETHER = 4  # Calls of a kind whose backward passes are still to come: each has a recording of its own
 LARGEST_IMAGE = 1 << 21  # In pixels; larger ones wait for the GPU as it is
@@ -54,7 +54,7 @@ class Frame(NamedTuple):
 
 
 @torch.no_grad()
-def replayed(given: Given, frame: Frame, differentiable: bool) -> tuple[Picture, int] | None:
+def replayed(given: Given, frame: Frame, differentiable: bool) -> tuple[BlendResult, int] | None:
     """The picture and the number of its (Gaussian, tile) pairs; None where the call is to be launched instead.
 
     given: its extents become 0 where a feature is not finite.
@@ -63,7 +63,7 @@ def replayed(given: Given, frame: Frame, differentiable: bool) -> tuple[Picture,
     features, device = given.features, given.features.device
     small = 0 < len(features) <= (ONE_SORT if differentiable else LARGEST_COUNT)
     small &= frame.width * frame.height <= LARGEST_IMAGE
-    if device.type != "cuda" or features.dtype != torch.float32 or not small or is_recording(device):
+    if device.type != "cuda" or features.dtype != torch.float32 or not small or is_capturing(device):
         return None
     kind = _kind((device, stream_handle(device), *features.shape, frame, differentiable))
     recording = kind.take(lambda pairs: _Recording(given, frame, pairs))
@@ -75,9 +75,9 @@ def replayed(given: Given, frame: Frame, differentiable: bool) -> tuple[Picture,
         return None
     if not differentiable:
         kind.idle.append(recording)
-        return Picture(image, transmittance, recording.adjoint), pairs
+        return BlendResult(image, transmittance, recording.adjoint), pairs
     lease = _Lease(kind.idle, recording)
-    return Picture(image, transmittance, lease.adjoint), pairs
+    return BlendResult(image, transmittance, lease.adjoint), pairs
 
 
 class _Recording:
@@ -93,25 +93,25 @@ class _Recording:
         self._transmittance = features.new_empty(height, width)
         self._pairs = torch.empty(1, dtype=torch.int64, pin_memory=True)
         self._counted, self._stream = torch.cuda.Event(), torch.cuda.current_stream(features.device)
-        self._counter = GraphRecorder(features.device)
-        self._drawer = GraphRecorder(features.device, self._counter.stream)
+        self._counter = CudaGraphRunner(features.device)
+        self._drawer = CudaGraphRunner(features.device, self._counter.stream)
 
         def count():
-            records, counts = pack_records(means2d, conics, opacities, extents, threshold, width, height, features)
-            numbered = number_entries(counts, depths, extents, emission=False)
+            records, counts = pack_gaussians(means2d, conics, opacities, extents, threshold, width, height, features)
+            numbered = order_intersections(counts, depths, extents, unsorted=False)
             self._pairs.copy_(numbered[1][-1:], non_blocking=True)
             return records, numbered
 
         def draw(records, numbered, room: int) -> Adjoint:
             order, ends = numbered
-            lists = build_tile_lists(records, order, ends, depths, extents, width, height, room, emission=False)
+            lists = build_tile_lists(records, order, ends, depths, extents, width, height, room, unsorted=False)
             return blend_on_cuda(features, lists, records, self._image, self._transmittance, threshold, False)
 
         # Launched once: nothing may be compiled or loaded during a recording, and it tells how much room is needed.
         with self._counter.launching():
             records, numbered = count()
             room = int(ROOM * max(pairs, int(numbered[1][-1])))
-            self.room = min(max(LEAST_ROOM, room), LARGEST_CAPACITY)
+            self.room = min(max(LEAST_ROOM, room), MAX_INTERSECTIONS)
             draw(records, numbered, self.room)
             del records, numbered
         records, numbered = self._counter.record(None, count)
@@ -145,7 +145,7 @@ class _Kind:
         with suppress(IndexError):
             return self.idle.pop()
         self.launched += 1
-        if self.launched <= LAUNCHED_FIRST or self.made >= TOGETHER:
+        if self.launched <= WARMUP_CALLS or self.made >= TOGETHER:
             return None
         self.made += 1
         try:

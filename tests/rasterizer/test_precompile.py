@@ -11,7 +11,8 @@ from sehdr_warp.bench.splats import Size, make_photo_scene
 from sehdr_warp.bench.step import make_trainer
 from sehdr_warp.kernels.plane_sweep_cpu import sweep_rows
 from sehdr_warp.kernels.shared_ranges import share_ranges
-from sehdr_warp.rasterizer import ahead, launching
+from sehdr_warp.rasterizer import precompile
+from sehdr_warp.rasterizer.warp_launch import launching
 from sehdr_warp.runs.config_files import load_config
 
 
@@ -28,9 +29,9 @@ def is_loaded(kernel):
 
 
 def test_kernels_are_loaded_beside_the_block_and_launch_as_ever(monkeypatch):
-    monkeypatch.setattr(ahead, "PATIENCE", 0.0)
+    monkeypatch.setattr(precompile, "PATIENCE", 0.0)
     kernels, values = [make_kernel(3.0), make_kernel(5.0)], torch.ones(4)
-    with ahead.loaded_ahead(kernels):
+    with precompile.precompiled(kernels):
         launching.launch(kernels[1], 4, values)
         until = time.monotonic() + 60
         while not is_loaded(kernels[0]) and time.monotonic() < until:
@@ -41,17 +42,17 @@ def test_kernels_are_loaded_beside_the_block_and_launch_as_ever(monkeypatch):
 
 def test_a_block_that_refuses_at_once_has_nothing_compiled():
     kernel = make_kernel(7.0)
-    with pytest.raises(ValueError, match="refused"), ahead.loaded_ahead([kernel]):
+    with pytest.raises(ValueError, match="refused"), precompile.precompiled([kernel]):
         raise ValueError("refused")
     assert not is_loaded(kernel)
     assert not [each for each in threading.enumerate() if each.name == "sehdr-warp ahead"]
 
 
 def test_what_cannot_be_compiled_is_no_end_of_the_block(monkeypatch):
-    monkeypatch.setattr(ahead, "PATIENCE", 0.0)
+    monkeypatch.setattr(precompile, "PATIENCE", 0.0)
     broken = make_kernel(2.0)
-    monkeypatch.setattr(ahead.wp, "load_module", lambda *_, **__: 1 / 0)
-    with ahead.loaded_ahead([broken]):
+    monkeypatch.setattr(precompile.wp, "load_module", lambda *_, **__: 1 / 0)
+    with precompile.precompiled([broken]):
         time.sleep(0.05)
 
 
@@ -63,5 +64,5 @@ def test_a_training_launches_what_was_compiled_ahead():
         trainer.iteration = iteration
         trainer.step()
     launched = {kernel for kernel, *_ in launching._of_thread.launches} | {sweep_rows, share_ranges}
-    assert launched.issuperset(ahead.training_kernels(3, antialiased=False))
-    assert launched.issuperset(ahead.training_kernels(None, antialiased=False))
+    assert launched.issuperset(precompile.training_kernels(3, antialiased=False))
+    assert launched.issuperset(precompile.training_kernels(None, antialiased=False))

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sehdr_warp.rasterizer.code_residual import code_tensor
-from sehdr_warp.rasterizer.unexplained import unexplained_pixels
+from sehdr_warp.rasterizer.residual_sampling import sample_residual_pixels
 
 SIZE = 24, 18  # At which pixels are told, of a photo of 12 x 9
 
@@ -13,7 +13,7 @@ SIZE = 24, 18  # At which pixels are told, of a photo of 12 x 9
 def drawn(shown, codes, device, *, index=None, mask=None, count=4000):
     uniform = torch.from_numpy(np.random.default_rng(0).random(count)).to(device)
     given = shown.to(device), code_tensor(codes, device), index, mask, uniform, 3, SIZE
-    pixels, meant = (values.cpu() for values in unexplained_pixels(*given, least=0.02))
+    pixels, meant = (values.cpu() for values in sample_residual_pixels(*given, least=0.02))
     assert (pixels[:, 0] == 3).all() and pixels[:, 1:].min() >= 2
     assert pixels[:, 1].max() < SIZE[0] - 2 and pixels[:, 2].max() < SIZE[1] - 2
     return pixels[:, 1:], meant

@@ -16,17 +16,17 @@ from ..kernels import (
     plane_sweep,
     plane_sweep_cpu,
     relocation,
+    residual_sampling,
     shared_ranges,
     ssim,
     tiles,
     training_step,
-    unexplained,
 )
 from ..kernels.constants import ALPHA_THRESHOLD
 from ..kernels.project import projection_kernel
 from .blending import halvings
-from .loading import is_fused, load_on_cpu
 from .ssim import CPU_LANES
+from .warp_launch.loading import compile_for_cpu, uses_fused_multiply_add
 
 log = logging.getLogger(__name__)
 
@@ -43,21 +43,27 @@ def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
     return [
         *(shared_ranges.share_ranges, plane_sweep_cpu.sweep_rows, plane_sweep.trust_depths, plane_sweep.place_matches),
         *(*blend, projection_kernel(real, antialiased), distance.compare),
-        *(harmonics.harmonics_kernel(real, 0), lists.pack_records, lists.key_by_depth, lists.emit_entries),
-        *(tiles.count_tiles, tiles.place_entries, distance.blur_columns, distance.blur_derivatives, distance.gradient),
-        *(lists.gather_entries, harmonics.harmonics_adjoint_kernel(real, 0, True)),
+        *(harmonics.harmonics_kernel(real, 0), lists.pack_gaussians, lists.key_by_depth, lists.emit_intersections),
+        *(
+            tiles.count_tiles,
+            tiles.place_intersections,
+            distance.blur_columns,
+            distance.blur_derivatives,
+            distance.gradient,
+        ),
+        *(lists.gather_intersections, harmonics.harmonics_adjoint_kernel(real, 0, True)),
         *(training_step.judge_step, training_step.add_position_noise),
         *(relocation.number_places, relocation.count_copies, relocation.share_opacities, relocation.copy_rows),
-        *(relocation.clear_rows, unexplained.error_weights_kernel(wp.uint8), unexplained.drawn_pixels),
+        *(relocation.clear_rows, residual_sampling.error_weights_kernel(wp.uint8), residual_sampling.sampled_pixels),
     ]
 
 
 @contextmanager
-def loaded_ahead(kernels: Sequence[Any], modules: Sequence[str] = ()) -> Iterator[None]:
+def precompiled(kernels: Sequence[Any], modules: Sequence[str] = ()) -> Iterator[None]:
     """Imports modules and compiles kernels for the CPU, or finds them in the cache, on two threads beside this block,
     which waits for one of them each at most, at its end. What fails is told to whoever needs it."""
     over = threading.Event()
-    fused = [kernel for kernel in kernels if is_fused(kernel)]
+    fused = [kernel for kernel in kernels if uses_fused_multiply_add(kernel)]
 
     def work(kernels: Sequence[Any], modules: Sequence[str]) -> None:
         if over.wait(PATIENCE):
@@ -68,7 +74,7 @@ def loaded_ahead(kernels: Sequence[Any], modules: Sequence[str] = ()) -> Iterato
             for kernel in kernels:
                 if over.is_set():
                     return
-                load_on_cpu(kernel)
+                compile_for_cpu(kernel)
         except Exception:
             log.debug("not all could be loaded ahead", exc_info=True)
 

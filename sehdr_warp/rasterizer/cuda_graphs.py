@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import torch
 import warp as wp
 
-from .launching import torch_stream
+from .warp_launch.launching import torch_stream
 
 T = TypeVar("T")
 
@@ -43,7 +43,7 @@ def _one_thread():
     return torch.autograd.set_multithreading_enabled(False)
 
 
-def is_recording(device: torch.device) -> bool:
+def is_capturing(device: torch.device) -> bool:
     """Whether what is launched on a device now is recorded instead of done."""
     return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
 
@@ -61,7 +61,7 @@ def _own_stream(owner, device: torch.device) -> torch.cuda.Stream:
     return stream
 
 
-class GraphRecorder:
+class CudaGraphRunner:
     """Records a function of no arguments, its torch operations and Warp launches alike, and replays it.
 
     The function works on fixed memory: what differs between replays it must read from tensors that are filled before.

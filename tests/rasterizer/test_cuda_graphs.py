@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sehdr_warp.rasterizer import GraphRecorder, rasterize, recording
+from sehdr_warp.rasterizer import CudaGraphRunner, cuda_graphs, rasterize
 
 from .scenes import random_scene, relative_error
 
@@ -12,7 +12,7 @@ needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graph
 
 def test_a_device_without_cuda_graphs_is_refused():
     with pytest.raises(ValueError, match="device cpu has no CUDA graphs"):
-        GraphRecorder("cpu")
+        CudaGraphRunner("cpu")
 
 
 def test_no_two_recorders_alive_record_on_one_stream(monkeypatch):
@@ -20,15 +20,15 @@ def test_no_two_recorders_alive_record_on_one_stream(monkeypatch):
         pass
 
     taken = iter(range(3))
-    monkeypatch.setattr(recording, "_idle_streams", {})
+    monkeypatch.setattr(cuda_graphs, "_idle_streams", {})
     monkeypatch.setattr(torch.cuda, "Stream", lambda device: (device, next(taken)))
     device = torch.device("cuda:0")
     first, second, third = Owner(), Owner(), Owner()
-    streams = [recording._own_stream(owner, device) for owner in (first, second)]
+    streams = [cuda_graphs._own_stream(owner, device) for owner in (first, second)]
     assert streams[0] != streams[1]
     del first
-    assert recording._own_stream(third, device) == streams[0]
-    assert recording._own_stream(Owner(), device) == (device, 2), "taken anew, as both others are in use"
+    assert cuda_graphs._own_stream(third, device) == streams[0]
+    assert cuda_graphs._own_stream(Owner(), device) == (device, 2), "taken anew, as both others are in use"
 
 
 @needs_gpu
@@ -37,13 +37,13 @@ def test_a_recorded_render_and_its_gradients_follow_their_inputs():
     target = torch.rand(scene.height, scene.width, 3, device="cuda:0")
 
     def step():
-        rendering = rasterize(*scene.arguments, capacity=20_000)
+        rendering = rasterize(*scene.arguments, max_intersections=20_000)
         loss = (rendering.image - target).square().sum()
         gradients = torch.autograd.grad(loss, scene.tensors[:5])
         return loss.detach(), rendering.overflow, *gradients
 
     step()
-    recorder = GraphRecorder("cuda:0")
+    recorder = CudaGraphRunner("cuda:0")
     for shift in (0.0, 0.3, -0.2):
         with torch.no_grad():
             scene.tensors[0] += shift
@@ -56,7 +56,7 @@ def test_a_recorded_render_and_its_gradients_follow_their_inputs():
 
 @needs_gpu
 def test_a_launched_graph_that_lives_on_spoils_no_recording():
-    recorder = GraphRecorder("cuda:0")
+    recorder = CudaGraphRunner("cuda:0")
     values = torch.ones(4, device="cuda:0", requires_grad=True)
 
     def step():
@@ -75,7 +75,7 @@ def test_a_launched_graph_that_lives_on_spoils_no_recording():
 def test_garbage_with_a_recording_in_it_is_not_collected_during_another():
     class Holder:
         def __init__(self):
-            self.me, self.recorder = self, GraphRecorder("cuda:0")
+            self.me, self.recorder = self, CudaGraphRunner("cuda:0")
             self.values = self.recorder.run("a", lambda: torch.ones(1 << 20, device="cuda:0") * 2)
 
     def step():
@@ -86,14 +86,14 @@ def test_garbage_with_a_recording_in_it_is_not_collected_during_another():
 
     for _ in range(3):
         Holder()
-        recorder = GraphRecorder("cuda:0")
+        recorder = CudaGraphRunner("cuda:0")
         for _ in range(2):
             assert (recorder.run("step", step) == 60_000).all()
 
 
 @needs_gpu
 def test_an_invalidated_recording_is_made_again():
-    recorder, factor = GraphRecorder("cuda:0"), [2.0]
+    recorder, factor = CudaGraphRunner("cuda:0"), [2.0]
     values = torch.ones(4, device="cuda:0")
 
     def step():
@@ -111,9 +111,9 @@ def test_an_invalidated_recording_is_made_again():
 
 @needs_gpu
 def test_a_recording_leaves_the_device_what_launches_no_longer_use():
-    large = torch.zeros(2 * recording.IDLE_BYTES, dtype=torch.uint8, device="cuda")
+    large = torch.zeros(2 * cuda_graphs.IDLE_BYTES, dtype=torch.uint8, device="cuda")
     held = torch.cuda.memory_reserved()
     del large
     assert torch.cuda.memory_reserved() == held
-    GraphRecorder("cuda:0")
-    assert torch.cuda.memory_reserved() <= held - 2 * recording.IDLE_BYTES + (4 << 20)
+    CudaGraphRunner("cuda:0")
+    assert torch.cuda.memory_reserved() <= held - 2 * cuda_graphs.IDLE_BYTES + (4 << 20)

@@ -33,7 +33,7 @@ def error_weights_kernel(code):
 
 
 @wp.kernel(module="unique", module_options=FORWARD)
-def drawn_pixels(
+def sampled_pixels(
     first: int,
     places: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.float64), width: int, view: int,
     across: float, down: float, columns: int, rows: int, border: int,

@@ -6,7 +6,7 @@ import warp as wp
 from sehdr_warp.bench.splats import Size, make_splat_scene
 from sehdr_warp.kernels.constants import ALPHA_THRESHOLD
 from sehdr_warp.rasterizer import rasterize
-from sehdr_warp.rasterizer.drawn import drawn_pairs
+from sehdr_warp.rasterizer.workload import count_blended_pairs
 
 
 def test_what_warps_draw_is_counted(device, monkeypatch):
@@ -19,10 +19,10 @@ def test_what_warps_draw_is_counted(device, monkeypatch):
         given = means, log_scales + grown, quaternions, opacities, features
         with monkeypatch.context() as fibers:
             fibers.setattr(wp.config, "enable_cpu_blocks", device == "cpu")
-            pairs, drawn = drawn_pairs((*given, *camera), 40, 24)
+            pairs, drawn = count_blended_pairs((*given, *camera), 40, 24)
         each = [rasterize(*(tensor[i : i + 1] for tensor in given), *camera, 40, 24).alpha for i in range(400)]
         colored = torch.stack(each) >= ALPHA_THRESHOLD
-        assert pairs == rasterize(*given, *camera, 40, 24).entry_count
+        assert pairs == rasterize(*given, *camera, 40, 24).intersection_count
         return drawn, int(colored.view(400, 6, 4, 5, 8).any(4).any(2).sum())
 
     faint, alone = counted(0.05 * opacities)

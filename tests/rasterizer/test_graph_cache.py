@@ -3,22 +3,22 @@
 import pytest
 import torch
 
-from sehdr_warp.rasterizer import rasterize, replays, tile_lists
+from sehdr_warp.rasterizer import graph_cache, rasterize, tile_lists
 
 from .scenes import random_like, random_scene, relative_error
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
-CALLS = replays.LAUNCHED_FIRST + 3
+CALLS = graph_cache.WARMUP_CALLS + 3
 
 
 @pytest.fixture(autouse=True)
 def nothing_is_recorded():
-    replays.forget()
+    graph_cache.forget()
 
 
 def launched(*arguments, **options):
     """rasterize() with room for all pairs, which is never replayed."""
-    return rasterize(*arguments, capacity=100_000, **options)
+    return rasterize(*arguments, max_intersections=100_000, **options)
 
 
 def scene_of(count=300, channels=3):
@@ -26,7 +26,7 @@ def scene_of(count=300, channels=3):
 
 
 def recordings():
-    return sum(kind.made for kind in replays._kinds.values())
+    return sum(kind.made for kind in graph_cache._kinds.values())
 
 
 def values_and_gradients(splat, scene, *, by_alpha=True, **options):
@@ -70,14 +70,14 @@ def test_replays_follow_their_arguments_and_their_need_of_room(options):
 @needs_gpu
 def test_pictures_stay_and_backward_passes_come_in_any_order():
     scene = scene_of()
-    shifts = [0.02 * call for call in range(CALLS + replays.TOGETHER)]
+    shifts = [0.02 * call for call in range(CALLS + graph_cache.TOGETHER)]
 
     def seen(splat, shift):
         return splat(scene.tensors[0] + shift, *scene.arguments[1:]).image
 
     images = [seen(rasterize, shift) for shift in shifts]
     truths = [seen(launched, shift) for shift in shifts]
-    assert recordings() == replays.TOGETHER
+    assert recordings() == graph_cache.TOGETHER
     for place in (*range(1, len(shifts), 2), *range(0, len(shifts), 2)):
         pair = [
             torch.autograd.grad((i * random_like(i, place)).sum(), scene.tensors[:5])
@@ -129,11 +129,11 @@ def test_a_feature_that_is_not_finite_is_culled_in_a_replay_as_well():
 
 
 def test_calls_are_recorded_after_some_and_hold_what_they_were_given():
-    kind, made = replays._Kind(), iter("abcdefgh")
-    assert [kind.take(lambda pairs: next(made)) for _ in range(replays.LAUNCHED_FIRST)] == [
+    kind, made = graph_cache._Kind(), iter("abcdefgh")
+    assert [kind.take(lambda pairs: next(made)) for _ in range(graph_cache.WARMUP_CALLS)] == [
         None
-    ] * replays.LAUNCHED_FIRST
-    leases = [replays._Lease(kind.idle, kind.take(lambda pairs: next(made))) for _ in range(replays.TOGETHER)]
+    ] * graph_cache.WARMUP_CALLS
+    leases = [graph_cache._Lease(kind.idle, kind.take(lambda pairs: next(made))) for _ in range(graph_cache.TOGETHER)]
     assert kind.take(lambda pairs: next(made)) is None, "all are held"
     del leases[1]
     assert kind.take(lambda pairs: next(made)) == "b"
@@ -145,17 +145,17 @@ def test_calls_are_recorded_after_some_and_hold_what_they_were_given():
 
 
 def test_what_cannot_be_recorded_is_launched():
-    kind, asked = replays._Kind(), []
+    kind, asked = graph_cache._Kind(), []
 
     def record(pairs):
         asked.append(pairs)
         raise torch.OutOfMemoryError("no memory")
 
-    assert not any(kind.take(record) for _ in range(replays.LAUNCHED_FIRST + 5)) and len(asked) == 1
+    assert not any(kind.take(record) for _ in range(graph_cache.WARMUP_CALLS + 5)) and len(asked) == 1
 
 
 def test_only_the_latest_kinds_are_remembered():
-    kinds = [replays._kind((n,)) for n in range(replays.KINDS)]
-    assert replays._kind((0,)) is kinds[0]
-    replays._kind((replays.KINDS,))
-    assert replays._kind((0,)) is kinds[0] and replays._kind((1,)) is not kinds[1]
+    kinds = [graph_cache._kind((n,)) for n in range(graph_cache.KINDS)]
+    assert graph_cache._kind((0,)) is kinds[0]
+    graph_cache._kind((graph_cache.KINDS,))
+    assert graph_cache._kind((0,)) is kinds[0] and graph_cache._kind((1,)) is not kinds[1]

@@ -4,14 +4,14 @@
 import torch
 from torch import Tensor
 
-from ..kernels import unexplained as kernels
+from ..kernels import residual_sampling as kernels
 from .code_residual import CODES, WHITE
-from .launching import launch
 from .plane_sweep import BORDER
+from .warp_launch.launching import launch
 
 
 @torch.no_grad()
-def unexplained_pixels(
+def sample_residual_pixels(
     shown: Tensor,
     codes: Tensor,
     index: Tensor | None,
@@ -40,5 +40,5 @@ def unexplained_pixels(
     pixels = torch.empty(len(places), 3, dtype=torch.int32, device=shown.device)
     meant = torch.empty(len(places), dtype=torch.bool, device=shown.device)
     resized = size[0] / width, size[1] / height, *size, BORDER
-    launch(kernels.drawn_pixels, len(places), places, steps[-1], width, view, *resized, pixels, meant)
+    launch(kernels.sampled_pixels, len(places), places, steps[-1], width, view, *resized, pixels, meant)
     return pixels, meant
