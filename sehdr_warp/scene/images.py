@@ -41,10 +41,20 @@ PILLOW_ERRORS = (
 
 @dataclass(frozen=True)
 class EncodedImage:
-    """pixels: [H, W, 3] uint8 or uint16, the stored codes; alpha: [H, W] float32 in [0, 1], None if all is opaque."""
+    """The codes of a photo, and what its file states beside them.
+
+    Attributes:
+        pixels: [H, W, 3] uint8 or uint16, the stored codes.
+        alpha: [H, W] float32 in [0, 1]; None if all is opaque.
+        above_white: [H, W, 3] float16, light of white pixels as a multiple of white's; 0 where it is not known. None if
+            the file states none.
+        above_white_deviation: standard deviation of the natural logarithm of above_white.
+    """
 
     pixels: np.ndarray
     alpha: np.ndarray | None
+    above_white: np.ndarray | None = None
+    above_white_deviation: float = 0.0
 
     @property
     def levels(self) -> int:
@@ -72,7 +82,7 @@ def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> Encod
             turn = _orientation(image) if oriented else 1
         except PILLOW_ERRORS as error:
             raise InputError(path, f"cannot be decoded ({error})", DAMAGED) from None
-    return EncodedImage(_upright(pixels, turn), None if alpha is None else _upright(alpha, turn))
+    return EncodedImage(turn_upright(pixels, turn), None if alpha is None else turn_upright(alpha, turn))
 
 
 def has_16_bits(path: Path) -> bool:
@@ -198,7 +208,7 @@ def _low_byte_tiles(image: ImageFile.ImageFile) -> list | None:
     return tiles or None
 
 
-def _upright(array: np.ndarray, orientation: int) -> np.ndarray:
+def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:
     """[H, W, ...] turned as EXIF's orientation says: 5 to 8 lie on their side, then rows or columns are backwards."""
     array = array.swapaxes(0, 1) if orientation in (5, 6, 7, 8) else array
     array = array[::-1] if orientation in (3, 4, 7, 8) else array

@@ -15,8 +15,10 @@ import numpy as np
 from ..errors import InputError, SehdrError
 from ..quiet import silent_stderr
 from .capture import reinhard_gamma
+from .dng import read_dng
+from .dng_develop import CLIPPED, clipping_level, develop_dng
 from .hdr_files import read_hdr
-from .images import HDR_SUFFIXES, RAW_SUFFIXES, check_size, require_file
+from .images import HDR_SUFFIXES, RAW_SUFFIXES, EncodedImage, check_size, require_file
 from .types import codes_of
 
 CURVES = {"raw": "srgb", "linear": "srgb", "float": "hdr-nerf"}
@@ -24,10 +26,7 @@ CURVES = {"raw": "srgb", "linear": "srgb", "float": "hdr-nerf"}
 _XYZ_FROM_REC709 = np.array(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
 )
-# What clips is not at white to the last bit: a sensor reads it out with noise, and demosaicing mixes it with others.
-_CLIPPED = 0.99
-# Sensors that clip below the white level that is stated do so above this part of it, and at so many pixels.
-_LEAST_WHITE, _PILE = 0.75, 64
+_NOISE = 0.02  # Standard deviation of the logarithm of light near white, from a sensor's noise and demosaicing
 _MIDDLE_GREY = 0.18
 _MOST_JUDGED = 24
 _REMEDY = "develop the photos as JPEG, PNG or TIFF, or convert them to DNG"
@@ -67,44 +66,65 @@ def tone_mapped(path: Path) -> np.ndarray:
 
 
 def raw_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
-    """(width, height) of the developed photo as the sensor lies, and turned upright."""
+    """Return (width, height) of the developed photo as the sensor lies, and turned upright."""
+    dng = read_dng(path)
     with _opened(path) as raw:
-        width, height = raw.sizes.width, raw.sizes.height
-        check_size(path, width, height)
-        return (width, height), (height, width) if raw.sizes.flip in (5, 6) else (width, height)
+        stored, turned = (raw.sizes.width, raw.sizes.height), (raw.sizes.height, raw.sizes.width)
+        sizes = (stored, turned if raw.sizes.flip in (5, 6) else stored) if dng is None else dng.sizes
+    check_size(path, *sizes[0])
+    return sizes
 
 
 def raw_codes(path: Path, *, oriented: bool) -> np.ndarray:
-    """[H, W, 3] uint16 sRGB codes of a RAW file in the sensor's colors, 1 at each channel's white level."""
+    """Return [H, W, 3] uint16 sRGB codes of a RAW file in the sensor's colors, 1 at each channel's white level."""
+    return read_raw(path, oriented=oriented).pixels
+
+
+def read_raw(path: Path, *, oriented: bool) -> EncodedImage:
+    """Return the codes of a RAW file, as raw_codes() does, and the light above white that a DNG's gain map states.
+
+    Args:
+        path: the file.
+        oriented: turn the pixels upright.
+
+    Raises:
+        InputError: if the file is missing or damaged, or holds what LibRaw does not decode.
+    """
     raw_sizes(path)
+    dng = read_dng(path)
     with _opened(path) as raw:
-        import rawpy
+        if dng is None:
+            linear = _developed(raw, oriented)
+            return EncodedImage(linear_codes(linear), None)
+        sensor = develop_dng(path, dng, raw, oriented=oriented)
+    codes = linear_codes(np.where(sensor.clipped, 1, sensor.light))
+    known = (sensor.light > 1) & ~sensor.clipped
+    above = np.where(known, sensor.light, 0).astype(np.float16) if known.any() else None
+    return EncodedImage(codes, None, above, _NOISE)
 
-        options: dict[str, Any] = {"output_color": rawpy.ColorSpace.raw, "gamma": (1, 1), "output_bps": 16}
-        options |= {"no_auto_bright": True, "user_wb": [1, 1, 1, 1], "adjust_maximum_thr": 0.0}
-        linear = raw.postprocess(**options, user_flip=None if oriented else 0).astype(np.float32) / 65535
-        clipped = linear >= _CLIPPED * _saturation(raw)
-    return linear_codes(np.where(clipped, 1, linear))
 
+def _developed(raw: Any, oriented: bool) -> np.ndarray:
+    """Return [H, W, 3] float32 light of an opened RAW file, 1 where a channel clips."""
+    import rawpy
 
-def _saturation(raw: Any) -> np.ndarray:
-    """[3] where each channel of an opened RAW file clips, as a share of the white level that is known of its camera:
-    below 1 where pixels pile up at their largest value, and no other near it is as frequent by far."""
+    options: dict[str, Any] = {"output_color": rawpy.ColorSpace.raw, "gamma": (1, 1), "output_bps": 16}
+    options |= {"no_auto_bright": True, "user_wb": [1, 1, 1, 1], "adjust_maximum_thr": 0.0}
     levels, values, colors = np.ones(3), raw.raw_image_visible, raw.raw_colors_visible
+    black, ranges = np.array(raw.black_level_per_channel, float), np.ones(3)
     for channel, members in enumerate(((0,), (1, 3), (2,))):
-        black = raw.black_level_per_channel[channel]
-        shares = (values[np.isin(colors, members)].astype(np.float32) - black) / (raw.white_level - black)
-        top = shares.max(initial=0)
-        at_top, below = (shares > 0.995 * top).sum(), (shares > 0.95 * top).sum()
-        if _LEAST_WHITE < top < 1 and at_top > max(_PILE, below / 4):
-            levels[channel] = top
-    return levels
+        shares = values[np.isin(colors, members)].astype(np.float32) - black[channel]
+        levels[channel] = clipping_level(shares / (raw.white_level - black[channel]))
+        # LibRaw divides all channels by the range of the one with the lowest black level.
+        ranges[channel] = (raw.white_level - black.min()) / (raw.white_level - black[list(members)].mean())
+    linear = raw.postprocess(**options, user_flip=None if oriented else 0).astype(np.float32) / 65535
+    linear *= ranges.astype(np.float32)
+    return np.where(linear >= CLIPPED * levels, 1, linear)
 
 
 def linear_codes(linear: np.ndarray) -> np.ndarray:
     """[H, W, 3] uint16 sRGB codes of a sensor's light, 1 at white: of 16 linear bits, what the dark keeps is what
     matters. From 0.99 on it counts as white."""
-    linear = np.where(linear >= _CLIPPED, 1, linear)
+    linear = np.where(linear >= CLIPPED, 1, linear)
     bright = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
     return codes_of(np.where(linear <= 0.0031308, 12.92 * linear, bright), 16)
 
@@ -149,10 +169,13 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         # LibRaw prints of damage, too.
         with silent_stderr(), rawpy.imread(str(path)) as raw:
-            if raw.raw_pattern is None or raw.num_colors != 3:
+            # Linear raw has no filter; what has neither, or other colors, is no photo of a camera known here.
+            linear = raw.raw_pattern is None and raw.raw_type == rawpy.RawType.Stack and read_dng(path) is not None
+            if raw.num_colors != 3 or not (linear or raw.raw_pattern is not None):
                 raise InputError(path, "is no photo through a filter of three colors", _REMEDY)
             yield raw
     except rawpy.LibRawError as error:
+        read_dng(path)  # Its own words come first, for example of a compression that LibRaw does not know.
         reason = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
         raise InputError(path, f"cannot be read as RAW ({reason})", "copy the file again") from None
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from .hdr_files import hdr_size
 from .images import EncodedImage, image_sizes, read_ldr
-from .linear_photos import kind_of, raw_codes, raw_sizes, tone_mapped
+from .linear_photos import kind_of, raw_sizes, read_raw, tone_mapped
 
 
 def photo_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -26,4 +26,4 @@ def read_photo(path: Path, *, oriented: bool = False) -> EncodedImage:
     kind = kind_of(path)
     if kind == "encoded":
         return read_ldr(path, oriented=oriented)
-    return EncodedImage(raw_codes(path, oriented=oriented) if kind == "raw" else tone_mapped(path), None)
+    return read_raw(path, oriented=oriented) if kind == "raw" else EncodedImage(tone_mapped(path), None)

@@ -1,0 +1,188 @@
+"""Develop a DNG's samples by the file's own levels, opcode lists, crop and scale; LibRaw decodes and demosaics.
+
+A color filter's mosaic is brought to light in multiples of each channel's white level first, and goes to LibRaw's
+demosaicing as a plain file in memory, so that one range holds for all channels.
+"""
+
+import io
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from .dng import DngRaw
+from .dng_opcodes import apply_opcodes
+from .images import DAMAGED, turn_upright
+
+CLIPPED = 0.99
+"""Part of the clipping level from which a sample is clipped: a sensor reads it with noise, and demosaicing mixes it."""
+# A sensor that clips below its stated white level does so above this part of it, and at more than this many pixels.
+_LEAST_WHITE, _PILE = 0.75, 64
+
+
+@dataclass(frozen=True)
+class SensorLight:
+    """A developed RAW photo.
+
+    Attributes:
+        light: [H, W, 3] float32 in the sensor's colors, 1 at the white level; above 1 where a gain map says so.
+        clipped: [H, W, 3] bool, where the sensor clipped.
+    """
+
+    light: np.ndarray
+    clipped: np.ndarray
+
+
+def clipping_level(shares: np.ndarray) -> float:
+    """Return where samples of a channel clip, as a part of the white level that they are stated in.
+
+    The result is below 1 if pixels pile up at the largest value and no other value near it is nearly as frequent.
+    """
+    top = float(shares.max(initial=0))
+    at_top, below = (shares > 0.995 * top).sum(), (shares > 0.95 * top).sum()
+    return top if _LEAST_WHITE < top < 1 and at_top > max(_PILE, below / 4) else 1.0
+
+
+def develop_dng(path: Path, dng: DngRaw, raw: Any, *, oriented: bool) -> SensorLight:
+    """Return the light of a DNG that LibRaw has opened.
+
+    Args:
+        path: of the file, for errors.
+        dng: its tags.
+        raw: rawpy's open file.
+        oriented: turn the pixels as the file's orientation says.
+
+    Raises:
+        InputError: if the samples do not fit the tags, or an opcode list is damaged.
+    """
+    pattern = dng.pattern
+    samples = 3 if pattern is None else 1
+    stored = np.asarray(raw.raw_image)
+    stored = stored.reshape(*stored.shape[:2], -1)[:, :, :samples]
+    if stored.shape != (dng.size[1], dng.size[0], samples):
+        height, width = stored.shape[:2]
+        problem = f"its tags state {dng.size[0]} x {dng.size[1]} pixels, LibRaw decodes {width} x {height}"
+        raise InputError(path, problem, DAMAGED)
+    cell = 1 if pattern is None else len(pattern)
+    if dng.opcodes[0]:
+        stored = apply_opcodes(dng.opcodes[0], stored.astype(np.float32) / 65535, path, cell=cell) * 65535
+    top, left, bottom, right = dng.active
+    light = _normalized(stored[top:bottom, left:right], dng)
+    levels = np.ones(light.shape, np.float32)
+    for channel in range(3):
+        places = (..., channel) if pattern is None else (_places(light.shape, pattern, channel), 0)
+        levels[places] = clipping_level(light[places])
+    if dng.opcodes[1]:
+        light = apply_opcodes(dng.opcodes[1], light, path, cell=cell)
+        levels = apply_opcodes(dng.opcodes[1], levels, path, cell=cell)
+    if pattern is not None:
+        light, levels = (_demosaiced(each[..., 0], pattern) for each in (light, levels))
+    light, levels = (np.maximum(each, 0.0) for each in (light, levels))
+    if dng.opcodes[2]:
+        levels = apply_opcodes(dng.opcodes[2], levels, path)
+        light = apply_opcodes(dng.opcodes[2], light, path)
+    light, levels = (_cropped(each, dng) for each in (light, levels))
+    clipped = light >= CLIPPED * levels
+    if oriented:
+        light, clipped = (turn_upright(each, dng.orientation) for each in (light, clipped))
+    return SensorLight(light, clipped)
+
+
+def _places(shape: tuple[int, ...], pattern: np.ndarray, channel: int) -> np.ndarray:
+    """Return [H, W] bool, where the filter has a channel."""
+    height, width = shape[:2]
+    repeats = -(-height // len(pattern)), -(-width // len(pattern))
+    return np.tile(pattern == channel, repeats)[:height, :width]
+
+
+def _normalized(stored: np.ndarray, dng: DngRaw) -> np.ndarray:
+    """Return [H, W, samples] float32: 0 at the black level, 1 at the white level of the same pixel and channel."""
+    rows, columns, _ = dng.black.shape
+    light = np.empty(stored.shape, np.float32)
+    for row in range(rows):
+        for column in range(columns):
+            black = dng.black[row, column] + dng.black_rows[row::rows, None, None]
+            black = (black + dng.black_columns[column::columns][:, None]).astype(np.float32)
+            part = stored[row::rows, column::columns].astype(np.float32)
+            light[row::rows, column::columns] = (part - black) / (dng.white.astype(np.float32) - black)
+    return light
+
+
+def _demosaiced(mosaic: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+    """Return [H, W, 3] float32 in the sensor's colors from a mosaic [H, W], by LibRaw."""
+    import rawpy
+
+    channels = [mosaic[_places(mosaic.shape, pattern, channel)] for channel in range(3)]
+    if all(values.min() == values.max() for values in channels):
+        return np.broadcast_to(np.array([values[0] for values in channels], np.float32), (*mosaic.shape, 3))
+    headroom = max(1.0, float(mosaic.max()))
+    with rawpy.imread(io.BytesIO(_plain_dng(mosaic / headroom, pattern))) as raw:
+        options: dict[str, Any] = {"output_color": rawpy.ColorSpace.raw, "gamma": (1, 1), "output_bps": 16}
+        options |= {"no_auto_bright": True, "user_wb": [1, 1, 1, 1], "adjust_maximum_thr": 0.0, "user_flip": 0}
+        return raw.postprocess(**options).astype(np.float32) * np.float32(headroom / 65535)
+
+
+def _plain_dng(mosaic: np.ndarray, pattern: np.ndarray) -> bytes:
+    """Return a DNG of 16-bit samples with black level 0 and white level 65535."""
+    height, width = mosaic.shape
+    samples = np.rint(np.clip(mosaic, 0, 1) * 65535).astype("<u2")
+    size = len(pattern)
+    short, long, byte, text, rational, signed = 3, 4, 1, 2, 5, 10
+
+    def fractions(*values: int) -> bytes:
+        return b"".join(struct.pack("<ii", value, 1) for value in values)
+
+    tags: dict[int, tuple[int, int, bytes]] = {
+        254: (long, 1, struct.pack("<I", 0)),
+        256: (long, 1, struct.pack("<I", width)),
+        257: (long, 1, struct.pack("<I", height)),
+        258: (short, 1, struct.pack("<H", 16)),
+        259: (short, 1, struct.pack("<H", 1)),
+        262: (short, 1, struct.pack("<H", 32803)),
+        271: (text, 6, b"plain\0"),
+        272: (text, 6, b"plain\0"),
+        273: (long, 1, b"\0\0\0\0"),
+        277: (short, 1, struct.pack("<H", 1)),
+        278: (long, 1, struct.pack("<I", height)),
+        279: (long, 1, struct.pack("<I", samples.nbytes)),
+        33421: (short, 2, struct.pack("<HH", size, size)),
+        33422: (byte, size * size, bytes(int(channel) for channel in pattern.ravel())),
+        50706: (byte, 4, bytes([1, 4, 0, 0])),
+        50708: (text, 6, b"plain\0"),
+        50714: (long, 1, struct.pack("<I", 0)),
+        50717: (long, 1, struct.pack("<I", 65535)),
+        50721: (signed, 9, fractions(1, 0, 0, 0, 1, 0, 0, 0, 1)),
+        50728: (rational, 3, fractions(1, 1, 1)),
+        50778: (short, 1, struct.pack("<H", 21)),
+    }
+    start, blobs, entries = 8 + 2 + 12 * len(tags) + 4, b"", b""
+    room = sum(len(data) + len(data) % 2 for _, _, data in tags.values() if len(data) > 4)
+    for tag, (kind, count, data) in sorted(tags.items()):
+        if tag == 273:
+            data = struct.pack("<I", start + room)
+        elif len(data) > 4:
+            place, blobs = start + len(blobs), blobs + data + b"\0" * (len(data) % 2)
+            data = struct.pack("<I", place)
+        entries += struct.pack("<HHI", tag, kind, count) + data.ljust(4, b"\0")
+    head = b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + struct.pack("<I", 0)
+    return b"".join((head, blobs, samples.tobytes()))
+
+
+def _cropped(image: np.ndarray, dng: DngRaw) -> np.ndarray:
+    """Return the default crop of an image of the active area [H, W, 3], with square pixels."""
+    from scipy.ndimage import map_coordinates
+
+    (width, height), (left, top, *_) = dng.sizes[0], dng.crop
+    whole = dng.scale == (1.0, 1.0) and left == int(left) and top == int(top)
+    if whole:
+        return np.ascontiguousarray(image[int(top) : int(top) + height, int(left) : int(left) + width])
+    across = left + (np.arange(width) + 0.5) / dng.scale[0] - 0.5
+    down = top + (np.arange(height) + 0.5) / dng.scale[1] - 0.5
+    result = np.empty((height, width, image.shape[2]), np.float32)
+    places = np.stack(np.meshgrid(down, across, indexing="ij"))
+    for channel in range(image.shape[2]):
+        result[..., channel] = map_coordinates(image[..., channel], places, order=1, mode="nearest")
+    return result

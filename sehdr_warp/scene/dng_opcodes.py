@@ -1,0 +1,313 @@
+"""DNG's opcode lists (Adobe's DNG specification 1.7, chapter 7): shading maps, bad pixels, vignetting, lens distortion.
+
+Phones and drones leave lens shading to a GainMap; without it the corners of their photos are dark and tinted.
+"""
+
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from .images import DAMAGED
+
+_OPTIONAL = 1  # Flag: a reader that does not know the opcode may skip it
+_MOST_OPCODES = 4096
+_LARGEST_DEGREE = 8
+
+
+class _Reader:
+    """A big-endian cursor over the bytes of one opcode. Raises ValueError past their end."""
+
+    def __init__(self, data: bytes):
+        self.data, self.position = data, 0
+
+    def take(self, layout: str) -> tuple:
+        size = struct.calcsize(f">{layout}")
+        if self.position + size > len(self.data):
+            raise ValueError(f"ends early, at byte {len(self.data)}")
+        self.position += size
+        return struct.unpack_from(f">{layout}", self.data, self.position - size)
+
+    def array(self, kind: str, count: int) -> np.ndarray:
+        size = np.dtype(kind).itemsize * count
+        if self.position + size > len(self.data):
+            raise ValueError(f"ends early, at byte {len(self.data)}")
+        self.position += size
+        return np.frombuffer(self.data, f">{kind}", count, self.position - size).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class _Area:
+    """Rows, columns and planes of an image [H, W, planes] that an opcode changes."""
+
+    rows: slice
+    columns: slice
+    planes: range
+
+    @staticmethod
+    def of(reader: _Reader, shape: tuple[int, ...]) -> "_Area":
+        top, left, bottom, right, plane, planes, row_pitch, column_pitch = reader.take("8I")
+        if row_pitch < 1 or column_pitch < 1 or plane >= shape[2]:
+            raise ValueError(f"pitches {row_pitch}, {column_pitch}, first plane {plane} of {shape[2]}")
+        rows = slice(top, min(bottom, shape[0]), row_pitch)
+        columns = slice(left, min(right, shape[1]), column_pitch)
+        return _Area(rows, columns, range(plane, min(plane + planes, shape[2])))
+
+    def change(self, image: np.ndarray, function: Callable[[np.ndarray, int], np.ndarray]) -> None:
+        """Replace the area's values by function(values [h, w], place of the plane in the area)."""
+        for place, plane in enumerate(self.planes):
+            part = image[self.rows, self.columns, plane]
+            if part.size:
+                image[self.rows, self.columns, plane] = function(part, place)
+
+
+def apply_opcodes(data: bytes, image: np.ndarray, source: Path, *, cell: int = 1) -> np.ndarray:
+    """Apply an opcode list to an image.
+
+    Args:
+        data: the list as the file holds it; may be empty.
+        image: [H, W, planes] float32 in the units of the list: stored samples / 65535 for the first list, light in
+            multiples of the white level for the others. Changed in place.
+        source: the file, for errors.
+        cell: side of the color filter's pattern in pixels, 1 without one: pixels so far apart have one color.
+
+    Returns:
+        The image; a new array if an opcode moved pixels.
+
+    Raises:
+        InputError: if the list is damaged, or demands an opcode that is not known here.
+    """
+    for number, flags, body in _opcodes(data, source):
+        function = _FUNCTIONS.get(number)
+        try:
+            if function is not None:
+                image = function(_Reader(body), image, cell)
+            elif not flags & _OPTIONAL:
+                problem = f"demands opcode {number} of DNG, which is not supported"
+                raise InputError(source, problem, "develop the photos as JPEG, PNG or TIFF")
+        except (ValueError, struct.error, OverflowError, MemoryError) as error:
+            raise InputError(source, f"its DNG opcode {number} is damaged ({error!s:.80})", DAMAGED) from None
+    return image
+
+
+def moves_pixels(data: bytes, source: Path) -> bool:
+    """Return whether an opcode list corrects lens distortion."""
+    return any(number in (1, 2) for number, _, _ in _opcodes(data, source))
+
+
+def _opcodes(data: bytes, source: Path) -> Iterator[tuple[int, int, bytes]]:
+    """Yield number, flags and parameters of each opcode."""
+    if not data:
+        return
+    reader = _Reader(data)
+    try:
+        (count,) = reader.take("I")
+        if count > _MOST_OPCODES:
+            raise ValueError(f"{count} opcodes")
+        for _ in range(count):
+            number, _, flags, size = reader.take("4I")
+            yield number, flags, bytes(reader.take(f"{size}s")[0])
+    except (ValueError, struct.error, OverflowError, MemoryError) as error:
+        raise InputError(source, f"its list of DNG opcodes is damaged ({error!s:.80})", DAMAGED) from None
+
+
+def _gain_map(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
+    """Multiply by a grid of gains, interpolated bilinearly; places are relative to the image's size."""
+    from scipy.ndimage import map_coordinates
+
+    area = _Area.of(reader, image.shape)
+    points_v, points_h = reader.take("2I")
+    spacing_v, spacing_h, origin_v, origin_h = reader.take("4d")
+    (planes,) = reader.take("I")
+    if not (points_v and points_h and planes):
+        raise ValueError("no points")
+    gains = reader.array("f4", points_v * points_h * planes).reshape(points_v, points_h, planes)
+    if not np.isfinite(gains).all() or gains.min() < 0:
+        raise ValueError("gains below zero or not finite")
+
+    def places(pixels: slice, count: int, origin: float, spacing: float) -> np.ndarray:
+        relative = (np.arange(count)[pixels] + 0.5) / count - origin
+        return relative / spacing if spacing > 0 else np.zeros_like(relative)
+
+    down = places(area.rows, image.shape[0], origin_v, spacing_v)
+    right = places(area.columns, image.shape[1], origin_h, spacing_h)
+
+    def multiplied(part: np.ndarray, place: int) -> np.ndarray:
+        grid = gains[:, :, min(place, planes - 1)]
+        # Separable: columns of the grid first, so that a large photo needs no coordinates of its own.
+        rows = map_coordinates(
+            grid, np.stack(np.meshgrid(down, np.arange(points_h), indexing="ij")), order=1, mode="nearest"
+        )
+        columns = np.clip(right, 0, points_h - 1)
+        first = np.minimum(columns.astype(int), max(points_h - 2, 0))
+        share = (columns - first).astype(np.float32)
+        rows = rows.astype(np.float32)
+        after = rows[:, np.minimum(first + 1, points_h - 1)]
+        return part * (rows[:, first] * (1 - share) + after * share)
+
+    area.change(image, multiplied)
+    return image
+
+
+def _fix_bad_pixels_constant(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
+    constant, _ = reader.take("2I")
+    return _filled(image, np.rint(image * 65535) == constant, cell)
+
+
+def _fix_bad_pixels_list(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
+    _, points, rectangles = reader.take("3I")
+    bad = np.zeros(image.shape, bool)
+    places = reader.array("u4", 2 * points).astype(int).reshape(-1, 2)
+    places = places[(places < image.shape[:2]).all(axis=1)]
+    bad[places[:, 0], places[:, 1]] = True
+    for top, left, bottom, right in reader.array("u4", 4 * rectangles).astype(int).reshape(-1, 4):
+        bad[top:bottom, left:right] = True
+    return _filled(image, bad, cell)
+
+
+def _filled(image: np.ndarray, bad: np.ndarray, cell: int) -> np.ndarray:
+    """Replace bad pixels by the mean of the good ones of the same color around them."""
+    rows, columns, planes = np.nonzero(bad)
+    total, count = np.zeros(len(rows)), np.zeros(len(rows))
+    for down in (-cell, 0, cell):
+        for right in (-cell, 0, cell):
+            y, x = rows + down, columns + right
+            inside = (y >= 0) & (y < image.shape[0]) & (x >= 0) & (x < image.shape[1])
+            y, x = np.where(inside, y, rows), np.where(inside, x, columns)
+            good = inside & ~bad[y, x, planes]
+            total += np.where(good, image[y, x, planes], 0)
+            count += good
+    image[rows, columns, planes] = np.where(count > 0, total / np.maximum(count, 1), image[rows, columns, planes])
+    return image
+
+
+def _map_table(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
+    area = _Area.of(reader, image.shape)
+    (count,) = reader.take("I")
+    table = (reader.array("u2", count) / 65535).astype(np.float32)
+    if not count:
+        raise ValueError("no table")
+    area.change(image, lambda part, _: table[np.clip(np.rint(part * 65535), 0, count - 1).astype(int)])
+    return image
+
+
+def _map_polynomial(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
+    area = _Area.of(reader, image.shape)
+    (degree,) = reader.take("I")
+    if degree > _LARGEST_DEGREE:
+        raise ValueError(f"degree {degree}")
+    terms = reader.array("f8", degree + 1)
+    area.change(image, lambda part, _: np.polynomial.polynomial.polyval(part, terms).astype(np.float32))
+    return image
+
+
+def _along(axis: int, combine: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Callable:
+    """Return the function of DeltaPerRow and its kin: combine each row (axis 0) or column (axis 1) with a number."""
+
+    def apply(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
+        area = _Area.of(reader, image.shape)
+        (count,) = reader.take("I")
+        values = reader.array("f4", count).astype(np.float32)
+        shape = image[area.rows, area.columns].shape
+        if area.planes and count != shape[axis]:
+            raise ValueError(f"{count} numbers for {shape[axis]} {('rows', 'columns')[axis]}")
+        values = values[:, None] if axis == 0 else values[None]
+        area.change(image, lambda part, _: combine(part, values))
+        return image
+
+    return apply
+
+
+@dataclass(frozen=True)
+class _Polar:
+    """Places of an image relative to an optical center, in units of the distance to the farthest corner."""
+
+    right: np.ndarray
+    down: np.ndarray
+    center: tuple[float, float]
+    unit: float
+
+    @staticmethod
+    def of(center_x: float, center_y: float, shape: tuple[int, ...]) -> "_Polar":
+        height, width = shape[:2]
+        x, y = center_x * (width - 1), center_y * (height - 1)
+        unit = max(float(np.hypot(max(x, width - 1 - x), max(y, height - 1 - y))), 1e-6)
+        if not np.isfinite(unit):
+            raise ValueError("center is not finite")
+        right = ((np.arange(width) - x) / unit).astype(np.float32)[None]
+        return _Polar(right, ((np.arange(height) - y) / unit).astype(np.float32)[:, None], (x, y), unit)
+
+    @property
+    def squared(self) -> np.ndarray:
+        """[H, W] squares of the distances from the center."""
+        return self.right**2 + self.down**2
+
+
+def _fix_vignette_radial(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
+    terms = reader.array("f8", 5)
+    squared = _Polar.of(*reader.take("2d"), image.shape).squared
+    image *= np.polynomial.polynomial.polyval(squared, [1.0, *terms]).astype(np.float32)[..., None]
+    return image
+
+
+def _warp_rectilinear(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
+    (planes,) = reader.take("I")
+    terms = reader.array("f8", 6 * planes).reshape(-1, 6)
+    polar = _Polar.of(*reader.take("2d"), image.shape)
+
+    def moved(k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        squared, right, down = polar.squared, polar.right, polar.down
+        factor = np.polynomial.polynomial.polyval(squared, k[:4])
+        x = factor * right + k[4] * 2 * right * down + k[5] * (squared + 2 * right**2)
+        y = factor * down + k[5] * 2 * right * down + k[4] * (squared + 2 * down**2)
+        return x, y
+
+    return _warped(image, polar, terms, moved)
+
+
+def _warp_fisheye(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
+    (planes,) = reader.take("I")
+    terms = reader.array("f8", 4 * planes).reshape(-1, 4)
+    polar = _Polar.of(*reader.take("2d"), image.shape)
+
+    def moved(k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        radius = np.sqrt(polar.squared)
+        angle = np.arctan(radius)
+        factor = angle * np.polynomial.polynomial.polyval(angle**2, k) / np.maximum(radius, 1e-9)
+        return factor * polar.right, factor * polar.down
+
+    return _warped(image, polar, terms, moved)
+
+
+def _warped(image: np.ndarray, polar: _Polar, terms: np.ndarray, moved: Callable) -> np.ndarray:
+    """Return each plane [H, W] resampled at moved(terms of the plane), relative to the center."""
+    from scipy.ndimage import map_coordinates
+
+    if not len(terms) or not np.isfinite(terms).all():
+        raise ValueError("no finite terms")
+    result = np.empty_like(image)
+    for plane in range(image.shape[2]):
+        if plane < len(terms):
+            x, y = moved(terms[plane])
+            places = np.stack([y * polar.unit + polar.center[1], x * polar.unit + polar.center[0]])
+        map_coordinates(image[..., plane], places, order=1, mode="nearest", output=result[..., plane])
+    return result
+
+
+_FUNCTIONS: dict[int, Callable[[_Reader, np.ndarray, int], np.ndarray]] = {
+    1: _warp_rectilinear,
+    2: _warp_fisheye,
+    3: _fix_vignette_radial,
+    4: _fix_bad_pixels_constant,
+    5: _fix_bad_pixels_list,
+    7: _map_table,
+    8: _map_polynomial,
+    9: _gain_map,
+    10: _along(0, np.add),
+    11: _along(1, np.add),
+    12: _along(0, np.multiply),
+    13: _along(1, np.multiply),
+}
