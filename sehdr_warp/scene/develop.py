@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from ..response import Response
 
 _log = logging.getLogger("sehdr_warp.scene")
+_LEAST_CLIPPED = 0.05  # Part of a pixel's area that may be clipped for its light above white to be known
 _PIXELS_AT_ONCE = 64_000_000  # Of the photos that are read side by side
 
 
@@ -129,7 +130,7 @@ class _Developer:
             mask = None if stored is None else warped(stored)
             return View(name, codes_of(reinhard_gamma(hdr * shot.seconds), 8), *stated, mask, hdr, shot.image)
         encoded = as_photographed(shot, oriented=oriented)
-        codes, alpha = encoded.pixels, encoded.alpha
+        codes, alpha, above = encoded.pixels, encoded.alpha, encoded.above_white
         masks = [] if undistortion is None or undistortion.inside is None else [_shrunk(undistortion.inside, camera)]
         if stored is not None:
             masks.append(warped(stored))
@@ -137,12 +138,15 @@ class _Developer:
             masks.append(warped(alpha))
             alpha = None
         if undistortion or alpha is not None or (camera.width, camera.height) != (lens.width, lens.height):
-            codes = self._averaged(codes, alpha, warped)
+            codes, above = self._averaged(codes, alpha, above, warped)
         mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32) if masks else None
         mask = None if mask is None or mask.min() >= 1 - 1e-6 else mask
-        return View(name, codes, *stated, mask, hdr, shot.image)
+        return View(name, codes, *stated, mask, hdr, shot.image, above, encoded.above_white_deviation)
 
-    def _averaged(self, codes: np.ndarray, alpha: np.ndarray | None, warped: Callable) -> np.ndarray:
+    def _averaged(
+        self, codes: np.ndarray, alpha: np.ndarray | None, above: np.ndarray | None, warped: Callable
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Return the codes of the mean light, and the light above white that is left of `above` in it."""
         levels = int(np.iinfo(codes.dtype).max)
         with self._alone:
             if levels not in self._tables:
@@ -152,12 +156,25 @@ class _Developer:
         def seen(values: np.ndarray, rows: slice) -> np.ndarray:
             return values if alpha is None else values * alpha[rows, :, None]
 
-        light = warped(codes, lambda rows: seen(self._tables[levels][codes[rows]], rows))
-        clipped = warped(codes, lambda rows: seen((codes[rows] == levels).astype(np.float32), rows))
-        # A mean over clipped samples is a lower bound: with half of the area clipped, white is the honest value.
+        def light_of(rows: slice) -> np.ndarray:
+            light = self._tables[levels][codes[rows]]
+            return light if above is None else np.where(above[rows] > 0, above[rows] * white, light)
+
+        def clipped_in(rows: slice) -> np.ndarray:
+            clipped = codes[rows] == levels
+            return (clipped if above is None else clipped & (above[rows] == 0)).astype(np.float32)
+
+        white = self._tables[levels][levels]
+        light = warped(codes, lambda rows: seen(light_of(rows), rows))
+        clipped = warped(codes, lambda rows: seen(clipped_in(rows), rows))
         with self._alone:
             encoded = self.response.encode(light)
-        return codes_of(np.where(clipped >= 0.5, np.float32(1.0), encoded), 16)
+        # A mean over clipped samples is a lower bound: with half of the area clipped, white is the honest value.
+        averaged = codes_of(np.where(clipped >= 0.5, np.float32(1.0), encoded), 16)
+        if above is not None:
+            known = (averaged == 65535) & (clipped < _LEAST_CLIPPED)
+            above = np.where(known, np.maximum(light / white, 1), 0).astype(np.float16) if known.any() else None
+        return averaged, above
 
 
 def _shrunk(image: np.ndarray, to: Lens | Camera, values: Callable[[slice], np.ndarray] | None = None) -> np.ndarray:

@@ -98,8 +98,8 @@ def read_raw(path: Path, *, oriented: bool) -> EncodedImage:
             return EncodedImage(linear_codes(linear), None)
         sensor = develop_dng(path, dng, raw, oriented=oriented)
     codes = linear_codes(np.where(sensor.clipped, 1, sensor.light))
-    known = (sensor.light > 1) & ~sensor.clipped
-    above = np.where(known, sensor.light, 0).astype(np.float16) if known.any() else None
+    known = (codes == 65535) & ~sensor.clipped
+    above = np.where(known, np.maximum(sensor.light, 1), 0).astype(np.float16) if known.any() else None
     return EncodedImage(codes, None, above, _NOISE)
 
 

@@ -1,5 +1,6 @@
 """DNG files as phones, drones and converters write them: each from light that the test knows."""
 
+import json
 import struct
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
+from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.linear_photos import color_matrix, raw_codes, raw_sizes, read_raw
 
 from .dng_files import area, gain_map, longs, mosaic, opcodes, rationals, shorts, write_tagged_dng
@@ -210,3 +212,19 @@ def test_what_cannot_be_read_is_named(tmp_path):
     refused("one channel", values=np.zeros((HEIGHT, WIDTH), np.uint16), tags={262: shorts(34892)})
     write_tagged_dng(file, stored(mosaic(EVEN)), LEVELS | {51009: opcodes((99, b""), optional=True)})
     np.testing.assert_allclose(light_of(file), EVEN, rtol=2e-3)
+
+
+def test_light_above_white_stays_with_a_view_that_is_averaged(tmp_path):
+    _, gains = shading()
+    maps = [gain_map(gains, (HEIGHT, WIDTH), top, left) for top in (0, 1) for left in (0, 1)]
+    for i in range(3):
+        light = np.full((HEIGHT, WIDTH, 3), 0.5) + 0.1 * X[..., None] / WIDTH
+        write_tagged_dng(tmp_path / f"{i}.dng", stored(mosaic(light)), LEVELS | {51009: opcodes(*maps)})
+    frames = [{"file_path": f"{i}.dng", "transform_matrix": np.eye(4).tolist()} for i in range(3)]
+    (tmp_path / "transforms.json").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "fl_x": 100, "frames": frames}))
+    view = load_scene(tmp_path, max_size=WIDTH // 4).views[0]
+    expected = 0.6 * gains[0, 0]
+    assert view.light_above_white[0, -1] == pytest.approx(expected, rel=0.1)
+    white = view.codes == 65535
+    assert white.any() and not white.all()
+    assert ((view.light_above_white >= 1) == white).all()
