@@ -47,7 +47,7 @@ def photographed(photos: str, folder: str, view: str) -> None:
     if not Path(folder).exists():
         sw.train(sw.load_scene(photos, max_size=360), folder)
     run = sw.load_run(folder)
-    scene = run.even(sw.load_scene(photos, max_size=360, response=run.response))
+    scene = run.normalize_photos(sw.load_scene(photos, max_size=360, response=run.response))
     shown = next(each for each in scene.views if each.name == view)
     others = (each.camera for each in scene.views if each is not shown)
     near = min(others, key=lambda camera: float(np.linalg.norm(camera.position - shown.camera.position)))

@@ -91,14 +91,14 @@ def run_evaluate(asked: Evaluate) -> None:
 
 def run_score(asked: Score) -> None:
     from ..scene import load_scene
-    from ..scene.load import read_capture
+    from ..scene.load import parse_dataset
     from .score import score_folder
 
     def figures():
         response = asked.response or enclosing_run_response(asked.folder)
         if response is None:
-            capture = read_capture(asked.truth)
-            bent = capture.alpha == "background" or not all(shot.lens.is_pinhole for shot in capture.shots)
+            dataset = parse_dataset(asked.truth)
+            bent = dataset.alpha == "background" or not all(record.lens.is_pinhole for record in dataset.records)
             # Photos that keep their codes are clipped and dark where they are by any response.
             response = "auto" if bent or asked.max_size is not None else "srgb"
         truth = load_scene(asked.truth, response=response, max_size=asked.max_size)

@@ -69,7 +69,7 @@ def evaluate(run: Any, scene: Scene, *, lpips_weights: Path | str | None = None)
         SehdrError: for a scene without views, images that disagree with their camera or a render that is not finite.
         InputError: for LPIPS weights that cannot be read.
     """
-    return Evaluation(RunPictures(run), run.even(scene), run.device, lpips_weights).result()
+    return Evaluation(RunPictures(run), run.normalize_photos(scene), run.device, lpips_weights).result()
 
 
 class Evaluation:

@@ -61,7 +61,7 @@ def write_report(
     paths = [Path(out, name) for name in names]
     for path in paths:
         check_absent(path, overwrite)
-    scene = run.even(scene)
+    scene = run.normalize_photos(scene)
     given, held_out = scene.test_views or scene.train_views, bool(scene.test_views)
     if not given:
         raise SehdrError("the scene has no views to report on; check its splits")

@@ -18,7 +18,7 @@ from ..model.radiance_field import RadianceField, RenderedView, Surroundings
 from ..model.sensor_colors import rec709_of
 from ..response import Response
 from ..scene import Camera, Scene, load_cameras
-from ..scene.photo_gains import PhotoGains
+from ..scene.exposure_compensation import ExposureCompensation
 from ..splats import read_gaussians
 from .checkpoint import Checkpoint, under
 from .config import Config
@@ -38,15 +38,15 @@ class _Rendered:
     degree: int
     base_time: float
     color_matrix: np.ndarray | None = None
-    photo_gains: PhotoGains | None = None
+    photo_gains: ExposureCompensation | None = None
 
     @property
     def device(self) -> torch.device:
         return self.model.gaussians.means.device
 
-    def even(self, scene: Scene) -> Scene:
+    def normalize_photos(self, scene: Scene) -> Scene:
         """The scene as it was trained on: without what the camera changed between its photos, if that was found."""
-        return scene if self.photo_gains is None else self.photo_gains.even(scene, self.model.response)
+        return scene if self.photo_gains is None else self.photo_gains.normalize_photos(scene, self.model.response)
 
     @property
     def gaussian_count(self) -> int:
@@ -187,7 +187,8 @@ class Run(_Rendered):
         """What the training photos of a scene say of the Gaussians; the model has their confidence from then on. Their
         HDR truth counts only if it was trained on."""
         truth = self.config.loss.uses_hdr
-        evidence = gather_evidence(self.model, self.even(scene).train_views, degree=self.degree, truth=truth)
+        views = self.normalize_photos(scene).train_views
+        evidence = gather_evidence(self.model, views, degree=self.degree, truth=truth)
         self.model.confidence = evidence.confidence()
         return evidence
 
@@ -218,9 +219,9 @@ def as_rec709(rendered: RenderedView, matrix: np.ndarray | None, base_time: floa
     return rendered if matrix is None else replace(rendered, hdr=rec709_of(rendered.hdr, matrix, base_time))
 
 
-def photo_gains(info: dict) -> PhotoGains | None:
+def photo_gains(info: dict) -> ExposureCompensation | None:
     """What run.json says of the photos' gains."""
-    return PhotoGains(**found) if (found := info.get("photo_gains")) else None
+    return ExposureCompensation.from_dict(stored) if (stored := info.get("photo_gains")) else None
 
 
 def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) -> RadianceField:

@@ -21,7 +21,7 @@ import os
 import re
 import shutil
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -33,8 +33,8 @@ from ..model.confidence import Evidence
 from ..model.radiance_field import RadianceField
 from ..response import Response
 from ..scene import Camera, Scene
+from ..scene.exposure_compensation import ExposureCompensation
 from ..scene.images import MAX_PIXELS
-from ..scene.photo_gains import PhotoGains
 from .checkpoint import (
     FORMAT,
     REMEDY,
@@ -149,7 +149,7 @@ class RunFolder:
         plan: dict | None,
         state: tuple[dict[str, Tensor], dict],
         *,
-        gains: PhotoGains | None = None,
+        gains: ExposureCompensation | None = None,
         overwrite: bool = False,
     ) -> None:
         """Makes the folder, locked, with all that does not change and a checkpoint of the start. All of it is there
@@ -163,7 +163,7 @@ class RunFolder:
         if scene.color_matrix is not None:
             info["color_matrix"] = scene.color_matrix.tolist()
         if gains is not None:
-            info["photo_gains"] = asdict(gains)
+            info["photo_gains"] = gains.to_dict()
         with atomic_folder(self.path / _NEW, ours=True) as beside:
             new = RunFolder(beside)
             if plan is not None:

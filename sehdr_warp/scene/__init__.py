@@ -1,9 +1,9 @@
-"""What was photographed: cameras, views, scenes, and the readers that load them. Imports neither torch nor warp."""
+"""Cameras, views, scenes, and the readers that load them from photos. Imports neither torch nor warp."""
 
 from .camera import Camera, look_at
 from .camera_files import load_cameras
-from .develop import develop
-from .load import choose_response, embedded_folder, embedded_scenes, is_embedded, load_scene, read_capture
+from .load import choose_response, embedded_folder, embedded_scenes, is_embedded, load_scene, parse_dataset
+from .preprocess import preprocess
 from .types import Scene, View, codes_of, encoded_values
 
 __all__ = [
@@ -12,7 +12,6 @@ __all__ = [
     "View",
     "choose_response",
     "codes_of",
-    "develop",
     "embedded_folder",
     "embedded_scenes",
     "encoded_values",
@@ -20,5 +19,6 @@ __all__ = [
     "load_cameras",
     "load_scene",
     "look_at",
-    "read_capture",
+    "parse_dataset",
+    "preprocess",
 ]

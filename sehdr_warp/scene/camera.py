@@ -7,13 +7,16 @@ import numpy as np
 
 
 def limited_size(width: int, height: int, max_size: int | None) -> tuple[int, int]:
-    """The size with the longest side at most max_size pixels and the same aspect, rounded; never larger."""
+    """Return the size scaled down, with the same aspect, to at most max_size pixels on its longest side."""
     scale = 1.0 if max_size is None else min(1.0, max_size / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def look_at(position, target=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0)) -> np.ndarray:
-    """[4, 4] world_to_camera of a camera at `position` that looks at `target`, upright where `up` is not along that."""
+    """Return the world_to_camera matrix [4, 4] of a camera at `position` that looks at `target`.
+
+    Its image is upright with respect to `up`, which must not be parallel to the direction of view.
+    """
     position = np.asarray(position, float)
     forward = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
     right = np.cross(forward, up)
@@ -33,11 +36,11 @@ class Camera:
 
     Attributes:
         width: of the image in pixels, at least 1.
-        height: likewise.
-        fx: focal length in pixels, positive.
-        fy: likewise.
-        cx: principal point in pixels.
-        cy: likewise.
+        height: of the image in pixels, at least 1.
+        fx: horizontal focal length in pixels, positive.
+        fy: vertical focal length in pixels, positive.
+        cx: column of the principal point in pixels.
+        cy: row of the principal point in pixels.
         world_to_camera: [4, 4] float64, rigid.
 
     Raises:
@@ -53,6 +56,7 @@ class Camera:
     world_to_camera: np.ndarray
 
     def __post_init__(self):
+        """Check the values and copy the pose."""
         pose = np.array(self.world_to_camera, dtype=np.float64)
         pose.setflags(write=False)
         object.__setattr__(self, "world_to_camera", pose)
@@ -72,7 +76,7 @@ class Camera:
 
     @property
     def camera_to_world(self) -> np.ndarray:
-        """[4, 4] float64, the inverse of world_to_camera."""
+        """The inverse [4, 4] of world_to_camera, float64."""
         inverse = np.eye(4)
         inverse[:3, :3] = self.world_to_camera[:3, :3].T
         inverse[:3, 3] = self.position
@@ -80,31 +84,36 @@ class Camera:
 
     @property
     def position(self) -> np.ndarray:
-        """[3] float64, the camera's centre in world coordinates."""
+        """The camera's centre [3] in world coordinates, float64."""
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
 
     @property
     def intrinsics(self) -> np.ndarray:
-        """[4] float64: fx, fy, cx, cy in pixels."""
+        """fx, fy, cx, cy in pixels, float64 [4]."""
         return np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float64)
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The same view at another size; the principal point and the focal lengths scale with each axis."""
+        """Return the same view at another size; principal point and focal lengths scale with each axis."""
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.world_to_camera)
 
     def within(self, max_size: int | None) -> "Camera":
-        """The same view, at most so many pixels on its longest side."""
+        """Return the same view with at most max_size pixels on its longest side."""
         return self.resized(*limited_size(self.width, self.height, max_size))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON; from_dict reads them back exactly."""
+        """Return plain values for JSON, which from_dict reads back exactly."""
         names = ("width", "height", "fx", "fy", "cx", "cy")
         return {name: getattr(self, name) for name in names} | {"world_to_camera": self.world_to_camera.tolist()}
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "Camera":
-        """The camera that to_dict described; raises KeyError for a missing field, ValueError for a bad value."""
+        """Return the camera that to_dict described.
+
+        Raises:
+            KeyError: if a field is missing.
+            ValueError: if a value is not possible.
+        """
         width, height = (int(values[name]) for name in ("width", "height"))
         fx, fy, cx, cy = (float(values[name]) for name in ("fx", "fy", "cx", "cy"))
         return Camera(width, height, fx, fy, cx, cy, np.array(values["world_to_camera"], dtype=np.float64))

@@ -1,4 +1,4 @@
-"""Cameras of one's own: JSON of this package, nerfstudio and 3DGS, transforms.json, COLMAP models, OpenUSD cameras."""
+"""Readers of camera files: JSON of this package, nerfstudio and 3DGS, transforms.json, COLMAP models, OpenUSD."""
 
 import json
 import logging
@@ -13,8 +13,8 @@ from ..errors import InputError
 from ..files import read_json, read_text
 from ..splats.usd import open_stage, pxr
 from .camera import Camera
-from .capture import pose_from_camera_to_world
 from .colmap_model import find_model, read_model
+from .dataparser import pose_from_camera_to_world
 from .images import MAX_PIXELS
 from .names import natural_key
 from .read_transforms import frame_lens, frame_pose, frames_of, pose_from_opengl
@@ -22,22 +22,22 @@ from .read_transforms import frame_lens, frame_pose, frames_of, pose_from_opengl
 log = logging.getLogger(__name__)
 USD_SUFFIXES = (".usda", ".usdc", ".usd", ".usdz")
 USD_SIZE = ("sehdr:width", "sehdr:height")
-"""Attributes of a UsdGeomCamera that state its picture's size in pixels, which USD itself does not."""
+"""Attributes of a UsdGeomCamera for its picture's size in pixels, for which USD has none."""
 _USD_WIDTH = 1920
 _DATAPARSER = "dataparser_transforms.json"
 
 
 def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
-    """Named cameras from a file, in its order, without distortion.
+    """Read named cameras from a file, in its order, without distortion.
 
     Args:
         path: {"cameras": [{"name": ..., **Camera.to_dict()}, ...]}, nerfstudio's camera_path.json, transforms.json, the
             cameras.json of 3DGS's reference release, a COLMAP model's folder, or an OpenUSD stage, whose moving cameras
-            are one for each frame. nerfstudio's paths lie in the space of its dataparser: a dataparser_transforms.json
-            beside the file, which it writes with a training, leads back to the photos' own.
+            give one camera for each frame. nerfstudio's paths are in the coordinates of its dataparser; a
+            dataparser_transforms.json beside the file, which it writes with a training, converts them to the set's own.
 
     Raises:
-        InputError: where the file is damaged, a pose or size cannot be, or two cameras share a name.
+        InputError: if the file is damaged, a pose or size is not possible, or two cameras share a name.
     """
     path = Path(path)
     if path.is_dir():
@@ -79,7 +79,7 @@ def _of_json(path: Path) -> list[tuple[str, Camera]]:
 
 
 def _listed(path: Path, entries: list, read) -> list[tuple[str, Camera]]:
-    """read(entry, index) of each, with an error that names the camera."""
+    """Call read(entry, index) for each entry, with errors that name the camera."""
     cameras = []
     for i, entry in enumerate(entries):
         try:
@@ -99,7 +99,7 @@ def _list(path: Path) -> list[Any]:
 
 
 def _inria(entry: dict, path: Path) -> Camera:
-    """position and rotation (its rows) of camera to world in OpenCV axes, fx and fy in pixels, axis in the middle."""
+    """Read position and rotation (rows) of camera to world in OpenCV axes, fx and fy in pixels; centred axis."""
     width, height = int(entry["width"]), int(entry["height"])
     matrix = np.c_[np.array(entry["rotation"], np.float64).reshape(3, 3), np.array(entry["position"], np.float64)]
     pose = pose_from_camera_to_world(matrix, path, str(entry["img_name"]))
@@ -107,7 +107,7 @@ def _inria(entry: dict, path: Path) -> Camera:
 
 
 def _nerfstudio(entry, index: int, values: dict, path: Path, back: np.ndarray | None) -> Camera:
-    """An entry of camera_path.json: camera_to_world (OpenGL axes, 16 numbers by rows) and fov (vertical, degrees)."""
+    """Read an entry of camera_path.json: camera_to_world (OpenGL axes, 16 numbers by rows), fov (vertical, degrees)."""
     width, height, fov = int(values["render_width"]), int(values["render_height"]), float(entry["fov"])
     matrix = np.array(entry["camera_to_world"], dtype=np.float64).reshape(4, 4)
     if not 1e-6 <= fov < 180:
@@ -121,7 +121,7 @@ def _nerfstudio(entry, index: int, values: dict, path: Path, back: np.ndarray | 
 
 
 def _dataparser(path: Path) -> np.ndarray | None:
-    """[4, 4] from nerfstudio's space to the photos', by the file beside a camera path; None without one."""
+    """Return the matrix [4, 4] from nerfstudio's coordinates to the set's, None without its file beside the path."""
     beside = path.with_name(_DATAPARSER)
     if not beside.is_file():
         log.warning("%s: no %s beside it; its cameras are taken as they stand", path, _DATAPARSER)
@@ -144,7 +144,7 @@ def _of_colmap(folder: Path) -> list[tuple[str, Camera]]:
 
 
 def _of_usd(path: Path) -> list[tuple[str, Camera]]:
-    """Every UsdGeomCamera, at each frame of the stage where it moves; of 1920 pixels' width where it states no size."""
+    """Read every UsdGeomCamera, at each frame of the stage if it moves; 1920 pixels wide if it states no size."""
     pxr("Usd")
     stored = read_apart(usd_camera_arrays, path, "USD", "export it again")
     read = lambda entry, _: (str(entry[0]), _usd_camera(entry[1], entry[2], path, str(entry[0])))  # noqa: E731
@@ -152,8 +152,12 @@ def _of_usd(path: Path) -> list[tuple[str, Camera]]:
 
 
 def usd_camera_arrays(path: Path) -> dict[str, Any]:
-    """names [n]; lenses [n, 7]: width and height in pixels (0: not stated), focal length, both apertures and both of
-    their offsets in one unit; matrices [n, 4, 4], which act on row vectors."""
+    """Read the cameras of a stage as arrays.
+
+    Returns:
+        names [n]; lenses [n, 7] of width and height in pixels (0 if not stated), focal length, horizontal and vertical
+        aperture and their offsets in one unit; matrices [n, 4, 4], which act on row vectors.
+    """
     Usd, UsdGeom = pxr("Usd"), pxr("UsdGeom")
     stage = open_stage(path)
     names, lenses, matrices = [], [], []
@@ -166,24 +170,24 @@ def usd_camera_arrays(path: Path) -> dict[str, Any]:
             frames = map(Usd.TimeCode, range(first, last + 1))
         size = [(prim.GetAttribute(name).Get() if prim.HasAttribute(name) else 0) or 0 for name in USD_SIZE]
         for frame in frames:
-            seen = camera.GetCamera(frame)
+            state = camera.GetCamera(frame)
             names.append(f"{prim.GetName()}_{int(frame.GetValue()):04d}" if moving else prim.GetName())
-            offsets = seen.horizontalApertureOffset, seen.verticalApertureOffset
-            lenses.append([*size, seen.focalLength, seen.horizontalAperture, seen.verticalAperture, *offsets])
-            matrices.append(np.array(seen.transform, np.float64))
+            offsets = state.horizontalApertureOffset, state.verticalApertureOffset
+            lenses.append([*size, state.focalLength, state.horizontalAperture, state.verticalAperture, *offsets])
+            matrices.append(np.array(state.transform, np.float64))
     shapes = ("names", names, str, (-1,)), ("lenses", lenses, float, (-1, 7)), ("matrices", matrices, float, (-1, 4, 4))
     return {name: np.array(values, kind).reshape(shape) for name, values, kind, shape in shapes}
 
 
 def _usd_camera(lens: np.ndarray, matrix: np.ndarray, path: Path, name: str) -> Camera:
-    """USD's axes are OpenGL's."""
-    stated, (focal, aperture, vertical, right, up) = lens[:2], lens[2:].tolist()
-    width = int(stated[0] or _USD_WIDTH)
-    height = int(stated[1] or round(width * vertical / aperture))
+    """Return the camera of a row of usd_camera_arrays; USD's axes are OpenGL's."""
+    size, (focal, aperture, vertical, right, up) = lens[:2], lens[2:].tolist()
+    width = int(size[0] or _USD_WIDTH)
+    height = int(size[1] or round(width * vertical / aperture))
     fx, fy = focal / aperture * width, focal / vertical * height
     matrix = matrix.T.copy()
-    size = np.linalg.norm(matrix[:3, :3], axis=0)
-    matrix[:3, :3] /= np.where(size > 0, size, 1)
+    scale = np.linalg.norm(matrix[:3, :3], axis=0)
+    matrix[:3, :3] /= np.where(scale > 0, scale, 1)
     pose = pose_from_opengl(matrix, path, name)
     return Camera(
         width, height, fx, fy, width / 2 - right / aperture * width, height / 2 + up / vertical * height, pose

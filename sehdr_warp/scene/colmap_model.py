@@ -1,4 +1,4 @@
-"""COLMAP's sparse models, binary and text (https://colmap.github.io/format.html), read as files that may be hostile."""
+"""Reader of COLMAP's sparse models, binary and text (https://colmap.github.io/format.html), safe for hostile files."""
 
 import struct
 from collections.abc import Callable, Iterator
@@ -9,17 +9,23 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import read_bytes, read_lines
-from .capture import NO_POINTS, Cloud, pose_from_quaternion
+from .dataparser import NO_POINTS, PointCloud, pose_from_quaternion
 from .lens import CAMERA_MODELS, Lens
 
-# Not through pycolmap, which hangs on a count that is damaged and takes a truncated file for a whole one.
+# pycolmap is not used here: it hangs on a damaged count and accepts a truncated file as a whole one.
 MAX_NAME_BYTES = 4096
 _REMEDY = "export the model again with COLMAP"
 
 
 @dataclass(frozen=True)
 class ModelImage:
-    """name: as stored, not yet trusted as a path; world_to_camera: [4, 4]."""
+    """A registered image.
+
+    Attributes:
+        name: as stored, not yet trusted as a path.
+        lens: intrinsics.
+        world_to_camera: [4, 4].
+    """
 
     name: str
     lens: Lens
@@ -28,24 +34,33 @@ class ModelImage:
 
 @dataclass(frozen=True)
 class SparseModel:
-    """images: in the file's order; cloud: the points seen in them."""
+    """A reconstruction.
+
+    Attributes:
+        images: in the file's order.
+        cloud: its points.
+    """
 
     images: tuple[ModelImage, ...]
-    cloud: Cloud
+    cloud: PointCloud
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder that holds cameras, or None: sparse/0, sparse, or a text export beside them (sparse/txt, sparse_txt,
-    sparse_txt/0), of the folder itself, else of its colmap/ or dense/."""
+    """Return the folder that holds a model's cameras, or None.
+
+    Looks for sparse/0, sparse, or a text export (sparse/txt, sparse_txt, sparse_txt/0) in the folder itself, then in
+    its colmap/ and dense/.
+    """
     names = ("sparse/0", "sparse", "sparse/txt", "sparse_txt", "sparse_txt/0")
     places = (folder / above / name for above in (".", "colmap", "dense") for name in names)
     return next((p for p in places if any((p / f"cameras{end}").is_file() for end in (".bin", ".txt"))), None)
 
 
 def read_model(folder: Path) -> SparseModel:
-    """Cameras, images and (where present) points3D of a folder, binary files before text files.
+    """Read cameras, images and (if present) points3D of a folder, binary files before text files.
 
-    Raises InputError where a file is missing, empty, damaged or truncated, or holds values that cannot be.
+    Raises:
+        InputError: if a file is missing, empty, damaged or truncated, or holds impossible values.
     """
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
     camera_path, image_path = (folder / f"{name}{'.bin' if binary else '.txt'}" for name in ("cameras", "images"))
@@ -68,8 +83,8 @@ def read_model(folder: Path) -> SparseModel:
     return SparseModel(tuple(images.values()), read_points(folder))
 
 
-def read_points(folder: Path) -> Cloud:
-    """The points of points3D.bin, .txt or .ply; else none."""
+def read_points(folder: Path) -> PointCloud:
+    """Read the points of points3D.bin, .txt or .ply; none if there is no such file."""
     readers = {".bin": _points_binary, ".txt": _points_text, ".ply": read_ply_points}
     for name in ("points3D.bin", "points3D.txt", "points3D.ply", "points3d.ply"):
         if (path := folder / name).is_file():
@@ -77,8 +92,12 @@ def read_points(folder: Path) -> Cloud:
     return NO_POINTS
 
 
-def read_ply_points(path: Path) -> Cloud:
-    """Places and colors of a PLY file's vertices; grey where it has no colors. InputError where it is damaged."""
+def read_ply_points(path: Path) -> PointCloud:
+    """Read positions and colors of a PLY file's vertices, grey if it has no colors.
+
+    Raises:
+        InputError: if the file is damaged.
+    """
     from plyfile import PlyData
 
     read_bytes(path)
@@ -89,17 +108,17 @@ def read_ply_points(path: Path) -> Cloud:
         if {"red", "green", "blue"} <= set(vertex.dtype.names):
             colors = np.stack([vertex[name] for name in ("red", "green", "blue")], axis=1)
             colors = colors / 255 if np.issubdtype(colors.dtype, np.integer) else colors
-    # plyfile has no exception of its own for what damaged files do to it.
+    # plyfile raises many kinds of exceptions for damaged files.
     except Exception as error:  # noqa: BLE001
         raise InputError(path, f"cannot be read as PLY points ({error!r:.120})", "export the points again") from None
     return _checked_points(points, np.clip(colors, 0, 1), path)
 
 
-def _checked_points(points: np.ndarray, colors: np.ndarray, path: Path) -> Cloud:
+def _checked_points(points: np.ndarray, colors: np.ndarray, path: Path) -> PointCloud:
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
         raise InputError(path, f"point {int(np.argmax(bad))} is at {points[np.argmax(bad)].tolist()}", _REMEDY)
-    return points, colors.astype(np.float32)
+    return PointCloud(points, colors.astype(np.float32))
 
 
 class _Bytes:
@@ -116,7 +135,7 @@ class _Bytes:
         return struct.unpack_from(layout, self.data, self.position - size)
 
     def count(self, smallest: int) -> int:
-        """A 64-bit count of records of at least so many bytes each."""
+        """Read a 64-bit count of records that take at least `smallest` bytes each."""
         (count,) = self.take("<Q")
         left = len(self.data) - self.position
         if count * smallest > left:
@@ -158,7 +177,7 @@ def _images_binary(path: Path) -> Iterator[tuple]:
         yield pose, camera_id, name
 
 
-def _points_binary(path: Path) -> Cloud:
+def _points_binary(path: Path) -> PointCloud:
     file = _Bytes(path)
     table = np.empty((file.count(43 + 8), 6))
     for row in table:
@@ -168,7 +187,7 @@ def _points_binary(path: Path) -> Cloud:
 
 
 def _records(path: Path, what: str, parse: Callable[[str], tuple], lines_each: int = 1) -> Iterator[tuple]:
-    """parse(line) of a text file's lines but empty ones and comments; ValueError becomes an InputError."""
+    """Parse the lines of a text file except empty ones and comments; ValueError becomes an InputError."""
     lines = enumerate(read_lines(path), start=1)
     for number, line in lines:
         if not line.strip() or line.startswith("#"):
@@ -201,6 +220,6 @@ def _point(line: str) -> tuple:
     return float(x), float(y), float(z), *color
 
 
-def _points_text(path: Path) -> Cloud:
+def _points_text(path: Path) -> PointCloud:
     table = np.array([*_records(path, "a point with x, y, z and colors in 0..255", _point)], np.float64).reshape(-1, 6)
     return _checked_points(table[:, :3], table[:, 3:] / 255, path)

@@ -1,4 +1,4 @@
-"""The command lines of `sehdr-warp scenes`, `responses` and `calibrate`. torch is imported when they run."""
+"""Commands `sehdr-warp scenes`, `responses` and `calibrate`. torch is imported when they run."""
 
 import json
 import shlex
@@ -41,19 +41,20 @@ class Calibrate:
     """Replace files that exist."""
 
 
-def run_scenes(asked: Scenes) -> None:
-    """Prints the names; `embedded` alone is embedded:room."""
+def run_scenes(args: Scenes) -> None:
+    """Print the names; `embedded` alone means embedded:room."""
     from . import embedded_scenes
 
     names = [f"embedded:{name}" for name in embedded_scenes()]
-    print(json.dumps(names) if asked.json else "\n".join(names))
+    print(json.dumps(names) if args.json else "\n".join(names))
 
 
-def run_responses(asked: Responses) -> None:
+def run_responses(args: Responses) -> None:
+    """Print the names of responses with their meaning."""
     from ..response import response_names
 
     names = response_names()
-    if asked.json:
+    if args.json:
         print(json.dumps(names))
         return
     names["colour:NAME"] = "a camera's encoding of colour-science, such as colour:S-Log3"
@@ -62,11 +63,12 @@ def run_responses(asked: Responses) -> None:
         print(f"{name:<12}  {meaning}")
 
 
-def run_calibrate(asked: Calibrate) -> None:
+def run_calibrate(args: Calibrate) -> None:
+    """Calibrate the response of an exposure stack and write it."""
     from ..model.exposure import seconds
     from .stack import calibrate
 
-    times = None if asked.exposures is None else seconds(asked.exposures, "--exposures")
-    calibrate(asked.stack, times=times, channel=asked.channel, out=asked.out, overwrite=asked.overwrite)
-    named = shlex.quote(str(asked.out))
-    print(f"{asked.out}: take it with --response {named}; the plot is {asked.out.with_suffix('.png')}")
+    times = None if args.exposures is None else seconds(args.exposures, "--exposures")
+    calibrate(args.stack, times=times, channel=args.channel, out=args.out, overwrite=args.overwrite)
+    named = shlex.quote(str(args.out))
+    print(f"{args.out}: take it with --response {named}; the plot is {args.out.with_suffix('.png')}")

@@ -10,7 +10,7 @@ from typing import Any
 
 from ..errors import InputError
 from ..files import read_bytes
-from .capture import Shot
+from .dataparser import ImageRecord
 from .images import HDR_SUFFIXES, PILLOW_ERRORS, RAW_SUFFIXES, exif_of, open_image
 
 _EXIF_IFD = 0x8769
@@ -21,62 +21,64 @@ SHORTEST, LONGEST = 1e-12, 1e12
 _REMEDY = "correct it, or state every image's seconds in exposures.json"
 
 
-def choose_exposure(shots: Sequence[Shot], index: int | None, source: Path) -> tuple[list[Shot], list[str]]:
-    """One shot of each view, and notes.
+def choose_exposure(
+    records: Sequence[ImageRecord], index: int | None, source: Path
+) -> tuple[list[ImageRecord], list[str]]:
+    """One record of each view, and notes.
 
     index: the exposure's number in the file names; None takes the middle one (of an even count the longer).
     Raises InputError where no view has the number.
     """
-    keys = sorted({shot.exposure_key for shot in shots if shot.exposure_key is not None})
+    keys = sorted({record.exposure_key for record in records if record.exposure_key is not None})
     asked = f"exposure index {index} asked for"
     if not keys:
         if index not in (None, 0):
             raise InputError(source, f"{asked}, but each view has one exposure", "leave the exposure index out")
-        return list(shots), []
+        return list(records), []
     chosen, notes = keys[len(keys) // 2] if index is None else index, []
     if chosen not in keys:
         raise InputError(source, f"{asked}, but the exposures are {keys}", f"choose one of {keys[0]} to {keys[-1]}")
     if index is None and len(keys) > 1:
         notes = [f"each view has {len(keys)} exposures {keys}; took the middle one, index {chosen}"]
-    taken = [shot for shot in shots if shot.exposure_key in (None, chosen)]
-    missing = sorted({shot.view for shot in shots} - {shot.view for shot in taken})
+    taken = [record for record in records if record.exposure_key in (None, chosen)]
+    missing = sorted({record.view for record in records} - {record.view for record in taken})
     if missing:
         notes.append(f"{len(missing)} views without exposure {chosen} were left out: {', '.join(missing[:5])}")
     return taken, notes
 
 
-def with_exposure_times(shots: list[Shot], source: Path) -> tuple[list[Shot], bool, list[str]]:
-    """The shots with a time each, whether the times are known, and notes.
+def with_exposure_times(records: list[ImageRecord], source: Path) -> tuple[list[ImageRecord], bool, list[str]]:
+    """The records with a time each, whether the times are known, and notes.
 
     The set's own seconds come first, then `exposures.json` beside the images or in the data folder, then EXIF. An
     EXIF time counts as t (ISO / ISO_0) (N_0 / N)^2 with the first photo's ISO_0 and f-number N_0, so that photos that
     differ in sensitivity or aperture keep their ratio of recorded light. With none at all, each is 1 second.
     Raises InputError for a time that is not positive and finite, and where only some photos state one.
     """
-    stated, strange, notes = [shot.exposure_time for shot in shots], [], []
+    stated, strange, notes = [record.exposure_time for record in records], [], []
     if None in stated:
-        listed, strange = _listed_times(shots, source)
-        stated = [listed.get(s.image.name) if time is None else time for time, s in zip(stated, shots, strict=True)]
+        listed, strange = _listed_times(records, source)
+        stated = [listed.get(s.image.name) if time is None else time for time, s in zip(stated, records, strict=True)]
     if set(stated) == {None}:
-        stated, notes = _exif_times(shots)
+        stated, notes = _exif_times(records)
     notes = [*strange, *notes]
     times = [float(time) for time in stated if time is not None]
-    for shot, time in zip(shots, stated, strict=True):
+    for record, time in zip(records, stated, strict=True):
         if time is None and times:
-            problem = f"exposure time is absent in {len(shots) - len(times)} of {len(shots)} images"
+            problem = f"exposure time is absent in {len(records) - len(times)} of {len(records)} images"
             problem += "".join(f" ({note})" for note in strange)
-            raise InputError(shot.image, problem, "state all in exposures.json, or strip them all")
+            raise InputError(record.image, problem, "state all in exposures.json, or strip them all")
         if time is not None and not SHORTEST <= time <= LONGEST:
-            raise InputError(shot.image, f"exposure time {time} s is not in {SHORTEST} to {LONGEST}", _REMEDY)
+            raise InputError(record.image, f"exposure time {time} s is not in {SHORTEST} to {LONGEST}", _REMEDY)
     if not times:
         notes.append("no exposure times were found: each view counts as 1 s")
-        return [replace(shot, exposure_time=1.0) for shot in shots], False, notes
+        return [replace(record, exposure_time=1.0) for record in records], False, notes
     shortest, longest = min(times), max(times)
     if longest > shortest * 1.01:
         stops = math.log2(longest / shortest)
         span = f"{shutter(shortest)} to {shutter(longest)}".replace(" s to", " to")
         notes.append(f"exposures differ: {span} ({stops:.1f} stops); each view keeps its own")
-    return [replace(shot, exposure_time=time) for shot, time in zip(shots, times, strict=True)], True, notes
+    return [replace(record, exposure_time=time) for record, time in zip(records, times, strict=True)], True, notes
 
 
 def shutter(time: float) -> str:
@@ -98,10 +100,10 @@ def parse_seconds(value, source: Path, field: str) -> float:
     return seconds
 
 
-def _listed_times(shots: list[Shot], source: Path) -> tuple[dict[str, float], list[str]]:
+def _listed_times(records: list[ImageRecord], source: Path) -> tuple[dict[str, float], list[str]]:
     """exposures.json, {"file name": seconds} or a list of {"file": ..., "exposure_time": seconds}; and a note, if it
     names what is not there."""
-    places = (folder / "exposures.json" for folder in (shots[0].image.parent, source))
+    places = (folder / "exposures.json" for folder in (records[0].image.parent, source))
     path = next((place for place in places if place.is_file()), None)
     if path is None:
         return {}, []
@@ -114,19 +116,19 @@ def _listed_times(shots: list[Shot], source: Path) -> tuple[dict[str, float], li
         problem = f"is not a table of exposure times ({error!r:.80})"
         raise InputError(path, problem, 'write {"file name": seconds, ...}') from None
     listed = {Path(str(name)).name: parse_seconds(value, path, str(name)) for name, value in entries}
-    folders = {shot.image.parent for shot in shots} | {source}
+    folders = {record.image.parent for record in records} | {source}
     strange = [name for name in listed if not any((folder / name).exists() for folder in folders)]
     named = ", ".join(strange[:3]) + (" ..." if len(strange) > 3 else "")
     note = f"{path.name}: {len(strange)} of its {len(listed)} names belong to no photo: {named}"
     return listed, [note] * bool(strange)
 
 
-def _exif_times(shots: list[Shot]) -> tuple[list[float | None], list[str]]:
-    settings = [exif_exposure(shot.image) for shot in shots]
-    notes, factors = [], [1.0] * len(shots)
+def _exif_times(records: list[ImageRecord]) -> tuple[list[float | None], list[str]]:
+    settings = [exif_exposure(record.image) for record in records]
+    notes, factors = [], [1.0] * len(records)
     for name, place, power in (("ISO", 1, 1.0), ("f-number", 2, -2.0)):
         values = [value for setting in settings if (value := setting[place]) is not None]
-        if 0 < len(values) < len(shots):
+        if 0 < len(values) < len(records):
             notes.append(f"{name} is not stated for all photos and was not counted")
         elif len(set(values)) > 1:
             factors = [f * (v / values[0]) ** power for f, v in zip(factors, values, strict=True)]
@@ -176,7 +178,7 @@ def exif_lens(path: Path | None) -> tuple[str, ...]:
     return tuple(map(str, stated)) if set(stated) != {None} else ()
 
 
-def made_by_camera(sources: Sequence[Path | None]) -> bool:
+def are_camera_jpegs(sources: Sequence[Path | None]) -> bool:
     """Whether most of the files are a camera's own: JPEGs whose EXIF states an exposure time or f-number."""
     photos = (path for path in sources if path and path.suffix.lower() in (".jpg", ".jpeg") and path.is_file())
     made = sum(any(exif_exposure(photo)[::2]) for photo in photos)

@@ -1,7 +1,7 @@
-"""LDR pixels from files: PNG (8 and 16 bits), JPEG, TIFF, WebP and BMP, with sizes known before decoding.
+"""Readers of LDR images: PNG (8 and 16 bits), JPEG, TIFF, WebP and BMP, with sizes checked before decoding.
 
-open_image is the one place where pictures are opened: what a file is says its content, and nothing but these formats is
-decoded. Pillow knows many more, and hands some (EPS) to other programs.
+All images are opened by open_image. The content decides the format, whatever the name says, and only these formats are
+decoded: Pillow knows many more, and passes some (EPS) to other programs.
 """
 
 import struct
@@ -15,14 +15,14 @@ from PIL import Image, ImageFile
 from ..errors import InputError
 
 MAX_PIXELS = 160_000_000
-"""Above any camera's frame (the largest backs give 151 megapixels), far below what would exhaust memory."""
-MAX_SIDE = 65_536  # Of no photo; a damaged width that passes for few pixels in all takes long to decode
+"""Above the frame of any camera (the largest backs have 151 megapixels), far below what would exhaust memory."""
+MAX_SIDE = 65_536  # No photo has a longer side; a damaged one with few pixels in all would take long to decode
 LDR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 HDR_SUFFIXES = (".exr", ".hdr")
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw")
 PHOTO_SUFFIXES = (*LDR_SUFFIXES, *RAW_SUFFIXES, *HDR_SUFFIXES)
 _BAND_ROWS = 512
-_opening = threading.Lock()  # Pillow's limit of pixels, which is put aside, is one for all threads
+_opening = threading.Lock()  # Pillow's pixel limit, which is lifted while opening, is shared by all threads
 _FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP")
 _MODES = ("L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "I", "I;16", "I;16L", "I;16B", "I;16N")
 _OTHER_MODES = {
@@ -36,7 +36,7 @@ PILLOW_ERRORS = (
     ArithmeticError, AttributeError, EOFError, Image.DecompressionBombError, LookupError, MemoryError, OSError,
     RuntimeError, SyntaxError, TypeError, ValueError, struct.error,
 )  # fmt: skip
-"""What Pillow raises for damaged files. Where it does for EXIF, the pixels may still be good."""
+"""What Pillow raises for damaged files. If it does so for EXIF, the pixels may still be good."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class EncodedImage:
 
 
 def image_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
-    """The photo's size in its file and after its EXIF orientation, each (width, height); errors as open_image."""
+    """Return the photo's size as stored and after its EXIF orientation, each (width, height); raises as open_image."""
     with open_image(path) as image:
         width, height = image.size
         return image.size, (height, width) if _orientation(image) in (5, 6, 7, 8) else image.size
@@ -72,9 +72,13 @@ def image_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
 def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> EncodedImage:
     """Decode a photo; 16-bit files keep their 16 bits, palettes and grey become RGB.
 
-    oriented: turn the pixels as the EXIF orientation says. mask: one bit a pixel is enough.
+    Args:
+        path: the file.
+        oriented: turn the pixels as the EXIF orientation says.
+        mask: accept one bit per pixel.
 
-    Raises InputError where the file is missing, damaged, truncated, of another kind, or larger than MAX_PIXELS.
+    Raises:
+        InputError: if the file is missing, damaged, truncated, of another kind, or larger than MAX_PIXELS.
     """
     with open_image(path, mask=mask) as image:
         try:
@@ -86,15 +90,23 @@ def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> Encod
 
 
 def has_16_bits(path: Path) -> bool:
-    """Whether a photo that read_ldr decodes has 16 bits; errors as open_image."""
+    """Return whether a photo that read_ldr decodes has 16 bits; raises as open_image."""
     with open_image(path) as image:
         return image.mode.startswith("I") or bool(_low_byte_tiles(image))
 
 
 def open_image(path: Path, *, mask: bool = False) -> ImageFile.ImageFile:
-    """The image with its header read and its pixels not; InputError where it is missing, none, too large, one of
-    several pictures in its file, or not of grey or RGB. Of a stereo pair or a photo with a gain map (MPO) it is the
-    first."""
+    """Open an image and read its header, not its pixels.
+
+    Of a stereo pair or a photo with a gain map (MPO) it is the first image.
+
+    Args:
+        path: the file.
+        mask: accept one bit per pixel.
+
+    Raises:
+        InputError: if the file is missing, not an image, too large, an animation or several pages, or not grey or RGB.
+    """
     require_file(path)
     # Pillow's own limit is global and lower for its warning; ours is checked below, before any pixel is decoded.
     with _opening:
@@ -121,15 +133,20 @@ def open_image(path: Path, *, mask: bool = False) -> ImageFile.ImageFile:
 
 
 def exif_of(image: Image.Image) -> Image.Exif:
-    """EXIF as it is stored, without the pixels: to look for it behind those, Pillow decodes a whole PNG. Raises one of
-    PILLOW_ERRORS where it is damaged."""
+    """Return the EXIF of an image without decoding its pixels if possible.
+
+    To look for EXIF behind the pixels Pillow decodes a whole PNG, so this is done only if a chunk there may hold it.
+
+    Raises:
+        PILLOW_ERRORS: if it is damaged.
+    """
     if image.format == "PNG" and _has_text_behind_pixels(Path(image.filename)):  # pyright: ignore[reportAttributeAccessIssue]
         return image.getexif()
     return Image.Image.getexif(image)
 
 
 def _has_text_behind_pixels(png: Path) -> bool:
-    """Whether a PNG has a chunk that may hold EXIF behind its pixels."""
+    """Return whether a PNG has a chunk that may hold EXIF behind its pixels."""
     with png.open("rb") as file:
         file.seek(8)
         behind = False
@@ -143,7 +160,7 @@ def _has_text_behind_pixels(png: Path) -> bool:
 
 
 def require_file(path: Path) -> None:
-    """Raises InputError where an image file is missing or empty."""
+    """Raise InputError if an image file is missing or empty."""
     if not path.is_file():
         raise InputError(path, "image file not found", "check the data folder")
     if path.stat().st_size == 0:
@@ -151,7 +168,7 @@ def require_file(path: Path) -> None:
 
 
 def check_size(path: Path, width: int, height: int, most: int = MAX_PIXELS) -> None:
-    """Raises InputError for a size of no pixels, of more than `most`, or with a side of more than MAX_SIDE."""
+    """Raise InputError for a size of no pixels, of more than `most`, or with a side of more than MAX_SIDE."""
     if width < 1 or height < 1 or width * height > most:
         raise InputError(path, f"size {width} x {height} is not between 1 and {most} pixels", "scale the image down")
     if max(width, height) > MAX_SIDE:
@@ -159,7 +176,7 @@ def check_size(path: Path, width: int, height: int, most: int = MAX_PIXELS) -> N
 
 
 def _decode(image: ImageFile.ImageFile, path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Code values [H, W, 3] and alpha [H, W] in [0, 1] or None."""
+    """Return code values [H, W, 3] and alpha [H, W] in [0, 1] or None."""
     if image.mode in ("RGB", "RGBA") and (low := _low_byte_tiles(image)):
         with open_image(path) as second:
             second.tile = low
@@ -176,7 +193,7 @@ def _decode(image: ImageFile.ImageFile, path: Path) -> tuple[np.ndarray, np.ndar
 
 
 def _converted(image: Image.Image, mode: str) -> np.ndarray:
-    """[H, W, C] uint8, made in bands: Pillow copies what it converts and hands over."""
+    """Convert an image to [H, W, C] uint8 in bands, because Pillow copies what it converts."""
     width, height = image.size
     codes = np.empty((height, width, len(mode)), np.uint8)
     for top in range(0, height, _BAND_ROWS):
@@ -195,7 +212,10 @@ def _split(values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _low_byte_tiles(image: ImageFile.ImageFile) -> list | None:
-    """Pillow keeps the high byte of 16-bit color; asking for the other byte order makes it keep the low one."""
+    """Return tiles that decode the low bytes of 16-bit color.
+
+    Pillow keeps the high byte; with the other byte order it keeps the low one.
+    """
     other = {"16B": "16L", "16L": "16B", "16N": "16B" if np.little_endian else "16L"}
     tiles = []
     for tile in image.tile:
@@ -209,14 +229,14 @@ def _low_byte_tiles(image: ImageFile.ImageFile) -> list | None:
 
 
 def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:
-    """[H, W, ...] turned as EXIF's orientation says: 5 to 8 lie on their side, then rows or columns are backwards."""
+    """Turn [H, W, ...] as EXIF's orientation says: 5 to 8 swap the axes, then rows or columns are reversed."""
     array = array.swapaxes(0, 1) if orientation in (5, 6, 7, 8) else array
     array = array[::-1] if orientation in (3, 4, 7, 8) else array
     return np.ascontiguousarray(array[:, ::-1] if orientation in (2, 3, 6, 7) else array)
 
 
 def _orientation(image: Image.Image) -> int:
-    """EXIF's orientation, 1 (as stored) where there is none."""
+    """Return EXIF's orientation, 1 (as stored) if there is none."""
     try:
         return exif_of(image).get(0x0112, 1)
     except PILLOW_ERRORS:

@@ -1,4 +1,4 @@
-"""Cameras as photographed, with lens distortion, and how photos are resampled: to pinhole cameras, and smaller."""
+"""Cameras with lens distortion, and resampling of photos: undistortion to pinhole cameras, and area averages."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,21 +20,26 @@ PARAMETER_COUNTS = dict(CAMERA_MODELS.values())
 
 _ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE",
               "SIMPLE_DIVISION", "SIMPLE_FISHEYE"}  # fmt: skip
-# Models that are pinholes where every parameter after the principal point, if there is one, is zero.
+# Models that are pinholes if every parameter after the principal point, if there is one, is zero.
 _NEUTRAL_AT_ZERO = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV",
                     "SIMPLE_DIVISION", "DIVISION"}  # fmt: skip
 _MAX_SIDE = 1 << 16
-_BAND_VALUES = 1 << 24  # Averaged at once: 64 MB
+_BAND_VALUES = 1 << 24  # Values that are averaged at one time, 64 MB
 
 
 @dataclass(frozen=True)
 class Lens:
     """A camera's intrinsics as a data set states them.
 
-    model, params: one of CAMERA_MODELS, its parameters in COLMAP's order; the top left pixel's centre is (0.5, 0.5).
-    width, height: size in pixels of the images that params speak of. source: the file that states them.
+    Attributes:
+        model: one of CAMERA_MODELS.
+        width: of the images that params refer to, in pixels.
+        height: of the images that params refer to, in pixels.
+        params: in COLMAP's order; the centre of the top left pixel is (0.5, 0.5).
+        source: the file that states them.
 
-    Raises InputError for an unknown model, a wrong number of parameters, a size outside 1..65536 or bad values.
+    Raises:
+        InputError: for an unknown model, a wrong number of parameters, a size outside 1..65536 or bad values.
     """
 
     model: str
@@ -44,6 +49,7 @@ class Lens:
     source: Path
 
     def __post_init__(self):
+        """Check the values."""
         remedy, wanted, problem = "correct the camera or export it again", PARAMETER_COUNTS.get(self.model), None
         if wanted is None:
             problem = f"camera model {self.model!r:.40} is not supported"
@@ -61,21 +67,23 @@ class Lens:
 
     @property
     def focal(self) -> tuple[float, float]:
+        """Focal lengths (fx, fy) in pixels."""
         return (self.params[0], self.params[0]) if self.model in _ONE_FOCAL else (self.params[0], self.params[1])
 
     @property
     def centre(self) -> tuple[float, float]:
+        """Principal point (cx, cy) in pixels."""
         first = 1 if self.model in _ONE_FOCAL else 2
         return self.params[first], self.params[first + 1]
 
     @property
     def is_pinhole(self) -> bool:
-        """True where the photos need no resampling."""
+        """True if the photos need no undistortion."""
         first = 3 if self.model in _ONE_FOCAL else 4
         return self.model in _NEUTRAL_AT_ZERO and not any(self.params[first:])
 
     def resized(self, width: int, height: int) -> "Lens":
-        """The same lens for images of another size; distortion parameters are free of the scale."""
+        """Return the same lens for images of another size; distortion parameters do not depend on it."""
         sx, sy = width / self.width, height / self.height
         params = list(self.params)
         if self.model in _ONE_FOCAL:
@@ -85,17 +93,23 @@ class Lens:
         return Lens(self.model, width, height, tuple(params), self.source)
 
     def pinhole(self, world_to_camera: np.ndarray) -> Camera:
-        """The camera without its distortion parameters, at the same size."""
+        """Return the camera without its distortion parameters, at the same size."""
         return Camera(self.width, self.height, *self.focal, *self.centre, world_to_camera)
 
 
 class Undistortion:
-    """Resamples photos of one distorting lens, bilinearly, to COLMAP's choice of a pinhole camera.
+    """Bilinear resampling of the photos of one lens to the pinhole camera that COLMAP's undistorter chooses.
 
-    Raises InputError where the lens cannot be undone.
+    Attributes:
+        inside: [H, W] bool, True where the lens imaged something; None if it did everywhere.
     """
 
     def __init__(self, lens: Lens):
+        """Compute the map.
+
+        Raises:
+            InputError: if the distortion cannot be inverted.
+        """
         import pycolmap
 
         described = f"distortion {lens.model} {lens.params}"
@@ -121,10 +135,11 @@ class Undistortion:
         self.inside: np.ndarray | None = None if inside.all() else inside
 
     def camera(self, world_to_camera: np.ndarray) -> Camera:
+        """Return the pinhole camera of a pose."""
         return Camera(*self.intrinsics, world_to_camera)
 
     def apply(self, image: np.ndarray) -> np.ndarray:
-        """[H, W] or [H, W, C] float32 -> the pinhole camera's image; 0 where the lens saw nothing."""
+        """Resample [H, W] or [H, W, C] float32 to the pinhole camera, 0 outside of the lens's image."""
         from scipy.ndimage import map_coordinates
 
         done = np.empty((*self._places.shape[1:], *image.shape[2:]), np.float32)
@@ -139,9 +154,15 @@ class Undistortion:
 def area_average(
     image: np.ndarray, width: int, height: int, values: Callable[[slice], np.ndarray] | None = None
 ) -> np.ndarray:
-    """[H, W] or [H, W, C] -> [height, width(, C)] float32, not larger: each pixel the mean of the area that it covers,
-    exactly for any ratio. values: what rows of the image count as, float32; by default themselves. They are asked for a
-    few at a time: a photo may be too large to be made floats at once."""
+    """Downsample [H, W] or [H, W, C] to float32 [height, width(, C)], each pixel the exact mean of the area it covers.
+
+    Args:
+        image: the pixels.
+        width: not larger than the image's.
+        height: not larger than the image's.
+        values: returns the float32 values of a slice of rows, by default the pixels; it is called for few rows at a
+            time, because a photo may be too large to be converted to floats as a whole.
+    """
     values = values or (lambda rows: image[rows].astype(np.float32, copy=False))
     count = image.shape[0]
     if height != count:
@@ -163,7 +184,7 @@ def area_average(
 
 
 def _overlaps(source: int, target: int):
-    """[target, source] sparse float32: the share of each source pixel in each target pixel; rows sum to 1."""
+    """Return the share of each source pixel in each target pixel, sparse float32 [target, source]; rows sum to 1."""
     from scipy.sparse import csr_array
 
     edges = np.arange(target + 1) * (source / target)

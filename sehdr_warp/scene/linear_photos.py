@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import InputError, SehdrError
 from ..quiet import silent_stderr
-from .capture import reinhard_gamma
+from .dataparser import reinhard_gamma
 from .dng import read_dng
 from .dng_develop import CLIPPED, clipping_level, develop_dng
 from .hdr_files import read_hdr

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError, did_you_mean
-from .capture import Capture, Shot
 from .colmap_model import find_model
-from .develop import as_photographed, develop, fitted_lens, with_content
-from .exposure import choose_exposure, made_by_camera, with_exposure_times
+from .dataparser import DataparserOutputs, ImageRecord
+from .exposure import are_camera_jpegs, choose_exposure, with_exposure_times
 from .images import has_16_bits
 from .linear_photos import CURVES, color_matrix, float_time, one_kind
 from .masks import assign_masks
 from .names import unique_names
+from .preprocess import fitted_lens, preprocess, read_codes, require_content
 from .read_folders import (
     image_folder,
     is_hdr_gs,
@@ -85,78 +85,82 @@ def load_scene(
 
     if max_size is not None and max_size < 1:
         raise InputError(path, f"longest side of {max_size} pixels asked for", "give at least 1 pixel")
-    capture = read_capture(path, exposure_index=exposure_index, holdout=holdout, cache=cache)
+    dataset = parse_dataset(path, exposure_index=exposure_index, holdout=holdout, cache=cache)
     chosen_by = None
-    if capture.kind == "encoded" and str(response) == "linear":
-        capture = as_linear(capture)
-        response = "auto" if capture.kind == "linear" else response
-    if capture.kind != "encoded":
-        chosen = response_by_name(CURVES[capture.kind])
+    if dataset.kind == "encoded" and str(response) == "linear":
+        dataset = as_linear(dataset)
+        response = "auto" if dataset.kind == "linear" else response
+    if dataset.kind != "encoded":
+        chosen = response_by_name(CURVES[dataset.kind])
         if isinstance(response, str | Path) and str(response) not in ("auto", chosen.name):
-            problem = f"its photos are {capture.kind}: their light is known, and response {response} is not theirs"
+            problem = f"its photos are {dataset.kind}: their light is known, and response {response} is not theirs"
             raise InputError(path, problem, "leave the response out")
-        matrix = color_matrix([shot.image for shot in capture.shots]) if capture.kind == "raw" else None
-        return replace(develop(capture, chosen, max_size, photos), color_matrix=matrix, light_known=True)
+        matrix = color_matrix([record.image for record in dataset.records]) if dataset.kind == "raw" else None
+        return replace(preprocess(dataset, chosen, max_size, photos), color_matrix=matrix, light_known=True)
     if isinstance(response, str) and response == "auto":
-        response, chosen_by = choose_response(capture, method, candidates), (method, tuple(map(str, candidates)))
+        response, chosen_by = choose_response(dataset, method, candidates), (method, tuple(map(str, candidates)))
     elif isinstance(response, str | Path):
         response = response_by_name("srgb" if response == "learned" else response)
-    return replace(develop(capture, response, max_size, photos), chosen_by=chosen_by)
+    return replace(preprocess(dataset, response, max_size, photos), chosen_by=chosen_by)
 
 
-def read_capture(
+def parse_dataset(
     path: Path | str, *, exposure_index: int | None = None, holdout: int | None = None, cache: Path | str | None = None
-) -> Capture:
+) -> DataparserOutputs:
     """Cameras, files, exposure times and splits of a data folder; of photos their sizes alone. Arguments and errors are
     load_scene's."""
     if holdout is not None and holdout < 0:
         raise InputError(path, f"every {holdout}th view asked for as test view", "give 0 (none) or more")
     folder = _folder(path)
-    capture = _read(folder, cache)
-    if not capture.shots:
+    dataset = _read(folder, cache)
+    if not dataset.records:
         raise InputError(folder, "has no views", "check the data folder")
-    shots, masks = assign_masks(capture.shots, folder)
-    shots, notes = choose_exposure(shots, exposure_index, folder)
-    kind, more = one_kind([shot.image for shot in shots if not shot.derived] or [Path("derived")]), []
-    if kind == "float" and all(shot.exposure_time is None for shot in shots):
-        time = float_time([shot.image for shot in shots])
-        shots = [replace(shot, exposure_time=time, hdr=shot.hdr or shot.image) for shot in shots]
+    records, masks = assign_masks(dataset.records, folder)
+    records, notes = choose_exposure(records, exposure_index, folder)
+    kind, more = one_kind([record.image for record in records if not record.derived] or [Path("derived")]), []
+    if kind == "float" and all(record.exposure_time is None for record in records):
+        time = float_time([record.image for record in records])
+        records = [replace(record, exposure_time=time, hdr=record.hdr or record.image) for record in records]
         times_known = True
         more = ["float pictures: their values are taken as light, at no exposure"]
     else:
-        shots, times_known, more = with_exposure_times(shots, folder)
-    shots, split = _with_splits(shots, capture, holdout)
-    training = sum(shot.split == "train" for shot in shots)
+        records, times_known, more = with_exposure_times(records, folder)
+    records, split = _with_splits(records, dataset, holdout)
+    training = sum(record.split == "train" for record in records)
     if training < 2:
-        found = f"{len(shots)} view{'s' * (len(shots) != 1)}, {training} for training"
+        found = f"{len(records)} view{'s' * (len(records) != 1)}, {training} for training"
         raise InputError(folder, f"has {found}; one view does not show depth", "add views from other places")
-    for shot in shots:
-        if not shot.derived:
-            fitted_lens(shot)
-    notes = (*capture.notes, *masks, *notes, *more, *split)
+    for record in records:
+        if not record.derived:
+            fitted_lens(record)
+    notes = (*dataset.notes, *masks, *notes, *more, *split)
     name = str(path) if is_embedded(path) else folder.resolve().name
     told = {"notes": notes, "name": name, "folder": folder, "times_known": times_known, "kind": kind}
-    return replace(capture, shots=tuple(shots), **told)
+    return replace(dataset, records=tuple(records), **told)
 
 
-def as_linear(capture: Capture) -> Capture:
-    """A capture whose photos are proportional to light, if all of them have 16 bits; of 8 bits codes stay codes."""
-    if any(shot.derived for shot in capture.shots) or not all(has_16_bits(shot.image) for shot in capture.shots):
-        return capture
-    return replace(capture, kind="linear", shots=tuple(replace(shot, linear=True) for shot in capture.shots))
+def as_linear(dataset: DataparserOutputs) -> DataparserOutputs:
+    """A dataset whose photos are proportional to light, if all of them have 16 bits; of 8 bits codes stay codes."""
+    if any(record.derived for record in dataset.records) or not all(
+        has_16_bits(record.image) for record in dataset.records
+    ):
+        return dataset
+    return replace(dataset, kind="linear", records=tuple(replace(record, linear=True) for record in dataset.records))
 
 
-def choose_response(capture: Capture, method: str = "posterior", candidates: Sequence[str] = ()) -> "Response":
+def choose_response(
+    dataset: DataparserOutputs, method: str = "posterior", candidates: Sequence[str] = ()
+) -> "Response":
     """The response that fits the training photos best, from their codes as photographed.
 
     Photos are up to 24 of the training views, evenly spread; for method "paper" a random one. candidates: names, and
     files of one curve or of many; none: the built-in ones. Raises InputError where photos show nothing.
     """
-    shots = capture.training
+    records = dataset.training
 
     def codes() -> Iterator[tuple[np.ndarray, None]]:
-        for shot in photos_to_judge(shots, method):
-            image = as_photographed(shot)
+        for record in sample_photos(records, method):
+            image = read_codes(record)
             if image.alpha is not None:  # What is not there has no color.
                 image.pixels[image.alpha < 1] = 0
             photo = image.pixels, None
@@ -164,11 +168,13 @@ def choose_response(capture: Capture, method: str = "posterior", candidates: Seq
             yield photo
             del photo
 
-    photos = with_content(codes(), capture.folder)  # One at a time: they may be large.
-    return best_response(photos, [None if shot.derived else shot.image for shot in shots], method, candidates)
+    photos = require_content(codes(), dataset.folder)  # One at a time: they may be large.
+    return select_response_for(
+        photos, [None if record.derived else record.image for record in records], method, candidates
+    )
 
 
-def photos_to_judge(photos: Sequence, method: str) -> Sequence:
+def sample_photos(photos: Sequence, method: str) -> Sequence:
     """Those of the training photos that a response is chosen from."""
     chosen = photos[:: -(-len(photos) // _MOST_JUDGED)]
     if method == "paper":
@@ -177,15 +183,15 @@ def photos_to_judge(photos: Sequence, method: str) -> Sequence:
     return chosen
 
 
-def best_response(
+def select_response_for(
     codes: Iterable[np.ndarray], files: list[Path | None], method: str, candidates: Sequence[str]
 ) -> "Response":
-    """The candidate that fits the codes of photos_to_judge best; files: of all training photos."""
+    """The candidate that fits the codes of sample_photos best; files: of all training photos."""
     from ..response import responses_named
     from ..response.selection import select_response
 
     known = [response for name in candidates for response in responses_named(name)] or None
-    return select_response(codes, known, method=method, from_camera=made_by_camera(files)).response
+    return select_response(codes, known, method=method, from_camera=are_camera_jpegs(files)).response
 
 
 def _folder(path: Path | str) -> Path:
@@ -205,7 +211,7 @@ def _folder(path: Path | str) -> Path:
     return folder
 
 
-def _read(folder: Path, cache: Path | str | None) -> Capture:
+def _read(folder: Path, cache: Path | str | None) -> DataparserOutputs:
     """The first layout that fits, the most telling one first."""
 
     def has(*names: str) -> bool:
@@ -226,18 +232,20 @@ def _read(folder: Path, cache: Path | str | None) -> Capture:
     return reader(folder) if reader else read_photos(folder, cache)
 
 
-def _with_splits(shots: list[Shot], capture: Capture, holdout: int | None) -> tuple[list[Shot], tuple[str, ...]]:
-    """The shots with a split each, and a note where the set does not state it."""
-    if holdout is None and any(shot.split for shot in shots):
-        return [replace(shot, split=shot.split or "train") for shot in shots], ()
-    held = _held_out(len(shots), holdout, capture.holdout)
-    shots = [replace(shot, split="test" if i in held else "train") for i, shot in enumerate(shots)]
+def _with_splits(
+    records: list[ImageRecord], dataset: DataparserOutputs, holdout: int | None
+) -> tuple[list[ImageRecord], tuple[str, ...]]:
+    """The records with a split each, and a note where the set does not state it."""
+    if holdout is None and any(record.split for record in records):
+        return [replace(record, split=record.split or "train") for record in records], ()
+    held = _held_out(len(records), holdout, dataset.holdout)
+    records = [replace(record, split="test" if i in held else "train") for i, record in enumerate(records)]
     if not held:
-        return shots, ("no views are held out for testing",)
-    names = [name for name, shot in zip(unique_names(shots), shots, strict=True) if shot.split == "test"]
+        return records, ("no views are held out for testing",)
+    names = [name for name, record in zip(unique_names(records), records, strict=True) if record.split == "test"]
     listed = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
     are = "is" if len(names) == 1 else "are"
-    return shots, (f"{len(names)} of {len(shots)} views {are} held out for testing: {listed}",)
+    return records, (f"{len(names)} of {len(records)} views {are} held out for testing: {listed}",)
 
 
 def _held_out(count: int, step: int | None, published: tuple[int, int] | None) -> set[int]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..files import contained
-from .capture import Shot
+from .dataparser import ImageRecord
 from .images import LDR_SUFFIXES, PHOTO_SUFFIXES, read_ldr
 from .names import natural_key, sibling, without_mask_ending
 
@@ -18,7 +18,7 @@ _MOST_NAMED = 3
 _REMEDY = "name each like its photo, such as masks/IMG_1.png or masks/IMG_1.jpg.png"
 
 
-def assign_masks(shots: Sequence[Shot], folder: Path) -> tuple[list[Shot], list[str]]:
+def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[ImageRecord], list[str]]:
     """Give each photo without a mask the mask file that is named like it, in any layout.
 
     Masks lie in `masks/` or `mask/` of the data folder, under the photo's path below the data folder or below the
@@ -28,7 +28,7 @@ def assign_masks(shots: Sequence[Shot], folder: Path) -> tuple[list[Shot], list[
     a mask that is named like the view serves all its exposures.
 
     Args:
-        shots: the photos; a mask that the set states itself stays.
+        records: the photos; a mask that the set states itself stays.
         folder: the data folder.
 
     Returns:
@@ -37,24 +37,24 @@ def assign_masks(shots: Sequence[Shot], folder: Path) -> tuple[list[Shot], list[
     Raises:
         InputError: if a mask is a link that leads out of the data folder.
     """
-    bases = _bases([shot.image for shot in shots], folder)
+    bases = _bases([record.image for record in records], folder)
     shared = Counter(
-        key for image, view in {(s.image, s.view) for s in shots} for key in {image.name, image.stem, view}
+        key for image, view in {(s.image, s.view) for s in records} for key in {image.name, image.stem, view}
     )
     places = [place for name in MASK_FOLDERS if (place := folder / name).is_dir()]
     files = {place: {file: _key(file, place) for file in _files_below(place)} for place in places}
     index = [{key: file for file, key in reversed(keys.items())} for keys in files.values()]
-    beside = {parent: _masks_beside(parent) for parent in {shot.image.parent for shot in shots}}
+    beside = {parent: _masks_beside(parent) for parent in {record.image.parent for record in records}}
     masked, used = [], set()
-    for shot in shots:
-        keys = _photo_keys(shot, bases, shared)
-        near = beside[shot.image.parent]
-        tables = [*((masks, keys) for masks in index), (near, [shot.image.name, shot.image.stem])]
-        mask = shot.mask or next((masks[key] for masks, names in tables for key in names if key in masks), None)
-        if mask is not None and shot.mask is None:
+    for record in records:
+        keys = _photo_keys(record, bases, shared)
+        near = beside[record.image.parent]
+        tables = [*((masks, keys) for masks in index), (near, [record.image.name, record.image.stem])]
+        mask = record.mask or next((masks[key] for masks, names in tables for key in names if key in masks), None)
+        if mask is not None and record.mask is None:
             mask = contained(folder, mask.relative_to(folder).as_posix(), folder)
         used.add(mask)
-        masked.append(replace(shot, mask=mask))
+        masked.append(replace(record, mask=mask))
     notes = []
     for place, keys in files.items():
         # A mask of a photo that the set leaves out is named with that photo, not here.
@@ -118,13 +118,13 @@ def _bases(images: Sequence[Path], folder: Path) -> list[Path]:
     return [common, *above]
 
 
-def _photo_keys(shot: Shot, bases: Sequence[Path], shared: Counter) -> list[str]:
+def _photo_keys(record: ImageRecord, bases: Sequence[Path], shared: Counter) -> list[str]:
     """List the names without suffix under which the masks of a photo are looked for, the most exact first."""
-    image = shot.image
+    image = record.image
     paths = [image.relative_to(base) for base in bases if image.is_relative_to(base)]
     keys = [key for path in paths for key in (path.as_posix(), path.with_suffix("").as_posix())]
-    keys += [path.with_name(shot.view).as_posix() for path in paths] + [f"{shot.split}/{shot.view}"]
-    return keys + [key for key in (image.name, image.stem, shot.view) if shared[key] == 1]
+    keys += [path.with_name(record.view).as_posix() for path in paths] + [f"{record.split}/{record.view}"]
+    return keys + [key for key in (image.name, image.stem, record.view) if shared[key] == 1]
 
 
 def _key(mask: Path, place: Path) -> str:

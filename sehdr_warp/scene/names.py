@@ -6,26 +6,26 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from .capture import Shot
+from .dataparser import ImageRecord
 
 
 def natural_key(name: str) -> tuple:
-    """Sorts img2 before img10."""
+    """Return a sort key that puts img2 before img10."""
     return tuple((1, int(part), part) if part.isdecimal() else (0, 0, part) for part in re.split(r"(\d+)", name))
 
 
 def view_and_exposure(stem: str) -> tuple[str, int | None]:
-    """The view and the exposure's number of `<view>_<k>`; None for a name without one."""
+    """Split `<view>_<k>` into the view and the exposure's number, which is None for a name without one."""
     match = re.fullmatch(r"(.+)_(\d{1,3})", stem)
     return (match[1], int(match[2])) if match else (stem, None)
 
 
 def sibling(path: Path, suffixes: tuple[str, ...]) -> Path | None:
-    """The file of the same stem beside `path` with one of the suffixes in either case, or None."""
+    """Return the file beside `path` with the same stem and one of the suffixes in either case, or None."""
     candidates = (path.with_suffix(spelled) for suffix in suffixes for spelled in (suffix, suffix.upper()))
     try:
         return next((candidate for candidate in candidates if candidate.is_file()), None)
-    except (OSError, ValueError):  # A name from a data file that no file can have.
+    except (OSError, ValueError):  # A name from a data file that is not possible as a file name.
         return None
 
 
@@ -45,17 +45,19 @@ def list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     return sorted((file for file in photos if file.is_file()), key=lambda file: natural_key(file.name))
 
 
-def unique_names(shots: Sequence[Shot]) -> list[str]:
-    """A name for each shot that can also name a file, unique without regard to case: the view's key. Where two share
-    one (`train/r_0` and `test/r_0`), a test view keeps it, others have their folder before (`train_r_0`), or a number.
+def unique_names(records: Sequence[ImageRecord]) -> list[str]:
+    """Return a name for each photo that can name a file, unique without regard to case.
+
+    It is the view's key. If two photos share one (`train/r_0` and `test/r_0`), a test view keeps it, and others get
+    their folder in front (`train_r_0`) or a number behind.
     """
-    plain = [re.sub(r"[^\w.+-]", "_", shot.view) or "view" for shot in shots]
+    plain = [re.sub(r"[^\w.+-]", "_", record.view) or "view" for record in records]
     counts = Counter(name.lower() for name in plain)
     shared = [counts[name.lower()] > 1 for name in plain]
     names, taken = {}, set()
-    for i in sorted(range(len(shots)), key=lambda i: (shared[i], shots[i].split != "test")):
-        base = f"{shots[i].image.parent.name}_{plain[i]}" if shared[i] and shots[i].split != "test" else plain[i]
+    for i in sorted(range(len(records)), key=lambda i: (shared[i], records[i].split != "test")):
+        base = f"{records[i].image.parent.name}_{plain[i]}" if shared[i] and records[i].split != "test" else plain[i]
         numbered = (f"{base}_{number}" if number > 1 else base for number in itertools.count(1))
         names[i] = next(name for name in numbered if name.lower() not in taken)
         taken.add(names[i].lower())
-    return [names[i] for i in range(len(shots))]
+    return [names[i] for i in range(len(records))]

@@ -24,12 +24,12 @@ from ..caches import usable, user_cache
 from ..errors import InputError
 from .types import View
 
-_LARGE = 1 << 14  # Arrays of fewer bytes are pickled
+_LARGE = 1 << 14  # Bytes; smaller arrays are pickled
 _ALIGNED = 64
 _ARRAYS = "codes", "mask", "hdr", "light_above_white"
 _LEAST, _MOST_BYTES = 1 << 30, 28  # Of a file, and of a pixel in it: 16-bit codes, a mask, truth, light above white
 SHARE = 0.5
-"""Of the free memory, photos of a scene stay in it up to so much."""
+"""Photos of a scene stay in memory if they take at most this share of what is free."""
 
 
 class _Map(mmap.mmap):
@@ -37,21 +37,27 @@ class _Map(mmap.mmap):
 
 
 class PhotoFile:
-    """Room for `most` bytes of arrays in a nameless file in a folder, by default the user's cache.
-
-    Raises InputError where the folder cannot be written to, and, from keep(), where the disk is full.
-    """
+    """Space for arrays in a nameless file in a folder, by default the user's cache."""
 
     def __init__(self, most: int, folder: Path | str | None = None):
+        """Create the file.
+
+        Args:
+            most: bytes that the file can hold.
+            folder: where it lies; None is the user's cache.
+
+        Raises:
+            InputError: if the folder cannot be written to.
+        """
         self.folder = Path(folder or _folder())
         try:
-            # Sparse: what is not written takes no room. Only its end is known, so that it is mapped once.
+            # A sparse file: only what is written takes space on the disk. Its full size is set now and mapped once.
             self._file = tempfile.TemporaryFile(dir=self.folder, buffering=0)  # noqa: SIM115
             self._file.truncate(most)
         except OSError as error:
             raise self._refused(error) from None
         self.most, self.used = most, 0
-        # Shared, though nobody writes to it: a private mapping that could be written would count as memory.
+        # A shared mapping, although nothing writes through it: a private one would count as memory of this process.
         self._map = _Map(self._file.fileno(), most, access=mmap.ACCESS_WRITE)
         self._map.owner = self  # The file stays open for as long as any array lies in it.
         self._start = np.frombuffer(self._map, np.uint8, 1).ctypes.data
@@ -59,7 +65,11 @@ class PhotoFile:
         _files.add(self)
 
     def keep(self, array: np.ndarray) -> np.ndarray:
-        """The same array in the file. One that is there already stays where it is."""
+        """Return the array as part of the file; one that lies there already is returned as it is.
+
+        Raises:
+            InputError: if the disk is full.
+        """
         if self.place(array) is not None:
             return array
         offset, data = self.used, np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
@@ -76,18 +86,21 @@ class PhotoFile:
         return self._array(offset, array.dtype, array.shape)
 
     def share(self, value: Any) -> tuple:
-        """Puts any value into the file, large arrays as they are; what taken() gives back in another process, as
-        long as this one lives."""
-        told = io.BytesIO()
-        _Pickler(told, self).dump(value)
-        return self.told(self.keep(np.frombuffer(told.getvalue(), np.uint8)))
+        """Put any value into the file, large arrays without a copy.
 
-    def told(self, kept: np.ndarray) -> tuple:
-        """What another process needs to find an array of this file."""
-        return self.path, self.most, self.place(kept), kept.dtype.str, kept.shape
+        Returns:
+            A handle from which open_shared() gives the value back in another process, while this one lives.
+        """
+        pickled = io.BytesIO()
+        _Pickler(pickled, self).dump(value)
+        return self.handle(self.keep(np.frombuffer(pickled.getvalue(), np.uint8)))
+
+    def handle(self, array: np.ndarray) -> tuple:
+        """Return what another process needs to find an array of this file."""
+        return self.path, self.most, self.place(array), array.dtype.str, array.shape
 
     def place(self, array: np.ndarray) -> int | None:
-        """Where in the file an array lies, None for one that is elsewhere."""
+        """Return the offset of an array in the file, None for one that lies elsewhere."""
         offset = array.ctypes.data - self._start
         inside = 0 <= offset <= self.most - array.nbytes and array.flags.c_contiguous
         return offset if inside else None
@@ -104,18 +117,18 @@ _files: weakref.WeakSet[PhotoFile] = weakref.WeakSet()
 
 
 def _file_of(array: np.ndarray) -> PhotoFile | None:
-    """The file that an array lies in."""
+    """Return the file that an array lies in, None if it is in memory."""
     return next((file for file in _files if file.place(array) is not None), None)
 
 
-def taken(told: tuple) -> Any:
-    """What another process of this user put into its file by share(); arrays stay in the file."""
+def open_shared(handle: tuple) -> Any:
+    """Return what another process of this user put into its file by share(); arrays stay in the file."""
     finder = _Unpickler(io.BytesIO())
-    return _Unpickler(io.BytesIO(finder.persistent_load(told).tobytes())).load()
+    return _Unpickler(io.BytesIO(finder.persistent_load(handle).tobytes())).load()
 
 
 def can_share() -> bool:
-    """Whether this system lets a process open the nameless file of another."""
+    """Return whether this system lets a process open the nameless file of another."""
     return sys.platform == "linux"
 
 
@@ -128,7 +141,7 @@ class _Pickler(pickle.Pickler):
         if type(obj) is not np.ndarray or obj.nbytes < _LARGE or obj.dtype.hasobject:
             return None
         file = _file_of(obj) or self.photos
-        return file.told(file.keep(obj))
+        return file.handle(file.keep(obj))
 
 
 class _Unpickler(pickle.Unpickler):
@@ -145,21 +158,26 @@ class _Unpickler(pickle.Unpickler):
 
 
 class PhotoKeeper:
-    """Where the photos of a scene stay while it is read: in memory, or in a file of the disk that the system reads from
-    as they are looked at.
-
-    where: "memory", "disk", or "auto": the disk if they would take more than SHARE of the memory that is free. count:
-    of the photos; pixels: of all together, as photographed.
-    """
+    """Keeper of a scene's photos, in memory or in a file on the disk that the system pages in as they are used."""
 
     def __init__(self, where: str, count: int, pixels: int):
+        """Prepare for the photos of a scene.
+
+        Args:
+            where: "memory", "disk", or "auto" for the disk if the photos would take more than SHARE of the free memory.
+            count: number of photos.
+            pixels: of all photos together, at their full size.
+        """
         self.where, self.count, self.pixels = where, count, pixels
         self.file: PhotoFile | None = None
         self.note: str | None = None
 
-    def kept(self, view: View) -> View:
-        """The view with its arrays where they are to stay; the first one decides. Raises InputError where neither
-        memory nor disk have room."""
+    def store(self, view: View) -> View:
+        """Return the view with its arrays in their final place, which the first view's size decides.
+
+        Raises:
+            InputError: if neither memory nor disk have enough space.
+        """
         arrays = {name: array for name in _ARRAYS if (array := getattr(view, name)) is not None}
         if self.note is None:
             self._decide(self.count * sum(array.nbytes for array in arrays.values()))
@@ -173,17 +191,17 @@ class PhotoKeeper:
             return
         folder = _folder()
         disk = shutil.disk_usage(folder).free
-        told = f"the photos take {_gigabytes(size)}; {_gigabytes(free)} of memory are free"
+        sizes = f"the photos take {_gigabytes(size)}; {_gigabytes(free)} of memory are free"
         if size > disk:
             remedy = "use smaller photos (--max-size), free some of it, or name a folder of another disk in SEHDR_CACHE"
-            raise InputError(folder, f"{told}, and {_gigabytes(disk)} of this disk", remedy)
+            raise InputError(folder, f"{sizes}, and {_gigabytes(disk)} of this disk", remedy)
         # Views are at most as large as their photos; masks and truth are floats.
         self.file = PhotoFile(max(_LEAST, 2 * size, self.pixels * _MOST_BYTES), folder)
-        self.note = f"photos: {told}: they are read from a nameless file in {folder}, which goes with this process"
+        self.note = f"photos: {sizes}: they are read from a nameless file in {folder}, which goes with this process"
 
 
 def available_memory() -> int:
-    """Bytes of memory that this process may still take without swapping, as far as the system tells."""
+    """Return the bytes of memory that this process may still take without swapping, as far as the system reports."""
     found = [1 << 62]
     with suppress(OSError, ValueError, AttributeError):
         found.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))

@@ -1,4 +1,4 @@
-"""Photos of any kind: encoded ones, RAW files and float pictures, by their suffix."""
+"""Photos of any kind: encoded images, RAW files and float images, by their suffix."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from .linear_photos import kind_of, raw_sizes, read_raw, tone_mapped
 
 
 def photo_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
-    """(width, height) of the photo in its file and turned upright; InputError as read_photo raises it."""
+    """Return (width, height) of the photo as stored and turned upright; raises as read_photo."""
     kind = kind_of(path)
     if kind == "encoded":
         return image_sizes(path)
@@ -19,9 +19,16 @@ def photo_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 def read_photo(path: Path, *, oriented: bool = False) -> EncodedImage:
-    """The codes of a photo; of RAW files 16 bits of the sensor's colors, of float pictures 8 at their own exposure.
+    """Read the codes of a photo.
 
-    oriented: turn the pixels upright. Raises InputError where the file is missing, damaged or too large.
+    RAW files have 16 bits in the sensor's primaries, float images 8 bits at an exposure of their own.
+
+    Args:
+        path: the file.
+        oriented: turn the pixels upright.
+
+    Raises:
+        InputError: if the file is missing, damaged or too large.
     """
     kind = kind_of(path)
     if kind == "encoded":

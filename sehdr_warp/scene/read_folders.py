@@ -1,4 +1,4 @@
-"""Readers of folders without transforms: COLMAP's sets and HDR-GS's, HDR-NeRF's real ones and LLFF's, bare photos."""
+"""Readers of folders without transforms: COLMAP, HDR-GS, HDR-NeRF's real sets, LLFF, and bare photos."""
 
 import os
 import re
@@ -9,8 +9,8 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import contained, read_bytes, read_json
-from .capture import NO_POINTS, Capture, Cloud, Shot, pose_from_camera_to_world
 from .colmap_model import SparseModel, find_model, read_model
+from .dataparser import NO_POINTS, DataparserOutputs, ImageRecord, PointCloud, pose_from_camera_to_world
 from .exposure import parse_seconds
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 from .lens import Lens
@@ -20,8 +20,8 @@ from .photos import photo_sizes
 from .sfm import reconstruct
 from .stack import refuse_stack
 
+FEWEST_PHOTOS = 3  # A training needs at least as many
 # From the full size to reduced copies.
-FEWEST_PHOTOS = 3  # That a training makes sense of
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 # HDR-NeRF's synthetic exposures, which HDR-GS's folders do not state (its train_synthetic.py holds them as constants).
 _HDR_GS_SECONDS = (0.125, 0.5, 2.0, 8.0, 32.0)
@@ -30,57 +30,59 @@ _POSES_REMEDY = "export the poses again with LLFF's imgs2poses"
 
 
 def image_folder(folder: Path) -> Path | None:
+    """Return the folder of images, at full size if possible, or None."""
     return next((folder / name for name in _IMAGE_FOLDERS if (folder / name).is_dir()), None)
 
 
-def read_colmap(folder: Path) -> Capture:
-    """One shot for each image of the model, in the natural order of the names."""
+def read_colmap(folder: Path) -> DataparserOutputs:
+    """Parse a COLMAP set: one record for each image of the model, in the natural order of the names."""
     model, source = _model(folder)
     images = image_folder(folder)
     if images is None:
         raise InputError(folder / "images", "folder not found", "put the photos that COLMAP used there")
-    shots, absent = [], []
+    records, absent = [], []
     for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
         image = contained(images, entry.name, source)
         if image.suffix.lower() in HDR_SUFFIXES and (photo := sibling(image, LDR_SUFFIXES)):
             hdr, image = image, photo
-        elif not os.path.isfile(image):  # As of a name that no file can have.
+        elif not os.path.isfile(image):  # Also for a name that is not possible as a file name.
             absent.append(entry.name)
             continue
         else:
             beside = (sibling(folder / name / image.name, HDR_SUFFIXES) for name in ("hdr", "exr"))
             hdr = next((file for file in beside if file), None)
-        shots.append(Shot(image.stem, image, entry.lens, entry.world_to_camera, hdr=hdr))
-    if not shots:
+        records.append(ImageRecord(image.stem, image, entry.lens, entry.world_to_camera, hdr=hdr))
+    if not records:
         problem = f"none of the model's {len(absent)} images is here (the first is {absent[0]!r:.90})"
         raise InputError(images, problem, _REMEDY)
     notes = ()
     if absent:
         notes = (f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ...",)
-    return Capture("colmap", tuple(shots), holdout=(8, 0), cloud=model.cloud, notes=notes)
+    return DataparserOutputs("colmap", tuple(records), holdout=(8, 0), cloud=model.cloud, notes=notes)
 
 
 def is_hdr_gs(folder: Path) -> bool:
+    """Return whether a folder has HDR-GS's synthetic layout."""
     there = (folder / "exr").is_dir() and (folder / "images").is_dir() and find_model(folder) is not None
     return there and bool(_exposures_by_view(folder / "images"))
 
 
-def read_hdr_gs(folder: Path) -> Capture:
-    """HDR-GS's synthetic layout: `images/<v>_<e>.png`, `exr/<v>.exr`, and a model with one image of each view."""
+def read_hdr_gs(folder: Path) -> DataparserOutputs:
+    """Parse HDR-GS's synthetic layout: `images/<v>_<e>.png`, `exr/<v>.exr`, a model with one image of each view."""
     cloud, poses = _poses_by_view(folder)
-    exposures, shots = _exposures_by_view(folder / "images"), []
+    exposures, records = _exposures_by_view(folder / "images"), []
     seconds, notes = _hdr_gs_seconds(folder, 1 + max(key for files in exposures.values() for key in files))
     for view, (lens, pose) in poses.items():
         hdr = sibling(folder / "exr" / f"{view}.exr", HDR_SUFFIXES)
         for key, image in sorted(exposures.get(view, {}).items()):
-            shots.append(Shot(view, image, lens, pose, key, seconds[key] if seconds else None, hdr=hdr))
-    if not shots:
+            records.append(ImageRecord(view, image, lens, pose, key, seconds[key] if seconds else None, hdr=hdr))
+    if not records:
         raise InputError(folder / "images", "none of the model's images is in images/", _REMEDY)
-    return Capture("hdr-gs", tuple(shots), "background", (2, 1), cloud, notes)
+    return DataparserOutputs("hdr-gs", tuple(records), "background", (2, 1), cloud, notes)
 
 
-def _poses_by_view(folder: Path) -> tuple[Cloud, dict[str, tuple]]:
-    """The points, and lens and pose of each view (names without `_<exposure>`) in natural order."""
+def _poses_by_view(folder: Path) -> tuple[PointCloud, dict[str, tuple]]:
+    """Return the points, and lens and pose of each view (names without `_<exposure>`) in natural order."""
     model, source = _model(folder)
     poses = {}
     for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
@@ -107,7 +109,7 @@ def _exposures_by_view(images: Path) -> dict[str, dict[int, Path]]:
 
 
 def _hdr_gs_seconds(folder: Path, count: int) -> tuple[list[float] | None, tuple[str, ...]]:
-    """Seconds by exposure number: "exposure_times" in `exposure_times.json`, or HDR-GS's constants."""
+    """Return seconds by exposure number from `exposure_times.json`, or HDR-GS's constants, and notes."""
     path = folder / "exposure_times.json"
     if path.is_file():
         values = read_json(path).get("exposure_times")
@@ -119,43 +121,48 @@ def _hdr_gs_seconds(folder: Path, count: int) -> tuple[list[float] | None, tuple
     return None, ()
 
 
-def read_hdr_nerf_real(folder: Path) -> Capture:
-    """HDR-NeRF's real layout: `input_images/<view>_<k>.jpg`, `poses_bounds_exps.npy` [n, 18] by sorted file names,
-    seconds last. `sparse/0` beside it (HDR-GS's edition) wins: all exposures of a view then have one pose."""
+def read_hdr_nerf_real(folder: Path) -> DataparserOutputs:
+    """Parse HDR-NeRF's real layout.
+
+    `input_images/<view>_<k>.jpg`, and `poses_bounds_exps.npy` [n, 18] by sorted file names with seconds last. Poses of
+    a `sparse/0` beside it (HDR-GS's edition) win, because there all exposures of a view have one pose.
+    """
     path = folder / "poses_bounds_exps.npy"
     rows = _rows(path, 18)
     images = _images(folder / "input_images", path, len(rows))
     cloud, poses = _poses_by_view(folder) if find_model(folder) is not None else (NO_POINTS, None)
-    shots, absent = [], set()
+    records, absent = [], set()
     for row, image in zip(rows, images, strict=True):
         view, key = view_and_exposure(image.stem)
         if poses is not None and view not in poses:
             absent.add(view)
             continue
         lens, pose = _camera(row, path, image.name) if poses is None else poses[view]
-        shots.append(Shot(view, image, lens, pose, exposure_key=key, exposure_time=float(row[17])))
+        records.append(ImageRecord(view, image, lens, pose, exposure_key=key, exposure_time=float(row[17])))
     notes = (f"{len(absent)} views are not in the sparse model and were left out",) if absent else ()
-    return Capture("hdr-nerf-real", tuple(shots), holdout=(2, 1), cloud=cloud, notes=notes)
+    return DataparserOutputs("hdr-nerf-real", tuple(records), holdout=(2, 1), cloud=cloud, notes=notes)
 
 
-def read_llff(folder: Path) -> Capture:
-    """`images/` with `poses_bounds.npy` [n, 17], rows in the order of the sorted file names."""
+def read_llff(folder: Path) -> DataparserOutputs:
+    """Parse LLFF's layout: `images/` and `poses_bounds.npy` [n, 17], rows in the order of the sorted file names."""
     path = folder / "poses_bounds.npy"
     rows = _rows(path, 17)
     images = _images(folder / "images", path, len(rows))
-    shots = (Shot(image.stem, image, *_camera(row, path, image.name)) for row, image in zip(rows, images, strict=True))
-    return Capture("llff", tuple(shots), holdout=(8, 0))
+    records = (
+        ImageRecord(image.stem, image, *_camera(row, path, image.name)) for row, image in zip(rows, images, strict=True)
+    )
+    return DataparserOutputs("llff", tuple(records), holdout=(8, 0))
 
 
 def _rows(path: Path, width: int) -> np.ndarray:
-    """[n, width] float64; mapped, so that no more memory is asked for than the file has bytes."""
+    """Read an array [n, width] as float64, mapped so that a false header cannot allocate more than the file has."""
     read_bytes(path, 1 << 28)
     try:
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
         if rows.dtype.kind != "f" or rows.ndim != 2 or rows.shape[1] != width:
             raise ValueError(f"shape {rows.shape} of {rows.dtype}")
         return np.array(rows, np.float64)
-    # NumPy parses the header as Python; what that raises for damaged ones is open-ended.
+    # NumPy parses the header as Python, which raises any kind of exception for a damaged one.
     except Exception as error:  # noqa: BLE001
         raise InputError(path, f"is not an [n, {width}] array of numbers ({error!s:.80})", _POSES_REMEDY) from None
 
@@ -170,7 +177,7 @@ def _images(folder: Path, path: Path, count: int) -> list[Path]:
 
 
 def _camera(row: np.ndarray, path: Path, name: str) -> tuple[Lens, np.ndarray]:
-    """Columns of the 3 x 5 matrix: down, right, backwards, position, (height, width, focal length)."""
+    """Return lens and pose from the 3 x 5 matrix of columns down, right, back, position, (height, width, focal)."""
     matrix = row[:15].reshape(3, 5)
     if not np.isfinite(matrix).all():
         raise InputError(path, f"pose of {name!r:.90} is not finite", _POSES_REMEDY)
@@ -182,8 +189,8 @@ def _camera(row: np.ndarray, path: Path, name: str) -> tuple[Lens, np.ndarray]:
     return lens, pose_from_camera_to_world(camera_to_world, path, name)
 
 
-def read_photos(folder: Path, cache: Path | str | None = None) -> Capture:
-    """One shot for each photo of the folder, or of its `images/`, that structure from motion could place."""
+def read_photos(folder: Path, cache: Path | str | None = None) -> DataparserOutputs:
+    """Parse bare photos of a folder, or its `images/`: one record for each that structure from motion places."""
     places = (place for place in (folder, folder / "images") if place.is_dir())
     found = [list_images(place, PHOTO_SUFFIXES) for place in places]
     # A lone picture beside `images/` is a cover.
@@ -204,16 +211,16 @@ def read_photos(folder: Path, cache: Path | str | None = None) -> Capture:
     for photo in photos:
         photo_sizes(photo)
     if kind == "raw":
-        color_matrix(photos)  # Photos of several cameras are refused before minutes of matching.
+        color_matrix(photos)  # Refuse photos of several cameras before minutes of matching.
     refuse_stack(photos, folder)
-    model, shots, lost = reconstruct(photos, cache), [], []
+    model, records, lost = reconstruct(photos, cache), [], []
     placed = {int(Path(image.name).stem): image for image in model.images}
     for i, photo in enumerate(photos):
         if (image := placed.get(i)) is None:
             lost.append(photo.name)
             continue
-        shots.append(Shot(photo.stem, photo, image.lens, image.world_to_camera, oriented=True))
+        records.append(ImageRecord(photo.stem, photo, image.lens, image.world_to_camera, oriented=True))
     notes = ()
     if lost:
         notes = (f"{len(lost)} of {len(photos)} photos could not be placed and were left out: {', '.join(lost[:5])}",)
-    return Capture("photos", tuple(shots), cloud=model.cloud, notes=notes)
+    return DataparserOutputs("photos", tuple(records), cloud=model.cloud, notes=notes)

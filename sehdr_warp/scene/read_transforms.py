@@ -1,4 +1,4 @@
-"""transforms.json and its kin (nerfstudio, instant-ngp, Blender, HDR-NeRF's synthetic sets)."""
+"""Readers of transforms.json and related layouts (nerfstudio, instant-ngp, Blender, HDR-NeRF's synthetic sets)."""
 
 import math
 import re
@@ -9,8 +9,8 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import contained, read_json
-from .capture import DERIVED_PHOTOS, NO_POINTS, Capture, Cloud, Shot, pose_from_camera_to_world
 from .colmap_model import find_model, read_ply_points, read_points
+from .dataparser import DERIVED_PHOTOS, NO_POINTS, DataparserOutputs, ImageRecord, PointCloud, pose_from_camera_to_world
 from .exposure import parse_seconds
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 from .lens import Lens
@@ -21,37 +21,37 @@ _REMEDY = "correct the file or export it again"
 _INCOMPLETE = "copy the whole set"
 
 
-def read_transforms(folder: Path) -> Capture:
-    """One shot for each frame of transforms.json, or of transforms_{train,test}.json (val where there is no test)."""
+def read_transforms(folder: Path) -> DataparserOutputs:
+    """Parse transforms.json, or transforms_{train,test}.json (val if there is no test): one record for each frame."""
     if (folder / "transforms.json").is_file():
         files = [(folder / "transforms.json", None)]
     else:
         other = "test" if (folder / "transforms_test.json").is_file() else "val"
         files = [(folder / "transforms_train.json", "train"), (folder / f"transforms_{other}.json", "test")]
-    shots, cloud = [], NO_POINTS
+    records, cloud = [], NO_POINTS
     for path, split in files:
         if split == "test" and not path.is_file():
             continue
         values = read_json(path)
         frames = frames_of(values, path)
         named = _named_splits(values, frames)
-        shots += [_frame_shot(folder, path, values, frame, name, split or named.get(name)) for name, frame in frames]
+        records += [_frame_shot(folder, path, values, frame, name, split or named.get(name)) for name, frame in frames]
         if not len(cloud[0]):
             cloud = _points(folder, path, values)
-    kept, notes = [shot for shot in shots if shot.split], ()
-    if 0 < len(kept) < len(shots):
-        notes = (f"{len(shots) - len(kept)} frames belong to neither the train nor the test split and were left out",)
-    return Capture("transforms", tuple(kept or shots), "background", cloud=cloud, notes=notes)
+    kept, notes = [record for record in records if record.split], ()
+    if 0 < len(kept) < len(records):
+        notes = (f"{len(records) - len(kept)} frames belong to neither the train nor the test split and were left out",)
+    return DataparserOutputs("transforms", tuple(kept or records), "background", cloud=cloud, notes=notes)
 
 
-def read_hdr_nerf(folder: Path) -> Capture:
-    """HDR-NeRF's synthetic layout (xhuangcv/hdr-nerf, load_syn_llff.py).
+def read_hdr_nerf(folder: Path) -> DataparserOutputs:
+    """Parse HDR-NeRF's synthetic layout (xhuangcv/hdr-nerf, load_syn_llff.py).
 
     `transforms_<split>.json` with frames whose file_path lacks the `_<k>.png` of the exposure; `exposure_<split>.json`
-    maps `<file_path>_<k>.png` to seconds; truth in `<split>_hdr/hdr_%03d.exr` by the frame's place; points where there
-    are some. `"photo_response": "reinhard-gamma"` (ours) marks truth alone: its photos are made of it by that curve.
+    maps `<file_path>_<k>.png` to seconds; truth is in `<split>_hdr/hdr_%03d.exr` by the frame's index. With
+    `"photo_response": "reinhard-gamma"` (this package's field) photos are computed from the truth by that curve.
     """
-    shots = []
+    records = []
     for split in ("train", "test"):
         path, times_path = folder / f"transforms_{split}.json", folder / f"exposure_{split}.json"
         if split == "test" and not path.is_file():
@@ -74,16 +74,22 @@ def read_hdr_nerf(folder: Path) -> Capture:
                 image = hdr if stated and hdr else contained(folder, file, times_path)
                 if image.is_file():
                     lens, view = frame_lens(values, frame, image, path), Path(_plain(name)).name
-                    present.append(Shot(view, image, lens, pose, key, time, split, hdr=hdr, derived=bool(stated)))
+                    present.append(
+                        ImageRecord(view, image, lens, pose, key, time, split, hdr=hdr, derived=bool(stated))
+                    )
             if not present:
                 absent = folder / f"{_plain(name)}_{min(exposures)}.png"
                 raise InputError(absent, "image file not found", _INCOMPLETE)
-            shots += present
-    return Capture("hdr-nerf", tuple(shots), "background", cloud=_sparse_points(folder))
+            records += present
+    return DataparserOutputs("hdr-nerf", tuple(records), "background", cloud=_sparse_points(folder))
 
 
 def frames_of(values: dict, path: Path) -> list[tuple[str, dict]]:
-    """(file_path, frame) of each frame; InputError where there is none."""
+    """Return (file_path, frame) of each frame.
+
+    Raises:
+        InputError: if there are no frames or one has no file_path.
+    """
     frames = values.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(path, "has no frames", _REMEDY)
@@ -94,7 +100,7 @@ def frames_of(values: dict, path: Path) -> list[tuple[str, dict]]:
 
 
 def _named_splits(values: dict, frames: list[tuple[str, dict]]) -> dict[str, str]:
-    """Splits by file_path: nerfstudio's <split>_filenames, or a frame's own "split"."""
+    """Return splits by file_path: nerfstudio's <split>_filenames, or a frame's own "split"."""
     known = ("train", "test", "val")
     named = {name: frame["split"] for name, frame in frames if frame.get("split") in known}
     for split in ("train", "val", "test"):
@@ -105,7 +111,7 @@ def _named_splits(values: dict, frames: list[tuple[str, dict]]) -> dict[str, str
     return {name: kept[split] for name, split in named.items() if split in kept}
 
 
-def _frame_shot(folder: Path, path: Path, values: dict, frame: dict, name: str, split: str | None) -> Shot:
+def _frame_shot(folder: Path, path: Path, values: dict, frame: dict, name: str, split: str | None) -> ImageRecord:
     image, hdr = contained(folder, name, path), None
     if image.suffix.lower() not in PHOTO_SUFFIXES:
         # Blender's file_path has no ending; a dot in the stem must not be taken for one.
@@ -119,11 +125,11 @@ def _frame_shot(folder: Path, path: Path, values: dict, frame: dict, name: str, 
     mask, time = frame.get("mask_path"), frame.get("exposure_time")
     mask = None if mask is None else contained(folder, mask, path)
     time = None if time is None else parse_seconds(time, path, name)
-    return Shot(image.stem, image, lens, pose, exposure_time=time, split=split, mask=mask, hdr=hdr)
+    return ImageRecord(image.stem, image, lens, pose, exposure_time=time, split=split, mask=mask, hdr=hdr)
 
 
 def _matrix(values) -> np.ndarray:
-    """The array that JSON values spell; one of no elements where they spell none."""
+    """Return the array of JSON values, or an empty one if they are not numbers."""
     try:
         return np.array(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -131,18 +137,33 @@ def _matrix(values) -> np.ndarray:
 
 
 def frame_pose(frame: dict, path: Path, name: str) -> np.ndarray:
-    """[4, 4] world_to_camera of a frame's transform_matrix; InputError where it is no pose."""
+    """Return world_to_camera [4, 4] of a frame's transform_matrix.
+
+    Raises:
+        InputError: if it is not a pose.
+    """
     return pose_from_opengl(_matrix(frame.get("transform_matrix")), path, name)
 
 
 def pose_from_opengl(matrix: np.ndarray, path: Path, name: str) -> np.ndarray:
+    """Return world_to_camera [4, 4] of a camera-to-world matrix in OpenGL axes; see pose_from_camera_to_world."""
     if matrix.shape in ((4, 4), (3, 4)):
         matrix[:3, 1:3] *= -1  # From x right, y up, -z forward to y down, z forward.
     return pose_from_camera_to_world(matrix, path, name)
 
 
 def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Lens:
-    """The lens of a frame, whose values win over the file's; the size is the image's where neither states it."""
+    """Return the lens of a frame, whose values win over the file's.
+
+    Args:
+        values: the file's top level.
+        frame: the frame's entry.
+        image: its photo, for the size if neither states it.
+        path: to name in errors.
+
+    Raises:
+        InputError: if values are missing or not possible.
+    """
     stated = values | frame
 
     def number(key: str, absent: Any = None) -> Any:
@@ -182,8 +203,8 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
     return Lens(model, int(width), int(height), (*pinhole, *bent), path)
 
 
-def _points(folder: Path, path: Path, values: dict) -> Cloud:
-    """ply_file_path (in the frames' coordinates), or nerfstudio's COLMAP model moved by applied_transform."""
+def _points(folder: Path, path: Path, values: dict) -> PointCloud:
+    """Read ply_file_path (in the frames' coordinates), or nerfstudio's COLMAP model moved by applied_transform."""
     name = values.get("ply_file_path")
     if isinstance(name, str) and (ply := contained(folder, name, path)).is_file():
         return read_ply_points(ply)
@@ -193,22 +214,22 @@ def _points(folder: Path, path: Path, values: dict) -> Cloud:
         if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
             raise InputError(path, "applied_transform is not a finite 3 x 4 matrix", _REMEDY)
         points = points @ matrix[:3, :3].T + matrix[:3, 3]
-    return points, colors
+    return PointCloud(points, colors)
 
 
-def _sparse_points(folder: Path) -> Cloud:
+def _sparse_points(folder: Path) -> PointCloud:
     places = (find_model(folder), folder / "sparse" / "0", folder / "sparse", folder)
     clouds = (read_points(place) for place in places if place is not None)
     return next((cloud for cloud in clouds if len(cloud[0])), NO_POINTS)
 
 
 def _plain(name: str) -> str:
-    """`./train/r_0` and `train/r_0` are the same."""
+    """Return a path without a leading `./` and with forward slashes."""
     return re.sub(r"^(\./)+", "", name.replace("\\", "/"))
 
 
 def _exposures_of(values: dict, path: Path) -> dict[str, dict[int, tuple[str, float]]]:
-    """frame -> exposure number -> (file name, seconds)."""
+    """Return frame -> exposure number -> (file name, seconds)."""
     found: dict[str, dict[int, tuple[str, float]]] = {}
     for key, value in values.items():
         match = re.fullmatch(r"(.+)_(\d{1,3})(\.[A-Za-z]+)?", _plain(key))

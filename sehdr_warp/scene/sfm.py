@@ -1,7 +1,7 @@
 """Structure from motion through pycolmap: poses and points of bare photos.
 
-pycolmap only ever sees images that this module wrote under names of its own, and its models come back through the
-package's bounded reader. Results go to a cache folder under a key made of all that they depend on.
+pycolmap reads only images that this module writes under its own names, and its models are read by the package's own
+reader. Results are cached under a key of everything that they depend on.
 """
 
 import contextlib
@@ -24,9 +24,9 @@ from ..caches import usable, user_cache
 from ..errors import InputError, SehdrError
 from ..files import atomic_folder, is_sealed
 from .colmap_model import SparseModel, read_model
-from .develop import told
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
 from .photos import read_photo
+from .preprocess import log_progress
 
 _log = logging.getLogger("sehdr_warp.scene")
 
@@ -34,16 +34,22 @@ _log = logging.getLogger("sehdr_warp.scene")
 MAX_SIDE = 1200
 _SEED = 0
 _VERSION = 3
-# Up to here every pair is matched; beyond, each photo with its neighbors by name (a walk or a video).
+# Up to so many photos every pair is matched; in larger sets each photo is matched with its neighbors by name.
 _EXHAUSTIVE_LIMIT = 150
 
 
 def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> SparseModel:
-    """Cameras (SIMPLE_RADIAL, at the photos' oriented size), poses and points of a list of photos.
+    """Find cameras (SIMPLE_RADIAL, at the photos' oriented size), poses and points of photos.
 
-    The names in the model are the photos' indices (`00003.png` is photos[3]); photos that could not be placed are
-    missing from it. cache: a folder for results, None the user's; the same photos, wherever they lie, are solved once.
-    Raises InputError where fewer than two photos can be placed.
+    Args:
+        photos: the files.
+        cache: a folder for results, None for the user's; the same photos are solved once, wherever they lie.
+
+    Returns:
+        A model whose names are the photos' indices (`00003.png` is photos[3]), without photos that could not be placed.
+
+    Raises:
+        InputError: if fewer than two photos can be placed.
     """
     key = _key("photos", MAX_SIDE, _SEED, [(photo.name, _digest(photo)) for photo in photos])
 
@@ -70,10 +76,10 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Spar
 
 @contextlib.contextmanager
 def _cached(cache: Path | str | None, name: str, solve: Callable[[Path, Path], None]) -> Iterator[Path]:
-    """The folder of a finished result: the cached one, or a new one that solve(work, result) fills.
+    """Provide the folder of a result: the cached one, or a new one that solve(work, result) fills.
 
-    The user's is $SEHDR_CACHE, or sehdr-warp/ in $XDG_CACHE_HOME or ~/.cache; one that cannot be written is done
-    without, and a damaged result is made again. A named one is asked for.
+    The user's cache is $SEHDR_CACHE, or sehdr-warp/ in $XDG_CACHE_HOME or ~/.cache. If it cannot be written, the result
+    is temporary; a damaged result is computed again. A cache that the caller names must be writable.
     """
     with contextlib.ExitStack() as stack:
         stated = cache or os.environ.get("SEHDR_CACHE")
@@ -95,7 +101,7 @@ def _cached(cache: Path | str | None, name: str, solve: Callable[[Path, Path], N
                     (Path(work) / "model").mkdir()
                     solve(Path(work), result)
             except SehdrError:
-                if not place.is_dir():  # Else another process finished the same work first; its result is as good.
+                if not place.is_dir():  # Else another process finished the same work first; its result is used.
                     raise
         yield place
 
@@ -117,26 +123,26 @@ def _name(index: int) -> str:
 
 
 def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Oriented 8-bit copies of at most MAX_SIDE pixels; returns the oriented full sizes and the copies' sizes."""
+    """Write oriented 8-bit copies of at most MAX_SIDE pixels; returns the oriented full sizes and the copies' sizes."""
     folder.mkdir()
-    sizes, small, shown = [], [], False
-    for i, photo in told("reading photos", photos):
+    sizes, small, visible = [], [], False
+    for i, photo in log_progress("reading photos", photos):
         codes = read_photo(photo, oriented=True).pixels
         image = Image.fromarray(codes if codes.dtype == np.uint8 else (codes >> 8).astype(np.uint8))
         image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
         sizes.append(codes.shape[1::-1])
         small.append(image.size)
         values = np.asarray(image)
-        shown |= bool(((values > 2) & (values < 253)).mean() > 1e-3)
+        visible |= bool(((values > 2) & (values < 253)).mean() > 1e-3)
         image.save(folder / _name(i), compress_level=1)
-    if not shown:
+    if not visible:
         problem = "the photos are all black or all white"
         raise InputError(photos[0].parent, problem, "expose them so that the scene shows")
     return sizes, small
 
 
 def _focal_prior(equivalent: str, width: int, height: int) -> float:
-    """Pixels: from EXIF's 35 mm equivalent (whose diagonal is 43.27 mm), or COLMAP's guess of 1.2 longest sides."""
+    """Return pixels from EXIF's 35 mm equivalent (whose diagonal is 43.27 mm), or COLMAP's 1.2 longest sides."""
     with contextlib.suppress(ValueError):
         if 4 <= float(equivalent) <= 2000:
             return float(equivalent) / 43.27 * math.hypot(width, height)
@@ -144,8 +150,10 @@ def _focal_prior(equivalent: str, width: int, height: int) -> float:
 
 
 def _device(photo: Path) -> tuple[str, ...]:
-    """EXIF's maker, model, focal length and its 35 mm equivalent, as text; "None" where EXIF does not say, and of RAW
-    and float photos, which are of one camera anyhow."""
+    """Return EXIF's maker, model, focal length and its 35 mm equivalent as text, "None" if EXIF does not state them.
+
+    RAW and float photos have "None" for all, because a set of them has one camera.
+    """
     if photo.suffix.lower() not in LDR_SUFFIXES:
         return ("None",) * 4
     with open_image(photo) as image:
@@ -158,12 +166,12 @@ def _device(photo: Path) -> tuple[str, ...]:
 
 
 def _extract(database: Path, images: Path, names: list[str], model: str, params) -> None:
-    """Features of images that share one camera."""
+    """Extract the features of images that share one camera."""
     import pycolmap
 
     stated = ",".join(f"{value:.17g}" for value in params)
     reader = pycolmap.ImageReaderOptions(camera_model=model, camera_params=stated)
-    for start in range(0, len(names), 8):  # Each on a core of its own.
+    for start in range(0, len(names), 8):  # Eight photos at a time, one on each core.
         part = names[start : start + 8]
         if len(names) > 1:
             _log.info("finding features in photos %d to %d of %d", start + 1, start + len(part), len(names))
@@ -191,7 +199,7 @@ def _match(database: Path, count: int) -> None:
 
 
 def _map(database: Path, work: Path, count: int, source: Path):
-    """The largest reconstruction; where photos are left, after a second try with weaker conditions."""
+    """Return the largest reconstruction, after a second try with weaker conditions if photos are missing from it."""
     import pycolmap
 
     best = None
@@ -215,8 +223,8 @@ def _map(database: Path, work: Path, count: int, source: Path):
             models = pycolmap.incremental_mapping(
                 database, work / "images", output, options, next_image_callback=next_image
             )
-        found = [*([] if best is None else [best]), *models.values()]
-        best = max(found, key=lambda model: model.num_reg_images(), default=None)
+        candidates = [*([] if best is None else [best]), *models.values()]
+        best = max(candidates, key=lambda model: model.num_reg_images(), default=None)
         if best is not None and best.num_reg_images() == count:
             return best
     if best is None or best.num_reg_images() < 2:
@@ -227,7 +235,7 @@ def _map(database: Path, work: Path, count: int, source: Path):
 
 @contextlib.contextmanager
 def _quiet():
-    """pycolmap logs every step to the terminal; only its fatal errors pass."""
+    """Suppress pycolmap's log on the terminal except fatal errors."""
     import pycolmap
 
     level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, int(pycolmap.logging.FATAL)

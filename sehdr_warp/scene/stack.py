@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from ..errors import InputError
-from .capture import Shot
+from .dataparser import ImageRecord
 from .exposure import shutter, with_exposure_times
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, open_image, read_ldr
 from .lens import Lens
@@ -42,13 +42,13 @@ def read_stack(folder: Path, times: Sequence[float] | None = None) -> tuple[list
         raise InputError(folder, "is no folder of photos", "give a folder of one scene at several exposure times")
     if times is None:
         no_lens = Lens("PINHOLE", 1, 1, (1.0, 1.0, 0.5, 0.5), folder)
-        shots = [Shot(file.stem, file, no_lens, np.eye(4)) for file in files]
-        shots, known, notes = with_exposure_times(shots, folder)
+        records = [ImageRecord(file.stem, file, no_lens, np.eye(4)) for file in files]
+        records, known, notes = with_exposure_times(records, folder)
         if not known:
             raise InputError(folder, "its photos state no exposure times", "give --exposures or an exposures.json")
         for note in notes:
             log.info(note)
-        times = [shot.seconds for shot in shots]
+        times = [record.seconds for record in records]
     if len(times) != len(files):
         raise InputError(folder, f"has {len(files)} photos, and {len(times)} times are given", "give one for each")
     return files, times
@@ -61,23 +61,25 @@ def refuse_stack(photos: Sequence[Path], folder: Path) -> None:
         return
     no_lens = Lens("PINHOLE", 1, 1, (1.0, 1.0, 0.5, 0.5), folder)
     try:
-        shots, known, _ = with_exposure_times([Shot(file.stem, file, no_lens, np.eye(4)) for file in photos], folder)
-        shots = sorted(shots, key=lambda shot: shot.seconds)
-        steps = [b.seconds / a.seconds for a, b in pairwise(shots)]
-        if not known or min(steps) < LEAST_STEP or not all(starmap(_alike, pairwise(_thumbnails(shots)))):
+        records, known, _ = with_exposure_times(
+            [ImageRecord(file.stem, file, no_lens, np.eye(4)) for file in photos], folder
+        )
+        records = sorted(records, key=lambda record: record.seconds)
+        steps = [b.seconds / a.seconds for a, b in pairwise(records)]
+        if not known or min(steps) < LEAST_STEP or not all(starmap(_alike, pairwise(_thumbnails(records)))):
             return
     except (InputError, *PILLOW_ERRORS):
         return  # Who reads these photos says what is wrong with them.
-    span = f"{shutter(shots[0].seconds)} to {shutter(shots[-1].seconds)}"
+    span = f"{shutter(records[0].seconds)} to {shutter(records[-1].seconds)}"
     problem = f"its {len(photos)} photos are an exposure stack from one place ({span}), which does not show depth"
     command = f"`sehdr-warp calibrate {shlex.quote(str(photos[0].parent))} --out camera.csv`"
     remedy = f"take photos from different places; {command} finds the camera's response in the stack"
     raise InputError(folder, problem, remedy)
 
 
-def _thumbnails(shots: Sequence[Shot]) -> Iterator[np.ndarray]:
-    for shot in shots:
-        with open_image(shot.image) as image:
+def _thumbnails(records: Sequence[ImageRecord]) -> Iterator[np.ndarray]:
+    for record in records:
+        with open_image(record.image) as image:
             small = image.convert("L")
             small.thumbnail((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
             yield np.asarray(small)

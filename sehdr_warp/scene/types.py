@@ -1,4 +1,4 @@
-"""What was photographed: views, the scene they form, and what the user should know about it."""
+"""Views, and the scene that they form."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +18,12 @@ class View:
 
     Attributes:
         name: the image's stem in the data (`r_0`); unique within a scene.
-        codes: [H, W, 3] uint8 as photographed, or uint16 where the photo has 16 bits or was averaged; at the camera's
-            size.
-        camera: where it was taken from.
+        codes: [H, W, 3] uint8 as stored in the photo, or uint16 if the photo has 16 bits, was averaged or converted to
+            other primaries; at the camera's size.
+        camera: its undistorted camera.
         exposure_time: seconds, positive.
         split: "train" or "test".
-        mask: [H, W] float32 in [0, 1], 1 where the pixel counts; None means all count.
+        mask: [H, W] float32 in [0, 1], 1 keeps the pixel; None keeps all.
         hdr: [H, W, 3] float32 scene-linear truth (radiance, not multiplied by the exposure time); None without truth.
         source: the file the photo came from.
         light_above_white: [H, W, 3] float16, the light of clipped pixels that the photo's file states beside its codes
@@ -32,7 +32,7 @@ class View:
         light_above_white_deviation: standard deviation of the natural logarithm of light_above_white.
 
     Raises:
-        ValueError: for codes of another type or shape; codes_of makes them of encoded values.
+        ValueError: if codes have another type or shape; codes_of returns codes for encoded values.
     """
 
     name: str
@@ -47,6 +47,7 @@ class View:
     light_above_white_deviation: float = 0.0
 
     def __post_init__(self):
+        """Check the types and shapes."""
         codes = self.codes
         if getattr(codes, "dtype", None) not in (np.uint8, np.uint16) or codes.ndim != 3 or codes.shape[2] != 3:
             found = f"{getattr(codes, 'dtype', type(codes).__name__)} {list(getattr(codes, 'shape', ()))}"
@@ -62,7 +63,7 @@ class View:
 
     @property
     def image(self) -> np.ndarray:
-        """[H, W, 3] float32 in [0, 1]: the encoded values, made anew at each call."""
+        """The encoded values [H, W, 3] float32 in [0, 1], computed at each access."""
         return encoded_values(self.codes)
 
 
@@ -72,18 +73,18 @@ class Scene:
 
     Attributes:
         name: of the set.
-        format: the layout that was read (colmap, transforms, hdr-nerf, hdr-nerf-real, hdr-gs, llff, photos).
+        format: the layout of the data (colmap, transforms, hdr-nerf, hdr-nerf-real, hdr-gs, llff, photos).
         views: in the order of their names.
         points: [P, 3] float64 world coordinates, P may be 0.
         point_colors: [P, 3] float32 in [0, 1], encoded like photos.
-        exposure_times_known: False where no file stated them (then each view's is 1 second).
-        notes: one line each on what the user should know (differing exposures, views left out, ...).
-        response: the curve the photos were averaged by; None for a scene made by hand.
-        chosen_by: the method and the candidates that chose the response; None where it was named.
-        light_known: the photos' codes were made of light by `response`, of no camera's choice: RAW, linear, float.
-        evened: what the camera changed between photos unsaid is taken out of them; see photo_gains.
-        color_matrix: [3, 3] from the colors of the codes' light to linear Rec.709; None where these are Rec.709
-            themselves.
+        exposure_times_known: False if no file states them; then each view has 1 second.
+        notes: lines for the user (differing exposures, views left out, ...).
+        response: the curve by which the photos were averaged; None for a scene built in code.
+        chosen_by: the method and the candidates that selected the response; None if the user named it.
+        light_known: True if this package encoded the codes from known light by `response`: RAW, linear and float
+            photos, and those whose files state their transfer function.
+        photos_normalized: True if the photos were normalized; see ExposureCompensation.normalize_photos.
+        color_matrix: [3, 3] from the primaries of the codes' light to linear Rec.709; None if these are Rec.709.
     """
 
     name: str
@@ -97,24 +98,31 @@ class Scene:
     chosen_by: tuple[str, tuple[str, ...]] | None = None
     color_matrix: np.ndarray | None = None
     light_known: bool = False
-    evened: bool = False
+    photos_normalized: bool = False
 
     @property
     def train_views(self) -> tuple[View, ...]:
+        """The views to train on."""
         return tuple(view for view in self.views if view.split == "train")
 
     @property
     def test_views(self) -> tuple[View, ...]:
+        """The views held out for testing."""
         return tuple(view for view in self.views if view.split == "test")
 
 
 def encoded_values(codes: np.ndarray) -> np.ndarray:
-    """float32 in [0, 1] from uint8 or uint16 codes."""
+    """Return float32 values in [0, 1] of uint8 or uint16 codes."""
     return codes.astype(np.float32) / np.float32(np.iinfo(codes.dtype).max)
 
 
 def codes_of(image: np.ndarray, bits: int | None = None) -> np.ndarray:
-    """Codes of encoded values in [0, 1], rounded: uint8 or uint16 by bits (8, 16), or by whether 8 bits hold them."""
+    """Return the rounded codes of encoded values, which are clipped to [0, 1].
+
+    Args:
+        image: any shape.
+        bits: 8 or 16; None takes 8 if these hold the values exactly, else 16.
+    """
     image = np.clip(image, 0.0, 1.0)
     if bits != 16:
         small = np.rint(image * 255)

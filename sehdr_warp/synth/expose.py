@@ -21,7 +21,7 @@ _MOST_SAMPLES, _STEPS_PER_STOP = 200_000, 16
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Shot noise and read noise of a linear sensor, in electrons.
+    """ImageRecord noise and read noise of a linear sensor, in electrons.
 
     full_well: at the response's clip_exposure; for a curve that only approaches its peak, at Response.white.
     read_noise: standard deviation.

@@ -200,7 +200,7 @@ def _train(asked: Train, ranks=None) -> None:
 
 def _check_truth(data: Mapping, config) -> None:
     """Refuses photos without the HDR truth that the loss needs before a response is chosen for them."""
-    from ..scene.load import read_capture
+    from ..scene.load import parse_dataset
     from ..scene.names import unique_names
     from .targets import check_truth
 
@@ -208,9 +208,9 @@ def _check_truth(data: Mapping, config) -> None:
     if not config.loss.uses_hdr or mended:
         return
     known = {name: data.get(name) for name in ("exposure_index", "holdout")}
-    capture = read_capture(data["path"], **known)
-    named = zip(unique_names(capture.shots), capture.shots, strict=True)
-    views = [(name, shot.hdr is not None) for name, shot in named if shot.split == "train"]
+    capture = parse_dataset(data["path"], **known)
+    named = zip(unique_names(capture.records), capture.records, strict=True)
+    views = [(name, record.hdr is not None) for name, record in named if record.split == "train"]
     check_truth(capture.name, views, config.loss)
 
 

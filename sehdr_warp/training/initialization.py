@@ -18,7 +18,7 @@ from ..response import Response, ToneMapper, response_by_name
 from ..runs.config import Config
 from ..runs.run import assemble_field
 from ..scene import Scene, View
-from ..scene.load import best_response, photos_to_judge
+from ..scene.load import sample_photos, select_response_for
 from ..splats import read_gaussians
 from .densification import gaussian_budget
 from .matching import Matcher
@@ -64,8 +64,8 @@ def choose_response(scene: Scene, config: Config) -> Response:
     if scene.response is not None and scene.chosen_by == (options.method, options.candidates):
         return scene.response
     views = scene.train_views
-    codes = [view.codes for view in photos_to_judge(views, options.method)]
-    return best_response(codes, [view.source for view in views], options.method, options.candidates)
+    codes = [view.codes for view in sample_photos(views, options.method)]
+    return select_response_for(codes, [view.source for view in views], options.method, options.candidates)
 
 
 def make_field(

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from ..errors import InputError, SehdrError, surroundings_told
 from ..parallel import thread_count
-from ..scene.photo_file import PhotoFile, can_share, taken
+from ..scene.photo_file import PhotoFile, can_share, open_shared
 
 log = logging.getLogger(__name__)
 
@@ -141,7 +141,7 @@ class Ranks:
             if self.store.check(["ended"]):
                 return None
             time.sleep(_POLL)
-        return taken(pickle.loads(self.store.get("shared")))
+        return open_shared(pickle.loads(self.store.get("shared")))
 
     def ends_first(self) -> bool:
         """Whether this is the first rank that ends with an error; it alone tells why."""

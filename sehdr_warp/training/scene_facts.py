@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..scene import Scene, View, encoded_values
-from ..scene.exposure import made_by_camera
+from ..scene.exposure import are_camera_jpegs
 from ..scene.linear_photos import kind_of
 from .initialization import focus_distance, pixels_of, points_on_rays
 
@@ -70,7 +70,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     return SceneFacts(
         photos=len(views),
         pixels=sum(view.camera.width * view.camera.height for view in views),
-        from_camera=made_by_camera([view.source for view in views]),
+        from_camera=are_camera_jpegs([view.source for view in views]),
         truths=sum(view.hdr is not None for view in views),
         points=len(scene.points),
         seen=float(shown[shown > 0].mean()) if shown.any() else 0.0,

@@ -25,7 +25,7 @@ from ..runs.device import pick_device
 from ..runs.run import Run, as_rec709, field_from_checkpoint, load_run, photo_gains
 from ..runs.run_folder import RunFolder
 from ..scene import Camera, Scene
-from ..scene.photo_gains import PhotoGains
+from ..scene.exposure_compensation import ExposureCompensation
 from .following import hand_on, told_of_ranks
 from .held_out import evaluate_views, figures_told, warn_of_fall
 from .initialization import choose_response, make_field, make_matcher, sizes_of
@@ -333,9 +333,9 @@ class Training:
             log.info("%s", line)
         return trainer
 
-    def _even(self, scene: Scene, gains: PhotoGains | None, response: Response) -> Scene:
+    def _even(self, scene: Scene, gains: ExposureCompensation | None, response: Response) -> Scene:
         """The scene that is trained on from here."""
-        self.scene = scene if gains is None else gains.even(scene, response)
+        self.scene = scene if gains is None else gains.normalize_photos(scene, response)
         return self.scene
 
     def _continue(self, config: Config | None) -> Trainer:

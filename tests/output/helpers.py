@@ -64,7 +64,7 @@ class AnalyticRun:
         self.gain, self.confident = 1.0, True
         self.rendered = 0
 
-    def even(self, scene):
+    def normalize_photos(self, scene):
         return scene
 
     def summary(self):

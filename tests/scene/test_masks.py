@@ -159,7 +159,7 @@ def test_note_without_masks():
 
 
 def test_masks_of_the_tankard(shared):
-    capture = read_llff(shared / "data" / "tankard_turntable")
-    assert len(capture.shots) == 69
+    dataset = read_llff(shared / "data" / "tankard_turntable")
+    assert len(dataset.records) == 69
     scene = load(shared / "data" / "tankard_turntable", max_size=100)
     assert "masks: 69 of 69 photos have one" in " ".join(scene.notes)

@@ -11,7 +11,7 @@ import pytest
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_scene
-from sehdr_warp.scene.photo_file import PhotoFile, taken
+from sehdr_warp.scene.photo_file import PhotoFile, open_shared
 from tests.make_scenes import write_blender, write_ply
 
 LOAD = """
@@ -57,7 +57,7 @@ def test_arrays_are_kept_shared_and_gone(tmp_path):
     assert photos.keep(kept) is kept and photos.used < 2 * given.nbytes
     assert list(tmp_path.iterdir()) == [], "no name"
     if sys.platform == "linux":
-        value = taken(
+        value = open_shared(
             photos.share({"photo": kept, "mask": np.ones((80, 80), np.float32), "name": "a", "small": given[:1]})
         )
         np.testing.assert_array_equal(value["photo"], given)

@@ -141,7 +141,7 @@ def test_fern_is_read_as_pycolmap_reads_it(shared):
 
 def test_hdr_gs_layout(tmp_path):
     write_colmap(tmp_path, name="{}_1.png")
-    from sehdr_warp.scene.capture import reinhard_gamma
+    from sehdr_warp.scene.dataparser import reinhard_gamma
 
     (tmp_path / "exr").mkdir()
     import OpenEXR

@@ -203,7 +203,7 @@ def test_limited_size():
 
 def test_photos_made_by_a_camera(tmp_path):
     """JPEGs that state an exposure; neither other JPEGs nor other files, nor a minority of them."""
-    from sehdr_warp.scene.exposure import made_by_camera
+    from sehdr_warp.scene.exposure import are_camera_jpegs
 
     tags = Image.Exif()
     tags.get_ifd(0x8769)[0x829D] = 8.0
@@ -212,9 +212,9 @@ def test_photos_made_by_a_camera(tmp_path):
     picture.save(tmp_path / "plain.jpg")
     picture.save(tmp_path / "screen.png", exif=tags)
     camera, plain, screen = (tmp_path / name for name in ("camera.JPG", "plain.jpg", "screen.png"))
-    assert made_by_camera([camera]) and made_by_camera([camera, camera, plain])
+    assert are_camera_jpegs([camera]) and are_camera_jpegs([camera, camera, plain])
     for others in ([plain], [screen], [camera, plain], [None], [tmp_path / "gone.jpg"], []):
-        assert not made_by_camera(others)
+        assert not are_camera_jpegs(others)
 
 
 @pytest.mark.parametrize("behind", [False, True])

@@ -15,7 +15,7 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.files import LIST
 from sehdr_warp.scene import load_scene, sfm
-from sehdr_warp.scene.capture import Shot
+from sehdr_warp.scene.dataparser import ImageRecord
 from sehdr_warp.scene.exposure import shutter
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import _held_out
@@ -136,7 +136,7 @@ def test_names_are_unique_and_test_views_keep_theirs(tmp_path):
     lens = Lens("SIMPLE_PINHOLE", 4, 4, (4, 2, 2), tmp_path)
 
     def shot(path, split):
-        return Shot((tmp_path / path).stem, tmp_path / path, lens, np.eye(4), split=split)
+        return ImageRecord((tmp_path / path).stem, tmp_path / path, lens, np.eye(4), split=split)
 
     shots = [shot("train/r_0.png", "train"), shot("train/R_1.png", "train"), shot("test/r_0.png", "test"),
              shot("a/x.png", None), shot("b/X.png", None), shot("train/r_2.png", "train")]  # fmt: skip

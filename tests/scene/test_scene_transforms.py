@@ -8,7 +8,7 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_cameras
-from sehdr_warp.scene.capture import reinhard_gamma
+from sehdr_warp.scene.dataparser import reinhard_gamma
 from tests.make_scenes import (
     arc_poses,
     load,

@@ -10,7 +10,7 @@ from scenes.generator.recipes import RECIPES
 from scenes.generator.truth_set import pack_truth
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import embedded_scenes
-from sehdr_warp.scene.capture import reinhard_gamma
+from sehdr_warp.scene.dataparser import reinhard_gamma
 from tests.make_scenes import load
 
 from .conftest import write_truth

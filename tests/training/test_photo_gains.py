@@ -9,7 +9,7 @@ from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene import codes_of
-from sehdr_warp.scene.photo_gains import PhotoGains
+from sehdr_warp.scene.exposure_compensation import ExposureCompensation
 from sehdr_warp.training import photo_gains as gains_of_a_training
 from sehdr_warp.training.matching import LARGEST_SIDE, at_matching_size
 from sehdr_warp.training.photo_gains import evens, find_gains
@@ -52,22 +52,22 @@ def test_stated_times_are_doubted_where_photos_contradict_them(device):
 
 
 def test_stated_times_stay_where_colors_or_corners_alone_drift(device):
-    """Cameras state no white balance and no falloff: exposures are held to what they do state."""
+    """Cameras state no white balance and no vignetting: exposures are held to what they do state."""
     light = np.linspace(-0.5, 0.5, 9)[:, None] * [1, 0, -1]
     scene = wall_and_lamp()
     views, tinted, darkened = scene.views, [], []
     column, row = np.meshgrid(np.arange(64) - 31.5, np.arange(64) - 31.5)
     corners = 0.5 ** ((column**2 + row**2) / (2 * 32**2))[..., None]
-    for view, tint in zip(views, light, strict=True):
-        tinted.append(replace(view, codes=codes_of(view.image * 2**tint, 8)))
+    for view, white_balance in zip(views, light, strict=True):
+        tinted.append(replace(view, codes=codes_of(view.image * 2**white_balance, 8)))
         darkened.append(replace(view, codes=codes_of(view.image * corners, 8)))
     gains, _, decision = find_gains(replace(scene, views=tuple(tinted)), CONFIG, LINEAR, device)
-    assert "stay as stated" in decision.choice and "white balance" in decision.reason and gains.corners == 0
+    assert "stay as stated" in decision.choice and "white balance" in decision.reason and gains.corner_loss == 0
     found = np.log2([gains.gains[view.name] for view in views])
     np.testing.assert_allclose(found, light, atol=0.06)
     assert (found[:, 1] == 0).all()
     gains, _, decision = find_gains(replace(scene, views=tuple(darkened)), CONFIG, LINEAR, device)
-    assert "stay as stated" in decision.choice and gains.corners == pytest.approx(0.5, abs=0.1) and not gains.stops
+    assert "stay as stated" in decision.choice and gains.corner_loss == pytest.approx(0.5, abs=0.1) and not gains.stops
 
 
 def test_times_that_a_camera_rounds_are_put_right(device):
@@ -137,7 +137,7 @@ def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
     run = load_run(tmp_path / "run")
     decision = next(made for made in run.decisions() if made["name"] == "photo-gains")
     assert "out of the photos" in decision["choice"] and "stops" in decision["reason"]
-    evened = run.even(scene)
+    evened = run.normalize_photos(scene)
     assert (run.color_matrix == scene.color_matrix).all()
     ratios = [view.exposure_time / time for view, time in zip(evened.views, times, strict=True)]
     assert np.ptp(ratios) / np.mean(ratios) < 0.05
@@ -151,7 +151,7 @@ def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
 
 def test_large_photos_are_matched_and_evened_small(monkeypatch):
     """Full-size copies of a large set, evened again and again, would take more memory than there is."""
-    (scene, _), sizes, even = drifting(), [], PhotoGains._view
+    (scene, _), sizes, even = drifting(), [], ExposureCompensation._view
     factor = LARGEST_SIDE // 64 + 4
     large = tuple(
         replace(
@@ -166,7 +166,7 @@ def test_large_photos_are_matched_and_evened_small(monkeypatch):
         sizes.append(max(view.codes.shape))
         return even(gains, view, response)
 
-    monkeypatch.setattr(PhotoGains, "_view", watched)
+    monkeypatch.setattr(ExposureCompensation, "_view", watched)
     gains, matcher, _ = find_gains(replace(scene, views=large), CONFIG, LINEAR, "cpu")
     assert gains is not None and max(large[0].codes.shape) > LARGEST_SIDE
     assert sizes and max(sizes) <= LARGEST_SIDE

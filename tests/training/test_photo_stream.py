@@ -47,7 +47,7 @@ def test_photos_of_several_sizes_have_no_common_place(device):
 
 def test_a_training_on_a_file_is_the_same_bits(scene, trained, tmp_path):
     keeper = PhotoKeeper("disk", len(scene.views), len(scene.views) * 32 * 32)
-    kept = dataclasses.replace(scene, views=tuple(keeper.kept(view) for view in scene.views))
+    kept = dataclasses.replace(scene, views=tuple(keeper.store(view) for view in scene.views))
     assert "read from a nameless file" in keeper.note
     train(kept, tmp_path / "disk", VARIANTS["default"], device="cpu")
     first, second = (RunFolder(run).newest_checkpoint().tensors for run in (trained("default"), tmp_path / "disk"))

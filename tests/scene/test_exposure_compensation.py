@@ -1,4 +1,4 @@
-"""Gains of photos and falloff: fitted to points in view of cameras, and taken out of codes."""
+"""Gains of photos and vignetting: fitted to points in view of cameras, and taken out of codes."""
 
 from dataclasses import replace
 
@@ -9,20 +9,20 @@ from PIL import Image
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View, codes_of, photo_file
 from sehdr_warp.scene.camera import look_at
-from sehdr_warp.scene.photo_gains import (
+from sehdr_warp.scene.exposure_compensation import (
     BAND_ROWS,
-    PhotoGains,
+    ExposureCompensation,
     disagreement,
     fit_gains,
-    left_of_falloff,
-    lenses_of,
+    initial_gains,
+    lens_groups,
+    remaining_vignetting,
     rough_gains,
-    start_gains,
 )
 
 SIZE, PHOTOS = 48, 6
 SRGB = response_by_name("srgb")
-FALLOFF = (0.25, 0.1)
+VIGNETTING = (0.25, 0.1)
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +39,15 @@ def points():
     return np.c_[np.random.default_rng(1).uniform(-1.5, 1.5, (400, 2)), np.full(400, 4.0)]
 
 
-def everywhere(falloff, photos=range(PHOTOS)):
-    return {f"p_{k}": falloff for k in photos}
+def everywhere(vignetting, photos=range(PHOTOS)):
+    return {f"p_{k}": vignetting for k in photos}
 
 
-def photographed(gains, falloff, focal=lambda name: 60.0) -> Scene:
-    """A wall of smooth colors, its photos taken by cameras of such gains, falloff and focal lengths, by name; the last
-    photo is held out."""
+def photographed(gains, vignetting, focal=lambda name: 60.0) -> Scene:
+    """A wall of smooth colors, its photos taken by cameras of such gains, vignetting and focal lengths, by name.
+
+    The last photo is held out.
+    """
     views = []
     for index in range(PHOTOS):
         place, f = (0.25 * index - 0.6, 0.1 * (index % 3), 0.0), focal(f"p_{index}")
@@ -56,7 +58,7 @@ def photographed(gains, falloff, focal=lambda name: 60.0) -> Scene:
         light = 0.12 + 0.05 * np.sin(np.concatenate([wall[0] + wall[1], 2 * wall[0], 1 - wall[1]], 2))
         r = np.hypot(column - 24, row - 24)[..., None] / np.hypot(24, 24)
         name = f"p_{index}"
-        a, b = falloff.get(name, (0, 0))
+        a, b = vignetting.get(name, (0, 0))
         light = light * np.array(gains.get(name, (1, 1, 1))) * np.exp(-a * r**2 - b * r**4)
         split = "test" if index == PHOTOS - 1 else "train"
         views.append(View(name, codes_of(SRGB.encode(light), 8), camera, 1.0, split))
@@ -64,25 +66,25 @@ def photographed(gains, falloff, focal=lambda name: 60.0) -> Scene:
 
 
 def test_gains_and_falloff_are_found(gains, points):
-    scene = photographed(gains, everywhere(FALLOFF))
+    scene = photographed(gains, everywhere(VIGNETTING))
     hidden, seen = points.copy(), np.ones((PHOTOS, len(points)), bool)
     hidden[::10, 2] = 2.0  # points that are none
     hidden[1::2, 2], seen[1:, 1::2] = 7.0, False  # behind the wall, and known to be
     found = fit_gains(scene.train_views, scene.test_views, hidden, seen, SRGB)
     for name, gain in gains.items():
         np.testing.assert_allclose(found.gains[name], gain, rtol=0.02)
-    assert found.corners == pytest.approx(1 - np.exp(-sum(FALLOFF)), abs=0.03)
+    assert found.corner_loss == pytest.approx(1 - np.exp(-sum(VIGNETTING)), abs=0.03)
     assert found.stops > 0.3
-    rough = start_gains(scene.train_views, SRGB)
+    rough = initial_gains(scene.train_views, SRGB)
     np.testing.assert_allclose([rough.gains[v.name] for v in scene.train_views], list(gains.values())[:-1], rtol=0.25)
     rough, known = rough_gains(scene.train_views, hidden, seen, SRGB), (scene.train_views, hidden, seen, SRGB)
-    assert (rough.stops, rough.tint) == pytest.approx((found.stops, found.tint), rel=0.15)
-    assert rough.corners == pytest.approx(found.corners, abs=0.1)
+    assert (rough.stops, rough.white_balance) == pytest.approx((found.stops, found.white_balance), rel=0.15)
+    assert rough.corner_loss == pytest.approx(found.corner_loss, abs=0.1)
     for colors in (False, True):
         before, after = (disagreement(*known, taken, colors=colors) for taken in (None, found))
         assert after < 0.1 * before
-    wrong = replace(found, falloff=everywhere((0.0, 0.8)))
-    assert left_of_falloff(*known, found) < 0.15 and left_of_falloff(*known, wrong) > 0.8
+    wrong = replace(found, vignetting=everywhere((0.0, 0.8)))
+    assert remaining_vignetting(*known, found) < 0.15 and remaining_vignetting(*known, wrong) > 0.8
 
 
 @pytest.mark.parametrize("told", ["times", "places"])
@@ -92,28 +94,30 @@ def test_what_follows_stated_times_or_places_is_told_apart(told):
     views = [replace(v, exposure_time=2.0 ** (k % 4)) for k, v in enumerate(photographed({}, {}).train_views)]
     stops = [np.log2(v.exposure_time) if told == "times" else v.camera.position @ [1.5, 3, 0] for v in views]
     shared = 2 ** (0.4 * np.array(stops))
-    along = PhotoGains({v.name: (gain, gain, gain) for v, gain in zip(views, shared, strict=True)})
-    assert along.stops > 0.2 and along.stops_beside(views) == pytest.approx(0, abs=1e-9)
+    along = ExposureCompensation({v.name: (gain, gain, gain) for v, gain in zip(views, shared, strict=True)})
+    assert along.stops > 0.2 and along.unexplained_stops(views) == pytest.approx(0, abs=1e-9)
     off = np.array([0.1, -0.2, 0.2, -0.2, 0.1])
     columns = np.array([(1, *v.camera.position[:2], np.log2(v.exposure_time)) for v in views])
     off -= columns @ np.linalg.lstsq(columns, off, rcond=None)[0]  # Of no slope over either
-    both = PhotoGains({v.name: tuple(2**e * np.array(along.gains[v.name])) for v, e in zip(views, off, strict=True)})
-    assert both.stops_beside(views) == pytest.approx(off.std()) and off.std() > 0.05
-    shared = np.array(list(both.following(views).gains.values())) / list(along.gains.values())
+    both = ExposureCompensation(
+        {v.name: tuple(2**e * np.array(along.gains[v.name])) for v, e in zip(views, off, strict=True)}
+    )
+    assert both.unexplained_stops(views) == pytest.approx(off.std()) and off.std() > 0.05
+    shared = np.array(list(both.explained_part(views).gains.values())) / list(along.gains.values())
     np.testing.assert_allclose(shared, shared[0, 0])
 
 
 def test_each_lens_has_its_falloff(gains, points):
-    dark = everywhere(FALLOFF, range(0, PHOTOS, 2))
+    dark = everywhere(VIGNETTING, range(0, PHOTOS, 2))
     scene = photographed(gains, dark, lambda name: 60.0 if name in dark else 70.0)
     views, seen = scene.train_views, np.ones((PHOTOS, len(points)), bool)
     found = fit_gains(views, scene.test_views, points, seen, SRGB)
-    corners = {name: 1 - np.exp(-sum(found.falloff.get(name, (0, 0)))) for name in gains}
+    corners = {name: 1 - np.exp(-sum(found.vignetting.get(name, (0, 0)))) for name in gains}
     for name, lacking in corners.items():
         assert lacking == pytest.approx(1 - np.exp(-sum(dark.get(name, (0, 0)))), abs=0.03)
     rough = rough_gains(views, points, seen, SRGB)
-    assert rough.corners == pytest.approx(found.corners, abs=0.1)
-    assert left_of_falloff(views, points, seen, SRGB, found) < 0.15
+    assert rough.corner_loss == pytest.approx(found.corner_loss, abs=0.1)
+    assert remaining_vignetting(views, points, seen, SRGB, found) < 0.15
 
 
 def test_a_lens_is_told_by_exif_and_by_the_field_of_view(tmp_path):
@@ -128,7 +132,7 @@ def test_a_lens_is_told_by_exif_and_by_the_field_of_view(tmp_path):
 
     def lenses(sources, focals=(60.0,) * PHOTOS):
         given = zip(views, sources, focals, strict=True)
-        return lenses_of([replace(v, source=s, camera=replace(v.camera, fx=f, fy=f)) for v, s, f in given]).tolist()
+        return lens_groups([replace(v, source=s, camera=replace(v.camera, fx=f, fy=f)) for v, s, f in given]).tolist()
 
     one, two = taken(0, "One"), taken(1, "Two")
     assert lenses([None] * PHOTOS) == [0] * PHOTOS == lenses([tmp_path / "none.jpg"] * PHOTOS)
@@ -143,25 +147,26 @@ def test_a_lens_is_told_by_exif_and_by_the_field_of_view(tmp_path):
 
 
 def test_exposure_white_balance_and_falloff_are_parts(gains):
-    whole = PhotoGains(gains, everywhere(FALLOFF))
-    values, exposure, tint = (
-        np.array(list(found.gains.values())) for found in (whole, whole.parts(tint=False), whole.parts(exposure=False))
+    whole = ExposureCompensation(gains, everywhere(VIGNETTING))
+    values, exposure, white_balance = (
+        np.array(list(found.gains.values()))
+        for found in (whole, whole.parts(white_balance=False), whole.parts(exposure=False))
     )
     np.testing.assert_allclose(exposure, values[:, 1:2].repeat(3, 1))
-    np.testing.assert_allclose(exposure * tint, values)
-    assert whole.parts(falloff=False).falloff == {} and whole.parts().falloff == whole.falloff
+    np.testing.assert_allclose(exposure * white_balance, values)
+    assert whole.parts(vignetting=False).vignetting == {} and whole.parts().vignetting == whole.vignetting
 
 
 def test_photos_that_do_not_drift_have_no_gains(points):
     scene = photographed({}, {})
     found = fit_gains(scene.train_views, scene.test_views, points, np.ones((PHOTOS, len(points)), bool), SRGB)
-    assert found.stops < 0.02 and abs(found.corners) < 0.02
+    assert found.stops < 0.02 and abs(found.corner_loss) < 0.02
 
 
 def test_evened_photos_hold_the_light_without_gains(gains):
-    plain, scene = photographed({}, {}), photographed(gains, everywhere(FALLOFF))
-    evened = PhotoGains(gains, everywhere(FALLOFF)).even(scene, SRGB)
-    assert PhotoGains(gains, everywhere(FALLOFF)).even(evened, SRGB) is evened
+    plain, scene = photographed({}, {}), photographed(gains, everywhere(VIGNETTING))
+    evened = ExposureCompensation(gains, everywhere(VIGNETTING)).normalize_photos(scene, SRGB)
+    assert ExposureCompensation(gains, everywhere(VIGNETTING)).normalize_photos(evened, SRGB) is evened
     for ours, truth in zip(evened.views, plain.views, strict=True):
         told = (truth.image > 0.1) & (ours.image < 0.95)
         light = SRGB.decode(ours.image) / ours.exposure_time
@@ -171,7 +176,7 @@ def test_evened_photos_hold_the_light_without_gains(gains):
 
 def test_an_exposure_alone_leaves_the_codes(gains):
     scene = photographed({}, {})
-    twice = PhotoGains({"p_0": (2.0, 2.0, 2.0)}).even(scene, SRGB)
+    twice = ExposureCompensation({"p_0": (2.0, 2.0, 2.0)}).normalize_photos(scene, SRGB)
     assert twice.views[0].exposure_time == 2.0 and twice.views[0].codes is scene.views[0].codes
 
 
@@ -180,17 +185,19 @@ def test_white_stays_white_and_black_black(gains):
     codes = scene.views[0].codes.copy()
     codes[:8], codes[-8:] = 255, 0
     scene = replace(scene, views=(replace(scene.views[0], codes=codes), *scene.views[1:]))
-    (first, *_) = PhotoGains(gains, everywhere(FALLOFF)).even(scene, SRGB).views
+    (first, *_) = ExposureCompensation(gains, everywhere(VIGNETTING)).normalize_photos(scene, SRGB).views
     assert first.codes.dtype == np.uint16 and (first.codes[:8] == 65535).all() and (first.codes[-8:] == 0).all()
 
 
-@pytest.mark.parametrize("falloff", [None, FALLOFF])
-def test_photos_are_evened_row_by_row_as_by_their_light(gains, falloff):
+@pytest.mark.parametrize("vignetting", [None, VIGNETTING])
+def test_photos_are_evened_row_by_row_as_by_their_light(gains, vignetting):
     tall = np.random.default_rng(5).integers(0, 256, (3 * BAND_ROWS + 5, 20, 3), dtype=np.uint8)
     camera = Camera(20, len(tall), 60.0, 60.0, 10.0, len(tall) / 2, np.eye(4))
     view = View("p_0", tall, camera, 2.0, "train")
-    found = PhotoGains(gains, {} if falloff is None else {"p_0": falloff})
-    (evened,) = found.even(Scene("tall", "hand-made", (view,), np.zeros((0, 3)), np.zeros((0, 3))), SRGB).views
+    found = ExposureCompensation(gains, {} if vignetting is None else {"p_0": vignetting})
+    (evened,) = found.normalize_photos(
+        Scene("tall", "hand-made", (view,), np.zeros((0, 3)), np.zeros((0, 3))), SRGB
+    ).views
     largest = max(gains["p_0"])
     light = SRGB.decode(view.image.astype(np.float64)) / (found.light(view) / largest)
     expected = codes_of(SRGB.encode(light), 16)
@@ -200,15 +207,15 @@ def test_photos_are_evened_row_by_row_as_by_their_light(gains, falloff):
 
 
 def test_photos_that_do_not_fit_into_memory_are_evened_into_a_file(gains, monkeypatch, caplog):
-    scene = photographed(gains, everywhere(FALLOFF))
-    in_memory = PhotoGains(gains, everywhere(FALLOFF)).even(scene, SRGB)
+    scene = photographed(gains, everywhere(VIGNETTING))
+    in_memory = ExposureCompensation(gains, everywhere(VIGNETTING)).normalize_photos(scene, SRGB)
     monkeypatch.setattr(photo_file, "available_memory", lambda: 0)
     with caplog.at_level("INFO"):
-        on_disk = PhotoGains(gains, everywhere(FALLOFF)).even(scene, SRGB)
+        on_disk = ExposureCompensation(gains, everywhere(VIGNETTING)).normalize_photos(scene, SRGB)
     assert "they are read from a nameless file" in caplog.text
     files = {photo_file._file_of(view.codes) for view in on_disk.views}
     assert len(files) == 1 and None not in files
     assert all(np.array_equal(a.codes, b.codes) for a, b in zip(on_disk.views, in_memory.views, strict=True))
     # Photos that are left as they are stay in the file where they were.
-    again = PhotoGains({}).even(replace(on_disk, evened=False), SRGB)
+    again = ExposureCompensation({}).normalize_photos(replace(on_disk, photos_normalized=False), SRGB)
     assert all(a.codes is b.codes for a, b in zip(again.views, on_disk.views, strict=True))

@@ -1,4 +1,4 @@
-"""From shots to views: decode, orient, undistort and scale, every average taken over light by one response."""
+"""Preprocess photos into views: decode, orient, undistort and resize, with every average taken in linear light."""
 
 import logging
 import threading
@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import InputError
 from ..parallel import made_ahead
 from .camera import Camera
-from .capture import Capture, Shot, reinhard_gamma
+from .dataparser import DataparserOutputs, ImageRecord, reinhard_gamma
 from .hdr_files import hdr_size, read_hdr
 from .images import EncodedImage
 from .lens import Lens, Undistortion, area_average
@@ -28,108 +28,132 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("sehdr_warp.scene")
 _LEAST_CLIPPED = 0.05  # Part of a pixel's area that may be clipped for its light above white to be known
-_PIXELS_AT_ONCE = 64_000_000  # Of the photos that are read side by side
+_PIXELS_AT_ONCE = 64_000_000  # Pixels of the photos that are read in parallel, which bounds memory
 
 
-def develop(capture: Capture, response: "Response", max_size: int | None = None, photos: str = "auto") -> Scene:
-    """The scene of a capture: each photo undistorted and averaged to size, in the light that `response` decodes.
+def preprocess(
+    dataset: DataparserOutputs, response: "Response", max_size: int | None = None, photos: str = "auto"
+) -> Scene:
+    """Undistort and resize the photos of a dataset.
 
-    max_size: longest side of the views in pixels, None keeps the photos'. A photo that is neither bent nor averaged
-    keeps its codes; others become uint16. photos: where views stay, see PhotoKeeper.
-    Raises InputError where a file is damaged, sizes disagree, or the photos show nothing but black or white.
+    A photo that needs neither keeps its codes; others get codes of 16 bits.
+
+    Args:
+        dataset: what parse_dataset returned.
+        response: decodes codes to the light in which averages are taken.
+        max_size: longest side of the views in pixels; None keeps the photos' sizes.
+        photos: where views are stored, see PhotoKeeper.
+
+    Raises:
+        InputError: if a file is damaged, sizes disagree, or the photos show nothing but black or white.
     """
-    developer, names = _Developer(max_size, response, capture.alpha), unique_names(capture.shots)
-    keeper = PhotoKeeper(photos, len(names), sum(shot.lens.width * shot.lens.height for shot in capture.shots))
-    # Some copies of a photo are made on its way. While OpenEXR and LibRaw read, nobody's words reach the terminal.
-    quiet = any(shot.hdr is not None or kind_of(shot.image) != "encoded" for shot in capture.shots)
-    most = 1 if quiet else _PIXELS_AT_ONCE // max(shot.lens.width * shot.lens.height for shot in capture.shots)
-    shots = ((shot, names[i]) for i, shot in told("reading views", capture.shots))
-    views = [keeper.kept(view) for view in made_ahead(lambda given: developer.view(*given), shots, most)]
-    deque(with_content(((view.codes, view.mask) for view in views if view.split == "train"), capture.folder), maxlen=0)
-    notes = *capture.notes, *mask_note(list(developer.mask_shares.values())), *([keeper.note] if keeper.note else [])
-    stated = *capture.cloud, capture.times_known, notes
-    return Scene(capture.name, capture.format, tuple(views), *stated, response=response)
+    preprocessor, names = _Preprocessor(max_size, response, dataset.alpha), unique_names(dataset.records)
+    keeper = PhotoKeeper(photos, len(names), sum(record.lens.width * record.lens.height for record in dataset.records))
+    # OpenEXR and LibRaw are read one at a time: their output to the terminal is suppressed for the whole process.
+    quiet = any(record.hdr is not None or kind_of(record.image) != "encoded" for record in dataset.records)
+    most = 1 if quiet else _PIXELS_AT_ONCE // max(record.lens.width * record.lens.height for record in dataset.records)
+    jobs = ((record, names[i]) for i, record in log_progress("reading views", dataset.records))
+    views = [keeper.store(view) for view in made_ahead(lambda job: preprocessor.view(*job), jobs, most)]
+    deque(
+        require_content(((view.codes, view.mask) for view in views if view.split == "train"), dataset.folder), maxlen=0
+    )
+    notes = *dataset.notes, *mask_note(list(preprocessor.mask_shares.values())), *([keeper.note] if keeper.note else [])
+    points, colors = dataset.cloud
+    known = dataset.times_known
+    return Scene(dataset.name, dataset.format, tuple(views), points, colors, known, notes, response=response)
 
 
-def with_content(photos: Iterable[tuple[np.ndarray, np.ndarray | None]], folder: Path) -> Iterator[np.ndarray]:
-    """The codes of photos, one by one; then refuses sets that show nothing: fewer than one sample in a thousand between
-    black and white.
+def require_content(photos: Iterable[tuple[np.ndarray, np.ndarray | None]], folder: Path) -> Iterator[np.ndarray]:
+    """Yield the codes of photos, then refuse sets with less than one sample in a thousand between black and white.
 
-    photos: codes and mask of each. Large photos are looked at on a grid of about a million pixels.
+    Args:
+        photos: codes and mask of each. Large photos are sampled on a grid of about a million pixels.
+        folder: to name in the error.
+
+    Raises:
+        InputError: after the last photo, if they show nothing.
     """
-    shown = total = 0
+    visible = total = 0
     light = 0.0
     for codes, mask in photos:
         step = max(1, round((codes.shape[0] * codes.shape[1] / 1e6) ** 0.5))
         values, white = codes[::step, ::step], np.iinfo(codes.dtype).max
         values = values if mask is None else values[mask[::step, ::step] > 0.5]
-        shown += int(((values > white * 1.5 / 255) & (values < white * (1 - 1.5 / 255))).sum())
+        visible += int(((values > white * 1.5 / 255) & (values < white * (1 - 1.5 / 255))).sum())
         total, light = total + values.size, light + float(values.sum(dtype=np.float64)) / white
         yield codes
-        del codes, values  # Before the next is read: they may be large.
-    if shown < total * 1e-3 or total == 0:
+        del codes, values  # Free the memory before the next photo is read.
+    if visible < total * 1e-3 or total == 0:
         mean = light / max(total, 1)
-        state = "masked out" if total == 0 else f"black or white in {100 - 100 * shown / total:.1f} % (mean {mean:.3f})"
+        state = (
+            "masked out" if total == 0 else f"black or white in {100 - 100 * visible / total:.1f} % (mean {mean:.3f})"
+        )
         remedy = "expose them so that the scene shows, or choose another exposure index"
         raise InputError(folder, f"the training photos are {state}", remedy)
 
 
-def told(doing: str, items: Sequence) -> Iterator[tuple[int, Any]]:
-    """enumerate(items), with a line to the log before every tenth."""
+def log_progress(activity: str, items: Sequence) -> Iterator[tuple[int, Any]]:
+    """Enumerate items, with a log line before every tenth."""
     for i, item in enumerate(items):
         if i % 10 == 0:
-            _log.info("%s %d to %d of %d", doing, i + 1, min(i + 10, len(items)), len(items))
+            _log.info("%s %d to %d of %d", activity, i + 1, min(i + 10, len(items)), len(items))
         yield i, item
 
 
-def as_photographed(shot: Shot, *, oriented: bool = False) -> EncodedImage:
-    """A shot's codes before anything is undistorted or averaged; of a set of truth alone, HDR-NeRF's photo of it."""
-    if not shot.derived and kind_of(shot.image) == "float":
-        return EncodedImage(float_codes(read_hdr(shot.image), shot.seconds), None)
-    if not shot.derived:
-        read = read_photo(shot.image, oriented=oriented)
-        return EncodedImage(linear_codes(read.pixels / read.levels), read.alpha) if shot.linear else read
-    return EncodedImage(codes_of(reinhard_gamma(read_hdr(shot.image) * shot.seconds), 8), None)
+def read_codes(record: ImageRecord, *, oriented: bool = False) -> EncodedImage:
+    """Read a photo's codes, or compute them from HDR truth or light, before anything is undistorted or resized.
+
+    Args:
+        record: the photo.
+        oriented: turn the pixels as the EXIF orientation says.
+    """
+    if not record.derived and kind_of(record.image) == "float":
+        return EncodedImage(float_codes(read_hdr(record.image), record.seconds), None)
+    if not record.derived:
+        photo = read_photo(record.image, oriented=oriented)
+        return EncodedImage(linear_codes(photo.pixels / photo.levels), photo.alpha) if record.linear else photo
+    return EncodedImage(codes_of(reinhard_gamma(read_hdr(record.image) * record.seconds), 8), None)
 
 
-class _Developer:
+class _Preprocessor:
     def __init__(self, max_size: int | None, response: "Response", alpha: str):
         self.max_size, self.response, self.alpha = max_size, response, alpha
         self._tables: dict[int, np.ndarray] = {}
         self._last: tuple[Lens, Undistortion] | None = None
         self.mask_shares: dict[str, float | None] = {}  # By view: the mean of its mask file
-        self._alone = threading.Lock()  # For what photos share; responses work on all cores by themselves
+        self._alone = threading.Lock()  # Guards what threads share; a response uses all cores by itself
 
-    def view(self, shot: Shot, name: str) -> View:
-        lens, oriented = (shot.lens, False) if shot.derived else fitted_lens(shot)
-        working, undistortion, full = lens, None, lens.pinhole(shot.world_to_camera)
-        if not (lens.is_pinhole or shot.derived):
-            # Distortion is smooth: undone at twice the final size or more it is right to a fraction of a final pixel.
+    def view(self, record: ImageRecord, name: str) -> View:
+        lens, oriented = (record.lens, False) if record.derived else fitted_lens(record)
+        working, undistortion, full = lens, None, lens.pinhole(record.world_to_camera)
+        if not (lens.is_pinhole or record.derived):
+            # Distortion is smooth: undistorting at twice the final size or more is exact to a fraction of a pixel.
             factor = 1 if self.max_size is None else max(lens.width, lens.height) // (2 * self.max_size)
             if factor > 1:
                 working = lens.resized(round(lens.width / factor), round(lens.height / factor))
-            # Sets mostly share one lens, whose map is as large as an image.
+            # The map of a lens is as large as an image; the photos of a set mostly share one lens.
             with self._alone:
                 if self._last is None or self._last[0] != working:
                     self._last = working, Undistortion(working)
                 undistortion = self._last[1]
-            full = undistortion.camera(shot.world_to_camera)
+            full = undistortion.camera(record.world_to_camera)
         camera = full.within(self.max_size)
 
         def warped(image: np.ndarray, values: Callable[[slice], np.ndarray] | None = None) -> np.ndarray:
-            """[H, W] or [H, W, C] at the photo's size -> float32 at the camera's, undistorted; see area_average."""
+            """Undistort and average [H, W] or [H, W, C] from the photo's size to the camera's; see area_average."""
             if not undistortion:
                 return _shrunk(image, camera, values)
             return _shrunk(undistortion.apply(_shrunk(image, working, values)), camera)
 
-        hdr = None if shot.hdr is None else warped(_read_truth(shot.hdr, lens, camera, undistortion is not None))
-        stated = camera, shot.seconds, shot.split or "train"
-        stored = None if shot.mask is None else _fitted_mask(shot.mask, lens, oriented)
+        hdr = None if record.hdr is None else warped(_read_truth(record.hdr, lens, camera, undistortion is not None))
+        time, split = record.seconds, record.split or "train"
+        stored = None if record.mask is None else _fitted_mask(record.mask, lens, oriented)
         self.mask_shares[name] = None if stored is None else float(stored.mean())
-        if shot.derived and hdr is not None:  # HDR-NeRF's photo of the truth, at the final size.
+        if record.derived and hdr is not None:  # Compute HDR-NeRF's photo from the truth at the final size.
             mask = None if stored is None else warped(stored)
-            return View(name, codes_of(reinhard_gamma(hdr * shot.seconds), 8), *stated, mask, hdr, shot.image)
-        encoded = as_photographed(shot, oriented=oriented)
+            codes = codes_of(reinhard_gamma(hdr * time), 8)
+            return View(name, codes, camera, time, split, mask, hdr, record.image)
+        encoded = read_codes(record, oriented=oriented)
         codes, alpha, above = encoded.pixels, encoded.alpha, encoded.above_white
         masks = [] if undistortion is None or undistortion.inside is None else [_shrunk(undistortion.inside, camera)]
         if stored is not None:
@@ -141,7 +165,18 @@ class _Developer:
             codes, above = self._averaged(codes, alpha, above, warped)
         mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32) if masks else None
         mask = None if mask is None or mask.min() >= 1 - 1e-6 else mask
-        return View(name, codes, *stated, mask, hdr, shot.image, above, encoded.above_white_deviation)
+        return View(
+            name,
+            codes,
+            camera,
+            time,
+            split,
+            mask,
+            hdr,
+            source=record.image,
+            light_above_white=above,
+            light_above_white_deviation=encoded.above_white_deviation,
+        )
 
     def _averaged(
         self, codes: np.ndarray, alpha: np.ndarray | None, above: np.ndarray | None, warped: Callable
@@ -153,7 +188,7 @@ class _Developer:
                 light = self.response.decode(np.arange(levels + 1, dtype=np.float64) / levels)
                 self._tables[levels] = np.maximum(light, 0.0).astype(np.float32)
 
-        def seen(values: np.ndarray, rows: slice) -> np.ndarray:
+        def weighted(values: np.ndarray, rows: slice) -> np.ndarray:
             return values if alpha is None else values * alpha[rows, :, None]
 
         def light_of(rows: slice) -> np.ndarray:
@@ -165,11 +200,11 @@ class _Developer:
             return (clipped if above is None else clipped & (above[rows] == 0)).astype(np.float32)
 
         white = self._tables[levels][levels]
-        light = warped(codes, lambda rows: seen(light_of(rows), rows))
-        clipped = warped(codes, lambda rows: seen(clipped_in(rows), rows))
+        light = warped(codes, lambda rows: weighted(light_of(rows), rows))
+        clipped = warped(codes, lambda rows: weighted(clipped_in(rows), rows))
         with self._alone:
             encoded = self.response.encode(light)
-        # A mean over clipped samples is a lower bound: with half of the area clipped, white is the honest value.
+        # A mean over clipped samples is a lower bound, so a pixel counts as clipped if half of its area is.
         averaged = codes_of(np.where(clipped >= 0.5, np.float32(1.0), encoded), 16)
         if above is not None:
             known = (averaged == 65535) & (clipped < _LEAST_CLIPPED)
@@ -183,7 +218,7 @@ def _shrunk(image: np.ndarray, to: Lens | Camera, values: Callable[[slice], np.n
 
 def _read_truth(path: Path, lens: Lens, camera: Camera, bent: bool) -> np.ndarray:
     size = hdr_size(path)
-    # Truth may be rendered larger than the photos (HDR-NeRF's evaluation averages it down); never smaller.
+    # Truth may be larger than the photos, because HDR-NeRF's evaluation averages it down, but never smaller.
     larger = size[0] >= camera.width and size[1] >= camera.height and _same_aspect(size, lens)
     if size != (lens.width, lens.height) and (bent or not larger):
         problem = f"HDR truth is {size[0]} x {size[1]}, the photo {lens.width} x {lens.height}"
@@ -191,15 +226,18 @@ def _read_truth(path: Path, lens: Lens, camera: Camera, bent: bool) -> np.ndarra
     return read_hdr(path)
 
 
-def fitted_lens(shot: Shot) -> tuple[Lens, bool]:
-    """The lens at the file's size, and whether the pixels are to be turned as EXIF says.
+def fitted_lens(record: ImageRecord) -> tuple[Lens, bool]:
+    """Return the lens at the photo's size, and whether the pixels are to be turned as EXIF says.
 
-    COLMAP ignores the EXIF orientation, other tools follow it: the size that agrees with the camera's tells which,
-    and stored pixels win where both do. Whole-number reductions of the camera's size (images_2 ...) are taken.
+    COLMAP ignores the EXIF orientation, other tools follow it: the size that agrees with the camera's decides, and the
+    stored orientation wins if both agree. Photos may be smaller than the camera's size by a whole factor (images_2).
+
+    Raises:
+        InputError: if no orientation and factor fits.
     """
-    lens = shot.lens
-    stored, turned = photo_sizes(shot.image)
-    choices = [(stored, False), (turned, True)] if shot.oriented is None else [(turned, True)]
+    lens = record.lens
+    stored, turned = photo_sizes(record.image)
+    choices = [(stored, False), (turned, True)] if record.oriented is None else [(turned, True)]
     for factor in range(1, 17):
         for (width, height), oriented in choices:
             if factor == 1 and (width, height) == (lens.width, lens.height):
@@ -207,7 +245,7 @@ def fitted_lens(shot: Shot) -> tuple[Lens, bool]:
             if factor > 1 and abs(lens.width / factor - width) < 1 and abs(lens.height / factor - height) < 1:
                 return lens.resized(width, height), oriented
     problem = f"image is {stored[0]} x {stored[1]}, its camera {lens.width} x {lens.height}"
-    raise InputError(shot.image, problem, "use the images that the cameras were solved for")
+    raise InputError(record.image, problem, "use the images that the cameras were solved for")
 
 
 def _fitted_mask(path: Path, lens: Lens, oriented: bool) -> np.ndarray:

@@ -1,0 +1,154 @@
+"""What a reader returns for a data folder before any pixel is decoded: cameras, files, exposure times, points."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import InputError
+from .lens import Lens
+
+DERIVED_PHOTOS = "reinhard-gamma"
+"""Value of `photo_response` in a set without photos: its photos are computed from the truth by this curve."""
+
+
+def reinhard_gamma(exposure: np.ndarray) -> np.ndarray:
+    """Encode exposure by HDR-NeRF's synthetic response, (x / (1 + x))^(1 / 2.2): x >= 0 to [0, 1)."""
+    exposure = np.maximum(exposure, 0.0)
+    return (exposure / (1.0 + exposure)) ** (1 / 2.2)
+
+
+@dataclass(frozen=True)
+class ImageRecord:
+    """One photo of one view.
+
+    Attributes:
+        view: key that photos of one view at several exposures share; becomes the view's name.
+        image: the photo's file.
+        lens: intrinsics.
+        world_to_camera: [4, 4] float64, rigid.
+        exposure_key: the exposure's number if a view has several (the k of `<view>_<k>.png`); None otherwise.
+        exposure_time: seconds from the set's own files; None if only EXIF may state it.
+        split: "train" or "test", if the set states it.
+        mask: its mask file.
+        hdr: its file of HDR truth.
+        derived: the set has no photos; this one is computed from the truth, and `image` is the truth's file.
+        linear: the photo's codes are proportional to light; they are re-encoded by sRGB's curve.
+        oriented: the lens refers to the pixels after EXIF orientation; None decides by the sizes.
+    """
+
+    view: str
+    image: Path
+    lens: Lens
+    world_to_camera: np.ndarray
+    exposure_key: int | None = None
+    exposure_time: float | None = None
+    split: str | None = None
+    mask: Path | None = None
+    hdr: Path | None = None
+    derived: bool = False
+    linear: bool = False
+    oriented: bool | None = None
+
+    @property
+    def seconds(self) -> float:
+        """The exposure time in seconds, after with_exposure_times() has set it."""
+        assert self.exposure_time is not None
+        return self.exposure_time
+
+
+class PointCloud(NamedTuple):
+    """Sparse points of a set.
+
+    Attributes:
+        positions: [P, 3] float64 world coordinates.
+        colors: [P, 3] float32 encoded values in [0, 1].
+    """
+
+    positions: np.ndarray
+    colors: np.ndarray
+
+
+NO_POINTS = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+
+
+@dataclass(frozen=True)
+class DataparserOutputs:
+    """A data folder as parsed.
+
+    Attributes:
+        format: the layout; see Scene.
+        records: the photos.
+        alpha: what transparency means: "background" (nothing there: composite over black light) or "mask" (not
+            observed).
+        holdout: (step, offset) of the held-out views in the protocol that the layout was published with; None for a
+            layout without one.
+        cloud: the points that come with the set.
+        notes: see Scene.
+        name: what the user asked for.
+        folder: where the set lies.
+        times_known: False if no file states exposure times.
+        kind: of the photos: encoded, linear, raw or float; see linear_photos.py.
+    """
+
+    format: str
+    records: tuple[ImageRecord, ...]
+    alpha: str = "mask"
+    holdout: tuple[int, int] | None = None
+    cloud: PointCloud = NO_POINTS
+    notes: tuple[str, ...] = ()
+    name: str = ""
+    folder: Path = Path()
+    times_known: bool = True
+    kind: str = "encoded"
+
+    @property
+    def training(self) -> tuple[ImageRecord, ...]:
+        """The photos to train on."""
+        return tuple(record for record in self.records if record.split == "train")
+
+
+def pose_from_quaternion(quaternion, translation, source: Path, name: str) -> np.ndarray:
+    """Return world_to_camera [4, 4] from COLMAP's quaternion (w, x, y, z) and translation.
+
+    Raises:
+        InputError: if they are not finite, or the quaternion's length is near 0 or very large.
+    """
+    from scipy.spatial.transform import Rotation
+
+    length = np.linalg.norm(quaternion)
+    if not (np.isfinite(length) and np.isfinite(translation).all()):
+        raise InputError(source, f"pose of {name!r:.90} is not finite", "remove the image or export the model again")
+    if not 1e-8 < length < 1e8:
+        raise InputError(source, f"quaternion of {name!r:.90} has length {length:g}", "export the model again")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix(), translation
+    return pose
+
+
+def pose_from_camera_to_world(matrix, source: Path, name: str) -> np.ndarray:
+    """Return world_to_camera [4, 4] from a camera-to-world matrix in OpenCV axes, with the nearest rotation.
+
+    Args:
+        matrix: 3 x 4 or 4 x 4.
+        source: file to name in errors.
+        name: image to name in errors.
+
+    Raises:
+        InputError: for another shape, values that are not finite, scale (beyond 1e-3), shear or reflection.
+    """
+    remedy = "export the poses again without scale"
+    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
+        raise InputError(source, f"pose of {name!r:.90} is not a finite 4 x 4 matrix", remedy)
+    u, stretch, vt = np.linalg.svd(matrix[:3, :3])
+    rotation = u @ vt
+    if np.abs(stretch - 1).max() > 1e-3 or np.linalg.det(rotation) < 0:
+        problem = f"pose of {name!r:.90} is no rotation (stretch {np.round(stretch, 4).tolist()})"
+        raise InputError(source, problem, remedy)
+    if not np.abs(matrix[:3, 3]).max() < 1e12:
+        raise InputError(source, f"position of {name!r:.90} is {matrix[:3, 3].tolist()}", "check the units")
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.T
+    pose[:3, 3] = -rotation.T @ matrix[:3, 3]
+    return pose
