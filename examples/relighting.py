@@ -50,7 +50,7 @@ def main(out: Path, *, views: int = 72, size: int = 48, samples: int = 32, itera
     (out / "photos" / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
 
     # The walls are matt: harmonics of a higher degree would only learn from where few photos saw the lamp.
-    config = sw.load_config("default", {"schedule.iterations": iterations, "model.harmonics_degree": 1})
+    config = sw.load_config("default", {"schedule.iterations": iterations, "model.sh_degree": 1})
     run = sw.train(
         sw.load_scene(out / "photos", holdout=0),
         out / "run",

@@ -106,9 +106,9 @@ RUNS = {
     "run.json nested": (lambda run: (run / "run.json").write_text("[" * 100_000), "run.json"),
     "run.json binary": (lambda run: (run / "run.json").write_bytes(b"\xff\xfe"), "run.json"),
     "run.json without response": (lambda run: edit_json(run / "run.json", response=None), "run.json"),
-    "gains of another version": (
-        lambda run: edit_json(run / "run.json", photo_gains={"gains": {"r_0": [1.0] * 3}, "falloff": [0.1, 0.2]}),
-        "run.json: photo_gains.falloff = [0.1, 0.2] is of all photos, and this version reads one of each; train",
+    "run of version 0.2": (
+        lambda run: edit_json(run / "run.json", format=2, version="0.2.0"),
+        "run.json: format = 2 is of sehdr-warp 0.2.0, and this one reads format 3; train again (train PHOTOS --out",
     ),
     "response damaged": (lambda run: edit_json(run / "run.json", response={"kind": "table"}), "response"),
     "base exposure zero": (lambda run: edit_json(run / "run.json", base_time=0), "base_time"),

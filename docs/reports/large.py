@@ -46,7 +46,7 @@ def main(sizes: tyro.conf.Positional[tuple[str, ...]], /, json: Path, photos: in
 def compare(size: Size, photos: int, iterations: int, device: str = "cuda:0") -> list[dict]:
     """A row for each of ours and gsplat's."""
     scene = _scene(size, photos, device)
-    fixed = {"densification.max_gaussians": size.gaussians, "densification.budget": 0, "model.initial_density": 0}
+    fixed = {"densification.cap_max": size.gaussians, "mcmc.cap_density": 0, "model.initial_density": 0}
     fixed |= {"response.name": RESPONSE, "plan.enabled": False, "schedule.iterations": iterations}
     config = load_config("default", fixed)
     place = {"photos": f"{len(scene.train_views)} + {len(scene.test_views)}", "iterations": iterations}
@@ -78,7 +78,7 @@ def _train(scene: Scene, config: Config, device: str) -> dict:
 
 def _train_gsplat(scene: Scene, config: Config, device: str) -> dict:
     torch.manual_seed(0)
-    trained = train_gsplat(scene, "mcmc", config, config.densification.max_gaussians, device)
+    trained = train_gsplat(scene, "mcmc", config, config.densification.cap_max, device)
     row = {"method": "gsplat mcmc", "gaussians": trained.count(), "seconds": trained.loop_seconds}
     row["memory"] = torch.cuda.max_memory_allocated(device)
     return row | _means(trained, scene, device)

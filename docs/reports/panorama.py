@@ -67,7 +67,7 @@ def main(
         "PYTHONPATH=. python docs/reports/panorama.py --work panorama_work --json docs/reports/results/panorama.json"
     )
     # As the plan of photos has it where cameras look all around; on truth there is no plan.
-    config = load_config("truth", {"schedule.iterations": iterations, "densification.prune_angle": WIDEST})
+    config = load_config("truth", {"schedule.iterations": iterations, "mcmc.prune_near_angle": WIDEST})
     kept = (work / "run" / "summary.json").is_file()
     run = load_run(work / "run", device=device) if kept else train(scene, work / "run", config, device=device)
     at = (float(PLACE[0]), float(PLACE[1]), float(PLACE[2]))

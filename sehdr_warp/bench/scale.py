@@ -113,8 +113,12 @@ def _step_rows(size: Size, photos: int, device, peer: bool, repetitions: int, ch
     rows, losses = [], {}
     for who, rasterizer in ({OURS: None} | ({GSPLAT: rasterize_with_gsplat} if peer else {})).items():
         forget_peaks(device)
-        fixed = {"densification.stop": 0, "densification.max_gaussians": size.gaussians + 1, "model.initial_density": 0}
-        config = load_config(STEP_PRESET, fixed | {"schedule.recorded": who == OURS})
+        fixed = {
+            "densification.refine_stop_iter": 0,
+            "densification.cap_max": size.gaussians + 1,
+            "model.initial_density": 0,
+        }
+        config = load_config(STEP_PRESET, fixed | {"schedule.use_cuda_graph": who == OURS})
         trainer = make_trainer(scene, config, device, rasterizer)
         trainer.step()
         losses[who] = trainer.loss

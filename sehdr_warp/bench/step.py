@@ -45,7 +45,7 @@ def bench_step(size: Size, device: torch.device, *, presets: Sequence[str], repe
     for preset in presets:
         # No points but the scene's, and growth by a tenth at most: the times are for the count that was asked for.
         most = size.gaussians * 11 // 10 + 1
-        config = load_config(preset, {"densification.max_gaussians": most, "model.initial_density": 0})
+        config = load_config(preset, {"densification.cap_max": most, "model.initial_density": 0})
         if config.response.name == "auto":  # to choose it takes longer than to time
             config = override_config(config, {"response.name": "srgb"})
         if device.type == "cuda":
@@ -63,8 +63,8 @@ def bench_step(size: Size, device: torch.device, *, presets: Sequence[str], repe
 
 def thick_of_training(config: Config) -> int:
     """The first iteration from which on harmonics and densification, whose interval it is a multiple of, cost most."""
-    every = config.scaled(config.densification.every)
-    ready = max(config.model.harmonics_degree * config.schedule.harmonics_every, config.densification.start)
+    every = config.scaled(config.densification.refine_every)
+    ready = max(config.model.sh_degree * config.schedule.sh_degree_interval, config.densification.refine_start_iter)
     return -(-(config.scaled(ready) + 1) // every) * every
 
 
@@ -96,7 +96,9 @@ def step_variant(trainer: Trainer) -> Variant:
     first = thick_of_training(trainer.config)
 
     def between_changes():
-        if trainer.iteration + trainer.batch >= first + trainer.config.scaled(trainer.config.densification.every):
+        if trainer.iteration + trainer.batch >= first + trainer.config.scaled(
+            trainer.config.densification.refine_every
+        ):
             trainer.iteration = first
 
     return Variant(trainer.step, prepare=between_changes)
@@ -134,7 +136,7 @@ def _rows(scene: Scene, config: Config, device: torch.device, repetitions: int) 
     rows = []
     for name in (OURS, LAUNCHED) if device.type == "cuda" else (OURS,):
         forget_peaks(device)
-        trainer = make_trainer(scene, override_config(config, {"schedule.recorded": name == OURS}), device)
+        trainer = make_trainer(scene, override_config(config, {"schedule.use_cuda_graph": name == OURS}), device)
         row = {"implementation": name, "gaussians": trainer.field.gaussians.count}
         row |= (_time_row_of_steps if device.type == "cuda" else time_step)(trainer, repetitions)
         if rows:
@@ -155,8 +157,8 @@ def _parts(scene: Scene, config: Config, device: torch.device) -> list[dict]:
         given[:] = [arguments]
         return rasterize(*arguments, **options)
 
-    make_trainer(scene, override_config(config, {"schedule.recorded": False}), device, rasterizer).step()
-    work = work_of(given[0], 3 * (config.model.harmonics_degree + 1) ** 2)
+    make_trainer(scene, override_config(config, {"schedule.use_cuda_graph": False}), device, rasterizer).step()
+    work = work_of(given[0], 3 * (config.model.sh_degree + 1) ** 2)
     return parts_of_step(step_variant(make_trainer(scene, config, device)), work, device)
 
 
@@ -168,7 +170,7 @@ def amortized(trainer: Trainer, step: Callable[[], object]) -> dict:
     """The mean step over whole densification intervals, changes of the count included."""
     trainer.iteration = thick_of_training(trainer.config) - 1
     step()  # the first change prepares what the others use
-    photos = INTERVALS[trainer.device.type] * trainer.config.scaled(trainer.config.densification.every)
+    photos = INTERVALS[trainer.device.type] * trainer.config.scaled(trainer.config.densification.refine_every)
     steps = -(-photos // trainer.batch)
     wait(trainer.device)
     started = time.perf_counter()

@@ -35,7 +35,7 @@ def _photos(clipped: float = 0.0) -> Scene:
 
 def _trainer(device, clipped: float = 0.0, fields: Mapping[str, object] | None = None) -> Trainer:
     """A short training that neither adds nor moves Gaussians by itself. fields: of the config."""
-    still = {"densification.stop": 0, "densification.noise": 0.0, "schedule.harmonics_every": 30_000}
+    still = {"densification.refine_stop_iter": 0, "mcmc.noise_lr": 0.0, "schedule.sh_degree_interval": 30_000}
     config = load_config("default", {"schedule.iterations": STEPS, "seed": 1} | still | dict(fields or {}))
     scene = _photos(clipped)
     return Trainer(scene, config, make_field(scene, config, response_by_name("srgb"), device))
@@ -129,7 +129,7 @@ def _clipped_batches(device):
 
 def _guard(device):
     """A step whose gradient is NaN changes nothing; the next one goes on."""
-    trainer = _trainer(device, fields={"schedule.recorded": False})  # a hook cannot be recorded
+    trainer = _trainer(device, fields={"schedule.use_cuda_graph": False})  # a hook cannot be recorded
     trainer.step()
     gaussians = trainer.field.gaussians
     before = {name: tensor.clone() for name, tensor in gaussians.tensors().items()}

@@ -15,7 +15,7 @@ try:
 except ImportError:  # Windows has no limits of this kind.
     resource = None
 
-REMEDY = "use fewer Gaussians (densification.max_gaussians) or a smaller image (--max-size)"
+REMEDY = "use fewer Gaussians (densification.cap_max) or a smaller image (--max-size)"
 
 COMPILER_BYTES = 64 << 20  # Half of it is too little for a kernel of the CPU
 

@@ -14,10 +14,10 @@ from ..files import plain_size, read_json
 from ..scene.exposure import LONGEST, SHORTEST
 from .config_files import field_and_problem
 
-FORMAT = 2  # Version of what a run holds; a reader refuses others
+FORMAT = 3  # Version of the run folder; a reader refuses others
 TENSORS, VALUES = "state.safetensors", "checkpoint.json"
 REMEDY = "the run is damaged: train again"
-OTHER_VERSION = "train again, or use the version that wrote it"
+OTHER_VERSION = "train again (train PHOTOS --out THIS_FOLDER --overwrite), or use the version that wrote it"
 _OLDER = "remove this folder to use an older checkpoint, or train again"
 
 
@@ -113,11 +113,8 @@ def read_values(path: Path, kind: type[BaseModel], remedy: str = REMEDY) -> dict
     """The values in a file of this version's format, checked to be of a kind."""
     values = read_run_json(path, remedy)
     if (found := values.get("format")) != FORMAT:
-        problem = f"format = {found!r:.60} is not {FORMAT}, which this version reads"
-        raise InputError(path, problem, OTHER_VERSION)
-    gains = values.get("photo_gains")
-    if isinstance(gains, dict) and isinstance(gains.get("falloff"), list):
-        problem = f"photo_gains.falloff = {gains['falloff']!r:.60} is of all photos, and this version reads one of each"
+        writer = f"sehdr-warp {values['version']:.20}" if isinstance(values.get("version"), str) else "another version"
+        problem = f"format = {found!r:.60} is of {writer}, and this one reads format {FORMAT}"
         raise InputError(path, problem, OTHER_VERSION)
     try:
         kind.model_validate(values)

@@ -43,16 +43,16 @@ class ModelConfig(_Table):
     display: encoded values are, with 3DGS's offset of 0.5"""
     tone_map: Literal["pixel", "gaussian"] = "pixel"
     """pixel: composite radiance, then apply the response to each pixel; gaussian: apply it to each Gaussian (SeHDR)"""
-    harmonics_degree: Annotated[int, Field(ge=0, le=3)] = 3
+    sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
     """highest degree of the spherical harmonics"""
     initial_density: Annotated[float, Field(ge=0.0, le=1000.0)] = 20.0
     """Gaussians to start from, times the square root of the training photos' pixels: the scene's points and, up to so
     many, points matched between the photos; 0: the scene's points alone"""
-    photo_gains: Literal["auto", "unstated", "always", "never"] = "auto"
+    exposure_compensation: Literal["auto", "unstated", "always", "never"] = "auto"
     """take out of the photos what the camera changed between them (exposure, white balance, falloff towards the
     corners), where points that they share show that it did; auto: exposure only where photos state no times, or times
     that the points contradict; unstated: only photos that state none; needs the plan and matched points"""
-    start: str = ""
+    init_file: str = ""
     """a file of Gaussians to start from in place of points, in the scene's coordinates: PLY, OpenUSD or glTF;
     empty: none"""
     antialiased: bool = False
@@ -109,7 +109,7 @@ class LossConfig(_Table):
     anchor_weight: Weight = 0.0
     """learned response: weight of (f(1) - 1/2)^2, which holds the scale (HDR-NeRF: 0.5)"""
     opacity_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 0.01
-    """weight of the mean opacity: relocation needs some that fade (3DGS-MCMC: 0.01)"""
+    """weight of the mean opacity, which lets unneeded Gaussians fade for mcmc to relocate (3DGS-MCMC: 0.01)"""
 
     @property
     def uses_hdr(self) -> bool:
@@ -118,43 +118,53 @@ class LossConfig(_Table):
 
 
 class DensificationConfig(_Table):
-    """How Gaussians are added and taken away."""
+    """When and how far the number of Gaussians changes; options of one strategy are in the tables mcmc and adc."""
 
-    strategy: Literal["gradient", "relocation"] = "relocation"
-    """gradient: clone and split where image gradients are large (3DGS); relocation: move the dead to where the living
-    are (3DGS-MCMC)"""
-    start: Annotated[int, Field(ge=0, le=10**12)] = 500
-    """first iteration after which the count may change"""
-    stop: Annotated[int, Field(ge=0, le=10**12)] = 15_000
-    """the iteration from which it may no longer"""
-    every: Iteration = 100
+    strategy: Literal["mcmc", "adc"] = "mcmc"
+    """mcmc: relocate transparent Gaussians to opaque ones (3DGS-MCMC); adc: duplicate and split where image gradients
+    are large (3DGS's adaptive density control)"""
+    refine_start_iter: Annotated[int, Field(ge=0, le=10**12)] = 500
+    """iteration after which the number of Gaussians may change"""
+    refine_stop_iter: Annotated[int, Field(ge=0, le=10**12)] = 15_000
+    """iteration from which it stays"""
+    refine_every: Iteration = 100
     """iterations between changes"""
-    max_gaussians: Annotated[int, Field(ge=1, le=2**31 - 1)] = 3_000_000
-    """the count never exceeds this"""
-    budget: Annotated[float, Field(ge=0.0, le=1e6)] = 120.0
-    """relocation: nor this many times the square root of the training photos' pixels, if they start with fewer; 0: no
-    such bound"""
-    grow_gradient: Positive = 0.0002
-    """gradient: mean gradient in normalised screen units that makes one grow"""
-    grow_scale: Positive = 0.01
-    """gradient: larger than this part of the scene is split, smaller is cloned"""
+    cap_max: Annotated[int, Field(ge=1, le=2**31 - 1)] = 3_000_000
+    """largest number of Gaussians"""
     prune_opacity: Annotated[float, Field(gt=0.0, le=0.5)] = 0.005
-    """fainter ones are taken away (relocation: are moved)"""
-    prune_scale: Positive = 0.1
-    """gradient: larger than this part of the scene is taken away after the first reset"""
-    prune_angle: Weight = 0.0
-    """relocation: one whose standard deviation exceeds this part of its distance from the nearest training camera is
-    moved: it veils what cameras see that look all around; 0: none"""
+    """mcmc relocates, and adc removes, Gaussians below this opacity"""
+
+
+class McmcConfig(_Table):
+    """Options of densification.strategy = "mcmc" (3DGS-MCMC, NeurIPS 2024)."""
+
+    cap_density: Annotated[float, Field(ge=0.0, le=1e6)] = 120.0
+    """largest number of Gaussians, as a multiple of the square root of the training photos' pixels; ignored if the
+    training starts with more; 0 disables this cap"""
+    growth_rate: Part = 0.05
+    """fraction of new Gaussians per change; more in a training too short to reach the cap at this rate"""
+    seed_fraction: Part = 0.2
+    """fraction of the relocated and new Gaussians that is placed where a photo is reproduced worst, at depths on which
+    photos agree; 0 disables"""
+    noise_lr: Annotated[float, Field(ge=0.0, le=1e12)] = 5e5
+    """strength of the noise on positions, in units of their learning rate; 0 disables"""
+    prune_near_angle: Weight = 0.0
+    """relocate Gaussians whose standard deviation exceeds this multiple of the distance to the nearest training camera
+    (floaters in front of cameras); 0 disables"""
+
+
+class AdcConfig(_Table):
+    """Options of densification.strategy = "adc" (3DGS, section 5.2)."""
+
+    grow_grad2d: Positive = 0.0002
+    """mean gradient of the projected position, in normalised screen units, above which a Gaussian is duplicated or
+    split"""
+    grow_scale3d: Positive = 0.01
+    """split Gaussians larger than this fraction of the scene, duplicate smaller ones"""
+    prune_scale3d: Positive = 0.1
+    """remove Gaussians larger than this fraction of the scene, after the first reset"""
     reset_every: Iteration = 3000
-    """gradient: iterations between resets of the opacities"""
-    growth: Part = 0.05
-    """relocation: the count grows by this part at each change, or by more where the training is too short to reach its
-    budget so"""
-    births: Part = 0.2
-    """relocation: part of the moved and the new ones that is born where the photos are explained worst, at depths on
-    which they agree"""
-    noise: Annotated[float, Field(ge=0.0, le=1e12)] = 5e5
-    """relocation: strength of the noise on the positions, in learning rates"""
+    """iterations between resets of the opacities"""
 
 
 class OptimizerConfig(_Table):
@@ -185,20 +195,20 @@ class ScheduleConfig(_Table):
 
     iterations: Annotated[int, Field(ge=1, le=10_000_000)] = 30_000
     """training steps; one photo each"""
-    harmonics_every: Iteration = 1000
+    sh_degree_interval: Iteration = 1000
     """iterations between degrees of the harmonics; degree 0 first"""
-    average: Annotated[int, Field(ge=0, le=10**12)] = 750
+    ema_window: Annotated[int, Field(ge=0, le=10**12)] = 750
     """the scene is the mean over about so many of the last iterations, the later the more; 0: the last alone"""
     evaluate_at: Annotated[tuple[Iteration, ...], Many] = (500, 1000, 2000, 4000, 7000, 10_000, 14_000, 20_000, 30_000)
     """iterations that test the held-out views; the last always does"""
     checkpoint_every: Iteration = 5000
     """iterations between checkpoints; one is always written at the end"""
-    checkpoints_kept: Annotated[int, Field(ge=1, le=1000)] = 1
+    keep_checkpoints: Annotated[int, Field(ge=1, le=1000)] = 1
     """older checkpoints are deleted"""
-    photos: Literal["auto", "device", "memory", "disk"] = "auto"
+    photo_cache: Literal["auto", "device", "memory", "disk"] = "auto"
     """where photos are kept: on the device, in memory and copied to the device a step ahead, on the disk and read from
     there, or as far down as they must be to fit; on a CPU device and memory are one"""
-    recorded: bool = True
+    use_cuda_graph: bool = True
     """on a GPU, replay training steps as CUDA graphs; off, launch each: much slower"""
 
 
@@ -219,6 +229,8 @@ class Config(_Table):
     fusion: FusionConfig = FusionConfig()
     loss: LossConfig = LossConfig()
     densification: DensificationConfig = DensificationConfig()
+    mcmc: McmcConfig = McmcConfig()
+    adc: AdcConfig = AdcConfig()
     optimizer: OptimizerConfig = OptimizerConfig()
     schedule: ScheduleConfig = ScheduleConfig()
     plan: PlanConfig = PlanConfig()
@@ -238,8 +250,8 @@ class Config(_Table):
         return max(1, round(iteration * self.schedule.iterations / REFERENCE_ITERATIONS))
 
     def degree_at(self, iteration: int) -> int:
-        """The degree of the harmonics that a step after so many uses: one more every harmonics_every."""
-        return min(self.model.harmonics_degree, iteration // self.scaled(self.schedule.harmonics_every))
+        """The degree of the harmonics that a step after so many uses: one more every sh_degree_interval."""
+        return min(self.model.sh_degree, iteration // self.scaled(self.schedule.sh_degree_interval))
 
 
 def _contradictions(config: Config) -> Iterator[str]:

@@ -24,8 +24,11 @@ from .config import Config, ConfigError
 _LARGEST_FILE = 1 << 20
 _REMEDY = "`sehdr-warp config` lists every field with its meaning"
 _GONE = tomllib.loads((resources.files("sehdr_warp.runs") / "gone.toml").read_text(encoding="utf-8"))
+RENAMED: dict[str, str] = _GONE.pop("renamed")
+"""Fields of version 0.2, each with its name since version 0.3."""
 GONE: dict[str, str] = {path: advice for advice, paths in _GONE.items() for path in paths}
-"""Fields of earlier versions, each with what to do now."""
+"""Fields of earlier versions that no longer exist, each with what to do instead."""
+_RENAMED_VALUES = {"densification.strategy": {"relocation": "mcmc", "gradient": "adc"}}
 
 
 def preset_names() -> list[str]:
@@ -127,6 +130,8 @@ def config_from_dict(values: dict, source: Path | str = "config", flags: Mapping
         flag = next((flag for path, flag in flags.items() if path in problem), None)
     if path in GONE:
         raise InputError(source, f"{problem} of an earlier version is gone", GONE[path])
+    if path in RENAMED:
+        raise InputError(source, f"{problem} has another name since version 0.3", f"write {RENAMED[path]}")
     raise InputError(flag or source, problem, _REMEDY)
 
 
@@ -139,8 +144,11 @@ def field_and_problem(found: ValidationError) -> tuple[str, str]:
         name, value = next(iter(value.items()))
         path += f".{name}"
     value = f"{path or 'the config'} = {reprlib.repr(value)}"
-    if path in GONE:
+    if path in GONE or path in RENAMED:
         return path, value
+    names = _RENAMED_VALUES.get(path, {})
+    if isinstance(error["input"], str) and error["input"] in names:
+        return path, f"{value} has another name since version 0.3: {names[error['input']]!r}"
     if unknown:
         return path, f"unknown field {value}{did_you_mean(path, (name for name, _ in config_fields()))}"
     return path, f"{value}: {error['msg'][0].lower()}{error['msg'][1:]}"

@@ -11,11 +11,11 @@ SPANS = 5  # From which a mean begins: what is older would weigh less than a hun
 
 
 class Averaging:
-    """Exponential means of Gaussians over about schedule.average of the last iterations, once their count stays."""
+    """Exponential means of Gaussians over about schedule.ema_window of the last iterations, once their count stays."""
 
     def __init__(self, config: Config, last_change: int):
         self.total = config.schedule.iterations
-        span = config.scaled(config.schedule.average) if config.schedule.average else 1
+        span = config.scaled(config.schedule.ema_window) if config.schedule.ema_window else 1
         self.every = max(1, span // SAMPLES)
         self.part = self.every / span
         self.first = max(self.total - SPANS * span, last_change)

@@ -82,7 +82,9 @@ class MachineOptions:
 class Train:
     """Train a scene from photos of one exposure. What the scene does not need is left out; what you name stays."""
 
-    gone: ClassVar[Mapping[str, str]] = {configs.flag_of(path): advice for path, advice in configs.GONE.items()} | {
+    gone: ClassVar[Mapping[str, str]] = {
+        **{configs.flag_of(path): advice for path, advice in configs.GONE.items()},
+        **{configs.flag_of(path): f"write {configs.flag_of(name)}" for path, name in configs.RENAMED.items()},
         "--plan": "it is the default; --plan.enabled false trains without",
         "--predict-hdr": configs.GONE["loss.predictor"],
         "--set": "every field is a flag, as --loss.clipping false for --set loss.clipping=false",
@@ -170,7 +172,7 @@ def _train(asked: Train, ranks=None) -> None:
     config = _config(asked, resumed)
     device = pick_device(asked.machine.device) if ranks is None else ranks.device
     options = config.response
-    photos = {"device": "memory"}.get(config.schedule.photos, config.schedule.photos)
+    photos = {"device": "memory"}.get(config.schedule.photo_cache, config.schedule.photo_cache)
     given = {"method": options.method, "candidates": options.candidates, "photos": photos}
     if out is not None:
         _check_truth(data, config)
@@ -278,7 +280,7 @@ def _cost(config) -> str:
     planned = "as many steps as the photos deserve, up to" if config.plan.enabled else "steps:"
     parts = {
         f"{planned} {config.schedule.iterations}": True,
-        f"up to {config.densification.max_gaussians:,} Gaussians": True,
+        f"up to {config.densification.cap_max:,} Gaussians": True,
         f"{len(config.fusion.exposures)} brackets in every step": config.fusion.enabled,
         "a learned response": config.response.name == "learned",
         "needs HDR truth": config.loss.uses_hdr,

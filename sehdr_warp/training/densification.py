@@ -17,7 +17,7 @@ from ..model.spare_rows import moments_of
 from ..rasterizer import Rendering
 from ..rasterizer.relocation import Drawn, clear_rows, copy_rows, count_copies, number_places, share_opacities
 from ..rasterizer.training_step import add_gradient_statistics, add_position_noise
-from ..runs.config import Config, DensificationConfig
+from ..runs.config import Config
 
 SPLIT_SHRINK = 1.6  # The two halves of a split are this much smaller (3DGS: 0.8 times the number of halves)
 SHORTEST_INTERVAL = 20
@@ -43,10 +43,12 @@ class Densification:
 
     def __init__(self, config: Config, extent: float, pixels: int):
         self.config, self.options, self.extent = config, config.densification, extent
-        self.most = self.options.max_gaussians
-        self.start, self.stop, self.every, self.reset_every = (
-            config.scaled(getattr(self.options, name)) for name in ("start", "stop", "every", "reset_every")
+        self.most = self.options.cap_max
+        self.start, self.stop = (
+            config.scaled(self.options.refine_start_iter),
+            config.scaled(self.options.refine_stop_iter),
         )
+        self.every, self.reset_every = config.scaled(self.options.refine_every), config.scaled(config.adc.reset_every)
         self.every = max(self.every, SHORTEST_INTERVAL)
         self.photos = 1
         """Iterations that the step makes at once: where several ranks train, each takes a photo."""
@@ -144,13 +146,13 @@ class GradientDensification(Densification):
 
     def _grown(self, gaussians: Gaussians, gradient: Tensor, generator) -> tuple[Tensor, dict[str, Tensor]]:
         """[N] bool, which Gaussians stay as they are, and rows of those to add: clones, and halves of the others."""
-        wanted = gradient > self.options.grow_gradient
+        wanted = gradient > self.config.adc.grow_grad2d
         room = self.most - gaussians.count
         if int(wanted.sum()) > room:
             # Short of room, those that the image pulls at hardest go first.
             first = gradient.topk(max(room, 0)).indices
             wanted = torch.zeros_like(wanted).index_fill_(0, first, True) & wanted
-        small = gaussians.log_scales.amax(1) <= math.log(self.options.grow_scale * self.extent)
+        small = gaussians.log_scales.amax(1) <= math.log(self.config.adc.grow_scale3d * self.extent)
         clones, parents = (wanted & small).nonzero()[:, 0], (wanted & ~small).nonzero()[:, 0]
         added = [gaussians.rows(clones), *(self._half(gaussians, parents, generator) for _ in range(2))]
         return ~(wanted & ~small), {name: torch.cat([rows[name] for rows in added]) for name in PARAMETER_NAMES}
@@ -174,7 +176,7 @@ class GradientDensification(Densification):
     def _wanted(self, rows: dict[str, Tensor], oversized: bool) -> Tensor:
         wanted = torch.sigmoid(rows["opacity_logits"]) >= self.options.prune_opacity
         if oversized:
-            wanted &= rows["log_scales"].amax(1) <= math.log(self.options.prune_scale * self.extent)
+            wanted &= rows["log_scales"].amax(1) <= math.log(self.config.adc.prune_scale3d * self.extent)
         return wanted
 
     def state(self, count: int) -> dict[str, Tensor]:
@@ -196,14 +198,14 @@ class Relocation(Densification):
 
     def __init__(self, config: Config, extent: float, pixels: int, places: Tensor | None = None):
         super().__init__(config, extent, pixels)
-        self.most = gaussian_budget(self.options, pixels)
+        self.most = gaussian_budget(config, pixels)
         self.places = places
 
     @torch.no_grad()
     def change(self, iteration: int, gaussians: Gaussians, optimizer, generator, births: Births | None = None) -> bool:
         if not self._is_due(iteration):
             return False
-        count, part = gaussians.count, self.options.births
+        count, part = gaussians.count, self.config.mcmc.seed_fraction
         added = self.next_count(iteration, count) - count
         opacities = gaussians.opacities()
         dead = (opacities <= self.options.prune_opacity) | self._veils(gaussians)
@@ -226,35 +228,35 @@ class Relocation(Densification):
         return added > 0
 
     def next_count(self, iteration: int, count: int) -> int:
-        """How many Gaussians there are after the change at an iteration: more by `growth`, or by as much as takes the
+        """Return the count after the change at an iteration: more by `growth_rate`, or by as much as takes the
         count to the budget by the last change, at most MOST_GROWTH."""
-        growth = self.options.growth
+        growth = self.config.mcmc.growth_rate
         if growth and count < self.most:
             left = (self.stop - 1) // self.every - iteration // self.every + 1
             growth = max(growth, min((self.most / count) ** (1 / left) - 1, MOST_GROWTH))
         return max(count, min(self.most, math.ceil((1 + growth) * count)))
 
     def perturb(self, iteration: int, gaussians: Gaussians, means_rate: float) -> None:
-        if self.options.noise:
+        if self.config.mcmc.noise_lr:
             add_position_noise(
                 gaussians.means,
                 gaussians.log_scales,
                 gaussians.quaternions,
                 gaussians.opacity_logits,
-                strength=self.options.noise * means_rate,
+                strength=self.config.mcmc.noise_lr * means_rate,
                 # Of the iteration and not of a running generator, so that a resumed training draws what it would have.
                 seed=(self.config.seed * SEED_STEP + iteration) % 2**31,
             )
 
     def _veils(self, gaussians: Gaussians) -> Tensor:
-        """[N] whether each is wider than `prune_angle` allows before the nearest camera."""
+        """[N] whether each is wider than `prune_near_angle` allows before the nearest camera."""
         means = gaussians.means
-        if self.places is None or not self.options.prune_angle:
+        if self.places is None or not self.config.mcmc.prune_near_angle:
             return torch.zeros(len(means), dtype=torch.bool, device=means.device)
         exact = "donot_use_mm_for_euclid_dist"
         parts = means.split(max(1, PAIRS // len(self.places)))
         nearest = torch.cat([torch.cdist(part, self.places, compute_mode=exact).amin(1) for part in parts])
-        return gaussians.log_scales.amax(1) > torch.log(self.options.prune_angle * nearest)
+        return gaussians.log_scales.amax(1) > torch.log(self.config.mcmc.prune_near_angle * nearest)
 
     def _fill(self, gaussians, generator, places, changed, weights, begin: Tensor, end: Tensor, most: int) -> None:
         """Puts into the places from begin to end, at most `most`, copies of Gaussians drawn by weights, which share
@@ -273,15 +275,15 @@ class Relocation(Densification):
 
 def make_densification(config: Config, extent: float, pixels: int, places: Tensor | None = None) -> Densification:
     """The strategy that config.densification.strategy names; places: [V, 3] of the training cameras."""
-    if config.densification.strategy == "gradient":
+    if config.densification.strategy == "adc":
         return GradientDensification(config, extent, pixels)
     return Relocation(config, extent, pixels, places)
 
 
-def gaussian_budget(options: DensificationConfig, pixels: int) -> int:
-    """The most Gaussians that relocation makes for training photos of so many pixels in all."""
-    most = int(options.budget * math.sqrt(pixels)) if options.budget else options.max_gaussians
-    return min(options.max_gaussians, most)
+def gaussian_budget(config: Config, pixels: int) -> int:
+    """Return the largest number of Gaussians that "mcmc" makes for training photos of so many pixels in total."""
+    most, density = config.densification.cap_max, config.mcmc.cap_density
+    return min(most, int(density * math.sqrt(pixels))) if density else most
 
 
 def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:

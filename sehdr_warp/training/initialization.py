@@ -79,35 +79,35 @@ def make_field(
     trained."""
     check_views(scene)
     rng = np.random.default_rng(config.seed)
-    if config.model.start:
+    if config.model.init_file:
         gaussians = start_gaussians(scene, config, response, rng)
         return assemble_field(gaussians, config, response, base_time(scene)).to(device)
     matcher = matcher or partial(make_matcher, scene, response, device)
     points, colors = start_points(scene, config, matcher, rng)
-    most = config.densification.max_gaussians
+    most = config.densification.cap_max
     if len(points) > most:
         chosen = np.sort(rng.choice(len(points), most, replace=False))
         points, colors = points[chosen], colors[chosen]
     dc = color_model(config.model.radiance).start(colors, response)
     points, dc = (torch.tensor(values, dtype=torch.float32) for values in (points, dc))
-    gaussians = Gaussians.from_points(points, dc, config.model.harmonics_degree)
+    gaussians = Gaussians.from_points(points, dc, config.model.sh_degree)
     return assemble_field(gaussians, config, response, base_time(scene)).to(device)
 
 
 def start_gaussians(scene: Scene, config: Config, response: Response, rng: np.random.Generator) -> Gaussians:
-    """Those of the file that model.start names, in the config's color model and degree. Display colors count as codes
-    of the scene's own photos; radiance is in the scene's units."""
-    read, time = read_gaussians(config.model.start), base_time(scene)
-    if read.count > config.densification.max_gaussians:
-        read = read.rows(np.sort(rng.choice(read.count, config.densification.max_gaussians, replace=False)))
-    degree = config.model.harmonics_degree
+    """Read the Gaussians of model.init_file, in the config's color model and degree. Display colors count as codes of
+    the scene's own photos; radiance is in the scene's units."""
+    read, time = read_gaussians(config.model.init_file), base_time(scene)
+    if read.count > config.densification.cap_max:
+        read = read.rows(np.sort(rng.choice(read.count, config.densification.cap_max, replace=False)))
+    degree = config.model.sh_degree
     read = replace(read.padded(degree), base_time=time if read.color_model == "display" else read.base_time)
     read = replace(read, harmonics=read.harmonics[:, : (degree + 1) ** 2])
     field = field_of(read)
     field.response = response
     positions = np.stack([view.camera.position for view in scene.train_views])
     wanted = gaussians_of(field, config.model.radiance, positions, time)
-    _log.info("starting from the %d Gaussians of %s", read.count, config.model.start)
+    _log.info("starting from the %d Gaussians of %s", read.count, config.model.init_file)
     return field_of(replace(wanted, base_time=time)).gaussians.requires_grad_()
 
 
@@ -161,7 +161,7 @@ def _matched(matcher: Matcher, count: int, seed: int) -> tuple[np.ndarray, np.nd
 def start_count(config: Config, pixels: int) -> int:
     """How many points a training on photos of so many pixels in all starts from, if the scene has no more."""
     options = config.densification
-    most = gaussian_budget(options, pixels) if options.strategy == "relocation" else options.max_gaussians
+    most = gaussian_budget(config, pixels) if options.strategy == "mcmc" else options.cap_max
     return min(most, round(config.model.initial_density * math.sqrt(pixels)))
 
 

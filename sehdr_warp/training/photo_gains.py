@@ -44,7 +44,7 @@ FEWEST = 100  # Points that a fit needs
 
 def evens(scene: Scene, config: Config, response: Response) -> bool:
     """Whether a training looks for drift: where it may, matches points, and knows light."""
-    wanted = config.model.photo_gains
+    wanted = config.model.exposure_compensation
     asked = wanted in ("auto", "always") or (wanted == "unstated" and not scene.exposure_times_known)
     return asked and config.model.initial_density > 0 and not response.learnable
 
@@ -54,7 +54,7 @@ def find_gains(
 ) -> tuple[ExposureCompensation | None, Matcher, Decision]:
     """The gains, None where there is no drift to speak of; a matcher of the training views, evened by them; and what
     the plan says of it."""
-    stated = scene.exposure_times_known and config.model.photo_gains != "always"
+    stated = scene.exposure_times_known and config.model.exposure_compensation != "always"
     views, others = scene.train_views, scene.test_views
     cameras = [view.camera for view in others]
 

@@ -31,7 +31,7 @@ def fits_device(source: PhotoSource, device: torch.device) -> bool:
 
 
 def held_views(source: PhotoSource, where: str, recorded: bool) -> "ViewStack | PhotoStream | Sequence[TrainingView]":
-    """The views of a source as steps take them. where: schedule.photos. recorded: whether steps are."""
+    """The views of a source as steps take them. where: schedule.photo_cache. recorded: whether steps are."""
     device = torch.device(source.device)
     if device.type == "cpu":  # Memory is the device's, or a file is mapped into it.
         return source

@@ -25,7 +25,7 @@ PASSES = 300  # Steps on each photo. A second look at the same photos teaches le
 FEWEST_ITERATIONS = 4000
 CPU_SECONDS = 60.0  # What a training on a CPU may take, as far as CPU_FEWEST allows
 CPU_FEWEST = 1000
-WIDEST = 0.12  # densification.prune_angle where cameras look all around
+WIDEST = 0.12  # mcmc.prune_near_angle where cameras look all around
 CPU_BUDGET = 60.0  # Of densification, where time is short: twice as many Gaussians gain less than twice the steps
 RATES_FOR = 30_000  # The steps that 3DGS made its learning rates for
 HASTE, MOST_HASTE = 0.22, 2.5  # Shorter trainings learn faster by this power of what is missing, so much at most
@@ -190,9 +190,9 @@ def check_fields(scene: Scene, config: Config) -> None:
                 refuse("fusion.exposures", problem, f"stay within 1/{REACH:.0f} and {REACH:.0f} times")
     if {"loss.hdr_truth", "loss.linear_weight", "loss.hdr_weight"} & set(given):
         largest_truth(scene, config.loss)
-    if "densification.max_gaussians" in given and config.densification.max_gaussians < points:
+    if "densification.cap_max" in given and config.densification.cap_max < points:
         remedy = f"use {points} or more, or leave the field out"
-        refuse("densification.max_gaussians", f"the scene starts from {points} points", remedy)
+        refuse("densification.cap_max", f"the scene starts from {points} points", remedy)
 
 
 def _response(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
@@ -241,32 +241,32 @@ def _linear_loss(facts: SceneFacts, config: Config, device: torch.device) -> Cho
 
 def _densification(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     fields: dict[str, object] = {}
-    if _is_short_of_time(facts, config, device) and "densification.budget" not in config.plan.keep:
-        fields = {"densification.budget": CPU_BUDGET}
+    if _is_short_of_time(facts, config, device) and "mcmc.cap_density" not in config.plan.keep:
+        fields = {"mcmc.cap_density": CPU_BUDGET}
         config = override_config(config, fields, "plan")
     options = config.densification
-    most = gaussian_budget(options, facts.pixels)
-    reason = f"densification.max_gaussians = {options.max_gaussians}"
-    if options.budget:
-        reason = f"{options.budget:g} times the square root of {facts.pixels} pixels, below {options.max_gaussians}"
-    if options.strategy == "relocation":
+    most, density = gaussian_budget(config, facts.pixels), config.mcmc.cap_density
+    reason = f"densification.cap_max = {options.cap_max}"
+    if density:
+        reason = f"{density:g} times the square root of {facts.pixels} pixels, below {options.cap_max}"
+    if options.strategy == "mcmc":
         start = max(facts.points, start_count(config, facts.pixels))
-        choice = f"relocation grows to at most {most}" if start < most else "relocation without growth"
+        choice = f"mcmc, growing to at most {most} Gaussians" if start < most else "mcmc without growth"
         if facts.around:
-            fields["densification.prune_angle"] = WIDEST
+            fields["mcmc.prune_near_angle"] = WIDEST
             reason += "; the cameras look all around from within, where wide Gaussians would veil them"
         return fields, choice, f"{reason}; {start} to start with"
     # Relocation has this budget by itself; densification by gradients stops nowhere.
-    most = min(options.max_gaussians, max(most, 2 * facts.points))
+    most = min(options.cap_max, max(most, 2 * facts.points))
     reason += f"; {facts.points} points to start from"
-    return {"densification.max_gaussians": most}, f"{most} Gaussians", reason
+    return {"densification.cap_max": most}, f"{most} Gaussians", reason
 
 
 def _is_short_of_time(facts: SceneFacts, config: Config, device: torch.device) -> bool:
-    """Whether a CPU lacks time for the fewest steps of a GPU, by relocation to more than CPU_BUDGET, and nobody asked
+    """Whether a CPU lacks time for the fewest steps of a GPU, by mcmc to more than CPU_BUDGET, and nobody asked
     for as many."""
     options, steps = config.densification, config.schedule.iterations
-    if device.type != "cpu" or options.strategy != "relocation" or options.budget <= CPU_BUDGET:
+    if device.type != "cpu" or options.strategy != "mcmc" or config.mcmc.cap_density <= CPU_BUDGET:
         return False
     asked = "schedule.iterations" in config.plan.keep and steps >= FEWEST_ITERATIONS
     return not asked and FEWEST_ITERATIONS * cpu_step_seconds(facts, config) > CPU_SECONDS
@@ -327,6 +327,6 @@ def cpu_step_seconds(facts: SceneFacts, config: Config) -> float:
     """About how long a step takes on this machine's CPU, with two thirds of the Gaussians that the training ends with:
     the mean over one that grows for half of its steps."""
     start = max(facts.points, start_count(config, facts.pixels))
-    count = max(start, gaussian_budget(config.densification, facts.pixels))
-    work = CPU_PIXEL * facts.pixels / facts.photos + CPU_GAUSSIAN * min(count, config.densification.max_gaussians) / 1.5
+    count = max(start, gaussian_budget(config, facts.pixels))
+    work = CPU_PIXEL * facts.pixels / facts.photos + CPU_GAUSSIAN * min(count, config.densification.cap_max) / 1.5
     return work / thread_count()

@@ -305,7 +305,7 @@ class Training:
             told = "iteration %d: the loss is %s; no checkpoint is written, the last one stays"
             log.warning(told, self.iteration, loss)
         else:
-            kept = self.config.schedule.checkpoints_kept
+            kept = self.config.schedule.keep_checkpoints
             self.folder.write_checkpoint(tensors, values | {"seconds": self.seconds}, kept=kept)
 
     def _log(self, split: str, figures: dict[str, float]) -> None:
@@ -370,13 +370,13 @@ class Training:
     def _crowded(self) -> Iterator[str]:
         """What to know of a training with more start points than it may have, or may add to."""
         count, budget = self.trainer.field.gaussians.count, self.trainer.densification.most
-        points, most = len(self.scene.points), self.config.densification.max_gaussians
+        points, most = len(self.scene.points), self.config.densification.cap_max
         if self.iteration == 0 and points > most:
-            yield f"{points} start points: drawn from, for densification.max_gaussians = {most}"
+            yield f"{points} start points: drawn from, for densification.cap_max = {most}"
         if count > budget:
             yield (
-                f"{count} Gaussians are more than relocation's budget of {budget} for these photos: they move, and "
-                "none are added; densification.budget=0 lets them grow to densification.max_gaussians"
+                f"{count} Gaussians are more than the cap of {budget} for these photos: they are relocated, and "
+                "none are added; mcmc.cap_density=0 lets them grow to densification.cap_max"
             )
 
 

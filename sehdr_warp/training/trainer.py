@@ -80,7 +80,7 @@ class Trainer:
         self._order = PhotoOrder(len(self._views), config.seed, self.rank, self.batch)
         self._generator = torch.Generator(device=self.device).manual_seed(config.seed)
         self._index = torch.zeros(1, dtype=torch.int64, device=self.device)
-        recorded = self.device.type == "cuda" and config.schedule.recorded
+        recorded = self.device.type == "cuda" and config.schedule.use_cuda_graph
         self._recorder = CudaGraphRunner(self.device) if recorded else None
         # What follows the exchange of gradients is a recording of its own.
         self._follower = CudaGraphRunner(self.device, self._recorder.stream) if self._recorder and ranks else None
@@ -98,7 +98,7 @@ class Trainer:
 
     @property
     def degree(self) -> int:
-        """The degree of the harmonics at this iteration: one more every harmonics_every."""
+        """The degree of the harmonics at this iteration: one more every sh_degree_interval."""
         return self.config.degree_at(self.iteration)
 
     @property
@@ -324,7 +324,7 @@ class Trainer:
             # What a broken recording leaves behind on the device is no ground to go on from.
             raise SehdrError(
                 f"iteration {self.iteration}: the step could not be recorded as a CUDA graph "
-                f"({str(error).splitlines()[0]}); train with --schedule.recorded=false, which is slower"
+                f"({str(error).splitlines()[0]}); train with --schedule.use-cuda-graph=false, which is slower"
             ) from error
 
     def check(self, *, wait: bool = True) -> None:
@@ -377,7 +377,7 @@ class Trainer:
             given, loss = (self._views, self.field.base_time, self.device), self.config.loss
             light = self.field.response if compares_light(loss, self.field) else None
             source = photo_source(*given, truth=loss.uses_hdr, clipping=loss.clipping, light=light)
-            self._stack = held_views(source, self.config.schedule.photos, self._recorder is not None)
+            self._stack = held_views(source, self.config.schedule.photo_cache, self._recorder is not None)
             self._scale = source.scale
         if self._fine and self.iteration > INTERVALS_FROM * self.config.schedule.iterations:
             self._fine = False

@@ -15,7 +15,7 @@ from sehdr_warp.training.train import train
 
 from ..training.wall_and_lamp import HALF, LAMP, wall_and_lamp
 
-FIELDS = {"schedule.iterations": 150, "response.name": "linear", "plan.enabled": False, "densification.budget": 12.0}
+FIELDS = {"schedule.iterations": 150, "response.name": "linear", "plan.enabled": False, "mcmc.cap_density": 12.0}
 pytestmark = pytest.mark.usefixtures("few_probes")
 CONFIG = load_config("fast", FIELDS)
 

@@ -10,6 +10,7 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import (
     GONE,
+    RENAMED,
     config_as_toml,
     config_fields,
     config_from_dict,
@@ -54,11 +55,11 @@ def test_paper_preset_is_the_papers():
 
 @pytest.mark.parametrize("name", preset_names())
 def test_presets_keep_the_densification_of_their_method(name):
-    """The default's relocation goes with its opacity weight; what builds on 3DGS has neither."""
+    """The default's mcmc goes with its opacity weight; what builds on 3DGS has neither."""
     config = load_config(name)
     found = config.densification.strategy, config.loss.opacity_weight
     relocates = name in ("default", "fast", "demo", "truth")
-    assert found == (("relocation", 0.01) if relocates else ("gradient", 0.0))
+    assert found == (("mcmc", 0.01) if relocates else ("adc", 0.0))
 
 
 @pytest.mark.parametrize("path,item", list(config_fields()), ids=[path for path, _ in config_fields()])
@@ -82,6 +83,8 @@ def test_every_field_is_documented_and_read(path, item):
     [
         ("[model]\nopacity = 0.2", ["model.opacity", "0.2", "unknown"]),
         ("[loss]\nknee = 8.0", ["loss.knee = 8.0 of an earlier version is gone", "leave it out"]),
+        ("[densification]\nbudget = 9.0", ["budget = 9.0 has another name since version 0.3; write mcmc.cap_density"]),
+        ("[densification]\nstrategy = 'relocation'", ["'relocation' has another name since version 0.3: 'mcmc'"]),
         ("[response]\nform = 'mlp'", ["response.form = 'mlp'", 'write response.name = "learned"']),
         ("[los]\nclipping = true", ["los.clipping = True", "did you mean loss.clipping?"]),
         ("[model]\nradiance2 = 1", ["model.radiance2 = 1", "did you mean model.radiance?"]),
@@ -162,7 +165,8 @@ def test_values_of_flags(path, text, value):
 
 
 def test_no_field_is_both_here_and_gone():
-    assert not {path for path, _ in config_fields()} & GONE.keys()
+    fields = {path for path, _ in config_fields()}
+    assert not fields & (GONE.keys() | RENAMED.keys()) and set(RENAMED.values()) <= fields
 
 
 def test_base_and_overrides(tmp_path):

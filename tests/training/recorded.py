@@ -8,7 +8,7 @@ from sehdr_warp.training.trainer import Trainer
 
 def train_on_gpu(scene, config, *, recorded: bool = True, iterations: int | None = None) -> tuple[Trainer, int]:
     """The trainer after its iterations, and how many of them were replayed."""
-    config = override_config(config, {"schedule.recorded": recorded})
+    config = override_config(config, {"schedule.use_cuda_graph": recorded})
     trainer = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cuda:0"))
     replays = 0
     for _ in range(iterations or config.schedule.iterations):

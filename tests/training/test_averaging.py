@@ -11,7 +11,7 @@ from sehdr_warp.training.train import Training, train
 
 from .toy import QUICK, load_unscaled
 
-AVERAGED = QUICK | {"schedule.iterations": 40, "schedule.average": 4500, "densification.stop": 20}
+AVERAGED = QUICK | {"schedule.iterations": 40, "schedule.ema_window": 4500, "densification.refine_stop_iter": 20}
 
 
 class Moving:
@@ -27,7 +27,7 @@ class Moving:
 @pytest.mark.parametrize("average", [0, 100, 1000])
 def test_the_mean_is_as_old_as_its_span(average):
     iterations = 6000
-    config = load_config("default", {"schedule.iterations": iterations, "schedule.average": 5 * average})
+    config = load_config("default", {"schedule.iterations": iterations, "schedule.ema_window": 5 * average})
     averaging, gaussians = Averaging(config, 500), Moving()
     begin = max(iterations - SPANS * average, 500) + average // 10
     for iteration in range(1, iterations + 1):
@@ -41,7 +41,7 @@ def test_the_mean_is_as_old_as_its_span(average):
 
 
 def test_means_begin_when_the_count_stays():
-    config = load_config("default", {"schedule.iterations": 1000, "schedule.average": 15_000})
+    config = load_config("default", {"schedule.iterations": 1000, "schedule.ema_window": 15_000})
     assert Averaging(config, 500).first == 500
 
 
@@ -55,7 +55,7 @@ def test_a_training_that_stops_in_between_ends_in_the_same_bits(scene, tmp_path)
     stopped = RunFolder(tmp_path / "parts").newest_checkpoint()
     assert isinstance(stopped, Checkpoint) and any(name.startswith("average.") for name in stopped.tensors)
     resumed = train(scene, tmp_path / "parts", device="cpu", resume=True)
-    last = load_unscaled("default", AVERAGED | {"schedule.average": 0})
+    last = load_unscaled("default", AVERAGED | {"schedule.ema_window": 0})
     plain = train(scene, tmp_path / "plain", last, device="cpu")
     for name, values in whole.model.gaussians.tensors().items():
         assert torch.equal(values, resumed.model.gaussians.tensors()[name]), name

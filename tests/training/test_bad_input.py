@@ -10,7 +10,7 @@ from sehdr_warp.training.train import train
 
 from .wall_and_lamp import in_lamp, photographed, texture, wall_and_lamp
 
-SHORT = {"response.name": "linear", "schedule.iterations": 80, "densification.max_gaussians": 2500}
+SHORT = {"response.name": "linear", "schedule.iterations": 80, "densification.cap_max": 2500}
 SHORT |= {"plan.keep": tuple(name for name in SHORT if name != "response.name")}
 
 
@@ -53,7 +53,7 @@ def test_a_sky_that_fills_the_photo(tmp_path, device):
     run = train(
         scene,
         tmp_path / "run",
-        SHORT | {"schedule.iterations": 400, "densification.max_gaussians": 1000},
+        SHORT | {"schedule.iterations": 400, "densification.cap_max": 1000},
         device=device,
     )
     assert decibels(run, scene) > flat + 2

@@ -49,7 +49,7 @@ def test_an_older_run_gets_it_on_demand(run, scene, caplog):
 
 
 def test_that_of_another_checkpoint_does_not_count(run):
-    save_file({"confidence": run.model.confidence}, run.folder.confidence, {"format": "2", "checkpoint": "0" * 64})
+    save_file({"confidence": run.model.confidence}, run.folder.confidence, {"format": "3", "checkpoint": "0" * 64})
     assert load_run(run.path).model.confidence is None
 
 
@@ -59,7 +59,7 @@ def test_that_of_another_checkpoint_does_not_count(run):
     ids=["short", "values", "damaged"],
 )
 def test_damage_is_one_line(run, confidence, problem):
-    stated = {"format": "2", "checkpoint": run.checkpoint_hash}
+    stated = {"format": "3", "checkpoint": run.checkpoint_hash}
     if isinstance(confidence, bytes):
         run.folder.confidence.write_bytes(confidence)
     else:

@@ -40,8 +40,8 @@ def rendering_with(gradient, visible):
     return SimpleNamespace(means2d=means2d, radii=visible.float())
 
 
-def gradient_strategy(**options):
-    values = {"densification.strategy": "gradient"}
+def adc_strategy(**options):
+    values = {"densification.strategy": "adc"}
     values |= {f"densification.{name}": value for name, value in options.items()}
     return GradientDensification(load_config("default", values), EXTENT, 1)
 
@@ -54,7 +54,7 @@ def observe(strategy, gradients):
 
 
 def test_statistics_are_means_over_the_photos_that_show_it():
-    strategy = gradient_strategy()
+    strategy = adc_strategy()
     gradient = torch.tensor([[3.0, 0.0], [0.0, 4.0]])
     strategy.prepare(2, "cpu")
     strategy.observe(rendering_with(gradient, torch.tensor([True, True])), 200, 100, torch.tensor(1.0))
@@ -69,7 +69,7 @@ def test_small_are_cloned_and_large_are_split():
     gaussians.overwrite({"log_scales": torch.tensor([small, large, small]).log()[:, None].expand(3, 3)})
     optimizer = adam(gaussians)
     before = gaussians.rows(torch.arange(3))
-    strategy = gradient_strategy()
+    strategy = adc_strategy()
     observe(strategy, [1.0, 1.0, 0.0])
     assert strategy.change(600, gaussians, optimizer, torch.Generator().manual_seed(0))
     # Kept: 0 and 2; added: a clone of 0, and two halves of 1.
@@ -86,7 +86,7 @@ def test_small_are_cloned_and_large_are_split():
 
 
 def test_split_points_are_drawn_from_the_parent():
-    strategy, gaussians = gradient_strategy(), cloud(4)
+    strategy, gaussians = adc_strategy(), cloud(4)
     scales = torch.tensor([0.5, 0.01, 0.2])
     quaternion = torch.tensor([0.3, -0.5, 0.7, 0.2])
     gaussians.overwrite({"log_scales": scales.log().expand(4, 3), "quaternions": quaternion.expand(4, 4)})
@@ -99,7 +99,7 @@ def test_split_points_are_drawn_from_the_parent():
 
 
 def test_statistics_stay_where_recorded_steps_add_to_them():
-    strategy, gaussians = gradient_strategy(), cloud(4)
+    strategy, gaussians = adc_strategy(), cloud(4)
     observe(strategy, [1e-6] * 4)
     held = strategy.gradient_sum, strategy.seen
     for iteration in (600, 14_900):  # The last change too: steps after it still add.
@@ -121,7 +121,7 @@ def test_the_budget_goes_to_the_largest_gradients():
     optimizer = adam(gaussians)
     # Neither faint nor huge, so that nothing is pruned.
     gaussians.overwrite({"log_scales": torch.full((6, 3), math.log(0.001)), "opacity_logits": torch.zeros(6)})
-    strategy = gradient_strategy(max_gaussians=8)
+    strategy = adc_strategy(cap_max=8)
     observe(strategy, [0.1, 0.6, 0.2, 0.5, 0.3, 0.4])
     strategy.change(600, gaussians, optimizer, torch.Generator())
     assert gaussians.count == 8
@@ -134,7 +134,7 @@ def test_faint_and_oversized_are_pruned():
     logits = torch.logit(torch.tensor([0.5, 0.004, 0.5, 0.5, 0.5]))
     scales = torch.tensor([0.01, 0.01, 0.3, 0.01, 0.01]).log()[:, None].expand(5, 3)
     gaussians.overwrite({"opacity_logits": logits, "log_scales": scales})
-    strategy = gradient_strategy()
+    strategy = adc_strategy()
     observe(strategy, [0.0] * 5)
     strategy.change(2900, gaussians, optimizer, torch.Generator())
     assert gaussians.count == 4, "only the faint one before the first reset"
@@ -147,7 +147,7 @@ def test_opacity_reset():
     gaussians = cloud(3)
     optimizer = adam(gaussians)
     gaussians.overwrite({"opacity_logits": torch.logit(torch.tensor([0.9, 0.5, 0.006]))})
-    strategy = gradient_strategy()
+    strategy = adc_strategy()
     strategy.change(3000, gaussians, optimizer, torch.Generator())
     torch.testing.assert_close(gaussians.opacities().detach(), torch.tensor([0.01, 0.01, 0.006]))
     assert (optimizer.state[gaussians.opacity_logits]["exp_avg"] == 0).all()
@@ -156,13 +156,14 @@ def test_opacity_reset():
 
 @pytest.mark.parametrize("iteration", [500, 550, 15_100])
 def test_nothing_changes_outside_the_schedule(iteration):
-    gaussians, strategy = cloud(4), gradient_strategy()
+    gaussians, strategy = cloud(4), adc_strategy()
     observe(strategy, [1.0] * 4)
     assert not strategy.change(iteration, gaussians, None, torch.Generator()) and gaussians.count == 4
 
 
-def relocation(places=None, **options):
-    values = {"densification.strategy": "relocation"} | {f"densification.{k}": v for k, v in options.items()}
+def mcmc_strategy(places=None, *, cap_max=None, **options):
+    values = {"densification.strategy": "mcmc"} | {f"mcmc.{name}": value for name, value in options.items()}
+    values |= {} if cap_max is None else {"densification.cap_max": cap_max}
     return make_densification(load_config("default", values), EXTENT, 10**6, places)
 
 
@@ -187,7 +188,7 @@ def test_relocation_moves_what_veils_a_camera(rooms, monkeypatch):
     log_scales = torch.stack([widths.log(), *2 * [torch.full((8,), -5.0)]], 1)
     optimizer = adam(gaussians)
     gaussians.overwrite({"means": means, "log_scales": log_scales, "opacity_logits": torch.zeros(8)})
-    strategy = relocation(places, prune_angle=0.25, growth=0.0, births=0.0)
+    strategy = mcmc_strategy(places, prune_near_angle=0.25, growth_rate=0.0, seed_fraction=0.0)
     assert not strategy.change(600, gaussians, optimizer, torch.Generator())
     # More than a quarter of 0.9 from the first camera, and of 2.9 from the second; not of the others.
     moved = (gaussians.means.detach() != means).any(1)
@@ -222,7 +223,7 @@ def test_relocation_moves_the_dead_and_keeps_the_image(rooms):
 
     before, tensors = image(), dict(gaussians.named_parameters())
     # In place: what a recorded step holds of them stays good.
-    assert not relocation(growth=0.0).change(600, gaussians, optimizer, generator)
+    assert not mcmc_strategy(growth_rate=0.0).change(600, gaussians, optimizer, generator)
     assert all(gaussians.get_parameter(name) is parameter for name, parameter in tensors.items())
     after = image()
     assert gaussians.count == 8 and (gaussians.opacities() > 0.005).all()
@@ -251,7 +252,7 @@ def test_the_born_come_first_and_take_the_places_of_the_dead(rooms, dead, colors
     logits = torch.logit(torch.tensor([0.004] * dead + [0.5] * (10 - dead)))[torch.randperm(10)]
     gaussians.overwrite({"opacity_logits": logits})
     gone, before = (logits < -5).nonzero()[:, 0].tolist(), gaussians.rows(torch.arange(10))
-    strategy = relocation(births=0.5, growth=0.3)
+    strategy = mcmc_strategy(seed_fraction=0.5, growth_rate=0.3)
     strategy.change(
         600, gaussians, optimizer, torch.Generator().manual_seed(0), born([10.0 + k for k in range(colors)])
     )
@@ -280,7 +281,7 @@ def test_relocation_does_not_wait_for_a_gpu():
         optimizer, generator = adam(gaussians), torch.Generator("cuda:0").manual_seed(0)
         gaussians.overwrite({"opacity_logits": torch.linspace(-6, 2, 100, device="cuda:0")})
         gaussians.reserve(120, optimizer)
-        strategy = relocation()
+        strategy = mcmc_strategy()
         torch.cuda.set_sync_debug_mode(waited if waited == "error" else "default")
         try:
             strategy.change(600, gaussians, optimizer, generator)
@@ -293,13 +294,13 @@ def test_relocation_grows_to_the_budget(rooms):
     gaussians = cloud(100)
     optimizer = adam(gaussians)
     gaussians.overwrite({"opacity_logits": torch.zeros(100)})
-    strategy = relocation(max_gaussians=104)
+    strategy = mcmc_strategy(cap_max=104)
     strategy.change(600, gaussians, optimizer, torch.Generator().manual_seed(0))
     assert gaussians.count == 104
     strategy.change(700, gaussians, optimizer, torch.Generator().manual_seed(0))
     assert gaussians.count == 104
     # 0.106 Gaussians for each of 1000, the square root of 10^6 pixels.
-    strategy = relocation(budget=0.106)
+    strategy = mcmc_strategy(cap_density=0.106)
     strategy.change(600, gaussians, optimizer, torch.Generator().manual_seed(0))
     assert gaussians.count == 106
 
@@ -323,11 +324,11 @@ def test_noise_comes_with_the_iteration():
         gaussians = cloud(50)
         gaussians.overwrite({"opacity_logits": torch.full((50,), -6.0)})
         before = gaussians.means.detach().clone()
-        relocation(noise=1.0).perturb(iteration, gaussians, 1.0)
+        mcmc_strategy(noise_lr=1.0).perturb(iteration, gaussians, 1.0)
         moved.append(gaussians.means.detach() - before)
     assert torch.equal(moved[0], moved[1]) and not torch.allclose(moved[0], moved[2])
     still = cloud(50)
-    relocation(noise=0.0).perturb(7, still, 1.0)
+    mcmc_strategy(noise_lr=0.0).perturb(7, still, 1.0)
     assert torch.equal(still.means, cloud(50).means)
 
 

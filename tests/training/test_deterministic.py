@@ -9,11 +9,11 @@ from .toy import load_unscaled
 
 SHORT = {
     "schedule.iterations": 14,
-    "schedule.harmonics_every": 4,
-    "densification.start": 4,
-    "densification.stop": 12,
-    "densification.every": 4,
-    "densification.reset_every": 8,
+    "schedule.sh_degree_interval": 4,
+    "densification.refine_start_iter": 4,
+    "densification.refine_stop_iter": 12,
+    "densification.refine_every": 4,
+    "adc.reset_every": 8,
     "deterministic": True,
 }
 

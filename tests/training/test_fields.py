@@ -12,28 +12,31 @@ from sehdr_warp.training.trainer import Trainer
 
 from .toy import quick
 
-EARLY = {f"densification.{name}": value for name, value in (("start", 1), ("stop", 44), ("every", 20))}
-EARLY |= {"densification.reset_every": 20, "schedule.harmonics_every": 4}
+EARLY = {
+    f"densification.{name}": value
+    for name, value in (("refine_start_iter", 1), ("refine_stop_iter", 44), ("refine_every", 20))
+}
+EARLY |= {"adc.reset_every": 20, "schedule.sh_degree_interval": 4}
 BASE = {
-    "relocation": quick(length=45, **EARLY),
-    "gradient": quick(
+    "mcmc": quick(length=45, **EARLY),
+    "adc": quick(
         length=45,
-        **EARLY | {"densification.strategy": "gradient", "loss.opacity_weight": 0.0, "densification.noise": 0.0},
+        **EARLY | {"densification.strategy": "adc", "loss.opacity_weight": 0.0, "mcmc.noise_lr": 0.0},
     ),
 }
 FIELDS = [
-    ("relocation", "model.antialiased", True),
-    ("relocation", "optimizer.means_final", 1e-3),
-    ("relocation", "optimizer.log_scales", 0.05),
-    ("relocation", "optimizer.quaternions", 0.01),
-    ("relocation", "optimizer.opacity_logits", 0.1),
-    ("relocation", "optimizer.harmonics_rest", 0.01),
-    ("relocation", "densification.prune_opacity", 0.3),
-    ("relocation", "densification.prune_angle", 0.02),
-    ("gradient", "densification.prune_opacity", 0.3),
-    ("gradient", "densification.grow_gradient", 5e-3),
-    ("gradient", "densification.grow_scale", 1.0),
-    ("gradient", "densification.prune_scale", 0.04),
+    ("mcmc", "model.antialiased", True),
+    ("mcmc", "optimizer.means_final", 1e-3),
+    ("mcmc", "optimizer.log_scales", 0.05),
+    ("mcmc", "optimizer.quaternions", 0.01),
+    ("mcmc", "optimizer.opacity_logits", 0.1),
+    ("mcmc", "optimizer.harmonics_rest", 0.01),
+    ("mcmc", "densification.prune_opacity", 0.3),
+    ("mcmc", "mcmc.prune_near_angle", 0.02),
+    ("adc", "densification.prune_opacity", 0.3),
+    ("adc", "adc.grow_grad2d", 5e-3),
+    ("adc", "adc.grow_scale3d", 1.0),
+    ("adc", "adc.prune_scale3d", 0.04),
 ]
 
 
@@ -60,4 +63,4 @@ def test_a_field_has_an_effect(end, strategy, field, value):
 
 @pytest.mark.parametrize("strategy", BASE)
 def test_what_is_no_change_has_none(end, strategy):
-    assert torch.equal(end(strategy, "schedule.checkpoints_kept", 2), end(strategy))
+    assert torch.equal(end(strategy, "schedule.keep_checkpoints", 2), end(strategy))

@@ -46,7 +46,7 @@ def test_a_training_starts_from_a_file_of_gaussians(scene, tmp_path, radiance, d
     file = tmp_path / "start.ply"
     written = gaussians(200, degree=1, color_model="display" if radiance == "display" else "log")
     write_gaussians(file, written)
-    config = {"model.start": str(file), "model.radiance": radiance, "model.harmonics_degree": degree}
+    config = {"model.init_file": str(file), "model.radiance": radiance, "model.sh_degree": degree}
     response = response_by_name("srgb")
     field = make_field(scene, load_config("default", config), response, "cpu")
     assert field.gaussians.count == 200 and field.gaussians.degree == degree
@@ -57,7 +57,7 @@ def test_a_training_starts_from_a_file_of_gaussians(scene, tmp_path, radiance, d
     found = field.render(camera).hdr
     assert float(expected.max()) > 0.01
     assert float((found - expected).abs().mean()) < 0.02 * float(expected.mean())
-    few = load_config("default", config | {"densification.max_gaussians": 50})
+    few = load_config("default", config | {"densification.cap_max": 50})
     assert make_field(scene, few, response, "cpu").gaussians.count == 50
 
 

@@ -80,7 +80,7 @@ def test_start_points_are_the_scenes_and_matched_ones():
 def test_gaussians_are_born_where_the_photos_are_not_explained(device):
     """A field that shows the wall alone: what is born is the lamp."""
     scene = wall_and_lamp()
-    config = load_config("default", {"densification.births": 0.5, "schedule.iterations": 300})
+    config = load_config("default", {"mcmc.seed_fraction": 0.5, "schedule.iterations": 300})
     dark = [replace(v, codes=np.where(v.codes.min(2, keepdims=True) > 250, np.uint8(77), v.codes)) for v in scene.views]
     wall = replace(scene, views=tuple(dark))
     field = make_field(wall, config, LINEAR, device)

@@ -145,7 +145,7 @@ def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
     for views in (training.scene.views, resumed.scene.views):
         assert [view.exposure_time for view in views] == pytest.approx([view.exposure_time for view in evened.views])
     for value, known, asked in (("never", False, False), ("unstated", True, False), ("unstated", False, True)):
-        config = load_config("default", {"model.photo_gains": value})
+        config = load_config("default", {"model.exposure_compensation": value})
         assert evens(replace(scene, exposure_times_known=known), config, LINEAR) == asked
 
 

@@ -59,7 +59,7 @@ def test_a_training_on_a_file_is_the_same_bits(scene, trained, tmp_path):
 def test_streamed_steps_are_recorded_and_the_same_on_a_gpu(scene):
     config, states = override_config(VARIANTS["default"], {"deterministic": True}), []
     for photos in ("device", "memory"):
-        chosen = override_config(config, {"schedule.photos": photos})
+        chosen = override_config(config, {"schedule.photo_cache": photos})
         trainer = Trainer(scene, chosen, make_field(scene, chosen, choose_response(scene, chosen), "cuda:0"))
         for _ in range(60):
             trainer.step()

@@ -69,7 +69,7 @@ def test_wide_gaussians_move_where_cameras_look_all_around(scene, turned, aside,
         )
     plan = make_plan(replace(scene, views=views, points=scene.points * 0), config_of())
     assert plan.facts.around == around
-    assert plan.config.densification.prune_angle == (WIDEST if around else 0)
+    assert plan.config.mcmc.prune_near_angle == (WIDEST if around else 0)
     assert ("all around" in plan.table()) == around
 
 
@@ -91,13 +91,13 @@ def test_a_plan_decides_everything_once_with_figures(scene):
     [
         ("iterations", {"photos": 200}, "schedule.iterations", 4000, 30_000),
         # Relocation's budget: 120 times the square root of 6144, and of 10^6.
-        ("densification", {"pixels": 10**6}, "densification.max_gaussians", 9406, 120_000),
+        ("densification", {"pixels": 10**6}, "densification.cap_max", 9406, 120_000),
     ],
 )
 def test_decisions_follow_their_figures(facts, name, change, field, few, many):
     small = {"photos": 6, "seen": 3.0, "pixels": 6144}
     # Relocation has a budget of its own.
-    config = config_of(**({"densification__strategy": "gradient"} if name == "densification" else {}))
+    config = config_of(**({"densification__strategy": "adc"} if name == "densification" else {}))
     assert RULES[name](replace(facts, **small), config, GPU)[0].get(field) == few
     assert RULES[name](replace(facts, **small | change), config, GPU)[0].get(field) == many
 
@@ -158,7 +158,7 @@ def test_a_cpu_short_of_time_gets_half_the_gaussians_unless_steps_are_asked_for(
     monkeypatch.setattr("sehdr_warp.training.plan.thread_count", lambda: 2)
     large, rule = replace(facts, photos=18, pixels=18 * 200 * 200), RULES["densification"]
     asked = config_of(schedule__iterations=4000, plan__keep=["schedule.iterations"])
-    assert rule(large, config_of(), CPU)[0] == {"densification.budget": 60.0}
+    assert rule(large, config_of(), CPU)[0] == {"mcmc.cap_density": 60.0}
     assert "at most 50911" in rule(large, config_of(), CPU)[1]
     for given, config, device in ((facts, config_of(), CPU), (large, config_of(), GPU), (large, asked, CPU)):
         assert rule(given, config, device)[0] == {}
@@ -215,7 +215,7 @@ def test_scenes_without_a_plan_get_one_line(scene, spoil, words):
 @pytest.mark.parametrize(
     "changes,spoil,words",
     [
-        ({"densification.max_gaussians": 20}, None, ["max_gaussians = 20", "60 points"]),
+        ({"densification.cap_max": 20}, None, ["cap_max = 20", "60 points"]),
         ({"loss.hdr_weight": 0.6}, "hdr", ["no training view has", "hdr_weight = 0.6"]),
         ({"loss.hdr_truth": True, "loss.linear_weight": 0.5}, "hdr", ["no training view has", "hdr_truth = true"]),
         (

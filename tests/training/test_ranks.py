@@ -38,13 +38,13 @@ def together(tmp_path_factory):
 
 
 def _all(ranks, folder):
-    team.train_together(ranks, folder, ["gradient", "default"], 60)
+    team.train_together(ranks, folder, ["adc", "default"], 60)
     team.differ(ranks, folder)
     team.mixed(ranks, folder)
     team.fall_silent(ranks, folder)
 
 
-@pytest.mark.parametrize("strategy", ["gradient", "default"])
+@pytest.mark.parametrize("strategy", ["adc", "default"])
 def test_ranks_stay_alike_and_one_can_go_on(scene, trained, together, strategy):
     """Counts change at 25 and 50, in steps of two photos; at 60 they stop, and one rank goes on to 90."""
     (tensors, values), (others, their_values) = (
@@ -86,7 +86,7 @@ def command(tmp_path, monkeypatch, capfd):
 
     def train(disturb, *words):
         flags = "--device cpu --gpus 2 --max-size 24 --preset fast --response srgb --iterations 20000"
-        flags += " --schedule.checkpoint-every 30 --model.initial-density 0 --densification.births 0"
+        flags += " --schedule.checkpoint-every 30 --model.initial-density 0 --mcmc.seed-fraction 0"
         seen = threading.Thread(target=once_saved, args=(tmp_path / "run", disturb))
         seen.start()
         status = call("train", "embedded", "--out", tmp_path / "run", *flags.split(), *words)
@@ -121,7 +121,7 @@ def test_a_signal_saves_and_ends_all(command, tmp_path):
 
 
 def test_rates_and_decays_follow_the_batch():
-    config, field = VARIANTS["gradient"], toy_field()
+    config, field = VARIANTS["adc"], toy_field()
     one, four = (make_optimizer(field, config, 2.0, batch) for batch in (1, 4))
     for a, b in zip(one.param_groups, four.param_groups, strict=True):
         assert b["lr"] == pytest.approx(2 * a["lr"]) and b["betas"] == pytest.approx([beta**4 for beta in a["betas"]])
@@ -135,7 +135,7 @@ def test_rates_and_decays_follow_the_batch():
 
 def test_gradients_go_through_one_buffer():
     field = toy_field()
-    optimizer = make_optimizer(field, VARIANTS["gradient"], 1.0)
+    optimizer = make_optimizer(field, VARIANTS["adc"], 1.0)
     flat, given = FlatGradients(optimizer, 0, 1, factored=False), {}
     for name in ("means", "opacity_logits"):
         parameter = getattr(field.gaussians, name)
@@ -153,7 +153,7 @@ def test_gradients_go_through_one_buffer():
 
 def test_harmonics_go_as_their_factors():
     field, count = toy_field(), 3
-    optimizer, means = make_optimizer(field, VARIANTS["gradient"], 1.0), field.gaussians.means
+    optimizer, means = make_optimizer(field, VARIANTS["adc"], 1.0), field.gaussians.means
     ranks = [FlatGradients(optimizer, place, count, factored=True) for place in range(count)]
     seen = [HarmonicsGradients(torch.randn(1, len(means), 3), torch.randn(1, 3), means, 1) for _ in ranks]
     for flat, harmonics in zip(ranks, seen, strict=True):

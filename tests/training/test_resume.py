@@ -18,7 +18,7 @@ from sehdr_warp.training.trainer import Trainer
 from .toy import VARIANTS, quick, without_truth
 
 
-@pytest.mark.parametrize("variant", ["gradient", "default", "paper"])
+@pytest.mark.parametrize("variant", ["adc", "default", "paper"])
 def test_resume_is_exact(scene, trained, tmp_path, variant):
     blind = without_truth(scene)
     shutil.copytree(trained(variant).parent / "killed", tmp_path / "killed")
@@ -41,12 +41,12 @@ def test_resume_is_exact(scene, trained, tmp_path, variant):
 
 def test_a_run_begins_with_a_checkpoint_of_its_start(scene, trained, tmp_path):
     scene = without_truth(scene)
-    begun = Training(scene, tmp_path / "cut", VARIANTS["gradient"], device="cpu")
+    begun = Training(scene, tmp_path / "cut", VARIANTS["adc"], device="cpu")
     assert RunFolder(tmp_path / "cut").newest_checkpoint().values["iteration"] == 0
     with pytest.raises(InputError, match="another training is at work"):
         train(scene, tmp_path / "cut", device="cpu", resume=True)
     del begun
-    again, whole = train(scene, tmp_path / "cut", device="cpu", resume=True), load_run(trained("gradient"))
+    again, whole = train(scene, tmp_path / "cut", device="cpu", resume=True), load_run(trained("adc"))
     assert torch.equal(whole.model.gaussians.means, again.model.gaussians.means)
     assert len(again.metrics()) == len(whole.metrics())
 
@@ -73,7 +73,7 @@ def copy_at_each_change(monkeypatch, folder: Path, place: Path) -> list[Path]:
 def test_a_run_is_replaced_whole_or_not_at_all(scene, trained, tmp_path, monkeypatch):
     """At any change of the disk the old run or the new one is there, and what is another's stays."""
     scene = without_truth(scene)
-    out, old = shutil.copytree(trained("gradient"), tmp_path / "run"), load_run(trained("gradient"))
+    out, old = shutil.copytree(trained("adc"), tmp_path / "run"), load_run(trained("adc"))
     others = "notes.txt", "checkpoints/iteration_best"
     for name in others:
         (out / name).write_text("mine")
@@ -93,7 +93,7 @@ def test_a_run_is_replaced_whole_or_not_at_all(scene, trained, tmp_path, monkeyp
     assert ends == sorted(ends) and {(0, 90), (5, 0)} < {*ends} and len({*ends[5::12]}) > 1
 
 
-@pytest.mark.parametrize("variant", ["gradient", "hdr-gs"])
+@pytest.mark.parametrize("variant", ["adc", "hdr-gs"])
 def test_a_trainer_continues_from_its_state(scene, variant):
     config = VARIANTS[variant]
     threads = torch.get_num_threads()

@@ -77,7 +77,7 @@ def test_weights_mix_photos_and_truth(scene):
 
 def test_photos_of_no_weight_teach_nothing(scene):
     views = tuple(dataclasses.replace(view, codes=view.codes[::-1].copy()) for view in scene.views)
-    config = quick("truth", **{"model.initial_density": 0.0, "densification.births": 0.0})
+    config = quick("truth", **{"model.initial_density": 0.0, "mcmc.seed_fraction": 0.0})
     trainers = [trainer_of(scene, config), trainer_of(dataclasses.replace(scene, views=views), config)]
     for trainer in trainers:
         for _ in range(5):

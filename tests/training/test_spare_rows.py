@@ -22,11 +22,11 @@ def trained_steps(scene, config, device, reserves):
     return training, moves
 
 
-@pytest.mark.parametrize("variant", ["default", "gradient"])
+@pytest.mark.parametrize("variant", ["default", "adc"])
 def test_spare_rows_change_nothing_of_a_training(scene, device, variant, monkeypatch):
     monkeypatch.setattr(densification, "SPARE", 8.0)  # So few Gaussians become many at once.
     monkeypatch.setattr(trainer, "MOST_ROOM", 8.0)
-    config = override_config(VARIANTS[variant], {"deterministic": True, "schedule.recorded": False})
+    config = override_config(VARIANTS[variant], {"deterministic": True, "schedule.use_cuda_graph": False})
     (plain, all_moved), (roomy, moved) = (trained_steps(scene, config, device, reserves) for reserves in (False, True))
     assert all(all_moved) and not any(moved) and len(moved) == len(all_moved) > 1
     assert roomy.field.gaussians.reserved > roomy.field.gaussians.count

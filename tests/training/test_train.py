@@ -34,7 +34,7 @@ def test_every_variant_learns_and_loads_as_it_was_trained(scene, trained, varian
     assert last["seconds"] > first["seconds"] > 0
     assert run.base_time == EXPOSURE_TIME and run.gaussian_count == last["gaussians"]
     assert run.summary()["finished"] and run.summary()["skipped_steps"] == 0
-    again = evaluate_views(run.model, scene.test_views, run.config.model.harmonics_degree)
+    again = evaluate_views(run.model, scene.test_views, run.config.model.sh_degree)
     assert again["psnr_ldr"] == pytest.approx(last["psnr_ldr"], abs=1e-4)
     assert np.isfinite(run.render(run.cameras[0].camera).hdr.numpy()).all()
 
@@ -45,17 +45,17 @@ def test_a_scene_without_points_starts_from_drawn_ones(tmp_path):
     assert run.metrics()[-1]["psnr_ldr"] > 20
 
 
-@pytest.mark.parametrize("options", [{}, {"densification.budget": 0.1}, {"densification.max_gaussians": 50}])
+@pytest.mark.parametrize("options", [{}, {"mcmc.cap_density": 0.1}, {"densification.cap_max": 50}])
 def test_more_start_points_than_the_budget_stay_as_many_and_are_told(scene, tmp_path, caplog, options):
     """60 points; 0.1 times the square root of six photos of 32 x 32 pixels is 7."""
     caplog.set_level("INFO")
-    config = quick(**{"schedule.iterations": 40, "densification.growth": 0.5, "model.initial_density": 0.0} | options)
+    config = quick(**{"schedule.iterations": 40, "mcmc.growth_rate": 0.5, "model.initial_density": 0.0} | options)
     run = train(scene, tmp_path / "run", config, device="cpu")
     told = caplog.text
-    assert ("60 Gaussians are more than relocation's budget of 7" in told) == ("densification.budget" in options)
-    assert ("60 start points: drawn from" in told) == ("densification.max_gaussians" in options)
+    assert ("60 Gaussians are more than the cap of 7" in told) == ("mcmc.cap_density" in options)
+    assert ("60 start points: drawn from" in told) == ("densification.cap_max" in options)
     count = run.gaussian_count
-    assert count == options.get("densification.max_gaussians", 60) if options else count > 60
+    assert count == options.get("densification.cap_max", 60) if options else count > 60
 
 
 def test_what_was_repaired_in_a_response_file_is_told(scene, tmp_path, caplog):
@@ -177,9 +177,9 @@ def test_wide_codes_are_intervals_in_the_last_part_alone(scene):
     assert max(widths[:17]) == 0 < min(widths[17:])
 
 
-@pytest.mark.parametrize("variant", ["default", "gradient"])
+@pytest.mark.parametrize("variant", ["default", "adc"])
 def test_gradients_by_harmonics_as_factors_make_the_same_steps(scene, device, variant):
-    config = override_config(VARIANTS[variant], {"schedule.harmonics_every": 2})
+    config = override_config(VARIANTS[variant], {"schedule.sh_degree_interval": 2})
     fields = [make_field(scene, config, choose_response(scene, config), device) for _ in range(2)]
     for field, factored in zip(fields, (True, False), strict=True):
         with torch.no_grad():  # How a ball is turned shows in no photo: its gradient would be rounding.
@@ -195,7 +195,7 @@ def test_gradients_by_harmonics_as_factors_make_the_same_steps(scene, device, va
 
 
 def test_non_finite_steps_are_skipped_and_then_stop(scene):
-    config = quick(**{"densification.noise": 0.0})
+    config = quick(**{"mcmc.noise_lr": 0.0})
     field = make_field(scene, config, choose_response(scene, config), "cpu")
     trainer = Trainer(scene, config, field)
     trainer.step()
@@ -251,12 +251,12 @@ def test_a_step_that_cannot_be_recorded_ends_the_training_with_a_way_out(scene, 
     trainer._recorder = BrokenRecorder()
     monkeypatch.setattr(trainer, "_can_record", lambda *_: trainer.iteration > 1)
     trainer.step()
-    with pytest.raises(SehdrError, match=r"iteration 2: .*not permitted.*schedule.recorded=false"):
+    with pytest.raises(SehdrError, match=r"iteration 2: .*not permitted.*schedule.use_cuda_graph=false"):
         trainer.step()
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
-@pytest.mark.parametrize("variant", ["default", "gradient"])
+@pytest.mark.parametrize("variant", ["default", "adc"])
 def test_recorded_steps_train_like_launched_ones(variant):
     check_recorded_like_launched(toy_scene(), VARIANTS[variant], 60)
 
@@ -326,5 +326,5 @@ def test_a_run_of_an_earlier_version_is_refused_in_one_line(scene, tmp_path):
     info = json.loads(run.folder.info.read_text())
     run.folder.info.write_text(json.dumps(info | {"format": 1}))
     for use in (load_run, lambda path: train(scene, path, device="cpu", resume=True)):
-        with pytest.raises(InputError, match="format = 1 is not 2, which this version reads; train again"):
+        with pytest.raises(InputError, match="format = 1 is of sehdr-warp .* this one reads format 3; train again"):
             use(run.path)

@@ -14,8 +14,9 @@ from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
 
 EXPOSURE_TIME = 0.25
 NUMBERS = (
-    *(f"densification.{name}" for name in ("start", "stop", "every", "reset_every")),
-    *(f"schedule.{name}" for name in ("harmonics_every", "evaluate_at", "checkpoint_every")),
+    *(f"densification.{name}" for name in ("refine_start_iter", "refine_stop_iter", "refine_every")),
+    "adc.reset_every",
+    *(f"schedule.{name}" for name in ("sh_degree_interval", "evaluate_at", "checkpoint_every")),
 )
 """The fields of a config that are iteration numbers."""
 
@@ -73,14 +74,14 @@ def load_unscaled(preset: str = "default", overrides: dict | None = None, length
 QUICK = {
     # That of the toy scene: what a training makes of a wrong one is not its fault.
     "response.name": "srgb",
-    "schedule.harmonics_every": 40,
+    "schedule.sh_degree_interval": 40,
     "schedule.evaluate_at": [10],
     "schedule.checkpoint_every": 60,
-    "densification.start": 20,
-    "densification.stop": 80,
-    "densification.every": 25,
-    "densification.max_gaussians": 400,
-    "model.harmonics_degree": 1,
+    "densification.refine_start_iter": 20,
+    "densification.refine_stop_iter": 80,
+    "densification.refine_every": 25,
+    "densification.cap_max": 400,
+    "model.sh_degree": 1,
     "optimizer.means": 1e-3,
     "model.initial_density": 2.0,
 }
@@ -97,7 +98,7 @@ def quick(preset: str = "default", length: int = 90, **options) -> Config:
 
 VARIANTS = {
     "default": quick(),
-    "gradient": quick(**{"densification.strategy": "gradient", "loss.opacity_weight": 0.0}),
+    "adc": quick(**{"densification.strategy": "adc", "loss.opacity_weight": 0.0}),
     "3dgs": quick("3dgs", **{"optimizer.harmonics_dc": 0.01}),
     "paper": quick("paper", 130, **PAPER),
     "paper-truth": quick("paper-truth", 150, **PAPER),
