@@ -78,11 +78,11 @@ def _browsed(run: sw.Run, shown: sw.View, scene: sw.Scene) -> Image.Image:
     """The page of `view`, two and a half stops down beside the photo, with the pointer on the brightest light."""
     from playwright.sync_api import sync_playwright
 
-    from sehdr_warp.viewer.frames import Rendering
+    from sehdr_warp.viewer.frames import ViewerScene
     from sehdr_warp.viewer.server import Server, Viewer
 
     photos = {view.name: view for view in scene.views}
-    viewer = Viewer([Rendering(run, run.scene_name)], lambda _: photos)
+    viewer = Viewer([ViewerScene(run, run.scene_name)], lambda _: photos)
     with Server(viewer, port=18080) as server, sync_playwright() as driver:
         Thread(target=server.serve_forever, daemon=True).start()
         chromium = driver.chromium.launch(executable_path=shutil.which("chromium"), args=SOFTWARE)

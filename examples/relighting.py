@@ -15,8 +15,8 @@ import numpy as np
 from PIL import Image
 
 import sehdr_warp as sw
+from sehdr_warp.output.environment_map import latlong
 from sehdr_warp.output.exr import write_exr
-from sehdr_warp.output.panorama import latlong
 from sehdr_warp.output.tonemap import encode_srgb
 from sehdr_warp.scene import look_at
 
@@ -58,7 +58,7 @@ def main(out: Path, *, views: int = 72, size: int = 48, samples: int = 32, itera
         overwrite=True,
     )
     at = (float(PLACE[0]), float(PLACE[1]), float(PLACE[2]))
-    sw.write_panorama(run, out / "env.exr", at=at, size=4 * size, axes="scene", overwrite=True)
+    sw.write_environment_map(run, out / "env.exr", at=at, size=4 * size, axes="scene", overwrite=True)
     write(out / "truth.exr", true_map(mi, room, size, 4 * samples))
 
     truth, ours = (lit_balls(mi, out / name, 2 * size, samples) for name in ("truth.exr", "env.exr"))

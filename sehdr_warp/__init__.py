@@ -21,7 +21,7 @@ _HOMES = {
     "evaluation.score": ("score_folder",),
     "output.brackets": ("write_brackets",),
     "output.export": ("export",),
-    "output.panorama": ("write_panorama",),
+    "output.environment_map": ("write_environment_map",),
     "output.render_views": ("render_views",),
     "output.report": ("write_report",),
     "response": ("Response", "response_by_name", "response_names"),

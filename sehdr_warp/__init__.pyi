@@ -5,8 +5,8 @@ from .evaluation.compare import compare_runs
 from .evaluation.evaluate import evaluate
 from .evaluation.score import score_folder
 from .output.brackets import write_brackets
+from .output.environment_map import write_environment_map
 from .output.export import export
-from .output.panorama import write_panorama
 from .output.render_views import render_views
 from .output.report import write_report
 from .rasterizer import Rendering, differentiable, rasterize, rasterize_directions, spherical_harmonics, ssim
@@ -58,7 +58,7 @@ __all__ = [
     "ssim",
     "train",
     "write_brackets",
-    "write_panorama",
+    "write_environment_map",
     "write_report",
 ]
 

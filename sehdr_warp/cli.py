@@ -22,7 +22,7 @@ COMMANDS = {
         "view": ("viewer.commands", "View", "run_view"),
         "eval": ("evaluation.commands", "Evaluate", "run_evaluate"),
         "report": ("output.commands", "Report", "run_report"),
-        "panorama": ("output.commands", "Panorama", "run_panorama"),
+        "envmap": ("output.commands", "EnvironmentMap", "run_environment_map"),
         "export": ("output.commands", "Export", "run_export"),
         "convert": ("output.commands", "Convert", "run_convert"),
         "compare": ("evaluation.commands", "Compare", "run_compare"),
@@ -45,6 +45,11 @@ COMMANDS = {
 """Every command, under the headings of the help: its module, dataclass of options, and the function that runs them."""
 words_given: list[str] = []
 """The words of the command line that is run."""
+_RENAMED = {
+    "panorama": f"the command is {PROGRAM} envmap",
+    "resume": f"{PROGRAM} train --resume --out RUN goes on with a training",
+}
+"""What to type for commands of earlier versions, and for words that people expect to be commands."""
 _LIGHT = {"presets", "config", "responses", "scenes", "completion"}
 """Commands that load no torch."""
 _LEAST_ADDRESS_SPACE = 1536 << 20
@@ -134,6 +139,8 @@ def parse_command(words: list[str]) -> tuple[Callable, object]:
     from .arguments import parse
 
     name, *rest = words
+    if name in _RENAMED:
+        raise UsageError(f"no command {name}: {_RENAMED[name]}")
     if name not in _MODULES:
         raise UsageError(f"no command {name}{did_you_mean(name, _MODULES)}; {PROGRAM} --help lists them")
     options, run = _load(name)

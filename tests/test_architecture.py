@@ -32,7 +32,7 @@ ALLOWED = {
     "output": ANY | {"runs", "scene", "response", "splats", "model.exposure", "model.baking", "model.sensor_colors"},
     "viewer": ANY | {"runs", "scene", "output"},
     "evaluation": ANY
-    | {"runs", "scene", "rasterizer.ssim", "model.baking", "output.names", "output.charts", "output.panorama"},
+    | {"runs", "scene", "rasterizer.ssim", "model.baking", "output.names", "output.charts", "output.environment_map"},
     "runs": ANY | {"scene", "response", "model", "splats", "output.notebook"},
     "training": ANY
     | {"runs", "scene", "response", "model", "rasterizer", "splats", "evaluation.metrics", "evaluation.protocols"},

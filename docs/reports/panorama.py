@@ -20,7 +20,7 @@ from scenes.generator.stage import Stage
 from sehdr_warp.bench.results import finish, new_result
 from sehdr_warp.evaluation.metrics import mu_law
 from sehdr_warp.model.baking import sphere_directions
-from sehdr_warp.output.panorama import latlong, solid_angles, write_panorama
+from sehdr_warp.output.environment_map import latlong, solid_angles, write_environment_map
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import load_run
@@ -71,7 +71,9 @@ def main(
     kept = (work / "run" / "summary.json").is_file()
     run = load_run(work / "run", device=device) if kept else train(scene, work / "run", config, device=device)
     at = (float(PLACE[0]), float(PLACE[1]), float(PLACE[2]))
-    map_file = write_panorama(run, work / "map.exr", at=at, size=width, axes="scene", pixel="float", overwrite=True)
+    map_file = write_environment_map(
+        run, work / "map.exr", at=at, size=width, axes="scene", pixel="float", overwrite=True
+    )
     peak = float(max(wanted.max(), panorama.max()))
     shown = np.stack([run.render(camera).hdr.cpu().numpy() for camera in judged])
     rays = np.stack([_rays(camera) for camera in judged])

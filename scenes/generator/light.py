@@ -1,6 +1,6 @@
 """The light that reaches four places of a scene from all directions, beside its views: `light/place_<k>.exr`.
 
-Each is an environment map as `sehdr-warp panorama --axes scene` writes it: R, G, B radiance in the set's unit, A which
+Each is an environment map as `sehdr-warp envmap --axes scene` writes it: R, G, B radiance in the set's unit, A which
 part of a pixel shows surfaces (or sky) that two training views or more show, with the place in `sehdr:position`.
 """
 
@@ -13,8 +13,8 @@ import numpy as np
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.files import read_json
+from sehdr_warp.output.environment_map import envmap
 from sehdr_warp.output.exr import exr_header, rgb_channels, write_exr
-from sehdr_warp.output.panorama import envmap
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.hdr_files import read_hdr
 from sehdr_warp.synth.expose import truth_path

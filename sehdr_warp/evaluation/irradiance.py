@@ -11,7 +11,7 @@ import torch
 
 from ..errors import InputError
 from ..model.baking import sphere_directions
-from ..output.panorama import latlong, solid_angles
+from ..output.environment_map import latlong, solid_angles
 from ..scene import Camera
 from ..scene.hdr_files import read_exr_channels
 
@@ -24,7 +24,7 @@ FINER = 4  # Pixels of a render, across, for one of the truth's
 @dataclass(frozen=True, eq=False)
 class LightMap:
     """The truth of a place: position [3] in the scene; radiance [H, 2 H, 3], lat-long in the scene's axes (see
-    output.panorama); seen [H, 2 H] in [0, 1], which part of a pixel photos show."""
+    output.environment_map); seen [H, 2 H] in [0, 1], which part of a pixel photos show."""
 
     position: np.ndarray
     radiance: np.ndarray

@@ -2,9 +2,9 @@
 
 import logging
 import math
-from collections.abc import Iterable, Mapping
-from contextlib import nullcontext
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
 from datetime import datetime
 from fractions import Fraction
 from pathlib import Path
@@ -33,38 +33,41 @@ _SHORTEST, _LONGEST = 1e-6, 1e6
 def bracket_exposures(
     base_time: float, *, evs: Items | None = None, exposures: Items | None = None
 ) -> tuple[Exposure, ...]:
-    """The exposures of a bracket, ascending.
+    """Return the exposures of a bracket, ascending.
 
-    base_time: seconds at 0 EV. exposures: items of field/exposure.py's grammar, such as "1/125, -2ev, 8x"; numbers are
-    seconds. evs: shorthand for stops, such as "-4,-2,0" or [-4, -2, 0]. Exactly one of both.
+    Args:
+        base_time: Seconds at 0 EV.
+        evs: Stops, such as "-4,-2,0" or [-4, -2, 0]. Give either evs or exposures.
+        exposures: Seconds, stops or multiples of the base time, such as "1/125, -2ev, 8x"; numbers are seconds.
 
-    Raises SehdrError, naming the value, where both or none are given, an item cannot be read or comes twice, or a time
-    is outside 1e-6 to 1e6 seconds.
+    Raises:
+        SehdrError: With the value, if both or none are given, an item cannot be read or appears twice, or a time is
+            outside 1e-6 to 1e6 seconds.
     """
     if evs is not None and exposures is None:
         stops = [ev for ev in evs.split(",") if ev.strip()] if isinstance(evs, str) else evs
-        name, made = "evs", read_exposures([_stops_item(ev) for ev in stops], base_time, "evs")
+        name, bracket = "evs", read_exposures([_stops_item(ev) for ev in stops], base_time, "evs")
     elif exposures is not None and evs is None:
-        name, made = "exposures", read_exposures(exposures, base_time, "exposures")
+        name, bracket = "exposures", read_exposures(exposures, base_time, "exposures")
     else:
-        count = "both were given" if evs is not None else "neither was given"
-        raise SehdrError(f"brackets need evs or exposures, and {count}; give one of them")
-    for exposure in made:
+        count = "both are set" if evs is not None else "neither is set"
+        raise SehdrError(f"brackets need either evs or exposures, and {count}; set one of them")
+    for exposure in bracket:
         if not _SHORTEST <= exposure.time <= _LONGEST:
             time = f"{exposure.time:.6g} s ({exposure.ev:+g} EV)"
             raise SehdrError(f"{name}: {time} is outside {_SHORTEST:g} to {_LONGEST:g} seconds")
-    return made
+    return bracket
 
 
 def _stops_item(ev: str | float) -> str:
-    """The item of the grammar that a number of stops is."""
+    """Return a number of stops as an item of read_exposures."""
     text = str(ev).strip()
     try:
         if math.isfinite(float(Fraction(text))):
             return f"{text}ev"
     except (ValueError, ZeroDivisionError, OverflowError):
         pass
-    raise SehdrError(f"evs: {ev!r} is no number of stops; write numbers, such as -4,-2,0,2,4")
+    raise SehdrError(f"evs: {ev!r} is not a number of stops; write numbers, such as -4,-2,0,2,4")
 
 
 def write_brackets(
@@ -78,53 +81,69 @@ def write_brackets(
     colorspace: str = "rec709",
     pixel: str = "half",
     multipart: bool = False,
-    by: str = "view",
+    group_by: str = "view",
     ldr: str | None = None,
     response: Any = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Writes exposure brackets of HDR views; returns the EXR files.
+    """Write exposure brackets of HDR views and return the paths of the EXR files.
 
-    Every pixel is E dt, computed in float64 and rounded once. Files: `out/brackets/<view>/<view>_b<i>_ev<+x.x>.exr`
-    with i ascending by exposure, by="exposure" `out/brackets/b<i>_ev<+x.x>/<view>.exr`, or `out/brackets/<view>.exr`;
-    the like in `out/brackets_ldr` where ldr is given; and `out/brackets.json`. All appear together when the last one is
-    written.
+    Every pixel is radiance times exposure time, computed in float64 and rounded once. The files are
+    `out/brackets/<view>/<view>_b<i>_ev<+x.x>.exr` with i ascending by exposure (group_by="exposure":
+    `out/brackets/b<i>_ev<+x.x>/<view>.exr`; multipart: `out/brackets/<view>.exr`), the same in `out/brackets_ldr` if
+    ldr is set, and `out/brackets.json`. All appear together once the last one is written.
 
     Args:
-        out: the folder for the files.
-        views: name -> [H, W, 3] scene-linear Rec.709 radiance E, >= 0, not multiplied by an exposure time.
-        base_time: seconds at 0 EV.
-        evs: stops, such as "-4,-2,0" or [-4, -2, 0]; either these or exposures.
-        exposures: seconds, stops or multiples of the base time, such as "1/125, -2ev, 8x"; numbers are seconds.
-        cameras: by name, for the EXR attributes.
-        colorspace: primaries of the EXR files.
-        pixel: "half" (float where half would overflow) or "float".
-        multipart: one EXR file with all exposures of a view.
-        by: "view" or "exposure", what a folder is of.
-        ldr: "jpeg", "png" or "png16" adds simulated photos, through the response.
-        response: the camera's, for ldr.
-        overwrite: replace folders that an earlier call wrote.
+        out: Folder for the files.
+        views: Name -> [H, W, 3] scene-linear Rec.709 radiance, >= 0, not multiplied by an exposure time.
+        base_time: Seconds at 0 EV.
+        evs: Stops, such as "-4,-2,0" or [-4, -2, 0]. Give either evs or exposures.
+        exposures: Seconds, stops or multiples of the base time, such as "1/125, -2ev, 8x"; numbers are seconds.
+        cameras: Camera of each view by name, for the EXR attributes.
+        colorspace: Primaries of the EXR files.
+        pixel: "half" (float if half would overflow) or "float".
+        multipart: Write one EXR file with all exposures of a view.
+        group_by: "view" or "exposure": what one folder holds.
+        ldr: "jpeg", "png" or "png16" adds simulated photos through the response.
+        response: Camera response for ldr.
+        overwrite: Replace folders that an earlier call wrote.
 
     Raises:
-        SehdrError: for unusable exposures or options.
-        InputError: where something would be replaced or a pixel is not finite.
+        SehdrError: For unusable exposures or options.
+        InputError: If a file would be replaced or a pixel is not finite.
     """
-    made = bracket_exposures(base_time, evs=evs, exposures=exposures)
-    brackets = Brackets(made, base_time, colorspace, pixel, multipart, ldr, response, by=by)
+    brackets = Brackets(
+        exposures=bracket_exposures(base_time, evs=evs, exposures=exposures),
+        base_time=base_time,
+        colorspace=colorspace,
+        pixel=pixel,
+        multipart=multipart,
+        ldr=ldr,
+        response=response,
+        group_by=group_by,
+    )
     radiances = dict(views)
-    names = zip(safe_names(list(radiances)), radiances.items(), strict=True)
-    given = ((safe, radiance, (cameras or {}).get(name)) for safe, (name, radiance) in names)
-    return brackets.write(Path(out), given, overwrite)
+    with brackets.open(Path(out), overwrite) as writer:
+        for file_name, (name, radiance) in zip(safe_names(list(radiances)), radiances.items(), strict=True):
+            writer.write(file_name, radiance, (cameras or {}).get(name))
+    return writer.files()
 
 
 @dataclass(frozen=True)
 class Brackets:
-    """What is written of each view.
+    """Options of exposure brackets, checked when they are set.
 
-    exposures: ascending, as from bracket_exposures. base_time: seconds at 0 EV. colorspace: of the EXR files. pixel:
-    "half" (float where half would overflow) or "float". multipart: one EXR file with all exposures of a view. ldr: one
-    of LDR_FORMATS adds simulated photos through response.encode. captured: local time. provenance: text by key, for the
-    EXR attributes. by: "view" or "exposure", what a folder is of; folders by exposure hold sequences.
+    Attributes:
+        exposures: Ascending, as from bracket_exposures.
+        base_time: Seconds at 0 EV.
+        colorspace: Primaries of the EXR files.
+        pixel: "half" (float if half would overflow) or "float".
+        multipart: One EXR file with all exposures of a view.
+        ldr: One of LDR_FORMATS to add simulated photos through response.encode, or None.
+        response: Camera response for ldr.
+        captured: Local time.
+        provenance: Text by key, for the EXR attributes.
+        group_by: "view" or "exposure": what one folder holds. Folders by exposure hold image sequences.
     """
 
     exposures: tuple[Exposure, ...]
@@ -136,35 +155,41 @@ class Brackets:
     response: Any = None
     captured: datetime | None = None
     provenance: Mapping[str, str] | None = None
-    by: str = "view"
+    group_by: str = "view"
 
     def __post_init__(self):
+        """Raise SehdrError for options that contradict each other."""
         color_space(self.colorspace)
         stored_pixel_type((), self.pixel)
-        if self.by not in ("view", "exposure"):
-            raise SehdrError(f"folders by {self.by!r} are not one of view, exposure")
-        if self.multipart and self.by == "exposure":
-            raise SehdrError("a multi-part file holds all exposures of a view; leave out multipart, or by")
+        if self.group_by not in ("view", "exposure"):
+            raise SehdrError(f"group_by {self.group_by!r} is not one of view, exposure")
+        if self.multipart and self.group_by == "exposure":
+            raise SehdrError("a multi-part file holds all exposures of a view; leave out multipart, or group_by")
         if self.ldr is not None and self.ldr not in LDR_FORMATS:
             raise SehdrError(f"LDR brackets {self.ldr!r} are not one of {', '.join(LDR_FORMATS)}")
         if self.ldr is not None and self.response is None:
-            raise SehdrError("LDR brackets need a camera response; give one, or leave out ldr")
+            raise SehdrError("LDR brackets need a camera response; pass response, or leave out ldr")
 
     def header(self, view: str, exposure_time: float, camera: Camera | None, **facts: str) -> dict[str, Any]:
-        """The EXR attributes of a picture."""
+        """Return the EXR attributes of a picture."""
         facts = {**(self.provenance or {}), **facts, "view": view, "baseExposureTime": repr(self.base_time)}
         return exr_header(self.colorspace, exposure_time, camera, self.captured, facts)
 
-    def write(
-        self, out: Path, views: Iterable[tuple[str, np.ndarray, Camera | None]], overwrite: bool = False
-    ) -> list[Path]:
-        """As write_brackets() says, one view at a time: a name that is safe for files, radiance, and camera."""
+    @contextmanager
+    def open(self, out: Path, overwrite: bool = False) -> Iterator["BracketWriter"]:
+        """Open a writer of brackets; its files appear together when the context ends without an error.
+
+        Args:
+            out: Folder for the files.
+            overwrite: Replace folders that an earlier call wrote.
+        """
         with (
             atomic_path(out / "brackets.json", overwrite) as manifest,
             atomic_folder(out / "brackets", overwrite) as folder,
             atomic_folder(out / "brackets_ldr", overwrite) if self.ldr else nullcontext(out) as photos,
         ):
-            written = [self._write_view(out, folder, photos, *view) for view in views]
+            writer = BracketWriter(self, out, folder, photos)
+            yield writer
             described = {
                 "format": MANIFEST_FORMAT,
                 "software": "sehdr-warp",
@@ -175,43 +200,74 @@ class Brackets:
                 "response": getattr(self.response, "name", None),
                 "ldr": self.ldr,
                 "provenance": dict(self.provenance or {}),
-                "views": written,
+                "views": writer.views,
             }
             write_json(manifest, described)
-        return [out / file for file in dict.fromkeys(each["file"] for view in written for each in view["exposures"])]
 
-    def _write_view(
-        self, out: Path, folder: Path, photos: Path, name: str, radiance: np.ndarray, camera: Camera | None
-    ) -> dict:
-        """Writes the bracket of a view; returns its entry in the manifest."""
+
+@dataclass(frozen=True)
+class BracketWriter:
+    """Writes the brackets of views one at a time; from Brackets.open().
+
+    Attributes:
+        brackets: Options.
+        out: Folder that the files belong to.
+        folder: Where EXR files are written until all are complete.
+        photos: The same for simulated photos.
+        views: Entries of the manifest so far.
+    """
+
+    brackets: Brackets
+    out: Path
+    folder: Path
+    photos: Path
+    views: list[dict] = field(default_factory=list)
+
+    def files(self) -> list[Path]:
+        """Return the paths of the EXR files."""
+        names = dict.fromkeys(each["file"] for view in self.views for each in view["exposures"])
+        return [self.out / name for name in names]
+
+    def write(self, name: str, radiance: np.ndarray, camera: Camera | None) -> None:
+        """Write the bracket of a view.
+
+        Args:
+            name: Of the view, safe for files.
+            radiance: [H, W, 3] scene-linear Rec.709 radiance.
+            camera: For the EXR attributes.
+        """
+        options = self.brackets
         radiance = np.asarray(radiance, np.float64)
         if radiance.shape[2:] != (3,):
             raise ValueError(f"radiance has shape {radiance.shape}, not [H, W, 3]")
-        check_finite(out / "brackets" / name, radiance, "{count} radiances")
-        linear = from_rec709(radiance, self.colorspace)
-        pixels = [linear * exposure.time for exposure in self.exposures]
+        check_finite(self.out / "brackets" / name, radiance, "{count} radiances")
+        linear = from_rec709(radiance, options.colorspace)
+        pixels = [linear * exposure.time for exposure in options.exposures]
         # One type for all exposures of a view, so that their ratios keep one precision.
-        pixel = stored_pixel_type(pixels, self.pixel)
-        if pixel != self.pixel:
+        pixel = stored_pixel_type(pixels, options.pixel)
+        if pixel != options.pixel:
             log.info("%s: its brackets reach above 65504, which half cannot; written as float", name)
         parts, entries = [], []
-        for index, (exposure, image) in enumerate(zip(self.exposures, pixels, strict=True)):
-            label, header = f"b{index}_{exposure.label}", self.header(name, exposure.time, camera, ev=repr(exposure.ev))
+        for index, (exposure, image) in enumerate(zip(options.exposures, pixels, strict=True)):
+            label, header = (
+                f"b{index}_{exposure.label}",
+                options.header(name, exposure.time, camera, ev=repr(exposure.ev)),
+            )
             parts.append(Part(rgb_channels(image), header, label))
-            place = f"{name}/{name}_{label}" if self.by == "view" else f"{label}/{name}"
-            file = f"{name}.exr" if self.multipart else f"{place}.exr"
+            place = f"{name}/{name}_{label}" if options.group_by == "view" else f"{label}/{name}"
+            file = f"{name}.exr" if options.multipart else f"{place}.exr"
             entry = {"index": index, "exposure_time": exposure.time, "ev": exposure.ev, "file": f"brackets/{file}"}
-            if self.multipart:
+            if options.multipart:
                 entry["part"] = index
             else:
-                write_exr(folder / file, parts[-1].channels, pixel=pixel, header=header)
-            if self.ldr:
-                photo = f"{place}.{'jpg' if self.ldr == 'jpeg' else 'png'}"
-                exif = exposure_exif(exposure.time, bias=exposure.ev, captured=self.captured)
-                codes = quantize(self.response.encode(radiance * exposure.time), 16 if self.ldr == "png16" else 8)
-                write_picture(photos / photo, codes, exif=exif)
+                write_exr(self.folder / file, parts[-1].channels, pixel=pixel, header=header)
+            if options.ldr:
+                photo = f"{place}.{'jpg' if options.ldr == 'jpeg' else 'png'}"
+                exif = exposure_exif(exposure.time, bias=exposure.ev, captured=options.captured)
+                codes = quantize(options.response.encode(radiance * exposure.time), 16 if options.ldr == "png16" else 8)
+                write_picture(self.photos / photo, codes, exif=exif)
                 entry["ldr_file"] = f"brackets_ldr/{photo}"
             entries.append(entry)
-        if self.multipart:
-            write_multipart_exr(folder / f"{name}.exr", parts, pixel=pixel)
-        return {"view": name, "pixel": pixel, "exposures": entries}
+        if options.multipart:
+            write_multipart_exr(self.folder / f"{name}.exr", parts, pixel=pixel)
+        self.views.append({"view": name, "pixel": pixel, "exposures": entries})

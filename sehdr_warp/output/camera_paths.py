@@ -20,12 +20,12 @@ _PARALLEL = np.sin(np.radians(1)) ** 2
 
 
 def evenly(items: Sequence[Item], count: int) -> list[Item]:
-    """At most `count` of them, evenly chosen from the first to the last."""
+    """Return at most `count` items, evenly chosen from the first to the last."""
     return [items[i] for i in sorted({round(i) for i in np.linspace(0, len(items) - 1, count)})]
 
 
 def common_focus(cameras: Sequence[Camera]) -> np.ndarray | None:
-    """[3] the point nearest to all optical axes (least squares); None where they are parallel or it lies behind."""
+    """Return the point [3] nearest to all optical axes (least squares); None if they are parallel or it lies behind."""
     positions, forward = _positions(cameras), _axes(cameras, 2)
     off_axis = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     matrix = off_axis.mean(axis=0)
@@ -36,14 +36,19 @@ def common_focus(cameras: Sequence[Camera]) -> np.ndarray | None:
 
 
 def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[Camera]:
-    """A closed path of `count` cameras about the common focus of the given ones, upright, all looking at it.
+    """Return a closed path of cameras around the common focus of a set, upright, all looking at the focus.
 
-    Where the given cameras go round the focus, a circle of their mean radius and height; else an oval along the arc
-    that they stand on, as wide as they scatter about it, which shows nothing that no photo saw. Size and intrinsics
-    are those of the middle camera. focus_distance: of the focus ahead where the optical axes are parallel; world units,
-    positive.
+    If the set surrounds the focus, the path is a circle of the set's mean radius and height. Otherwise it is an oval
+    along the arc that the set covers, as wide as the set scatters about that arc, so that it shows nothing no photo
+    shows. Size and intrinsics are those of the middle camera.
 
-    Raises SehdrError without cameras or for a count outside 1 to 100 000.
+    Args:
+        cameras: The set, usually the training cameras.
+        count: Number of cameras on the path.
+        focus_distance: Distance of the focus if the optical axes are parallel; world units, positive.
+
+    Raises:
+        SehdrError: Without cameras, or for a count outside 1 to 100 000.
     """
     _check(cameras, count)
     positions, focus = _positions(cameras), common_focus(cameras)
@@ -75,8 +80,11 @@ def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[
 
 
 def _along(azimuths: np.ndarray, values: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, float]:
-    """Values of cameras as a smooth course over their azimuths, read at others, and how far they scatter about it: who
-    walks an arc goes up and down with the ground. Never beyond the values that are given."""
+    """Fit a smooth curve to values over azimuths; return it at other azimuths, and the standard deviation about it.
+
+    People who walk an arc go up and down with the ground; the curve follows that. It never leaves the range of the
+    values.
+    """
     degree = min(2, (len(values) - 1) // 3) if np.ptp(azimuths) > 1e-6 else 0
     course = np.polynomial.Polynomial.fit(azimuths, values, degree)
     return np.clip(course(at), values.min(), values.max()), float(np.std(values - course(azimuths)))
@@ -89,11 +97,13 @@ def mean_up(cameras: Sequence[Camera], fallback: Camera | None = None) -> np.nda
 
 
 def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
-    """`count` cameras along a smooth path through the given ones, in their order, evenly spaced in time.
+    """Return `count` cameras along a smooth path through a set, in its order, evenly spaced in time.
 
     Positions follow a cubic spline and rotations a spherical one (scipy's RotationSpline), both over chord length, so
     that speed stays even. Size and intrinsics are those of the first camera.
-    Raises SehdrError without cameras or for a count outside 1 to 100 000.
+
+    Raises:
+        SehdrError: Without cameras, or for a count outside 1 to 100 000.
     """
     from scipy.interpolate import CubicSpline
     from scipy.spatial.transform import Rotation, RotationSpline
@@ -116,8 +126,11 @@ def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
 
 
 def facts_of_cameras(entries: Sequence[Any]) -> dict[str, Any]:
-    """What a page flies by, of views with name, split and camera: plain values. up, focus: [3], or None; size: of the
-    space that the cameras take up."""
+    """Return what a page needs to fly through a scene, as plain values.
+
+    `up` and `focus` are [3] (focus may be None), `size` is the extent of the camera positions, `views` lists name,
+    split and camera.
+    """
     cameras = [entry.camera for entry in entries]
     focus, up, size = None, np.array([0.0, -1.0, 0.0]), 0.0
     if cameras:

@@ -24,22 +24,26 @@ STYLE: dict[Any, Any] = {
 
 
 def save_picture(figure: Any, path: Path, dpi: int) -> None:
-    """Writes a matplotlib Figure as PNG. Letters of a name that no font here has become boxes, without a warning."""
+    """Write a matplotlib Figure as PNG, without warnings about letters that no installed font has."""
     with catch_warnings():
         filterwarnings("ignore", message="Glyph .* missing from font")
         figure.savefig(path, dpi=dpi, facecolor="white", format="png")
 
 
 def training_points(curve: Sequence[Mapping], key: str) -> list[tuple[float, float]]:
-    """(seconds, dB) of the lines of metrics.jsonl that have both."""
+    """Return (seconds, dB) of the lines of metrics.jsonl that have both."""
     return [(line["seconds"], line[key]) for line in curve if line.get(key) is not None and "seconds" in line]
 
 
 def training_chart(rows: Mapping[str, Sequence[Sequence[Mapping]]]):
-    """A matplotlib Figure: held-out PSNR against training seconds, a panel for each of PANELS that has figures.
+    """Plot held-out PSNR against training seconds, one panel for each of PANELS that has figures.
 
-    rows: label -> the metrics of one run, or of several that differ by their seed. One color a row, one line a run; of
-    a single row the last figure stands in the panel's title.
+    Args:
+        rows: Label -> the metrics of one run, or of several that differ by their seed. Each label has a color and each
+            run a line; for a single label the panel's title states the last figure.
+
+    Returns:
+        A matplotlib Figure.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure

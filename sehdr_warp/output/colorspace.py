@@ -12,8 +12,13 @@ _REC709 = (0.640, 0.330, 0.300, 0.600, 0.150, 0.060, 0.3127, 0.3290)
 
 
 class ColorSpace(NamedTuple):
-    """A linear RGB space: its name on the command line, in colour.RGB_COLOURSPACES, and as `colorInteropID` of OpenEXR
-    (Color Interop Forum), if it has one."""
+    """A linear RGB space.
+
+    Attributes:
+        name: On the command line.
+        dataset: Key in colour.RGB_COLOURSPACES.
+        interop_id: `colorInteropID` of OpenEXR (Color Interop Forum), if the space has one.
+    """
 
     name: str
     dataset: str
@@ -35,7 +40,11 @@ _ALIASES = {
 
 
 def color_space(name: str) -> ColorSpace:
-    """The space of a name or alias (`ap0`, `ap1`, `bt709`, `bt2020`, ...), in any case; SehdrError if unknown."""
+    """Return the space of a name or alias (`ap0`, `ap1`, `bt709`, `bt2020`, ...), in any case.
+
+    Raises:
+        SehdrError: For an unknown name.
+    """
     key = name.strip().lower()
     for space in SPACES:
         if space.name == _ALIASES.get(key, key):
@@ -45,7 +54,7 @@ def color_space(name: str) -> ColorSpace:
 
 @cache
 def chromaticities(name: str) -> tuple[float, ...]:
-    """CIE xy of red, green, blue and white: eight numbers in the order of OpenEXR's `chromaticities`."""
+    """Return CIE xy of red, green, blue and white: eight numbers in the order of OpenEXR's `chromaticities`."""
     if color_space(name).name == "rec709":
         return _REC709
     space = _dataset(color_space(name).dataset)
@@ -54,28 +63,30 @@ def chromaticities(name: str) -> tuple[float, ...]:
 
 @cache
 def matrix_from_rec709(name: str) -> np.ndarray:
-    """[3, 3] float64: linear Rec.709 column vectors to the named space."""
+    """Return [3, 3] float64 that converts linear Rec.709 column vectors to the named space."""
     return matrix_to(color_space(name).dataset)
 
 
 @cache
 def matrix_to(dataset: str) -> np.ndarray:
-    """[3, 3] float64: linear Rec.709 to a space of colour.RGB_COLOURSPACES, white to white by Bradford's adaptation, as
-    in the ACES transforms and OpenColorIO's built-in ones."""
+    """Return [3, 3] float64 that converts linear Rec.709 to a space of colour.RGB_COLOURSPACES.
+
+    White maps to white by Bradford's adaptation, as in the ACES transforms and OpenColorIO's built-in ones.
+    """
     import colour
 
     return colour.matrix_RGB_to_RGB(_dataset(color_space("rec709").dataset), _dataset(dataset), "Bradford")
 
 
 def from_rec709(rgb: np.ndarray, name: str) -> np.ndarray:
-    """Converts [..., 3] linear Rec.709 to the named space, in float64. Values are not clipped."""
+    """Convert [..., 3] linear Rec.709 to the named space, in float64. Values are not clipped."""
     rgb = np.asarray(rgb, np.float64)
     # A product with the identity would turn infinities into NaN and -0 into 0; Rec.709 passes through untouched.
     return rgb if color_space(name).name == "rec709" else rgb @ matrix_from_rec709(name).T
 
 
 def _dataset(dataset: str):
-    """colour-science's space, with matrices of its primaries: the published ones are rounded to four digits."""
+    """Return colour-science's space with matrices derived from its primaries; the published ones are rounded."""
     import colour
 
     space = colour.RGB_COLOURSPACES[dataset].copy()

@@ -14,10 +14,16 @@ from .light_pictures import photo_light, shown_photo
 
 @dataclass(frozen=True)
 class Comparison:
-    """A view, all [H, W, 3] radiance but where said.
+    """A view beside its photo; pictures are [H, W, 3] radiance unless stated.
 
-    photo: encoded, in [0, 1]. from_photo: what the photo alone gives, its response undone. hdr: rendered. confidence:
-    [H, W] in [0, 1] of the render, if it was measured. new: rendered half-way to the nearest other view, if any.
+    Attributes:
+        name: Of the view.
+        photo: Encoded values in [0, 1].
+        from_photo: Radiance that the photo alone gives, its response inverted.
+        hdr: Rendered radiance.
+        truth: HDR truth, if the scene has it.
+        confidence: [H, W] in [0, 1] of the render, if it was measured.
+        new: Rendered half-way to the nearest other view, if there is one.
     """
 
     name: str
@@ -30,7 +36,7 @@ class Comparison:
 
 
 def compare(run, view: View, views: Sequence[View]) -> Comparison:
-    """A view of a run beside its photo; views: all of the scene."""
+    """Render a view of a run and compare it with its photo; `views` are all views of the scene."""
     confidence, hdr, new = run.render_confidence(view.camera), as_array(run.render(view.camera).hdr), None
     others = [other.camera for other in views if other.name != view.name]
     if others:

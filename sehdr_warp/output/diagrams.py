@@ -21,7 +21,7 @@ _MAP_VIEWS, _MAP_SIZE, _SAMPLES = 12, 640, 200
 
 
 def training_svg(metrics: Sequence[Mapping]) -> str:
-    """Held-out PSNR in dB against seconds of training, a line for each of PANELS that has figures; or nothing."""
+    """Plot held-out PSNR in dB against training seconds, a line for each of PANELS; empty without figures."""
     lines = {title: points for key, title in PANELS.items() if (points := training_points(metrics, key))}
     if not lines:
         return ""
@@ -34,27 +34,35 @@ def training_svg(metrics: Sequence[Mapping]) -> str:
     def place(seconds: float, decibels: float) -> tuple[float, float]:
         return 40 + 620 * seconds / longest, 250 - 225 * (decibels - low) / (high - low)
 
-    drawn = []
+    elements = []
     for decibels in range(low, high + 1, step):
         y = place(0, decibels)[1]
-        drawn.append(f'<path d="M40 {y:.1f}H660" stroke="{LINE}"/><text x="0" y="{y + 4:.1f}">{decibels} dB</text>')
+        elements.append(f'<path d="M40 {y:.1f}H660" stroke="{LINE}"/><text x="0" y="{y + 4:.1f}">{decibels} dB</text>')
     for seconds in np.linspace(0, longest, 5):
         x, anchor = place(seconds, low)[0], "middle" if 0 < seconds < longest else "start" if not seconds else "end"
-        drawn.append(f'<text x="{x:.1f}" y="272" text-anchor="{anchor}">{seconds:.0f} s</text>')
+        elements.append(f'<text x="{x:.1f}" y="272" text-anchor="{anchor}">{seconds:.0f} s</text>')
     for color, (title, line) in zip(COLORS, lines.items()):
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*point) for point in line))
         x, y = place(*line[-1])
-        drawn.append(f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="2"/>')
-        drawn += [f'<circle cx="{a:.1f}" cy="{b:.1f}" r="2.5" fill="{color}"/>' for a, b in (place(*p) for p in line)]
+        elements.append(f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="2"/>')
+        elements += [
+            f'<circle cx="{a:.1f}" cy="{b:.1f}" r="2.5" fill="{color}"/>' for a, b in (place(*p) for p in line)
+        ]
         label = f"{escape(title)}: {line[-1][1]:.1f} dB"
-        drawn.append(f'<text x="{x + 12:.1f}" y="{y + 4:.1f}" style="fill:{color}">{label}</text>')
-    return _svg(860, 280, "Held-out PSNR against training time", drawn)
+        elements.append(f'<text x="{x + 12:.1f}" y="{y + 4:.1f}" style="fill:{color}">{label}</text>')
+    return _svg(860, 280, "Held-out PSNR against training time", elements)
 
 
 def camera_map(run: Any, tone_map: Any, names: Sequence[str] = ()) -> str:
-    """The scene from above, as its training photos see it, with their cameras and the held-out ones.
+    """Draw the scene from above as its training photos show it, with training and held-out cameras.
 
-    tone_map: radiance [N, 3] to sRGB. names: cameras that are labelled. Empty where there are no cameras.
+    Args:
+        run: The trained run.
+        tone_map: Converts radiance [N, 3] to sRGB.
+        names: Cameras to label.
+
+    Returns:
+        SVG; empty if there are no cameras.
     """
     entries = run.cameras
     if not entries:
@@ -66,7 +74,7 @@ def camera_map(run: Any, tone_map: Any, names: Sequence[str] = ()) -> str:
     east /= max(float(np.linalg.norm(east)), 1e-9)
     plane = np.stack([east, np.cross(up, east)])  # Away from the first camera is up on the page.
     positions = np.array([camera.position for camera in cameras]) @ plane.T
-    points, colors = _seen([entry.camera for entry in entries if entry.split == "train"] or cameras, run, up)
+    points, colors = _visible_points([entry.camera for entry in entries if entry.split == "train"] or cameras, run, up)
     ground = points @ plane.T
     spread = np.concatenate([positions, np.percentile(ground, (2, 98), axis=0)] if len(ground) else [positions])
     low, high = spread.min(axis=0), spread.max(axis=0)
@@ -80,7 +88,7 @@ def camera_map(run: Any, tone_map: Any, names: Sequence[str] = ()) -> str:
             height,
         ]
 
-    drawn = [_ground(place(ground), tone_map(colors), round(width), round(height))] if len(ground) else []
+    elements = [_ground(place(ground), tone_map(colors), round(width), round(height))] if len(ground) else []
     for entry, at in zip(entries, place(positions)):
         camera, color = entry.camera, COLORS[entry.split != "train"]
         across = camera.width / camera.fx / 2
@@ -88,17 +96,21 @@ def camera_map(run: Any, tone_map: Any, names: Sequence[str] = ()) -> str:
         ends = [at + 26 * corner * [1, -1] / max(np.linalg.norm(corner), 1e-9) for corner in corners]
         wedge = " ".join(f"{x:.1f},{y:.1f}" for x, y in (at, *ends))
         title = f"<title>{escape(entry.name)} ({entry.split})</title>"
-        drawn.append(f'<g fill="{color}" stroke="{color}">{title}<polygon points="{wedge}" fill-opacity="0.18"/>')
-        drawn.append(f'<circle cx="{at[0]:.1f}" cy="{at[1]:.1f}" r="3"/></g>')
+        elements.append(f'<g fill="{color}" stroke="{color}">{title}<polygon points="{wedge}" fill-opacity="0.18"/>')
+        elements.append(f'<circle cx="{at[0]:.1f}" cy="{at[1]:.1f}" r="3"/></g>')
         if entry.name in names:
             style = "fill:var(--ink);stroke:var(--ground);stroke-width:3px;paint-order:stroke"
-            drawn.append(f'<text x="{at[0] + 7:.1f}" y="{at[1] - 6:.1f}" style="{style}">{escape(entry.name)}</text>')
-    return f'<div class="map">{_svg(round(width), round(height), "Cameras from above", drawn)}</div>'
+            elements.append(
+                f'<text x="{at[0] + 7:.1f}" y="{at[1] - 6:.1f}" style="{style}">{escape(entry.name)}</text>'
+            )
+    return f'<div class="map">{_svg(round(width), round(height), "Cameras from above", elements)}</div>'
 
 
-def _seen(cameras: Sequence[Camera], run: Any, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the scene [N, 3] and their radiance, from small renders of some cameras; what lies higher than the
-    cameras, such as a ceiling, is left out."""
+def _visible_points(cameras: Sequence[Camera], run: Any, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return points of the scene [N, 3] and their radiance, from small renders of some cameras.
+
+    What lies higher than the cameras, such as a ceiling, is left out.
+    """
     chosen = evenly(cameras, _MAP_VIEWS)
     ceiling, points, colors = max(float(camera.position @ up) for camera in chosen), [], []
     for camera in chosen:
@@ -109,14 +121,14 @@ def _seen(cameras: Sequence[Camera], run: Any, up: np.ndarray) -> tuple[np.ndarr
         rays = np.stack([(column + 0.5 - small.cx) / small.fx, (row + 0.5 - small.cy) / small.fy, np.ones(len(row))], 1)
         points.append((rays * depth[row, column, None]) @ small.world_to_camera[:3, :3] + small.position)
         colors.append(as_array(rendered.hdr)[row, column])
-    found, light = np.concatenate(points), np.concatenate(colors)
-    below = found @ up < ceiling
-    order = np.argsort(found[below] @ up)
-    return found[below][order], light[below][order]
+    all_points, light = np.concatenate(points), np.concatenate(colors)
+    below = all_points @ up < ceiling
+    order = np.argsort(all_points[below] @ up)
+    return all_points[below][order], light[below][order]
 
 
 def _ground(at: np.ndarray, colors: np.ndarray, width: int, height: int) -> str:
-    """An <image> of points in pixels; later ones lie over earlier ones."""
+    """Draw points, in pixels, as an SVG <image>; later points cover earlier ones."""
     inside = ((at >= 0) & (at < [width - 1, height - 1])).all(axis=1)
     column, row = at[inside].astype(int).T
     picture = np.zeros((height, width, 4), np.uint8)

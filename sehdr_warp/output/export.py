@@ -33,23 +33,23 @@ def export(
     cameras: bool = False,
     overwrite: bool = False,
 ) -> Path:
-    """Writes the Gaussians of a trained run; returns the path.
+    """Write the Gaussians of a trained run; return the path.
 
-    What the file keeps of the scene is measured on pictures and goes to the log.
+    How well the file keeps the scene is measured on pictures and logged.
 
     Args:
-        run: of load_run, train or load_splats.
-        path: the file; its suffix decides: .ply, .glb (glTF), .usda, .usdc, .usdz (OpenUSD).
+        run: From load_run, train or load_splats.
+        path: The file; its suffix decides: .ply, .glb (glTF), .usda, .usdc, .usdz (OpenUSD).
         kind: "ldr" for the colors of a photo, which viewers show, refined to the run's own pictures; "hdr" for
             scene-linear radiance. None: hdr for USD, else ldr.
-        exposure_time: seconds, of ldr colors; by default the scene's.
-        degree: harmonics are padded with zeros up to this, for readers that take no other; at most 3.
-        cameras: also write `cameras.json` beside it, as the reference release of 3D Gaussian Splatting does.
-        overwrite: replace files that exist.
+        exposure_time: Seconds, of ldr colors; by default the scene's.
+        degree: Pad harmonics with zeros up to this degree, for readers that take no other; at most 3.
+        cameras: Also write `cameras.json` beside it, as the reference release of 3D Gaussian Splatting does.
+        overwrite: Replace files that exist.
 
     Raises:
-        SehdrError: for options that do not fit.
-        InputError: for an unknown suffix, where a file exists or a value is not finite.
+        SehdrError: For options that do not fit.
+        InputError: For an unknown suffix, if a file exists, or if a value is not finite.
     """
     path = Path(path)
     held = color_model_of(path)
@@ -58,13 +58,13 @@ def export(
     beside = path.with_name("cameras.json")
     for file in (path, *[beside] * cameras):
         check_absent(file, overwrite)  # Before minutes of fitting.
-    seen = [entry.camera for entry in run.cameras if entry.split == "train"]
-    positions = np.array([camera.position for camera in seen]).reshape(-1, 3)
+    photos = [entry.camera for entry in run.cameras if entry.split == "train"]
+    positions = np.array([camera.position for camera in photos]).reshape(-1, 3)
     if kind == "ldr":
         time = run.base_time if exposure_time is None else float(exposure_time)
         gaussians = gaussians_of(run.model, "display", positions, time, run.color_matrix)
         if gaussians.color_model != run.model.color_model.name:
-            gaussians = refine(gaussians, _photographed(run, time), seen)
+            gaussians = refine(gaussians, _photographed(run, time), photos)
     else:
         color_model = held or ("linear" if run.model.color_model.name == "linear" else "log")
         gaussians = gaussians_of(run.model, color_model, positions, color_matrix=run.color_matrix)
@@ -80,8 +80,8 @@ def _check(path: Path, kind: str, held: str | None, exposure_time: float | None,
     if kind not in KINDS:
         raise SehdrError(f"kind {kind!r} is not one of {', '.join(KINDS)}")
     if held not in (None, "linear" if kind == "hdr" else "display"):
-        told = "is tagged as scene-linear" if held == "linear" else "knows display colors only"
-        raise InputError(path, f"{check_suffix(path)} {told}, and kind {kind} is not", "leave the kind out")
+        limit = "is tagged as scene-linear" if held == "linear" else "knows display colors only"
+        raise InputError(path, f"{check_suffix(path)} {limit}, and kind {kind} is not", "leave the kind out")
     if exposure_time is not None and kind == "hdr":
         raise SehdrError("an HDR file has no exposure time; leave it out, or write kind ldr")
     if exposure_time is not None and not 0 < exposure_time < math.inf:
@@ -114,12 +114,12 @@ def _judged(run) -> Sequence[Camera]:
 
 
 def _photographed(run, time: float) -> Callable:
-    """Simulated photos; of a scene in a sensor's colors, pictures of its light."""
+    """Return a function that renders simulated photos, or light for a scene in a sensor's colors."""
     return _shown(run, time) if run.color_matrix is not None else lambda camera: run.render_ldr(camera, time)
 
 
 def _shown(run, time: float) -> Callable:
-    """Pictures of a run's radiance at an exposure time, encoded by sRGB."""
+    """Return a function that renders radiance at an exposure time, encoded by sRGB."""
     from ..response import response_by_name
 
     encode = response_by_name("srgb").encode

@@ -31,8 +31,10 @@ _FLIP_Y_Z = np.diag([1.0, -1.0, -1.0, 1.0])
 class Part:
     """One picture of a file.
 
-    channels: name -> [H, W] finite numbers, all of one shape: R, G, B, A, Z, and any other. header: attributes such as
-    exr_header() makes. name: unique in the file; may be empty where it has one part.
+    Attributes:
+        channels: Name -> [H, W] finite numbers, all of one shape: R, G, B, A, Z, and any other.
+        header: Attributes such as exr_header() returns.
+        name: Unique in the file; may be empty if the file has one part.
     """
 
     channels: Mapping[str, np.ndarray]
@@ -47,8 +49,15 @@ def exr_header(
     captured: datetime | None = None,
     provenance: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """OpenEXR attributes for a picture. exposure_time: seconds, what radiance was multiplied by. captured: local time.
-    provenance: text by key, as `sehdr:<key>`."""
+    """Return OpenEXR attributes for a picture.
+
+    Args:
+        colorspace: Primaries of the pixels.
+        exposure_time: Seconds that radiance was multiplied by.
+        camera: Camera of the picture.
+        captured: Local time.
+        provenance: Text by key, written as `sehdr:<key>`.
+    """
     space = color_space(colorspace)
     header: dict[str, Any] = {"chromaticities": chromaticities(space.name), "sehdr:colorSpace": space.name}
     if space.interop_id:
@@ -64,18 +73,18 @@ def exr_header(
 
 
 def as_data(header: Mapping[str, Any]) -> dict[str, Any]:
-    """The attributes of a picture's part, for one that holds no colors."""
+    """Return the attributes of a picture's part, for a part that holds no colors."""
     colors = ("chromaticities", "sehdr:colorSpace", "colorInteropID")
     return {key: value for key, value in header.items() if key not in colors} | {"colorInteropID": "data"}
 
 
 def rgb_channels(image: np.ndarray) -> dict[str, np.ndarray]:
-    """R, G and B of [H, W, 3]."""
+    """Return R, G and B of [H, W, 3]."""
     return dict(zip("RGB", np.moveaxis(image, 2, 0), strict=True))
 
 
 def stored_pixel_type(arrays: Sequence[np.ndarray], pixel: str = "half") -> str:
-    """The type that holds all values unclipped: `pixel`, or "float" where half would overflow."""
+    """Return the type that holds all values unclipped: `pixel`, or "float" if half would overflow."""
     if pixel not in _TYPES:
         raise ValueError(f"pixel type {pixel!r} is not one of {', '.join(_TYPES)}")
     fits = all(np.abs(array).max() <= np.finfo(np.float16).max for array in arrays)
@@ -83,21 +92,27 @@ def stored_pixel_type(arrays: Sequence[np.ndarray], pixel: str = "half") -> str:
 
 
 def write_exr(path: Path | str, channels: Mapping[str, np.ndarray], *, header: Any = None, **options: Any) -> str:
-    """write_multipart_exr() for one part without a name; header: as of Part."""
+    """Write a file with one unnamed part; header as in Part, options as in write_multipart_exr()."""
     return write_multipart_exr(path, [Part(channels, header or {})], **options)
 
 
 def write_multipart_exr(
     path: Path | str, parts: Sequence[Part], *, pixel: str = "half", overwrite: bool = False
 ) -> str:
-    """Writes a file with ZIP compression; returns the pixel type of the colors.
+    """Write parts into one file and return the pixel type of the colors.
 
-    pixel: "half" or "float". Where half cannot hold a value (above 65504 in size), all channels of the file are float
-    instead, and each part's `sehdr:pixelType` says so: nothing is clipped. Depth (`Z`, or a layer's `.Z`) and places
-    are always float: half's 11 bits are too few for them.
+    Args:
+        path: The file.
+        parts: At least one, with different names.
+        pixel: "half" or "float". If half cannot hold a value (above 65504 in size), all channels of the file are float
+            instead, and each part's `sehdr:pixelType` says so: nothing is clipped. Depth (`Z`, or a layer's `.Z`) and
+            positions are always float, because half's 11 bits are too few for them.
+        overwrite: Replace a file that exists.
 
-    Raises InputError where a value is NaN or infinite (with channel and place) or `path` exists (unless overwrite);
-    SehdrError where the file cannot be written; ValueError for an unknown pixel type, unequal shapes or names.
+    Raises:
+        InputError: If a value is NaN or infinite (with channel and place), or `path` exists.
+        SehdrError: If the file cannot be written.
+        ValueError: For an unknown pixel type, unequal shapes, or repeated names.
     """
     import OpenEXR
 
@@ -143,7 +158,13 @@ def _check(path: Path, part: Part) -> None:
 
 
 def check_finite(path: Path, image: np.ndarray, what: str) -> None:
-    """Raises InputError for NaN and infinity in [H, W] or [H, W, 3]; what: they are, with {count} for how many."""
+    """Raise InputError if [H, W] or [H, W, 3] holds NaN or infinity.
+
+    Args:
+        path: File that the picture is for.
+        image: The picture.
+        what: Name of the values in the message, with {count} for how many are affected.
+    """
     bad = ~np.isfinite(image)
     if bad.any():
         y, x, *channel = place = tuple(np.argwhere(bad)[0])
@@ -153,12 +174,12 @@ def check_finite(path: Path, image: np.ndarray, what: str) -> None:
 
 
 def _is_depth(name: str) -> bool:
-    """Also places in the world, for which half is too coarse as well."""
+    """Return whether a channel holds depth or positions, for which half is too coarse."""
     return name == "Z" or name.endswith(".Z") or name.startswith("position.")
 
 
 def _camera_attributes(camera: Camera) -> dict[str, Any]:
-    """Matrices act on row vectors (p M), as all of OpenEXR's do."""
+    """Return a camera as OpenEXR attributes; matrices act on row vectors (p M), as all of OpenEXR's do."""
     # x and y run over [0, 1] from the top left corner; z is the distance along the axis; w divides.
     to_ndc = np.zeros((4, 4))
     to_ndc[0, [0, 2]] = np.array([camera.fx, camera.cx]) / camera.width

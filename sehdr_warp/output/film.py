@@ -1,5 +1,8 @@
-"""Films of camera paths: H.264 for any display, HEVC with 10 bits as HLG or HDR10 for HDR displays, or ProRes 4444 in a
-camera's logarithm for grading."""
+"""Films of camera paths.
+
+H.264 for any display, HEVC with 10 bits as HLG or HDR10 for HDR displays, or ProRes 4444 in a camera's logarithm for
+grading.
+"""
 
 import logging
 import time
@@ -31,7 +34,16 @@ REFERENCE_WHITE, PEAK = 203.0, 1000.0
 
 @dataclass(frozen=True)
 class Transfer:
-    """How light becomes codes. codec, pixels: of FFmpeg. primaries, curve, matrix: code points of ITU-T H.273."""
+    """How light becomes codes.
+
+    Attributes:
+        codec: Encoder of FFmpeg.
+        pixels: Pixel format of FFmpeg.
+        options: Options of the encoder.
+        primaries: Code point of ITU-T H.273, as are the next two.
+        curve: Transfer characteristics.
+        matrix: Matrix coefficients.
+    """
 
     codec: str
     pixels: str
@@ -73,16 +85,24 @@ def write_film(
     overwrite: bool = False,
     tell: Callable[[str], None] | None = None,
 ) -> Path:
-    """Renders a film of cameras, one each frame, at the size of the first; returns `out`, whose suffix says the format.
+    """Render a film of cameras, one each frame, at the size of the first, and return its path.
 
-    transfer: "sdr": H.264, Rec.709, tone-mapped by one map for all frames; "hlg" or "hdr10": HEVC of 10 bits in
-    Rec.2020, in which a photo's white is 203 cd/m2 and light is kept up to 1000; "logc3", "slog3", "acescct": ProRes
-    4444 of 10 bits (.mov), in which a photo's white is a reflectance of 1. ev_ramp: stops from the photos' exposure
-    at the first and the last frame, changing evenly. exposed: SDR is not tone-mapped but exposed and clipped, as a
-    camera does; so too where the ramp moves. tell: takes a line at each frame that says how far the film is; by
-    default the log has one now and then.
+    Args:
+        run: From load_run, train or load_splats.
+        out: The file; its suffix decides the container.
+        cameras: One for each frame.
+        fps: Frames a second.
+        transfer: "sdr": H.264 in Rec.709, tone-mapped by one map for all frames. "hlg", "hdr10": 10-bit HEVC in
+            Rec.2020 in which the photos' white is 203 cd/m2 and light is kept up to 1000. "logc3", "slog3", "acescct":
+            10-bit ProRes 4444 (.mov) in which the photos' white is a reflectance of 1.
+        ev_ramp: Stops from the photos' exposure at the first and the last frame, changing evenly.
+        exposed: Expose and clip SDR as a camera does, instead of tone mapping. Also done if the ramp moves.
+        overwrite: Replace a film that exists.
+        tell: Receives a line of progress at each frame; by default the log has one now and then.
 
-    Raises SehdrError without PyAV (the extra `film`) or its encoder, InputError where `out` exists (unless overwrite).
+    Raises:
+        SehdrError: Without PyAV (the extra `film`) or its encoder.
+        InputError: If `out` exists (unless overwrite).
     """
     av, kind = film_library(), TRANSFERS[transfer]
     out, first = Path(out), cameras[0]
@@ -105,10 +125,10 @@ def write_film(
                 context = stream.codec_context
                 context.color_primaries, context.color_trc, context.colorspace = kind.primaries, kind.curve, kind.matrix
                 context.color_range = 1
-                for camera, ev in zip(_told(cameras, out, tell), stops):
+                for camera, ev in zip(_with_progress(cameras, out, tell), stops):
                     hdr = as_array(run.render(camera.resized(width, height)).hdr) * np.float32(2.0**ev)
-                    shown = look(hdr) if look else encode(hdr * np.float32(gain), transfer)
-                    for packet in stream.encode(_frame(av, shown, kind)):
+                    encoded = look(hdr) if look else encode(hdr * np.float32(gain), transfer)
+                    for packet in stream.encode(_frame(av, encoded, kind)):
                         container.mux(packet)
                 for packet in stream.encode():
                     container.mux(packet)
@@ -119,11 +139,11 @@ def write_film(
 
 
 def encode(light: np.ndarray, transfer: str) -> np.ndarray:
-    """[..., 3] linear Rec.709 display light, in which 1 is the photos' white, as R'G'B' in [0, 1] of a transfer.
+    """Encode [..., 3] linear Rec.709 display light, in which 1 is the photos' white, as R'G'B' in [0, 1].
 
     sdr: Rec.709's primaries, the sRGB curve. hdr10: Rec.2020, SMPTE ST 2084 of cd/m2. hlg: Rec.2020, BT.2100's OETF of
-    the scene light that its system gamma of 1.2 shows so on a display of 1000 cd/m2. logc3 (at EI 800), slog3, acescct:
-    in the primaries of LOGS.
+    the scene light that its system gamma of 1.2 shows as this light on a display of 1000 cd/m2. logc3 (at EI 800),
+    slog3, acescct: in the primaries of LOGS.
     """
     if transfer == "sdr":
         return encode_srgb(light)
@@ -134,29 +154,32 @@ def encode(light: np.ndarray, transfer: str) -> np.ndarray:
         linear = np.maximum(np.asarray(light, np.float64) @ matrix_to(primaries).T, 1e-10)
         return np.clip(colour.log_encoding(linear, curve), 0, 1)
     wide = np.maximum(np.asarray(light, np.float64) @ matrix_from_rec709("rec2020").T, 0) * REFERENCE_WHITE
-    shown = np.minimum(wide, PEAK)
+    luminances = np.minimum(wide, PEAK)
     if transfer == "hdr10":
-        powered = (shown / 10000) ** 0.1593017578125
+        powered = (luminances / 10000) ** 0.1593017578125
         return ((0.8359375 + 18.8515625 * powered) / (1 + 18.6875 * powered)) ** 78.84375
-    luminance = (shown / PEAK) @ np.array([0.2627, 0.6780, 0.0593])
-    scene = shown / PEAK * np.maximum(luminance, 1e-12)[..., None] ** (1 / 1.2 - 1)
+    luminance = (luminances / PEAK) @ np.array([0.2627, 0.6780, 0.0593])
+    scene = luminances / PEAK * np.maximum(luminance, 1e-12)[..., None] ** (1 / 1.2 - 1)
     scene = np.clip(scene, 0, 1)
     high = 0.17883277 * np.log(np.maximum(12 * scene - 0.28466892, 1e-9)) + 0.55991073
     return np.where(scene <= 1 / 12, np.sqrt(3 * scene), high)
 
 
 def _frame(av: Any, encoded: np.ndarray, kind: Transfer) -> Any:
-    """A video frame of R'G'B' [H, W, 3] in [0, 1]; FFmpeg's scaler makes Y'CbCr of it by the matrix of the transfer."""
+    """Return a video frame of R'G'B' [H, W, 3] in [0, 1].
+
+    FFmpeg's scaler converts it to Y'CbCr by the matrix of the transfer.
+    """
     deep = np.rint(np.clip(encoded, 0, 1) * 65535).astype(np.uint16)
     frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(deep), format="rgb48le")
     spaces = {1: "ITU709", 9: "BT2020"}
-    made = frame.reformat(format=kind.pixels, dst_colorspace=spaces[kind.matrix], dst_color_range="MPEG")
-    made.color_primaries, made.color_trc, made.colorspace = kind.primaries, kind.curve, kind.matrix
-    return made
+    converted = frame.reformat(format=kind.pixels, dst_colorspace=spaces[kind.matrix], dst_color_range="MPEG")
+    converted.color_primaries, converted.color_trc, converted.colorspace = kind.primaries, kind.curve, kind.matrix
+    return converted
 
 
-def _told(cameras: Sequence[Camera], out: Path, tell: Callable[[str], None] | None) -> Iterator[Camera]:
-    """The cameras; meanwhile `tell`, or the log now and then, says how far the film is."""
+def _with_progress(cameras: Sequence[Camera], out: Path, tell: Callable[[str], None] | None) -> Iterator[Camera]:
+    """Yield the cameras, and report progress through `tell`, or through the log now and then."""
     started = due = time.monotonic()
     for index, camera in enumerate(cameras):
         now = time.monotonic()
@@ -167,7 +190,7 @@ def _told(cameras: Sequence[Camera], out: Path, tell: Callable[[str], None] | No
 
 
 def film_library() -> Any:
-    """PyAV; raises SehdrError where it is not installed."""
+    """Return PyAV; raise SehdrError if it is not installed."""
     try:
         import av
     except ImportError:

@@ -18,8 +18,10 @@ EXIF_TIME = "%Y:%m:%d %H:%M:%S"
 
 
 def quantize(values: np.ndarray, bits: int = 8) -> np.ndarray:
-    """Encoded values in [0, 1] to code values, rounded to nearest: uint8 or (16 bits) uint16. Values outside are
-    limited; NaN raises ValueError."""
+    """Convert encoded values in [0, 1] to code values: uint8 or, with 16 bits, uint16.
+
+    Values are rounded to nearest and limited to [0, 1]; NaN raises ValueError.
+    """
     if np.isnan(values).any():
         raise ValueError("the picture holds NaN")
     white = 2**bits - 1
@@ -27,8 +29,13 @@ def quantize(values: np.ndarray, bits: int = 8) -> np.ndarray:
 
 
 def exposure_exif(exposure_time: float, *, bias: float | None = None, captured: datetime | None = None) -> Image.Exif:
-    """ExposureTime in seconds as the nearest rational of 32 bits; bias: ExposureBiasValue in stops. captured:
-    DateTimeOriginal."""
+    """Return EXIF with an exposure time.
+
+    Args:
+        exposure_time: Seconds, stored as the nearest 32-bit rational.
+        bias: ExposureBiasValue in stops.
+        captured: DateTimeOriginal.
+    """
     exif = Image.Exif()
     exif[_SOFTWARE] = "sehdr-warp"
     details = exif.get_ifd(_EXIF_IFD)
@@ -41,8 +48,10 @@ def exposure_exif(exposure_time: float, *, bias: float | None = None, captured: 
 
 
 def write_picture(path: Path | str, codes: np.ndarray, *, exif: Image.Exif | None = None) -> None:
-    """Writes [H, W, 3] code values as PNG (uint8, uint16) or, by a .jpg suffix, JPEG (uint8) without chroma
-    subsampling. Raises InputError and SehdrError as atomic_path does, ValueError for another type."""
+    """Write [H, W, 3] code values as PNG (uint8, uint16) or, by a .jpg suffix, JPEG without chroma subsampling (uint8).
+
+    Raises InputError and SehdrError as atomic_path does, and ValueError for another type.
+    """
     jpeg = Path(path).suffix == ".jpg"
     if codes.dtype not in ((np.uint8,) if jpeg else (np.uint8, np.uint16)):
         raise ValueError(f"code values are {codes.dtype}, not uint8{'' if jpeg else ' or uint16'}")
@@ -55,12 +64,12 @@ def write_picture(path: Path | str, codes: np.ndarray, *, exif: Image.Exif | Non
 
 
 def as_array(value) -> np.ndarray:
-    """A torch tensor on any device, or an array, as an array."""
+    """Return a torch tensor on any device, or an array, as an array."""
     return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
 
 
 def _png16(codes: np.ndarray, exif: Image.Exif | None) -> bytes:
-    """A 16-bit PNG, which Pillow cannot write in color (PNG specification, 3rd edition: sections 5, 9 and 11.3.3)."""
+    """Return a 16-bit color PNG, which Pillow cannot write (PNG specification, 3rd edition: 5, 9 and 11.3.3)."""
     height, width = codes.shape[:2]
     rows = codes.astype(">u2").reshape(height, -1).view(np.uint8)
     # Each row's filter, 2, is "Up": each byte less the one above it.

@@ -27,16 +27,20 @@ CURVE_STOPS, CURVE_SIZE = (-20.0, 20.0), 1024  # As light.js has them
 
 
 def display_gain(response: Any) -> float:
-    """What turns exposures of a response into display light, so that a photo's middle grey is shown as middle grey: 1
-    for an sRGB or linear camera."""
+    """Return the factor from exposures of a response to display light that shows a photo's middle grey as middle grey.
+
+    It is 1 for an sRGB or linear camera.
+    """
     grey = float(response.decode(encode_srgb(np.array([MIDDLE_GREY])).astype(np.float64))[0])
     return MIDDLE_GREY / grey if grey > 0 else 1.0
 
 
 def exposure_of_white(run: Any, white: float | None) -> float:
-    """Seconds that radiance is multiplied by so that a file shows the photos' white as `white`; 1 for None.
+    """Return the seconds to multiply radiance by so that a file shows the photos' white as `white`; 1 for None.
 
-    Raises SehdrError for a white outside 0.001 to 10000."""
+    Raises:
+        SehdrError: For a white outside 0.001 to 10000.
+    """
     exposure = 1.0 if white is None else white * run.base_time * display_gain(run.response)
     if not (math.isfinite(exposure) and exposure > 0 and (white is None or 1e-3 <= white <= 1e4)):
         raise SehdrError(f"white {white} is not between 0.001 and 10000; 1 shows the photos' white as 1")
@@ -44,14 +48,16 @@ def exposure_of_white(run: Any, white: float | None) -> float:
 
 
 def curve_table(response: Any) -> str:
-    """A response over CURVE_STOPS of exposure, evenly, as half floats in base64: what a page draws the camera's look
-    by."""
+    """Return a response over CURVE_STOPS of exposure, evenly sampled, as half floats in base64.
+
+    Pages draw the camera's look with it.
+    """
     values = response.encode(2.0 ** np.linspace(*CURVE_STOPS, CURVE_SIZE))
     return base64.b64encode(np.asarray(values).astype("<f2").tobytes()).decode()
 
 
 def photo_light(run: Any, view: View) -> np.ndarray:
-    """[H, W, 3] linear Rec.709 radiance that a photo alone tells: the run's response undone."""
+    """Return [H, W, 3] linear Rec.709 radiance that a photo alone gives: the run's response inverted."""
     light = np.asarray(run.response.decode(view.image), np.float32) / view.exposure_time
     if run.color_matrix is None:
         return light
@@ -59,43 +65,48 @@ def photo_light(run: Any, view: View) -> np.ndarray:
 
 
 def shown_photo(run: Any, view: View) -> np.ndarray:
-    """[H, W, 3] in [0, 1] as a photo is looked at: its encoded values, or of a RAW one its light as sRGB."""
+    """Return [H, W, 3] in [0, 1] as a photo is looked at: encoded values, or the light of a RAW photo as sRGB."""
     if run.color_matrix is None:
         return view.image
     return encode_srgb(np.clip(photo_light(run, view) * view.exposure_time, 0, 1))
 
 
 def photographed(run: Any, exposure: np.ndarray) -> np.ndarray:
-    """[H, W, 3] in [0, 1]: exposures in Rec.709 as a photo of the run would show them; see shown_photo."""
+    """Return [H, W, 3] in [0, 1]: Rec.709 exposures as a photo of the run would show them (see shown_photo)."""
     if run.color_matrix is None:
         return np.clip(run.response.encode(exposure), 0, 1)
     return encode_srgb(np.clip(exposure, 0, 1))
 
 
 def jpeg(encoded: np.ndarray, quality: int = 88) -> bytes:
-    """A JPEG of [H, W, 3] sRGB-encoded values in [0, 1]."""
+    """Encode [H, W, 3] sRGB values in [0, 1] as JPEG."""
     buffer = io.BytesIO()
     Image.fromarray(quantize(encoded)).save(buffer, "JPEG", quality=quality, optimize=True)
     return buffer.getvalue()
 
 
 def img(data: bytes, alternative: str, size: tuple[int, int], **attributes: str) -> str:
-    """An <img> that holds a JPEG. size: width and height."""
+    """Return an <img> that holds a JPEG; size is width and height."""
     extra = "".join(f' {name.replace("_", "-")}="{escape(value)}"' for name, value in attributes.items())
     source = "data:image/jpeg;base64," + base64.b64encode(data).decode()
     return f'<img src="{source}" alt="{escape(alternative)}" width="{size[0]}" height="{size[1]}"{extra}>'
 
 
 def packed_light(light: np.ndarray) -> str:
-    """[H, W, 3] as deflated half floats in base64: what light.js unpacks."""
+    """Return [H, W, 3] as deflated half floats in base64, which light.js unpacks."""
     half = np.clip(light, 0, np.finfo(np.float16).max).astype("<f2")
     return base64.b64encode(zlib.compress(half.tobytes(), 9)).decode()
 
 
 def dial(lights: Mapping[str, np.ndarray], base_time: float, gain: float, right: str, stops: float = 8.0) -> str:
-    """Pictures of one size under one exposure dial, two of them side by side: HTML that light.js brings to life.
+    """Return HTML that shows pictures of one size under one exposure dial, two of them side by side.
 
-    lights: name -> [H, W, 3] exposures at the base time, seconds. gain: see display_gain. right: which is on the right.
+    Args:
+        lights: Name -> [H, W, 3] exposures at the base time.
+        base_time: Seconds.
+        gain: See display_gain.
+        right: Name of the picture on the right.
+        stops: Range of the dial.
     """
     height, width = next(iter(lights.values())).shape[:2]
     scripts = "".join(
@@ -114,7 +125,7 @@ def dial(lights: Mapping[str, np.ndarray], base_time: float, gain: float, right:
 
 
 def side_choices(names: list[str], left: str, right: str) -> str:
-    """What stands left and right of a split."""
+    """Return the two <select> elements that choose what stands left and right of a split."""
     choices = "".join(
         f'<select aria-label="{side}">'
         + "".join(f"<option{' selected' * (name == chosen)}>{escape(name)}</option>" for name in names)
@@ -125,12 +136,17 @@ def side_choices(names: list[str], left: str, right: str) -> str:
 
 
 def page_file(name: str) -> str:
-    """A file of the folder `page`."""
+    """Return the text of a file in the folder `page`."""
     return Path(__file__).parent.joinpath("page", name).read_text(encoding="utf-8")
 
 
 def whole_page(title: str, style: str, body: str) -> str:
-    """A page that needs no other file. title: plain text; style: a file of the folder `page`, after style.css; body:
-    HTML."""
-    filled = {"title": escape(title), "style": page_file("style.css") + page_file(style), "body": body}
-    return Template(page_file("page.html")).substitute(filled, version=__version__)
+    """Return a page that needs no other file.
+
+    Args:
+        title: Plain text.
+        style: A file of the folder `page`, placed after style.css.
+        body: HTML.
+    """
+    values = {"title": escape(title), "style": page_file("style.css") + page_file(style), "body": body}
+    return Template(page_file("page.html")).substitute(values, version=__version__)

@@ -16,16 +16,16 @@ _STYLE += " gap: 14px; align-items: center; margin: 8px 0 0; } output { text-ali
 
 
 def run_html(run: Any) -> str:
-    """HTML of a run: one frame with all it needs, which static pages of a notebook show too."""
+    """Return HTML of a run: one frame with all it needs, which static pages of a notebook show too."""
     entries = run.cameras
-    shown = next((entry for entry in entries if entry.split == "test"), entries[0] if entries else None)
+    opening = next((entry for entry in entries if entry.split == "test"), entries[0] if entries else None)
     figures = [f"{run.gaussian_count:,} Gaussians", f"{run.iterations} steps", duration(run.train_seconds)]
     scores = [line["psnr_ldr"] for line in run.metrics() if "psnr_ldr" in line]
     figures += [f"held-out PSNR {score:.1f} dB" for score in scores[-1:]]
-    figures += [f"view {shown.name}"] if shown else []
+    figures += [f"view {opening.name}"] if opening else []
     body, height = f"<p><b>{escape(run.scene_name)}</b> &middot; {escape(' · '.join(figures))}</p>", 72
-    if shown is not None:
-        camera = shown.camera.within(_LONGEST)
+    if opening is not None:
+        camera = opening.camera.within(_LONGEST)
         light = as_array(run.render(camera).hdr) * np.float32(run.base_time)
         body += dial({"scene": light}, run.base_time, display_gain(run.response), "scene")
         height += 34 + round(_LONGEST * camera.height / camera.width)

@@ -16,13 +16,17 @@ _ROLE = "aces_interchange"
 
 
 def ocio_view(config: str, view: str, gain: float = 1.0) -> Callable[[np.ndarray], np.ndarray]:
-    """What makes encoded values in [0, 1] of linear Rec.709 radiance [H, W, 3].
+    """Return a function from linear Rec.709 radiance [H, W, 3] to encoded values in [0, 1].
 
-    gain: what brings radiance to display light, in which 1 is the photos' white. config: a file (.ocio, .ocioz) or a
-    built-in one (ocio://default). view: of the default display, or "DISPLAY/VIEW".
-    Light enters as ACES2065-1, by the role aces_interchange.
+    Args:
+        config: A file (.ocio, .ocioz) or a built-in config (ocio://default). Light enters as ACES2065-1, by the role
+            aces_interchange.
+        view: View of the default display, or "DISPLAY/VIEW".
+        gain: Factor from radiance to display light, in which 1 is the photos' white.
 
-    Raises SehdrError without OpenColorIO, InputError for a config that cannot be read or lacks role, display or view.
+    Raises:
+        SehdrError: Without OpenColorIO.
+        InputError: For a config that cannot be read, or that lacks the role, display or view.
     """
     try:
         OCIO: Any = import_module("PyOpenColorIO")  # Its stubs lack what it loads from its library.
@@ -40,17 +44,17 @@ def ocio_view(config: str, view: str, gain: float = 1.0) -> Callable[[np.ndarray
         raise InputError(config, f"has no role {_ROLE}, by which light enters", "take a config for OpenColorIO 2")
     display, _, name = view.rpartition("/")
     display = display or read.getDefaultDisplay()
-    for what, given, known in (
+    for what, value, known in (
         ("display", display, list(read.getDisplays())),
         ("view", name, list(read.getViews(display))),
     ):
-        if given not in known:
-            raise InputError(config, f"has no {what} {given!r}", f"choose one of {', '.join(known)}")
+        if value not in known:
+            raise InputError(config, f"has no {what} {value!r}", f"choose one of {', '.join(known)}")
     processor = read.getProcessor(_ROLE, display, name, OCIO.TRANSFORM_DIR_FORWARD).getDefaultCPUProcessor()
 
-    def shown(radiance: np.ndarray) -> np.ndarray:
+    def encode(radiance: np.ndarray) -> np.ndarray:
         pixels = np.ascontiguousarray(from_rec709(radiance, "aces2065-1") * gain, np.float32)
         processor.applyRGB(pixels)
         return np.clip(np.nan_to_num(pixels), 0, 1)
 
-    return shown
+    return encode

@@ -1,5 +1,4 @@
-"""What a training achieved: a page to look through, and pictures for papers: what the photo lost and HDR held, exposure
-stops, error against time."""
+"""Reports of a training: a page to look through, and pictures for papers."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -34,26 +33,26 @@ def write_report(
     overwrite: bool = False,
     evaluation: Mapping[str, Any] | None = None,
 ) -> list[Path]:
-    """Renders some held-out views of a trained run and writes the report; returns the paths of its files.
+    """Render some held-out views of a trained run and write the report; return the paths of its files.
 
     `report.html`: one page without a network: figures, what was left out and why, photo, scene and truth as Ultra HDR,
     brackets with an exposure dial, confidence, unexplained regions, error against time, cameras. For papers:
-    `comparison.png`: photo; photo, HDR scene and truth (where there is some) at -4 EV; a new view. `stops.png`: the
-    view of most clipped light from -4 to +4 stops: the photo alone, the HDR scene with its confidence, the truth.
-    `training.png`: held-out error against training time; left out for a run without evaluations. Of a scene without
-    test views the training views are shown, and captions say so.
+    `comparison.png`: photo; photo, HDR scene and truth (if known) at -4 EV; a new view. `stops.png`: the view with the
+    most clipped light from -4 to +4 stops: the photo alone, the HDR scene with its confidence, the truth.
+    `training.png`: held-out error against training time; absent for a run without evaluations. A scene without test
+    views shows training views, and captions say so.
 
     Args:
-        run: of load_run or train.
-        scene: what it was trained on.
-        out: the folder for the files.
-        view_count: how many views, evenly chosen.
-        overwrite: replace files that exist.
-        evaluation: of evaluate(), for the page's figures.
+        run: From load_run or train.
+        scene: What it was trained on.
+        out: Folder for the files.
+        view_count: Number of views, evenly chosen.
+        overwrite: Replace files that exist.
+        evaluation: Result of evaluate(), for the page's figures.
 
     Raises:
-        InputError: where a file exists.
-        SehdrError: for a scene without views.
+        InputError: If a file exists.
+        SehdrError: For a scene without views.
     """
     metrics = run.metrics()
     charted = any(training_points(metrics, key) for key in PANELS)
@@ -62,10 +61,10 @@ def write_report(
     for path in paths:
         check_absent(path, overwrite)
     scene = run.normalize_photos(scene)
-    given, held_out = scene.test_views or scene.train_views, bool(scene.test_views)
-    if not given:
+    candidates, held_out = scene.test_views or scene.train_views, bool(scene.test_views)
+    if not candidates:
         raise SehdrError("the scene has no views to report on; check its splits")
-    views = evenly(given, max(view_count, 1))
+    views = evenly(candidates, max(view_count, 1))
     comparisons = [compare(run, view, scene.views) for view in views]
     brightest = max(comparisons, key=lambda comparison: float((comparison.photo > 0.99).mean()))
     time = views[0].exposure_time
@@ -81,8 +80,17 @@ def write_report(
 
 
 def comparison_figure(comparisons: Sequence[Comparison], exposure_time: float, caption: str, *, held_out: bool = True):
-    """A matplotlib Figure: one row a view, with what the photo and the scene hold four stops darker, and a new view,
-    tone-mapped by one map for all. exposure_time: seconds at 0 EV."""
+    """Draw photos, what photo and scene hold four stops darker, and a new view, one row for each comparison.
+
+    Args:
+        comparisons: The rows. New views are tone-mapped by one map.
+        exposure_time: Seconds at 0 EV.
+        caption: Text below the figure.
+        held_out: Whether the photos were not trained on.
+
+    Returns:
+        A matplotlib Figure.
+    """
     columns = {"Held-out photo" if held_out else "Training photo": [c.photo for c in comparisons]}
     for name, key in (("Photo", "from_photo"), ("HDR scene", "hdr"), ("Truth", "truth")):
         radiances = [getattr(c, key) for c in comparisons]
@@ -96,8 +104,15 @@ def comparison_figure(comparisons: Sequence[Comparison], exposure_time: float, c
 
 
 def stops_figure(comparison: Comparison, exposure_time: float):
-    """A matplotlib Figure: one view at several exposures on a plain sRGB display, in rows for the photo alone, the HDR
-    scene with its confidence (where there is one) and the truth. exposure_time: seconds at 0 EV."""
+    """Draw one view at several exposures: the photo alone, the HDR scene with its confidence, and the truth.
+
+    Args:
+        comparison: The view.
+        exposure_time: Seconds at 0 EV.
+
+    Returns:
+        A matplotlib Figure, for a plain sRGB display.
+    """
     sources = {"Photo alone": comparison.from_photo, "HDR scene": comparison.hdr, "Truth": comparison.truth}
     sources = {name: radiance for name, radiance in sources.items() if radiance is not None}
     rows = [[None, *(expose(radiance, stop, scale=exposure_time) for stop in STOPS)] for radiance in sources.values()]
@@ -115,8 +130,10 @@ def stops_figure(comparison: Comparison, exposure_time: float):
 
 
 def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, cell: float):
-    """Pictures [H, W, 3] with titles above, names at the left and a caption below; None and the end of a shorter row
-    leave a place empty. cell: width of a picture, inches."""
+    """Arrange pictures [H, W, 3] with titles above, names at the left and a caption below.
+
+    None and the end of a shorter row leave a place empty. `cell` is the width of a picture in inches.
+    """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine

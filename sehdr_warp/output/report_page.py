@@ -44,10 +44,15 @@ def report_page(
     held_out: bool,
     evaluation: Mapping[str, Any] | None = None,
 ) -> str:
-    """The whole page, HTML.
+    """Return the whole page as HTML.
 
-    comparisons: views that are shown; brightest: the one of most clipped light, for the brackets. held_out: whether
-    they were not trained on. evaluation: of evaluate(), for the table of held-out views.
+    Args:
+        run: The trained run.
+        scene: What it was trained on.
+        comparisons: Views to show.
+        brightest: The view with the most clipped light, for the brackets.
+        held_out: Whether the views were not trained on.
+        evaluation: Result of evaluate(), for the table of held-out views.
     """
     gain = display_gain(run.response)
     times = {view.name: view.exposure_time for view in scene.views}
@@ -73,17 +78,17 @@ def report_page(
 
 
 def _section(title: str, lead: str, body: str) -> str:
-    """Nothing without a body."""
+    """Return a section of the page; empty without a body."""
     return f"<section>\n<h2>{title}</h2>\n<p>{lead}</p>\n{body}\n</section>" if body else ""
 
 
 def _figure(body: str, caption: str = "") -> str:
-    told = f"\n<figcaption>{caption}</figcaption>" if caption else ""
-    return f"<figure>\n{body}{told}\n</figure>" if body else ""
+    note = f"\n<figcaption>{caption}</figcaption>" if caption else ""
+    return f"<figure>\n{body}{note}\n</figure>" if body else ""
 
 
 def _wide(body: str) -> str:
-    """What a narrow window scrolls sideways rather than shrinks."""
+    """Wrap what a narrow window should scroll sideways rather than shrink."""
     return f'<div class="wide">{body}</div>' if body else ""
 
 
@@ -104,13 +109,13 @@ def _header(run: Any, scene: Scene) -> str:
         "held-out photos": f"{last['psnr_ldr']:.1f} dB" if "psnr_ldr" in last else None,
         "held-out HDR, mu-law": f"{last['psnr_mu']:.1f} dB" if "psnr_mu" in last else None,
     }
-    shown = "".join(f"<li>{name}<b>{value}</b></li>" for name, value in facts.items() if value is not None)
+    items = "".join(f"<li>{name}<b>{value}</b></li>" for name, value in facts.items() if value is not None)
     notes = "".join(f"<li>{escape(note)}</li>" for note in scene.notes)
-    told = f"Trained on {escape(summary['device'])}." if "device" in summary else "The training has not ended."
+    note = f"Trained on {escape(summary['device'])}." if "device" in summary else "The training has not ended."
     return (
         f'<header>\n<p class="quiet">sehdr-warp report</p>\n<h1>{escape(scene.name)}</h1>\n'
-        f'<p class="quiet">{told}</p>\n'
-        f'<ul class="facts">{shown}</ul>{f"<ul>{notes}</ul>" if notes else ""}\n</header>'
+        f'<p class="quiet">{note}</p>\n'
+        f'<ul class="facts">{items}</ul>{f"<ul>{notes}</ul>" if notes else ""}\n</header>'
     )
 
 
@@ -146,8 +151,8 @@ def _pictures(run: Any, comparisons: Sequence[Comparison], times: Mapping[str, f
     )
 
 
-def _brackets(shown: Comparison, time: float, gain: float) -> str:
-    sources = {"Photo alone": shown.from_photo, "Scene": shown.hdr, "Truth": shown.truth}
+def _brackets(comparison: Comparison, time: float, gain: float) -> str:
+    sources = {"Photo alone": comparison.from_photo, "Scene": comparison.hdr, "Truth": comparison.truth}
     known = {name: light for name, light in sources.items() if light is not None}
     lights = {name: smaller(light * time, _DIAL) for name, light in known.items()}
     cells = ["<span>&nbsp;</span>", *(f"<span>{stops_text(stop)}</span>" for stop in STOPS)]
@@ -158,7 +163,7 @@ def _brackets(shown: Comparison, time: float, gain: float) -> str:
             picture = jpeg(expose(small, stop, scale=time * gain), 82)
             cells.append(img(picture, f"{name} at {stops_text(stop)}", (small.shape[1], small.shape[0])))
     lead = (
-        f"View {escape(shown.name)}, re-exposed from {shutter(time)} (0 EV) and shown as a plain display does. "
+        f"View {escape(comparison.name)}, re-exposed from {shutter(time)} (0 EV) and shown as a plain display does. "
         "What the photo clipped stays flat; the scene keeps its light."
     )
     body = _figure(dial(lights, time, gain, "Scene")) + _figure(_wide(f'<div class="strip">{"".join(cells)}</div>'))
@@ -188,12 +193,12 @@ def _confidence(comparisons: Sequence[Comparison]) -> str:
 
 
 def _unexplained(run: Any, scene: Scene) -> str:
-    """The photos with the worst regions, each in a box."""
-    found = run.summary().get("unexplained")
-    if found is None:
+    """Show the photos with the worst unexplained regions, each region in a box."""
+    unexplained = run.summary().get("unexplained")
+    if unexplained is None:
         return ""
     views, photos = {view.name: view for view in scene.views}, {}
-    for region in found["worst"]:
+    for region in unexplained["worst"]:
         if region["photo"] in views:
             photos.setdefault(region["photo"], []).append(region)
     figures = []
@@ -226,9 +231,13 @@ def _unexplained(run: Any, scene: Scene) -> str:
         )
         picture = picture.replace(f'width="{size[0]}" height="{size[1]}">', f'width="{width}" height="{height}"/>')
         label = f'role="img" aria-label="unexplained regions of {escape(name)}"'
-        drawn = f'<svg viewBox="0 0 {width} {height}" {label}>{picture}{"".join(boxes)}</svg>'
-        figures.append(_figure(drawn, f"{escape(name)}: {len(regions)} of the worst regions"))
-    counted = f"{found['regions']} regions in {found['photos']} training photos" if found["regions"] else "None"
+        svg = f'<svg viewBox="0 0 {width} {height}" {label}>{picture}{"".join(boxes)}</svg>'
+        figures.append(_figure(svg, f"{escape(name)}: {len(regions)} of the worst regions"))
+    counted = (
+        f"{unexplained['regions']} regions in {unexplained['photos']} training photos"
+        if unexplained["regions"]
+        else "None"
+    )
     lead = f"{counted}: places that photo and scene show at least a stop apart."
     if figures:
         lead += " Amber: the photo is brighter than the scene, by so many stops; blue: darker."
@@ -266,8 +275,8 @@ def _table(evaluation: Mapping[str, Any] | None, held_out: bool) -> str:
     titles = ["part of the photos", "pixels", "photo PSNR, dB", *["HDR mu-law PSNR, dB"] * known]
     body += "\n<br>\n" + _rows(titles, regions, first_number=1)
     split = "Held-out views" if held_out else "Training views, since none is held out: figures flatter"
-    told = " HDR under the protocol gt-max; <code>sehdr-warp eval</code> has the others." if known else ""
-    return _section("Figures", f"{split}.{told}", body)
+    note = " HDR under the protocol gt-max; <code>sehdr-warp eval</code> has the others." if known else ""
+    return _section("Figures", f"{split}.{note}", body)
 
 
 def _map(run: Any, comparisons: Sequence[Comparison]) -> str:
@@ -276,8 +285,8 @@ def _map(run: Any, comparisons: Sequence[Comparison]) -> str:
         'From above, as the photos see it. <span style="color: var(--accent)">Amber</span>: trained on. '
         '<span style="color: var(--cool)">Blue</span>: held out.'
     )
-    drawn = camera_map(run, tone_map, [each.name for each in comparisons])
-    return _section("Cameras", lead, _figure(drawn))
+    svg = camera_map(run, tone_map, [each.name for each in comparisons])
+    return _section("Cameras", lead, _figure(svg))
 
 
 def _footer(run: Any, held_out: bool) -> str:
@@ -291,7 +300,7 @@ def _footer(run: Any, held_out: bool) -> str:
 
 
 def _rows(titles: Sequence[str], rows: Sequence[Sequence], mean: Sequence = (), first_number: int = 99) -> str:
-    """A table; columns from first_number on hold numbers. Nothing without rows."""
+    """Return a table; columns from first_number on hold numbers. Empty without rows."""
     if not rows:
         return ""
 
@@ -310,18 +319,18 @@ def smaller(picture: np.ndarray, longest: int) -> np.ndarray:
 
 
 def _size(picture: np.ndarray, longest: int) -> tuple[int, int]:
-    """Width and height of a picture that is reduced to a longest side."""
+    """Return width and height of a picture reduced to a longest side."""
     height, width = picture.shape[:2]
     return limited_size(width, height, longest)
 
 
 def stops_text(stops: float) -> str:
-    """`+2 EV`, `-1.5 EV` with a true minus sign, `0 EV`."""
+    """Format stops as `+2 EV`, `-1.5 EV` with a true minus sign, or `0 EV`."""
     return f"{round(stops, 1):+g} EV".replace("-", "\N{MINUS SIGN}") if stops else "0 EV"
 
 
 def duration(time: float) -> str:
-    """`45 s`, `3 min 20 s`, `2 h 5 min`."""
+    """Format seconds as `45 s`, `3 min 20 s` or `2 h 5 min`."""
     minutes, rest = divmod(round(time), 60)
     if minutes < 60:
         return f"{minutes} min {rest} s" if minutes else f"{rest} s"
@@ -329,5 +338,5 @@ def duration(time: float) -> str:
 
 
 def number(value: float | None, digits: int) -> str:
-    """A figure, or a dash where there is none."""
+    """Format a figure, or a dash if there is none."""
     return "\N{EN DASH}" if value is None else f"{value:.{digits}f}"

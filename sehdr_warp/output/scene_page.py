@@ -26,18 +26,20 @@ _HALF = float(np.finfo(np.float16).max)
 
 
 def write_scene_page(run: Any, path: Path | str, *, overwrite: bool = False) -> Path:
-    """Writes a run as one HTML file, which shows it in any browser with WebGL2, under an exposure slider and without a
-    network; returns the path.
+    """Write a run as one HTML file that any browser with WebGL2 shows; return the path.
 
-    Means are float32, all else half. Raises InputError where the file exists (unless overwrite), a value is not finite
-    or the scene has no cameras to look from.
+    The page has an exposure slider and needs no network. Means are float32, all else half.
+
+    Raises:
+        InputError: If the file exists (unless overwrite), a value is not finite or the scene has no cameras to look
+            from.
     """
     path = Path(path)
     check_absent(path, overwrite)
     if not run.cameras:
         raise InputError(path, "the scene has no cameras to look from", "export the run, or put cameras.json beside it")
-    seen = [entry.camera for entry in run.cameras if entry.split == "train"] or [e.camera for e in run.cameras]
-    gaussians = gaussians_of(run.model, "linear", np.array([camera.position for camera in seen]))
+    cameras = [entry.camera for entry in run.cameras if entry.split == "train"] or [e.camera for e in run.cameras]
+    gaussians = gaussians_of(run.model, "linear", np.array([camera.position for camera in cameras]))
     gaussians.require_finite(path)
     harmonics = np.clip(gaussians.harmonics * np.float32(run.base_time), -_HALF, _HALF)
     columns = dict(zip("xyz", gaussians.means.T))

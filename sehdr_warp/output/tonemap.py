@@ -20,19 +20,23 @@ _LOW, _HIGH, _WHITE = 1.0, 99.0, 99.8
 
 @dataclass(frozen=True)
 class ToneMap:
-    """scale: multiplies radiance, so that the scene's log-average comes to its key. white: the least scaled luminance
-    that is shown as white."""
+    """Reinhard's operator with fixed parameters.
+
+    Attributes:
+        scale: Factor on radiance that brings the scene's log-average to its key.
+        white: Least scaled luminance that is shown as white.
+    """
 
     scale: float
     white: float
 
     def __call__(self, radiance: np.ndarray) -> np.ndarray:
-        """[..., 3] linear Rec.709 radiance to sRGB-encoded float32 in [0, 1]; negative radiance counts as 0."""
+        """Convert [..., 3] linear Rec.709 radiance to sRGB-encoded float32 in [0, 1]; negative radiance counts as 0."""
         scaled = np.maximum(np.asarray(radiance, np.float32), 0) * np.float32(self.scale)
         luminance = (scaled @ _LUMINANCE.astype(np.float32))[..., None]
-        shown = self._curve(luminance)
-        by_luminance = scaled * (shown / np.maximum(luminance, 1e-12))
-        weight = np.minimum(shown, 1)
+        displayed = self._curve(luminance)
+        by_luminance = scaled * (displayed / np.maximum(luminance, 1e-12))
+        weight = np.minimum(displayed, 1)
         return encode_srgb(by_luminance * (1 - weight) + self._curve(scaled) * weight)
 
     def _curve(self, value: np.ndarray) -> np.ndarray:
@@ -40,8 +44,10 @@ class ToneMap:
 
 
 def fit_tone_map(pictures: Iterable[np.ndarray]) -> ToneMap:
-    """The one tone map of a scene's pictures, each [H, W, 3] linear Rec.709 radiance; black scenes get the identity
-    scale. Raises ValueError without pictures."""
+    """Return one tone map for pictures of a scene, each [H, W, 3] linear Rec.709 radiance.
+
+    Black scenes get the identity. Raises ValueError without pictures.
+    """
     # float64 before the logarithm: radiance may be small in its units.
     values = np.concatenate([(np.maximum(np.asarray(p, np.float64), 0) @ _LUMINANCE).ravel() for p in pictures])
     values = values[np.isfinite(values) & (values > 0)]  # Writers refuse what is not finite, and say where.
@@ -58,12 +64,14 @@ def fit_tone_map(pictures: Iterable[np.ndarray]) -> ToneMap:
 
 
 def expose(radiance: np.ndarray, stops: float, *, scale: float = 1.0) -> np.ndarray:
-    """[..., 3] radiance as a display shows it: radiance scale 2^stops, clipped to [0, 1], sRGB-encoded. scale: what
-    brings the picture to its normal exposure; the base exposure time, or ToneMap.scale."""
+    """Return [..., 3] radiance as a display shows it: radiance scale 2^stops, clipped to [0, 1], sRGB-encoded.
+
+    `scale` brings the picture to its normal exposure: the base exposure time, or ToneMap.scale.
+    """
     return encode_srgb(np.asarray(radiance, np.float32) * np.float32(scale * 2.0**stops))
 
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1 encoding of display-linear values, limited to [0, 1]; float32."""
+    """Encode display-linear values, limited to [0, 1], by IEC 61966-2-1; float32."""
     linear = np.clip(np.asarray(linear, np.float32), 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** np.float32(1 / 2.4) - np.float32(0.055))

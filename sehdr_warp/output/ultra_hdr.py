@@ -31,12 +31,14 @@ _DIRECTORY = (
 )
 
 
-def ultra_hdr(light: np.ndarray, shown: np.ndarray) -> bytes:
-    """A JPEG that an HDR display shows as `light`, any other as `shown`.
+def ultra_hdr(light: np.ndarray, base: np.ndarray) -> bytes:
+    """Return a JPEG that an HDR display shows as `light`, and any other display as `base`.
 
-    light: [H, W, 3] linear Rec.709 display light, in which 1 is white. shown: [H, W, 3] sRGB-encoded, in [0, 1].
+    Args:
+        light: [H, W, 3] linear Rec.709 display light, in which 1 is white.
+        base: [H, W, 3] sRGB-encoded, in [0, 1].
     """
-    codes = quantize(shown).astype(np.float32) / 255
+    codes = quantize(base).astype(np.float32) / 255
     plain = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
     light = np.clip(light, 0, 2**MOST_STOPS)
     gain = np.log2((light + _OFFSET) / (plain + _OFFSET))
@@ -44,9 +46,9 @@ def ultra_hdr(light: np.ndarray, shown: np.ndarray) -> bytes:
     brightest = max(float(np.log2(light.max(initial=0) + 1e-9)), 0.1)  # At which a display shows all of it
     facts = {"GainMapMin": low, "GainMapMax": high, "Gamma": 1, "OffsetSDR": _OFFSET, "OffsetHDR": _OFFSET}
     facts |= {"HDRCapacityMin": 0, "HDRCapacityMax": brightest, "BaseRenditionIsHDR": False}
-    told = " ".join(f'hdrgm:{name}="{value}"' for name, value in facts.items())
-    second = _with(_jpeg((gain - low) / (high - low)), _segment(0xE1, _XMP + _PACKET.format(f"{told}>").encode()))
-    first = _jpeg(shown)
+    attributes = " ".join(f'hdrgm:{name}="{value}"' for name, value in facts.items())
+    second = _with(_jpeg((gain - low) / (high - low)), _segment(0xE1, _XMP + _PACKET.format(f"{attributes}>").encode()))
+    first = _jpeg(base)
     xmp = _segment(0xE1, _XMP + _PACKET.format(_DIRECTORY.format(len(second))).encode())
     size = len(first) + len(xmp) + len(_index(0, 0, 0))
     # Offsets are counted from behind "MPF\0", of which the index is the last segment that is put in.
@@ -65,7 +67,13 @@ def _segment(marker: int, data: bytes) -> bytes:
 
 
 def _index(first: int, second: int, offset: int) -> bytes:
-    """The Multi-Picture index of two pictures of so many bytes, the second at an offset from the index's header."""
+    """Return the Multi-Picture index of two pictures.
+
+    Args:
+        first: Bytes of the first picture.
+        second: Bytes of the second.
+        offset: Of the second picture from the index's header.
+    """
     entries = struct.pack(">IIIIIIII", 0x00030000, first, 0, 0, 0, second, offset, 0)
     fields = struct.pack(">HHI4s", 0xB000, 7, 4, b"0100") + struct.pack(">HHII", 0xB001, 4, 1, 2)
     fields += struct.pack(">HHII", 0xB002, 7, len(entries), 8 + 2 + 3 * 12 + 4)
@@ -73,7 +81,7 @@ def _index(first: int, second: int, offset: int) -> bytes:
 
 
 def _head(jpeg: bytes) -> int:
-    """Where segments can be put in: behind the start and JFIF's own segment."""
+    """Return where segments can be inserted: behind the start marker and JFIF's own segment."""
     return 4 + struct.unpack(">H", jpeg[4:6])[0]
 
 

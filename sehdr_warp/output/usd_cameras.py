@@ -37,7 +37,10 @@ _CAMERA = """    def Camera "{name}"
 
 
 def usd_cameras(cameras: Sequence[tuple[str, Camera]]) -> str:
-    """The text of a stage with a UsdGeomCamera for each; its size in pixels stands in attributes of this package."""
+    """Return the text of a stage with one UsdGeomCamera for each camera.
+
+    The size in pixels, which USD does not have, is stored in attributes of this package.
+    """
     return _STAGE.format(cameras="\n".join(map(_described, _identifiers([name for name, _ in cameras]), cameras)))
 
 
@@ -54,10 +57,10 @@ def _described(name: str, named: tuple[str, Camera]) -> str:
 
 
 def _identifiers(names: Sequence[str]) -> list[str]:
-    """Names of prims: letters, digits and `_`, all different."""
-    made: list[str] = []
+    """Return names of prims: letters, digits and `_`, all different."""
+    identifiers: list[str] = []
     for name in names:
         plain = re.sub(r"^(?=\d)", "_", re.sub(r"\W", "_", name, flags=re.ASCII))
         numbered = (plain if number == 1 else f"{plain}_{number}" for number in range(1, len(names) + 2))
-        made.append(next(each for each in numbered if each not in made))
-    return made
+        identifiers.append(next(each for each in numbered if each not in identifiers))
+    return identifiers

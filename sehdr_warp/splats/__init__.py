@@ -24,7 +24,11 @@ _OTHER = {
 
 
 def check_suffix(path: Path | str, *others: str) -> str:
-    """The suffix of a splat file, in lower case; InputError for one that is not read and written, nor of the others."""
+    """Return the suffix of a splat file in lower case; `others` are suffixes that the caller accepts too.
+
+    Raises:
+        InputError: For a suffix that is neither read nor written.
+    """
     suffix = Path(path).suffix.lower()
     if suffix not in (*SUFFIXES, *others):
         why = f"{suffix} is not read or written here: it {_OTHER[suffix]}" if suffix in _OTHER else "is no splat file"
@@ -33,16 +37,18 @@ def check_suffix(path: Path | str, *others: str) -> str:
 
 
 def color_model_of(path: Path | str) -> str | None:
-    """The one color model that a file of this suffix can hold; None where it can hold any (PLY)."""
+    """Return the one color model that a file of this suffix can hold; None if it can hold any (PLY)."""
     suffix = check_suffix(path)
     return {".ply": None, ".glb": "display"}.get(suffix, "linear")
 
 
 def read_gaussians(path: Path | str) -> GaussianArrays:
-    """The Gaussians in a file of one of SUFFIXES.
+    """Read the Gaussians in a file of one of SUFFIXES.
 
-    Raises InputError where it is missing, damaged, of another kind or holds no Gaussian. Gaussians with a value that is
-    not finite are left out, with a warning.
+    Gaussians with a value that is not finite are left out, with a warning.
+
+    Raises:
+        InputError: If the file is missing, damaged, of another kind or holds no Gaussian.
     """
     suffix = check_suffix(path)
     read = {".ply": read_ply, ".glb": read_glb}.get(suffix, read_usd)
@@ -50,10 +56,12 @@ def read_gaussians(path: Path | str) -> GaussianArrays:
 
 
 def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: bool = False) -> None:
-    """Writes a file of one of SUFFIXES.
+    """Write a file of one of SUFFIXES.
 
-    Raises InputError where a value is NaN or infinite (with field and index), the file exists (unless overwrite), or
-    cannot hold these colors (see color_model_of); SehdrError where it cannot be written.
+    Raises:
+        InputError: If a value is NaN or infinite (with field and index), the file exists (unless overwrite), or the
+            format cannot hold these colors (see color_model_of).
+        SehdrError: If the file cannot be written.
     """
     held, suffix = color_model_of(path), check_suffix(path)
     if held not in (None, gaussians.color_model):

@@ -24,11 +24,17 @@ _MOST_LOG_SCALE = 20.0
 class GaussianArrays:
     """N Gaussians as NumPy arrays, float32.
 
-    means [N, 3] world; log_scales [N, 3], natural logarithm of the standard deviations; quaternions [N, 4] (w x y z);
-    opacity_logits [N]; harmonics [N, (degree + 1)^2, 3], degree 0 to 3. color_model: what their sum over a viewing
-    direction means, per channel: "display": sRGB-encoded color max(sum + 0.5, 0), as every 3DGS viewer takes it; "log":
-    scene-linear radiance exp(sum); "linear": max(sum, 0). base_time: seconds at which the scene was photographed, of
-    display colors those of the photo that they show.
+    Attributes:
+        means: [N, 3] world coordinates.
+        log_scales: [N, 3] natural logarithm of the standard deviations.
+        quaternions: [N, 4] (w x y z).
+        opacity_logits: [N].
+        harmonics: [N, (degree + 1)^2, 3], degree 0 to 3.
+        color_model: Meaning of the harmonics' sum over a viewing direction, per channel. "display": sRGB-encoded color
+            max(sum + 0.5, 0), as every 3DGS viewer reads it; "log": scene-linear radiance exp(sum); "linear": max(sum,
+            0).
+        base_time: Seconds at which the scene was photographed; for display colors, the exposure time of the photo that
+            they show.
     """
 
     means: np.ndarray
@@ -41,38 +47,44 @@ class GaussianArrays:
 
     @property
     def count(self) -> int:
+        """Number of Gaussians."""
         return len(self.means)
 
     @property
     def degree(self) -> int:
+        """Degree of the harmonics."""
         return math.isqrt(self.harmonics.shape[1]) - 1
 
     @property
     def opacities(self) -> np.ndarray:
-        """[N] in (0, 1)."""
+        """Opacities [N] in (0, 1)."""
         return (1 / (1 + np.exp(-self.opacity_logits.astype(np.float64)))).astype(np.float32)
 
     @property
     def unit_quaternions(self) -> np.ndarray:
-        """[N, 4] of length 1; the identity where they are zero."""
+        """Quaternions [N, 4] of length 1; the identity for those that are zero."""
         length = np.linalg.norm(self.quaternions, axis=1, keepdims=True)
         return np.where(length > 0, self.quaternions / np.where(length > 0, length, 1), [1, 0, 0, 0]).astype(np.float32)
 
     def with_colors(self, harmonics: np.ndarray, color_model: str) -> "GaussianArrays":
+        """Return a copy with other harmonics and color model."""
         return replace(self, harmonics=np.ascontiguousarray(harmonics, np.float32), color_model=color_model)
 
     def padded(self, degree: int) -> "GaussianArrays":
-        """With harmonics up to `degree`, zero beyond their own; never fewer."""
+        """Return a copy with harmonics up to `degree`, zero beyond its own; never fewer."""
         missing = max((degree + 1) ** 2 - self.harmonics.shape[1], 0)
         return replace(self, harmonics=np.pad(self.harmonics, ((0, 0), (0, missing), (0, 0))))
 
     def rows(self, index: np.ndarray) -> "GaussianArrays":
-        """Those at an index or mask [N]."""
+        """Return the Gaussians at an index or mask [N]."""
         return replace(self, **{name: getattr(self, name)[index] for name in _ARRAYS})
 
     def checked(self, path: Path | str) -> "GaussianArrays":
-        """Without Gaussians that are not finite; InputError where none is left, arrays differ in length, or the base
-        time is no time."""
+        """Return a copy without Gaussians that are not finite.
+
+        Raises:
+            InputError: If none is left, arrays differ in length, or the base time is not positive.
+        """
         if len(lengths := {len(getattr(self, name)) for name in _ARRAYS}) > 1:
             raise InputError(path, f"its arrays are of {sorted(lengths)} Gaussians", "export it again")
         if not 0 < self.base_time < math.inf:
@@ -80,19 +92,19 @@ class GaussianArrays:
             raise InputError(path, problem, "state a positive number of seconds")
         logits = np.clip(self.opacity_logits, -_MOST_LOGIT, _MOST_LOGIT)
         log_scales = np.clip(self.log_scales, -_MOST_LOG_SCALE, _MOST_LOG_SCALE)
-        given = replace(self, opacity_logits=logits, log_scales=log_scales)
-        arrays = (getattr(given, name) for name in _ARRAYS)
+        clamped = replace(self, opacity_logits=logits, log_scales=log_scales)
+        arrays = (getattr(clamped, name) for name in _ARRAYS)
         finite = np.all([np.isfinite(each).all(tuple(range(1, each.ndim))) for each in arrays], axis=0)
         if not finite.any():
-            found = "all of its Gaussians have values that are not finite" if self.count else "holds no Gaussian"
-            raise InputError(path, found, "export it again")
+            problem = "all of its Gaussians have values that are not finite" if self.count else "holds no Gaussian"
+            raise InputError(path, problem, "export it again")
         if finite.all():
-            return given
+            return clamped
         log.warning("%s: %d of %d Gaussians are not finite and were left out", path, (~finite).sum(), self.count)
-        return given.rows(finite)
+        return clamped.rows(finite)
 
     def require_finite(self, path: Path | str) -> None:
-        """Raises InputError with field, count and the first index where a value is NaN or infinite."""
+        """Raise InputError with field, count and the first index if a value is NaN or infinite."""
         for name in _ARRAYS:
             bad = ~np.isfinite(getattr(self, name)).reshape(self.count, -1).all(1)
             if bad.any():
@@ -104,7 +116,7 @@ _ARRAYS = tuple(field.name for field in fields(GaussianArrays))[:5]
 
 
 def degree_of(coefficients: float, path: Path) -> int:
-    """The degree of so many coefficients for each channel; InputError for a number that no degree has."""
+    """Return the degree with this many coefficients per channel; raise InputError if there is none."""
     degree = round(math.sqrt(coefficients)) - 1
     if (degree + 1) ** 2 != coefficients or not 0 <= degree <= MAX_DEGREE:
         problem = f"has {coefficients:.4g} harmonics for each channel, not 1, 4, 9 or 16"
@@ -113,8 +125,11 @@ def degree_of(coefficients: float, path: Path) -> int:
 
 
 def harmonic_basis(directions: np.ndarray, degree: int) -> np.ndarray:
-    """[..., (degree + 1)^2] float64 real spherical harmonics of unit directions [..., 3], orthonormal over the sphere,
-    with the Condon-Shortley phase and in the order of 3D Gaussian Splatting: l = 0, 1, ..., and m = -l ... l."""
+    """Return [..., (degree + 1)^2] float64 real spherical harmonics of unit directions [..., 3].
+
+    They are orthonormal over the sphere, with the Condon-Shortley phase and in the order of 3D Gaussian Splatting: l =
+    0, 1, ..., and m = -l ... l.
+    """
     from scipy.special import sph_harm_y
 
     x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
@@ -128,7 +143,7 @@ def harmonic_basis(directions: np.ndarray, degree: int) -> np.ndarray:
 
 
 def evaluate_colors(gaussians: GaussianArrays, directions: np.ndarray) -> np.ndarray:
-    """[N, D, 3] colors in the model's own meaning for directions [D, 3] or [N, D, 3]."""
+    """Return [N, D, 3] colors, as the color model defines them, for directions [D, 3] or [N, D, 3]."""
     value = harmonic_basis(directions, gaussians.degree) @ gaussians.harmonics.astype(np.float64)
     if gaussians.color_model == "log":
         return np.exp(np.clip(value, -80, 80))

@@ -26,6 +26,7 @@ _DAMAGED = "export it again"
 
 
 def write_glb(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
+    """Write a .glb file; arguments as in write_gaussians."""
     color = np.clip(gaussians.harmonics[:, 0] * HARMONIC_0 + 0.5, 0, 1)
     attributes = {
         "POSITION": gaussians.means,
@@ -70,20 +71,20 @@ def write_glb(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
 
 
 def read_glb(path: Path) -> GaussianArrays:
-    """The one primitive with the extension, of display colors in sRGB."""
+    """Read the one primitive with the extension, with display colors in sRGB."""
     described, binary = _chunks(path)
     try:
         meshes = [(mesh, each) for mesh in described["meshes"] for each in mesh["primitives"]]
-        found = [(mesh, each) for mesh, each in meshes if EXTENSION in each.get("extensions", {})]
-        if len(found) != 1:
-            problem = f"has {len(found)} primitives with {EXTENSION}, not one"
+        primitives = [(mesh, each) for mesh, each in meshes if EXTENSION in each.get("extensions", {})]
+        if len(primitives) != 1:
+            problem = f"has {len(primitives)} primitives with {EXTENSION}, not one"
             raise InputError(path, problem, "export one scene of Gaussians")
-        mesh, primitive = found[0]
+        mesh, primitive = primitives[0]
         attributes = primitive["attributes"]
-        stated = primitive["extensions"][EXTENSION]
+        extension = primitive["extensions"][EXTENSION]
         for key, known in (("colorSpace", _SPACE), ("kernel", "ellipse")):
-            if stated.get(key) != known:
-                problem = f"its {key} is {stated.get(key)!r:.60}, not {known}"
+            if extension.get(key) != known:
+                problem = f"its {key} is {extension.get(key)!r:.60}, not {known}"
                 raise InputError(path, problem, "export it as display colors in sRGB, of ellipses")
         if any({"matrix", "translation", "rotation", "scale"} & set(node) for node in described.get("nodes", [])):
             raise InputError(path, "moves its Gaussians by a node's transform", "bake the transform into the Gaussians")
@@ -93,8 +94,8 @@ def read_glb(path: Path) -> GaussianArrays:
                 raise InputError(path, f"has no attribute {name}", "export it by the ratified extension")
             return _accessor(described, binary, attributes[name], columns)
 
-        kept = (name for name in attributes if name.startswith(f"{EXTENSION}:SH_DEGREE_"))
-        degree = degree_of(sum(1 for _ in kept), path)
+        names = (name for name in attributes if name.startswith(f"{EXTENSION}:SH_DEGREE_"))
+        degree = degree_of(sum(1 for _ in names), path)
         means, scales = values("POSITION", 3), values(f"{EXTENSION}:SCALE", 3)
         quaternions = np.roll(values(f"{EXTENSION}:ROTATION", 4), 1, axis=1)
         opacities = values(f"{EXTENSION}:OPACITY", 1)[:, 0]
@@ -112,7 +113,7 @@ def _harmonic_names(degree: int) -> list[str]:
 
 
 def _chunks(path: Path) -> tuple[dict[str, Any], bytes]:
-    """The description and the binary chunk."""
+    """Return the description and the binary chunk."""
     data = read_bytes(path)
     if len(data) < 20 or struct.unpack_from("<2I", data) != (_MAGIC, 2):
         raise InputError(path, "is not binary glTF 2.0", _DAMAGED)
@@ -127,7 +128,7 @@ def _chunks(path: Path) -> tuple[dict[str, Any], bytes]:
 
 
 def _accessor(described: dict, binary: bytes, index: int, columns: int) -> np.ndarray:
-    """[count, columns] float32; ValueError or KeyError where the file is damaged."""
+    """Return [count, columns] float32; raise ValueError or KeyError if the file is damaged."""
     accessor = described["accessors"][index]
     view = described["bufferViews"][accessor["bufferView"]]
     kind, one = _TYPES[accessor["componentType"]]

@@ -21,6 +21,7 @@ _MOST_HEADER = 1 << 16
 
 
 def write_ply(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
+    """Write a .ply file; arguments as in write_gaussians."""
     from plyfile import PlyData, PlyElement
 
     rest = gaussians.harmonics[:, 1:].swapaxes(1, 2).reshape(gaussians.count, -1)
@@ -44,7 +45,7 @@ def write_ply(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
 
 
 def read_ply(path: Path) -> GaussianArrays:
-    """Of the reference release, gsplat, nerfstudio and this package; other properties are passed over."""
+    """Read a file of the reference release, gsplat, nerfstudio or this package; other properties are ignored."""
     from plyfile import PlyData, PlyParseError
 
     _check_header(path)
@@ -75,8 +76,10 @@ def _columns(columns: list[np.ndarray]) -> np.ndarray:
 
 
 def _check_header(path: Path) -> None:
-    """Refuses a file that claims more than it can hold, before anything is read: of a text plyfile would first ask for
-    the memory of all that is claimed."""
+    """Refuse a file that claims more than it can hold, before anything is read.
+
+    plyfile would first reserve the memory of all that a text file claims.
+    """
     size = len(read_start := _start(path))
     header = read_start.partition(b"end_header")[0]
     if not header.startswith(b"ply") or size == len(header):
@@ -109,11 +112,11 @@ def _without(missing: list[str], names: set[str]) -> str:
 
 
 def _facts(comments: list[str], path: Path) -> tuple[str, float]:
-    """The color model and the base exposure time that the header states."""
-    stated = dict(line.removeprefix("sehdr:").split(maxsplit=1) for line in comments if re.match(r"sehdr:\w+ \S", line))
-    color_model = stated.get("color_model", "display")
+    """Return the color model and the base exposure time that the header states."""
+    facts = dict(line.removeprefix("sehdr:").split(maxsplit=1) for line in comments if re.match(r"sehdr:\w+ \S", line))
+    color_model = facts.get("color_model", "display")
     try:
-        base_time = float(stated.get("base_exposure_time", 1.0))
+        base_time = float(facts.get("base_exposure_time", 1.0))
     except ValueError:
         base_time = np.nan
     if color_model not in _COLOR_MODELS or not 0 < base_time < np.inf:

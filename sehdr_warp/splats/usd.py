@@ -22,7 +22,7 @@ _DEVIATIONS = 3.0
 
 
 def pxr(module: str) -> Any:
-    """A module of OpenUSD; SehdrError where it is not installed."""
+    """Return a module of OpenUSD; raise SehdrError if it is not installed."""
     from importlib import import_module
 
     try:
@@ -32,8 +32,10 @@ def pxr(module: str) -> Any:
 
 
 def open_stage(path: Path) -> Any:
-    """A stage, of files in the folder of `path` alone. To be called by what read_apart calls: OpenUSD is misled by a
-    damaged file to fill any memory."""
+    """Open a stage whose files all lie in the folder of `path`.
+
+    Call it only from functions that read_apart calls: a damaged file can make OpenUSD fill any memory.
+    """
     stage = pxr("Usd").Stage.Open(str(path))
     folder = path.resolve().parent
     for layer in stage.GetUsedLayers():
@@ -43,6 +45,7 @@ def open_stage(path: Path) -> Any:
 
 
 def write_usd(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
+    """Write a .usda, .usdc or .usdz file; arguments as in write_gaussians."""
     Usd, UsdGeom, UsdVol, Sdf = (pxr(name) for name in ("Usd", "UsdGeom", "UsdVol", "Sdf"))
     packed = path.suffix.lower() == ".usdz"
     with atomic_path(path, overwrite) as temporary:
@@ -78,7 +81,7 @@ def write_usd(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
 
 
 def read_usd(path: Path) -> GaussianArrays:
-    """The one ParticleField3DGaussianSplat of a stage, where it stands in the world."""
+    """Read the one ParticleField3DGaussianSplat of a stage, in world coordinates."""
     pxr("Usd")
     stored = read_apart(usd_arrays, path, "USD", "export it again")
     if stored["count"] != 1:
@@ -108,14 +111,14 @@ def read_usd(path: Path) -> GaussianArrays:
 
 
 def usd_arrays(path: Path) -> dict[str, Any]:
-    """How many prims of Gaussians a stage has, and the attributes of the first."""
+    """Return how many prims of Gaussians a stage has, and the attributes of the first."""
     Usd, UsdGeom, UsdVol = (pxr(name) for name in ("Usd", "UsdGeom", "UsdVol"))
     stage = open_stage(path)
-    found = [prim for prim in stage.Traverse() if prim.IsA(UsdVol.ParticleField3DGaussianSplat)]
-    if len(found) != 1:
-        return {"count": len(found)}
-    prim, splat = found[0], UsdVol.ParticleField3DGaussianSplat(found[0])
-    told = {
+    prims = [prim for prim in stage.Traverse() if prim.IsA(UsdVol.ParticleField3DGaussianSplat)]
+    if len(prims) != 1:
+        return {"count": len(prims)}
+    prim, splat = prims[0], UsdVol.ParticleField3DGaussianSplat(prims[0])
+    stored = {
         "count": 1,
         "space": str(Usd.ColorSpaceAPI.ComputeColorSpaceName(prim, None) or ""),
         "matrix": np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())),
@@ -124,8 +127,8 @@ def usd_arrays(path: Path) -> dict[str, Any]:
     }
     for name in ("positions", "scales", "orientations", "opacities", _HARMONICS):
         for value in filter(None, (prim.GetAttribute(each).Get() for each in (f"{name}h", name))):
-            told[name] = np.array(value, np.float32)
-    return told
+            stored[name] = np.array(value, np.float32)
+    return stored
 
 
 def _array(kind: str, values: np.ndarray):
@@ -133,7 +136,7 @@ def _array(kind: str, values: np.ndarray):
 
 
 def _quaternions(values: np.ndarray):
-    """OpenUSD's arrays hold the real part last."""
+    """Return quaternions in OpenUSD's order, with the real part last."""
     return _array("QuatfArray", np.roll(values, -1, axis=1))
 
 

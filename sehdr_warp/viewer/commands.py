@@ -29,7 +29,8 @@ class View:
     """The photos, if they have moved since the training."""
 
 
-def run_view(asked: View) -> None:
+def run_view(args: View) -> None:
+    """Run `sehdr-warp view`."""
     from functools import cache
 
     from ..errors import InputError, UsageError
@@ -37,20 +38,20 @@ def run_view(asked: View) -> None:
     from .server import Server, Viewer
     from .watching import Watch
 
-    if not asked.runs:
+    if not args.runs:
         raise UsageError("view needs RUN, the folder of a run; see sehdr-warp view --help")
-    if not 0 <= asked.port < 65536:
-        raise UsageError(f"--port {asked.port}: is no port; give 1 to 65535, or 0 for any")
-    watch = Watch(asked.runs, lambda path: open_scene(path, asked.device))
+    if not 0 <= args.port < 65536:
+        raise UsageError(f"--port {args.port}: is no port; give 1 to 65535, or 0 for any")
+    watch = Watch(args.runs, lambda path: open_scene(path, args.device))
 
     @cache
     def photos(index: int) -> dict:
         if not isinstance(watch.shown[index].run, Run):
-            raise InputError(asked.runs[index], "is a file of Gaussians, without photos", "view the run it came from")
-        return {view.name: view for view in load_run_photos(watch.shown[index], asked.data).views}
+            raise InputError(args.runs[index], "is a file of Gaussians, without photos", "view the run it came from")
+        return {view.name: view for view in load_run_photos(watch.shown[index], args.data).views}
 
     watch.start()
-    with Server(Viewer(watch.shown, photos), asked.host, asked.port) as server:
+    with Server(Viewer(watch.shown, photos), args.host, args.port) as server:
         print(f"{server.url}  (Ctrl-C ends it)", flush=True)
         try:
             server.serve_forever()

@@ -17,36 +17,48 @@ MOST_PIXELS = 4096 * 2304
 _HALF_MOST = 65504.0
 
 
-class Rendering:
-    """A run that several threads may render from, one at a time; otherwise the run.
+class ViewerScene:
+    """A run that several threads may render from, one at a time; other attributes are the run's.
 
-    clipped: for each Gaussian the share of photographed values that were clipped, [N]; None where it is not known.
+    Attributes:
+        run: The scene that is shown.
+        name: Its path, as on the command line.
+        clipped: [N] share of photographed values that were clipped, for each Gaussian; None if unknown.
+        lock: Held while the scene is rendered.
+        version: Counts replacements.
     """
 
     def __init__(self, run: Any, name: str, clipped: Tensor | None = None):
+        """Show a run under a name."""
         self.run, self.name, self.clipped = run, name, clipped
         self.lock, self.version = threading.Lock(), 0
 
     def replace(self, run: Any, clipped: Tensor | None) -> None:
-        """Shows another run from now on."""
+        """Show another run from now on."""
         with self.lock:
             self.run, self.clipped = run, clipped
             self.version += 1
 
     def __getattr__(self, name: str):
+        """Return an attribute of the run."""
         return getattr(self.run, name)
 
     def render(self, camera: Camera):
+        """Render a camera while no other thread does."""
         with self.lock:
             return self.run.render(camera)
 
     def render_confidence(self, camera: Camera) -> Tensor | None:
+        """Render confidence while no other thread renders."""
         with self.lock:
             return self.run.render_confidence(camera)
 
     def frame(self, camera: Camera, *, draft: bool = False, clipped: bool = False) -> memoryview:
-        """Half floats, row by row: [H, W, 4] exposure at the base time and confidence (1 in a draft, and where it is
-        not known), [H, W] depth, and with `clipped` [H, W] the share of clipped values."""
+        """Render a camera as half floats, row by row.
+
+        The planes are [H, W, 4] exposure at the base time and confidence (1 in a draft, or if unknown), [H, W] depth,
+        and with `clipped` [H, W] the share of clipped values.
+        """
         with torch.no_grad():
             rendered = self.render(camera)
             light, size = torch.as_tensor(rendered.hdr), (camera.height, camera.width)
@@ -56,9 +68,9 @@ class Rendering:
                     planes.append(self.run.model.render_mean(camera, self.clipped))
             confidence = None if draft else self.render_confidence(camera)
             frame = torch.empty((4 + len(planes), *size), dtype=torch.float16, device=light.device)
-            shown = frame[:4].view(*size, 4)
-            shown[..., :3] = (light * self.base_time).clamp_(0, _HALF_MOST)
-            shown[..., 3] = 1.0 if confidence is None else torch.as_tensor(confidence)
+            picture = frame[:4].view(*size, 4)
+            picture[..., :3] = (light * self.base_time).clamp_(0, _HALF_MOST)
+            picture[..., 3] = 1.0 if confidence is None else torch.as_tensor(confidence)
             for place, plane in zip(frame[4:], planes, strict=True):
                 place.copy_(plane.clamp(0, _HALF_MOST))
             if frame.is_cuda:  # Into pages that the device writes to itself: several times as fast
@@ -66,7 +78,7 @@ class Rendering:
             return frame.numpy().data.cast("B")
 
     def facts(self) -> dict[str, Any]:
-        """What the page knows of the run: plain values."""
+        """Return what the page knows of the run, as plain values."""
         return {
             "name": self.name,
             "version": self.version,
@@ -82,7 +94,11 @@ class Rendering:
 
 
 def camera_of(values: dict) -> Camera:
-    """The camera that a page describes; raises ValueError, KeyError or TypeError for a bad one, or one too large."""
+    """Return the camera that a page describes.
+
+    Raises:
+        ValueError: For a bad value, or a picture that is too large; KeyError or TypeError for a missing or wrong field.
+    """
     camera = Camera.from_dict(values)
     if camera.width * camera.height > MOST_PIXELS:
         raise ValueError(f"{camera.width} x {camera.height} is more than {MOST_PIXELS} pixels")
@@ -90,7 +106,7 @@ def camera_of(values: dict) -> Camera:
 
 
 def camera_file(cameras: Sequence[Camera]) -> str:
-    """Cameras as `render --cameras` reads them."""
+    """Return cameras as JSON that `render --cameras` reads."""
     digits = max(3, len(str(len(cameras) - 1)))
     named = [{"name": f"view_{i:0{digits}d}"} | camera.to_dict() for i, camera in enumerate(cameras)]
     return json.dumps({"cameras": named}, indent=1)

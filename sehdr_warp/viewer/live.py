@@ -14,7 +14,7 @@ from sehdr_warp.scene import Camera
 
 from ..console import format_seconds
 from ..errors import SehdrError
-from .frames import Rendering
+from .frames import ViewerScene
 from .server import Server, Viewer
 
 log = logging.getLogger(__name__)
@@ -26,15 +26,16 @@ MOST_POINTS = 500
 _WAIT = 0.05
 
 
-class LiveTraining(Rendering):
-    """A Training, as the one run of a Viewer and its `training`.
+class LiveTraining(ViewerScene):
+    """A Training, as the one scene of a Viewer and its `training`.
 
-    attend() gives the training's steps on; between them pictures are made that browsers wait for, for at most SHARE of
-    the time, and no longer than that at a stretch but where one picture takes longer. Nothing is computed that the
-    training would read: its result is that without a viewer.
+    attend() passes on the training's steps. Between them it renders pictures that browsers wait for, for at most SHARE
+    of the time, and no longer than that at a stretch unless one picture takes longer. Nothing the training reads is
+    changed: its result is the same as without a viewer.
     """
 
     def __init__(self, training: Any, name: str):
+        """Show a Training under a name."""
         super().__init__(training, name)
         self.paused = self.ended = False
         self._thread: threading.Thread | None = None
@@ -42,9 +43,10 @@ class LiveTraining(Rendering):
         self._asked: queue.Queue[_Picture] = queue.Queue()
         self._credit = self._spent = 0.0
         self._curve: list[tuple] = []
-        self._told: dict[str, Any] = {}
+        self._progress: dict[str, Any] = {}
 
     def __getattr__(self, name: str):
+        """Return what the viewer reads of a run from the training."""
         field = self.run.trainer.field
         known = {"response": field.response, "base_time": field.base_time, "gaussian_count": field.gaussians.count}
         known |= {"scene_name": self.run.scene.name, "iterations": self.run.iteration, "cameras": self.run.scene.views}
@@ -54,18 +56,20 @@ class LiveTraining(Rendering):
         return known[name]
 
     def render(self, camera: Camera):
+        """Render between two steps."""
         return self._between_steps(lambda: self.run.render(camera))
 
     def frame(self, camera: Camera, *, draft: bool = False, clipped: bool = False) -> memoryview:
+        """Render between two steps; see ViewerScene.frame."""
         return self._between_steps(lambda: super(LiveTraining, self).frame(camera, draft=draft, clipped=clipped))
 
     def _between_steps(self, make: Callable[[], Any]) -> Any:
-        """What `make` gives. A browser's thread waits until the training has made it, in the time for pictures."""
+        """Call `make` in the training's thread and return its result; other threads wait for it."""
         if threading.current_thread() is self._thread:
             return make()
         picture = _Picture(make)
         self._asked.put(picture)
-        while not picture.made.wait(_WAIT):
+        while not picture.done.wait(_WAIT):
             if self.ended:
                 raise SehdrError("the training has ended; `sehdr-warp view` shows the run")
         if picture.error is not None:
@@ -73,21 +77,21 @@ class LiveTraining(Rendering):
         return picture.result
 
     def render_confidence(self, camera: Camera) -> None:
-        """Nothing yet: it is measured at the end."""
+        """Return None: confidence is measured at the end of a training."""
 
     def control(self, what: str) -> None:
-        """pause, resume, or step: one step, then a pause."""
+        """Pause, resume, or make one step and then pause."""
         if what not in ("pause", "resume", "step"):
             raise ValueError(f"{what!r} is none of pause, resume, step")
         self.paused = what != "resume"
         self._steps += what == "step"
 
-    def told(self) -> dict[str, Any]:
-        """What the page shows of the training: plain values."""
-        return self._told | {"paused": self.paused, "ended": self.ended, "curve": list(self._curve)}
+    def progress(self) -> dict[str, Any]:
+        """Return what the page shows of the training, as plain values."""
+        return self._progress | {"paused": self.paused, "ended": self.ended, "curve": list(self._curve)}
 
     def attend(self) -> Iterator[Any]:
-        """The steps of the training, with pictures made in between."""
+        """Yield the steps of the training, and render pictures in between."""
         started, last = time.perf_counter(), 0.0
         self._thread = threading.current_thread()
         try:
@@ -121,26 +125,26 @@ class LiveTraining(Rendering):
     def _make(self, picture: "_Picture") -> None:
         started = time.perf_counter()
         picture.make()
-        taken = time.perf_counter() - started
+        duration = time.perf_counter() - started
         if not self.paused:
-            self._spent += taken
-            self._credit -= taken
+            self._spent += duration
+            self._credit -= duration
 
     def _tell(self, step: Any, elapsed: float) -> None:
         figures = {"loss": step.loss, "psnr": step.psnr, "gaussians": step.gaussians}
         self._curve.append((step.iteration, *figures.values()))
         if len(self._curve) > MOST_POINTS:
             self._curve = self._curve[::2]
-        left = None if step.seconds_left is None else format_seconds(step.seconds_left)
+        remaining = None if step.seconds_left is None else format_seconds(step.seconds_left)
         share = self._spent / max(elapsed, 1e-9)
-        self._told = {"iteration": step.iteration, "total": step.total, "left": left, "share": share} | figures
+        self._progress = {"iteration": step.iteration, "total": step.total, "left": remaining, "share": share} | figures
 
 
 class _Picture:
-    """Something to be computed by another thread."""
+    """A computation for another thread."""
 
     def __init__(self, function: Callable[[], Any]):
-        self.function, self.made = function, threading.Event()
+        self.function, self.done = function, threading.Event()
         self.result: Any = None
         self.error: Exception | None = None
 
@@ -150,12 +154,12 @@ class _Picture:
                 self.result = self.function()
         except Exception as error:  # noqa: BLE001  It is raised where it was asked for.
             self.error = error
-        self.made.set()
+        self.done.set()
 
 
 @contextmanager
 def viewed(training: Any, name: str) -> Iterator[Iterator]:
-    """The steps of a Training, while a server shows it."""
+    """Serve a page that shows a Training while its steps are made; the context is an iterator of the steps."""
     live = LiveTraining(training, name)
     photos = {view.name: view for view in training.scene.views}
     with Server(Viewer([live], lambda index: photos, live)) as server:

@@ -25,7 +25,7 @@ from ..output.film import write_film
 from ..output.images import quantize
 from ..output.light_pictures import page_file, shown_photo
 from ..output.render_views import render_views
-from .frames import Rendering, camera_file, camera_of
+from .frames import ViewerScene, camera_file, camera_of
 
 log = logging.getLogger(__name__)
 PORTS_TRIED = 50
@@ -42,23 +42,27 @@ _LOCAL = ("127.0.0.1", "localhost", "[::1]")
 
 
 class Refusal(Exception):
-    """An answer that is an error: a status of HTTP and a line."""
+    """An error answer: an HTTP status and one line."""
 
     def __init__(self, status: int, line: str):
+        """Set the status and the line."""
         self.status = status
         super().__init__(line)
 
 
 class Viewer:
-    """What the server shows.
-
-    runs: to look at and compare. photos: returns the views of a run by name, reading them where that has not happened;
-    raises SehdrError where they are gone. training: as TrainingView, where one runs.
-    """
+    """What the server shows, and its answers to a page."""
 
     def __init__(
-        self, runs: Sequence[Rendering], photos: Callable[[int], dict[str, Any]] | None = None, training: Any = None
+        self, runs: Sequence[ViewerScene], photos: Callable[[int], dict[str, Any]] | None = None, training: Any = None
     ):
+        """Set what is shown.
+
+        Args:
+            runs: Scenes to look at and compare.
+            photos: Returns the views of a run by name, and reads them on first use; raises SehdrError if they are gone.
+            training: A LiveTraining, if one runs.
+        """
         self.runs, self.training, self.saving = list(runs), training, ""
         self._photos, self._reading, self._saving = photos, threading.Lock(), threading.Lock()
         page = Path(__file__).parent / "page"
@@ -73,50 +77,50 @@ class Viewer:
         }
 
     def get(self, path: str) -> tuple[str, bytes]:
-        """Content type and content; raises Refusal."""
+        """Answer a GET: content type and content; raise Refusal."""
         if path in self.files:
             kind, text = self.files[path]
             return f"{kind}; charset=utf-8", text.encode()
         if path == "/scene":
-            told = {"runs": [run.facts() for run in self.runs], "training": self.training is not None}
-            return "application/json", json.dumps(told).encode()
+            facts = {"runs": [run.facts() for run in self.runs], "training": self.training is not None}
+            return "application/json", json.dumps(facts).encode()
         if path == "/versions":
             return "application/json", json.dumps([run.version for run in self.runs]).encode()
         if path == "/training" and self.training is not None:
-            return "application/json", json.dumps(self.training.told()).encode()
+            return "application/json", json.dumps(self.training.progress()).encode()
         if path == "/saving":
             return "text/plain", self.saving.encode()
         if path.startswith("/photo/"):
             return "image/png", self._photo(path.removeprefix("/photo/"))
         raise Refusal(404, "no such page")
 
-    def post(self, path: str, asked: dict) -> tuple[str, bytes | memoryview]:
-        """Content type and content; raises Refusal, and what a bad question raises."""
+    def post(self, path: str, request: dict) -> tuple[str, bytes | memoryview]:
+        """Answer a POST: content type and content; raise Refusal, or the error of a bad request."""
         if path == "/training" and self.training is not None:
-            self.training.control(str(asked["do"]))
+            self.training.control(str(request["do"]))
             return "application/json", b"{}"
         if path == "/frame":
-            options = {name: bool(asked.get(name)) for name in ("draft", "clipped")}
-            return "application/octet-stream", self._run(asked).frame(camera_of(asked["camera"]), **options)
+            options = {name: bool(request.get(name)) for name in ("draft", "clipped")}
+            return "application/octet-stream", self._run(request).frame(camera_of(request["camera"]), **options)
         if path in ("/path", "/save"):
-            cameras = [camera_of(camera) for camera in asked["cameras"][:MOST_VIEWS]]
+            cameras = [camera_of(camera) for camera in request["cameras"][:MOST_VIEWS]]
             if not cameras:
-                raise Refusal(400, "no cameras are given")
-            if asked.get("count"):
-                cameras = interpolate(cameras, min(int(asked["count"]), MOST_VIEWS))
+                raise Refusal(400, "the request has no cameras")
+            if request.get("count"):
+                cameras = interpolate(cameras, min(int(request["count"]), MOST_VIEWS))
             if path == "/path":
                 return "application/json", camera_file(cameras).encode()
-            return self._save(self._run(asked), cameras, str(asked["kind"]), asked)
+            return self._save(self._run(request), cameras, str(request["kind"]), request)
         raise Refusal(404, "no such page")
 
-    def _run(self, asked: dict) -> Rendering:
-        index = int(asked.get("run", 0))
+    def _run(self, request: dict) -> ViewerScene:
+        index = int(request.get("run", 0))
         if not 0 <= index < len(self.runs):
             raise Refusal(404, "no such run")
         return self.runs[index]
 
     def _photo(self, name: str) -> bytes:
-        """The photo of a run and view by their indices, as PNG."""
+        """Return the photo of a run and view, named by their indices, as PNG."""
         run, _, view = name.partition("/")
         if not (run.isascii() and view.isascii() and run.isdigit() and view.isdigit() and len(name) < 20):
             raise Refusal(404, "no such photo")
@@ -124,28 +128,28 @@ class Viewer:
         if self._photos is None or int(view) >= len(entries):
             raise Refusal(404, "no such photo")
         with self._reading:
-            found = self._photos(int(run)).get(entries[int(view)].name)
-        if found is None:
+            view_photo = self._photos(int(run)).get(entries[int(view)].name)
+        if view_photo is None:
             raise Refusal(404, "no such photo")
         buffer = io.BytesIO()
-        photo = shown_photo(self._run({"run": run}), found)
+        photo = shown_photo(self._run({"run": run}), view_photo)
         Image.fromarray(quantize(photo)).save(buffer, "PNG", compress_level=1)
         return buffer.getvalue()
 
-    def _save(self, run: Rendering, cameras: Sequence, kind: str, asked: dict) -> tuple[str, bytes]:
-        """Files of cameras, as `render` writes them: one EXR, a zip of brackets and all, or a film."""
+    def _save(self, run: ViewerScene, cameras: Sequence, kind: str, request: dict) -> tuple[str, bytes]:
+        """Return files of cameras as `render` writes them: one EXR, a zip of brackets and the rest, or a film."""
         if not self._saving.acquire(blocking=False):
             raise Refusal(503, "another save is still being made")
         try:
             with tempfile.TemporaryDirectory() as folder:
                 if kind == "film":
-                    stops = float(asked.get("stops") or 0)
+                    stops = float(request.get("stops") or 0)
                     options = {"ev_ramp": (stops, stops), "exposed": True, "tell": self._tell}
                     return "video/mp4", write_film(run, Path(folder, "film.mp4"), cameras, **options).read_bytes()
-                given = Path(folder, "cameras.json")
-                given.write_text(camera_file(cameras), encoding="utf-8")
-                evs = str(asked.get("evs") or "-4,-2,0,2,4") if kind == "brackets" else None
-                files = render_views(run, Path(folder, "views"), cameras=given, evs=evs)
+                camera_path = Path(folder, "cameras.json")
+                camera_path.write_text(camera_file(cameras), encoding="utf-8")
+                evs = str(request.get("evs") or "-4,-2,0,2,4") if kind == "brackets" else None
+                files = render_views(run, Path(folder, "views"), cameras=camera_path, evs=evs)
                 if kind == "exr" and len(cameras) == 1:
                     return "image/x-exr", files[0].read_bytes()
                 buffer = io.BytesIO()
@@ -158,16 +162,17 @@ class Viewer:
             self._saving.release()
 
     def _tell(self, line: str) -> None:
-        """What a page shows meanwhile of a film that is made."""
+        """Set the line that a page shows while a film is rendered."""
         self.saving = line
 
 
 class Server(ThreadingHTTPServer):
-    """The viewer's server on a port of a host, the next free one where that is taken; its address is `url`."""
+    """The viewer's server on a port of a host; `url` is its address."""
 
     daemon_threads, block_on_close, request_queue_size = True, False, 64
 
     def __init__(self, viewer: Viewer, host: str = "127.0.0.1", port: int = 8080):
+        """Listen on the port, or on the next free one."""
         self.viewer, self.host = viewer, host
         self.free = threading.BoundedSemaphore(MOST_CONNECTIONS)
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -187,18 +192,21 @@ class Server(ThreadingHTTPServer):
         self.url = f"http://{place}:{self.server_address[1]}/"
 
     def process_request(self, request, client_address) -> None:
+        """Start a thread for a connection, unless there are too many."""
         if not self.free.acquire(blocking=False):
             self.shutdown_request(request)
             return
         super().process_request(request, client_address)
 
     def process_request_thread(self, request, client_address) -> None:
+        """Serve a connection and release its place."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self.free.release()
 
     def handle_error(self, request, client_address) -> None:
+        """Log a broken connection for debugging only."""
         log.debug("a connection of %s ended", client_address)
 
     def allowed(self, host: str, origin: str | None) -> bool:

@@ -7,32 +7,39 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import SehdrError
-from .frames import Rendering
+from .frames import ViewerScene
 
 log = logging.getLogger(__name__)
 PATIENCE = 2.0  # Seconds between looks
 
 
 class Watch(threading.Thread):
-    """Scenes of paths as `shown`; once started, it looks every PATIENCE seconds whether they have changed.
+    """Scenes that are loaded again when their files change.
 
-    load: gives the run, or the Gaussians, of a path; raises SehdrError. What cannot be read leaves the scene as it was,
-    and a line says why.
+    Once started, it looks every PATIENCE seconds whether the files have changed. A scene that cannot be read stays as
+    it was, and a line says why.
     """
 
     def __init__(self, paths: Sequence[Path], load: Callable[[Path], Any]):
+        """Load all scenes.
+
+        Args:
+            paths: Of runs, or files of Gaussians.
+            load: Returns the run, or the Gaussians, of a path; raises SehdrError.
+        """
         super().__init__(daemon=True)
         self._load, self._ended = load, threading.Event()
         self._states = [_state(path) for path in paths]  # Before they are read: what comes between is not missed.
         runs = [load(path) for path in paths]
-        self.shown = [Rendering(run, str(path), run.clipped_share()) for run, path in zip(runs, paths, strict=True)]
+        self.shown = [ViewerScene(run, str(path), run.clipped_share()) for run, path in zip(runs, paths, strict=True)]
 
     def run(self) -> None:
+        """Look for changes until stop() is called."""
         while not self._ended.wait(PATIENCE):
             self.look()
 
     def look(self) -> None:
-        """Loads again what has changed."""
+        """Load again the scenes whose files have changed."""
         for index, rendering in enumerate(self.shown):
             path, known = Path(rendering.name), self._states[index]
             self._states[index] = state = _state(path)
@@ -49,13 +56,14 @@ class Watch(threading.Thread):
                 log.debug("%s has changed and is shown as it is now", path)
 
     def stop(self) -> None:
+        """End the thread and wait for it."""
         self._ended.set()
         if self.is_alive():
             self.join(30)
 
 
 def _state(path: Path) -> dict[Path, int]:
-    """The files that a scene is read from, and when each was written; none where it is gone."""
+    """Return the files that a scene is read from with their times of change; empty if it is gone."""
     files = [path] if path.is_file() else [*path.glob("checkpoints/*/checkpoint.json"), path / "confidence.safetensors"]
     try:
         return {file: file.stat().st_mtime_ns for file in files if file.exists()}

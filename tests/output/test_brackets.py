@@ -28,12 +28,12 @@ def test_exposures_ascend_and_are_of_the_one_grammar():
 @pytest.mark.parametrize(
     "given, message",
     [  # The grammar's own refusals are field's to test.
-        ({"evs": [0], "exposures": [1]}, "both were given"),
-        ({}, "neither was given"),
-        ({"evs": [0, float("nan")]}, "evs: nan is no number of stops"),
+        ({"evs": [0], "exposures": [1]}, "both are set"),
+        ({}, "neither is set"),
+        ({"evs": [0, float("nan")]}, "evs: nan is not a number of stops"),
         ({"exposures": [2, 1, "4x"]}, "exposures: 2 s is given twice"),
         ({"evs": [1, 1.0]}, "evs: 1 s is given twice"),
-        ({"evs": "0,two"}, "evs: 'two' is no number of stops; write numbers"),
+        ({"evs": "0,two"}, "evs: 'two' is not a number of stops; write numbers"),
         ({"exposures": [1e-30]}, "exposures: 1e-30 s .* is outside"),
     ],
 )

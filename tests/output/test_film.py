@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from sehdr_warp.cli import parse_command
 from sehdr_warp.errors import InputError, SehdrError, UsageError
 from sehdr_warp.output import film
-from sehdr_warp.output.commands import Render, _ramp, run_render
+from sehdr_warp.output.commands import FilmOptions, Render, ViewFileOptions, _ramp, run_render
 from sehdr_warp.output.film import encode, write_film
 from sehdr_warp.output.light_pictures import display_gain
 
@@ -80,7 +81,7 @@ def test_a_ramp_runs_through_the_stops(tmp_path):
 def test_a_film_says_how_long_it_is(tmp_path, monkeypatch, capsys, caplog):
     run = smooth_run()[0]
     monkeypatch.setattr("sehdr_warp.output.commands.open_scene", lambda *_: run)
-    run_render(Render(run=tmp_path, video=tmp_path / "a.mkv", cameras="orbit", count=12, fps=24))
+    run_render(Render(run=tmp_path, video=tmp_path / "a.mkv", cameras="orbit", count=12))
     assert capsys.readouterr().out == f"{tmp_path / 'a.mkv'}: 12 frames, 0.5 s\n"
     assert not caplog.records  # Nor has the library a word about options of other containers.
     run.cameras = run.cameras[2:4]
@@ -99,14 +100,14 @@ def test_refusals(tmp_path, monkeypatch):
     with pytest.raises(SehdrError, match="cannot be written as a film .* choose .mov"):
         write_film(run, tmp_path / "film.mp4", cameras, transfer="logc3")
     assert [file.name for file in tmp_path.iterdir()] == ["mine.mp4"]
-    for asked in (Render(run=tmp_path), Render(run=tmp_path, out=tmp_path, ev_ramp="1:2")):
+    for args in (Render(run=tmp_path), Render(run=tmp_path, out=tmp_path, film=FilmOptions(ev_ramp="1:2"))):
         with pytest.raises(UsageError, match="--video"):
-            run_render(asked)
+            run_render(args)
 
     alone = {"run": tmp_path, "video": tmp_path / "new.mp4"}
-    with pytest.raises(UsageError, match="--evs, --ldr-brackets: of pictures, and none are written"):
-        run_render(Render(**alone, evs="-4,4", ldr_brackets="jpeg"))
-    with pytest.raises(UsageError, match="--count 240: of an orbit or interpolation"):
+    with pytest.raises(UsageError, match="--evs, --ldr-brackets: set for pictures, which only --out writes"):
+        run_render(Render(**alone, pictures=ViewFileOptions(evs="-4,4", ldr_brackets="jpeg")))
+    with pytest.raises(UsageError, match="--count 240: set for an orbit or interpolation"):
         run_render(Render(**alone, count=240))
 
     def missing():
@@ -115,3 +116,12 @@ def test_refusals(tmp_path, monkeypatch):
     monkeypatch.setattr(film, "film_library", missing)
     with pytest.raises(SehdrError, match="pip install"):
         write_film(run, tmp_path / "new.mp4", cameras)
+
+
+def test_old_flags_name_the_new_ones(tmp_path):
+    old = ("render", "--passes", "--aovs"), ("render", "--by", "--group-by"), ("envmap", "--fill", "--inpaint")
+    for command, flag, new in old:
+        with pytest.raises(UsageError, match=f"{flag} is gone: the option is {new}"):
+            parse_command([command, str(tmp_path), "--out", "x", flag, "1"])
+    with pytest.raises(UsageError, match="no command panorama: the command is sehdr-warp envmap"):
+        parse_command(["panorama", str(tmp_path)])

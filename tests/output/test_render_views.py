@@ -75,7 +75,7 @@ def test_brackets_are_the_hdr_file_times_the_exposure(tmp_path):
 
 def test_white_is_an_exposure_that_the_file_states(tmp_path):
     run = AnalyticRun()
-    render_views(run, tmp_path / "a", pixel="float", white=1.0)
+    render_views(run, tmp_path / "a", pixel="float", reference_white=1.0)
     render_views(run, tmp_path / "b", pixel="float")
     exposed, _, header = read_exr(tmp_path / "a" / "hdr" / "t_0.exr")
     plain = read_exr(tmp_path / "b" / "hdr" / "t_0.exr")[0]
@@ -85,11 +85,13 @@ def test_white_is_an_exposure_that_the_file_states(tmp_path):
     np.testing.assert_array_equal(exposed[..., 3:], plain[..., 3:])
     for white in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(SehdrError, match="white"):
-            render_views(run, tmp_path / "c", white=white)
+            render_views(run, tmp_path / "c", reference_white=white)
 
 
 def test_folders_by_exposure_hold_sequences(tmp_path):
-    render_views(AnalyticRun(), tmp_path, cameras="orbit", count=3, evs=[-2, 0], by="exposure", ldr_brackets="png")
+    render_views(
+        AnalyticRun(), tmp_path, cameras="orbit", count=3, evs=[-2, 0], group_by="exposure", ldr_brackets="png"
+    )
     names = [f"orbit_{i:03d}" for i in range(3)]
     for folder, suffix in (("brackets", "exr"), ("brackets_ldr", "png")):
         wanted = [f"{label}/{name}.{suffix}" for label in ("b0_ev-2.0", "b1_ev+0.0") for name in names]
@@ -98,7 +100,7 @@ def test_folders_by_exposure_hold_sequences(tmp_path):
     files = [each["file"] for view in manifest["views"] for each in view["exposures"]]
     assert len(files) == 6 and all((tmp_path / file).is_file() for file in files)
     with pytest.raises(SehdrError, match="multi-part"):
-        render_views(AnalyticRun(), tmp_path / "b", evs=[0], by="exposure", multipart=True)
+        render_views(AnalyticRun(), tmp_path / "b", evs=[0], group_by="exposure", multipart=True)
 
 
 def test_nothing_is_replaced_unless_asked_and_rendering_does_not_start(tmp_path):
@@ -124,10 +126,10 @@ def test_a_bad_pixel_leaves_nothing_new(tmp_path, multipart):
 
 
 def test_options_that_do_nothing_are_refused(tmp_path):
-    with pytest.raises(SehdrError, match="without exposures"):
+    with pytest.raises(SehdrError, match="brackets need exposures"):
         render_views(AnalyticRun(), tmp_path / "out", multipart=True)
-    with pytest.raises(SehdrError, match="without exposures"):
-        render_views(AnalyticRun(), tmp_path / "out", by="exposure")
+    with pytest.raises(SehdrError, match="brackets need exposures"):
+        render_views(AnalyticRun(), tmp_path / "out", group_by="exposure")
     with pytest.raises(SehdrError, match=r"no test views; choose other cameras \(train, all, "):
         render_views(AnalyticRun([("a", "train")]), tmp_path / "out")
     with pytest.raises(SehdrError, match="'tset' are neither a file nor one of train, test, all, orbit, interpolate"):
@@ -226,7 +228,7 @@ def test_paths_need_cameras():
 def test_passes_are_parts_of_their_own(tmp_path):
     OpenEXR = pytest.importorskip("OpenEXR")
     run = AnalyticRun()
-    render_views(run, tmp_path, passes="depth,position,normals,alpha,confidence,clipped")
+    render_views(run, tmp_path, aovs="depth,position,normals,alpha,confidence,clipped")
     view, rendered = run.cameras[3].camera, run.render(run.cameras[3].camera)
     with OpenEXR.File(str(tmp_path / "hdr" / "t_0.exr"), separate_channels=True) as file:
         headers = {part.name(): dict(part.header) for part in file.parts}
@@ -243,10 +245,10 @@ def test_passes_are_parts_of_their_own(tmp_path):
     assert (pixels["clipped"] == 0.25).all()
     run.confident = False
     with pytest.raises(SehdrError, match="was not measured"):
-        render_views(run, tmp_path, passes="clipped", overwrite=True)
-    for passes, words in (("depht", "did you mean depth"), ("alpha,alpha", "named twice")):
+        render_views(run, tmp_path, aovs="clipped", overwrite=True)
+    for aovs, words in (("depht", "did you mean depth"), ("alpha,alpha", "named twice")):
         with pytest.raises(SehdrError, match=words):
-            render_views(run, tmp_path, passes=passes, overwrite=True)
+            render_views(run, tmp_path, aovs=aovs, overwrite=True)
 
 
 def test_cameras_go_to_usd_and_come_back(tmp_path):

@@ -31,7 +31,7 @@ COMMANDS = {
     "export": "export run --out made/scene.ply --kind hdr --overwrite",
     "export usd": "export run --out made/scene.usda --overwrite",
     "report": "report run --out made --device cpu --overwrite",
-    "panorama": "panorama run --out made/light.exr --size 32 --device cpu --overwrite",
+    "envmap": "envmap run --out made/light.exr --size 32 --device cpu --overwrite",
     "eval": "eval run --json made/figures.json --device cpu --overwrite",
     "synth": "synth truth --out set --overwrite",
     "quality": "bench quality --scenes truth --methods demo --iterations 4 --out made --device cpu",

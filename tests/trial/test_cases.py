@@ -25,7 +25,7 @@ from .harness import COMMANDS, LATEST, SEED, TRAIN, call, files_in, limit_memory
 pytestmark = pytest.mark.trial
 TARGETS = {
     "render": "made/hdr", "export": "made/scene.ply", "export usd": "made/scene.usda", "report": "made/stops.png",
-    "panorama": "made/light.exr", "eval": "made/figures.json", "synth": "set", "train": "run",
+    "envmap": "made/light.exr", "eval": "made/figures.json", "synth": "set", "train": "run",
 }  # fmt: skip
 LINES = {**COMMANDS, "train": [*TRAIN, "--overwrite"]}
 
@@ -149,7 +149,7 @@ INPUTS = {
     "run/metrics.jsonl": " ".join(COMMANDS["report"]),
     "run/plan.json": " ".join(COMMANDS["report"]),
     "run/checkpoints/*/state.safetensors": " ".join(COMMANDS["eval"]),
-    "run/confidence.safetensors": " ".join(COMMANDS["panorama"]),
+    "run/confidence.safetensors": " ".join(COMMANDS["envmap"]),
     "made/scene.ply": "convert made/scene.ply other.ply",
     "made/scene.usda": "convert made/scene.usda other.ply",
     "made/light.exr": "score made --truth truth",

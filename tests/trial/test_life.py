@@ -12,7 +12,7 @@ import pytest
 
 from sehdr_warp import cli
 from sehdr_warp.runs.run import load_run
-from sehdr_warp.viewer.frames import Rendering
+from sehdr_warp.viewer.frames import ViewerScene
 from sehdr_warp.viewer.server import Server, Viewer
 
 from .harness import COMMANDS, TRAIN
@@ -68,7 +68,7 @@ def test_an_hour_of_the_viewer(space, live):
             client.request("POST", "/frame", asked, {"Content-Type": "application/json"})
         client.close()
 
-    with Server(Viewer([Rendering(run, "run", None)]), port=0) as server:
+    with Server(Viewer([ViewerScene(run, "run", None)]), port=0) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         live(look, FRAMES // FRAMES_EACH)
         server.shutdown()

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from sehdr_warp.viewer.frames import Rendering
+from sehdr_warp.viewer.frames import ViewerScene
 from sehdr_warp.viewer.server import Server, Viewer
 
 from ..output.helpers import AnalyticRun
@@ -22,7 +22,7 @@ def serve(tmp_path):
         run, scene = make(tmp_path)
         run.model = SimpleNamespace(render_mean=lambda camera, values: torch.full((camera.height, camera.width), 0.25))
         runs = [run, AnalyticRun()][:count]
-        shown = [Rendering(each, f"run {i}", torch.ones(1) if i == 0 else None) for i, each in enumerate(runs)]
+        shown = [ViewerScene(each, f"run {i}", torch.ones(1) if i == 0 else None) for i, each in enumerate(runs)]
         viewer = Viewer(shown, lambda index: {view.name: view for view in scene.views}, **options)
         server = Server(viewer, port=18080)
         servers.append(server)

@@ -7,7 +7,7 @@ import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.baking import field_of
-from sehdr_warp.output.panorama import cube, filled, latlong, solid_angles, write_panorama
+from sehdr_warp.output.environment_map import cube, inpainted, latlong, solid_angles, write_environment_map
 from sehdr_warp.output.radiance_file import write_radiance
 from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene.hdr_files import read_exr_channels, read_hdr
@@ -40,7 +40,7 @@ def read(path):
 def test_a_map_has_openexrs_orientation(tmp_path, run):
     import OpenEXR
 
-    write_panorama(run, tmp_path / "env.exr", at=(0, 0, 0), size=128, axes="scene", pixel="float")
+    write_environment_map(run, tmp_path / "env.exr", at=(0, 0, 0), size=128, axes="scene", pixel="float")
     image, channels, header = read(tmp_path / "env.exr")
     assert image.shape == (64, 128, 3) and header["envmap"] == OpenEXR.Envmap.ENVMAP_LATLONG and header["expTime"] == 1
     rows, columns = (32, 32, 0, 63, 32, 32), (32, 96, 64, 64, 64, 0)
@@ -57,7 +57,9 @@ def test_a_map_has_openexrs_orientation(tmp_path, run):
 @pytest.mark.parametrize("suffix", [".exr", ".hdr"])
 def test_white_is_an_exposure_that_the_file_states(tmp_path, run, suffix):
     for name, white in (("plain", None), ("exposed", 4.0)):
-        write_panorama(run, tmp_path / f"{name}{suffix}", at=(0, 0, 0), size=64, white=white, pixel="float")
+        write_environment_map(
+            run, tmp_path / f"{name}{suffix}", at=(0, 0, 0), size=64, reference_white=white, pixel="float"
+        )
     if suffix == ".hdr":
         radiance, again = (read_hdr(tmp_path / f"{name}.hdr") for name in ("plain", "exposed"))
         head = (tmp_path / "exposed.hdr").read_bytes()[:100].decode("latin-1")
@@ -68,12 +70,12 @@ def test_white_is_an_exposure_that_the_file_states(tmp_path, run, suffix):
         assert header["expTime"] == pytest.approx(4 * run.base_time) == 2
         np.testing.assert_allclose(shown, radiance * header["expTime"], rtol=1e-6)
     with pytest.raises(SehdrError, match="white 0.0 is not between"):
-        write_panorama(run, tmp_path / f"none{suffix}", white=0.0)
+        write_environment_map(run, tmp_path / f"none{suffix}", reference_white=0.0)
 
 
 def test_upright_maps_look_ahead_with_up_above(tmp_path, run):
     """The cameras look along +Z with -Y up, as COLMAP's often do."""
-    write_panorama(run, tmp_path / "env.exr", at="camera:1", size=128)
+    write_environment_map(run, tmp_path / "env.exr", at="camera:1", size=128)
     image, _, header = read(tmp_path / "env.exr")
     ahead, above, left = (image[place] for place in ((32, 64), (0, 64), (32, 32)))
     np.testing.assert_allclose([ahead, above, left], 0.95 * LIGHT[[4, 3, 1]], rtol=0.01)
@@ -84,7 +86,7 @@ def test_upright_maps_look_ahead_with_up_above(tmp_path, run):
 def test_mitsuba_sees_the_same(tmp_path, run):
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
-    write_panorama(run, tmp_path / "env.exr", at=(0, 0, 0), size=256, axes="scene", pixel="float")
+    write_environment_map(run, tmp_path / "env.exr", at=(0, 0, 0), size=256, axes="scene", pixel="float")
     scene = mi.load_dict({"type": "scene", "env": {"type": "envmap", "filename": str(tmp_path / "env.exr")}})
     for axis, light in zip(AXES, LIGHT, strict=True):
         seen = eval_map(mi, scene, axis)
@@ -98,7 +100,7 @@ def eval_map(mi, scene, axis):
 
 
 def test_a_cube_holds_the_same_light(tmp_path, run):
-    write_panorama(run, tmp_path / "env.exr", at=(0, 0, 0), size=64, layout="cube", axes="scene", pixel="float")
+    write_environment_map(run, tmp_path / "env.exr", at=(0, 0, 0), size=64, layout="cube", axes="scene", pixel="float")
     image = read(tmp_path / "env.exr")[0]
     assert image.shape == (6 * 64, 64, 3)
     np.testing.assert_allclose(image.reshape(6, 64, 64, 3)[:, 32, 32], 0.993 * LIGHT, rtol=0.02)
@@ -110,8 +112,8 @@ def test_a_cube_holds_the_same_light(tmp_path, run):
 
 
 def test_openimageio_and_opencv_read_it(tmp_path, run):
-    write_panorama(run, tmp_path / "env.exr", at=(0, 0, 0), size=64, axes="scene")
-    write_panorama(run, tmp_path / "env.hdr", at=(0, 0, 0), size=64, axes="scene")
+    write_environment_map(run, tmp_path / "env.exr", at=(0, 0, 0), size=64, axes="scene")
+    write_environment_map(run, tmp_path / "env.hdr", at=(0, 0, 0), size=64, axes="scene")
     image = read(tmp_path / "env.exr")[0]
     radiance = read_hdr(tmp_path / "env.hdr")
     assert np.abs(radiance - image).max() < image.max() / 100
@@ -153,8 +155,8 @@ def test_openexrs_converter_and_openimageio_see_the_same(tmp_path, run):
     places *= 3 / np.linalg.norm(places, axis=1, keepdims=True)
     run.model = field_of(GaussianArrays(places, *shape, np.ones(60, np.float32), colors, "linear", 0.5))
     options = {"at": (0, 0, 0), "axes": "scene", "pixel": "float"}
-    write_panorama(run, tmp_path / "env.exr", size=512, **options)
-    write_panorama(run, tmp_path / "cube.exr", size=128, layout="cube", **options)
+    write_environment_map(run, tmp_path / "env.exr", size=512, **options)
+    write_environment_map(run, tmp_path / "cube.exr", size=128, layout="cube", **options)
     ours = read(tmp_path / "cube.exr")[0]
     oiio = pytest.importorskip("OpenImageIO")
     seen = looked_at(oiio, tmp_path / "env.exr", cube(128).reshape(-1, 3)[::17])
@@ -178,9 +180,9 @@ def test_radiance_files_keep_seven_bits(tmp_path):
         write_radiance(tmp_path / "b.hdr", np.full((2, 2, 3), np.nan))
 
 
-def test_unseen_directions_are_filled_on_request(tmp_path, run, logged):
-    write_panorama(run, tmp_path / "env.exr", at=(0, 0, 0), size=64, axes="scene")
-    write_panorama(run, tmp_path / "fill.exr", at=(0, 0, 0), size=64, axes="scene", fill=True)
+def test_unseen_directions_are_inpainted_on_request(tmp_path, run, logged):
+    write_environment_map(run, tmp_path / "env.exr", at=(0, 0, 0), size=64, axes="scene")
+    write_environment_map(run, tmp_path / "fill.exr", at=(0, 0, 0), size=64, axes="scene", inpaint=True)
     (plain, channels, _), (full, again, _) = read(tmp_path / "env.exr"), read(tmp_path / "fill.exr")
     np.testing.assert_array_equal(channels["A"], again["A"])
     seen = channels["A"] > 0.5
@@ -194,7 +196,7 @@ def test_unseen_directions_are_filled_on_request(tmp_path, run, logged):
 def test_a_fill_is_the_light_of_what_is_seen():
     directions, weight = latlong(64), solid_angles(64, "latlong")
     alpha = np.where(directions[..., 2] > 0.5, 1.0, 0)
-    light = filled(np.where(alpha[..., None] > 0, np.array([1.0, 2, 4]), 1e5), alpha, directions, weight)
+    light = inpainted(np.where(alpha[..., None] > 0, np.array([1.0, 2, 4]), 1e5), alpha, directions, weight)
     np.testing.assert_allclose(light, np.broadcast_to([1.0, 2, 4], light.shape), rtol=1e-6)
 
 
@@ -208,19 +210,19 @@ def test_points_and_options_that_cannot_be(tmp_path, run, logged):
         ({"layout": "ball"}, "is not one of latlong, cube"),
     ):
         with pytest.raises(SehdrError, match=words):
-            write_panorama(run, tmp_path / "a.exr", **{"size": 64, **options})
+            write_environment_map(run, tmp_path / "a.exr", **{"size": 64, **options})
     with pytest.raises(SehdrError, match="one of .exr, .hdr"):
-        write_panorama(run, tmp_path / "a.png")
+        write_environment_map(run, tmp_path / "a.png")
     assert list(tmp_path.iterdir()) == []
-    write_panorama(run, tmp_path / "a.exr", size=64)
+    write_environment_map(run, tmp_path / "a.exr", size=64)
     assert any("is it within the scene?" in line for line in logged)
     with pytest.raises(InputError, match="exists already"):
-        write_panorama(run, tmp_path / "a.exr", size=64)
+        write_environment_map(run, tmp_path / "a.exr", size=64)
 
 
 def test_a_point_inside_of_something_is_warned_of(tmp_path, run, logged):
     """Lamps as wide as they are far, at a five hundredth of what the cameras went."""
     run.model = field_of(lamps(1.5))
     run.cameras = tuple(Entry(str(x), "train", camera(position=(x, 0, 0), target=(x, 0, 9))) for x in (-2e3, 2e3))
-    write_panorama(run, tmp_path / "a.exr", at=(0, 0, 0), size=64)
+    write_environment_map(run, tmp_path / "a.exr", at=(0, 0, 0), size=64)
     assert any("inside of something" in line for line in logged)

@@ -24,10 +24,10 @@ log = logging.getLogger(__name__)
 LAYOUTS = ("latlong", "cube")
 AXES = ("upright", "scene")
 SUFFIXES = (".exr", ".hdr")
-# Coverage above which a direction counts as seen; of the directions, fewer than the first share make a warning, and
-# surfaces nearer than the part of the cameras' spread in more than half of them mean that the point is in a wall.
-_SEEN, _LEAST_SEEN, _NEAR, _LARGEST = 0.5, 0.1, 0.02, 1 << 15
-_COARSE, _DARKEST = 128, 1e-9  # Of a fill: columns of the map that it is made on, and the least light
+# A direction counts as covered above this alpha. A covered share below _LEAST_COVERED gives a warning, as do surfaces
+# nearer than _NEAR times the spread of the cameras in more than half of all directions: the point is inside something.
+_COVERED, _LEAST_COVERED, _NEAR, _LARGEST = 0.5, 0.1, 0.02, 1 << 15
+_COARSE, _DARKEST = 128, 1e-9  # Inpainting: columns of the coarse map, and the least light
 # The nearest axes of a cube's faces in OpenEXR's order (+X -X +Y -Y +Z -Z): to the right, down, and out.
 _FACES = np.array(
     [
@@ -42,7 +42,7 @@ _FACES = np.array(
 )
 
 
-def write_panorama(
+def write_environment_map(
     run: Any,
     path: Path | str,
     *,
@@ -50,34 +50,35 @@ def write_panorama(
     size: int = 2048,
     layout: str = "latlong",
     axes: str = "upright",
-    fill: bool = False,
+    inpaint: bool = False,
     colorspace: str = "rec709",
-    white: float | None = None,
+    reference_white: float | None = None,
     pixel: str = "half",
     overwrite: bool = False,
 ) -> Path:
-    """Writes the light that reaches a point of a trained scene from all directions; returns the path.
+    """Write the light that reaches a point of a trained scene from all directions; return the path.
 
     Args:
-        run: of load_run, train or load_splats.
-        path: .exr (R, G, B radiance; A how far a direction was seen; in a second part, `data`, distance.Z and, if the
-            run has it, confidence; attribute `envmap`) or .hdr (Radiance, no more than R, G, B).
-        at: a point in the scene's coordinates, "camera:NAME", or "center": the middle of the training cameras.
-        size: pixels across, of a cube those of one face.
-        layout: "latlong": size x size / 2, the left edge at longitude pi, its middle along +Z, +X at a quarter, +Y up.
+        run: From load_run, train or load_splats.
+        path: .exr (R, G, B radiance; A coverage; in a second part, `data`, distance.Z and, if the run has it,
+            confidence; attribute `envmap`) or .hdr (Radiance: R, G, B only).
+        at: A point in the scene's coordinates, "camera:NAME", or "center": the mean of the training cameras.
+        size: Pixels across; for a cube those of one face.
+        layout: "latlong": size x size / 2, the left edge at longitude pi, +Z in the middle, +X at a quarter, +Y up.
             "cube": OpenEXR's six faces, one above the other.
-        axes: "upright": +Y is up in the photos, +Z is ahead of the named camera or of the middle one; "scene": those of
-            the scene's coordinates.
-        fill: what no photo saw gets the light around it, smoothly, as far as A is below 1; A tells it still.
-        colorspace: primaries of the file.
-        white: what the file shows the photos' white as, by an exposure that `expTime` (of .hdr EXPOSURE) states; None
+        axes: "upright": +Y is up in the photos, +Z is ahead of the named camera or of the middle one. "scene": the
+            scene's coordinates.
+        inpaint: Fill directions that no photo covers with the light around them, as far as A is below 1; A still tells
+            them.
+        colorspace: Primaries of the file.
+        reference_white: Value of the photos' white in the file; `expTime` (.hdr: EXPOSURE) states the exposure. None
             leaves radiance.
-        pixel: "half" (float where half would overflow) or "float".
-        overwrite: replace a file that exists.
+        pixel: "half" (float if half would overflow) or "float".
+        overwrite: Replace a file that exists.
 
     Raises:
-        SehdrError: for options that do not fit, or a point that sees next to nothing.
-        InputError: where the file exists or a pixel is not finite.
+        SehdrError: For options that do not fit, or a point from which next to nothing is visible.
+        InputError: If the file exists or a pixel is not finite.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -87,29 +88,31 @@ def write_panorama(
             raise SehdrError(f"{name} {value!r} is not one of {', '.join(known)}")
     if size < 16 or size % 2 or size > _LARGEST:
         raise SehdrError(f"size {size} cannot be; give an even number of pixels from 16 to {_LARGEST}")
-    exposure = exposure_of_white(run, white)
+    exposure = exposure_of_white(run, reference_white)
     check_absent(path, overwrite)
     cameras = {entry.name: entry.camera for entry in run.cameras}
-    seen = [entry.camera for entry in run.cameras if entry.split == "train"]
-    position, ahead = _point(at, cameras, seen)
-    to_world = np.eye(3) if axes == "scene" else _upright(seen, ahead)
+    photos = [entry.camera for entry in run.cameras if entry.split == "train"]
+    position, ahead = _point(at, cameras, photos)
+    to_world = np.eye(3) if axes == "scene" else _upright(photos, ahead)
     directions = (latlong if layout == "latlong" else cube)(size) @ to_world.T
     pixel_angle = 2 * np.pi / size if layout == "latlong" else 2 / size
-    focal = float(np.median([np.sqrt(c.fx * c.fy) for c in seen])) if seen else 1 / pixel_angle
-    found = run.render_directions(position, directions, focal_length=focal, pixel_angle=pixel_angle)
-    hdr, alpha, distance = (as_array(values) for values in (found.hdr, found.alpha, found.distance))
+    focal = float(np.median([np.sqrt(c.fx * c.fy) for c in photos])) if photos else 1 / pixel_angle
+    surroundings = run.render_directions(position, directions, focal_length=focal, pixel_angle=pixel_angle)
+    hdr, alpha, distance = (
+        as_array(values) for values in (surroundings.hdr, surroundings.alpha, surroundings.distance)
+    )
     weight = solid_angles(size, layout)
-    _judge(run, position, seen, alpha, distance, weight)
-    if fill:
-        hdr = hdr + (1 - alpha[..., None]) * filled(hdr, alpha, directions, weight)
-    log.info("%s: %.0f %% of all directions seen", path.name, 100 * weight[alpha > _SEEN].sum() / weight.sum())
+    _judge(run, position, photos, alpha, distance, weight)
+    if inpaint:
+        hdr = hdr + (1 - alpha[..., None]) * inpainted(hdr, alpha, directions, weight)
+    log.info("%s: %.0f %% of all directions seen", path.name, 100 * weight[alpha > _COVERED].sum() / weight.sum())
     hdr = exposure * from_rec709(hdr, colorspace)
     if path.suffix.lower() == ".hdr":
         write_radiance(path, hdr, exposure=exposure, overwrite=overwrite)
         return path
     data = {"distance.Z": distance}
-    if found.confidence is not None:
-        data["confidence"] = as_array(found.confidence)
+    if surroundings.confidence is not None:
+        data["confidence"] = as_array(surroundings.confidence)
     facts = {**provenance(run), "position": json.dumps(position.tolist()), "axes": axes}
     header = exr_header(colorspace, exposure, None, datetime.now().replace(microsecond=0), facts)
     header |= {"sehdr:mapToWorld": json.dumps(to_world.tolist()), "envmap": envmap(layout)}
@@ -122,14 +125,14 @@ def write_panorama(
 
 
 def envmap(layout: str) -> Any:
-    """The value of OpenEXR's attribute."""
+    """Return the value of OpenEXR's attribute `envmap`."""
     import OpenEXR
 
     return OpenEXR.Envmap.ENVMAP_LATLONG if layout == "latlong" else OpenEXR.Envmap.ENVMAP_CUBE
 
 
 def latlong(size: int) -> np.ndarray:
-    """[size / 2, size, 3] unit directions of the centers of a latitude-longitude map's pixels."""
+    """Return [size / 2, size, 3] unit directions of the pixel centers of a latitude-longitude map."""
     longitude = np.pi - 2 * np.pi * (np.arange(size) + 0.5) / size
     latitude = (np.pi / 2 - np.pi * (np.arange(size // 2) + 0.5) / (size // 2))[:, None]
     across = np.cos(latitude)
@@ -138,7 +141,7 @@ def latlong(size: int) -> np.ndarray:
 
 
 def cube(size: int) -> np.ndarray:
-    """[6 size, size, 3] unit directions of OpenEXR's cube map."""
+    """Return [6 size, size, 3] unit directions of OpenEXR's cube map."""
     place = 2 * (np.arange(size) + 0.5) / size - 1
     local = np.stack([*np.meshgrid(place, place), np.ones((size, size))], axis=2)
     faces = np.concatenate([local @ axes for axes in _FACES])
@@ -146,7 +149,7 @@ def cube(size: int) -> np.ndarray:
 
 
 def solid_angles(size: int, layout: str) -> np.ndarray:
-    """[H, W] what part of the sphere each pixel is, up to scale."""
+    """Return [H, W], the solid angle of each pixel up to scale."""
     if layout == "latlong":
         latitude = np.pi / 2 - np.pi * (np.arange(size // 2) + 0.5) / (size // 2)
         return np.repeat(np.cos(latitude)[:, None], size, axis=1)
@@ -155,19 +158,22 @@ def solid_angles(size: int, layout: str) -> np.ndarray:
     return np.tile(face, (6, 1))
 
 
-def filled(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """[H, W, 3] for each direction the geometric mean of the light in those that were seen, weighted by the inverse
-    fourth power of the distance on the sphere: lamps do not flood what lies beside them."""
+def inpainted(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return [H, W, 3] of light for each direction, interpolated from the directions that photos cover.
+
+    It is the geometric mean of their light weighted by the inverse fourth power of the distance on the sphere, so that
+    lamps do not flood their surroundings.
+    """
     from scipy.ndimage import map_coordinates
 
     x, y, z = np.moveaxis(directions, 2, 0)
     columns, rows = _COARSE, _COARSE // 2
     across, down = (np.pi - np.arctan2(x, z)) / (2 * np.pi) * columns, np.arccos(np.clip(y, -1, 1)) / np.pi * rows
     cells = np.minimum(down.astype(int), rows - 1) * columns + across.astype(int) % columns
-    seen = alpha > _SEEN
-    logs = np.log(np.maximum(hdr[seen] / alpha[seen][:, None], _DARKEST))
-    values = np.concatenate([logs, np.ones((len(logs), 1))], axis=1) * weight[seen][:, None]
-    sums = np.stack([np.bincount(cells[seen], column, rows * columns) for column in values.T], axis=1)
+    covered = alpha > _COVERED
+    logs = np.log(np.maximum(hdr[covered] / alpha[covered][:, None], _DARKEST))
+    values = np.concatenate([logs, np.ones((len(logs), 1))], axis=1) * weight[covered][:, None]
+    sums = np.stack([np.bincount(cells[covered], column, rows * columns) for column in values.T], axis=1)
     known, places = sums[:, 3] > 0, latlong(columns).reshape(-1, 3)
     near = sums[known, 3] / (2 - 2 * places @ places[known].T + (2 * np.pi / columns) ** 2) ** 2
     light = np.exp(near @ (sums[known, :3] / sums[known, 3:]) / near.sum(axis=1, keepdims=True))
@@ -176,16 +182,16 @@ def filled(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, weight: n
     return np.stack([map_coordinates(wrapped[..., i], at, order=1, mode="nearest") for i in range(3)], axis=2)
 
 
-def _point(at, cameras: dict[str, Camera], seen: list[Camera]) -> tuple[np.ndarray, Camera | None]:
-    """The point, and the camera that says what is ahead."""
+def _point(at, cameras: dict[str, Camera], photos: list[Camera]) -> tuple[np.ndarray, Camera | None]:
+    """Return the point, and the camera that defines what is ahead."""
     middle = None
-    if seen:
-        places = np.stack([camera.position for camera in seen])
-        middle = seen[int(np.argmin(np.linalg.norm(places - np.median(places, axis=0), axis=1)))]
+    if photos:
+        places = np.stack([camera.position for camera in photos])
+        middle = photos[int(np.argmin(np.linalg.norm(places - np.median(places, axis=0), axis=1)))]
     if isinstance(at, str) and at == "center":
         if middle is None:
             raise SehdrError("the scene has no cameras, so no center; say where with --at x,y,z")
-        return np.mean([camera.position for camera in seen], axis=0), middle
+        return np.mean([camera.position for camera in photos], axis=0), middle
     if isinstance(at, str) and at.startswith("camera:"):
         name = at.partition(":")[2]
         if name not in cameras:
@@ -201,11 +207,11 @@ def _point(at, cameras: dict[str, Camera], seen: list[Camera]) -> tuple[np.ndarr
     return position, middle
 
 
-def _upright(seen: list[Camera], ahead: Camera | None) -> np.ndarray:
-    """[3, 3] map to world axes: columns are +X (left of what is ahead), +Y (up) and +Z (ahead)."""
+def _upright(photos: list[Camera], ahead: Camera | None) -> np.ndarray:
+    """Return [3, 3] map to world axes; its columns are +X (left of what is ahead), +Y (up) and +Z (ahead)."""
     if ahead is None:
         return np.eye(3)
-    up = mean_up(seen or [ahead])
+    up = mean_up(photos or [ahead])
     forward = ahead.world_to_camera[2, :3]
     forward = forward - up * (forward @ up)
     if np.linalg.norm(forward) < 1e-3:  # It looks straight up or down.
@@ -214,18 +220,17 @@ def _upright(seen: list[Camera], ahead: Camera | None) -> np.ndarray:
     return np.stack([np.cross(up, forward), up, forward], axis=1)
 
 
-def _judge(run, position, seen: list[Camera], alpha: np.ndarray, distance: np.ndarray, weight: np.ndarray) -> None:
-    """Raises SehdrError for a point that nothing is seen from, and warns of one from which little or only near
-    things are."""
-    share = weight[alpha > _SEEN].sum() / weight.sum()
+def _judge(run, position, photos: list[Camera], alpha: np.ndarray, distance: np.ndarray, weight: np.ndarray) -> None:
+    """Warn about a point from which little, or only near things, are visible; raise SehdrError if nothing is."""
+    share = weight[alpha > _COVERED].sum() / weight.sum()
     place = ", ".join(f"{value:.4g}" for value in position)
     if share < 1e-3:
         remedy = "choose a point among the cameras (center, camera:NAME)"
         raise SehdrError(f"{run.path}: from ({place}) nothing of the scene is seen; {remedy}")
-    if share < _LEAST_SEEN:
+    if share < _LEAST_COVERED:
         log.warning("from (%s) only %.1f %% of all directions are seen: is it within the scene?", place, 100 * share)
-    spread = np.linalg.norm(np.ptp([camera.position for camera in seen], axis=0)) if len(seen) > 1 else 0.0
-    near = weight[(alpha > _SEEN) & (distance < _NEAR * spread)].sum() / weight.sum()
+    spread = np.linalg.norm(np.ptp([camera.position for camera in photos], axis=0)) if len(photos) > 1 else 0.0
+    near = weight[(alpha > _COVERED) & (distance < _NEAR * spread)].sum() / weight.sum()
     if near > 0.5:
         log.warning(
             "from (%s) %.0f %% of all directions are blocked at once: is it inside of something?", place, 100 * near
