@@ -15,7 +15,7 @@ import torch
 
 from ..errors import InputError, SehdrError
 from ..model.radiance_field import RenderedView
-from ..model.unexplained import MOST_NAMED, told, unexplained_regions
+from ..model.residual_regions import MAX_LISTED, find_residual_regions, regions_to_dict
 from ..rasterizer.memory import oom_context
 from ..response import Response
 from ..runs.checkpoint import first_not_finite
@@ -274,15 +274,15 @@ class Training:
 
     def _tell_unexplained(self, run: Run) -> None:
         """Compares the training photos with the scene, and names what is missing in the summary and in a line."""
-        regions = unexplained_regions(run.model, self.scene.train_views, degree=run.degree)
-        self.folder.write_summary(run.summary() | {"unexplained": told(regions)})
+        regions = find_residual_regions(run.model, self.scene.train_views, degree=run.degree)
+        self.folder.write_summary(run.summary() | {"unexplained": regions_to_dict(regions)})
         if regions:
             worst, photos = regions[0], len({region.photo for region in regions})
             log.warning(
                 "%d regions in %d photos are not explained by the scene; the worst: %s at column %.0f, row %.0f, "
                 "%d pixels %.1f stops %s than the photo (summary.json names %d)",
                 *(len(regions), photos, worst.photo, worst.column, worst.row, worst.pixels, abs(worst.stops)),
-                *("darker" if worst.stops > 0 else "brighter", min(len(regions), MOST_NAMED)),
+                *("darker" if worst.stops > 0 else "brighter", min(len(regions), MAX_LISTED)),
             )
 
     def _evaluate(self) -> None:
