@@ -23,7 +23,7 @@ from ..runs.config import Config
 from ..runs.config_files import as_config, config_fields, override_config
 from ..runs.device import pick_device
 from ..runs.run import Run, as_rec709, field_from_checkpoint, load_run, photo_gains
-from ..runs.run_folder import RunFolder
+from ..runs.run_writer import RunWriter, write_confidence
 from ..scene import Camera, Scene
 from ..scene.exposure_compensation import ExposureCompensation
 from .following import hand_on, told_of_ranks
@@ -113,7 +113,7 @@ class Training:
         data: dict[str, Any] | None = None,
         ranks: Ranks | None = None,
     ):
-        self.folder, self.ranks = RunFolder(out), ranks
+        self.folder, self.ranks = RunWriter(out), ranks
         self.device = pick_device(device)
         make_writer = summary_writer() if tensorboard else None
         config = as_config(config)
@@ -199,7 +199,7 @@ class Training:
                 return
             self._run = None
             run = self.run
-            self.folder.write_confidence(run.measure_confidence(self.scene), run.checkpoint_hash)
+            write_confidence(self.folder, run.measure_confidence(self.scene), run.checkpoint_hash)
             self._tell_unexplained(run)
 
     def pause(self) -> None:
