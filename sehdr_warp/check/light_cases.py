@@ -8,7 +8,7 @@ import torch
 
 from ..model.color_models import EXPOSURE_FLOOR
 from ..model.fusion import NeuralExposureFusion
-from ..model.radiance_field import TrainRender
+from ..model.radiance_field import Photograph
 from ..rasterizer import ssim
 from ..rasterizer.clipped_light import clipped_light_energy
 from ..response import Response, response_by_name
@@ -143,7 +143,7 @@ def _loss(prediction, photo):
     """The training's loss between encoded values of a simulated photo [H, W, 3] and a photo of black and white."""
     codes = (255 * photo).to(prediction.device, torch.uint8)
     target = Target(codes, code_scale(255, None, prediction.device, dtype=prediction.dtype))
-    shown = TrainRender(prediction, None, None, None)  # pyright: ignore[reportArgumentType]
+    shown = Photograph(prediction, None, None, None)  # pyright: ignore[reportArgumentType]
     return ldr_loss(shown, target, LossConfig())
 
 

@@ -35,6 +35,7 @@ class ImageRecord:
         hdr: its file of HDR truth.
         derived: the set has no photos; this one is computed from the truth, and `image` is the truth's file.
         linear: the photo's codes are proportional to light; they are re-encoded by sRGB's curve.
+        gain_map: the photo's light is taken from its gain map and re-encoded by sRGB's curve.
         oriented: the lens refers to the pixels after EXIF orientation; None decides by the sizes.
     """
 
@@ -49,6 +50,7 @@ class ImageRecord:
     hdr: Path | None = None
     derived: bool = False
     linear: bool = False
+    gain_map: bool = False
     oriented: bool | None = None
 
     @property
@@ -89,7 +91,7 @@ class DataparserOutputs:
         name: what the user asked for.
         folder: where the set lies.
         times_known: False if no file states exposure times.
-        kind: of the photos: encoded, linear, raw or float; see linear_photos.py.
+        kind: of the photos: encoded, linear, gain-map, raw or float; see linear_photos.py.
     """
 
     format: str

@@ -13,17 +13,19 @@ import numpy as np
 from PIL import Image, ImageFile
 
 from ..errors import InputError
+from .heif import HEIF_SUFFIXES, heif_installed, is_heif, read_deep_heif, register_heif
 
 MAX_PIXELS = 160_000_000
 """Above the frame of any camera (the largest backs have 151 megapixels), far below what would exhaust memory."""
 MAX_SIDE = 65_536  # No photo has a longer side; a damaged one with few pixels in all would take long to decode
-LDR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
+LDR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".avif", *HEIF_SUFFIXES * heif_installed())
+"""HEIF's among them if the package that decodes it is installed."""
 HDR_SUFFIXES = (".exr", ".hdr")
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw")
 PHOTO_SUFFIXES = (*LDR_SUFFIXES, *RAW_SUFFIXES, *HDR_SUFFIXES)
 _BAND_ROWS = 512
 _opening = threading.Lock()  # Pillow's pixel limit, which is lifted while opening, is shared by all threads
-_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP")
+_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "AVIF")
 _MODES = ("L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "I", "I;16", "I;16L", "I;16B", "I;16N")
 _OTHER_MODES = {
     "1": "one bit a pixel, black or white",
@@ -66,7 +68,7 @@ def image_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     """Return the photo's size as stored and after its EXIF orientation, each (width, height); raises as open_image."""
     with open_image(path) as image:
         width, height = image.size
-        return image.size, (height, width) if _orientation(image) in (5, 6, 7, 8) else image.size
+        return image.size, (height, width) if orientation_of(image) in (5, 6, 7, 8) else image.size
 
 
 def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> EncodedImage:
@@ -83,7 +85,7 @@ def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> Encod
     with open_image(path, mask=mask) as image:
         try:
             pixels, alpha = _decode(image, path)
-            turn = _orientation(image) if oriented else 1
+            turn = orientation_of(image) if oriented else 1
         except PILLOW_ERRORS as error:
             raise InputError(path, f"cannot be decoded ({error})", DAMAGED) from None
     return EncodedImage(turn_upright(pixels, turn), None if alpha is None else turn_upright(alpha, turn))
@@ -108,15 +110,18 @@ def open_image(path: Path, *, mask: bool = False) -> ImageFile.ImageFile:
         InputError: if the file is missing, not an image, too large, an animation or several pages, or not grey or RGB.
     """
     require_file(path)
+    if heif := is_heif(path):
+        register_heif(path)
     # Pillow's own limit is global and lower for its warning; ours is checked below, before any pixel is decoded.
     with _opening:
         limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
-            image = Image.open(path, formats=_FORMATS)
+            image = Image.open(path, formats=("HEIF",) if heif else _FORMATS)
             several = getattr(image, "is_animated", False) and image.format != "MPO"
         except PILLOW_ERRORS as error:
-            detail = f", which is one of {', '.join(_FORMATS)}" if "cannot identify" in str(error) else f" ({error})"
-            raise InputError(path, f"is not a readable image{detail}", DAMAGED) from None
+            kinds = f", which is one of {', '.join(_FORMATS)}" * (not heif)
+            detail = kinds if "cannot identify" in str(error) else f" ({error})"
+            raise InputError(path, f"is not a readable {'HEIC photo' if heif else 'image'}{detail}", DAMAGED) from None
         finally:
             Image.MAX_IMAGE_PIXELS = limit
     try:
@@ -177,6 +182,8 @@ def check_size(path: Path, width: int, height: int, most: int = MAX_PIXELS) -> N
 
 def _decode(image: ImageFile.ImageFile, path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Return code values [H, W, 3] and alpha [H, W] in [0, 1] or None."""
+    if image.format == "HEIF" and image.info.get("bit_depth", 8) > 8:
+        return _split(read_deep_heif(path))
     if image.mode in ("RGB", "RGBA") and (low := _low_byte_tiles(image)):
         with open_image(path) as second:
             second.tile = low
@@ -235,7 +242,7 @@ def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:
     return np.ascontiguousarray(array[:, ::-1] if orientation in (2, 3, 6, 7) else array)
 
 
-def _orientation(image: Image.Image) -> int:
+def orientation_of(image: Image.Image) -> int:
     """Return EXIF's orientation, 1 (as stored) if there is none."""
     try:
         return exif_of(image).get(0x0112, 1)

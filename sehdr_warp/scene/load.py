@@ -14,6 +14,7 @@ from ..errors import InputError, did_you_mean
 from .colmap_model import find_model
 from .dataparser import DataparserOutputs, ImageRecord
 from .exposure import are_camera_jpegs, choose_exposure, with_exposure_times
+from .gain_map import has_gain_map, read_gain_map
 from .images import has_16_bits
 from .linear_photos import CURVES, color_matrix, float_time, one_kind
 from .masks import assign_masks
@@ -90,6 +91,8 @@ def load_scene(
     if dataset.kind == "encoded" and str(response) == "linear":
         dataset = as_linear(dataset)
         response = "auto" if dataset.kind == "linear" else response
+    if dataset.kind == "encoded" and str(response) in ("auto", CURVES["gain-map"]):
+        dataset = as_gain_mapped(dataset)
     if dataset.kind != "encoded":
         chosen = response_by_name(CURVES[dataset.kind])
         if isinstance(response, str | Path) and str(response) not in ("auto", chosen.name):
@@ -146,6 +149,20 @@ def as_linear(dataset: DataparserOutputs) -> DataparserOutputs:
     ):
         return dataset
     return replace(dataset, kind="linear", records=tuple(replace(record, linear=True) for record in dataset.records))
+
+
+def as_gain_mapped(dataset: DataparserOutputs) -> DataparserOutputs:
+    """Take the light of photos from their gain maps if most photos of a dataset have one."""
+    maps = [
+        read_gain_map(record.image) for record in dataset.records if not record.derived and has_gain_map(record.image)
+    ]
+    headrooms = [gain_map.headroom for gain_map in maps if gain_map is not None]
+    if 2 * len(headrooms) <= len(dataset.records):
+        return dataset
+    note = f"{len(headrooms)} of {len(dataset.records)} photos have a gain map: light is taken from it, up to "
+    note += f"{max(headrooms):.1f} stops above white; --response NAME takes the codes and a curve instead"
+    records = tuple(replace(record, gain_map=True) for record in dataset.records)
+    return replace(dataset, kind="gain-map", records=records, notes=(*dataset.notes, note))
 
 
 def choose_response(

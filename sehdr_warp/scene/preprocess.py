@@ -13,6 +13,7 @@ from ..errors import InputError
 from ..parallel import made_ahead
 from .camera import Camera
 from .dataparser import DataparserOutputs, ImageRecord, reinhard_gamma
+from .gain_map import has_gain_map, light_of, read_gain_map, with_light_above_white
 from .hdr_files import hdr_size, read_hdr
 from .images import EncodedImage
 from .lens import Lens, Undistortion, area_average
@@ -111,6 +112,11 @@ def read_codes(record: ImageRecord, *, oriented: bool = False) -> EncodedImage:
         return EncodedImage(float_codes(read_hdr(record.image), record.seconds), None)
     if not record.derived:
         photo = read_photo(record.image, oriented=oriented)
+        if record.gain_map or (kind_of(record.image) == "encoded" and not record.linear and has_gain_map(record.image)):
+            gain_map = read_gain_map(record.image, oriented=oriented)
+            if record.gain_map:
+                return light_of(photo, gain_map)
+            return photo if gain_map is None else with_light_above_white(photo, gain_map)
         return EncodedImage(linear_codes(photo.pixels / photo.levels), photo.alpha) if record.linear else photo
     return EncodedImage(codes_of(reinhard_gamma(read_hdr(record.image) * record.seconds), 8), None)
 

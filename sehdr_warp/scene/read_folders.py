@@ -12,6 +12,7 @@ from ..files import contained, read_bytes, read_json
 from .colmap_model import SparseModel, find_model, read_model
 from .dataparser import NO_POINTS, DataparserOutputs, ImageRecord, PointCloud, pose_from_camera_to_world
 from .exposure import parse_seconds
+from .heif import HEIF_SUFFIXES, register_heif
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 from .lens import Lens
 from .linear_photos import color_matrix, one_kind
@@ -196,6 +197,8 @@ def read_photos(folder: Path, cache: Path | str | None = None) -> DataparserOutp
     # A lone picture beside `images/` is a cover.
     photos = next((each for each in found if len(each) > 1), next(filter(None, found), []))
     if not photos:
+        if heif := next((file for file in sorted(folder.iterdir()) if file.suffix.lower() in HEIF_SUFFIXES), None):
+            register_heif(heif)
         remedy = "give photos (JPEG, PNG, TIFF, RAW, EXR), a COLMAP set or a transforms.json"
         with suppress(OSError):
             inner = [place.name for place in sorted(folder.iterdir()) if place.is_dir()]

@@ -15,7 +15,7 @@ import torch
 
 from ..errors import InputError, SehdrError
 from ..model.radiance_field import RenderedView
-from ..model.residual_regions import MAX_LISTED, find_residual_regions, regions_to_dict
+from ..model.unexplained import MOST_NAMED, told, unexplained_regions
 from ..rasterizer.memory import oom_context
 from ..response import Response
 from ..runs.checkpoint import first_not_finite
@@ -23,7 +23,7 @@ from ..runs.config import Config
 from ..runs.config_files import as_config, config_fields, override_config
 from ..runs.device import pick_device
 from ..runs.run import Run, as_rec709, field_from_checkpoint, load_run, photo_gains
-from ..runs.run_writer import RunWriter, write_confidence
+from ..runs.run_folder import RunFolder
 from ..scene import Camera, Scene
 from ..scene.exposure_compensation import ExposureCompensation
 from .following import hand_on, told_of_ranks
@@ -113,7 +113,7 @@ class Training:
         data: dict[str, Any] | None = None,
         ranks: Ranks | None = None,
     ):
-        self.folder, self.ranks = RunWriter(out), ranks
+        self.folder, self.ranks = RunFolder(out), ranks
         self.device = pick_device(device)
         make_writer = summary_writer() if tensorboard else None
         config = as_config(config)
@@ -199,7 +199,7 @@ class Training:
                 return
             self._run = None
             run = self.run
-            write_confidence(self.folder, run.measure_confidence(self.scene), run.checkpoint_hash)
+            self.folder.write_confidence(run.measure_confidence(self.scene), run.checkpoint_hash)
             self._tell_unexplained(run)
 
     def pause(self) -> None:
@@ -274,15 +274,15 @@ class Training:
 
     def _tell_unexplained(self, run: Run) -> None:
         """Compares the training photos with the scene, and names what is missing in the summary and in a line."""
-        regions = find_residual_regions(run.model, self.scene.train_views, degree=run.degree)
-        self.folder.write_summary(run.summary() | {"unexplained": regions_to_dict(regions)})
+        regions = unexplained_regions(run.model, self.scene.train_views, degree=run.degree)
+        self.folder.write_summary(run.summary() | {"unexplained": told(regions)})
         if regions:
             worst, photos = regions[0], len({region.photo for region in regions})
             log.warning(
                 "%d regions in %d photos are not explained by the scene; the worst: %s at column %.0f, row %.0f, "
                 "%d pixels %.1f stops %s than the photo (summary.json names %d)",
                 *(len(regions), photos, worst.photo, worst.column, worst.row, worst.pixels, abs(worst.stops)),
-                *("darker" if worst.stops > 0 else "brighter", min(len(regions), MAX_LISTED)),
+                *("darker" if worst.stops > 0 else "brighter", min(len(regions), MOST_NAMED)),
             )
 
     def _evaluate(self) -> None:

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.own_files import LIST
+from sehdr_warp.files import LIST
 from sehdr_warp.scene import load_scene, sfm
 from sehdr_warp.scene.dataparser import ImageRecord
 from sehdr_warp.scene.exposure import shutter

@@ -1,0 +1,353 @@
+"""Gain maps: pictures beside a photo that state how much brighter than its codes its light was.
+
+Ultra HDR (Android: metadata as XMP `hdrgm`), ISO 21496-1 (binary metadata in JPEG, HEIF and AVIF), and Apple's HDR gain
+map (headroom in the maker note, or in XMP). All are decoded to the rendition of the largest headroom, which is the
+light that the phone recorded, as a multiple of the light of white.
+"""
+
+import io
+import logging
+import math
+import re
+import struct
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, TiffImagePlugin
+
+from ..errors import InputError
+from .heif import HeifItems, is_heif, item_bytes, read_items, register_heif, with_primary
+from .images import PILLOW_ERRORS, EncodedImage, check_size, exif_of, open_image, orientation_of, turn_upright
+from .linear_photos import linear_codes
+
+_log = logging.getLogger("sehdr_warp.scene")
+
+DEVIATION = 0.05
+"""Standard deviation of the logarithm of decoded light: 8 bits of map and photo, and a map of fewer pixels."""
+_ISO_JPEG = b"urn:iso:std:iso:ts:21496:-1\0"
+_APPLE_AUX = "urn:com:apple:photo:2020:aux:hdrgainmap"
+_MOST_STOPS = 16.0  # Between white and the largest light; encoders state 1 to 6
+
+
+@dataclass(frozen=True)
+class GainMap:
+    """A gain map as its file stores it. Numbers are one for each color channel, [3] float64.
+
+    Attributes:
+        encoded: [h, w, 1 or 3] float32 in [0, 1], of fewer pixels than the photo as a rule.
+        minimum: log2 of the gain that 0 stands for.
+        maximum: log2 of the gain that 1 stands for.
+        gamma: exponent of the encoding.
+        base_offset: added to the photo's light before it is multiplied.
+        alternate_offset: subtracted afterwards.
+        headroom: log2 of the brightest light that the file means, as a multiple of white.
+    """
+
+    encoded: np.ndarray
+    minimum: np.ndarray
+    maximum: np.ndarray
+    gamma: np.ndarray
+    base_offset: np.ndarray
+    alternate_offset: np.ndarray
+    headroom: float
+
+    def light(self, base: np.ndarray) -> np.ndarray:
+        """Return the light [H, W, 3] float32 of a photo whose own light [H, W, 3] is in [0, 1], 1 at white."""
+        height, width = base.shape[:2]
+        result = np.empty(base.shape, np.float32)
+        for channel in range(3):
+            plane = self.encoded[..., min(channel, self.encoded.shape[2] - 1)]
+            resized = Image.fromarray(plane).resize((width, height), Image.Resampling.BILINEAR)
+            share = np.clip(np.asarray(resized), 0, 1) ** np.float32(1 / self.gamma[channel])
+            span = self.maximum[channel] - self.minimum[channel]
+            gain = np.exp2(np.float32(self.minimum[channel]) + np.float32(span) * share)
+            light = (base[..., channel] + np.float32(self.base_offset[channel])) * gain
+            result[..., channel] = light - np.float32(self.alternate_offset[channel])
+        return np.maximum(result, 0)
+
+
+def light_of(photo: EncodedImage, gain_map: GainMap | None) -> EncodedImage:
+    """Return the light of a photo encoded by sRGB's curve as 16-bit sRGB codes, and what is above white beside it.
+
+    Args:
+        photo: as decoded.
+        gain_map: of the photo; None for one without, whose light ends at white.
+    """
+    light = _decoded(photo)
+    light = light if gain_map is None else gain_map.light(light)
+    codes = linear_codes(np.minimum(light, 1))
+    above = None if gain_map is None else _above_white(light, codes == 65535)
+    return replace(photo, pixels=codes, above_white=above, above_white_deviation=DEVIATION)
+
+
+def with_light_above_white(photo: EncodedImage, gain_map: GainMap) -> EncodedImage:
+    """Return a photo with the same codes, and the light of its white pixels beside them."""
+    above = _above_white(gain_map.light(_decoded(photo)), photo.pixels == photo.levels)
+    return replace(photo, above_white=above, above_white_deviation=DEVIATION)
+
+
+def _decoded(photo: EncodedImage) -> np.ndarray:
+    """Return [H, W, 3] float32 light by sRGB's transfer function (that of Display P3, too), 1 at white."""
+    codes = np.arange(photo.levels + 1) / photo.levels
+    table = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+    return table.astype(np.float32)[photo.pixels]
+
+
+def _above_white(light: np.ndarray, white: np.ndarray) -> np.ndarray | None:
+    return np.where(white, np.maximum(light, 1), 0).astype(np.float16) if white.any() else None
+
+
+def read_gain_map(path: Path, *, oriented: bool = False) -> GainMap | None:
+    """Return the gain map of a photo, or None if it has none that applies to it as it is decoded.
+
+    A damaged one is named in a warning and counts as none, because the photo itself is good.
+
+    Args:
+        path: the photo.
+        oriented: turn it like the photo, as EXIF's orientation says.
+
+    Raises:
+        InputError: if the photo itself is missing or damaged.
+    """
+    try:
+        found = _of_jpeg(path) if _is_jpeg(path) else _of_items(path)
+        if found is not None and oriented:
+            with open_image(path) as image:
+                found = replace(found, encoded=turn_upright(found.encoded, orientation_of(image)))
+        return found
+    except InputError:
+        raise
+    except (*PILLOW_ERRORS, IndexError, KeyError) as error:
+        _log.warning("%s: its gain map is damaged (%s): the photo is used without it", path, str(error)[:80])
+        return None
+
+
+def has_gain_map(path: Path) -> bool:
+    """Return whether a photo has a gain map that read_gain_map() decodes."""
+    with path.open("rb") as file:
+        head = file.read(1 << 16)
+    marked = (
+        b"MPF\0" in head if head[:2] == b"\xff\xd8" else head[4:8] == b"ftyp" and (b"tmap" in head or b"auxC" in head)
+    )
+    return marked and read_gain_map(path) is not None
+
+
+def _is_jpeg(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(2) == b"\xff\xd8"
+
+
+def _of_jpeg(path: Path) -> GainMap | None:
+    with open_image(path) as image:
+        count = getattr(image, "n_frames", 1)
+        if image.format != "MPO":
+            return None
+        photo, exif = image.size, exif_of(image)
+        for number in range(1, count):
+            image.seek(number)
+            iso = next((data for _, data in getattr(image, "applist", ()) if data.startswith(_ISO_JPEG)), None)
+            xmp = _text(image.info.get("xmp", b""))
+            if iso is not None and len(iso) > len(_ISO_JPEG) + 4:
+                make = _of_iso(iso[len(_ISO_JPEG) :])
+            elif "hdrgm:" in xmp:
+                make = _of_xmp(xmp)
+            elif "HDRGainMap" in xmp:
+                make = _of_apple(xmp, exif)
+            else:
+                continue
+            return _made(make, _pixels(image, photo))
+    return None
+
+
+def _of_items(path: Path) -> GainMap | None:
+    """Return the gain map of a HEIF or AVIF file."""
+    with path.open("rb") as file:
+        if file.read(12)[4:8] != b"ftyp":
+            return None
+    with open_image(path) as image:
+        photo, exif = image.size, exif_of(image)
+    items = read_items(path)
+    inputs = {number: to for kind, number, to in items.references if kind == "dimg"}
+    for number, item in items.items.items():
+        if item.kind == "tmap" and len(to := inputs.get(number, ())) >= 2 and to[0] == items.primary:
+            make = _of_iso(item_bytes(path, item)[1:])
+            return _made(make, _item_pixels(path, items, to[1], photo))
+    for number, item in items.items.items():
+        kinds = [data[4:].split(b"\0")[0].decode("latin-1") for name, data in item.properties if name == "auxC"]
+        if _APPLE_AUX in kinds:
+            xmp = "".join(_text(item_bytes(path, items.items[n])) for n in _described_by(items, number))
+            return _made(_of_apple(xmp, exif), _item_pixels(path, items, number, photo))
+    return None
+
+
+def _described_by(items: HeifItems, number: int) -> list[int]:
+    """Return the XMP items that describe an item."""
+    found = [source for kind, source, to in items.references if kind == "cdsc" and number in to]
+    return [source for source in found if source in items.items and items.items[source].kind == "mime"]
+
+
+def _item_pixels(path: Path, items: HeifItems, number: int, photo: tuple[int, int]) -> np.ndarray:
+    """Return the pixels of an item of a HEIF or AVIF file, turned like its primary picture."""
+    heif, auxiliary = is_heif(path), any(name == "auxC" for name, _ in items.items[number].properties)
+    if heif:
+        register_heif(path)
+    if heif and auxiliary:  # libheif shows it only as what belongs to another picture.
+        import pillow_heif
+
+        pixels = _pixels(pillow_heif.open_heif(path).get_aux_image(number).to_pillow(), photo)
+    else:
+        source = io.BytesIO(with_primary(path, items, number))
+        with Image.open(source, formats=("HEIF",) if heif else ("AVIF",)) as image:
+            pixels = _pixels(image, photo)
+    turned = {name: data for name, data in items.items[items.primary].properties if name in ("irot", "imir")}
+    own = {name for name, _ in items.items[number].properties}
+    if heif and "irot" in turned and "irot" not in own:
+        pixels = np.rot90(pixels, turned["irot"][-1] & 3)
+    return pixels
+
+
+def _pixels(image: Image.Image, photo: tuple[int, int]) -> np.ndarray:
+    """Return [h, w, 1 or 3] float32 in [0, 1] of an opened gain map, which has at most the photo's pixels."""
+    check_size(Path("gain map"), *image.size, most=max(photo[0] * photo[1], 1))
+    image = image if image.mode in ("L", "RGB") else image.convert("RGB")
+    values = np.asarray(image)
+    return (values.reshape(*values.shape[:2], -1) / np.float32(255)).astype(np.float32)
+
+
+def _text(data: Any) -> str:
+    return data.decode("utf-8", "replace") if isinstance(data, bytes) else str(data)
+
+
+@dataclass(frozen=True)
+class _Parameters:
+    """What metadata state: lists of 1 or 3 numbers, by the names of GainMap; apple_headroom is linear."""
+
+    minimum: tuple[float, ...] = (0.0,)
+    maximum: tuple[float, ...] = (1.0,)
+    gamma: tuple[float, ...] = (1.0,)
+    base_offset: tuple[float, ...] = (1 / 64,)
+    alternate_offset: tuple[float, ...] = (1 / 64,)
+    headroom: float = 1.0
+    base_is_hdr: bool = False
+    apple_headroom: float | None = None
+
+
+def _made(stated: _Parameters, encoded: np.ndarray) -> GainMap | None:
+    """Return the gain map of parameters and pixels; None if the photo itself is the HDR rendition.
+
+    Raises ValueError for parameters that cannot be.
+    """
+    if stated.base_is_hdr:
+        return None
+    if stated.apple_headroom is not None:
+        # light = base (1 + (headroom - 1) g), g decoded by Rec.709; as a gain map of stops.
+        linear = np.where(encoded <= 0.08145, encoded / 4.5, ((encoded + 0.099) / 1.099) ** (1 / 0.45))
+        stops = math.log2(stated.apple_headroom)
+        encoded = (np.log2(1 + (stated.apple_headroom - 1) * linear) / stops).astype(np.float32)
+        stated = _Parameters(maximum=(stops,), base_offset=(0.0,), alternate_offset=(0.0,), headroom=stops)
+    names = ("minimum", "maximum", "gamma", "base_offset", "alternate_offset")
+    numbers = {name: np.resize(np.array(getattr(stated, name), np.float64), 3) for name in names}
+    if not all(np.isfinite(values).all() for values in numbers.values()):
+        raise ValueError("its parameters are not finite")
+    if not ((numbers["gamma"] > 0.01) & (numbers["gamma"] < 100)).all():
+        raise ValueError(f"gamma {numbers['gamma'].tolist()}")
+    low, high = numbers["minimum"], numbers["maximum"]
+    if not (low.min() >= -_MOST_STOPS and (low <= high).all() and high.max() <= _MOST_STOPS):
+        raise ValueError(f"gains from {low.tolist()} to {high.tolist()} stops")
+    if not max(np.abs(numbers["base_offset"]).max(), np.abs(numbers["alternate_offset"]).max()) <= 1:
+        raise ValueError("offsets above the light of white")
+    return GainMap(encoded=encoded, headroom=float(high.max()), **numbers)
+
+
+def _of_xmp(xmp: str) -> _Parameters:
+    """Return the parameters of Ultra HDR's XMP (hdrgm 1.0)."""
+    stated = _xmp_values(xmp, "hdrgm")
+
+    def numbers(name: str, default: float) -> tuple[float, ...]:
+        values = tuple(float(value) for value in stated.get(name, ()))
+        return values if len(values) in (1, 3) else (default,)
+
+    return _Parameters(
+        minimum=numbers("GainMapMin", 0.0),
+        maximum=numbers("GainMapMax", 1.0),
+        gamma=numbers("Gamma", 1.0),
+        base_offset=numbers("OffsetSDR", 1 / 64),
+        alternate_offset=numbers("OffsetHDR", 1 / 64),
+        headroom=numbers("HDRCapacityMax", 1.0)[0],
+        base_is_hdr=stated.get("BaseRenditionIsHDR", [""])[0].lower() == "true",
+    )
+
+
+def _xmp_values(xmp: str, prefix: str) -> dict[str, list[str]]:
+    """Return the simple values and sequences of one namespace, by name."""
+    found = {name: [value] for name, value in re.findall(rf'\b{prefix}:(\w+)\s*=\s*["\']([^"\']*)["\']', xmp)}
+    for name, body in re.findall(rf"<{prefix}:(\w+)[^>/]*>(.*?)</{prefix}:\1>", xmp, re.DOTALL):
+        found[name] = re.findall(r"<rdf:li[^>]*>([^<]*)</rdf:li>", body) or [body.strip()]
+    return found
+
+
+def _of_iso(data: bytes) -> _Parameters:
+    """Return the parameters of ISO 21496-1's binary metadata, from the minimum version on.
+
+    libultrahdr's variant with one denominator for all numbers (flag 8) is read, too. Raises struct.error or ValueError.
+    """
+    least, _, flags = struct.unpack_from(">HHB", data)
+    if least > 0:
+        raise ValueError(f"metadata of version {least}")
+    channels, at = (3 if flags & 0x80 else 1), 5
+    common = struct.unpack_from(">I", data, at)[0] if flags & 8 else None
+    at += 4 if common is not None else 0
+
+    def take(signed: bool) -> float:
+        nonlocal at
+        (numerator,) = struct.unpack_from(">i" if signed else ">I", data, at)
+        at += 4
+        denominator = common
+        if denominator is None:
+            (denominator,) = struct.unpack_from(">I", data, at)
+            at += 4
+        if not denominator:
+            raise ValueError("a fraction with denominator 0")
+        return numerator / denominator
+
+    base, alternate = take(False), take(False)
+    rows = [(take(True), take(True), take(False), take(True), take(True)) for _ in range(channels)]
+    minimum, maximum, gamma, base_offset, alternate_offset = zip(*rows, strict=True)
+    return _Parameters(minimum, maximum, gamma, base_offset, alternate_offset, alternate, base_is_hdr=base > alternate)
+
+
+def _of_apple(xmp: str, exif: Any) -> _Parameters:
+    """Return the headroom of Apple's gain map: from XMP, else from the maker note, by Apple's published formula.
+
+    Raises ValueError if neither states it.
+    """
+    stated = _xmp_values(xmp, "HDRGainMap").get("HDRGainMapHeadroom")
+    if stated is not None:
+        headroom = float(stated[0])
+    else:
+        note = _apple_note(exif.get_ifd(0x8769).get(0x927C, b""))
+        if 33 not in note or 48 not in note:
+            raise ValueError("neither XMP nor maker note states its headroom")
+        bright, gain = note[33], note[48]
+        if bright < 1:
+            stops = -20 * gain + 1.8 if gain <= 0.01 else -0.101 * gain + 1.601
+        else:
+            stops = -70 * gain + 3.0 if gain <= 0.01 else -0.303 * gain + 2.303
+        headroom = 2.0 ** max(stops, 0.0)
+    if not 1 < headroom <= 2**_MOST_STOPS:
+        raise ValueError(f"headroom {headroom:g}")
+    return _Parameters(apple_headroom=headroom)
+
+
+def _apple_note(note: Any) -> dict[int, float]:
+    """Return the fractions of Apple's maker note by tag: a TIFF directory, big-endian, after 14 bytes."""
+    if not isinstance(note, bytes) or not note.startswith(b"Apple iOS\0"):
+        return {}
+    table = TiffImagePlugin.ImageFileDirectory_v2(b"MM\0*\0\0\0\x0e")
+    # Places in the note count from its beginning.
+    file = io.BytesIO(note)
+    file.seek(14)
+    table.load(file)
+    return {tag: float(table[tag]) for tag in (33, 48) if tag in table}

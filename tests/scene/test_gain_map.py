@@ -1,0 +1,221 @@
+"""Gain maps from files that the test writes: light behind white against the light they were made of."""
+
+import json
+import logging
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sehdr_warp.scene import load_scene
+from sehdr_warp.scene.gain_map import has_gain_map, light_of, read_gain_map
+from sehdr_warp.scene.images import read_ldr
+
+from .gain_map_files import iso_metadata, write_heif_pair, write_jpeg_pair, xmp_segment
+
+HEIGHT, WIDTH = 96, 128
+STOPS = 2.5
+
+
+def linear(codes):
+    values = codes / np.iinfo(codes.dtype).max
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def encoded(light):
+    light = np.clip(light, 0, 1)
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def scene():
+    """[H, W, 3] smooth light from 0.05 to 2^STOPS times white."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] / WIDTH
+    level = 0.5 + 0.5 * np.sin(2.5 * x + 2 * y)
+    return (0.05 * (2**STOPS / 0.05) ** level)[..., None] * [1.0, 0.9, 0.8]
+
+
+def pair(apple=False, channels=1):
+    """The photo clipped at white, and what the map holds: [h, w(, 3)] uint8 at half of the size."""
+    light = scene()
+    base = np.rint(255 * encoded(light)).astype(np.uint8)
+    shown = linear(base)
+    if apple:
+        share = (light.max(2) / shown.max(2) - 1) / (2**STOPS - 1)
+        share = np.clip(share, 0, 1)
+        stored = np.where(share <= 0.0181, 4.5 * share, 1.099 * np.maximum(share, 1e-9) ** 0.45 - 0.099)
+    else:
+        gains = np.log2((light + 1 / 64) / (shown + 1 / 64)) / STOPS
+        stored = gains if channels == 3 else gains[..., 0]
+    small = np.clip(stored, 0, 1)
+    small = small.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, -1).mean((1, 3)).squeeze()
+    return light, base, np.rint(255 * small).astype(np.uint8)
+
+
+def decoded(path):
+    return read_gain_map(path).light(linear(read_ldr(path).pixels))
+
+
+def assert_light(found, expected, channels=1):
+    """Within 3 %, where the map was not averaged over the edge of what is clipped."""
+    channel = slice(None) if channels == 3 else slice(0, 1)
+    error = np.abs(found / expected - 1)[..., channel]
+    assert np.percentile(error[8:-8, 8:-8], 98) < 0.03, np.percentile(error, [50, 90, 98, 100])
+    assert found[..., 0].max() == pytest.approx(expected[..., 0].max(), rel=0.03)
+
+
+def iso_segment(**options):
+    return 0xFFE2, b"urn:iso:std:iso:ts:21496:-1\0" + iso_metadata(STOPS, **options)
+
+
+def hdrgm(**more):
+    fields = {"Version": "1.0", "GainMapMin": "0", "GainMapMax": str(STOPS), "HDRCapacityMin": "0"}
+    return xmp_segment(fields | {"HDRCapacityMax": str(STOPS)} | more)
+
+
+@pytest.mark.parametrize("segment", [iso_segment(), hdrgm()], ids=["iso", "xmp"])
+def test_gain_maps_in_jpeg(tmp_path, segment):
+    light, base, gain = pair()
+    write_jpeg_pair(tmp_path / "a.jpg", base, gain, [segment])
+    assert has_gain_map(tmp_path / "a.jpg")
+    assert_light(decoded(tmp_path / "a.jpg"), light)
+    assert read_gain_map(tmp_path / "a.jpg").headroom == STOPS
+
+
+def test_a_gain_map_of_three_channels(tmp_path):
+    light, base, gain = pair(channels=3)
+    write_jpeg_pair(tmp_path / "a.jpg", base, gain, [iso_segment(channels=3)])
+    assert_light(decoded(tmp_path / "a.jpg"), light, channels=3)
+
+
+def test_libultrahdr_writes_what_is_read(tmp_path):
+    imagecodecs = pytest.importorskip("imagecodecs")
+    light = scene()
+    pixels = np.concatenate([light, np.ones((HEIGHT, WIDTH, 1))], 2).astype(np.float16)
+    (tmp_path / "a.jpg").write_bytes(imagecodecs.ultrahdr_encode(pixels, level=97))
+    found = decoded(tmp_path / "a.jpg")
+    theirs = imagecodecs.ultrahdr_decode((tmp_path / "a.jpg").read_bytes())[..., :3].astype(float)
+    inside = slice(4, -4), slice(4, -4)
+    np.testing.assert_allclose(found[inside], theirs[inside], rtol=0.05)
+    assert np.abs(found / theirs - 1)[inside].mean() < 0.015
+    median, high = np.percentile(np.abs(found / light - 1)[inside], [50, 90])
+    assert median < 0.015 and high < 0.035
+
+
+@pytest.mark.parametrize("stated", ["xmp", "maker note"])
+def test_apples_gain_map_in_jpeg(tmp_path, stated):
+    light, base, gain = pair(apple=True)
+    fields = {"HDRGainMapVersion": "131072"}
+    exif = Image.Exif()
+    if stated == "xmp":
+        fields["HDRGainMapHeadroom"] = str(2**STOPS)
+    else:  # 2.5 stops: -70 x + 3 with x = 1 / 140
+        exif.get_ifd(0x8769)[0x927C] = apple_note(1.01, 1 / 140)
+    segment = xmp_segment(fields, "HDRGainMap", "http://ns.apple.com/HDRGainMap/1.0/")
+    write_jpeg_pair(tmp_path / "a.jpg", base, gain, [segment], exif=exif.tobytes())
+    assert_light(decoded(tmp_path / "a.jpg"), light)
+
+
+def apple_note(bright, gain):
+    """Apple's maker note with tags 33 and 48: signed fractions behind a directory at byte 14."""
+    import struct
+
+    head = b"Apple iOS\0\0\1MM" + struct.pack(">H", 2)
+    at = 14 + 2 + 24 + 4
+    head += struct.pack(">HHII", 33, 10, 1, at) + struct.pack(">HHII", 48, 10, 1, at + 8) + bytes(4)
+    return head + struct.pack(">4i", round(bright * 10**6), 10**6, round(gain * 10**6), 10**6)
+
+
+def saved(path, pixels, **options):
+    if path.suffix == ".avif":
+        Image.fromarray(pixels).save(path, quality=95, **options)
+    else:
+        pytest.importorskip("pillow_heif").from_pillow(Image.fromarray(pixels)).save(path, quality=95, **options)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".heic", ".avif"])
+def test_iso_gain_maps_in_heif_and_avif(tmp_path, suffix):
+    light, base, gain = pair()
+    files = saved(tmp_path / f"b{suffix}", base), saved(tmp_path / f"g{suffix}", np.repeat(gain[..., None], 3, 2))
+    write_heif_pair(tmp_path / f"a{suffix}", *files, iso=iso_metadata(STOPS))
+    assert has_gain_map(tmp_path / f"a{suffix}") and not has_gain_map(files[0])
+    assert_light(decoded(tmp_path / f"a{suffix}"), light)
+
+
+def test_apples_gain_map_in_heic_is_turned_with_its_photo(tmp_path):
+    light, base, gain = pair(apple=True)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    stored = saved(tmp_path / "b.heic", base, exif=exif.tobytes())
+    other = saved(tmp_path / "g.heic", np.repeat(gain[..., None], 3, 2))
+    _, body = xmp_segment({"HDRGainMapHeadroom": str(2**STOPS)}, "HDRGainMap", "http://ns.apple.com/HDRGainMap/1.0/")
+    write_heif_pair(tmp_path / "a.heic", stored, other, apple_xmp=body.partition(b"\0")[2])
+    found = decoded(tmp_path / "a.heic")
+    assert found.shape == (WIDTH, HEIGHT, 3)
+    assert_light(found, np.rot90(light, -1))
+
+
+def test_photos_without_a_gain_map(tmp_path):
+    _, base, gain = pair()
+    Image.fromarray(base).save(tmp_path / "a.jpg")
+    write_jpeg_pair(tmp_path / "stereo.jpg", base, base, [])
+    write_jpeg_pair(tmp_path / "hdr_base.jpg", base, gain, [iso_segment(base_headroom=STOPS + 1)])
+    for name in ("a.jpg", "stereo.jpg", "hdr_base.jpg"):
+        assert not has_gain_map(tmp_path / name) and read_gain_map(tmp_path / name) is None
+
+
+@pytest.mark.parametrize("segment", [
+    (0xFFE2, b"urn:iso:std:iso:ts:21496:-1\0" + iso_metadata(STOPS)[:20]),
+    (0xFFE2, b"urn:iso:std:iso:ts:21496:-1\0\0\7" + iso_metadata(STOPS)[2:]),
+    hdrgm(GainMapMax="nan"), hdrgm(GainMapMax="400"), hdrgm(Gamma="0"), hdrgm(GainMapMax="much"),
+], ids=["cut", "version", "nan", "bright", "gamma", "word"])  # fmt: skip
+def test_a_damaged_gain_map_is_named_and_the_photo_is_used(tmp_path, caplog, segment):
+    _, base, gain = pair()
+    write_jpeg_pair(tmp_path / "a.jpg", base, gain, [segment])
+    with caplog.at_level(logging.WARNING, "sehdr_warp.scene"):
+        assert read_gain_map(tmp_path / "a.jpg") is None
+    assert "a.jpg: its gain map is damaged" in caplog.text
+    assert read_ldr(tmp_path / "a.jpg").pixels.shape == base.shape
+
+
+def write_set(folder, count=4):
+    """Posed photos with gain maps, all of one scene."""
+    light, base, gain = pair()
+    for i in range(count):
+        write_jpeg_pair(folder / f"{i}.jpg", base, gain, [iso_segment()])
+    frames = [{"file_path": f"{i}.jpg", "transform_matrix": np.eye(4).tolist()} for i in range(count)]
+    (folder / "transforms.json").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "fl_x": 100, "frames": frames}))
+    return light
+
+
+def test_a_set_with_gain_maps_has_their_light(tmp_path):
+    light = write_set(tmp_path)
+    scene = load_scene(tmp_path)
+    assert scene.light_known and scene.response.name == "srgb"
+    assert any("4 of 4 photos have a gain map: light is taken from it, up to 2.5 stops" in note for note in scene.notes)
+    view = scene.views[0]
+    white = view.codes == 65535
+    found = np.where(white, view.light_above_white, linear(view.codes))
+    assert (view.light_above_white[~white] == 0).all() and white.mean() > 0.2
+    assert_light(found, light)
+
+
+def test_a_named_response_keeps_the_codes_and_has_the_light_of_white_ones(tmp_path):
+    light = write_set(tmp_path)
+    view = load_scene(tmp_path, response="gamma-2.2").views[0]
+    assert view.codes.dtype == np.uint8
+    clipped = view.codes == 255
+    inside = clipped & (light > 1.3)
+    assert ((view.light_above_white > 0) == clipped).all()
+    error = np.abs(view.light_above_white[..., 0] / light[..., 0] - 1)[inside[..., 0]]
+    assert np.percentile(error, 90) < 0.03 and view.light_above_white_deviation > 0
+
+
+def test_a_gain_map_is_turned_with_its_photo(tmp_path):
+    light, base, gain = pair()
+    exif = Image.Exif()
+    exif[0x0112] = 8
+    write_jpeg_pair(tmp_path / "a.jpg", base, gain, [iso_segment()], exif=exif.tobytes())
+    photo = light_of(read_ldr(tmp_path / "a.jpg", oriented=True), read_gain_map(tmp_path / "a.jpg", oriented=True))
+    found = np.where(photo.pixels == 65535, photo.above_white, linear(photo.pixels))
+    assert_light(found, np.rot90(light))
