@@ -58,7 +58,7 @@ docs: $(VENV)/installed-dev
 
 # The tables and plots of docs/reports, from the results stored there.
 reports: $(VENV)/installed
-	$(BIN)/python docs/reports/write.py
+	$(BIN)/python -m benchmarks.report_pages
 
 # The pictures of README and guide: trains a scene that clips, a few minutes on two cores. That of the viewer needs
 # Chromium, and playwright, which `make test` installs.

@@ -37,7 +37,6 @@ COMMANDS = {
     },
     "measure and make": {
         "check": ("check.commands", "Check", "run_check"),
-        "bench": ("bench.commands", "Bench", "run_bench"),
         "synth": ("synth.commands", "Synth", "run_synth"),
         "completion": ("completion", "Completion", "run_completion"),
     },
@@ -139,6 +138,9 @@ def parse_command(words: list[str]) -> tuple[Callable, object]:
     from .arguments import parse
 
     name, *rest = words
+    if name == "bench":
+        program = " ".join(["python -m benchmarks", *rest])
+        raise UsageError(f"bench is not part of the installed program; in a checkout, run {program}")
     if name in _RENAMED:
         raise UsageError(f"no command {name}: {_RENAMED[name]}")
     if name not in _MODULES:

@@ -31,37 +31,12 @@ ALLOWED = {
     "model": ANY | {"scene", "response", "rasterizer", "splats"},
     "output": ANY | {"runs", "scene", "response", "splats", "model.exposure", "model.baking", "model.sensor_colors"},
     "viewer": ANY | {"runs", "scene", "output"},
-    "evaluation": ANY
-    | {"runs", "scene", "rasterizer.ssim", "model.baking", "output.names", "output.charts", "output.environment_map"},
+    "evaluation": ANY | {"runs", "scene", "rasterizer.ssim", "output.names", "output.charts"},
     "runs": ANY | {"scene", "response", "model", "splats", "output.notebook"},
     "training": ANY
     | {"runs", "scene", "response", "model", "rasterizer", "splats", "evaluation.metrics", "evaluation.protocols"},
     "synth": ANY | {"scene", "response", "output.exr", "output.images", "model.exposure"},
-    "check": ANY
-    | {
-        "bench.results",
-        "bench.splats",
-        "kernels.constants",
-        "scene",
-        "response",
-        "model",
-        "rasterizer",
-        "runs",
-        "training",
-    },
-    "bench": ANY
-    | {
-        "synth.expose",
-        "kernels.constants",
-        "scene",
-        "response",
-        "model",
-        "rasterizer",
-        "runs",
-        "training",
-        "output",
-        "evaluation",
-    },
+    "check": ANY | {"kernels.constants", "rasterizer", "runs.device"},
 }
 # Packages that only some rooms may import.
 ONLY_IN = {

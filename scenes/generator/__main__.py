@@ -62,7 +62,7 @@ class Pack:
 
 @dataclass(frozen=True)
 class Light:
-    """Add maps of the light at four places to a set, rendered or packed: what `bench quality` judges irradiance by."""
+    """Add maps of the light at four places to a set; `benchmarks quality` judges irradiance by them."""
 
     name: Positional[str]
     """Of the scene, or all."""

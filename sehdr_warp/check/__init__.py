@@ -1,1 +1,1 @@
-"""`sehdr-warp check`: numerical stability on stiff and extreme cases, against float64 truth."""
+"""`sehdr-warp check`: rendering of stiff and extreme scenes against float64 truth."""

@@ -35,12 +35,21 @@ class Reading:
 
 @dataclass(frozen=True)
 class Case:
-    """name: for --cases. what: one line. measure: device -> readings. quick: part of --quick and of the tests. note:
-    what float32 cannot do better here, and what is done about it."""
+    """A stiff or extreme problem and how it is measured.
+
+    Attributes:
+        name: for tables and for choosing it.
+        what: one line.
+        measure: takes a device, yields readings.
+        group: splat, light, poison or training.
+        quick: takes less than a second on two cores.
+        note: what float32 cannot do better here, and what is done about it.
+    """
 
     name: str
     what: str
     measure: Callable[[torch.device], Iterable[Reading]]
+    group: str = "splat"
     quick: bool = True
     note: str = ""
 

@@ -1,36 +1,49 @@
 """The command line of `sehdr-warp check`. torch is imported when it runs."""
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
 
-from ..bench.commands import Output
 from ..errors import SehdrError
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check(Output):
-    """Check numerical stability on this device: stiff and extreme cases against float64, each with its bound."""
+class Check:
+    """Check that this machine renders correctly: stiff and extreme scenes against float64, in seconds."""
 
-    cases: str | None = None
-    """Cases or groups (splat, light, poison, training) separated by commas; by default all."""
-    quick: bool = False
-    """Leave out the cases that take seconds."""
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
+    json: Path | None = None
+    """Also write the figures, with a description of this machine, to this file."""
+    overwrite: bool = False
+    """Replace the file of --json."""
+
+    gone: ClassVar[dict[str, str]] = {
+        "--quick": "every check is quick now",
+        "--cases": "in a checkout, python -m benchmarks stability --cases chooses among more cases",
+    }
 
 
-def run_check(command: Check) -> None:
-    """Raises SehdrError if a bound failed, after everything was written."""
-    from ..bench.results import new_result
+def run_check(options: Check) -> None:
+    """Measure every case; raise SehdrError, after everything is written, if one exceeds its bound."""
     from ..files import check_absent, write_json
     from ..runs.device import pick_device
-    from .catalogue import choose_cases, run_cases
+    from .result import new_result
+    from .run_cases import run_cases
+    from .splat_cases import POISON_CASES, SPLAT_CASES
 
-    if command.json is not None:
-        check_absent(command.json, command.overwrite)
-    device, cases = pick_device(command.device), choose_cases(command.cases, command.quick)
-    result = new_result("stability", device, {"device": str(device)}) | {"rows": run_cases(cases, device)}
-    if command.json is not None:
-        write_json(command.json, result, command.overwrite)
-    if failed := [row["case"] for row in result["rows"] if not row["holds"]]:
-        count = f"{len(failed)} of {len(cases)} cases exceed their bounds on {device}"
+    if options.json is not None:
+        check_absent(options.json, options.overwrite)
+    device = pick_device(options.device)
+    cases = [case for case in (*SPLAT_CASES, *POISON_CASES) if case.quick]
+    result = new_result("check", device, {"device": str(device)}) | {"rows": run_cases(cases, device)}
+    if options.json is not None:
+        write_json(options.json, result, options.overwrite)
+    require_bounds(result["rows"], device)
+
+
+def require_bounds(rows: list[dict], device: object) -> None:
+    """Raise SehdrError, which names the cases, if a row of run_cases() exceeds its bounds."""
+    if failed := [row["case"] for row in rows if not row["holds"]]:
+        count = f"{len(failed)} of {len(rows)} cases exceed their bounds on {device}"
         raise SehdrError(f"{count}: {', '.join(failed)}; please report them with the device and its driver")

@@ -1,4 +1,4 @@
-"""The catalogue's splats: shapes, places, opacities, overlap, radiance, and poison in their arguments."""
+"""Splats: shapes, places, opacities, overlap, radiance, and poison in their arguments."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -318,7 +318,7 @@ SPLAT_CASES = (
     Case("harmonics", "spherical harmonics from 1e-6 to 1e6 units, and at the camera", _harmonics),
 )  # fmt: skip
 POISON_CASES = (
-    Case("poison-gaussians", "NaN, infinite, huge and denormal numbers in Gaussians", _poisoned_gaussians),
-    Case("poison-camera", "the same in the camera", _poisoned_camera),
-    Case("poison-others", "the same in harmonics and similarity", _poisoned_others),
+    Case("poison-gaussians", "NaN, infinite, huge and denormal numbers in Gaussians", _poisoned_gaussians, "poison"),
+    Case("poison-camera", "the same in the camera", _poisoned_camera, "poison"),
+    Case("poison-others", "the same in harmonics and similarity", _poisoned_others, "poison"),
 )

@@ -155,7 +155,7 @@ def told(command: str) -> dict:
     """How a report's result says where figures are from."""
     import torch
 
-    from sehdr_warp.bench.results import new_result
+    from benchmarks.results import new_result
 
     result = new_result("trust", torch.device("cpu"), {})
     return {"command": command} | {name: result[name] for name in ("date", "machine", "notes")}

@@ -7,8 +7,8 @@ import pytest
 import torch
 import warp as wp
 
-from sehdr_warp.bench.splats import Size, make_photo_scene
-from sehdr_warp.bench.step import make_trainer
+from benchmarks.splats import Size, make_photo_scene
+from benchmarks.step import make_trainer
 from sehdr_warp.kernels.plane_sweep_cpu import sweep_rows
 from sehdr_warp.kernels.shared_ranges import share_ranges
 from sehdr_warp.rasterizer import precompile

@@ -3,7 +3,7 @@
 import torch
 import warp as wp
 
-from sehdr_warp.bench.splats import Size, make_splat_scene
+from benchmarks.splats import Size, make_splat_scene
 from sehdr_warp.kernels.constants import ALPHA_THRESHOLD
 from sehdr_warp.rasterizer import rasterize
 from sehdr_warp.rasterizer.workload import count_blended_pairs

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import uniform_filter
 
+from benchmarks.irradiance import read_light_maps
 from scenes.generator.__main__ import main
 from scenes.generator.light import PLACES, render_light
 from scenes.generator.recipes import RECIPES
 from scenes.generator.render import load_mitsuba
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.evaluation.irradiance import read_light_maps
 from sehdr_warp.output.environment_map import latlong
 from sehdr_warp.scene import embedded_folder, embedded_scenes, load_scene
 

@@ -1,15 +1,14 @@
 """A prepared folder for each case, and the table of the trial."""
 
-import importlib
 import json
 import os
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
 
-from sehdr_warp.bench.results import markdown_table
+from benchmarks.report_pages import trial_table
+from benchmarks.results import markdown_table
 from tests.fuzz.run import keep, kept, told
 
 from .harness import COMMANDS, SEED, TRAIN, VIEW, browse, call, load
@@ -39,8 +38,6 @@ def space(prepared, tmp_path) -> Path:
     return shutil.copytree(prepared, tmp_path / "space", symlinks=True)
 
 
-sys.path.append(str(Path(__file__).resolve().parents[2] / "docs" / "reports"))
-trial_table = importlib.import_module("write").trial_table
 KINDS = {"tracebacks": "Traceback", "hangs": "hangs for", "programs": "STARTED"}
 """What a failed case did, by words of its report; any other lost something, or did not say what it should."""
 

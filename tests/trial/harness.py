@@ -34,7 +34,6 @@ COMMANDS = {
     "envmap": "envmap run --out made/light.exr --size 32 --device cpu --overwrite",
     "eval": "eval run --json made/figures.json --device cpu --overwrite",
     "synth": "synth truth --out set --overwrite",
-    "quality": "bench quality --scenes truth --methods demo --iterations 4 --out made --device cpu",
 }
 VIEW = ["view", "run", "--port", "0", "--device", "cpu"]
 COMMANDS = {name: line.split() for name, line in COMMANDS.items()}

@@ -1,0 +1,98 @@
+"""What a photo's bits gain: scenes with truth, photographed linearly and through a curve at 8 to 14 bits.
+
+python -m benchmarks.bits --json docs/reports/results/bits.json
+
+White is the same for all: the light that sRGB's code 1 shows. Linear photos are what a sensor writes to a RAW file,
+curved ones what a JPEG (8 bits) or a TIFF holds. `camera` adds the noise of a sensor of 20,000 electrons that reads out
+with 5.
+"""
+
+import logging
+import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import partial
+from itertools import product
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+
+from sehdr_warp.evaluation.evaluate import evaluate
+from sehdr_warp.files import write_json
+from sehdr_warp.response import Response, response_by_name
+from sehdr_warp.runs.config_files import load_config
+from sehdr_warp.scene import Scene, codes_of, load_scene
+from sehdr_warp.scene.linear_photos import linear_codes
+from sehdr_warp.synth.expose import SensorNoise, exposure_ladder, noisy
+from sehdr_warp.training.train import train
+
+from .results import finish, new_result
+
+LOG = logging.getLogger("bits")
+SCENES = ("window", "lamps", "sunlit", "night")
+PHOTOS = [(bits, kind, "none") for kind in ("curve", "linear") for bits in (8, 10, 12, 14)]
+PHOTOS += [(8, "curve", "camera"), (14, "linear", "camera")]
+
+
+def main(
+    json: Path,
+    scenes: tuple[str, ...] = SCENES,
+    exposures: tuple[int, ...] = (0, 2),
+    iterations: int = 2000,
+    max_size: int | None = None,
+    jobs: int = 1,
+    device: str = "cuda",
+) -> None:
+    """Train every kind of photo of each scene at some exposures of its ladder, of which 2 is the middle."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    result = new_result("bits", torch.device(device), {"iterations": iterations, "max_size": max_size})
+    result["command"] = "python -m benchmarks.bits --json docs/reports/results/bits.json"
+    given = partial(row, iterations=iterations, max_size=max_size, device=device)
+    # Kernels are compiled once, not by each worker.
+    row((scenes[0], exposures[0], *PHOTOS[0]), iterations=30, max_size=max_size, device=device)
+    with ProcessPoolExecutor(jobs, get_context("spawn")) as workers:
+        asked = [(scene, exposure, *photos) for exposure, scene, photos in product(exposures, scenes, PHOTOS)]
+        for found in workers.map(given, asked):
+            result["rows"].append(found)
+            write_json(json, result, overwrite=True)  # What has ended outlives an interruption.
+    finish(result, json, overwrite=True)
+
+
+def row(asked: tuple[str, int, int, str, str], *, iterations: int, max_size: int | None, device: str) -> dict:
+    """Held-out figures of one training."""
+    name, exposure, bits, kind, noise = asked
+    curve = response_by_name("srgb")
+    truth = load_scene(f"embedded:{name}", max_size=max_size, response="srgb")
+    time = exposure_ladder(truth, curve)[exposure]
+    scene = photographed(truth, curve, time, bits, kind, SensorNoise() if noise == "camera" else None)
+    config = load_config("default", {"schedule.iterations": iterations, "response.name": "srgb"})
+    with tempfile.TemporaryDirectory() as folder:
+        figures = evaluate(train(scene, Path(folder) / "run", config, device=device), scene)
+    shown, regions = figures["protocol"]["gt-max"]["psnr_mu"], figures["regions"]
+    place = {"scene": name, "exposure": exposure, "bits": bits, "kind": kind, "noise": noise, "hdr": shown}
+    LOG.info("%s", place)
+    return place | {region.replace("-", "_"): regions[region]["psnr_mu"]["gt-max"] for region in regions}
+
+
+def photographed(truth: Scene, curve: Response, time: float, bits: int, kind: str, noise: SensorNoise | None) -> Scene:
+    """The scene in photos of so many bits, rounded before ("linear", read as RAW files are) or behind ("curve") the
+    curve."""
+    levels, views, random = 2**bits - 1, [], np.random.default_rng(0)
+    for view in truth.views:
+        assert view.hdr is not None
+        light = view.hdr.astype(np.float64) * time
+        light = light if noise is None else noisy(light, 1.0, noise, random)
+        if kind == "linear":
+            codes = linear_codes(np.rint(np.clip(light, 0, 1) * levels) / levels)
+        else:
+            codes = codes_of(np.rint(np.asarray(curve.encode(light)) * levels) / levels, 16)
+        # Of no file: a picture of light, as the truth is, would be learned from as it is.
+        views.append(replace(view, codes=codes, exposure_time=time, source=None))
+    return replace(truth, views=tuple(views), response=curve, light_known=True)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,253 @@
+"""The commands of `python -m benchmarks`. torch is imported when they run."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from sehdr_warp.arguments import numbers, positive
+from sehdr_warp.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Output:
+    """Where the result goes."""
+
+    json: Path | None = None
+    """Write the result to this file."""
+    overwrite: bool = False
+    """Replace files that exist."""
+
+    def report(self, result: dict) -> None:
+        """Print the result; raise SehdrError if a check failed."""
+        from .results import finish
+
+        finish(result)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timed(Output):
+    """How things are timed."""
+
+    device: str | None = None
+    """cpu or cuda:N; by default the first GPU if there is one."""
+    repetitions: int = 30
+    """Timed runs of each variant; slow ones have fewer on the CPU."""
+
+    def timing(self) -> dict:
+        from sehdr_warp.runs.device import pick_device
+
+        return {"device": pick_device(self.device), "repetitions": positive("--repetitions", self.repetitions)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kernels(Timed):
+    """Time the whole differentiable splat, forward and backward, beside plain torch or, if it is installed, gsplat."""
+
+    channels: str = "3,9,15"
+    """Feature channels, separated by commas."""
+    sizes: str | None = None
+    """Gaussians@WIDTHxHEIGHT such as 20k@200x200, separated by commas."""
+
+    def measure(self):
+        from .kernels import bench_kernels
+        from .splats import parse_size
+
+        timing = self.timing()
+        default = {"cuda": "50k@400x400,200k@800x800,1M@1600x1200", "cpu": "5k@200x200,20k@200x200"}
+        sizes = [parse_size(item) for item in (self.sizes or default[timing["device"].type]).split(",")]
+        return bench_kernels(sizes, numbers("--channels", self.channels, int, least=1), **timing)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step(Timed):
+    """Time a whole training step of presets on a synthetic scene, recorded and launched."""
+
+    preset: str = "default"
+    """Presets or TOML files, separated by commas."""
+    size: str | None = None
+    """Gaussians@WIDTHxHEIGHT; by default 100k@400x400 on a GPU and 20k@200x200 on the CPU."""
+
+    def measure(self):
+        from .splats import parse_size
+        from .step import bench_step
+
+        timing = self.timing()
+        size = parse_size(self.size or {"cuda": "100k@400x400", "cpu": "20k@200x200"}[timing["device"].type])
+        return bench_step(size, presets=_words(self.preset), **timing)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale(Timed):
+    """Time and memory of splats and training steps over Gaussians, pixels, channels and photos, with slopes."""
+
+    small: bool = False
+    """Every second point, without the largest."""
+
+    def measure(self):
+        from .scale import bench_scale
+
+        return bench_scale(small=self.small, **self.timing())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workers(Timed):
+    """Time training steps on more and more threads of the CPU, or on more and more GPUs."""
+
+    sizes: str | None = None
+    """Gaussians@WIDTHxHEIGHT, separated by commas; by default 1M@1600x1200 on GPUs, 20k@200x200 and 100k@800x800 on the
+    CPU."""
+
+    def measure(self):
+        from .splats import parse_size
+        from .workers import bench_workers
+
+        timing = self.timing()
+        default = {"cuda": "1M@1600x1200", "cpu": "20k@200x200,100k@800x800"}
+        sizes = [parse_size(item) for item in (self.sizes or default[timing["device"].type]).split(",")]
+        return bench_workers(sizes, **timing)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quality(Output):
+    """Train methods on scenes with HDR truth and compare; finished trainings in --out never run again. LPIPS is judged
+    where SEHDR_LPIPS names a folder with its weights."""
+
+    out: Path
+    """Folder of the jobs and their results."""
+    scenes: str = "embedded"
+    """Folders with HDR truth in all views, embedded or embedded:NAME, separated by commas."""
+    methods: str = "default,paper,hdr-gs,3dgs,truth"
+    """Presets or TOML files, separated by commas."""
+    curves: str = "hdr-nerf"
+    """Camera responses that expose the truth: names or files, separated by commas."""
+    exposures: str = "2"
+    """Out of a ladder of five, 0 to 4, separated by commas; every training has one."""
+    responses: str = "known"
+    """known (the method is told the curve), blind (it is not), or both, separated by a comma."""
+    seeds: str = "0"
+    """Seeds of the trainings, separated by commas."""
+    iterations: int | None = None
+    """Training steps; by default each preset's own."""
+    max_size: int | None = None
+    """Longest side of the views, in pixels."""
+    device: Literal["cpu", "cuda"] | None = None
+    """By default cuda if there is a GPU; CUDA_VISIBLE_DEVICES chooses among several."""
+    jobs: int = 1
+    """Trainings at one time, spread over the GPUs; more than one needs submitit."""
+    slurm: str | None = None
+    """Submit to SLURM, with these parameters, such as partition=gpu,time=240 (minutes)."""
+
+    def measure(self):
+        import torch
+
+        from .quality import plan_jobs, run_jobs
+        from .results import new_result
+
+        device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")
+        lpips = os.environ.get("SEHDR_LPIPS") or None
+        asked: dict[str, Any] = {
+            name: _words(getattr(self, name)) for name in ("scenes", "methods", "curves", "responses")
+        }
+        for name in ("exposures", "seeds"):
+            asked[name] = tuple(dict.fromkeys(numbers(f"--{name}", getattr(self, name), int, least=0)))
+        iterations = self.iterations and positive("--iterations", self.iterations)
+        jobs = plan_jobs(**asked, iterations=iterations, max_size=self.max_size, device=device, lpips=lpips is not None)
+        how = {"at_once": positive("--jobs", self.jobs), "slurm": _pairs("--slurm", self.slurm)}
+        rows = run_jobs(jobs, self.out, device=device, lpips=lpips and os.path.abspath(lpips), **how)
+        result = new_result("quality", torch.device(device), {"jobs": self.jobs})
+        result["rows"] = [row for row in rows if "error" not in row]
+        for job, row in zip(jobs, rows, strict=True):
+            error = row.get("error")
+            result["checks"].append({"what": job.label, "passed": error is None, "error": error})
+        return result
+
+
+@dataclass(frozen=True, kw_only=True)
+class Responses(Output):
+    """How well the camera's response is found from photos alone, on scenes with HDR truth."""
+
+    data: tyro.conf.Positional[tuple[str, ...]] = ("embedded",)
+    """Scenes with HDR truth."""
+    curves: str = "hdr-nerf,srgb,gamma-2.2,rec709,filmic,aces,camera"
+    """Responses that expose the scenes, separated by commas."""
+    exposures: int = 5
+    """Exposures of each scene, each four times longer than the last."""
+    max_size: int | None = None
+    """Longest side of the scenes' photos, in pixels."""
+
+    def measure(self):
+        from .response import bench_response
+
+        exposures = positive("--exposures", self.exposures)
+        return bench_response(self.data, _words(self.curves), exposures=exposures, max_size=self.max_size)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stability(Output):
+    """Stiff and extreme cases of splats, light and training against float64, each with its bound."""
+
+    cases: str | None = None
+    """Cases or groups (splat, light, poison, training), separated by commas; by default all."""
+    quick: bool = False
+    """Leave out the cases that take seconds."""
+    device: str | None = None
+    """cpu or cuda:N; by default the first GPU if there is one."""
+
+    def measure(self):
+        """Measure the cases and print each bound; checks are the cases."""
+        from sehdr_warp.check.run_cases import run_cases
+        from sehdr_warp.training.train import pick_device
+
+        from .results import new_result
+        from .stability.catalogue import choose_cases
+
+        device, cases = pick_device(self.device), choose_cases(self.cases, self.quick)
+        return new_result("stability", device, {"device": str(device)}) | {"rows": run_cases(cases, device)}
+
+    def report(self, result: dict) -> None:
+        """Raise SehdrError if a case exceeds its bound."""
+        from sehdr_warp.check.commands import require_bounds
+
+        require_bounds(result["rows"], result["settings"]["device"])
+
+
+@dataclass(frozen=True)
+class Benchmarks:
+    """Measure speed, memory, quality and stability."""
+
+    benchmark: (
+        Annotated[Kernels, tyro.conf.subcommand("kernels")]
+        | Annotated[Step, tyro.conf.subcommand("step")]
+        | Annotated[Scale, tyro.conf.subcommand("scale")]
+        | Annotated[Workers, tyro.conf.subcommand("workers")]
+        | Annotated[Quality, tyro.conf.subcommand("quality")]
+        | Annotated[Responses, tyro.conf.subcommand("response")]
+        | Annotated[Stability, tyro.conf.subcommand("stability")]
+    )
+
+
+def run_benchmark(options: Benchmarks) -> None:
+    """Measure, write and print; raise SehdrError, after everything is written, if a check failed."""
+    from sehdr_warp.files import check_absent, write_json
+
+    benchmark = options.benchmark
+    if benchmark.json is not None:
+        check_absent(benchmark.json, benchmark.overwrite)
+    result = benchmark.measure()
+    if benchmark.json is not None:
+        write_json(benchmark.json, result, benchmark.overwrite)
+    benchmark.report(result)
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(item.strip() for item in text.split(",") if item.strip()))
+
+
+def _pairs(flag: str, text: str | None) -> dict[str, str] | None:
+    pairs = {name: value for name, _, value in (item.partition("=") for item in _words(text or ""))}
+    if not all(name and value for name, value in pairs.items()):
+        raise InputError(f"{flag} {text}", "not name=value pairs", f"write for example {flag} partition=gpu")
+    return None if text is None else pairs

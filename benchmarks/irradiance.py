@@ -1,0 +1,83 @@
+"""How well surfaces would be lit by a trained scene: irradiance at some places, by direction, against the truth's."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.model.baking import sphere_directions
+from sehdr_warp.output.environment_map import latlong, solid_angles
+from sehdr_warp.scene import Camera
+from sehdr_warp.scene.hdr_files import read_exr_channels
+
+FOLDER = "light"
+NORMALS = 200  # Directions that surfaces face, evenly over the sphere
+LEAST_SEEN = 0.1  # Of the hemisphere before a surface, weighted by the cosine, that photos must show for it to count
+FINER = 4  # Pixels of a render, across, for one of the truth's
+
+
+@dataclass(frozen=True, eq=False)
+class LightMap:
+    """The truth of a place: position [3] in the scene; radiance [H, 2 H, 3], lat-long in the scene's axes (see
+    output.environment_map); seen [H, 2 H] in [0, 1], which part of a pixel photos show."""
+
+    position: np.ndarray
+    radiance: np.ndarray
+    seen: np.ndarray
+
+
+def read_light_maps(folder: Path) -> list[LightMap]:
+    """The maps in a set's folder `light`, which scenes.generator writes; none where there is no such folder.
+
+    Raises InputError for a file that is no such map.
+    """
+    maps = []
+    for path in sorted((folder / FOLDER).glob("*.exr")):
+        channels, header = read_exr_channels(path)
+        height, width = next(iter(channels.values())).shape
+        try:
+            position = np.array(json.loads(header["sehdr:position"]), float).reshape(3)
+            radiance, seen = np.stack([channels[name] for name in "RGB"], axis=2), channels["A"]
+        except (LookupError, ValueError, TypeError):
+            position, radiance, seen = np.full(3, np.nan), np.zeros(0), np.zeros(0)
+        if width != 2 * height or not np.isfinite(position).all() or not np.isfinite(radiance).all():
+            problem = "is no lat-long map with R, G, B, A and sehdr:position"
+            raise InputError(path, problem, f"remove it, or make {FOLDER}/ again by scenes.generator")
+        maps.append(LightMap(position, radiance, seen))
+    return maps
+
+
+@torch.no_grad()
+def irradiance_errors(run: Any, maps: Sequence[LightMap], cameras: Sequence[Camera], scale: float = 1.0) -> dict:
+    """{"median": relative error of irradiance over all directions of all places, "percentile_90", "places": the medians
+    of each place, "directions": how many count}; None in place of figures without maps or directions that count.
+
+    Light is mean over channels, and only that which photos show: the truth's part `seen` is taken of both. Surfaces
+    that face too little of it do not count. cameras: the training's. scale: of the run's radiance to the truth's.
+    """
+    focal = float(np.median([np.sqrt(camera.fx * camera.fy) for camera in cameras])) if cameras else 1.0
+    found = [_errors(run, each, focal, scale) for each in maps]
+    errors = np.concatenate([*found, np.zeros(0)])
+    told = {"median": None, "percentile_90": None, "places": [], "directions": len(errors)}
+    if len(errors):
+        told |= {"median": float(np.median(errors)), "percentile_90": float(np.percentile(errors, 90))}
+        told["places"] = [float(np.median(each)) if len(each) else None for each in found]
+    return told
+
+
+def _errors(run: Any, truth: LightMap, focal: float, scale: float) -> np.ndarray:
+    height, width = truth.seen.shape
+    fine = FINER * width
+    options = {"focal_length": focal, "pixel_angle": 2 * np.pi / fine}
+    light = run.render_directions(truth.position, latlong(fine), **options).hdr.mean(2).cpu().numpy()
+    light = scale * light.reshape(height, FINER, width, FINER).mean(axis=(1, 3))
+    weight = truth.seen * solid_angles(width, "latlong")
+    facing = np.maximum(sphere_directions(NORMALS) @ latlong(width).reshape(-1, 3).T, 0)
+    given, wanted, shown = (facing @ (each * weight).ravel() for each in (light, truth.radiance.mean(2), 1.0))
+    counted = shown > LEAST_SEEN * (facing @ solid_angles(width, "latlong").ravel())
+    return np.abs(given[counted] / np.maximum(wanted[counted], np.finfo(np.float32).tiny) - 1)

@@ -1,0 +1,149 @@
+"""`bench kernels`: the whole differentiable splat (project, order, bin, blend; colors given), timed and checked."""
+
+import logging
+from collections.abc import Callable, Sequence
+from itertools import product
+
+import torch
+
+from sehdr_warp.kernels.constants import TILE_SIZE
+from sehdr_warp.rasterizer.cuda_graphs import CudaGraphRunner
+from sehdr_warp.rasterizer.graph_cache import WARMUP_CALLS, forget
+from sehdr_warp.rasterizer.rasterization import rasterize
+from sehdr_warp.rasterizer.reference import rasterize_reference
+
+from .gsplat_peer import BOUND, GSPLAT, gsplat_renderer, note_missing
+from .results import check, new_result
+from .splats import NAMES, Size, SplatScene, make_splat_scene
+from .timing import Variant, peak_memory, time_variants
+
+LOG = logging.getLogger(__name__)
+OURS, PLAIN_TORCH = "sehdr-warp", "plain torch"
+RECORDED = "sehdr-warp, recorded"
+"""rasterize() with room for a quarter more entries than there are, replayed as a CUDA graph, as in a training step."""
+PLAIN_TORCH_BYTES = 4 << 30
+"""The plain torch rasterizer keeps about 16 numbers for each pixel-Gaussian pair; beyond this it is left out."""
+IMAGE_BOUND, GRADIENT_BOUND = 1e-4, 1e-3
+"""Largest relative difference, in norm, of float32 from float64. Alphas that fall on the other side of the threshold
+make most of it; a wrong formula or a lost Gaussian is far beyond."""
+REFERENCE_GAUSSIANS = 4000
+"""Scenes of at most so many Gaussians are checked themselves, larger ones on a smaller one of the same density."""
+
+
+def bench_kernels(sizes: Sequence[Size], channels: Sequence[int], device: torch.device, *, repetitions: int) -> dict:
+    """A result: every combination of size and channels, forward, and forward and backward."""
+    result = new_result("kernels", device, {"device": str(device), "repetitions": repetitions})
+    peer = note_missing(result, device)
+    for size, count in product(sizes, channels):
+        scene = make_splat_scene(size, count, device)
+        result["checks"] += _checks(scene, peer)
+        rows = _rows(scene, peer, repetitions)
+        result["rows"] += rows
+        ours = [row["median_ms"] for row in rows if row["implementation"] == OURS]
+        LOG.info("%s, %d channels: %.3f ms forward, %.3f ms with backward", size, count, *ours)
+    return result
+
+
+def render(scene: SplatScene, rasterizer: Callable | None = None) -> torch.Tensor:
+    return (rasterizer or rasterize)(*scene.arguments).image
+
+
+def splat_variant(call: Callable[[], torch.Tensor], scene: SplatScene, backward: bool = True) -> Variant:
+    """call() renders the scene; backward: and sends cotangent() back."""
+    if not backward:
+        return Variant(torch.no_grad()(call))
+    cotangent = scene.cotangent()
+    return Variant(lambda: call().backward(cotangent), prepare=scene.clear)
+
+
+def against_float64(scene: SplatScene, most: int, name: str = OURS) -> list[dict]:
+    """Checks of ours, on a scene like this of at most so many Gaussians."""
+    small = make_splat_scene(scene.size.reduced(most), scene.channels, scene.device)
+    truth = _image_and_gradients(small.to("cpu", torch.float64), rasterize_reference)
+    return _compared(name, "float64", _image_and_gradients(small), truth)
+
+
+@torch.no_grad()
+def against_gsplat(scene: SplatScene) -> dict:
+    return check("gsplat: image", OURS, _difference(gsplat_renderer(scene)(), render(scene)), BOUND)
+
+
+def _checks(scene: SplatScene, peer: bool) -> list[dict]:
+    """Against float64; on a GPU also against the CPU's kernels at full size."""
+    made = against_float64(scene, REFERENCE_GAUSSIANS)
+    if scene.device.type == "cuda":
+        cpu, recorded = _image_and_gradients(scene.to("cpu")), _recorded(scene, scene.cotangent())()
+        # The last of as many calls as are launched before a picture of this size is replayed.
+        called = [_image_and_gradients(scene) for _ in range(WARMUP_CALLS + 2)][-1]
+        for name, ours in ((OURS, called), (RECORDED, recorded)):
+            made += _compared(name, "the CPU's kernels", ours, cpu)
+    return [*made, against_gsplat(scene)] if peer else made
+
+
+def _image_and_gradients(scene: SplatScene, rasterizer: Callable | None = None) -> list[torch.Tensor]:
+    image = render(scene, rasterizer)
+    return [image.detach(), *torch.autograd.grad(image, scene.leaves, scene.cotangent())]
+
+
+def _compared(name: str, against: str, ours: list[torch.Tensor], truth: list[torch.Tensor]) -> list[dict]:
+    """Checks of an image and the gradients of NAMES."""
+    labels, bounds = ["image", *(f"gradient of {leaf}" for leaf in NAMES)], [IMAGE_BOUND] + [GRADIENT_BOUND] * 5
+    given = zip(labels, ours, truth, bounds, strict=True)
+    return [check(f"{name}: {label}", against, _difference(a, b), bound) for label, a, b, bound in given]
+
+
+def _difference(value: torch.Tensor, other: torch.Tensor) -> float:
+    """|value - other| / |other| over the whole tensor, in float64."""
+    value, other = value.detach().double().cpu(), other.detach().double().cpu()
+    return float((value - other).norm() / other.norm().clamp_min(1e-300))
+
+
+def _recorded(scene: SplatScene, cotangent: torch.Tensor | None) -> Callable[[], list[torch.Tensor]]:
+    """A replay: of [image], or with a cotangent of [image, gradients of the leaves]."""
+    with torch.no_grad():
+        max_intersections = rasterize(*scene.arguments).intersection_count * 5 // 4
+
+    def forward():
+        with torch.set_grad_enabled(cotangent is not None):
+            image = rasterize(*scene.arguments, max_intersections=max_intersections).image
+        if cotangent is None:
+            return [image]
+        return [image.detach(), *torch.autograd.grad(image, scene.leaves, cotangent)]
+
+    forward()  # loads the kernels, which a recording cannot
+    recorder = CudaGraphRunner(scene.device)
+    return lambda: recorder.run("render", forward)
+
+
+def _from_the_start(variant: Variant) -> Variant:
+    """As many calls as end in a replay, none of them recorded before: memory of recordings counts."""
+
+    def calls() -> None:
+        for _ in range(WARMUP_CALLS + 2):
+            variant.once()
+
+    return Variant(calls, prepare=forget)
+
+
+def _rows(scene: SplatScene, peer: bool, repetitions: int) -> list[dict]:
+    with torch.no_grad():
+        entries = rasterize(*scene.arguments).intersection_count
+    renderers = {OURS: lambda: render(scene)}
+    if peer:
+        renderers[GSPLAT] = gsplat_renderer(scene)
+    if scene.device.type == "cpu" and entries * TILE_SIZE**2 * 16 * 4 <= PLAIN_TORCH_BYTES:
+        renderers[PLAIN_TORCH] = lambda: render(scene, rasterize_reference)
+    place = {"gaussians": scene.size.gaussians, "width": scene.size.width, "height": scene.size.height}
+    rows = []
+    for name, backward in (("forward", False), ("forward + backward", True)):
+        variants = {key: splat_variant(call, scene, backward) for key, call in renderers.items()}
+        if scene.device.type == "cuda":
+            variants[RECORDED] = Variant(_recorded(scene, scene.cotangent() if backward else None))
+        timings = time_variants(variants, scene.device, repetitions=repetitions)
+        for key, timing in timings.items():
+            row = place | {"channels": scene.channels, "pass": name, "implementation": key, "entries": entries}
+            measured = variants[key] if scene.device.type == "cpu" else _from_the_start(variants[key])
+            row |= timing | {"peak_memory_bytes": peak_memory(measured, scene.device)}
+            ratio = None if key == OURS else timings[OURS]["median_ms"] / timing["median_ms"]
+            rows.append(row | {"ours_over_this": ratio})
+    return rows

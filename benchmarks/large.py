@@ -1,0 +1,101 @@
+"""Large synthetic scenes: `default` beside gsplat's simple trainer, at one count of Gaussians.
+
+python -m benchmarks.large 1M@1600x1200 --json docs/reports/results/large.json
+
+Both start from the scene's points, one Gaussian each, and move those that nobody needs. Photos stay codes on the GPU
+for both. gsplat (1.5.3) is trained as in captures.py.
+"""
+
+import logging
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+
+from sehdr_warp.response import response_by_name
+from sehdr_warp.runs.config import Config
+from sehdr_warp.runs.config_files import load_config
+from sehdr_warp.scene import Scene
+from sehdr_warp.training.train import Training
+
+from .captures import WARM_UP, figures, photographed, train_gsplat
+from .results import finish, new_result
+from .splats import Size, make_photo_scene, parse_size
+from .timing import forget_peaks, held_memory, wait
+
+LOG = logging.getLogger("large")
+RESPONSE = "srgb"
+HELD_OUT = 8
+"""Of so many photos one is held out."""
+
+
+def main(sizes: tyro.conf.Positional[tuple[str, ...]], /, json: Path, photos: int = 24, iterations: int = 1000) -> None:
+    """Compare on scenes of these sizes, Gaussians@WIDTHxHEIGHT."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    result = new_result("large", torch.device("cuda"), {"photos": photos, "iterations": iterations})
+    for size in map(parse_size, sizes):
+        result["rows"] += compare(size, photos, iterations)
+    finish(result, json, overwrite=True)
+
+
+def compare(size: Size, photos: int, iterations: int, device: str = "cuda:0") -> list[dict]:
+    """A row for each of ours and gsplat's."""
+    scene = _scene(size, photos, device)
+    fixed = {"densification.cap_max": size.gaussians, "mcmc.cap_density": 0, "model.initial_density": 0}
+    fixed |= {"response.name": RESPONSE, "plan.enabled": False, "schedule.iterations": iterations}
+    config = load_config("default", fixed)
+    place = {"photos": f"{len(scene.train_views)} + {len(scene.test_views)}", "iterations": iterations}
+    place |= {"width": size.width, "height": size.height}
+    rows: list[dict] = []
+    for train in (_train, _train_gsplat):
+        forget_peaks(torch.device(device))
+        row = place | train(scene, config, device)
+        row["step_ms"] = row.pop("seconds") * 1e3 / (iterations - iterations // WARM_UP)
+        rows.append(row | {"over_ours": row["step_ms"] / rows[0]["step_ms"] if rows else 1.0})
+        LOG.info("%s", rows[-1])
+    return rows
+
+
+def _train(scene: Scene, config: Config, device: str) -> dict:
+    scratch, begun, memory = Path(tempfile.mkdtemp()), 0.0, 0
+    training = Training(scene, scratch / "run", config, device=device)
+    for step in training:
+        if step.iteration == step.total // WARM_UP:
+            training.timed(partial(wait, training.device))
+            begun = training.seconds
+        memory = held_memory(training.device) or 0
+    row = {"method": "sehdr-warp", "gaussians": training.run.gaussian_count, "seconds": training.seconds - begun}
+    row["tests"] = [[line["iteration"], line["psnr_ldr"]] for line in training.folder.read_metrics()]
+    row |= {"memory": memory} | _means(lambda view: photographed(training.run, view), scene, device)
+    shutil.rmtree(scratch)
+    return row
+
+
+def _train_gsplat(scene: Scene, config: Config, device: str) -> dict:
+    torch.manual_seed(0)
+    trained = train_gsplat(scene, "mcmc", config, config.densification.cap_max, device)
+    row = {"method": "gsplat mcmc", "gaussians": trained.count(), "seconds": trained.loop_seconds}
+    row["memory"] = torch.cuda.max_memory_allocated(device)
+    return row | _means(trained, scene, device)
+
+
+def _means(render: Callable, scene: Scene, device: str) -> dict[str, float]:
+    response = response_by_name(RESPONSE)
+    seen = [figures(render(view), view, response, None, device) for view in scene.test_views]
+    return {name: float(np.mean([each[name] for each in seen])) for name in ("psnr", "ssim")}
+
+
+def _scene(size: Size, photos: int, device: str) -> Scene:
+    made = make_photo_scene(size, photos, device)
+    views = [replace(view, split="train" if k % HELD_OUT else "test") for k, view in enumerate(made.views)]
+    return replace(made, views=tuple(views))
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,201 @@
+"""An environment map beside the truth: a room rendered by Mitsuba, trained on the truth of cameras all around.
+
+python -m benchmarks.panorama --work panorama_work --json docs/reports/results/panorama.json
+
+Cameras stand within some steps of a place and look in all directions. The map of that place, and perspective views from
+there, are compared with what Mitsuba renders of them: mu-law PSNR with one peak, the brightest of the truth.
+"""
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+from scenes.generator.recipes import RECIPES
+from scenes.generator.render import _sensor, load_mitsuba
+from scenes.generator.stage import Stage
+from sehdr_warp.evaluation.metrics import mu_law
+from sehdr_warp.model.baking import sphere_directions
+from sehdr_warp.output.environment_map import latlong, solid_angles, write_environment_map
+from sehdr_warp.response import response_by_name
+from sehdr_warp.runs.config_files import load_config
+from sehdr_warp.runs.run import load_run
+from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
+from sehdr_warp.scene.hdr_files import read_hdr
+from sehdr_warp.synth.expose import ladder_of
+from sehdr_warp.training.plan import WIDEST
+from sehdr_warp.training.train import train
+
+from .results import finish, new_result
+
+LOG = logging.getLogger("panorama")
+RECIPE = "study"
+PLACE, SPREAD = np.array([0.0, -0.8, 1.3]), np.array([0.6, 0.5, 0.35])
+"""Meters, in the room: where the map is seen from, and how far from there cameras stand."""
+DEPTH, BATCH = 4, 1 << 21
+POLE, EDGE = np.radians(15), 8
+"""From a pole, and columns at either end of the map: where a projection would show."""
+
+
+def main(
+    json: Path,
+    work: Path,
+    views: int = 72,
+    size: int = 128,
+    width: int = 512,
+    samples: int = 64,
+    iterations: int = 3000,
+    device: str = "cpu",
+) -> None:
+    """Render, train (what is in `work` is kept) and compare. size: of views; width: of the map, pixels; samples: light
+    paths of a training view's pixel, of which the compared pictures take four times as many."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    work.mkdir(parents=True, exist_ok=True)
+    cameras = [_camera(size, PLACE + SPREAD * offset, out) for offset, out in _around(views)]
+    judged = [_camera(size, PLACE, out) for out in sphere_directions(12)]
+    truth = work / "truth.npz"
+    if not truth.is_file():
+        _render(truth, cameras, judged, width, samples)
+    with np.load(truth) as found:
+        seen, wanted, panorama = found["seen"], found["judged"], found["panorama"]
+    scene = _scene(cameras, seen)
+    settings = {"views": views, "size": size, "width": width, "samples": samples, "iterations": iterations}
+    result = new_result("panorama", torch.device(device), settings)
+    result["command"] = "python -m benchmarks.panorama --work panorama_work --json docs/reports/results/panorama.json"
+    # As the plan of photos has it where cameras look all around; on truth there is no plan.
+    config = load_config("truth", {"schedule.iterations": iterations, "mcmc.prune_near_angle": WIDEST})
+    kept = (work / "run" / "summary.json").is_file()
+    run = load_run(work / "run", device=device) if kept else train(scene, work / "run", config, device=device)
+    at = (float(PLACE[0]), float(PLACE[1]), float(PLACE[2]))
+    map_file = write_environment_map(
+        run, work / "map.exr", at=at, size=width, axes="scene", pixel="float", overwrite=True
+    )
+    peak = float(max(wanted.max(), panorama.max()))
+    shown = np.stack([run.render(camera).hdr.cpu().numpy() for camera in judged])
+    rays = np.stack([_rays(camera) for camera in judged])
+    weight, directions = solid_angles(width, "latlong"), latlong(width)
+    errors = _squared(_even(read_hdr(map_file)), _even(panorama), peak)
+    column = np.arange(width)
+    edge = np.broadcast_to((column < EDGE) | (column >= width - EDGE), errors.shape)
+    pole, shown_pole = (np.abs(each[..., 1]) > np.cos(POLE) for each in (directions, rays))
+    plain = _squared(shown, wanted, peak)
+    parts = {
+        "12 perspective views": (plain, np.ones(plain.shape)),
+        "of these, 15 degrees around the map's poles": (plain, 1.0 * shown_pole),
+        "the map": (errors, weight),
+        f"the map, {EDGE} columns on each side of the wrap": (errors, weight * edge),
+        "the map, 15 degrees around each pole": (errors, weight * pole),
+        "the map elsewhere": (errors, weight * ~(edge | pole)),
+    }
+    for name, (squared, share) in parts.items():
+        psnr = -10 * np.log10((squared * share).sum() / share.sum())
+        result["rows"].append({"what": name, "psnr": float(psnr)})
+    given, wanted_light = (_irradiance(image, directions, weight) for image in (read_hdr(map_file), panorama))
+    off = np.abs(given / wanted_light - 1)
+    told = f"{off.mean():.1%} off in the mean, {off.max():.1%} at most"
+    result["notes"].append(f"Irradiance of surfaces that face {len(off)} directions: {told}.")
+    result["notes"].append(f"{run.gaussian_count:,} Gaussians; the truth's peak is {peak:.3g}.")
+    finish(result, json, overwrite=True)
+
+
+def _around(count: int):
+    """Offsets in [-1, 1]^3 and directions that cover the sphere."""
+    random = np.random.default_rng(0)
+    return zip(random.uniform(-1, 1, (count, 3)), sphere_directions(count), strict=True)
+
+
+def _camera(size: int, position: np.ndarray, out: np.ndarray) -> Camera:
+    """80 degrees wide."""
+    focal = 0.5 * size / np.tan(np.radians(40))
+    return Camera(size, size, focal, focal, size / 2, size / 2, look_at(position, position + out))
+
+
+def _rays(camera: Camera) -> np.ndarray:
+    """[H, W, 3] unit directions of a camera's pixels in the world."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5 - camera.cx, np.arange(camera.height) + 0.5 - camera.cy)
+    local = np.stack([x / camera.fx, y / camera.fy, np.ones_like(x)], axis=2)
+    return local / np.linalg.norm(local, axis=2, keepdims=True) @ camera.world_to_camera[:3, :3]
+
+
+def _scene(cameras: list[Camera], seen: np.ndarray) -> Scene:
+    curve = response_by_name("srgb")
+    time = ladder_of(RECIPE, list(seen), curve.encode)[2]
+    views = [
+        View(f"r_{i}", codes_of(np.asarray(curve.encode(hdr * time)), 8), camera, time, "train", hdr=hdr)
+        for i, (camera, hdr) in enumerate(zip(cameras, seen, strict=True))
+    ]
+    return Scene(RECIPE, "transforms", tuple(views), np.zeros((0, 3)), np.zeros((0, 3), np.float32), response=curve)
+
+
+def _render(path: Path, cameras: list[Camera], judged: list[Camera], width: int, samples: int) -> None:
+    mi: Any = load_mitsuba()
+    recipe, meshes = RECIPES[RECIPE], path.with_name("meshes")
+    meshes.mkdir(exist_ok=True)
+    stage = Stage(mi, np.random.default_rng([0, *recipe.name.encode()]), meshes)
+    recipe.build(stage)
+    scene = mi.load_dict(stage.items)
+    tracer = mi.load_dict({"type": "path", "max_depth": DEPTH, "rr_depth": DEPTH})
+
+    def view(index: int, camera: Camera, count: int) -> np.ndarray:
+        LOG.info("view %d", index)
+        return np.array(mi.render(scene, sensor=_sensor(mi, camera), integrator=tracer, spp=count, seed=index))[..., :3]
+
+    seen = np.stack([view(i, camera, samples) for i, camera in enumerate(cameras)])
+    wanted = np.stack([view(1000 + i, camera, 4 * samples) for i, camera in enumerate(judged)])
+    np.savez_compressed(path, seen=seen, judged=wanted, panorama=_panorama(mi, scene, tracer, width, 4 * samples))
+
+
+def _panorama(mi: Any, scene: Any, tracer: Any, width: int, samples: int) -> np.ndarray:
+    """[H, W, 3] by rays of its own: Mitsuba has no camera for it."""
+    import drjit as dr
+
+    height, total = width // 2, np.zeros((width // 2 * width, 3))
+    launch = min(samples, max(1, BATCH // total.shape[0]))
+    for turn in range(-(-samples // launch)):
+        LOG.info("panorama, launch %d", turn)
+        count = total.shape[0] * launch
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(turn, count)
+        place = mi.UInt32(np.tile(np.arange(total.shape[0], dtype=np.uint32), launch))
+        longitude = np.pi - 2 * np.pi * (mi.Float(place % width) + sampler.next_1d()) / width
+        latitude = np.pi / 2 - np.pi * (mi.Float(place // width) + sampler.next_1d()) / height
+        sin, cos = dr.sincos(longitude)
+        up, flat = dr.sincos(latitude)
+        ray = mi.RayDifferential3f(mi.Point3f(*PLACE.tolist()), mi.Vector3f(flat * sin, up, flat * cos))
+        light = np.array(tracer.sample(scene, sampler, ray)[0]).reshape(3, launch, -1)
+        total += light.sum(1).T / (launch * -(-samples // launch))
+    return total.reshape(height, width, 3).astype(np.float32)
+
+
+def _irradiance(image: np.ndarray, directions: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """[200] up to scale, mean over channels."""
+    light = image.mean(axis=2) * weight
+    return np.array([(light * np.maximum(directions @ normal, 0)).sum() for normal in sphere_directions(200)])
+
+
+def _even(image: np.ndarray) -> np.ndarray:
+    """A lat-long map whose rows are averaged over as many pixels as make one of the equator: towards the poles a map
+    asks for more than the photos' pixels tell, and truth has it."""
+    height, width = image.shape[:2]
+    made = np.empty_like(image)
+    for row, latitude in enumerate(np.pi * ((np.arange(height) + 0.5) / height - 0.5)):
+        starts = np.arange(0, width, min(width, round(1 / np.cos(latitude))))
+        counts = np.diff(starts, append=width)[:, None]
+        made[row] = np.repeat(np.add.reduceat(image[row], starts) / counts, counts[:, 0], axis=0)
+    return made
+
+
+def _mu(image: np.ndarray, peak: float) -> np.ndarray:
+    return mu_law(torch.from_numpy(np.ascontiguousarray(image)) / peak).numpy()
+
+
+def _squared(image: np.ndarray, truth: np.ndarray, peak: float) -> np.ndarray:
+    """[...] squared mu-law error, mean over channels."""
+    return ((_mu(image, peak) - _mu(truth, peak)) ** 2).mean(axis=-1)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,154 @@
+"""The parts of a recorded training step: the GPU's time for each, and the least that memory and schedulers allow."""
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any
+
+import torch
+from torch.profiler import ProfilerActivity, profile
+
+from sehdr_warp.quiet import silent_stderr
+from sehdr_warp.rasterizer.workload import count_blended_pairs
+
+from .timing import Variant
+
+STEPS = 20
+"""Steps that are looked at."""
+COPIED = 1 << 28
+"""Bytes that are copied to learn what the memory gives."""
+CYCLES = 20_000_000
+"""That a kernel idles to learn what the clock gives."""
+SCHEDULERS = 4  # Of a multiprocessor, each of which issues one instruction of a warp in a cycle
+OTHER = "torch's own"
+
+KERNELS = {
+    "projection": ("project_*_forward",),
+    "harmonics": ("evaluate_*", "turns_adjoint_*"),
+    "activations": ("activate_*",),
+    "lists": ("pack_records_*", "key_by_*", "emit_*", "find_lists_*", "*radix_sort*", "*DeviceScan*"),
+    "blend": ("blend_forward_*", "pad_rows_*"),
+    "response and fusion": ("encode_*", "interpolate_*", "perceptrons_*", "mix_*", "point_adjoint_*", "unit_adjoint_*"),
+    "losses": ("compare_*", "gradient_in_*", "clipped_*", "code_residual_*"),
+    "blend, adjoint": ("blend_backward_*",),
+    "projection, adjoint": ("project_*_backward",),
+    "optimizer": ("update_*", "find_nonfinite_*", "judge_step_*"),
+    "densification": ("add_position_noise_*", "add_gradient_statistics_*"),
+    OTHER: ("*",),
+}
+"""The kernels of each part, by patterns; the first that fits has a kernel."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a step works on: Gaussians, numbers of each one's harmonics, features blended, (Gaussian, tile) pairs,
+    (Gaussian, warp) pairs that are drawn, pixels."""
+
+    gaussians: int
+    harmonics: int
+    channels: int
+    pairs: int
+    drawn: int
+    pixels: int
+
+
+FLOAT = 4
+GEOMETRY, PROJECTED, RECORD = 11, 9, 8  # Numbers of a Gaussian, of its projection, of what the blend reads of it
+
+BYTES: dict[str, Callable[[Work], float]] = {
+    "projection": lambda w: FLOAT * w.gaussians * (GEOMETRY + PROJECTED),
+    "harmonics": lambda w: FLOAT * w.gaussians * (w.harmonics + 3 + 3),
+    # Records, running counts; keys of 8 bytes and values of 4, written, read by one sort, and written by it.
+    "lists": lambda w: w.gaussians * (FLOAT * (PROJECTED + RECORD) + 16) + 36 * w.pairs,
+    "blend": lambda w: FLOAT * (w.pairs + w.gaussians * (RECORD + w.channels) + w.pixels * (w.channels + 2)),
+    # A code, an image and its gradient.
+    "losses": lambda w: 3 * w.pixels * (1 + 2 * FLOAT),
+    "blend, adjoint": lambda w: (
+        FLOAT * (w.pairs + w.gaussians * (RECORD + 2 * w.channels + 6) + w.pixels * (w.channels + 2))
+    ),
+    "projection, adjoint": lambda w: FLOAT * w.gaussians * (2 * GEOMETRY + 6),
+    # Parameters and both moments, read and written; the harmonics' gradients are made of three numbers.
+    "optimizer": lambda w: FLOAT * w.gaussians * (6 * (GEOMETRY + w.harmonics) + GEOMETRY + 3),
+}
+"""The fewest bytes that each part must move, were nothing read twice."""
+
+INSTRUCTIONS: dict[str, Callable[[Work], float]] = {
+    "blend": lambda w: w.drawn * (28 + 1.25 * (w.channels - 3)),
+    "blend, adjoint": lambda w: w.drawn * (49 + 2.25 * (w.channels - 3)),
+}
+"""That warps issue, at least: what sm_90's code of three channels has for a Gaussian in a warp, and one multiply-add
+and a fourth of a load for each more; the adjoint sums once more."""
+
+
+def part_of(kernel: str) -> str:
+    """The part that a kernel, as the profiler names it, belongs to."""
+    named = kernel.rpartition("__locals__")[2]  # Behind the function that made it
+    return next(part for part, patterns in KERNELS.items() if any(fnmatchcase(named, p) for p in patterns))
+
+
+def parts_of_step(variant: Variant, work: Work, device: torch.device) -> list[dict]:
+    """A row for each part of a step on a GPU: launches, microseconds, and the microseconds that its bytes and its
+    instructions take at least; None where no bound is known."""
+    for _ in range(STEPS):
+        variant.once()
+    torch.cuda.synchronize(device)
+    with silent_stderr(), profile(activities=[ProfilerActivity.CUDA]) as seen:
+        for _ in range(STEPS):
+            variant.once()
+        torch.cuda.synchronize(device)
+    times: dict[str, float] = defaultdict(float)
+    launches: dict[str, int] = defaultdict(int)
+    events: Any = seen.events()
+    for event in events:
+        if event.device_type == torch.autograd.DeviceType.CUDA:
+            part = part_of(event.name)
+            times[part] += event.time_range.elapsed_us() / STEPS
+            launches[part] += 1
+    memory, issued = bytes_per_microsecond(device), instructions_per_microsecond(device)
+    rows = []
+    for part in (part for part in KERNELS if launches[part]):
+        row = {"part": part, "launches": launches[part] / STEPS, "microseconds": times[part]}
+        if part in BYTES:
+            least = BYTES[part](work)
+            row |= {"least_megabytes": least / 1e6, "memory_microseconds": least / memory}
+        if part in INSTRUCTIONS:
+            row["issue_microseconds"] = INSTRUCTIONS[part](work) / issued
+        bounds = [row[name] for name in ("memory_microseconds", "issue_microseconds") if name in row]
+        rows.append(row | ({"over_bound": times[part] / max(bounds)} if bounds else {}))
+    return rows
+
+
+def work_of(arguments: Sequence[Any], harmonics: int) -> Work:
+    """arguments: rasterize()'s, seven tensors, width and height; harmonics: numbers of a Gaussian's."""
+    *splats, width, height = arguments
+    pairs, drawn = count_blended_pairs(splats, width, height)
+    return Work(len(splats[0]), harmonics, splats[4].shape[1], pairs, drawn, width * height)
+
+
+def bytes_per_microsecond(device: torch.device) -> float:
+    """What the memory gives to a copy: bytes read and written."""
+    source = torch.zeros(COPIED, dtype=torch.uint8, device=device)
+    target = torch.empty_like(source)
+    return 2 * COPIED / _microseconds(lambda: target.copy_(source))
+
+
+def instructions_per_microsecond(device: torch.device) -> float:
+    """That all schedulers issue at the clock that the GPU runs at."""
+    processors = torch.cuda.get_device_properties(device).multi_processor_count
+    clock = CYCLES / _microseconds(lambda: torch.cuda._sleep(CYCLES))  # pyright: ignore[reportPrivateUsage]
+    return processors * SCHEDULERS * clock
+
+
+def _microseconds(action: Callable[[], object], repetitions: int = 5) -> float:
+    """The least time of an action."""
+    action()
+    times = []
+    for _ in range(repetitions):
+        first, last = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        first.record()
+        action()
+        last.record()
+        last.synchronize()
+        times.append(first.elapsed_time(last) * 1e3)
+    return min(times)

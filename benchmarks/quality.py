@@ -1,0 +1,363 @@
+"""`bench quality`: every combination of methods with scenes and exposures is a job, with its folder and key, trained
+and evaluated once, several at a time; and their results as rows."""
+
+import contextlib
+import hashlib
+import json
+import logging
+import re
+import shutil
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import cycle, product
+from pathlib import Path
+
+import torch
+from filelock import FileLock, Timeout
+
+from benchmarks.irradiance import irradiance_errors, read_light_maps
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.evaluation.evaluate import evaluate
+from sehdr_warp.evaluation.metrics import REGIONS
+from sehdr_warp.evaluation.protocols import PROTOCOLS
+from sehdr_warp.files import read_json, write_json
+from sehdr_warp.response import response_by_name
+from sehdr_warp.runs.config import REFERENCE_ITERATIONS, Config
+from sehdr_warp.runs.config_files import config_from_dict, load_config, override_config, preset_names
+from sehdr_warp.scene import Scene, embedded_folder, is_embedded, load_scene
+from sehdr_warp.synth.expose import expose, exposure_ladder
+from sehdr_warp.training.train import train
+
+from .timing import Variant, forget_peaks, time_variants
+
+LOG = logging.getLogger(__name__)
+MONTH = 30 * 24 * 60  # Minutes, the longest that a worker may take
+FORMAT = 5  # Of a job and of its result; others are run again.
+RESULT, FAILURE = "result.json", "failure.json"
+TESTS, FIRST_TEST = 16, 100
+"""A training tests its held-out views this often, at iterations spaced evenly on a log scale from 1/100 of all."""
+EXPOSURES, FACTOR = 5, 4.0
+"""A scene's ladder: so many exposures, each so many times longer than the last, around a well exposed one."""
+KNOWN, BLIND, LEARNED = "known", "blind", "learned"
+"""Whether a method is told the curve, chooses one, or learns it: then known and blind are one training."""
+UPPER_BOUND = "truth"
+"""3DGS trained on the HDR truth, which every method is compared with."""
+WARM_UP_ITERATIONS = 30
+"""Of a training that is thrown away before the first of its kind in a process: kernels are compiled, steps recorded.
+All schedules scale with the length, so every part of a training is in it."""
+_warm: set[str] = set()
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training and its evaluation.
+
+    config: everything that decides the result, plain values; its hash is the key. place: where the scene is, which is
+    no part of the key, since folders move.
+    """
+
+    config: dict
+    place: str
+
+    @property
+    def key(self) -> str:
+        text = json.dumps(self.config, sort_keys=True, ensure_ascii=False)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    @property
+    def label(self) -> str:
+        """The job in words."""
+        config = self.config
+        where = f"{config['scene']['name']} {config['curve']} exposure {config['exposure']}"
+        return f"{where} {config['method']} {config['response']} seed {config['seed']}"
+
+    def folder(self, out: Path) -> Path:
+        return out / "jobs" / f"{re.sub(r'[^A-Za-z0-9.]+', '-', self.label)[:100].strip('-')}-{self.key}"
+
+    def result(self, out: Path) -> dict | None:
+        """The complete result; None where there is none, or one that was cut short or is another config's."""
+        found = _read(self.folder(out) / RESULT)
+        whole = "figures" in found and (found.get("format"), found.get("key")) == (FORMAT, self.key)
+        return found if whole else None
+
+
+def plan_jobs(
+    scenes: Sequence[str],
+    methods: Sequence[str],
+    *,
+    curves: Sequence[str] = ("hdr-nerf",),
+    exposures: Sequence[int] = (2,),
+    responses: Sequence[str] = (KNOWN,),
+    seeds: Sequence[int] = (0,),
+    iterations: int | None = None,
+    max_size: int | None = None,
+    device: str = "cpu",
+    lpips: bool = False,
+) -> list[Job]:
+    """Every combination. Methods that learn the response have one job for known and blind together; those that take
+    nothing from photos have none that is blind.
+
+    exposures: places in the ladder. iterations: None is the preset's own, or its plan's. device: kind, "cpu" or "cuda".
+
+    Raises SehdrError for a preset, field, curve or folder that cannot be used, before anything runs.
+    """
+    for item in set(exposures) - set(range(EXPOSURES)):
+        raise SehdrError(f"exposure {item} is not one of 0 to {EXPOSURES - 1}")
+    for item in set(responses) - {KNOWN, BLIND}:
+        raise SehdrError(f"response {item!r} is not one of {KNOWN}, {BLIND}")
+    for note in (note for curve in curves for note in response_by_name(curve).notes):
+        LOG.info("%s", note)
+    titles = [place.removeprefix("embedded:") if is_embedded(place) else Path(place).resolve().name for place in scenes]
+    for what, names, file in (("scenes", titles, "folder"), ("methods", [Path(m).stem for m in methods], "TOML file")):
+        if len(set(names)) < len(names):
+            raise SehdrError(f"two {what} have one name; rename a {file} so that tables can tell them apart")
+    found = {place: {"name": name, "sha256": _digest(place)} for place, name in zip(scenes, titles, strict=True)}
+    jobs = []
+    for method, seed, place, curve, exposure, response in product(methods, seeds, scenes, curves, exposures, responses):
+        config = _training(method, iterations, seed)
+        if config.response.name == LEARNED:
+            if response != responses[0]:
+                continue
+            response = LEARNED
+        elif config.loss.ldr_weight == 0 and response == BLIND:
+            continue
+        named = {KNOWN: curve, BLIND: "auto"}.get(response, config.response.name)
+        trained = override_config(config, {"response.name": named}, method)
+        decided = {
+            "format": FORMAT,
+            "scene": found[place] | {"max_size": max_size},
+            "curve": curve,
+            "curve_sha256": _digest(curve) if Path(curve).is_file() else None,
+            "exposure": exposure,
+            "method": Path(method).stem,
+            "sees_truth": trained.loss.uses_hdr,
+            "response": response,
+            "seed": seed,
+            "device": device,
+            "lpips": lpips,
+            "training": json.loads(json.dumps(trained.model_dump())),
+        }
+        jobs.append(Job(decided, place if is_embedded(place) else str(Path(place).absolute())))
+    if not jobs:
+        raise SehdrError(
+            f"there is nothing to train: choose methods from {', '.join(preset_names())}; those that take nothing from "
+            "photos need known in --responses"
+        )
+    return jobs
+
+
+def _training(method: str, iterations: int | None, seed: int) -> Config:
+    """The method's training, tested on a log scale of its length; what is stated is no plan's to change."""
+    stated = {} if iterations is None else {"schedule.iterations": iterations}
+    steps = {max(1, round(REFERENCE_ITERATIONS * FIRST_TEST ** (-k / (TESTS - 1)))) for k in range(TESTS)}
+    config = load_config(method, {"seed": seed, **stated})
+    times = {"schedule.evaluate_at": sorted(steps), "schedule.checkpoint_every": REFERENCE_ITERATIONS}
+    return override_config(config, times | {"plan.keep": sorted({*config.plan.keep, *stated, "response.name"})}, method)
+
+
+def _read(path: Path) -> dict:
+    """What a JSON file holds; nothing where it is missing or damaged."""
+    with contextlib.suppress(InputError):
+        return read_json(path)
+    return {}
+
+
+def _folder(place: str) -> Path:
+    return embedded_folder(place) if is_embedded(place) else Path(place)
+
+
+def _digest(place: str) -> str:
+    """A hash of a file, or of all files of a folder or embedded scene with their names."""
+    folder = _folder(place)
+    if not folder.exists():
+        raise InputError(place, "no such folder", "give folders with HDR truth, or embedded")
+    digest = hashlib.sha256()
+    for path in sorted(path for path in [folder, *folder.rglob("*")] if path.is_file()):
+        digest.update(str(path.relative_to(folder)).encode() + b"\0")
+        with open(path, "rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    out: Path,
+    *,
+    device: str,
+    at_once: int = 1,
+    slurm: dict | None = None,
+    lpips: str | None = None,
+) -> list[dict]:
+    """Runs the jobs that have no result in out/jobs, and returns a row for each job of the list: its result, or its
+    label and error.
+
+    device: kind, "cpu" or "cuda". at_once: trainings at one time; more than one, or any on SLURM, by submitit. slurm:
+    parameters of SLURM jobs such as {"partition": "gpu"}, None for this machine. lpips: folder of weights.
+    """
+    open_jobs = [job for job in jobs if job.result(out) is None]
+    LOG.info("%d jobs, %d of them to do", len(jobs), len(open_jobs))
+    for job in open_jobs:
+        (job.folder(out) / FAILURE).unlink(missing_ok=True)
+    at_once = max(1, min(at_once, len(open_jobs)))
+    if open_jobs and at_once == 1 and slurm is None:
+        work(open_jobs, out, device, 1, lpips)
+    elif open_jobs:
+        _submit(open_jobs, out, device, at_once, slurm, lpips)
+    rows = []
+    for job in jobs:
+        result, failure = job.result(out), _read(job.folder(out) / FAILURE)
+        error = failure.get("error", "no worker was left to run it")
+        rows.append(row_of(result) if result else {"label": job.label, "error": error})
+    return rows
+
+
+def row_of(result: dict) -> dict:
+    """A result as one flat row: what was trained, its figures, and its held-out tests as [seconds, dB]."""
+    config, figures = result["config"], result["figures"]
+    hdr, regions = figures["protocol"], figures["regions"]
+    names = ("curve", "exposure", "method", "sees_truth", "response", "seed", "device")
+    return {
+        "scene": config["scene"]["name"],
+        **{name: config[name] for name in names},
+        **{name: figures[name] for name in ("iterations", "gaussians", "peak_memory_bytes", "renders_per_second")},
+        **{name.replace("-", "_"): hdr[name]["psnr_mu"] for name in PROTOCOLS},
+        "ssim": hdr["gt-max"]["ssim_mu"],
+        "lpips": hdr["gt-max"]["lpips_mu"],
+        "ldr": figures["ldr"]["psnr"],
+        **{region.replace("-", "_"): regions[region]["psnr_mu"]["aligned"] for region in REGIONS},
+        **{f"lights_{name}": figures["lights"][name] for name in ("count", "lost")},
+        "irradiance": figures["irradiance"]["median"],
+        "clipped_share": regions["clipped"]["fraction"],
+        "confidence": figures["confidence"]["spearman_log2"],
+        "chosen": figures["response"],
+        "seconds": figures["train_seconds"],
+        "shared_by": result["shared_by"],
+        "tests": [[line["seconds"], line["psnr_mu"]] for line in result["curve"] if line.get("psnr_mu") is not None],
+    }
+
+
+def _submit(jobs, out: Path, device: str, at_once: int, slurm: dict | None, lpips: str | None) -> None:
+    """Workers by submitit, each taking job after job; returns when all have ended."""
+    try:
+        import submitit
+    except ImportError:
+        problem = "submitit starts several jobs at once and is not installed"
+        raise SehdrError(f"{problem}; pip install submitit, or take --jobs 1") from None
+    gpus = torch.cuda.device_count() if device == "cuda" and slurm is None else 0
+    shared = -(-at_once // gpus) if gpus else at_once if slurm is None else 1
+    workers = []
+    for index in range(at_once):
+        if slurm is None:
+            executor = submitit.LocalExecutor(folder=out / "logs")
+            executor.update_parameters(timeout_min=MONTH)
+            if gpus:
+                executor.update_parameters(gpus_per_node=1, visible_gpus=[index % gpus])
+        else:
+            executor = submitit.AutoExecutor(folder=out / "logs", cluster="slurm")
+            executor.update_parameters(timeout_min=MONTH, name="sehdr-warp")
+            one = {"gpus_per_node": 1} if device == "cuda" else {}
+            own = {key if key == "timeout_min" else f"slurm_{key}": value for key, value in slurm.items()}
+            executor.update_parameters(**one, **own)
+        workers.append(executor.submit(work, jobs, out.absolute(), device, shared, lpips))
+    try:
+        for worker in workers:
+            worker.wait()
+            if error := worker.exception():
+                LOG.warning("a worker ended early: %s", str(error).strip().splitlines()[-1])
+    except BaseException:
+        for worker in workers:
+            worker.cancel()
+        raise
+
+
+def work(jobs: Sequence[Job], out: Path, device: str, shared_by: int, lpips: str | None) -> None:
+    """A worker: takes the jobs that nobody is at, one after the other. Whoever holds the lock of a job's folder is at
+    it; the operating system lets go of it when a worker dies, however it dies."""
+    for job in jobs:
+        folder = job.folder(out)
+        folder.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(Timeout), FileLock(folder / "lock", timeout=0):
+            if job.result(out) is not None or (folder / FAILURE).exists():
+                continue
+            # Stays if this process is killed: then no other worker tries, and dies, again.
+            _write_failure(folder, "its process ended without a result")
+            try:
+                result = run_job(job, folder, "cuda:0" if device == "cuda" else device, lpips)
+                write_json(folder / RESULT, result | {"shared_by": shared_by}, ours=True)
+                (folder / FAILURE).unlink()
+                LOG.info("%s: done", job.label)
+            except SehdrError as error:
+                _write_failure(folder, str(error))
+            except Exception as error:
+                traceback.print_exc()
+                _write_failure(folder, f"{type(error).__name__}: {error}")
+                if device == "cuda":
+                    raise  # the device may be spoilt for this process; other workers go on
+
+
+def _write_failure(folder: Path, error: str) -> None:
+    write_json(folder / FAILURE, {"error": " ".join(error.split())[:1000]}, ours=True)
+
+
+def run_job(job: Job, folder: Path, device: str, lpips: str | None) -> dict:
+    """Trains, evaluates and returns the result as it is to be written. Scenes, photos and kernels stay for the next.
+
+    Raises SehdrError where the scene has no truth, the training diverges, or a file cannot be used.
+    """
+    config, out = job.config, folder / "run"
+    scene = exposed(job.place, config["scene"]["max_size"], config["curve"], config["exposure"])
+    training = config_from_dict(config["training"], job.label)
+    # A method that learns from photos alone sees no truth in the training views.
+    views = tuple(replace(view, hdr=None) if view.split == "train" else view for view in scene.views)
+    shown = scene if config["sees_truth"] else replace(scene, views=views)
+    _warm_up(shown, training, folder / "warm-up", device)
+    shutil.rmtree(out, ignore_errors=True)
+    forget_peaks(torch.device(device))
+    run = train(shown, out, training, device=device)
+    peak = torch.cuda.max_memory_allocated(device) if device.startswith("cuda") else None
+    figures = evaluate(run, scene, lpips_weights=lpips if config["lpips"] else None)
+    figures.pop("views")
+    given = read_light_maps(_folder(job.place)), [view.camera for view in scene.train_views]
+    figures["irradiance"] = irradiance_errors(run, *given, figures["protocol"]["aligned"]["scale"] or 1.0)
+    figures |= {"response": run.response.name, "peak_memory_bytes": peak}
+    figures["renders_per_second"] = _render_rate(run, scene)
+    curve = run.metrics()
+    shutil.rmtree(out, ignore_errors=True)
+    return {"format": FORMAT, "key": job.key, "config": config, "figures": figures, "curve": curve}
+
+
+def _warm_up(scene: Scene, config: Config, scratch: Path, device: str) -> None:
+    # What is compiled depends on the shape of the computation, not on seeds, rates or lengths.
+    shape = repr((config.model, config.response.name == "learned", config.fusion, config.densification.strategy))
+    if shape not in _warm:
+        short = override_config(config, {"schedule.iterations": WARM_UP_ITERATIONS, "plan.enabled": False})
+        shutil.rmtree(scratch, ignore_errors=True)
+        train(scene, scratch, short, device=device)
+        shutil.rmtree(scratch, ignore_errors=True)
+        _warm.add(shape)
+
+
+@torch.no_grad()
+def _render_rate(run, scene: Scene) -> float:
+    """HDR renders of held-out views per second, called one after the other."""
+    cameras = cycle([view.camera for view in scene.test_views or scene.train_views])
+    variant = Variant(lambda: run.render(next(cameras)))
+    return 1e3 / time_variants({"render": variant}, run.device, budget=1.0)["render"]["mean_ms"]
+
+
+@lru_cache(maxsize=8)
+def exposed(place: str, max_size: int | None, curve: str, exposure: int) -> Scene:
+    """A scene with its truth, as a job's camera took it: by a curve, at a place in the ladder of exposures."""
+    truth, response = _true_scene(place, max_size), response_by_name(curve)
+    return expose(truth, response, exposure_ladder(truth, response, EXPOSURES, FACTOR)[exposure])
+
+
+@lru_cache(maxsize=4)
+def _true_scene(place: str, max_size: int | None) -> Scene:
+    scene = load_scene(place, max_size=max_size, response="srgb")
+    for view in (view for view in scene.views if view.hdr is None):
+        problem = f"view {view.name} has no HDR truth"
+        raise InputError(place, problem, "only scenes with truth in every view can be benchmarked")
+    return scene

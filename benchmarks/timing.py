@@ -1,0 +1,124 @@
+"""Times and memory of a call, fair to all that are compared: variants take turns, so that a machine's moods hit all."""
+
+import gc
+import math
+import os
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import Any
+
+import torch
+from torch.profiler import ProfilerActivity, profile
+
+from sehdr_warp.quiet import silent_stderr
+from sehdr_warp.rasterizer.memory import warp_memory_bytes
+
+LEAST_REPETITIONS = 3
+BUDGET = 10.0
+"""Seconds that one variant may take on the CPU; a slow one runs less often."""
+TURNS = 3
+"""Each variant's repetitions come in so many turns, between the others'."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One thing to time. prepare() runs before every run() and is not timed."""
+
+    run: Callable[[], object]
+    prepare: Callable[[], object] = lambda: None
+
+    def once(self) -> None:
+        self.prepare()
+        self.run()
+
+
+def time_variants(
+    variants: dict[str, Variant], device: torch.device, *, repetitions: int = 30, budget: float = BUDGET
+) -> dict[str, dict]:
+    """See summary(). On a GPU events stand around each run with the device idle before, so that the host's time counts
+    where it is the limit."""
+    samples: dict[str, list[float]] = {name: [] for name in variants}
+    wanted = dict.fromkeys(variants, repetitions)
+    for name, variant in variants.items():
+        for _ in range(8 if device.type == "cuda" else 2):
+            variant.once()
+        if device.type == "cpu":
+            affordable = int(budget / max(_milliseconds(variant, device) / 1e3, 1e-9))
+            wanted[name] = min(repetitions, max(LEAST_REPETITIONS, affordable))
+    for turn in range(TURNS):
+        for name, variant in variants.items():
+            # The first run of a turn finds caches full of another variant's data, and is not timed.
+            variant.once()
+            for _ in range(wanted[name] * (turn + 1) // TURNS - wanted[name] * turn // TURNS):
+                samples[name].append(_milliseconds(variant, device))
+    return {name: summary(values) for name, values in samples.items()}
+
+
+def summary(samples: list[float]) -> dict:
+    """Median, mean, least and 90th percentile in ms, and the number of repetitions."""
+    ordered = sorted(samples)
+    return {
+        "median_ms": statistics.median(ordered),
+        "mean_ms": statistics.fmean(ordered),
+        "min_ms": ordered[0],
+        "p90_ms": ordered[math.ceil(0.9 * len(ordered)) - 1],
+        "repetitions": len(ordered),
+    }
+
+
+def _milliseconds(variant: Variant, device: torch.device) -> float:
+    variant.prepare()
+    if device.type == "cpu":
+        started = time.perf_counter()
+        variant.run()
+        return (time.perf_counter() - started) * 1e3
+    first, last = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    wait(device)
+    first.record(torch.cuda.current_stream(device))
+    variant.run()
+    last.record(torch.cuda.current_stream(device))
+    last.synchronize()
+    return first.elapsed_time(last)
+
+
+def wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def forget_peaks(device: torch.device) -> None:
+    """What is left of the measurement before must not count as the next one's."""
+    gc.collect()
+    if device.type == "cuda":
+        torch.cuda.init()  # before a first use torch has no peaks to forget, and says so by an error
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats(device)
+
+
+def held_memory(device: torch.device) -> int | None:
+    """The most that torch and Warp held at once on a GPU since forget_peaks(), bytes; None on the CPU."""
+    return torch.cuda.max_memory_allocated(device) + warp_memory_bytes(device) if device.type == "cuda" else None
+
+
+def peak_memory(variant: Variant, device: torch.device) -> int:
+    """Largest memory of torch's allocator during one run above what was in use before it, bytes."""
+    variant.prepare()
+    if device.type == "cuda":
+        wait(device)
+        before = torch.cuda.memory_allocated(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        variant.run()
+        wait(device)
+        return torch.cuda.max_memory_allocated(device) - before
+    os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # the profiler's own messages are not the user's
+    # It warns of what was allocated before, which is none of this.
+    with silent_stderr(), profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
+        variant.run()
+    # In the order of time; events() of the profiler leaves out what is freed within the operation that allocated it.
+    profiler: Any = recorded.profiler
+    events = profiler.kineto_results.events()
+    changes = [(event.start_ns(), event.nbytes()) for event in events if event.name() == "[memory]"]
+    return max(accumulate(nbytes for _, nbytes in sorted(changes)), default=0)

@@ -1,0 +1,41 @@
+"""What a training step's parts are told by, and what they are compared with."""
+
+import pytest
+import torch
+
+from benchmarks import parts
+from benchmarks.splats import Size
+from benchmarks.step import bench_step
+
+
+@pytest.mark.parametrize(
+    "kernel, part",
+    [
+        ("project_d287a562_cuda_kernel_forward", "projection"),
+        ("project_d287a562_cuda_kernel_backward", "projection, adjoint"),
+        ("backward_kernel__locals__blend_backward_64b9232b_cuda_kernel_forward", "blend, adjoint"),
+        ("void cub::_V_3::detail::radix_sort::DeviceRadixSortOnesweepKernel<int>", "lists"),
+        ("opacities_kernel__locals__activate_opacities_3c9e86f4_cuda_kernel_forward", "activations"),
+        ("update_harmonics_by_adam_973af1cd_cuda_kernel_forward", "optimizer"),
+        ("void at::native::vectorized_elementwise_kernel<4, at::native::exp_kernel_cuda>", parts.OTHER),
+    ],
+)
+def test_each_kernel_has_a_part(kernel, part):
+    assert parts.part_of(kernel) == part
+
+
+def test_bounds_grow_with_the_work():
+    little, much = parts.Work(10, 48, 3, 20, 40, 100), parts.Work(20, 48, 9, 40, 80, 200)
+    for bound in (*parts.BYTES.values(), *parts.INSTRUCTIONS.values()):
+        assert 0 < 1.5 * bound(little) < bound(much)
+    assert parts.BYTES.keys() | parts.INSTRUCTIONS.keys() < parts.KERNELS.keys()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_parts_of_a_step_are_measured_on_a_gpu():
+    result = bench_step(Size(2000, 64, 48), torch.device("cuda:0"), presets=["default"], repetitions=3, views=4)
+    rows = {row["part"]: row for row in result["parts"]}
+    assert rows.keys() == parts.KERNELS.keys() - {"response and fusion"}
+    assert all(row["microseconds"] > 0 and row["launches"] >= 1 for row in rows.values())
+    assert rows["optimizer"]["launches"] < rows[parts.OTHER]["launches"]
+    assert rows["blend"]["over_bound"] > 0.5

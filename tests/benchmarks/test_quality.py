@@ -1,0 +1,189 @@
+"""`python -m benchmarks quality`: jobs and keys, resuming, workers that fail or die, and one real training."""
+
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks import quality
+from benchmarks.quality import FAILURE, FORMAT, RESULT, Job, exposed, plan_jobs, run_job, run_jobs
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.files import write_json
+
+from ..make_scenes import write_blender
+from .command_line import call, refused
+
+FINE, DIVERGES, BREAKS, DIES = range(4)
+SMALL = ["quality", "--device", "cpu", "--max-size", "32", "--iterations", "12"]
+
+
+def jobs(methods=("default",), **changes) -> list[Job]:
+    return plan_jobs(["embedded"], methods, **{"iterations": 10} | changes)
+
+
+def made_up(job: Job, psnr: float = 30.0) -> dict:
+    """A complete result with plausible figures."""
+    hdr = {"psnr_mu": psnr, "ssim_mu": 0.9, "lpips_mu": None}
+    figures = {
+        "protocol": {name: dict(hdr) for name in ("gt-max", "self-max", "aligned")},
+        "ldr": {"psnr": psnr + 1},
+        "regions": {
+            name: {"fraction": 0.3, "psnr_mu": {"aligned": psnr - 3}} for name in ("clipped", "well-exposed", "dark")
+        },
+        "lights": {"count": 7, "lost": 0},
+        "irradiance": {"median": None},
+        "confidence": {"spearman_log2": 0.6},
+        "response": "srgb",
+        **dict.fromkeys(("train_seconds", "renders_per_second"), 2.0),
+        **dict.fromkeys(("peak_memory_bytes", "gaussians"), 5000),
+        "iterations": 10,
+    }
+    curve = [{"seconds": 1.0, "psnr_mu": psnr - 5}, {"seconds": 2.0, "psnr_mu": psnr}]
+    return {"format": FORMAT, "key": job.key, "shared_by": 1, "config": job.config, "figures": figures, "curve": curve}
+
+
+def run_stub(job, folder, *_):
+    """A training that takes no time: the seed says what becomes of a job."""
+    with open(folder.parent.parent / "ran.txt", "a") as file:
+        file.write(f"{job.config['seed']}\n")
+    if job.config["seed"] == DIVERGES:
+        raise SehdrError("iteration 7: not finite")
+    if job.config["seed"] == BREAKS:
+        raise RuntimeError("a defect")
+    if job.config["seed"] == DIES:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return made_up(job)
+
+
+def ran(out) -> list[int]:
+    path = out / "ran.txt"
+    return sorted(map(int, path.read_text().split())) if path.exists() else []
+
+
+def test_jobs_are_every_combination_and_their_keys_tell_them_apart(tmp_path):
+    changes = {"exposures": (0, 4), "responses": ("known", "blind"), "seeds": (0, 1)}
+    plain = tmp_path / "plain.toml"
+    plain.write_text('base = "default"\n[loss]\nclipping = false\nssim_weight = 0.1\n')
+    made = jobs(("default", "truth", "hdr-gs", str(plain)), **changes)
+    # The upper bound learns from truth and hdr-gs learns the curve: blind they would be the same trainings again.
+    assert len(made) == 2 * 2 * (2 + 1 + 1 + 2)
+    assert len({job.key for job in made}) == len({job.folder(Path()) for job in made}) == len(made)
+    for job in made:
+        config, training = job.config, job.config["training"]
+        told = {"known": "hdr-nerf", "blind": "auto"}.get(config["response"])
+        assert told is None or training["response"]["name"] == told
+        assert config["sees_truth"] == (config["method"] == "truth")
+        assert training["schedule"]["iterations"] == 10 and "schedule.iterations" in training["plan"]["keep"]
+        if config["method"] == "plain":
+            assert (training["loss"]["clipping"], training["loss"]["ssim_weight"]) == (False, 0.1)
+    assert jobs()[0].key == jobs()[0].key != jobs(max_size=40)[0].key
+    assert jobs(iterations=None)[0].config["training"]["schedule"]["iterations"] > 10
+
+
+def test_what_cannot_be_planned_is_named(capfd, tmp_path):
+    write_blender(tmp_path / "photos", 6)
+    for arguments, message in (
+        (["--methods", "nope"], "nope: no such preset or file"),
+        (["--methods", "default,elsewhere/default.toml"], "two methods have one name"),
+        (["--exposures", "5"], "exposure 5 is not one of 0 to 4"),
+        (["--responses", "seen"], "response 'seen' is not one of known, blind"),
+        (["--methods", "truth", "--responses", "blind"], "there is nothing to train"),
+        (["--scenes", tmp_path / "nowhere"], "no such folder"),
+        (["--jobs", "0"], "--jobs 0: not positive"),
+        (["--slurm", "gpu"], "not name=value pairs"),
+    ):
+        line = refused(capfd, *SMALL, "--out", tmp_path / "out", *arguments)
+        assert message in line, line
+    asked = ["--scenes", tmp_path / "photos", "--methods", "default"]
+    assert call(*SMALL, "--out", tmp_path / "out", *asked) == 1
+    assert "1 of 1 jobs failed, the first with: " in (line := capfd.readouterr().err) and "no HDR truth" in line
+
+
+def test_finished_jobs_never_run_again_and_damaged_results_do(tmp_path, monkeypatch):
+    monkeypatch.setattr(quality, "run_job", run_stub)
+    asked = jobs(seeds=(FINE, 7, 8))
+    assert [row["gt_max"] for row in run_jobs(asked, tmp_path, device="cpu")] == [30.0] * 3
+    folders = [job.folder(tmp_path) for job in asked]
+    whole = (folders[1] / RESULT).read_bytes()
+    (folders[1] / RESULT).write_bytes(whole[: len(whole) // 2])
+    (folders[2] / RESULT).write_text(json.dumps(json.loads((folders[2] / RESULT).read_text()) | {"key": "other"}))
+    assert [job.result(tmp_path) is not None for job in asked] == [True, False, False]
+    rows = run_jobs(asked, tmp_path, device="cpu")
+    assert ran(tmp_path) == [FINE, 7, 7, 8, 8] and not any("error" in row for row in rows)
+
+
+def test_a_job_that_fails_costs_itself_alone_and_is_tried_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(quality, "run_job", run_stub)
+    asked = jobs(seeds=(DIVERGES, BREAKS, 7))
+    rows = run_jobs(asked, tmp_path, device="cpu")
+    assert [row.get("error") for row in rows] == ["iteration 7: not finite", "RuntimeError: a defect", None]
+    run_jobs(asked, tmp_path, device="cpu")
+    assert ran(tmp_path) == [DIVERGES] * 2 + [BREAKS] * 2 + [7]
+    # A success takes the failure of before away.
+    write_json(asked[0].folder(tmp_path) / RESULT, made_up(asked[0]))
+    assert not any("error" in row for row in run_jobs(asked[:1], tmp_path, device="cpu"))
+    assert (asked[1].folder(tmp_path) / FAILURE).is_file()
+
+
+def test_submitit_runs_several_at_once_and_outlives_one_that_dies(tmp_path, monkeypatch):
+    # What it waits for the result of a process that is gone.
+    monkeypatch.setattr(pytest.importorskip("submitit").LocalJob, "_results_timeout_s", 1)
+    work = quality.work
+    monkeypatch.setattr(quality, "work", lambda *arguments: _run_stubbed(work, arguments))
+    rows = run_jobs(jobs(seeds=(DIES, 7)), tmp_path, device="cpu", at_once=2)
+    assert [row.get("error") for row in rows] == ["its process ended without a result", None]
+    assert ran(tmp_path).count(7) == 1
+
+
+def _run_stubbed(work, arguments):
+    work.__globals__["run_job"] = run_stub
+    return work(*arguments)
+
+
+def test_several_jobs_without_submitit_end_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "submitit", None)
+    with pytest.raises(SehdrError, match="submitit starts several jobs at once and is not installed; pip install"):
+        run_jobs(jobs(seeds=(0, 7)), tmp_path, device="cpu", at_once=2)
+
+
+def test_only_methods_with_truth_see_that_of_training_views(tmp_path, monkeypatch):
+    seen = {}
+
+    def look(scene, out, config, **options):
+        seen["train"] = {view.hdr is not None for view in scene.train_views}
+        seen["test"] = {view.hdr is not None for view in scene.test_views}
+        raise SehdrError("seen enough")
+
+    monkeypatch.setattr(quality, "train", look)
+    for name, truth in (("default", False), ("truth", True), ("paper", False), ("hdr-gs-truth", True)):
+        with pytest.raises(SehdrError, match="seen enough"):
+            run_job(jobs((name,), max_size=32)[0], tmp_path, "cpu", None)
+        assert seen == {"train": {truth}, "test": {True}}, name
+
+
+def test_exposures_are_four_times_apart_and_photos_follow():
+    dark, bright = (exposed("embedded", 32, "hdr-nerf", place) for place in (1, 2))
+    assert bright.views[0].exposure_time == pytest.approx(4 * dark.views[0].exposure_time)
+    assert bright.views[0].image.mean() > 1.3 * dark.views[0].image.mean()
+
+
+def test_one_training_from_the_command_line(tmp_path, capsys, few_probes, monkeypatch):
+    monkeypatch.setattr(quality, "WARM_UP_ITERATIONS", 2)
+    command = [*SMALL, "--methods", "default", "--out", tmp_path / "out", "--json"]
+    assert call(*command, tmp_path / "a.json") == 0
+    assert "gt-max dB" in capsys.readouterr().out
+    (row,) = json.loads((tmp_path / "a.json").read_text())["rows"]
+    assert (row["scene"], row["method"], row["response"], row["iterations"]) == ("embedded", "default", "known", 12)
+    assert 5 < row["gt_max"] < 60 and row["chosen"] == "hdr-nerf" and row["seconds"] > 0
+    assert row["tests"][-1][1] == pytest.approx(row["gt_max"], abs=0.5)
+    assert call(*command, tmp_path / "b.json") == 0
+    again = json.loads((tmp_path / "b.json").read_text())["rows"]
+    assert again == [row], "a finished job keeps its figures, its seconds among them"
+
+
+def test_a_scene_that_lost_its_place_is_told(tmp_path):
+    with pytest.raises(InputError, match="is not here"):
+        plan_jobs(["embedded:nowhere"], ["default"])

@@ -1,0 +1,96 @@
+"""The reports: made of stored results, and as they are in the repository."""
+
+import json
+import re
+
+import pytest
+
+from benchmarks.quality import plan_jobs, row_of
+from benchmarks.report_pages import REPORTS, write_readme, write_reports
+from benchmarks.report_plots import error_over_time
+from sehdr_warp.errors import InputError
+
+from .test_quality import made_up
+
+
+def test_the_pages_are_what_the_results_make(tmp_path):
+    """Pages may not be edited by hand: `make reports` makes them."""
+    (tmp_path / "results").mkdir()
+    for path in (REPORTS / "results").glob("*.json"):
+        (tmp_path / "results" / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "tried.csv").write_bytes((REPORTS / "tried.csv").read_bytes())
+    write_reports(tmp_path)
+    for page in sorted(REPORTS.glob("*.md")):
+        assert page.read_text() == (tmp_path / page.name).read_text(), page.name
+    pages = [
+        {path.name for path in folder.iterdir() if path.suffix in (".md", ".png")} for folder in (tmp_path, REPORTS)
+    ]
+    assert pages[0] == pages[1]
+
+
+def test_the_readme_shows_the_page_of_quality(tmp_path):
+    stored = json.loads((REPORTS / "results" / "quality.json").read_text())
+    readme = REPORTS.parents[1] / "README.md"
+    (copy := tmp_path / "README.md").write_text(re.sub(r"\d dB \|", "0 dB |", readme.read_text()))
+    assert copy.read_text() != readme.read_text()
+    write_readme(copy, stored)
+    assert copy.read_text() == readme.read_text()
+
+
+def test_quality_is_paired_with_the_upper_bound(tmp_path):
+    scenes = {"exposures": (1, 2), "responses": ("known",), "iterations": 10}
+    rows = []
+    for method, decibels in (("default", (30.0, 28.0)), ("hdr-gs", (20.0, 22.0)), ("truth", (33.0, 32.0))):
+        made = plan_jobs(["embedded"], [method], **scenes)
+        rows += [row_of(made_up(job, psnr)) for job, psnr in zip(made, decibels, strict=True)]
+    machine = {"cpu": "stub", "cores": 2, "gpu": None, "versions": {"torch": "2"}}
+    result = {
+        "command": "python -m benchmarks quality",
+        "machine": machine,
+        "date": "2026-01-01",
+        "rows": rows,
+        "notes": [],
+    }
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "quality.json").write_text(json.dumps(result))
+    assert {path.name for path in write_reports(tmp_path)} == {"quality.md", "quality.png", "README.md"}
+    lines = (tmp_path / "quality.md").read_text().splitlines()
+    cells = {line.split("|")[1].strip(): [c.strip() for c in line.split("|")[2:-1]] for line in lines if "|" in line}
+    # n, mean, worst, difference to the bound.
+    assert cells["default"][:4] == ["2", "29.00", "28.00", "-3.50"]
+    assert cells["hdr-gs"][:4] == ["2", "21.00", "20.00", "-11.50"], "a learned curve stands beside the known one"
+    assert cells["truth"][:4] == ["2", "32.50", "32.00", "-"]
+
+
+def test_error_over_time_is_a_mean_on_a_log_scale():
+    seconds, mean = zip(*error_over_time([[[1.0, 20.0], [100.0, 40.0]], [[1.0, 10.0], [10.0, 30.0]]], count=3))
+    assert seconds == pytest.approx([1, 10, 100]) and mean == pytest.approx([15, 30, 35])
+
+
+def test_what_is_no_result_is_named(tmp_path):
+    (tmp_path / "results").mkdir()
+    with pytest.raises(InputError, match="holds no results"):
+        write_reports(tmp_path)
+    (tmp_path / "results" / "step.json").write_text("{}")
+    with pytest.raises(InputError, match="is no result"):
+        write_reports(tmp_path)
+
+
+def test_means_over_the_whole_are_told_by_seed(tmp_path):
+    rows = []
+    for method, seed, decibels in (("default", 0, (30, 28)), ("default", 1, (31, 29)), ("truth", 0, (33, 32))):
+        made = plan_jobs(["embedded"], [method], exposures=(1, 2), seeds=(seed,), responses=("known",), iterations=10)
+        rows += [row_of(made_up(job, float(psnr))) for job, psnr in zip(made, decibels, strict=True)]
+    rows += [row_of(made_up(plan_jobs(["embedded"], ["default"], seeds=(2,), iterations=10)[0], 20.0))]
+    machine = {"cpu": "stub", "cores": 2, "gpu": None, "versions": {"torch": "2"}}
+    result = {"command": "-", "machine": machine, "date": "2026-01-01", "rows": rows, "notes": []}
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "quality.json").write_text(json.dumps(result))
+    write_reports(tmp_path)
+    told = (tmp_path / "quality.md").read_text().split("by seed:")[1]
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in told.splitlines() if line.startswith("| ")]
+    assert cells[2:] == [
+        ["default", "0", "29.00", "-3.50"],
+        ["default", "1", "30.00", "-"],
+        ["truth", "0", "32.50", "-"],
+    ]

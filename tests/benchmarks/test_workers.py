@@ -1,0 +1,51 @@
+"""`python -m benchmarks workers`: steps on threads, and on devices with a process each."""
+
+import json
+
+import pytest
+
+from benchmarks import workers
+from benchmarks.splats import Size
+from sehdr_warp.errors import SehdrError
+
+from .command_line import call
+
+
+def test_threads_are_timed_and_give_one_loss(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("SEHDR_THREADS", "3")
+    words = ["workers", "--device", "cpu", "--sizes", "300@40x32", "--repetitions", "1"]
+    assert call(*words, "--json", tmp_path / "a.json") == 0
+    result = json.loads((tmp_path / "a.json").read_text())
+    assert [(row["kind"], row["workers"]) for row in result["rows"]] == [("threads", n) for n in (1, 2, 3)]
+    assert result["rows"][0]["times_one"] == 1.0
+    assert all(row["photo_ms"] > 0 for row in result["rows"])
+    assert len({row["loss"] for row in result["rows"]}) == 1
+    assert "loss on 3 threads" in result["checks"][-1]["what"]
+    assert "| threads |" in capsys.readouterr().out
+
+
+def test_a_loss_that_depends_on_the_threads_is_found(monkeypatch, capsys):
+    right = workers.time_threads
+    monkeypatch.setenv("SEHDR_THREADS", "2")
+    monkeypatch.setattr(workers, "time_threads", lambda size, n, k: right(size, n, k) | {"loss": n / 7})
+    assert call("workers", "--device", "cpu", "--sizes", "300@40x32", "--repetitions", "1") == 1
+    assert "loss on 2 threads differs from one thread" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_ranks_are_timed_by_photo(monkeypatch, count):
+    monkeypatch.setenv("SEHDR_THREADS", "1")
+    timing = workers.time_ranks(Size(300, 40, 32), count, "cpu", 1)
+    assert timing["photo_ms"] > 0 and timing["amortized_ms"] > 0
+    assert timing["repetitions"] == workers.STEPS
+
+
+def test_what_ends_a_process_is_told_in_a_line():
+    with pytest.raises(SehdrError, match="a training of .* by 1 processes ended early: .*nosuch"):
+        workers.time_ranks(Size(300, 40, 32), 1, "nosuch", 1)
+
+
+def test_counts_double_up_to_what_there_is():
+    assert [workers.doubled(most) for most in (1, 2, 3, 16, 24)] == [
+        [1], [1, 2], [1, 2, 3], [1, 2, 4, 8, 16], [1, 2, 4, 8, 16, 24],
+    ]  # fmt: skip
