@@ -105,6 +105,11 @@ def camera_of(values: dict) -> Camera:
     return camera
 
 
+def frame_bytes(camera: Camera, clipped: bool) -> int:
+    """Return the size of a frame in bytes; see Rendering.frame."""
+    return 2 * (6 if clipped else 5) * camera.width * camera.height
+
+
 def camera_file(cameras: Sequence[Camera]) -> str:
     """Return cameras as JSON that `render --cameras` reads."""
     digits = max(3, len(str(len(cameras) - 1)))

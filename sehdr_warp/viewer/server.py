@@ -5,14 +5,17 @@ Nothing that comes in is trusted: a fixed set of paths, bounded bodies and sizes
 
 import errno
 import io
+import ipaddress
 import json
 import logging
+import re
 import socket
 import tempfile
 import threading
 import zipfile
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -25,12 +28,17 @@ from ..output.film import write_film
 from ..output.images import quantize
 from ..output.light_pictures import page_file, shown_photo
 from ..output.render_views import render_views
-from .frames import ViewerScene, camera_file, camera_of
+from .connections import SILENCE, BusyError, ClientGone, Connection, Connections
+from .frames import ViewerScene, camera_file, camera_of, frame_bytes
 
 log = logging.getLogger(__name__)
 PORTS_TRIED = 50
-MOST_BODY, MOST_VIEWS, MOST_CONNECTIONS = 4 << 20, 2000, 100
-PATIENCE = 60.0  # Seconds that a connection may be silent
+MOST_BODY, MOST_VIEWS = 4 << 20, 2000
+MOST_SAVED = 500_000_000
+"""Pixels of all pictures of a save, about 3 GB; `render` has no such bound."""
+MOST_STOPS = 30.0
+_SAVE_END = 30.0
+"""Seconds that the end of the server waits for a save to notice it."""
 _HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -65,6 +73,9 @@ class Viewer:
         """
         self.runs, self.training, self.saving = list(runs), training, ""
         self._photos, self._reading, self._saving = photos, threading.Lock(), threading.Lock()
+        # All pictures are made on one thread, because memory that libraries keep for each thread would add up.
+        self._renderer = ThreadPoolExecutor(1, thread_name_prefix="sehdr-warp viewer renders")
+        self._closed = threading.Event()
         page = Path(__file__).parent / "page"
         self.files = {
             "/": ("text/html", page.joinpath("viewer.html").read_text(encoding="utf-8")),
@@ -76,7 +87,7 @@ class Viewer:
             "/viewer.js": ("text/javascript", page.joinpath("viewer.js").read_text(encoding="utf-8")),
         }
 
-    def get(self, path: str) -> tuple[str, bytes]:
+    def get(self, path: str, client: "Client") -> tuple[str, bytes]:
         """Answer a GET: content type and content; raise Refusal."""
         if path in self.files:
             kind, text = self.files[path]
@@ -91,17 +102,19 @@ class Viewer:
         if path == "/saving":
             return "text/plain", self.saving.encode()
         if path.startswith("/photo/"):
-            return "image/png", self._photo(path.removeprefix("/photo/"))
+            return "image/png", self._photo(path.removeprefix("/photo/"), client)
         raise Refusal(404, "no such page")
 
-    def post(self, path: str, request: dict) -> tuple[str, bytes | memoryview]:
+    def post(self, path: str, request: dict, client: "Client") -> tuple[str, bytes | memoryview]:
         """Answer a POST: content type and content; raise Refusal, or the error of a bad request."""
         if path == "/training" and self.training is not None:
             self.training.control(str(request["do"]))
             return "application/json", b"{}"
         if path == "/frame":
             options = {name: bool(request.get(name)) for name in ("draft", "clipped")}
-            return "application/octet-stream", self._run(request).frame(camera_of(request["camera"]), **options)
+            run, camera = self._run(request), camera_of(request["camera"])
+            client.reserve(frame_bytes(camera, options["clipped"]))
+            return "application/octet-stream", self._on_renderer(client, partial(run.frame, camera, **options))
         if path in ("/path", "/save"):
             cameras = [camera_of(camera) for camera in request["cameras"][:MOST_VIEWS]]
             if not cameras:
@@ -110,8 +123,31 @@ class Viewer:
                 cameras = interpolate(cameras, min(int(request["count"]), MOST_VIEWS))
             if path == "/path":
                 return "application/json", camera_file(cameras).encode()
-            return self._save(self._run(request), cameras, str(request["kind"]), request)
+            return self._save(_SavedRun(self, self._run(request), client), cameras, str(request["kind"]), request)
         raise Refusal(404, "no such page")
+
+    def close(self) -> None:
+        """End the work for clients, and wait for it: native code must not run while Python ends."""
+        self._closed.set()
+        self._renderer.shutdown(wait=True, cancel_futures=True)
+        for lock in (self._saving, self._reading):
+            if lock.acquire(timeout=_SAVE_END):
+                lock.release()
+
+    def _on_renderer(self, client: "Client", make: Callable[[], Any]) -> Any:
+        """Return what `make` returns on the thread of the renderer, unless its client has gone by then."""
+
+        def call() -> Any:
+            if self._closed.is_set() or client.gone():
+                raise ClientGone
+            return make()
+
+        try:
+            return self._renderer.submit(call).result()
+        except (RuntimeError, CancelledError):
+            if self._closed.is_set():
+                raise ClientGone from None
+            raise
 
     def _run(self, request: dict) -> ViewerScene:
         index = int(request.get("run", 0))
@@ -119,44 +155,50 @@ class Viewer:
             raise Refusal(404, "no such run")
         return self.runs[index]
 
-    def _photo(self, name: str) -> bytes:
-        """Return the photo of a run and view, named by their indices, as PNG."""
+    def _photo(self, name: str, client: "Client") -> bytes:
+        """Return the photo of a run and a view by their indices, as PNG."""
         run, _, view = name.partition("/")
         if not (run.isascii() and view.isascii() and run.isdigit() and view.isdigit() and len(name) < 20):
             raise Refusal(404, "no such photo")
         entries = self._run({"run": run}).cameras
         if self._photos is None or int(view) >= len(entries):
             raise Refusal(404, "no such photo")
-        with self._reading:
-            view_photo = self._photos(int(run)).get(entries[int(view)].name)
-        if view_photo is None:
-            raise Refusal(404, "no such photo")
-        buffer = io.BytesIO()
-        photo = shown_photo(self._run({"run": run}), view_photo)
-        Image.fromarray(quantize(photo)).save(buffer, "PNG", compress_level=1)
+        with self._reading:  # One at a time, because pictures of a large photo take much memory on the way.
+            photo = self._photos(int(run)).get(entries[int(view)].name)
+            if photo is None or self._closed.is_set():
+                raise Refusal(404, "no such photo")
+            buffer = io.BytesIO()
+            picture = Image.fromarray(quantize(shown_photo(self._run({"run": run}), photo)))
+            picture.save(buffer, "PNG", compress_level=1)
+        client.reserve(buffer.tell())
         return buffer.getvalue()
 
-    def _save(self, run: ViewerScene, cameras: Sequence, kind: str, request: dict) -> tuple[str, bytes]:
-        """Return files of cameras as `render` writes them: one EXR, a zip of brackets and the rest, or a film."""
+    def _save(self, run: "_SavedRun", cameras: Sequence, kind: str, request: dict) -> tuple[str, bytes]:
+        """Return files of cameras, as `render` writes them: one EXR, a zip of brackets and all, or a film."""
+        stops, evs = _stops(request), str(request.get("evs") or "-4,-2,0,2,4") if kind == "brackets" else None
+        pictures = len(evs.split(",")) + 1 if evs else 1
+        pixels = pictures * sum(camera.width * camera.height for camera in cameras)
+        if kind != "film" and pixels > MOST_SAVED:
+            raise Refusal(413, f"{pixels} pixels are more than the {MOST_SAVED} of a save; use sehdr-warp render")
         if not self._saving.acquire(blocking=False):
             raise Refusal(503, "another save is still being made")
         try:
             with tempfile.TemporaryDirectory() as folder:
                 if kind == "film":
-                    stops = float(request.get("stops") or 0)
                     options = {"ev_ramp": (stops, stops), "exposed": True, "tell": self._tell}
                     return "video/mp4", write_film(run, Path(folder, "film.mp4"), cameras, **options).read_bytes()
                 camera_path = Path(folder, "cameras.json")
                 camera_path.write_text(camera_file(cameras), encoding="utf-8")
-                evs = str(request.get("evs") or "-4,-2,0,2,4") if kind == "brackets" else None
                 files = render_views(run, Path(folder, "views"), cameras=camera_path, evs=evs)
                 if kind == "exr" and len(cameras) == 1:
                     return "image/x-exr", files[0].read_bytes()
-                buffer = io.BytesIO()
-                with zipfile.ZipFile(buffer, "w") as packed:
+                packed = Path(folder, "views.zip")
+                with zipfile.ZipFile(packed, "w") as archive:
                     for file in files:
-                        packed.write(file, file.relative_to(folder))
-                return "application/zip", buffer.getvalue()
+                        archive.write(file, file.relative_to(folder))
+                        file.unlink()
+                run.client.reserve(packed.stat().st_size)
+                return "application/zip", packed.read_bytes()
         finally:
             self.saving = ""
             self._saving.release()
@@ -164,6 +206,45 @@ class Viewer:
     def _tell(self, line: str) -> None:
         """Set the line that a page shows while a film is rendered."""
         self.saving = line
+
+
+class Client:
+    """Who asks: what a request may know of its connection."""
+
+    def __init__(self, connections: Connections, connection: Connection):
+        """Set the connection and those beside it."""
+        self._connections, self._connection = connections, connection
+
+    def gone(self) -> bool:
+        """Return whether the client no longer waits for the answer."""
+        return self._connection.gone()
+
+    def reserve(self, size: int) -> None:
+        """Wait for room for an answer of so many bytes; see Connections.reserve."""
+        self._connections.reserve(self._connection, size)
+
+
+class _SavedRun:
+    """A run for a save: every picture is made on the renderer, and the save ends if its client leaves."""
+
+    def __init__(self, viewer: Viewer, run: ViewerScene, client: Client):
+        self._viewer, self._run, self.client = viewer, run, client
+
+    def render(self, camera: Any) -> Any:
+        return self._viewer._on_renderer(self.client, partial(self._run.render, camera))
+
+    def render_confidence(self, camera: Any) -> Any:
+        return self._viewer._on_renderer(self.client, partial(self._run.render_confidence, camera))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._run, name)
+
+
+def _stops(request: dict) -> float:
+    stops = float(request.get("stops") or 0)
+    if not abs(stops) <= MOST_STOPS:  # NaN is not.
+        raise Refusal(400, f"stops {stops} are not between -{MOST_STOPS:g} and {MOST_STOPS:g}")
+    return stops
 
 
 class Server(ThreadingHTTPServer):
@@ -174,7 +255,7 @@ class Server(ThreadingHTTPServer):
     def __init__(self, viewer: Viewer, host: str = "127.0.0.1", port: int = 8080):
         """Listen on the port, or on the next free one."""
         self.viewer, self.host = viewer, host
-        self.free = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        self.connections = Connections()
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         for tried in range(port, min(port + PORTS_TRIED, 65536)):
             try:
@@ -193,17 +274,23 @@ class Server(ThreadingHTTPServer):
 
     def process_request(self, request, client_address) -> None:
         """Start a thread for a connection, unless there are too many."""
-        if not self.free.acquire(blocking=False):
+        if not self.connections.add(request):
             self.shutdown_request(request)
             return
         super().process_request(request, client_address)
 
     def process_request_thread(self, request, client_address) -> None:
-        """Serve a connection and release its place."""
+        """Serve a connection and forget it at the end."""
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self.free.release()
+            self.connections.remove(request)
+
+    def server_close(self) -> None:
+        """Close all connections and end the work for them."""
+        super().server_close()
+        self.connections.close()
+        self.viewer.close()
 
     def handle_error(self, request, client_address) -> None:
         """Log a broken connection for debugging only."""
@@ -211,22 +298,29 @@ class Server(ThreadingHTTPServer):
 
     def allowed(self, host: str, origin: str | None) -> bool:
         """Whether a request comes from a page of this server: another site's could reach it by a name of its own."""
-        name, _, port = host.rpartition(":") if not host.endswith("]") else (host, "", "")
-        name = name or port
-        local = self.host in ("127.0.0.1", "localhost", "::1")
-        return (not local or name in _LOCAL) and origin in (None, f"http://{host}")
+        name = re.sub(r":[0-9]*$", "", host)
+        own = f"[{self.host}]" if ":" in self.host else self.host
+        return (not _is_local(self.host) or name in (*_LOCAL, own)) and origin in (None, f"http://{host}")
+
+
+def _is_local(host: str) -> bool:
+    """Return whether only this machine reaches a host's name or address."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost" or host.endswith(".localhost")
 
 
 class _Handler(BaseHTTPRequestHandler):
-    protocol_version, timeout, disable_nagle_algorithm = "HTTP/1.1", PATIENCE, True
+    protocol_version, timeout, disable_nagle_algorithm = "HTTP/1.1", SILENCE, True
     error_message_format, error_content_type = "%(message)s", "text/plain"
     server: Server  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def do_GET(self) -> None:
-        self._answer(lambda path: self.server.viewer.get(path))
+        self._answer(self.server.viewer.get)
 
     def do_POST(self) -> None:
-        self._answer(lambda path: self.server.viewer.post(path, self._body()))
+        self._answer(lambda path, client: self.server.viewer.post(path, self._body(), client))
 
     def _body(self) -> dict:
         length = self.headers.get("Content-Length", "")
@@ -236,38 +330,55 @@ class _Handler(BaseHTTPRequestHandler):
         data = self.rfile.read(int(length))
         if self.headers.get_content_type() != "application/json":
             raise Refusal(415, "a request is JSON")
-        values = json.loads(data)
+        values = json.loads(data, parse_constant=_refuse_constant)
         if not isinstance(values, dict):
             raise Refusal(400, "a request is an object")
         return values
 
-    def _answer(self, find: Callable[[str], tuple[str, bytes | memoryview]]) -> None:
+    def _answer(self, find: Callable[[str, Client], tuple[str, bytes | memoryview]]) -> None:
+        connections = self.server.connections
+        try:
+            connection = connections.of(self.connection)
+        except ClientGone:
+            self.close_connection = True
+            return
+        with connections.answering(connection):
+            self._send(connection, *self._found(partial(find, self.path, Client(connections, connection))))
+
+    def _found(self, find: Callable[[], tuple[str, bytes | memoryview]]) -> tuple[int, str, bytes | memoryview]:
+        """Return status, content type and content of an answer."""
         try:
             if not self.server.allowed(self.headers.get("Host", ""), self.headers.get("Origin")):
                 self.close_connection = True
                 raise Refusal(403, "only pages of this server may ask")
-            status, (kind, content) = 200, find(self.path)
+            return 200, *find()
         except Refusal as error:
-            status, kind, content = error.status, "text/plain", str(error).encode()
+            return error.status, "text/plain", str(error).encode()
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-            status, kind, content = 400, "text/plain", f"cannot be used: {error!s:.200}".encode()
-        except (RuntimeError, MemoryError) as error:  # A GPU without room
-            status, kind, content = (
-                500,
-                "text/plain",
-                f"cannot be rendered: {' '.join(str(error).split())[:200]}".encode(),
-            )
+            return 400, "text/plain", f"cannot be used: {error!s:.200}".encode()
+        except (RuntimeError, MemoryError) as error:  # For example, a GPU without room.
+            return 500, "text/plain", f"cannot be rendered: {' '.join(str(error).split())[:200]}".encode()
+        except BusyError as error:
+            return 503, "text/plain", str(error).encode()
         except SehdrError as error:
-            status, kind, content = 409, "text/plain", str(error).encode()
-        except OSError:  # The browser has gone.
+            return 409, "text/plain", str(error).encode()
+        except OSError:
             self.close_connection = True
-            return
-        with suppress(OSError):
+            return 500, "text/plain", b"the request ended early"
+
+    def _send(self, connection: Connection, status: int, kind: str, content: bytes | memoryview) -> None:
+        try:
             self.send_response(status)
             for name, value in {**_HEADERS, "Content-Type": kind, "Content-Length": str(len(content))}.items():
                 self.send_header(name, value)
             self.end_headers()
-            self.wfile.write(content)
+            connection.send(content)
+        except OSError:  # The client has gone, or reads nothing.
+            self.close_connection = True
 
     def log_message(self, format: str, *args) -> None:
         log.debug(format, *args)
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is not a number")

@@ -1,0 +1,146 @@
+"""The viewer under clients that never ask, never read, or leave: bounded memory, and others are served."""
+
+import json
+import socket
+import threading
+import time
+
+import pytest
+
+from sehdr_warp.viewer import connections
+from sehdr_warp.viewer.server import MOST_SAVED, Server
+
+from ..output.helpers import AnalyticRun, camera
+from .test_server import ask, frame
+
+
+def post(server, path, body):
+    """A request whose answer nobody reads yet, into as little memory of the system as it gives."""
+    client = socket.socket()
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    client.connect(server.server_address[:2])
+    data = json.dumps(body).encode()
+    head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+    client.sendall(f"{head}Content-Length: {len(data)}\r\n\r\n".encode() + data)
+    return client
+
+
+def until(condition, seconds=20.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_clients_that_never_read_make_room_for_others(serve, monkeypatch):
+    monkeypatch.setattr(connections, "MOST_BYTES", 50 << 20)
+    server, large, largest = serve(), camera(1600, 1200), 0
+    deaf = [post(server, "/frame", {"camera": large.to_dict(), "clipped": True}) for _ in range(8)]
+    watched = threading.Event()
+
+    def watch():
+        nonlocal largest
+        while not watched.wait(0.005):
+            largest = max(largest, sum(each.held for each in list(server.connections._open.values())))
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    until(lambda: largest > 20 << 20)
+    for _ in range(3):
+        started = time.monotonic()
+        frame(server, camera(64, 48))
+        assert time.monotonic() - started < 10
+    until(lambda: all(not each.answering for each in list(server.connections._open.values())), 60)
+    watched.set()
+    watcher.join()
+    assert largest <= 50 << 20
+    for client in deaf:
+        client.close()
+
+
+def test_silent_clients_make_room_for_others(serve, monkeypatch):
+    monkeypatch.setattr(connections, "MOST_CONNECTIONS", 5)
+    server = serve()
+    silent = [socket.create_connection(server.server_address[:2]) for _ in range(20)]
+    assert ask(server, "/scene")[0] == 200
+    assert len(server.connections._open) <= 5
+    for client in silent:
+        client.close()
+
+
+class _Slow(AnalyticRun):
+    """A run whose pictures take a moment."""
+
+    renders = 0
+
+    def render(self, camera):
+        self.renders += 1
+        time.sleep(0.02)
+        return super().render(camera)
+
+
+def slow(server):
+    server.viewer.runs[0].run = run = _Slow()
+    return run
+
+
+@pytest.mark.parametrize("kind", ["exr", "brackets", "film"])
+def test_a_save_ends_when_its_client_leaves(serve, kind):
+    if kind == "film":
+        pytest.importorskip("av")
+    server, small = serve(), camera(16, 16).to_dict()
+    run = slow(server)
+    client = post(server, "/save", {"cameras": [small] * 2000, "kind": kind, "evs": "-1,0,1"})
+    until(lambda: run.renders > 1)
+    assert ask(server, "/save", {"cameras": [small], "kind": "exr"})[0] == 503
+    client.close()
+    until(lambda: not server.viewer._saving.locked())
+    assert run.renders < 1000
+    assert ask(server, "/save", {"cameras": [small], "kind": "exr"})[0] == 200
+
+
+def test_the_end_of_the_server_ends_a_save(serve):
+    server = Server(serve().viewer, port=0)
+    run = slow(server)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    client = post(server, "/save", {"cameras": [camera(16, 16).to_dict()] * 2000, "kind": "exr"})
+    until(lambda: run.renders > 1)
+    server.shutdown()
+    started = time.monotonic()
+    server.server_close()
+    assert time.monotonic() - started < 10 and not server.viewer._saving.locked() and run.renders < 1000
+    client.close()
+
+
+@pytest.mark.parametrize("stops", [float("nan"), float("inf"), 1e300, -31, "1e400", [1]])
+def test_films_of_impossible_stops_are_refused(serve, stops):
+    status, _, content = ask(serve(), "/save", {"cameras": [camera().to_dict()], "kind": "film", "stops": stops})
+    assert status == 400 and b"\n" not in content
+
+
+def test_a_save_that_would_fill_the_disk_is_refused(serve):
+    large = camera(4096, 2304).to_dict()
+    status, _, content = ask(serve(), "/save", {"cameras": [large] * 60, "kind": "exr"})
+    assert status == 413 and str(MOST_SAVED).encode() in content
+
+
+@pytest.mark.parametrize("host", ["127.0.0.2", "localhost", "127.0.0.1"])
+def test_a_server_for_this_machine_alone_has_no_other_names(serve, host):
+    try:
+        server = Server(serve().viewer, host, 0)
+    except OSError:
+        pytest.skip(f"{host} is no address here")
+    port = server.server_address[1]
+    for name in (host, f"{host}:{port}", f"localhost:{port}", "[::1]:1"):
+        assert server.allowed(name, None)
+    for name in (
+        "",
+        "evil.example",
+        f"evil.example:{port}",
+        "127.0.0.2.evil.example",
+        f"localhost.evil:{port}",
+        "[::2]",
+    ):
+        assert not server.allowed(name, None)
+    assert not server.allowed(f"{host}:{port}", "http://evil.example")
+    server.server_close()
