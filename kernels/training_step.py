@@ -254,10 +254,14 @@ def add_position_noise(
     first: int,
     log_scales: wp.array(dtype=_vec3), quaternions: wp.array(dtype=_vec4),
     opacity_logits: wp.array(dtype=wp.float32),
-    seed: int, strength: float,
+    seed: int, strength: float, most_sizes: float, most_distance: float,
     means: wp.array(dtype=_vec3),
 ):
-    """means += strength * sigmoid(100 (0.005 - opacity)) * R S S R^T * normal noise, of seed and index alone."""
+    """Add strength / max(1, |mean|) * sigmoid(100 (0.005 - opacity)) * R S S R^T * normal noise to the means.
+
+    Each axis moves at most most_sizes of the Gaussian's standard deviations (times a normal number). Nothing moves
+    farther from the origin than most_distance, unless it is there already and comes nearer. Depends on seed and index
+    alone."""
     i = first + wp.tid()
     opacity = 1.0 / (1.0 + wp.exp(-opacity_logits[i]))
     above = SHARPNESS * (opacity - (1.0 - CENTRE))
@@ -265,12 +269,18 @@ def add_position_noise(
         return
     faintness = 1.0 / (1.0 + wp.exp(above))
     state = wp.rand_init(seed, i)
-    noise = _vec3(wp.randn(state), wp.randn(state), wp.randn(state)) * (strength * faintness)
+    mean = means[i]
+    distance = wp.length(mean)
+    amplitude = strength * faintness / wp.max(1.0, distance)
+    noise = _vec3(wp.randn(state), wp.randn(state), wp.randn(state))
     rotation = _g.rotation_from_quaternion(quaternions[i])
     along = wp.transpose(rotation) * noise
     scale = log_scales[i]
     shaped = _vec3()
     for axis in range(3):
         # Bounded as in the projection: for an opaque one the rest is 0, and 0 times infinity is no position.
-        shaped[axis] = along[axis] * wp.exp(2.0 * wp.clamp(scale[axis], -LOG_SCALE_MAX, LOG_SCALE_MAX))
-    means[i] = means[i] + rotation * shaped
+        size = wp.exp(wp.clamp(scale[axis], -LOG_SCALE_MAX, LOG_SCALE_MAX))
+        shaped[axis] = along[axis] * size * wp.min(amplitude * size, most_sizes)
+    moved = mean + rotation * shaped
+    if wp.length(moved) <= wp.max(distance, most_distance):
+        means[i] = moved

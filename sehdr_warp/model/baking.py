@@ -15,10 +15,11 @@ from torch import Tensor
 
 from ..response import response_by_name
 from ..scene import Camera
+from ..scene.normalization import Normalization
 from ..splats.arrays import HARMONIC_0, GaussianArrays, evaluate_colors, harmonic_basis
 from .adam import Adam
 from .gaussians import Gaussians
-from .radiance_field import CameraTensors, RadianceField
+from .radiance_field import RadianceField
 from .sensor_colors import rec709_of
 
 # Radiance below this counts as this: its logarithm must be finite.
@@ -61,8 +62,39 @@ def gaussians_of(
     exposure_time: seconds, by default the base time. seen_from: [C, 3] where the scene was photographed from.
     color_matrix: [3, 3] from the field's colors to linear Rec.709, if they are others.
 
-    Exact where the field's own harmonics mean that; else fitted for each Gaussian (see bake).
+    Exact where the field's own harmonics mean that; else fitted for each Gaussian (see bake). The result is in the
+    coordinates of the scene, as seen_from is.
     """
+    seen_from = field.normalization.points(seen_from)
+    stored = _in_colors(field, color_model, seen_from, exposure_time, color_matrix)
+    return to_scene(stored, field.normalization)
+
+
+def to_normalized(gaussians: GaussianArrays, normalization: Normalization) -> GaussianArrays:
+    """Return Gaussians of scene coordinates in normalized ones."""
+    return _moved(gaussians, normalization.points(gaussians.means), -math.log(normalization.unit))
+
+
+def to_scene(gaussians: GaussianArrays, normalization: Normalization) -> GaussianArrays:
+    """Return Gaussians of normalized coordinates in those of the scene."""
+    if normalization.is_identity:
+        return gaussians
+    return _moved(gaussians, normalization.scene_points(gaussians.means), math.log(normalization.unit))
+
+
+def _moved(gaussians: GaussianArrays, means: np.ndarray, log_scale: float) -> GaussianArrays:
+    sizes = gaussians.log_scales.astype(np.float64) + log_scale
+    return replace(gaussians, means=means.astype(np.float32), log_scales=sizes.astype(np.float32))
+
+
+def _in_colors(
+    field: RadianceField,
+    color_model: str,
+    seen_from: np.ndarray,
+    exposure_time: float | None,
+    color_matrix: np.ndarray | None,
+) -> GaussianArrays:
+    """Return gaussians_of() in the field's own coordinates, as seen_from is."""
     stored, to_radiance = _stored(field)
     if color_matrix is not None:
         to_radiance = _in_rec709(to_radiance or (lambda x: x / field.base_time), color_matrix, field.base_time)
@@ -166,12 +198,12 @@ def refine(
         fading = 0.5 * (1 + math.cos(math.pi * step / len(order)))
         for group, rate in zip(optimizer.param_groups, RATES.values(), strict=True):
             group["lr"] = rate * fading
-        shown = field.photograph(CameraTensors.of(cameras[index], device), field.base_time).encoded
+        shown = field.photograph(field.camera_tensors(cameras[index]), field.base_time).encoded
         assert shown is not None
         optimizer.zero_grad()
         (shown.clamp(0, 1) - wanted[index]).square().mean().backward()
         optimizer.step()
-    return _stored(field)[0]
+    return to_scene(_stored(field)[0], field.normalization)
 
 
 @torch.no_grad()

@@ -14,13 +14,14 @@ from torch import Tensor
 from ..response import Response
 from ..response.curve import HALF_CODE
 from ..scene import View
-from .radiance_field import CameraTensors, RadianceField
+from .radiance_field import RadianceField
 from .unexplained import MOST_VIEWS, unexplained_pixels
 
 CLIPPED_STOPS = 1.0  # Uncertainty of a pixel that is clipped in all channels
 PARTLY_CLIPPED_STOPS = 0.25  # Of a clipped channel beside others, which say where the light is, and it the hue
 MOST_STOPS = 4.0  # A misfit counts no more than this: 1/16 of the confidence already says that nothing is known
 LEAST_SEEN = 0.01  # Pixels of blending weight, over all photos, at which half of the confidence that they give counts
+LEAST_CONTRIBUTION = 1 / 255  # Pixels of blending weight in one photo: what has less is not part of the scene
 UNEXPLAINED = 8.0  # Times that a pixel counts of what the scene lacks: places behind it are hidden in few photos each
 
 
@@ -29,12 +30,22 @@ class Evidence:
     """What the training photos say of each of N Gaussians; [N] each.
 
     seen: pixels, the sum of its blending weights, UNEXPLAINED times where a photo shows what the scene lacks. stops:
-    their mean uncertainty. clipped: the share of their values.
+    their mean uncertainty. clipped: the share of their values. peak: pixels, as seen, in the photo that shows it most.
     """
 
     seen: Tensor
     stops: Tensor
     clipped: Tensor
+    peak: Tensor
+
+    @property
+    def contributes(self) -> Tensor:
+        """[N] bool: whether a Gaussian changes any photo by more than a code of 8 bits, summed over its pixels."""
+        return self.peak > LEAST_CONTRIBUTION
+
+    def rows(self, index: Tensor) -> "Evidence":
+        """Return the evidence of the Gaussians at an index or mask [N]."""
+        return Evidence(self.seen[index], self.stops[index], self.clipped[index], self.peak[index])
 
     def confidence(self) -> Tensor:
         """[N] in [0, 1]. 1: observed unclipped, and the scene agrees; 1/2: known to a factor of two; 0: never seen."""
@@ -78,7 +89,12 @@ def gather_evidence(
     """
     device = field.gaussians.means.device
     total = torch.zeros(field.gaussians.count, 3, device=device)
-    for view in views[:: -(-len(views) // MOST_VIEWS) or 1]:
+    peak = torch.zeros(field.gaussians.count, device=device)
+    every = -(-len(views) // MOST_VIEWS) or 1
+    for index, view in enumerate(views):
+        if index % every:
+            peak = torch.maximum(peak, _weight(field, view))
+            continue
         exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time
         counted = torch.ones_like(exposure[..., 0])
         if truth and view.hdr is not None:
@@ -91,7 +107,20 @@ def gather_evidence(
         if view.mask is not None:
             counted = counted * torch.tensor(view.mask, device=device)
         images = torch.stack([counted, counted * stops, counted * clipped], dim=2)
-        total += field.weighted_sums(CameraTensors.of(view.camera, device), images)
+        sums = field.weighted_sums(field.camera_tensors(view.camera), images)
+        total += sums
+        peak = torch.maximum(peak, sums[:, 0])
     seen = total[:, 0].clamp_min(0)
     means = total[:, 1:] / seen.clamp_min(1e-12)[:, None]
-    return Evidence(seen, means[:, 0].clamp_min(0), means[:, 1].clamp(0, 1))
+    return Evidence(seen, means[:, 0].clamp_min(0), means[:, 1].clamp(0, 1), peak)
+
+
+def _weight(field: RadianceField, view: View) -> Tensor:
+    """Return [N], pixels: the sum of each Gaussian's blending weights in a view, where its mask counts."""
+    device = field.gaussians.means.device
+    counted = torch.ones(view.camera.height, view.camera.width, device=device)
+    if view.mask is not None:
+        counted = torch.tensor(view.mask, device=device)
+    # As wide as a training's features: no further kernel is compiled.
+    images = counted[..., None].expand(-1, -1, 3).contiguous()
+    return field.weighted_sums(field.camera_tensors(view.camera), images)[:, 0]

@@ -7,6 +7,7 @@ sorted and blended once.
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -14,6 +15,7 @@ from ..rasterizer import Rendering, rasterize, rasterize_directions, spherical_h
 from ..rasterizer.activations import opacities_with_penalty
 from ..response import Response
 from ..scene import Camera
+from ..scene.normalization import Normalization
 from .color_models import color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
@@ -93,6 +95,8 @@ class RadianceField(nn.Module):
     base_time: dt_1, seconds. rasterizer: rasterize(), or what takes its arguments in its place.
     radiance: the name of the color model. tone_map: "pixel": f(sum of weighted x); "gaussian": sum of weighted f(x), as
     the paper composites. fusion: at the same base time; without, the HDR color is the base color.
+    normalization: between the coordinates of the scene, in which cameras come and distances are returned, and those of
+    the Gaussians.
     confidence: [N] in [0, 1], how far the photos vouch for each Gaussian; None where it was not measured.
     """
 
@@ -110,13 +114,19 @@ class RadianceField(nn.Module):
         fusion: NeuralExposureFusion | None = None,
         antialiased: bool = False,
         deterministic: bool = False,
+        normalization: Normalization | None = None,
     ):
         super().__init__()
+        self.normalization = normalization or Normalization()
         self.gaussians, self.fusion, self.rasterizer = gaussians, fusion, rasterizer
         self.response, self.base_time = response, base_time
         self.color_model, self.tone_map = color_model(radiance), tone_map
         self.antialiased, self.deterministic = antialiased, deterministic
         self.register_buffer("confidence", None, persistent=False)
+
+    def camera_tensors(self, camera: Camera) -> CameraTensors:
+        """Return a camera of scene coordinates in those of the Gaussians, on their device."""
+        return CameraTensors.of(self.normalization.camera(camera), self.gaussians.means.device)
 
     def photograph(
         self,
@@ -170,7 +180,7 @@ class RadianceField(nn.Module):
     @torch.no_grad()
     def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:
         """The HDR view of a camera, by one rasterisation of radiance and depth."""
-        tensors = CameraTensors.of(camera, self.gaussians.means.device)
+        tensors = self.camera_tensors(camera)
         pose = tensors.world_to_camera
         depth = self.gaussians.means @ pose[2, :3, None] + pose[2, 3]
         encoded, values = self.color_model.encoded, self._values(tensors.position, degree)
@@ -179,29 +189,38 @@ class RadianceField(nn.Module):
         colors, depth = rendering.image[..., :3], rendering.image[..., 3]
         if encoded:
             colors = self.response.decode(colors.clamp(0, 1))
-        return RenderedView(colors / self.base_time, rendering.alpha, _mean_of_seen(depth, rendering.alpha))
+        depth = _mean_of_seen(depth, rendering.alpha) * self.normalization.unit
+        return RenderedView(colors / self.base_time, rendering.alpha, depth)
 
     @torch.no_grad()
     def render_directions(
         self,
-        position: Tensor,
+        position: np.ndarray,
         directions: Tensor,
         *,
         focal_length: float,
         pixel_angle: float,
         degree: int | None = None,
     ) -> Surroundings:
-        """What is seen along unit directions [H, W, 3] from a position [3], float32 on the field's device; focal_length
-        (pixels) and pixel_angle (radians) as rasterize_directions() takes them."""
-        gaussians = self.gaussians
-        encoded, values = self.color_model.encoded, self._values(position, degree)
+        """Render what is seen along directions from a point.
+
+        Args:
+            position: [3] float64, scene coordinates.
+            directions: [H, W, 3] float32 unit vectors on the field's device.
+            focal_length: pixels, as rasterize_directions() takes it.
+            pixel_angle: radians, likewise.
+            degree: of the harmonics; by default all.
+        """
+        gaussians, seen_from = self.gaussians, self.normalization.points(position)
+        origin = torch.tensor(seen_from, dtype=torch.float32, device=gaussians.means.device)
+        encoded, values = self.color_model.encoded, self._values(origin, degree)
         colors = self.color_model.colors(values) if encoded else self._exposures(values)[1]
-        features = [colors, (gaussians.means - position).norm(dim=1, keepdim=True)]
+        features = [colors, (gaussians.means - origin).norm(dim=1, keepdim=True)]
         if self.confidence is not None:
             features.append(self.confidence[:, None])
         image, transmittance = rasterize_directions(
             *(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacities()),
-            *(torch.cat(features, dim=1), position, directions),
+            *(torch.cat(features, dim=1), origin, directions),
             focal_length=focal_length,
             pixel_angle=pixel_angle,
             antialiased=self.antialiased,
@@ -210,12 +229,12 @@ class RadianceField(nn.Module):
         colors = self.response.decode(colors.clamp(0, 1)) if encoded else colors
         distance, *confidence = (_mean_of_seen(image[..., i], alpha) for i in range(3, image.shape[2]))
         confidence = confidence[0].clamp(0, 1) if confidence else None
-        return Surroundings(colors / self.base_time, alpha, distance, confidence)
+        return Surroundings(colors / self.base_time, alpha, distance * self.normalization.unit, confidence)
 
     @torch.no_grad()
     def render_ldr(self, camera: Camera, exposure_time: float | None = None, *, degree: int | None = None) -> Tensor:
         """[H, W, 3] in [0, 1]: the simulated photo of exposure_time seconds, by default the base time."""
-        tensors = CameraTensors.of(camera, self.gaussians.means.device)
+        tensors = self.camera_tensors(camera)
         photo = self.photograph(tensors, exposure_time or self.base_time, degree=degree).encoded
         assert photo is not None
         return photo.clamp(0, 1)
@@ -232,7 +251,7 @@ class RadianceField(nn.Module):
         0.001."""
         # As wide as a training's features, though one channel is meant: no further kernel is compiled.
         features = values[:, None].expand(-1, 3).contiguous()
-        rendering = self._rasterize(CameraTensors.of(camera, features.device), features)
+        rendering = self._rasterize(self.camera_tensors(camera), features)
         return _mean_of_seen(rendering.image[..., 0], rendering.alpha).clamp(0, 1)
 
     def weighted_sums(self, camera: CameraTensors, images: Tensor) -> Tensor:

@@ -189,14 +189,32 @@ def add_gradient_statistics(
 
 @torch.no_grad()
 def add_position_noise(
-    means: Tensor, log_scales: Tensor, quaternions: Tensor, opacity_logits: Tensor, *, strength: float, seed: int
+    means: Tensor,
+    log_scales: Tensor,
+    quaternions: Tensor,
+    opacity_logits: Tensor,
+    *,
+    strength: float,
+    seed: int,
+    most_sizes: float = math.inf,
+    most_distance: float = math.inf,
 ) -> None:
-    """Adds to means, in place, the noise of 3DGS-MCMC's equation 8: normal, shaped by each Gaussian's covariance, and
-    faded out where opacities are above some hundredths.
+    """Add the position noise of 3DGS-MCMC (equation 8) to the means, in place.
 
-    means, log_scales: [N, 3]; quaternions: [N, 4], any length; opacity_logits: [N]; all contiguous float32 on one
-    device. strength: times the covariance, in world units the standard deviation; seed: of this call, an int32; the
-    same one gives the same noise on every device and with any number of threads.
+    The noise is normal, shaped by each Gaussian's covariance, and fades out for opacities above a few hundredths. Two
+    departures keep it bounded in scenes with far or large Gaussians: outside of the unit ball the strength falls with
+    the distance from the origin, so that it depends on the angle that a Gaussian covers, and a step is bounded by
+    the Gaussian's own size. The same seed gives the same noise on every device and with any number of threads.
+
+    Args:
+        means: [N, 3] normalized coordinates; this and the next three are contiguous float32 on one device.
+        log_scales: [N, 3] natural logarithms of standard deviations.
+        quaternions: [N, 4] (w, x, y, z) of any length.
+        opacity_logits: [N].
+        strength: factor of the covariance that gives the standard deviation of the noise.
+        seed: int32, of this call.
+        most_sizes: bound on the standard deviation of the noise along an axis, in standard deviations of the Gaussian.
+        most_distance: noise moves no Gaussian beyond this distance from the origin.
     """
     shapes = log_scales, quaternions, opacity_logits
-    launch(kernels.add_position_noise, len(means), *shapes, seed, strength, means)
+    launch(kernels.add_position_noise, len(means), *shapes, seed, strength, most_sizes, most_distance, means)

@@ -43,6 +43,13 @@ class _GainValues(Values):
     falloff: dict[str, Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]]
 
 
+class _NormalizationValues(Values):
+    """Center (scene coordinates) and unit of the coordinates that the Gaussians are in."""
+
+    center: Annotated[list[float], _Three]
+    unit: Annotated[float, Field(gt=0)]
+
+
 class RunValues(Values):
     """What run.json holds."""
 
@@ -50,6 +57,7 @@ class RunValues(Values):
     data: _DataValues
     base_time: Annotated[float, Field(ge=SHORTEST, le=LONGEST)]
     response: dict
+    normalization: _NormalizationValues | None = None
     color_matrix: Annotated[list[_Row], _Three] | None = None
     photo_gains: _GainValues | None = None
 

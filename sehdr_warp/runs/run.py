@@ -19,6 +19,7 @@ from ..model.sensor_colors import rec709_of
 from ..response import Response
 from ..scene import Camera, Scene, load_cameras
 from ..scene.exposure_compensation import ExposureCompensation
+from ..scene.normalization import Normalization
 from ..splats import read_gaussians
 from .checkpoint import Checkpoint, under
 from .config import Config
@@ -60,10 +61,10 @@ class _Rendered:
         self, position: np.ndarray, directions: np.ndarray, *, focal_length: float, pixel_angle: float
     ) -> Surroundings:
         """What is seen along unit directions [H, W, 3] from a position [3], as of RadianceField.render_directions."""
-        given = (torch.tensor(values, dtype=torch.float32, device=self.device) for values in (position, directions))
+        rays = torch.tensor(directions, dtype=torch.float32, device=self.device)
         options = {"focal_length": focal_length, "pixel_angle": pixel_angle, "degree": self.degree}
-        seen = self.model.render_directions(*given, **options)
-        return replace(seen, hdr=self.in_rec709(seen.hdr))
+        surroundings = self.model.render_directions(position, rays, **options)
+        return replace(surroundings, hdr=self.in_rec709(surroundings.hdr))
 
     def in_rec709(self, hdr: Tensor) -> Tensor:
         """[..., 3] radiance in linear Rec.709 of radiance in the colors that the scene was trained in."""
@@ -228,7 +229,9 @@ def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) ->
     """The RadianceField that a checkpoint holds, on the CPU; raises InputError if tensors are missing or do not fit."""
     try:
         gaussians = Gaussians(*(checkpoint.tensors[f"gaussians.{name}"] for name in PARAMETER_NAMES))
-        field = assemble_field(gaussians, config, Response.from_dict(info["response"]), info["base_time"])
+        normalization = Normalization.from_dict(info.get("normalization"))
+        response = Response.from_dict(info["response"])
+        field = assemble_field(gaussians, config, response, info["base_time"], normalization)
         learned = field.response if isinstance(field.response, torch.nn.Module) else None
         for name, part in (("fusion.", field.fusion), ("response.", learned)):
             if part is not None:
@@ -239,8 +242,14 @@ def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) ->
     return field
 
 
-def assemble_field(gaussians: Gaussians, config: Config, response: Response, base_time: float) -> RadianceField:
-    """Gaussians, response and a freshly seeded fusion as the config says."""
+def assemble_field(
+    gaussians: Gaussians,
+    config: Config,
+    response: Response,
+    base_time: float,
+    normalization: Normalization | None = None,
+) -> RadianceField:
+    """Return a field of Gaussians, a response and a freshly seeded fusion as the config says."""
     fusion, options = None, config.fusion
     if options.enabled:
         scale = 1.0 / base_time if options.radiance_scale == "base" else 1.0
@@ -255,6 +264,7 @@ def assemble_field(gaussians: Gaussians, config: Config, response: Response, bas
         fusion=fusion,
         antialiased=config.model.antialiased,
         deterministic=config.deterministic,
+        normalization=normalization,
     )
 
 

@@ -160,6 +160,7 @@ class RunFolder:
         self.check(resume=False, overwrite=overwrite)  # Photos were read since.
         info = {"format": FORMAT, "version": __version__, "scene": scene.name, "data": data}
         info |= {"base_time": field.base_time, "response": field.response.to_dict()}
+        info["normalization"] = field.normalization.to_dict()
         if scene.color_matrix is not None:
             info["color_matrix"] = scene.color_matrix.tolist()
         if gains is not None:

@@ -13,6 +13,7 @@ from ..rasterizer.plane_sweep import BORDER
 from ..rasterizer.residual_sampling import sample_residual_pixels
 from ..response import Response
 from ..splats.arrays import HARMONIC_0
+from .densification import FARTHEST
 from .matching import Matcher
 from .targets import TrainingView
 
@@ -49,11 +50,12 @@ def born_rows(
     starts = _starts(field.color_model, field.response, found.colors.device)
     start = starts.gather(0, (found.colors * 255).round().long())
     rest = field.gaussians.harmonics_rest
+    nearer = (FARTHEST / found.points.norm(dim=1)).clamp_max(1.0)
     quaternions = torch.zeros(room, 4, device=rest.device)
     quaternions[:, 0] = 1
     rows = {
-        "means": found.points,
-        "log_scales": found.footprints.log()[:, None].repeat(1, 3),
+        "means": found.points * nearer[:, None],
+        "log_scales": (found.footprints * nearer).log()[:, None].repeat(1, 3),
         "quaternions": quaternions,
         "opacity_logits": rest.new_full((room,), math.log(OPACITY / (1 - OPACITY))),
         "harmonics_dc": (start / HARMONIC_0).to(rest)[:, None, :],

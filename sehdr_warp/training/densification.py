@@ -27,6 +27,10 @@ SHORTEST_RESET = 300
 SPARE = 1.17  # Rows in multiples of the Gaussians: changes that add a twentieth each fill them in three
 MOST_GROWTH = 1.0  # A change adds at most as many as there are: each then shares with one other in the mean
 PAIRS = 1 << 24  # Of Gaussians and cameras whose distances are held at once
+NOISE_SIZES = 0.2
+"""Position noise moves a Gaussian by at most this many of its standard deviations in a step (times a normal number)."""
+FARTHEST = 100.0
+"""Position noise moves no Gaussian farther than this from the origin, in normalized units (1.1 camera radii)."""
 SEED_STEP = 1_000_003  # Seeds of trainings are this far apart in the seeds of their noise, one for each iteration
 
 
@@ -244,6 +248,8 @@ class Relocation(Densification):
                 gaussians.quaternions,
                 gaussians.opacity_logits,
                 strength=self.config.mcmc.noise_lr * means_rate,
+                most_sizes=NOISE_SIZES,
+                most_distance=FARTHEST,
                 # Of the iteration and not of a running generator, so that a resumed training draws what it would have.
                 seed=(self.config.seed * SEED_STEP + iteration) % 2**31,
             )

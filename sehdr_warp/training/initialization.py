@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..errors import InputError, SehdrError
-from ..model.baking import field_of, gaussians_of
+from ..model.baking import field_of, gaussians_of, to_normalized
 from ..model.color_models import color_model
 from ..model.gaussians import Gaussians
 from ..model.radiance_field import RadianceField
@@ -19,8 +19,9 @@ from ..runs.config import Config
 from ..runs.run import assemble_field
 from ..scene import Scene, View
 from ..scene.load import sample_photos, select_response_for
+from ..scene.normalization import Normalization, normalization_of
 from ..splats import read_gaussians
-from .densification import gaussian_budget
+from .densification import FARTHEST, gaussian_budget
 from .matching import Matcher
 
 _log = logging.getLogger(__name__)
@@ -39,16 +40,8 @@ def base_time(scene: Scene) -> float:
 
 
 def scene_extent(scene: Scene) -> float:
-    """The radius of the training cameras around their mean, plus a tenth (3DGS); for cameras at one place, a tenth of
-    the distance to the points. World units, positive."""
-    positions = np.stack([view.camera.position for view in scene.train_views])
-    center = positions.mean(0)
-    radius = 1.1 * float(np.linalg.norm(positions - center, axis=1).max())
-    if radius > 1e-6:
-        return radius
-    if len(scene.points):
-        return max(0.1 * float(np.median(np.linalg.norm(scene.points - center, axis=1))), 1e-6)
-    return 1.0
+    """Return the radius of the training cameras around their mean, plus a tenth (3DGS); scene units, positive."""
+    return normalization_of(scene).unit
 
 
 def choose_response(scene: Scene, config: Config) -> Response:
@@ -75,13 +68,25 @@ def make_field(
     device: torch.device | str,
     matcher: Callable[[], Matcher] | None = None,
 ) -> RadianceField:
-    """The field at iteration 0. matcher: makes what matches the photos. Raises InputError for a scene that cannot be
-    trained."""
+    """Return the field at iteration 0, in the normalized coordinates of the scene.
+
+    Args:
+        scene: in its own coordinates.
+        config: of the training.
+        response: of the camera.
+        device: that the field is on.
+        matcher: makes what matches the photos, in normalized coordinates.
+
+    Raises:
+        InputError: for a scene that cannot be trained.
+    """
     check_views(scene)
+    normalization = normalization_of(scene)
+    scene = normalization.scene(scene)
     rng = np.random.default_rng(config.seed)
     if config.model.init_file:
-        gaussians = start_gaussians(scene, config, response, rng)
-        return assemble_field(gaussians, config, response, base_time(scene)).to(device)
+        gaussians = start_gaussians(scene, config, response, rng, normalization)
+        return assemble_field(gaussians, config, response, base_time(scene), normalization).to(device)
     matcher = matcher or partial(make_matcher, scene, response, device)
     points, colors = start_points(scene, config, matcher, rng)
     most = config.densification.cap_max
@@ -91,13 +96,18 @@ def make_field(
     dc = color_model(config.model.radiance).start(colors, response)
     points, dc = (torch.tensor(values, dtype=torch.float32) for values in (points, dc))
     gaussians = Gaussians.from_points(points, dc, config.model.sh_degree)
-    return assemble_field(gaussians, config, response, base_time(scene)).to(device)
+    return assemble_field(gaussians, config, response, base_time(scene), normalization).to(device)
 
 
-def start_gaussians(scene: Scene, config: Config, response: Response, rng: np.random.Generator) -> Gaussians:
-    """Read the Gaussians of model.init_file, in the config's color model and degree. Display colors count as codes of
-    the scene's own photos; radiance is in the scene's units."""
-    read, time = read_gaussians(config.model.init_file), base_time(scene)
+def start_gaussians(
+    scene: Scene, config: Config, response: Response, rng: np.random.Generator, normalization: Normalization
+) -> Gaussians:
+    """Return the Gaussians of the file that model.init_file names, in the config's color model and degree.
+
+    Display colors count as codes of the scene's own photos; radiance is in the scene's units. The file is in the
+    scene's own coordinates; the scene and the result are in normalized ones.
+    """
+    read, time = to_normalized(read_gaussians(config.model.init_file), normalization), base_time(scene)
     if read.count > config.densification.cap_max:
         read = read.rows(np.sort(rng.choice(read.count, config.densification.cap_max, replace=False)))
     degree = config.model.sh_degree
@@ -122,10 +132,20 @@ def start_points(
         found = _matched(matcher(), wanted - len(points), config.seed)
         points, colors = (np.concatenate(both) for both in zip((points, colors), found, strict=True))
         _log.info("%d points matched between the photos", len(found[0]))
+    points = within_reach(points)
     if len(points) < FEWEST_POINTS:
         drawn = random_points(scene, max(wanted, FEWEST_DRAWN), rng)
         points, colors = (np.concatenate(both) for both in zip((points, colors), drawn, strict=True))
     return points, colors
+
+
+def within_reach(points: np.ndarray) -> np.ndarray:
+    """Return points [N, 3] of normalized coordinates, those beyond FARTHEST brought back to it along their direction.
+
+    From cameras within the unit ball the direction of such a point changes by less than a degree.
+    """
+    distances = np.linalg.norm(points, axis=1, keepdims=True)
+    return points * np.minimum(1.0, FARTHEST / np.maximum(distances, 1e-12))
 
 
 def match_points(
@@ -150,7 +170,10 @@ def match_points(
     Returns:
         [N, 3] places, and their encoded colors [N, 3] in [0, 1].
     """
-    return _matched(make_matcher(scene, response or scene.response or response_by_name("srgb"), device), count, seed)
+    normalization = normalization_of(scene)
+    response = response or scene.response or response_by_name("srgb")
+    points, colors = _matched(make_matcher(normalization.scene(scene), response, device), count, seed)
+    return normalization.scene_points(points), colors
 
 
 def _matched(matcher: Matcher, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from ..errors import InputError, SehdrError
+from ..model.confidence import Evidence, gather_evidence
 from ..model.radiance_field import RenderedView
 from ..model.unexplained import MOST_NAMED, told, unexplained_regions
 from ..rasterizer.memory import oom_context
@@ -26,6 +27,7 @@ from ..runs.run import Run, as_rec709, field_from_checkpoint, load_run, photo_ga
 from ..runs.run_folder import RunFolder
 from ..scene import Camera, Scene
 from ..scene.exposure_compensation import ExposureCompensation
+from ..scene.normalization import normalization_of
 from .following import hand_on, told_of_ranks
 from .held_out import evaluate_views, figures_told, warn_of_fall
 from .initialization import choose_response, make_field, make_matcher, sizes_of
@@ -135,6 +137,7 @@ class Training:
         self._first, self._pace, self._stopped = self.iteration, 0.0, False
         self._interrupted = threading.Event()
         self._run: Run | None = None
+        self._evidence: Evidence | None = None
         self._writer = make_writer and make_writer(str(self.folder.tensorboard))
         self._evaluate_at = {self.config.scaled(n) for n in self.config.schedule.evaluate_at} | {self.total}
         self._checkpoint_every = self.config.scaled(self.config.schedule.checkpoint_every)
@@ -199,7 +202,9 @@ class Training:
                 return
             self._run = None
             run = self.run
-            self.folder.write_confidence(run.measure_confidence(self.scene), run.checkpoint_hash)
+            evidence = run.measure_confidence(self.scene) if self._evidence is None else self._evidence
+            run.model.confidence = evidence.confidence()
+            self.folder.write_confidence(evidence, run.checkpoint_hash)
             self._tell_unexplained(run)
 
     def pause(self) -> None:
@@ -254,6 +259,8 @@ class Training:
         self._wait()
         self.trainer.settle()
         self.trainer.check()
+        if self.iteration >= self.total and self.iteration > self._first:
+            self._evidence = self._remove_unseen()
         self._checkpoint()
         if self.ranks is not None:
             self.ranks.part()
@@ -271,6 +278,19 @@ class Training:
         warn_of_fall(self.folder.read_metrics())
         if self._writer is not None:
             self._writer.close()
+
+    def _remove_unseen(self) -> Evidence:
+        """Remove the Gaussians that no training photo shows; return what the photos say of the others."""
+        trainer, views = self.trainer, self.scene.train_views
+        truth = self.config.loss.uses_hdr
+        evidence = gather_evidence(trainer.field, views, degree=trainer.degree, truth=truth)
+        count, contributes = trainer.field.gaussians.count, evidence.contributes
+        remaining = int(contributes.sum())
+        if remaining == count or remaining == 0:
+            return evidence
+        trainer.field.gaussians.keep(contributes, trainer.optimizer)
+        log.info("removed %d of %d Gaussians, which no training photo shows", count - remaining, count)
+        return evidence.rows(contributes)
 
     def _tell_unexplained(self, run: Run) -> None:
         """Compares the training photos with the scene, and names what is missing in the summary and in a line."""
@@ -314,12 +334,13 @@ class Training:
                 self._writer.add_scalar(f"{split}/{name}", value, self.iteration)
 
     def _begin(self, scene: Scene, config: Config, data: dict, overwrite: bool) -> Trainer:
-        config, plan = apply_plan(scene, config, self.device)
+        normalized = normalization_of(scene).scene(scene)
+        config, plan = apply_plan(normalized, config, self.device)
         check_truth(scene.name, [(view.name, view.hdr is not None) for view in scene.train_views], config.loss)
         response = choose_response(scene, config)
-        matcher, gains = cache(partial(make_matcher, scene, response, self.device)), None
+        matcher, gains = cache(partial(make_matcher, normalized, response, self.device)), None
         if plan is not None and evens(scene, config, response):
-            gains, found, decision = self.timed(partial(find_gains, scene, config, response, self.device))
+            gains, found, decision = self.timed(partial(find_gains, normalized, config, response, self.device))
             matcher, plan = (lambda: found), plan.with_decision(decision)
         evened = self._even(scene, gains, response)
         field = self.timed(partial(make_field, evened, config, response, self.device, matcher))

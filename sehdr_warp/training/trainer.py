@@ -63,6 +63,7 @@ class Trainer:
         self.config, self.field = config, field
         self.iteration = 0  # Steps done
         self.device = field.gaussians.means.device
+        scene = field.normalization.scene(scene)
         self.extent = scene_extent(scene)
         self.optimizer = adam.make_optimizer(field, config, self.extent, self.batch)
         pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)

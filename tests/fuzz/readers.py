@@ -162,7 +162,7 @@ def _read_run(folder: Path):
 def _confidence(folder: Path) -> None:
     _run(folder)
     checkpoint = RunFolder(folder).newest_checkpoint()
-    RunFolder(folder).write_confidence(Evidence(*torch.rand(3, 4)), checkpoint.values["sha256"])
+    RunFolder(folder).write_confidence(Evidence(*torch.rand(4, 4)), checkpoint.values["sha256"])
 
 
 def _read_confidence(folder: Path):

@@ -97,7 +97,9 @@ def test_truth_is_not_clipped():
 
 
 def test_confidence_of_evidence():
-    evidence = Evidence(torch.tensor([0.0, LEAST_SEEN, 1e6]), torch.tensor([0.0, 1.0, 1.0]), torch.zeros(3))
+    evidence = Evidence(
+        torch.tensor([0.0, LEAST_SEEN, 1e6]), torch.tensor([0.0, 1.0, 1.0]), torch.zeros(3), torch.ones(3)
+    )
     torch.testing.assert_close(evidence.confidence(), torch.tensor([0.0, 0.25, 0.5]))
 
 

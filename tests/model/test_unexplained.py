@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from sehdr_warp.model.confidence import gather_evidence
-from sehdr_warp.model.radiance_field import CameraTensors
 from sehdr_warp.model.unexplained import unexplained_regions
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.training.train import train
@@ -46,7 +45,7 @@ def test_a_missing_lamp_is_named_and_told(tmp_path, caplog):
     confidence, shares = gather_evidence(run.model, scene.views).confidence(), []
     for view in scene.views:
         lamp = torch.from_numpy((view.codes.min(2) > 250).astype(np.float32))
-        sums = run.model.weighted_sums(CameraTensors.of(view.camera, "cpu"), torch.stack([lamp, 1 - lamp], 2))
+        sums = run.model.weighted_sums(run.model.camera_tensors(view.camera), torch.stack([lamp, 1 - lamp], 2))
         shares.append((sums * confidence[:, None]).sum(0) / sums.sum(0))
     inside, outside = torch.stack(shares).mean(0).tolist()
     assert inside < 0.45 and outside > 0.9

@@ -160,9 +160,10 @@ def test_gradient_statistics_are_lengths_on_a_screen_of_two(device, usable):
     assert torch.equal(sums[1].cpu(), counted)
 
 
-def noise(device, opacity, seed=3, quaternion=(1.0, 0.0, 0.0, 0.0), scales=(0.3, 0.1, 0.02)):
-    """[COUNT, 3] what is added to positions at the origin."""
+def noise(device, opacity, seed=3, quaternion=(1.0, 0.0, 0.0, 0.0), scales=(0.3, 0.1, 0.02), mean=0.0, **bounds):
+    """[COUNT, 3] what is added to positions at (mean, 0, 0)."""
     means = torch.zeros(COUNT, 3, device=device)
+    means[:, 0] = mean
     add_position_noise(
         means,
         torch.tensor(scales, device=device).log().repeat(COUNT, 1),
@@ -170,7 +171,9 @@ def noise(device, opacity, seed=3, quaternion=(1.0, 0.0, 0.0, 0.0), scales=(0.3,
         torch.full((COUNT,), math.log(opacity / (1 - opacity)), device=device),
         strength=STRENGTH,
         seed=seed,
+        **bounds,
     )
+    means[:, 0] -= mean
     return means.cpu()
 
 
@@ -188,6 +191,28 @@ def test_noise_turns_with_the_gaussian(device):
     half = math.sqrt(0.5)
     turned = noise(device, 0.001, quaternion=(2 * half, 0.0, 0.0, 2 * half))  # a quarter turn about z, of length 2
     torch.testing.assert_close(turned.std(0), noise(device, 0.001).std(0)[[1, 0, 2]], rtol=0.02, atol=0)
+
+
+def test_noise_of_far_gaussians_depends_on_the_angle_that_they_cover(device):
+    near = noise(device, 0.001, mean=1.0)
+    far = noise(device, 0.001, mean=64.0, scales=(64 * 0.3, 64 * 0.1, 64 * 0.02))
+    torch.testing.assert_close(far.std(0), 64 * near.std(0), rtol=0.02, atol=0)
+
+
+def test_noise_is_bounded_by_the_size_of_a_gaussian(device):
+    scales = (1e4, 10.0, 1e-3)
+    moved = noise(device, 0.001, scales=scales, most_sizes=0.2)
+    strong = 0.2 * torch.tensor(scales)
+    torch.testing.assert_close(moved.std(0)[:2], strong[:2], rtol=0.02, atol=0)
+    torch.testing.assert_close(moved.std(0)[2], noise(device, 0.001, scales=scales).std(0)[2], rtol=0.02, atol=0)
+
+
+def test_noise_moves_nothing_out_of_reach(device):
+    moved = noise(device, 0.001, mean=9.0, scales=(5.0, 0.1, 0.1), most_distance=10.0)
+    assert (moved[:, 0] + 9).abs().max() <= 10 and moved.abs().max() > 0.5
+    # What is beyond it, as in runs of other coordinates, comes nearer alone.
+    outside = noise(device, 0.001, mean=50.0, scales=(5.0, 1e-6, 1e-6), most_distance=10.0)
+    assert outside[:, 0].max() <= 0 and outside[:, 0].min() < 0
 
 
 def test_noise_leaves_the_opaque(device):
