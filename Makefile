@@ -74,7 +74,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	touch $@
 
 $(VENV)/installed-test: $(VENV)/installed
-	$(EDITABLE) '.[test]'
+	$(EDITABLE) '.[test,test-interop]'
 	$(COMPILE)
 	touch $@
 

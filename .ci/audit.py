@@ -37,7 +37,8 @@ def main(database: Path) -> int:
     if not stored:
         sys.exit(f"{database}: holds no advisories; clone https://github.com/pypa/advisory-database")
     by_name: dict[str, list[dict]] = {}
-    pins = [line.strip().split("==") for line in PINS.read_text().splitlines() if "==" in line]
+    lines = (line.partition(";")[0].strip() for line in PINS.read_text().splitlines())
+    pins = [line.split("==") for line in lines if "==" in line]
     wanted, newest = {canonicalize_name(name) for name, _ in pins}, ""
     for path in stored:
         if canonicalize_name(path.parent.name) in wanted:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.version import Version
 
 import sehdr_warp
 from sehdr_warp import cli
@@ -161,14 +162,27 @@ def test_changelog_and_citation_state_the_version():
     assert f"\nversion: {sehdr_warp.__version__}\n" in (ROOT / "CITATION.cff").read_text()
 
 
+def pins_of(name):
+    """Exact versions by package, of a file that .ci/pin wrote."""
+    lines = (line.partition(";")[0].strip() for line in (ROOT / name).read_text().splitlines())
+    return dict(line.split("==") for line in lines if "==" in line)
+
+
 def test_constraints_pin_what_the_package_needs():
-    lines = (ROOT / "constraints.txt").read_text().splitlines()
-    pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
+    pins = pins_of("constraints.txt")
     for need in map(Requirement, sum(PROJECT["optional-dependencies"].values(), PROJECT["dependencies"])):
-        name = need.name.lower().replace("_", "-")
-        assert name == PROJECT["name"] or (name in pins and need.specifier.contains(pins[name])), (
-            f"{need} against {pins.get(name)}"
-        )
+        pin = pins.get(need.name.lower().replace("_", "-"))
+        if need.name != PROJECT["name"]:
+            assert pin, f"constraints.txt lacks {need.name}: run .ci/pin"
+            assert need.specifier.contains(pin), f"constraints.txt pins {pin}, pyproject.toml needs {need}: run .ci/pin"
+
+
+@pytest.mark.parametrize("need", PROJECT["dependencies"])
+def test_lowest_constraints_pin_the_lower_bound(need):
+    need = Requirement(need)
+    (bound,) = (Version(part.version) for part in need.specifier if part.operator == ">=")
+    pin = pins_of("constraints-lowest.txt").get(need.name.lower().replace("_", "-"), "0")
+    assert Version(pin) == bound, f"constraints-lowest.txt pins {need.name} {pin}, not {bound}: run .ci/pin"
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not here")

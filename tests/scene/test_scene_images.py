@@ -3,7 +3,6 @@
 import struct
 import zlib
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,6 +16,7 @@ from sehdr_warp.scene.images import exif_of, image_sizes, open_image, read_ldr
 from sehdr_warp.scene.lens import area_average
 from sehdr_warp.scene.masks import read_mask
 
+cv2 = pytest.importorskip("cv2")
 RNG = np.random.default_rng(1)
 
 
