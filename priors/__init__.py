@@ -1,0 +1,1 @@
+"""Training of the prior for clipped light; not part of the installed package."""

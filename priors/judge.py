@@ -1,0 +1,131 @@
+"""How good the prior for clipped light is on panoramas: against white, a constant and a ridge regression."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sehdr_warp.prior.network import LightNetwork, network_input
+
+from .panoramas import Pack
+from .photos import Camera, Photos
+
+PHOTOS, BATCH, SIZE = 768, 32, 96
+RIDGE = 10.0
+MU = 5000.0
+
+
+def judge(
+    network: LightNetwork, scale: float, pack: Pack, unseen: np.ndarray, chosen: np.ndarray, *, seed: int, device: str
+) -> dict:
+    """Return figures of each estimate on photos of unseen panoramas, plain (sRGB and other curves, 8 bits) and not.
+
+    For each estimate: rms (stops, all clipped values alike), level (spread of the mean error of photos, stops), light
+    (median over photos of |log2| of total clipped light over the truth), psnr and worst (mu-law dB over whole photos,
+    mean and mean of the worst 5 %). For the network also calibration: the share within one deviation, and by deviation.
+    """
+    learned = _collect(network, pack, chosen, seed + 100, device, plain=True)
+    result = {}
+    for name, plain in (("plain", True), ("camera", False)):
+        photos = _collect(network, pack, unseen, seed, device, plain=plain)
+        constant = float(np.mean([level for level in learned["level"]]))
+        ridge = _ridge(learned["cues"], learned["level"])
+        guesses = {
+            "white": [np.zeros_like(t) for t in photos["truth"]],
+            "constant": [np.full_like(t, constant) for t in photos["truth"]],
+            "ridge": [
+                np.full_like(t, max(0.0, float(ridge(c)))) for t, c in zip(photos["truth"], photos["cues"], strict=True)
+            ],
+            "network": photos["mean"],
+        }
+        figures = {guess: _figures(values, photos) for guess, values in guesses.items()}
+        error = np.concatenate([m - t for m, t in zip(photos["mean"], photos["truth"], strict=True)])
+        deviation = scale * np.concatenate(photos["deviation"])
+        figures["network"]["within_one_deviation"] = float((np.abs(error) <= deviation).mean())
+        edges = np.quantile(deviation, [0, 0.25, 0.5, 0.75, 1])
+        figures["network"]["by_deviation"] = [
+            {
+                "deviation": float(deviation[part].mean()),
+                "rms": float(np.sqrt((error[part] ** 2).mean())),
+                "within": float((np.abs(error[part]) <= deviation[part]).mean()),
+            }
+            for low, high in zip(edges, edges[1:], strict=False)
+            if (part := (deviation >= low) & (deviation <= high)).any()
+        ]
+        rng = np.random.default_rng(0)
+        sample = rng.choice(len(error), min(2000, len(error)), replace=False)
+        truth = np.concatenate(photos["truth"])
+        points = np.stack([truth[sample], truth[sample] + error[sample], deviation[sample]], 1)
+        figures["network"]["sample"] = np.round(points, 3).tolist()
+        result[name] = figures
+    return result
+
+
+@torch.no_grad()
+def _collect(network: LightNetwork, pack: Pack, chosen: np.ndarray, seed: int, device: str, *, plain: bool) -> dict:
+    """Return lists over photos: truth, mean and deviation of clipped values, cues, and what else figures need."""
+    camera = Camera(pack, device, chosen, rooms=False, seed=seed)
+    found: dict = {name: [] for name in ("truth", "mean", "deviation", "cues", "level", "clipped", "exposure")}
+    for _ in range(PHOTOS // BATCH):
+        photos = camera.take(BATCH, SIZE, plain=plain)
+        mean, deviation = network(network_input(photos.exposure, photos.clipped))
+        for k in range(BATCH):
+            clipped = photos.clipped[k] > 0
+            if int(clipped.sum()) < 5:
+                continue
+            truth = photos.truth[k][clipped].cpu().numpy()
+            found["truth"].append(truth)
+            found["mean"].append(mean[k][clipped].cpu().numpy())
+            found["deviation"].append(deviation[k][clipped].cpu().numpy())
+            found["cues"].append(_cues(photos, k))
+            found["level"].append(float(truth.mean()))
+            found["clipped"].append(clipped.cpu().numpy())
+            found["exposure"].append(torch.where(clipped, 1.0, photos.exposure[k].clamp(0, 1)).cpu().numpy())
+    return found
+
+
+def _cues(photos: Photos, k: int) -> np.ndarray:
+    """Return ten figures of a photo's histogram."""
+    logarithms = photos.exposure[k].amax(0).clamp_min(2.0**-12).log2()
+    some = photos.clipped[k].amax(0)
+    total = some.mean()
+    values: list[Tensor] = [total, (total + 1e-4).log(), photos.clipped[k].amin(0).sum() / some.sum().clamp_min(1)]
+    values += list(torch.quantile(logarithms, logarithms.new_tensor([0.1, 0.5, 0.75, 0.9, 0.95])))
+    near = logarithms[some == 0]
+    values += [(near > -0.5).float().mean(), (near > -1.0).float().mean()] if len(near) else [total, total]
+    return torch.stack([v.float() for v in values]).cpu().numpy()
+
+
+def _ridge(cues: list[np.ndarray], levels: list[float]):
+    """Return the regression of photos' mean excess on their cues, as a function of cues."""
+    x, y = np.array(cues), np.array(levels)
+    middle, spread = x.mean(0), x.std(0) + 1e-9
+    x = np.c_[np.ones(len(x)), (x - middle) / spread]
+    penalty = RIDGE * np.eye(x.shape[1])
+    penalty[0, 0] = 0
+    weights = np.linalg.solve(x.T @ x + penalty, x.T @ y)
+    return lambda c: weights[0] + weights[1:] @ ((c - middle) / spread)
+
+
+def _figures(guesses: list[np.ndarray], photos: dict) -> dict:
+    truths = photos["truth"]
+    errors = [g - t for g, t in zip(guesses, truths, strict=True)]
+    light = [abs(np.log2(np.exp2(g).sum() / np.exp2(t).sum())) for g, t in zip(guesses, truths, strict=True)]
+    pairs = zip(guesses, truths, photos["clipped"], photos["exposure"], strict=True)
+    psnr = np.sort([_psnr(g, t, clipped, exposure) for g, t, clipped, exposure in pairs])
+    return {
+        "photos": len(truths),
+        "rms": float(np.sqrt((np.concatenate(errors) ** 2).mean())),
+        "level": float(np.std([e.mean() for e in errors])),
+        "light": float(np.median(light)),
+        "psnr": float(psnr.mean()),
+        "worst": float(psnr[: max(1, len(psnr) // 20)].mean()),
+    }
+
+
+def _psnr(guess: np.ndarray, truth: np.ndarray, clipped: np.ndarray, exposure: np.ndarray) -> float:
+    """Return the mu-law PSNR of a photo with its clipped values at a guess; what is not clipped counts as right."""
+    largest = float(np.exp2(truth.max()))
+    error = np.zeros_like(exposure)
+    ours, true = (np.log1p(MU * np.minimum(np.exp2(v) / largest, 1)) / np.log1p(MU) for v in (guess, truth))
+    error[clipped] = ours - true
+    return float(-10 * np.log10(max((error**2).mean(), 1e-9)))

@@ -1,0 +1,180 @@
+"""Photos of panoramas and rooms by random cameras, with the truth of what they clip; in torch, on any device."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from .panoramas import Pack
+
+SIZES = (64, 80, 96, 128)  # Height and width of a batch's photos
+MOST_CLIPPED, LEAST_CLIPPED = 0.7, 5e-4  # Shares of a photo's pixels
+ROOM_SHARE = 0.35  # Of the photos of a training
+LEVELS = 255
+
+
+@dataclass(frozen=True)
+class Photos:
+    """A batch of simulated photos; [B, 3, S, S] each.
+
+    exposure: decoded, in units of white. clipped: 1 where the code is the largest, else 0. truth: log2 of the true
+    exposure over white where it is above, else 0.
+    """
+
+    exposure: Tensor
+    clipped: Tensor
+    truth: Tensor
+
+
+class Camera:
+    """Random photos of a pack's panoramas and rooms."""
+
+    def __init__(self, pack: Pack, device: torch.device | str, chosen: np.ndarray, *, rooms: bool, seed: int):
+        """Copy panoramas, rooms and curves to the device.
+
+        Args:
+            pack: of `read_pack`.
+            device: of the photos.
+            chosen: indices of the panoramas that are photographed.
+            rooms: whether rooms are photographed too.
+            seed: of every random number.
+        """
+        self.device, self.random = torch.device(device), np.random.default_rng(seed)
+        self.generator = torch.Generator(device=self.device).manual_seed(seed)
+        panoramas = torch.from_numpy(pack.panoramas[chosen]).permute(0, 3, 1, 2)
+        # One more column, so that interpolation goes on behind the last.
+        self.panoramas = torch.cat([panoramas, panoramas[..., :1]], 3).to(self.device)
+        self.rooms = torch.from_numpy(pack.rooms).permute(0, 1, 4, 2, 3).to(self.device) if rooms else None
+        self.curves = torch.from_numpy(pack.curves).to(self.device)
+        self.dct = _dct(8).to(self.device)
+
+    def take(self, count: int, size: int | None = None, *, plain: bool = False) -> Photos:
+        """Return `count` photos of one size; plain: without noise, JPEG and errors of the curve."""
+        size = size or int(self.random.choice(SIZES))
+        rooms = 0 if self.rooms is None else int(self.random.binomial(count, ROOM_SHARE))
+        views = [self._panorama_views(count - rooms, size)]
+        if rooms:
+            views.append(self._room_views(rooms, size))
+        return self._expose(torch.cat(views), plain)
+
+    def _uniform(self, count: int, low: float, high: float, channels: int = 1) -> Tensor:
+        values = torch.rand(count, channels, 1, 1, generator=self.generator, device=self.device)
+        return low + (high - low) * values
+
+    def _panorama_views(self, count: int, size: int) -> Tensor:
+        random, fine = self.random, 2 * size
+        index = torch.from_numpy(random.integers(len(self.panoramas), size=count)).to(self.device)
+        yaw, pitch, roll, fov = (
+            torch.from_numpy(np.radians(random.uniform(low, high, count)).astype(np.float32)).to(self.device)
+            for low, high in ((0, 360), (-35, 40), (-8, 8), (35, 90))
+        )
+        steps = (torch.arange(fine, device=self.device) + 0.5 - fine / 2) / (fine / 2)
+        half = torch.tan(fov / 2)[:, None, None]
+        x, y = steps[None, None, :] * half, -steps[None, :, None] * half
+        x, y = x.expand(count, fine, fine), y.expand(count, fine, fine)
+        cos, sin = torch.cos(roll)[:, None, None], torch.sin(roll)[:, None, None]
+        x, y = cos * x - sin * y, sin * x + cos * y
+        cos, sin = torch.cos(pitch)[:, None, None], torch.sin(pitch)[:, None, None]
+        up, forward = y * cos + sin, cos - y * sin
+        longitude = torch.atan2(x, forward) + yaw[:, None, None]
+        latitude = torch.atan2(up, torch.hypot(x, forward))
+        width = self.panoramas.shape[3] - 1
+        across = 2 * (torch.remainder(longitude / (2 * math.pi), 1) * width) / width - 1
+        grid = torch.stack([across, -2 * latitude / math.pi], -1)
+        views = F.grid_sample(self.panoramas[index], grid, mode="bilinear", padding_mode="border", align_corners=True)
+        views = F.avg_pool2d(views, 2)
+        mirrored = torch.from_numpy(random.random(count) < 0.5).to(self.device)
+        return torch.where(mirrored[:, None, None, None], views.flip(3), views)
+
+    def _room_views(self, count: int, size: int) -> Tensor:
+        assert self.rooms is not None
+        index = torch.from_numpy(self.random.integers(len(self.rooms), size=count)).to(self.device)
+        lights = self.rooms.shape[1]
+        weights = 2.0 ** self._uniform(count, -7, 3, lights)
+        views = (self.rooms[index] * weights[..., None]).sum(1)
+        part = float(self.random.uniform(0.6, 1))
+        whole = views.shape[-1]
+        side = int(part * whole)
+        top, left = self.random.integers(0, whole - side + 1, 2)
+        views = F.interpolate(views[..., top : top + side, left : left + side], size=(size, size), mode="area")
+        mirrored = torch.from_numpy(self.random.random(count) < 0.5).to(self.device)
+        return torch.where(mirrored[:, None, None, None], views.flip(3), views)
+
+    def _expose(self, radiance: Tensor, plain: bool) -> Photos:
+        """Photograph radiance [B, 3, S, S] at random exposures."""
+        count = len(radiance)
+        radiance = radiance * 2 ** self._uniform(count, -0.5, 0.5, 3)  # White balance
+        brightest = radiance.amax(1).flatten(1)
+        # Half of the photos choose white by the share that clips, half by a distance from the middle grey.
+        share = 2.0 ** self._uniform(count, math.log2(LEAST_CLIPPED), math.log2(MOST_CLIPPED / 2))[:, 0, 0, 0]
+        ranks = ((1 - share) * (brightest.shape[1] - 1)).long()
+        by_share = brightest.sort(1).values.gather(1, ranks[:, None])
+        by_middle = brightest.median(1, keepdim=True).values * 2 ** self._uniform(count, 0.5, 9)[:, 0, 0]
+        most = brightest.sort(1).values[:, int((1 - LEAST_CLIPPED) * (brightest.shape[1] - 1)), None]
+        first = torch.rand(count, 1, generator=self.generator, device=self.device) < 0.5
+        white = torch.where(first, by_share, torch.minimum(by_middle, most)).clamp_min(1e-12)
+        exposure = radiance / white[:, :, None, None]
+        truth = exposure.clamp_min(1).log2()
+        seen = exposure
+        if not plain:
+            noise = torch.randn(exposure.shape, generator=self.generator, device=self.device)
+            strength = 2.0 ** self._uniform(count, -14, -7)
+            seen = (seen + noise * (strength * (seen.clamp(0, 1) + 0.01)).sqrt()).clamp_min(0)
+        curves = self.curves[torch.from_numpy(self.random.integers(len(self.curves), size=count)).to(self.device)]
+        encoded = _interpolate(curves, seen.clamp(0, 1))
+        if not plain:
+            encoded = self._jpeg(encoded)
+        codes = torch.round(encoded * LEVELS)
+        clipped = (codes >= LEVELS).float()
+        decoded = _inverse(curves, codes / LEVELS)
+        if not plain:
+            decoded = decoded ** (2 ** self._uniform(count, -0.2, 0.2))
+        return Photos(decoded, clipped, truth * clipped)
+
+    def _jpeg(self, encoded: Tensor) -> Tensor:
+        """Return a part of the photos as a JPEG of random quality leaves them, without subsampling of color."""
+        count, _, height, width = encoded.shape
+        luma = encoded.new_tensor([[0.299, 0.587, 0.114], [-0.169, -0.331, 0.5], [0.5, -0.419, -0.081]])
+        planes = torch.einsum("kc,bchw->bkhw", luma, encoded)
+        blocks = planes.reshape(count, 3, height // 8, 8, width // 8, 8)
+        frequencies = torch.einsum("ui,bcyixj,vj->bcyuxv", self.dct, blocks, self.dct)
+        order = torch.arange(8, device=self.device)
+        coarse = 1 + (order[:, None] + order[None, :]).float()
+        step = coarse[None, None, None, :, None, :] * 2 ** self._uniform(count, -10, -6.5)[..., None, None]
+        # The strongest quantization of each is that of about quality 70, the weakest that of 98.
+        frequencies = torch.round(frequencies / step) * step
+        blocks = torch.einsum("ui,bcyuxv,vj->bcyixj", self.dct, frequencies, self.dct)
+        decoded = torch.einsum("kc,bchw->bkhw", torch.linalg.inv(luma), blocks.reshape(count, 3, height, width))
+        used = torch.rand(count, 1, 1, 1, generator=self.generator, device=self.device) < 0.6
+        return torch.where(used, decoded.clamp(0, 1), encoded)
+
+
+def _interpolate(curves: Tensor, values: Tensor) -> Tensor:
+    """Return each curve [B, K], at even steps of the cube root of exposure, at values [B, ...] in [0, 1]."""
+    steps = curves.shape[1] - 1
+    place = values.flatten(1) ** (1 / 3) * steps
+    low = place.floor().long().clamp_max(steps - 1)
+    part = place - low
+    found = curves.gather(1, low) * (1 - part) + curves.gather(1, low + 1) * part
+    return found.reshape(values.shape)
+
+
+def _inverse(curves: Tensor, encoded: Tensor) -> Tensor:
+    """Return the exposures at which increasing curves [B, K] are encoded values [B, ...]."""
+    steps = curves.shape[1] - 1
+    flat = encoded.flatten(1).contiguous()
+    high = torch.searchsorted(curves.contiguous(), flat).clamp(1, steps)
+    low_value, high_value = curves.gather(1, high - 1), curves.gather(1, high)
+    part = ((flat - low_value) / (high_value - low_value).clamp_min(1e-9)).clamp(0, 1)
+    return (((high - 1 + part) / steps) ** 3).reshape(encoded.shape)
+
+
+def _dct(size: int) -> Tensor:
+    """Return the orthonormal matrix [size, size] of the cosine transform."""
+    k, i = torch.arange(size)[:, None], torch.arange(size)[None]
+    matrix = torch.cos(math.pi * (2 * i + 1) * k / (2 * size)) * math.sqrt(2 / size)
+    matrix[0] /= math.sqrt(2)
+    return matrix
