@@ -1,4 +1,4 @@
-"""How smooth light is where a photo clips, and how far its edges are lifted: energy and gradient."""
+"""Energy and gradient of clipped pixels: smoothness, a lift at edges, and the distance from an estimate."""
 
 from functools import cache
 
@@ -17,15 +17,49 @@ def _terms_function(dtype):
     real = dtype
 
     @wp.func
-    def terms_of(v: real, total: real, clipped: real, pixels: int, smoothness: real, lift: real):
-        """Of a clipped value with logarithm v, whose `clipped` clipped neighbors of `pixels`, with itself, have the
-        `total`: with their mean m, smoothness / 2 (v - m)^2 - lift (1 - clipped / pixels) v and, with m as it is, its
-        derivative by v."""
+    def terms_of(
+        v: real, total: real, clipped: real, pixels: int, smoothness: real, lift: real,
+        expected: real, precision: real, hold: real,
+    ):
+        """Return the energy of a clipped value with logarithm v, and its derivative by v.
+
+        `clipped` of the `pixels` around the value, itself included, are clipped; `total` is the sum of their
+        logarithms and m their mean, which is held constant. The energy is smoothness / 2 (v - m)^2
+        - lift (1 - clipped / pixels) v + hold / 2 (precision (v - expected))^2. Below white, where v is 0, only the
+        last part has a derivative.
+        """
         away = v - total / clipped
         lifted = lift * (real(1.0) - clipped / real(pixels))
-        return real(0.5) * smoothness * away * away - lifted * v, smoothness * away - lifted
+        off = precision * (v - expected)
+        energy = real(0.5) * (smoothness * away * away + hold * off * off) - lifted * v
+        by_v = hold * precision * off
+        if v > real(0.0):
+            by_v += smoothness * away - lifted
+        return energy, by_v
 
     return terms_of
+
+
+@cache
+def _estimate_function(dtype):
+    real = dtype
+
+    @wp.func
+    def estimate_of(
+        estimates: wp.array(dtype=wp.float16), rows: int, columns: int,
+        y: int, x: int, channel: int, height: int, width: int,
+    ):
+        """Return the expected logarithm and its precision at a value of an image [height, width, 3], from estimates
+        [rows, columns, 6] that cover the same picture; 0 and 0 without estimates."""
+        expected = real(0.0)
+        precision = real(0.0)
+        if estimates:
+            place = ((y * rows) // height * columns + (x * columns) // width) * 6 + channel
+            expected = real(wp.float32(estimates[place]))
+            precision = real(wp.float32(estimates[place + 3]))
+        return expected, precision
+
+    return estimate_of
 
 
 @cache
@@ -57,16 +91,17 @@ def clipped_logarithms_kernel(dtype, code):
 def clipped_light_kernel(dtype):
     """The kernel for one scalar type."""
     real = dtype
-    terms_of = _terms_function(dtype)
+    terms_of, estimate_of = _terms_function(dtype), _estimate_function(dtype)
 
     @wp.kernel(module="unique", module_options=FORWARD)
     def clipped_light(
         first: int,
-        image: wp.array(dtype=real), logarithms: wp.array(dtype=real), height: int, width: int,
-        smoothness: real, lift: real, terms: wp.array(dtype=real), slopes: wp.array(dtype=real),
+        image: wp.array(dtype=real), logarithms: wp.array(dtype=real), white: real, height: int, width: int,
+        smoothness: real, lift: real, hold: real, estimates: wp.array(dtype=wp.float16), rows: int, columns: int,
+        terms: wp.array(dtype=real), slopes: wp.array(dtype=real),
     ):
-        """For each clipped value of image [H, W, 3], flat, the first of terms_of() with the values of its channel
-        within REACH is added to terms [H W 3], and its derivative by the value to the slopes, which may be None."""
+        """Add terms_of() each clipped value of image [H, W, 3], flat, with the values of its channel within REACH, to
+        terms [H W 3], and its derivative by the value to the slopes, which may be None."""
         i = first + wp.tid()
         v = logarithms[i]
         if v >= real(0.0):
@@ -82,10 +117,13 @@ def clipped_light_kernel(dtype):
                     if near >= real(0.0):
                         clipped += real(1.0)
                         total += near
-            energy, by_v = terms_of(v, total, clipped, pixels, smoothness, lift)
+            expected, precision = estimate_of(
+                estimates, rows, columns, row, column, i - 3 * (i // 3), height, width
+            )
+            energy, by_v = terms_of(v, total, clipped, pixels, smoothness, lift, expected, precision, hold)
             terms[i] = terms[i] + energy
-            if slopes and v > real(0.0):
-                slopes[i] = slopes[i] + by_v / image[i]
+            if slopes:
+                slopes[i] = slopes[i] + by_v / wp.max(image[i], white)
 
     return clipped_light
 
@@ -97,16 +135,17 @@ def clipped_light_patch_kernel(dtype, code):
     vec3, around = vector(3, dtype), vector(ROWS + 2 * REACH, dtype)
     functions = patch_functions(REACH)
     reach, patch_of, column_of, value_of = functions.reach, functions.patch_of, functions.column_of, functions.value_of
-    terms_of = _terms_function(dtype)
+    terms_of, estimate_of = _terms_function(dtype), _estimate_function(dtype)
     options = {"module_options": FORWARD | {"max_unroll": 32}, "launch_bounds": BLOCK_DIM, "grid_stride": False}
 
     @wp.kernel(module="unique", **options)
     def clipped_light_in_patches(
         image: wp.array(dtype=real), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64),
         mask: wp.array(dtype=real), white_code: int, white: real, height: int, width: int,
-        smoothness: real, lift: real, terms: wp.array(dtype=real), slopes: wp.array(dtype=real),
+        smoothness: real, lift: real, hold: real, estimates: wp.array(dtype=wp.float16), rows: int, columns: int,
+        terms: wp.array(dtype=real), slopes: wp.array(dtype=real),
     ):
-        """terms: [patches]; a patch's energy is added to its term."""
+        """Do what the two kernels above do; a patch's energy is added to its term of terms [patches]."""
         block, thread, top, left, _ = patch_of(wp.tid(), width, 3)
         photo = wp.int32(index[0])
         # Of columns: logarithms, how many there are, and the logarithm in their middle
@@ -150,10 +189,13 @@ def clipped_light_patch_kernel(dtype, code):
                         found += wp.tile_extract(sums, row, at + wp.static(CHANNELS) * k)
                     down = wp.min(y + wp.static(REACH + 1), height) - wp.max(y - wp.static(REACH), 0)
                     across = wp.min(x + wp.static(REACH + 1), width) - wp.max(x - wp.static(REACH), 0)
-                    term, by_v = terms_of(v, found[0], found[1], down * across, smoothness, lift)
+                    expected, precision = estimate_of(estimates, rows, columns, y, x, channel, height, width)
+                    term, by_v = terms_of(
+                        v, found[0], found[1], down * across, smoothness, lift, expected, precision, hold
+                    )
                     energy += term
-                    if slopes and v > real(0.0):
-                        slopes[i] = slopes[i] + by_v / image[i]
+                    if slopes:
+                        slopes[i] = slopes[i] + by_v / wp.max(image[i], white)
         of_patch = wp.tile_extract(wp.tile_sum(wp.tile(energy)), 0)
         if thread == 0:
             terms[block] = terms[block] + of_patch

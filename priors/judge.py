@@ -1,5 +1,7 @@
 """How good the prior for clipped light is on panoramas: against white, a constant and a ridge regression."""
 
+import itertools
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -27,7 +29,7 @@ def judge(
     result = {}
     for name, plain in (("plain", True), ("camera", False)):
         photos = _collect(network, pack, unseen, seed, device, plain=plain)
-        constant = float(np.mean([level for level in learned["level"]]))
+        constant = float(np.mean(list(learned["level"])))
         ridge = _ridge(learned["cues"], learned["level"])
         guesses = {
             "white": [np.zeros_like(t) for t in photos["truth"]],
@@ -48,7 +50,7 @@ def judge(
                 "rms": float(np.sqrt((error[part] ** 2).mean())),
                 "within": float((np.abs(error[part]) <= deviation[part]).mean()),
             }
-            for low, high in zip(edges, edges[1:], strict=False)
+            for low, high in itertools.pairwise(edges)
             if (part := (deviation >= low) & (deviation <= high)).any()
         ]
         rng = np.random.default_rng(0)

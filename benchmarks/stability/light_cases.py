@@ -11,7 +11,7 @@ from sehdr_warp.model.color_models import EXPOSURE_FLOOR
 from sehdr_warp.model.fusion import NeuralExposureFusion
 from sehdr_warp.model.radiance_field import Photograph
 from sehdr_warp.rasterizer import ssim
-from sehdr_warp.rasterizer.clipped_light import clipped_light_energy
+from sehdr_warp.rasterizer.clipped_light import ClippedWeights, clipped_light_energy
 from sehdr_warp.response import Response, response_by_name
 from sehdr_warp.response.table import TabulatedResponse
 from sehdr_warp.runs.config import LossConfig
@@ -155,10 +155,11 @@ def _clipped_light(device):
     spike = torch.full_like(noise, 4.0)
     spike[5, 6] = 2.0**100
     cases = {"around white": noise.exp(), "far above": 2**20 * noise.exp(), "equal": 0 * noise + 4, "one spike": spike}
+    weights = ClippedWeights(smoothness=1.0, lift=0.3)
     for name, image in cases.items():
 
         def energy(image):
-            return {"energy": clipped_light_energy(image, codes.to(image.device), 1.0, smoothness=1.0, lift=0.3)}
+            return {"energy": clipped_light_energy(image, codes.to(image.device), 1.0, weights)}
 
         # A logarithm of float32 is known to some units of its own, whatever is left of a difference of two.
         given = {"gradients": ("image",), "extra": 64 * UNIT, "label": f"{name} {{}}"}

@@ -1,5 +1,6 @@
 """Estimates of the light of clipped pixels, by the weights that come with the package."""
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -18,7 +19,7 @@ MOST_BYTES = 3_000_000  # Of a weights file
 
 @dataclass(frozen=True)
 class LightEstimate:
-    """What clipped pixels probably hold, in stops (log2) over white; [H, W, 3] each.
+    """What clipped pixels probably hold, in stops (log2) over white; [h, w, 3] each.
 
     mean: expected excess over white, at least 0. deviation: its standard deviation. Both mean nothing at values that
     are not clipped.
@@ -29,14 +30,15 @@ class LightEstimate:
 
 
 class LightPrior:
-    """A loaded network, on one device.
-
-    Args:
-        network: with its weights.
-        deviation_scale: factor of the deviations, fitted on photos that the network was not trained on.
-    """
+    """A loaded network, on one device."""
 
     def __init__(self, network: LightNetwork, deviation_scale: float = 1.0):
+        """Keep a network for estimates.
+
+        Args:
+            network: with its weights.
+            deviation_scale: factor of the deviations, fitted on photos that the network was not trained on.
+        """
         self.network, self.deviation_scale = network.eval(), deviation_scale
 
     @torch.no_grad()
@@ -48,20 +50,65 @@ class LightPrior:
             clipped: [H, W, 3] bool.
 
         Returns:
-            The estimate at every pixel, on the photo's device; photos larger than LARGEST are seen by the network
-            averaged down, and the result is interpolated.
+            The estimate on the photo's device, at the size of `coarse_size`.
         """
         parameter = next(self.network.parameters())
         picture = torch.cat([exposure, clipped.to(exposure)], 2).permute(2, 0, 1)[None].to(parameter)
-        size = picture.shape[2:]
-        if max(size) > LARGEST:
-            smaller = [max(1, round(side * LARGEST / max(size))) for side in size]
-            picture = F.interpolate(picture, size=smaller, mode="area")
+        picture = F.interpolate(picture, size=coarse_size(*exposure.shape[:2]), mode="area")
         found = self.network(network_input(picture[:, :3], picture[:, 3:]))
-        if max(size) > LARGEST:
-            found = [F.interpolate(values, size=size, mode="bilinear", align_corners=False) for values in found]
         mean, deviation = (values[0].permute(1, 2, 0).to(exposure) for values in found)
         return LightEstimate(mean, deviation * self.deviation_scale)
+
+
+def coarse_size(height: int, width: int) -> tuple[int, int]:
+    """Return the size at which the network sees a photo: the photo's own up to LARGEST, else averaged down to it."""
+    part = min(1.0, LARGEST / max(height, width))
+    return max(1, round(height * part)), max(1, round(width * part))
+
+
+@torch.no_grad()
+def combined_estimates(
+    exposure: Tensor,
+    clipped: Tensor,
+    prior: LightPrior | None,
+    stated: Tensor | None = None,
+    stated_deviation: float = 0.0,
+) -> Tensor:
+    """Return what is known of a photo's clipped light, from the prior and from what its file states.
+
+    Args:
+        exposure: [H, W, 3], as of LightPrior.estimate.
+        clipped: [H, W, 3] bool.
+        prior: None leaves it out.
+        stated: [H, W, 3], light in multiples of white, at least 1 where it is known, as View.light_above_white has it.
+        stated_deviation: standard deviation of its natural logarithm.
+
+    Returns:
+        [h, w, 6] float16 at the size of `coarse_size`: for each channel the expected natural logarithm of light over
+        white, and then 1 / its deviation; 0 where nothing is clipped or known. Two estimates of a value are averaged
+        by their precisions.
+    """
+    size = coarse_size(*exposure.shape[:2])
+    total = exposure.new_zeros(*size, 3)
+    precision = torch.zeros_like(total)
+    if prior is not None:
+        estimate = prior.estimate(exposure, clipped)
+        precision += (estimate.deviation * math.log(2)) ** -2
+        total += precision * estimate.mean * math.log(2)
+    if stated is not None and stated_deviation > 0:
+        known = (clipped & (stated >= 1)).to(exposure)
+        share, light = (_averaged(values, size) for values in (known, known * stated.to(exposure).clamp_min(1).log()))
+        weight = (share > 0).to(exposure) / stated_deviation**2
+        total += weight * light / share.clamp_min(1e-6)
+        precision += weight
+    some = _averaged(clipped.to(exposure), size) > 0
+    mean = torch.where(some, total / precision.clamp_min(1e-12), 0)
+    return torch.cat([mean, torch.where(some, precision.sqrt(), 0)], 2).half()
+
+
+def _averaged(values: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return [H, W, 3] averaged by area to [h, w, 3]."""
+    return F.interpolate(values.permute(2, 0, 1)[None], size=size, mode="area")[0].permute(1, 2, 0)
 
 
 def load_prior(device: torch.device | str = "cpu", path: Path = WEIGHTS) -> LightPrior:
@@ -77,7 +124,7 @@ def load_prior(device: torch.device | str = "cpu", path: Path = WEIGHTS) -> Ligh
 def _load(device: str, path: Path) -> LightPrior:
     from safetensors import SafetensorError, safe_open
 
-    remedy = "install sehdr-warp again, or train with loss.light_prior_weight=0"
+    remedy = "install sehdr-warp again, or train with --loss.light_prior=false"
     if not path.is_file():
         raise InputError(path, "the weights of the prior for clipped light are missing", remedy)
     if path.stat().st_size > MOST_BYTES:

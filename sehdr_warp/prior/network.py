@@ -20,6 +20,7 @@ class LightNetwork(nn.Module):
     """
 
     def __init__(self, width: int = WIDTH):
+        """Make the layers; width: channels of the first level."""
         super().__init__()
         widths = [width * min(2**level, 4) for level in range(LEVELS)]
         self.down = nn.ModuleList(_Block(a, b) for a, b in zip([INPUTS, *widths], widths, strict=False))
@@ -59,6 +60,7 @@ class _Block(nn.Module):
     """Two convolutions with a normalisation of groups of channels between them."""
 
     def __init__(self, inputs: int, outputs: int):
+        """Make the layers; inputs, outputs: channels."""
         super().__init__()
         self.first = nn.Conv2d(inputs, outputs, 3, padding=1)
         self.norm = nn.GroupNorm(4, outputs)

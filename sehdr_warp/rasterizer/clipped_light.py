@@ -1,4 +1,9 @@
-"""How smooth light is where a photo clips, as a torch operation (kernels/clipped_light.py)."""
+"""The light of clipped pixels: how smooth it is, and how far from an estimate, as a torch operation.
+
+The kernels are in kernels/clipped_light.py.
+"""
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -9,55 +14,85 @@ from .code_residual import CODES, WHITE
 from .warp_launch.launching import launch, scale_gradient, warp_scalar
 
 
+@dataclass(frozen=True)
+class ClippedWeights:
+    """Weights of the parts of clipped_light_energy(), each at least 0.
+
+    smoothness: of squared differences to the mean of clipped neighbours. lift: of the logarithm at edges. hold: of
+    the squared distance from an estimate, in its deviations.
+    """
+
+    smoothness: float = 0.0
+    lift: float = 0.0
+    hold: float = 0.0
+
+    def __bool__(self) -> bool:
+        """Return whether any part counts."""
+        return self.smoothness > 0 or self.lift > 0 or self.hold > 0
+
+
 def clipped_light_energy(
     image: Tensor,
     codes: Tensor,
     white: float,
+    weights: ClippedWeights,
     index: Tensor | None = None,
     mask: Tensor | None = None,
-    *,
-    smoothness: float,
-    lift: float,
+    estimates: Tensor | None = None,
 ) -> Tensor:
-    """What a photo leaves open, as smooth as it can be: a scalar, differentiable once with respect to the image.
+    """Return the energy of the clipped values of an image, a scalar, differentiable once with respect to the image.
 
-    The mean over all values of the image, where those that are clipped have smoothness / 2 times the squared difference
-    of their log light to the mean of the clipped ones around them, less lift times their log light as far as others
-    around them are not clipped. There the blur of Gaussians takes from lights: without a lift, the smaller a light the
-    darker it would get. Derivatives are with the means as they are: the light of each follows that of the others.
+    It is the mean over all values of the image. With v = log(value / white), and m the mean of v over the clipped
+    values of its channel within a few pixels, which is held constant, a clipped value has
 
-    image: [H, W, 3] exposures, float32 or float64. codes, index: as of code_residual(). white: the exposure that the
-    photo shows as white; light below it counts as white. smoothness, lift: weights, at least 0. mask: [H, W, 1], of the
-    image's type; where it is 0 a pixel is as if it were not clipped.
+        smoothness / 2 (v - m)^2              light is smooth
+        - lift (1 - share) v                  the blur of Gaussians takes light from edges; share: of pixels around
+                                              that are clipped
+        + hold / 2 ((v - mean) / deviation)^2   an estimate of its light
+
+    Args:
+        image: [H, W, 3] exposures, float32 or float64.
+        codes: as of code_residual().
+        white: the exposure that the photo shows as white; light below it counts as white.
+        weights: of the parts.
+        index: as of code_residual().
+        mask: [H, W, 1], of the image's type; a pixel where it is 0 counts as not clipped.
+        estimates: [h, w, 6] float16 for the same picture, sampled at the nearest place: for each channel the expected
+            v, and then 1 / its deviation, 0 where nothing is known.
     """
-    return _ClippedLight.apply(image, codes, index, mask, white, smoothness, lift)
+    return _ClippedLight.apply(image, codes, white, weights, index, mask, estimates)
 
 
-def add_clipped_light(image, codes, index, mask, white, smoothness, lift, terms, slopes) -> None:
-    """Adds what clipped_light_energy() is the total() of to terms, and its derivatives by the image, contiguous, to
-    slopes, [H, W, 3], which may be None."""
+def add_clipped_light(image, codes, white, weights, index, mask, estimates, terms, slopes) -> None:
+    """Add the terms that clipped_light_energy() is the sum of to terms, and its derivatives to slopes.
+
+    slopes: [H, W, 3], contiguous; may be None.
+    """
     if index is None:
         codes, index = codes[None], torch.zeros(1, dtype=torch.int64, device=codes.device)
     photos, mask = codes.contiguous().view(len(codes), -1), None if mask is None else mask.contiguous().view(-1)
-    given = image, photos, index, mask, WHITE[codes.dtype], white
+    photo = image, photos, index, mask, WHITE[codes.dtype], white
     # The mean is in the weights: it costs no launch, here and for the gradient.
-    numbers = *image.shape[:2], smoothness / image.numel(), lift / image.numel()
+    numbers = *image.shape[:2], *(part / image.numel() for part in (weights.smoothness, weights.lift, weights.hold))
+    rows, columns = (0, 0) if estimates is None else estimates.shape[:2]
+    estimates = None if estimates is None else estimates.contiguous().view(-1)
+    outputs = estimates, rows, columns, terms, slopes
     scalar, code = warp_scalar(image.dtype), CODES[codes.dtype]
     if patches.in_patches(image.device):
         kernel = clipped_light_patch_kernel(scalar, code)
-        patches.launch_patches(kernel, image, *given, *numbers, terms, slopes)
+        patches.launch_patches(kernel, image, *photo, *numbers, *outputs)
         return
     logarithms = torch.empty_like(image)
-    launch(clipped_logarithms_kernel(scalar, code), image.numel(), *given, logarithms)
-    launch(clipped_light_kernel(scalar), image.numel(), image, logarithms, *numbers, terms, slopes)
+    launch(clipped_logarithms_kernel(scalar, code), image.numel(), *photo, logarithms)
+    launch(clipped_light_kernel(scalar), image.numel(), image, logarithms, white, *numbers, *outputs)
 
 
 class _ClippedLight(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, image, codes, index, mask, white, smoothness, lift):
+    def forward(ctx, image, codes, white, weights, index, mask, estimates):
         image = image.detach().contiguous()
         terms, slopes = patches.new_terms(image).zero_(), torch.zeros_like(image)
-        add_clipped_light(image, codes, index, mask, white, smoothness, lift, terms, slopes)
+        add_clipped_light(image, codes, white, weights, index, mask, estimates, terms, slopes)
         ctx.save_for_backward(slopes)
         return patches.total(terms)
 

@@ -4,7 +4,7 @@ the fewest launches: one sum of all terms, and one gradient that each part goes 
 import torch
 from torch import Tensor
 
-from .clipped_light import add_clipped_light
+from .clipped_light import ClippedWeights, add_clipped_light
 from .code_residual import CodeScale, check_codes, residual
 from .patches import total
 from .ssim import distance_terms
@@ -19,31 +19,33 @@ def photo_loss(
     *,
     distance_weight: float,
     dissimilarity_weight: float,
-    smoothness: float = 0.0,
-    lift: float = 0.0,
+    clipped: ClippedWeights = ClippedWeights(),
+    estimates: Tensor | None = None,
 ) -> Tensor:
     """distance_weight mean |a - b| + dissimilarity_weight (1 - ssim(a, b)) of what code_residual(image, ...) gives, and
     clipped_light_energy() of the image where it has a weight: a scalar, differentiable once with respect to the image.
 
-    image: [H, W, 3] float32 or float64. codes, scale, index: as of code_residual(), with its errors. smoothness, lift:
-    as of clipped_light_energy(), where the scale's white is the exposure that the photo shows as white.
+    image: [H, W, 3] float32 or float64. codes, scale, index: as of code_residual(), with its errors. clipped:
+    weights of clipped_light_energy(), where the scale's white is the exposure that the photo shows as white. estimates:
+    as it takes them.
     """
     check_codes(image, codes, scale, index)
-    return _PhotoLoss.apply(image, codes, scale, index, (distance_weight, dissimilarity_weight), (smoothness, lift))
+    weights = distance_weight, dissimilarity_weight
+    return _PhotoLoss.apply(image, codes, scale, index, weights, clipped, estimates)
 
 
 class _PhotoLoss(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, image, codes, scale, index, weights, clipped):
+    def forward(ctx, image, codes, scale, index, weights, clipped, estimates):
         image = image.detach().contiguous()
         seen, truth, slopes = residual(image, codes, scale, index)
         terms, gradient = distance_terms(seen, truth, *weights, wanted=ctx.needs_input_grad[0], slopes=slopes)
-        if any(clipped):
-            add_clipped_light(image, codes, index, None, scale.white, *clipped, terms=terms, slopes=gradient)
+        if clipped:
+            add_clipped_light(image, codes, scale.white, clipped, index, None, estimates, terms, gradient)
         ctx.save_for_backward(*(() if gradient is None else (gradient,)))
         return total(terms)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, upstream):
-        return scale_gradient(ctx.saved_tensors[0], upstream), None, None, None, None, None
+        return scale_gradient(ctx.saved_tensors[0], upstream), None, None, None, None, None, None

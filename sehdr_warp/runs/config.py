@@ -102,6 +102,11 @@ class LossConfig(_Table):
     are compared"""
     clipped_lift: Weight = 0.0003
     """weight of the log light of clipped pixels beside others, which goes up: the blur of Gaussians takes from it"""
+    clipped_estimate: Weight = 0.003
+    """weight of the squared distance of the log light of clipped pixels from its estimates, in their deviations, where
+    exposures are compared; estimates come from the learned prior and from gain maps"""
+    light_prior: bool = False
+    """estimate the light of clipped pixels from the rest of each photo, by a learned prior; off: gain maps alone"""
     linear_weight: Weight = 0.0
     """weight of the linear loss (SeHDR: 0.5)"""
     hdr_truth: bool = False

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ..model.radiance_field import Photograph, RadianceField
-from ..rasterizer.clipped_light import clipped_light_energy
+from ..rasterizer.clipped_light import ClippedWeights, clipped_light_energy
 from ..rasterizer.code_residual import CodeScale, code_residual, code_values
 from ..rasterizer.photo_loss import photo_loss
 from ..rasterizer.ssim import image_distance, ssim
@@ -29,6 +29,7 @@ class Target:
 
     codes: [H, W, 3] as code_tensor() holds them; or with an index [1], int64, a stack [V, H, W, 3] that has the photo
     there. scale: what they are worth. mask: [H, W, 1] in [0, 1]. exposure_truth: [H, W, 3] radiance times base time.
+    estimates: of the light of clipped pixels, as clipped_light_energy() takes them.
     """
 
     codes: Tensor
@@ -36,6 +37,7 @@ class Target:
     mask: Tensor | None = None
     exposure_truth: Tensor | None = None
     index: Tensor | None = None
+    estimates: Tensor | None = None
 
     @property
     def encoded(self) -> Tensor:
@@ -111,19 +113,21 @@ def ldr_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor:
     image = photo.light if target.scale.mu else photo.encoded
     assert image is not None
     codes, scale, index, weight = target.codes, target.scale, target.index, config.ssim_weight
-    extends = target.scale.mu and config.clipping
-    clipped = {
-        "smoothness": config.clipped_smoothness if extends else 0.0,
-        "lift": config.clipped_lift if extends else 0.0,
-    }
+    clipped = clipped_weights(config, target) if target.scale.mu and config.clipping else ClippedWeights()
     if target.mask is None and weight:
         weights = {"distance_weight": _distance_weight(config.form, weight), "dissimilarity_weight": weight}
-        return photo_loss(image, codes, scale, index, **weights, **clipped)
+        return photo_loss(image, codes, scale, index, **weights, clipped=clipped, estimates=target.estimates)
     seen, truth = code_residual(image, codes, scale, index)
     loss = image_loss(seen, truth, target.mask, config.form, weight)
-    if any(clipped.values()):
-        loss = loss + clipped_light_energy(image, codes, scale.white, index, target.mask, **clipped)
+    if clipped:
+        loss = loss + clipped_light_energy(image, codes, scale.white, clipped, index, target.mask, target.estimates)
     return loss
+
+
+def clipped_weights(config: LossConfig, target: Target) -> ClippedWeights:
+    """Return the weights of the parts of a loss that shape clipped light; without estimates nothing holds it."""
+    hold = 0.0 if target.estimates is None else config.clipped_estimate
+    return ClippedWeights(config.clipped_smoothness, config.clipped_lift, hold)
 
 
 def compares_light(config: LossConfig, field: RadianceField) -> bool:

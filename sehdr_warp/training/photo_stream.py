@@ -68,6 +68,7 @@ class PhotoStream:
         self._cuda = self._device.type == "cuda"
         masked = any(view.mask is not None for view in views)
         shapes = {"codes": first.target.codes, "exposure_truth": first.target.exposure_truth}
+        shapes["estimates"] = first.target.estimates
         shapes["mask"] = torch.empty(first.camera.height, first.camera.width, 1) if masked else None
         self._parts = {name: like for name, like in shapes.items() if like is not None}
         self._slots = {name: self._room(like, SLOTS, self._device) for name, like in self._parts.items()}
@@ -154,6 +155,8 @@ class PhotoStream:
         if "exposure_truth" in self._parts:
             assert view.hdr is not None
             found["exposure_truth"] = torch.from_numpy(np.asarray(view.hdr, np.float32)) * self._source.base_time
+        if self._source.estimates is not None:
+            found["estimates"] = self._source.estimates[index]
         if "mask" in self._parts:  # One without a mask counts everywhere.
             whole = np.ones(view.codes.shape[:2], np.float32) if view.mask is None else view.mask
             found["mask"] = torch.from_numpy(np.asarray(whole, np.float32))[..., None]

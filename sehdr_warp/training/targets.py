@@ -59,7 +59,9 @@ class ViewStack:
         stacked = functional.pad(torch.stack(rows), (0, 1))
         time = times[0] if len(set(times)) == 1 else torch.tensor(times, device=stacked.device)
         mask, truth = (None if parts[0] is None else torch.stack(parts) for parts in (masks, truths))
-        target = Target(torch.stack([t.codes for t in targets]), targets[0].scale, mask, truth)
+        estimates = None if targets[0].estimates is None else torch.stack([t.estimates for t in targets])
+        codes = torch.stack([t.codes for t in targets])
+        target = Target(codes, targets[0].scale, mask, truth, estimates=estimates)
         return ViewStack(cameras[0].width, cameras[0].height, stacked, time, target)
 
     def __len__(self) -> int:
@@ -81,8 +83,9 @@ class ViewStack:
         """All of a view but its codes. take: gives one of a tensor [V, ...]."""
         pose, intrinsics, position = take(self.cameras)[:23].split((16, 4, 3))
         camera = CameraTensors(self.width, self.height, pose.view(4, 4), intrinsics, position)
-        mask, truth = (None if v is None else take(v) for v in (self.targets.mask, self.targets.exposure_truth))
-        return TrainingView(camera, time, replace(self.targets, mask=mask, exposure_truth=truth))
+        names = "mask", "exposure_truth", "estimates"
+        parts = {name: None if (v := getattr(self.targets, name)) is None else take(v) for name in names}
+        return TrainingView(camera, time, replace(self.targets, **parts))
 
 
 def largest_truth(scene: Scene, loss: LossConfig) -> float:
@@ -124,20 +127,33 @@ def training_views(
     return list(photo_source(views, base_time, device, truth=truth, clipping=clipping, light=light))
 
 
-def photo_source(views, base_time: float, device, *, truth: bool, clipping=True, light=None) -> "PhotoSource":
-    """training_views() that are made one by one, whenever one is asked for."""
+def photo_source(
+    views, base_time: float, device, *, truth: bool, clipping=True, light=None, estimates: list[Tensor] | None = None
+) -> "PhotoSource":
+    """Return training_views() that are made one by one, whenever one is asked for.
+
+    estimates: of each view's clipped light, as Target has them.
+    """
     deep = any(view.codes.dtype == np.uint16 for view in views)
-    return PhotoSource(
-        views, base_time, device, truth, deep, code_scale(65535 if deep else 255, light, device, clipping=clipping)
-    )
+    scale = code_scale(65535 if deep else 255, light, device, clipping=clipping)
+    return PhotoSource(views, base_time, device, truth, deep, scale, estimates)
 
 
 class PhotoSource(Sequence[TrainingView]):
     """Training views whose photos stay where they are, in memory or in a file, until one is asked for."""
 
-    def __init__(self, views: Sequence[View], base_time: float, device, truth: bool, deep: bool, scale: CodeScale):
+    def __init__(
+        self,
+        views: Sequence[View],
+        base_time: float,
+        device,
+        truth: bool,
+        deep: bool,
+        scale: CodeScale,
+        estimates: list[Tensor] | None = None,
+    ):
         self.views, self.base_time, self.device = views, base_time, device
-        self.truth, self._deep, self.scale = truth, deep, scale
+        self.truth, self._deep, self.scale, self.estimates = truth, deep, scale, estimates
 
     def __len__(self) -> int:
         return len(self.views)
@@ -151,7 +167,9 @@ class PhotoSource(Sequence[TrainingView]):
             for array in ((None if view.mask is None else view.mask[..., None]), (view.hdr if self.truth else None))
         )
         truth = None if radiance is None else radiance * self.base_time
-        target = Target(code_tensor(self.codes(index), self.device), self.scale, mask, truth)
+        codes = code_tensor(self.codes(index), self.device)
+        estimates = None if self.estimates is None else self.estimates[index].to(self.device)
+        target = Target(codes, self.scale, mask, truth, estimates=estimates)
         return TrainingView(CameraTensors.of(view.camera, self.device), view.exposure_time, target)
 
     def codes(self, index: int) -> np.ndarray:

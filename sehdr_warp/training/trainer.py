@@ -26,6 +26,7 @@ from .births import born_rows
 from .densification import SEED_STEP, make_densification
 from .graph_capacity import GraphCapacity
 from .initialization import make_matcher, scene_extent
+from .light_estimates import light_estimates
 from .losses import INTERVALS_FROM, compares_light, data_loss, needed_colours, regularised
 from .matching import Matcher
 from .photo_order import PhotoOrder
@@ -377,7 +378,9 @@ class Trainer:
         if self._stack is None:
             given, loss = (self._views, self.field.base_time, self.device), self.config.loss
             light = self.field.response if compares_light(loss, self.field) else None
-            source = photo_source(*given, truth=loss.uses_hdr, clipping=loss.clipping, light=light)
+            estimates = light_estimates(self._views, light, loss, self.device)
+            options = {"clipping": loss.clipping, "light": light, "estimates": estimates}
+            source = photo_source(*given, truth=loss.uses_hdr, **options)
             self._stack = held_views(source, self.config.schedule.photo_cache, self._recorder is not None)
             self._scale = source.scale
         if self._fine and self.iteration > INTERVALS_FROM * self.config.schedule.iterations:

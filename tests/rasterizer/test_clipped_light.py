@@ -7,12 +7,12 @@ import warp as wp
 
 from sehdr_warp.kernels.clipped_light import REACH
 from sehdr_warp.rasterizer import patches
-from sehdr_warp.rasterizer.clipped_light import clipped_light_energy
+from sehdr_warp.rasterizer.clipped_light import ClippedWeights, clipped_light_energy
 from sehdr_warp.rasterizer.code_residual import code_tensor
 
 from .scenes import relative_error
 
-WHITE, WEIGHTS = 1.3, {"smoothness": 0.7, "lift": 0.2}
+WHITE, WEIGHTS = 1.3, ClippedWeights(smoothness=0.7, lift=0.2, hold=0.4)
 
 
 @pytest.fixture(params=["values", "patches"])
@@ -37,7 +37,15 @@ def clipped_photo(bits=8):
     return light, codes.astype(np.uint16 if bits == 16 else np.uint8)
 
 
-def reference(light, codes, mask=None, means_of=None):
+def some_estimates():
+    """Estimates [9, 11, 6] for the photo, which know nothing of a part of it."""
+    generator = torch.Generator().manual_seed(5)
+    estimates = torch.rand(9, 11, 6, generator=generator)
+    estimates[:3, :3, 3:] = 0
+    return estimates.half()
+
+
+def reference(light, codes, mask=None, means_of=None, estimates=None):
     """Pixel by pixel. means_of: the light that the means are of, by default the same, held as it is."""
     clipped = (codes == np.iinfo(codes.dtype).max) & (True if mask is None else mask.numpy() > 0)
     logs, others = ((x / WHITE).clamp_min(1).log() for x in (light, (light if means_of is None else means_of).detach()))
@@ -45,31 +53,41 @@ def reference(light, codes, mask=None, means_of=None):
     for y, x, channel in np.argwhere(clipped):
         around = np.s_[max(y - REACH, 0) : y + REACH + 1, max(x - REACH, 0) : x + REACH + 1, channel]
         near, value = torch.from_numpy(clipped[around]), logs[y, x, channel]
-        total = total + WEIGHTS["smoothness"] / 2 * (value - others[around][near].mean()) ** 2
-        total = total - WEIGHTS["lift"] * (1 - near.double().mean()) * value
+        total = total + WEIGHTS.smoothness / 2 * (value - others[around][near].mean()) ** 2
+        total = total - WEIGHTS.lift * (1 - near.double().mean()) * value
+        if estimates is not None:
+            rows, columns = estimates.shape[:2]
+            found = estimates[y * rows // light.shape[0], x * columns // light.shape[1]].double()
+            # Light below white counts as white and is lifted all the same.
+            above = light[y, x, channel] / WHITE
+            value = value if above > 1 else above - above.detach()
+            total = total + WEIGHTS.hold / 2 * (found[channel + 3] * (value - found[channel])) ** 2
     return total / light.numel()
 
 
+@pytest.mark.parametrize("estimated", [False, True])
 @pytest.mark.parametrize("bits", [8, 16])
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
-def test_values_and_gradients_are_those_of_torch(device, kernels, bits, dtype, bound):
+def test_values_and_gradients_are_those_of_torch(device, kernels, bits, dtype, bound, estimated):
     light, codes = clipped_photo(bits)
     wanted = light.clone().requires_grad_()
-    expected = reference(wanted, codes)
+    estimates = some_estimates() if estimated else None
+    expected = reference(wanted, codes, estimates=estimates)
     (3 * expected).backward()
     ours = light.to(device, dtype).requires_grad_()
-    energy = clipped_light_energy(ours, code_tensor(codes, device), WHITE, **WEIGHTS)
+    options = {"estimates": estimates.to(device) if estimated else None}
+    energy = clipped_light_energy(ours, code_tensor(codes, device), WHITE, WEIGHTS, **options)
     (3 * energy).backward()
     assert relative_error(energy, expected) < bound
     assert relative_error(ours.grad, wanted.grad) < bound
     stack, index = code_tensor(np.stack([codes[::-1], codes]), device), torch.tensor([1], device=device)
-    assert torch.equal(clipped_light_energy(ours, stack, WHITE, **WEIGHTS, index=index), energy)
+    assert torch.equal(clipped_light_energy(ours, stack, WHITE, WEIGHTS, index=index, **options), energy)
 
 
 def test_gradient_is_that_of_finite_differences(device, kernels):
     light, codes = clipped_photo()
     image = light.to(device).requires_grad_()
-    clipped_light_energy(image, code_tensor(codes, device), WHITE, **WEIGHTS).backward()
+    clipped_light_energy(image, code_tensor(codes, device), WHITE, WEIGHTS).backward()
     step, generator = 1e-5, np.random.default_rng(0)
     for place in generator.permutation(np.argwhere(codes == 255))[:25]:
         ends = []
@@ -85,7 +103,7 @@ def test_masked_pixels_are_not_clipped(device, kernels):
     mask = torch.ones(40, 37, 1, dtype=torch.float64)
     mask[4:7] = 0
     photo = code_tensor(codes, device)
-    energy = clipped_light_energy(light.to(device), photo, WHITE, **WEIGHTS, mask=mask.to(device))
+    energy = clipped_light_energy(light.to(device), photo, WHITE, WEIGHTS, mask=mask.to(device))
     assert relative_error(energy, reference(light, codes, mask)) < 1e-12
     assert relative_error(energy, reference(light, codes)) > 1e-2
 
@@ -94,6 +112,6 @@ def test_masked_pixels_are_not_clipped(device, kernels):
 def test_extreme_light_leaves_numbers(device, kernels, scale):
     light, codes = clipped_photo()
     image = (light * scale).to(device, torch.float32).requires_grad_()
-    energy = clipped_light_energy(image, code_tensor(codes, device), WHITE, **WEIGHTS)
+    energy = clipped_light_energy(image, code_tensor(codes, device), WHITE, WEIGHTS)
     energy.backward()
     assert torch.isfinite(energy) and torch.isfinite(image.grad).all()

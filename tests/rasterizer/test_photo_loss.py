@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.rasterizer.clipped_light import clipped_light_energy
+from sehdr_warp.rasterizer.clipped_light import ClippedWeights, clipped_light_energy
 from sehdr_warp.rasterizer.code_residual import CodeScale, code_residual, code_tensor
 from sehdr_warp.rasterizer.photo_loss import photo_loss
 from sehdr_warp.rasterizer.ssim import image_distance
 
 from .scenes import relative_error
 
+CLIPPED = ClippedWeights(smoothness=0.7, lift=0.2, hold=0.3)
 WHITE, MU, WEIGHTS = 1.3, 300.0, {"distance_weight": 0.8, "dissimilarity_weight": 0.2}
 
 
@@ -29,21 +30,23 @@ def clipped_photo(dtype, mu):
     return light.to(dtype), codes, CodeScale(table.to(dtype), mu, WHITE)
 
 
-def composed(image, codes, scale, index, clipped):
+def composed(image, codes, scale, index, clipped, estimates):
     loss = image_distance(*code_residual(image, codes, scale, index), *WEIGHTS.values())
-    return loss + clipped_light_energy(image, codes, WHITE, index, **clipped) if clipped else loss
+    return loss + clipped_light_energy(image, codes, WHITE, clipped, index, None, estimates) if clipped else loss
 
 
-@pytest.mark.parametrize("clipped", [{}, {"smoothness": 0.7, "lift": 0.2}], ids=["codes", "and clipped light"])
+@pytest.mark.parametrize("clipped", [ClippedWeights(), CLIPPED], ids=["codes", "and clipped light"])
 @pytest.mark.parametrize("mu", [0.0, MU])
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-6), (torch.float64, 1e-14)])
 def test_value_and_gradient_are_those_of_the_operations(device, dtype, bound, mu, clipped):
     light, codes, scale = clipped_photo(dtype, mu)
     scale = CodeScale(scale.table.to(device), mu, WHITE)
     stack, index = code_tensor(np.stack([codes[::-1], codes]), device), torch.tensor([1], device=device)
+    estimates = torch.rand(7, 9, 6, generator=torch.Generator().manual_seed(1)).half().to(device)
     for given in ((stack, scale, index), (stack[1], scale, None)):
         ours, theirs = (light.to(device).requires_grad_() for _ in range(2))
-        found, expected = photo_loss(ours, *given, **WEIGHTS, **clipped), composed(theirs, *given, clipped)
+        found = photo_loss(ours, *given, **WEIGHTS, clipped=clipped, estimates=estimates)
+        expected = composed(theirs, *given, clipped, estimates)
         (3 * found).backward()
         (3 * expected).backward()
         assert found.dtype == dtype and found.shape == ()
@@ -54,7 +57,7 @@ def test_value_and_gradient_are_those_of_the_operations(device, dtype, bound, mu
 def test_without_a_gradient_the_value_is_the_same(device):
     light, codes, scale = clipped_photo(torch.float32, MU)
     given = code_tensor(codes, device), CodeScale(scale.table.to(device), MU, WHITE)
-    weights = WEIGHTS | {"smoothness": 0.7, "lift": 0.2}
+    weights = WEIGHTS | {"clipped": CLIPPED}
     image = light.to(device)
     assert torch.equal(photo_loss(image, *given, **weights), photo_loss(image.requires_grad_(), *given, **weights))
 

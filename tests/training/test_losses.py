@@ -100,6 +100,24 @@ def test_clipped_light_is_lifted_beside_what_does_not_clip():
     assert light.grad[0, :, 0].sign().tolist() == [0, 0, 0, 0, 0, -1, -1, -1, 1]
 
 
+def test_clipped_light_is_held_at_its_estimate_as_firmly_as_that_is_sure():
+    response = response_by_name("srgb")
+    light = (response.white * torch.tensor([[2.0, 8.0, 2.0, 8.0, 8.0]])[..., None].expand(1, 5, 3)).double()
+    target = target_of(row(1.0, 1.0, 1.0, 1.0, 0.9).double(), response)
+    estimates = torch.zeros(1, 5, 6, dtype=torch.float16)
+    estimates[..., :3] = math.log(4)
+    estimates[..., 3:] = torch.tensor([1.0, 1.0, 0.1, 0.1, 1.0])[None, :, None]
+    config = LossConfig(ssim_weight=0.0, clipped_smoothness=0.0, clipped_lift=0.0, clipped_estimate=1.0)
+    light.requires_grad_()
+    ldr_loss(Photograph(light, light, light, None, light), replace(target, estimates=estimates), config).backward()
+    slopes = (light.grad * light.detach())[0, :, 0]
+    assert slopes[0] < 0 < slopes[1]  # A photo's clipped pixels alone: the last is brighter than its photo shows.
+    assert (slopes[2:4] / slopes[:2]).tolist() == pytest.approx([0.01, 0.01], rel=1e-2)
+    plain = light.detach().requires_grad_()
+    ldr_loss(Photograph(plain, plain, plain, None, plain), target, config).backward()
+    assert plain.grad[0, :4].abs().max() == 0 and plain.grad[0, 4, 0] == light.grad[0, 4, 0]
+
+
 def test_a_code_is_worth_the_middle_of_what_it_stands_for():
     response = response_by_name("hdr-nerf")
     scale = code_scale(255, response, "cpu", dtype=torch.float64)

@@ -1,0 +1,49 @@
+"""Estimates of the light of clipped pixels, which hold a training where photos are a lower bound alone."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ..prior import coarse_size, combined_estimates, load_prior
+from ..response import Response
+from ..runs.config import LossConfig
+from ..scene import View
+
+
+@torch.no_grad()
+def light_estimates(
+    views: Sequence[View], response: Response | None, config: LossConfig, device: torch.device
+) -> list[Tensor] | None:
+    """Return what is known of each view's clipped light, on the CPU, as clipped_light_energy() takes it.
+
+    None where nothing clips, where the loss does not use it, or where nothing is known. The views are seen by the
+    learned prior if config.light_prior is on; light that a photo's file states counts in any case.
+
+    Args:
+        views: the training views.
+        response: the curve by which exposures are compared; None where they are not.
+        config: of the loss.
+        device: on which the prior runs.
+
+    Raises:
+        InputError: if the weights of the prior cannot be read.
+    """
+    if response is None or not config.clipping or config.clipped_estimate == 0:
+        return None
+    masks = [torch.from_numpy(view.codes >= view.levels) for view in views]
+    known = [config.light_prior or view.light_above_white is not None for view in views]
+    if not any(some and bool(mask.any()) for some, mask in zip(known, masks, strict=True)):
+        return None
+    prior = load_prior(device) if config.light_prior else None
+    found = []
+    for view, mask in zip(views, masks, strict=True):
+        if not bool(mask.any()):
+            found.append(torch.zeros(*coarse_size(*mask.shape[:2]), 6, dtype=torch.float16))
+            continue
+        exposure = response.decode(torch.from_numpy(view.image).to(device)).float() / response.white
+        stated = view.light_above_white
+        stated = None if stated is None else torch.from_numpy(stated).to(device).float()
+        estimates = combined_estimates(exposure, mask.to(device), prior, stated, view.light_above_white_deviation)
+        found.append(estimates.cpu())
+    return found

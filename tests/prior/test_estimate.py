@@ -1,0 +1,97 @@
+"""Estimates of clipped light: sizes, combination with what files state, and weights files that cannot be used."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.prior import LightPrior, coarse_size, combined_estimates, load_prior
+from sehdr_warp.prior.network import LightNetwork
+
+
+def photo(height=20, width=30):
+    """Exposure and clipped values of a photo with a lamp."""
+    exposure = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0)) * 0.5
+    clipped = torch.zeros(height, width, 3, dtype=torch.bool)
+    clipped[5:9, 10:16] = True
+    return torch.where(clipped, 1.0, exposure), clipped
+
+
+def small_prior(scale=1.0):
+    torch.manual_seed(0)
+    return LightPrior(LightNetwork(4), scale)
+
+
+@pytest.mark.parametrize(
+    ("size", "coarse"), [((20, 30), (20, 30)), ((1, 1), (1, 1)), ((3000, 4000), (120, 160)), ((5000, 3), (160, 1))]
+)
+def test_large_photos_are_seen_smaller_and_small_ones_as_they_are(size, coarse):
+    assert coarse_size(*size) == coarse
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 50), (20, 30), (170, 33)])
+def test_any_size_is_estimated(size):
+    exposure, clipped = torch.rand(*size, 3), torch.ones(*size, 3, dtype=torch.bool)
+    estimate = small_prior().estimate(exposure, clipped)
+    assert estimate.mean.shape == estimate.deviation.shape == (*coarse_size(*size), 3)
+    assert (estimate.mean >= 0).all() and (estimate.deviation > 0).all()
+
+
+def test_estimates_are_there_where_the_photo_clips_alone():
+    exposure, clipped = photo()
+    estimates = combined_estimates(exposure, clipped, small_prior())
+    assert torch.equal(estimates[..., 3:] > 0, clipped)
+    estimate = small_prior().estimate(exposure, clipped)
+    inside = clipped[..., 0]
+    assert torch.allclose(estimates[..., :3][inside].float(), math.log(2) * estimate.mean[inside], rtol=2e-3)
+    assert torch.allclose(1 / estimates[..., 3:][inside].float(), math.log(2) * estimate.deviation[inside], rtol=2e-3)
+
+
+def test_what_a_file_states_counts_by_its_precision():
+    exposure, clipped = photo()
+    stated = torch.where(clipped, 8.0, 0.0)
+    alone = combined_estimates(exposure, clipped, None, stated, 0.25)
+    assert torch.allclose(alone[6, 12].float(), torch.tensor(3 * [math.log(8)] + 3 * [4.0]), rtol=1e-3)
+    sure, unsure = (combined_estimates(exposure, clipped, small_prior(), stated, d)[6, 12, 0] for d in (0.01, 100.0))
+    estimate = small_prior().estimate(exposure, clipped).mean[6, 12, 0]
+    assert sure == pytest.approx(math.log(8), abs=1e-2)
+    assert unsure == pytest.approx(math.log(2) * float(estimate), rel=1e-2)
+
+
+def test_nothing_known_is_precision_zero():
+    exposure, clipped = photo()
+    assert (combined_estimates(exposure, clipped, None) == 0).all()
+    unstated = combined_estimates(exposure, clipped, None, torch.zeros(20, 30, 3), 0.3)
+    assert (unstated == 0).all()
+
+
+def test_weights_come_back_as_they_were_written(tmp_path):
+    network = LightNetwork(4).half()
+    save_file(network.state_dict(), tmp_path / "w.safetensors", {"deviation_scale": "1.5"})
+    exposure, clipped = photo()
+    ours, loaded = LightPrior(network.float(), 1.5), load_prior(path=tmp_path / "w.safetensors")
+    assert torch.equal(ours.estimate(exposure, clipped).deviation, loaded.estimate(exposure, clipped).deviation)
+
+
+def test_weights_that_cannot_be_used_are_one_line(tmp_path):
+    broken = {name: value.clone() for name, value in LightNetwork(4).half().state_dict().items()}
+    broken["out.bias"][0] = math.nan
+    save_file(broken, tmp_path / "nan.safetensors")
+    save_file({"out.weight": torch.zeros(6, 4, 1, 1)}, tmp_path / "few.safetensors")
+    (tmp_path / "text.safetensors").write_bytes(b"not weights" * 9)
+    (tmp_path / "large.safetensors").write_bytes(bytes(3_000_001))
+    names = {"missing": "missing", "text": "is not the weights", "few": "is not the weights"}
+    for name, problem in (names | {"nan": "not finite", "large": "bytes"}).items():
+        with pytest.raises(InputError, match=problem) as error:
+            load_prior(path=tmp_path / f"{name}.safetensors")
+        assert f"{name}.safetensors" in str(error.value) and "light_prior=false" in str(error.value)
+        assert "\n" not in str(error.value)
+
+
+def test_estimates_do_not_depend_on_the_number_type_of_the_mask():
+    exposure, clipped = photo()
+    one = combined_estimates(exposure, clipped, small_prior(), torch.from_numpy(np.zeros((20, 30, 3), np.float16)), 0.2)
+    assert torch.equal(one, combined_estimates(exposure, clipped, small_prior()))

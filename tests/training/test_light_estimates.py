@@ -1,0 +1,50 @@
+"""Estimates of clipped light as a training takes them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.response import response_by_name
+from sehdr_warp.runs.config import LossConfig
+from sehdr_warp.scene import Camera, View
+from sehdr_warp.training.light_estimates import light_estimates
+from sehdr_warp.training.targets import photo_source
+
+SRGB = response_by_name("srgb")
+CPU = torch.device("cpu")
+
+
+def view(code, stated=None, deviation=0.0):
+    """A photo 12 x 10 of one code; stated: light above white."""
+    codes = np.full((10, 12, 3), code, np.uint8)
+    above = None if stated is None else np.full(codes.shape, stated, np.float16)
+    camera = Camera(12, 10, 12.0, 12.0, 6.0, 5.0, np.eye(4))
+    return View("a", codes, camera, 1.0, "train", light_above_white=above, light_above_white_deviation=deviation)
+
+
+def test_gain_maps_count_without_the_prior():
+    views = [view(255, stated=4.0, deviation=0.5), view(100)]
+    first, second = light_estimates(views, SRGB, LossConfig(light_prior=False), CPU)
+    assert first[0, 0].tolist() == pytest.approx([np.log(4)] * 3 + [2.0] * 3, rel=1e-3)
+    assert (second == 0).all() and second.shape == first.shape
+
+
+@pytest.mark.parametrize(
+    "loss", [LossConfig(clipped_estimate=0.0), LossConfig(clipping=False), LossConfig(light_prior=False)]
+)
+def test_nothing_is_estimated_that_does_not_count(loss):
+    assert light_estimates([view(255)], SRGB, loss, CPU) is None
+
+
+def test_nothing_is_estimated_where_nothing_clips_or_exposures_are_not_compared():
+    assert light_estimates([view(254)], SRGB, LossConfig(), CPU) is None
+    assert light_estimates([view(255, stated=4.0, deviation=0.5)], None, LossConfig(), CPU) is None
+
+
+def test_targets_carry_the_estimates():
+    views = [replace(view(255, stated=4.0, deviation=0.5), name=name) for name in "ab"]
+    estimates = light_estimates(views, SRGB, LossConfig(light_prior=False), CPU)
+    source = photo_source(views, 1.0, CPU, truth=False, light=SRGB, estimates=estimates)
+    assert torch.equal(source[1].target.estimates, estimates[1])
