@@ -8,7 +8,7 @@ import torch
 
 from sehdr_warp.kernels.constants import TILE_SIZE
 from sehdr_warp.rasterizer.cuda_graphs import CudaGraphRunner
-from sehdr_warp.rasterizer.graph_cache import WARMUP_CALLS, forget
+from sehdr_warp.rasterizer.graph_cache import WARMUP_CALLS, clear_graphs
 from sehdr_warp.rasterizer.rasterization import rasterize
 from sehdr_warp.rasterizer.reference import rasterize_reference
 
@@ -122,7 +122,7 @@ def _from_the_start(variant: Variant) -> Variant:
         for _ in range(WARMUP_CALLS + 2):
             variant.once()
 
-    return Variant(calls, prepare=forget)
+    return Variant(calls, prepare=clear_graphs)
 
 
 def _rows(scene: SplatScene, peer: bool, repetitions: int) -> list[dict]:

@@ -15,8 +15,11 @@ from .geometry import geometry, vector
 
 @cache
 def harmonic_functions(dtype):
-    """Two functions: the direction from a camera to a place with the inverse of its length, 0 all where they are the
-    same; and Y_k(x, y, z) of a unit direction."""
+    """Return two functions: direction_of() and harmonic(), which is Y_k(x, y, z) of a unit direction.
+
+    direction_of() returns the unit direction from a camera to a place and the inverse of their distance. All four are 0
+    if the two coincide or if the distance is not finite.
+    """
     g = geometry(dtype)
     real, vec3, vec4 = g.real, g.vec3, g.vec4
 
@@ -24,10 +27,11 @@ def harmonic_functions(dtype):
     def direction_of(place: vec3, camera: vec3) -> vec4:
         offset = place - camera
         square = wp.dot(offset, offset)
-        inverse = real(0.0)
-        if square > real(1.0e-30):
+        direction = vec4()
+        if square > real(1.0e-30) and wp.isfinite(square):
             inverse = real(1.0) / wp.sqrt(square)
-        return vec4(offset[0] * inverse, offset[1] * inverse, offset[2] * inverse, inverse)
+            direction = vec4(offset[0] * inverse, offset[1] * inverse, offset[2] * inverse, inverse)
+        return direction
 
     @wp.func
     def harmonic(k: int, x: real, y: real, z: real) -> real:
@@ -72,8 +76,11 @@ def harmonic_functions(dtype):
 
 @cache
 def turn_function(dtype, degree: int):
-    """A function: the gradient by a mean of the sum of weights times harmonics, of which the first is number 1, and a
-    vector of as many. direction: direction_of() the mean."""
+    """Return turn() and the vector type of its weights.
+
+    turn() is the gradient, with respect to a mean, of the sum of weights times harmonics; weights[0] belongs to
+    harmonic number 1. Its `direction` is direction_of() the mean.
+    """
     g = geometry(dtype)
     real, vec3, vec4 = g.real, g.vec3, g.vec4
     weight_vector = vector(max((degree + 1) * (degree + 1) - 1, 1), dtype)
@@ -133,10 +140,10 @@ def turn_function(dtype, degree: int):
 
 @cache
 def harmonics_kernel(dtype, degree: int):
-    """values[i] = sum of coefficient[i, k] * Y_k(direction) over all k of degrees up to `degree`, three channels at
-    once.
+    """Return the kernel of values[i] = sum of coefficient[i, k] * Y_k(direction) over all k of degrees up to `degree`.
 
-    constant: [N, 1] vec3, the coefficient of Y_0; rest: [N, at least (degree + 1)^2 - 1] vec3.
+    One thread sums the three channels of a Gaussian. constant: [N, 1] vec3, the coefficient of Y_0; rest: [N, at least
+    (degree + 1)^2 - 1] vec3.
     """
     vec3 = geometry(dtype).vec3
     direction_of, harmonic = harmonic_functions(dtype)
@@ -159,11 +166,10 @@ def harmonics_kernel(dtype, degree: int):
 
 @cache
 def channels_kernel(dtype, degree: int, turning: bool):
-    """harmonics_kernel() with a thread for each channel: neighbouring threads read neighbouring numbers, as a GPU likes
-    best.
+    """Return harmonics_kernel() with one thread for each channel, so that reads coalesce on a GPU.
 
     constant, rest: [N, ..., 3], values: [N, 3]. turns, if `turning`: [N, 3] vec3, the gradient of each channel's value
-    by the centre. Covers [0, 3 N).
+    with respect to the mean. Launched over 3 N threads.
     """
     vec3 = geometry(dtype).vec3
     direction_of, harmonic = harmonic_functions(dtype)
@@ -192,9 +198,30 @@ def channels_kernel(dtype, degree: int, turning: bool):
 
 
 @cache
+def zero_if_unused(dtype):
+    """Return a function that drops gradients that are not finite of a Gaussian whose values nothing used.
+
+    0 times a NaN or infinite coefficient is NaN, and the camera's gradient sums over all Gaussians.
+    """
+    g = geometry(dtype)
+    real, vec3 = g.real, g.vec3
+
+    @wp.func
+    def without_nan(by_mean: vec3, gradient: vec3) -> vec3:
+        result = by_mean
+        if gradient[0] == real(0.0) and gradient[1] == real(0.0) and gradient[2] == real(0.0):
+            if not wp.isfinite(by_mean):
+                result = vec3()
+        return result
+
+    return without_nan
+
+
+@cache
 def turns_adjoint_kernel(dtype):
-    """mean_gradients[i]: the sum over the channels of value_gradients[i, c] turns[i, c]. Covers [0, N)."""
+    """Return the kernel of mean_gradients[i] = sum over c of value_gradients[i, c] * turns[i, c], over N threads."""
     vec3 = geometry(dtype).vec3
+    without_nan = zero_if_unused(dtype)
 
     @wp.kernel(module="unique", module_options=FORWARD)
     def turns_adjoint(
@@ -203,18 +230,21 @@ def turns_adjoint_kernel(dtype):
     ):
         i = first + wp.tid()
         gradient = value_gradients[i]
-        mean_gradients[i] = gradient[0] * turns[i, 0] + gradient[1] * turns[i, 1] + gradient[2] * turns[i, 2]
+        by_mean = gradient[0] * turns[i, 0] + gradient[1] * turns[i, 1] + gradient[2] * turns[i, 2]
+        mean_gradients[i] = without_nan(by_mean, gradient)
 
     return turns_adjoint
 
 
 @cache
 def harmonics_adjoint_kernel(dtype, degree: int, coefficients: bool):
-    """The adjoint of harmonics_kernel by centres and, if `coefficients`, by those, written rather than added to.
+    """Return the adjoint of harmonics_kernel() with respect to means and, if `coefficients`, to those.
 
-    value_gradients, mean_gradients: [N] vec3; constant_gradients, rest_gradients: as the coefficients; those of higher
-    degrees are set to 0. By the camera's position the gradient is the sum of mean_gradients, negated.
+    Gradients are written, not accumulated. value_gradients, mean_gradients: [N] vec3; constant_gradients,
+    rest_gradients: as the coefficients; those of higher degrees are set to 0. The gradient with respect to the camera's
+    position is the negative sum of mean_gradients.
     """
+    without_nan = zero_if_unused(dtype)
     vec3 = geometry(dtype).vec3
     direction_of, harmonic = harmonic_functions(dtype)
     turn, weight_vector = turn_function(dtype, degree)
@@ -242,15 +272,14 @@ def harmonics_adjoint_kernel(dtype, degree: int, coefficients: bool):
         weights = weight_vector()
         for k in range(wp.static(used)):
             weights[k] = wp.dot(rest[i, k], gradient)
-        mean_gradients[i] = turn(weights, direction)
+        mean_gradients[i] = without_nan(turn(weights, direction), gradient)
 
     return harmonics_adjoint
 
 
 @cache
 def basis_kernel(dtype, degree: int):
-    """basis[v, k, i] = Y_k of the direction from position v to mean i, for all k of degrees up to `degree`; [V, K, N].
-    Covers [0, V N)."""
+    """Return the kernel of basis[v, k, i] = Y_k(direction from position v to mean i), [V, K, N], over V N threads."""
     vec3 = geometry(dtype).vec3
     direction_of, harmonic = harmonic_functions(dtype)
 
@@ -271,8 +300,11 @@ def basis_kernel(dtype, degree: int):
 
 @cache
 def coefficient_gradient(dtype, count: int):
-    """A function: the gradient by one number of coefficients [N, count, 3], counted through, of which the first is
-    number `start`; 0 for those whose basis [V, K, N] is not there. value_gradients: [V, N, 3]."""
+    """Return the function that computes one number of the gradient with respect to coefficients [N, count, 3].
+
+    place: index of the number in the flat gradient. start: index of the first coefficient; those beyond the basis
+    [V, K, N] have gradient 0. value_gradients: [V, N, 3].
+    """
     real = dtype
 
     @wp.func
@@ -293,10 +325,10 @@ def coefficient_gradient(dtype, count: int):
 
 @cache
 def coefficient_adjoint_kernel(dtype, count: int):
-    """The adjoint by coefficients with a thread for each of their numbers: neighbouring threads write neighbouring
-    ones. A GPU takes several times as long where one thread writes all of a Gaussian.
+    """Return the adjoint with respect to coefficients, with one thread for each number so that writes coalesce.
 
-    gradients: [3 N count], otherwise as coefficient_gradient() takes them. Covers [0, 3 N count).
+    A GPU takes several times as long if one thread writes all coefficients of a Gaussian. gradients: [3 N count], which
+    is also the number of threads; otherwise as coefficient_gradient() takes them.
     """
     gradient_of = coefficient_gradient(dtype, count)
 

@@ -1,8 +1,8 @@
 """Projection of 3D Gaussians to 2D Gaussians (EWA splatting, Zwicker et al. 2001, as in 3DGS, Kerbl et al. 2023).
 
-One thread takes one Gaussian to the camera, linearises the perspective at its centre and returns the centre in pixels,
-the inverse of the 2D covariance (the conic), the depth, the opacity and the half-extent of the region in which the
-Gaussian still counts. Everything but the extents is differentiable; Warp generates the adjoint.
+One thread takes one Gaussian to the camera, linearises the perspective at its centre and writes the centre in pixels,
+the inverse of the 2D covariance (the conic), the depth, the opacity and the half-extent of the region in which its
+alpha reaches the threshold. Everything but the extents is differentiable; Warp generates the adjoint.
 
 The covariance is formed as a Gram matrix, M M^T + eps2d I with M = J W R diag(scale), and its determinant as
 |m0 x m1|^2 + eps2d (|m0|^2 + |m1|^2) + eps2d^2 over M's rows (Cauchy-Binet): no term is ever subtracted, so a
@@ -19,10 +19,14 @@ from .geometry import geometry, matrix
 
 @cache
 def projection_kernel(dtype, antialiased: bool):
-    """The projection for one scalar type.
+    """Return the projection kernel for one scalar type.
 
-    antialiased: the opacity is lowered by sqrt(det / det_blurred), so that the low pass keeps a Gaussian's energy
-    (Yu et al. 2024, Mip-Splatting); the factor counts as constant in the adjoint of the covariance.
+    The kernel's `forward_extents` is the forward pass's extents in the adjoint, and None in the forward pass.
+
+    Args:
+        dtype: wp.float32 or wp.float64.
+        antialiased: lower the opacity by sqrt(det / det_blurred), so that the blur by eps2d keeps a Gaussian's energy
+            (Yu et al. 2024, Mip-Splatting). The factor is constant in the adjoint of the covariance.
     """
     g = geometry(dtype)
     real, vec2, vec3, vec4, mat44 = g.real, g.vec2, g.vec3, g.vec4, g.mat44
@@ -43,10 +47,16 @@ def projection_kernel(dtype, antialiased: bool):
         opacities: wp.array(dtype=real), world_to_camera: wp.array(dtype=mat44),
         intrinsics: wp.array(dtype=vec4),
         width: int, height: int, near_plane: real, eps2d: real, alpha_threshold: real,
+        forward_extents: wp.array(dtype=vec2),
+        # outputs
         means2d: wp.array(dtype=vec2), conics: wp.array(dtype=vec3), depths: wp.array(dtype=real),
         opacities2d: wp.array(dtype=real), extents: wp.array(dtype=vec2),
     ):
         i = first + wp.tid()
+        # In the adjoint: a culled Gaussian has no gradient, and 0 times an infinite derivative must not become one.
+        if forward_extents:
+            if forward_extents[i][0] <= real(0.0):
+                return
         pose = world_to_camera[0]
         lens = intrinsics[0]
         fx = lens[0]
@@ -96,7 +106,12 @@ def projection_kernel(dtype, antialiased: bool):
         if wp.static(antialiased):
             opacity = opacity * compensation(determinant, blurred)
 
-        usable = in_front and blurred > real(1.0e-12) and wp.isfinite(blurred) and opacity > alpha_threshold
+        # wp.clamp() makes a bound of NaN, so the sizes are tested themselves.
+        finite = (
+            wp.isfinite(blurred) and wp.isfinite(opacity) and wp.isfinite(log_scale[0]) and wp.isfinite(log_scale[1])
+            and wp.isfinite(log_scale[2])
+        )
+        usable = in_front and blurred > real(1.0e-12) and finite and opacity > alpha_threshold
         extent_x = real(0.0)
         extent_y = real(0.0)
         if usable:

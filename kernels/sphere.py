@@ -40,12 +40,18 @@ def projection_kernel(dtype, antialiased: bool):
         means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quaternions: wp.array(dtype=vec4),
         opacities: wp.array(dtype=real), position: wp.array(dtype=vec3),
         near_plane: real, footprint: real, smoothing: real, alpha_threshold: real,
+        forward_distances: wp.array(dtype=real),
+        # outputs
         caps: wp.array(dtype=vec4), across: wp.array(dtype=vec3), along: wp.array(dtype=vec3),
         opacities2d: wp.array(dtype=real), distances: wp.array(dtype=real),
     ):
         # The limits below that nothing usable reaches keep the adjoint of a square root from dividing by 0.
         tiny = real(1.0e-30)
         i = first + wp.tid()
+        # As in project.py: in the adjoint a culled Gaussian has no gradient.
+        if forward_distances:
+            if forward_distances[i] <= real(0.0):
+                return
         offset = means[i] - position[0]
         distance = wp.length(offset)
         usable = distance > near_plane
@@ -83,6 +89,8 @@ def projection_kernel(dtype, antialiased: bool):
         v11 = wp.dot(m1, m1) + eps2d
         v01 = wp.dot(m0, m1)
         usable = usable and blurred > tiny and wp.isfinite(blurred) and opacity > alpha_threshold
+        usable = usable and wp.isfinite(opacity) and wp.isfinite(log_scale[0]) and wp.isfinite(log_scale[1])
+        usable = usable and wp.isfinite(log_scale[2])
         if usable:
             level = real(2.0) * wp.log(opacity / alpha_threshold)
             half = real(0.5) * (v00 + v11)

@@ -1,6 +1,6 @@
 """Which Gaussian touches which tile, front to back.
 
-`pack_gaussians` counts the tiles that each Gaussian's ellipse really touches (not its bounding box), and a prefix sum
+`pack_splats` counts the tiles that each Gaussian's ellipse really touches (not its bounding box), and a prefix sum
 over the counts gives every Gaussian its range of intersections. Two ways lead to lists in depth order, by stable sorts:
 Gaussians are put in it, `emit_intersections` fills their ranges, and a sort of the intersections by tile leaves each
 tile's list in the order in which they were emitted (the GPU has least to do); or `emit_keys` fills the ranges of the
@@ -25,7 +25,7 @@ farther ones are alike."""
 
 @cache
 def tile_kernels(dtype) -> SimpleNamespace:
-    """pack_gaussians, key_by_depth, emit_intersections, emit_keys and gather_intersections for one scalar type."""
+    """pack_splats, key_by_depth, emit_intersections, emit_keys and gather_intersections for one scalar type."""
     g = geometry(dtype)
     real, vec2, vec3, vec4 = g.real, g.vec2, g.vec3, g.vec4
     reals, reals2d = wp.array(dtype=real), wp.array2d(dtype=real)
@@ -50,7 +50,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
         )
 
     @wp.kernel(module="unique", module_options=options)
-    def pack_gaussians(
+    def pack_splats(
         first: int,
         means2d: vec2s, conics: wp.array(dtype=vec3), opacities: reals, features: reals2d,
         channels: int, alpha_threshold: real, columns: int, rows: int,
@@ -176,7 +176,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
             rows[i, column] = total
 
     return SimpleNamespace(
-        pack_gaussians=pack_gaussians, key_by_depth=key_by_depth, gather_intersections=gather_intersections,
+        pack_splats=pack_splats, key_by_depth=key_by_depth, gather_intersections=gather_intersections,
         emit_intersections=unsorted(wp.int32, by_depth=False), emit_keys=unsorted(wp.int64, by_depth=True),
     )
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,18 +11,24 @@ from ..kernels import blend_cpu, blend_cuda, blend_cuda_adjoint
 from ..kernels.constants import TILE_SIZE
 from ..kernels.tiles import tile_kernels
 from ..parallel import thread_count
-from .tile_lists import ONE_SORT, TileLists, UnsortedIntersections
+from .tile_lists import ONE_SORT, PackedSplats, TileLists, UnsortedIntersections
+from .torch_contract import keeps_graph
 from .warp_launch.launching import launch, warp_scalar
 
-PIECES_PER_THREAD = 16
-"""Of the image, on the CPU: some take longer than their intersections tell."""
+PIECES_PER_THREAD = 16  # Of the image, on the CPU: their work differs by more than their intersections.
 Adjoint = Callable[[Tensor, Tensor | None], Tensor]
-"""The backward pass: from the gradients by image and transmittance (None for 0) to those by Gaussian, [N, C + 6 or
-more]: features, conic a b c, x, y, opacity, and what fills up a row."""
+"""Maps the gradients by image and transmittance (None for 0) to those by Gaussian, [N, C + 6 or more]: features, conic
+a b c, x, y, opacity, and columns that pad a row."""
 
 
 class BlendResult(NamedTuple):
-    """image [H, W, C], transmittance [H, W], and how to differentiate them; with no graph behind them."""
+    """A blended image and its adjoint, with no graph behind them.
+
+    Attributes:
+        image: [H, W, C].
+        transmittance: [H, W].
+        adjoint: their backward pass.
+    """
 
     image: Tensor
     transmittance: Tensor
@@ -35,46 +41,56 @@ def blend(
     opacities: Tensor,
     features: Tensor,
     lists: TileLists,
-    records: tuple[Tensor, Tensor],
+    packed: PackedSplats,
     alpha_threshold: float,
     deterministic: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Blend features [N, C] over the tile lists: image [H, W, C] and the transmittance left [H, W].
+    """Blend features over the tile lists; return the image [H, W, C] and the transmittance [H, W].
 
-    Differentiable once with respect to means2d [N, 2], conics [N, 3], opacities [N] and features. Which intersections
-    count is decided by the lists and by alpha_threshold, and taken as given in the derivative.
+    Differentiable once with respect to the first four. Which intersections count is decided by the lists and by
+    alpha_threshold, and is constant in the derivative.
 
-    records: pack_gaussians()'s of these means2d, conics and opacities, and of alpha_threshold.
-    deterministic: on a GPU gradients are summed in a fixed order, as the CPU always does: slower, and the gradients of
-    every (Gaussian, tile) pair take memory.
+    Args:
+        means2d: [N, 2].
+        conics: [N, 3].
+        opacities: [N].
+        features: [N, C].
+        lists: of the Gaussians.
+        packed: of means2d, conics, opacities and alpha_threshold.
+        alpha_threshold: contributions with a smaller alpha are left out.
+        deterministic: on a GPU, sum gradients in a fixed order, as the CPU always does. Slower, and the gradients of
+            every intersection take memory.
     """
     rows = features.detach()
     image = rows.new_empty(lists.height, lists.width, rows.shape[1])
     transmittance = rows.new_empty(image.shape[:2])
     backend = blend_on_cuda if rows.device.type == "cuda" else blend_on_cpu
-    # The adjoint keeps one of them, and must not keep what torch makes a result of: it would keep itself.
-    given = rows, lists, records, image.detach(), transmittance.detach(), alpha_threshold, deterministic
-    return with_gradient(means2d, conics, opacities, features, BlendResult(image, transmittance, backend(*given)))
+    # The adjoint keeps some of these. It must not keep the results of the node that keeps it: detached are others.
+    adjoint = backend(rows, lists, packed, image.detach(), transmittance.detach(), alpha_threshold, deterministic)
+    return with_gradient(means2d, conics, opacities, features, BlendResult(image, transmittance, adjoint))
 
 
-def with_gradient(means2d, conics, opacities, features, picture: BlendResult) -> tuple[Tensor, Tensor]:
-    """A picture's image and transmittance, as functions of what it was drawn from."""
-    return _Blend.apply(means2d, conics, opacities, features, picture)
+def with_gradient(means2d, conics, opacities, features, result: BlendResult) -> tuple[Tensor, Tensor]:
+    """Return a result's image and transmittance as differentiable functions of what they were blended from."""
+    return _Blend.apply(means2d, conics, opacities, features, result)
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means2d, conics, opacities, features, picture: BlendResult):
-        ctx.sizes, ctx.adjoint = picture.image.shape, picture.adjoint
+    def forward(ctx, means2d, conics, opacities, features, result: BlendResult):
+        ctx.sizes, ctx.adjoint = result.image.shape, result.adjoint
+        # The adjoint reads them: torch then raises its own error if one is changed in place before.
+        ctx.save_for_backward(features, result.transmittance)
         ctx.set_materialize_grads(False)
-        return picture.image, picture.transmittance
+        return result.image, result.transmittance
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, by_image, by_transmittance):
-        adjoint, ctx.adjoint = ctx.adjoint, None
-        if adjoint is None:
-            raise RuntimeError("this blend was already differentiated once; run its forward pass again")
+        _ = ctx.saved_tensors  # Raises torch's errors for a freed graph and for changes in place.
+        adjoint = ctx.adjoint
+        if not keeps_graph():
+            ctx.adjoint = None
         if by_image is None and by_transmittance is None:
             return (None,) * 5
         _, width, channels = ctx.sizes
@@ -90,9 +106,15 @@ class _Blend(torch.autograd.Function):
 
 
 def blend_on_cpu(
-    features, lists: TileLists, records, image, left_over, alpha_threshold: float, deterministic: bool
+    features: Tensor,
+    lists: TileLists,
+    packed: PackedSplats,
+    image: Tensor,
+    transmittance: Tensor,
+    alpha_threshold: float,
+    deterministic: bool,
 ) -> Adjoint:
-    """Fill image [H, W, C] and left_over [H, W], the transmittance: balanced pieces of tiles, a thread each."""
+    """Fill image [H, W, C] and transmittance [H, W]: balanced pieces of tiles, a thread each."""
     scalar, unsorted = warp_scalar(features.dtype), lists.unsorted
     assert unsorted is not None, "sums in a fixed order need the intersections as they were emitted"
     height, width, channels = image.shape
@@ -103,41 +125,43 @@ def blend_on_cpu(
         return features.new_empty(tile_count, *shape, blend_cpu.LANES)
 
     iota, count = torch.arange(blend_cpu.LANES, dtype=features.dtype), blend_cpu.HALVES * TILE_SIZE
+    shapes, ellipses = packed.shapes, packed.ellipses
     frame = features, lists.columns, width, height, alpha_threshold, iota
-    transmittance, last = rows(count), rows(count)
+    tile_transmittance, last = rows(count), rows(count)
     launch(
         blend_cpu.forward_kernel(*kind),
         tile_count,
-        *(lists.ranges, lists.gaussians, *records, *frame),
-        *(transmittance, rows(channels, count), last, image.view(-1, channels), left_over),
+        *(lists.ranges, lists.gaussians, shapes, ellipses, *frame),
+        *(tile_transmittance, rows(channels, count), last, image.view(-1, channels), transmittance),
         ranges=pieces,
     )
 
-    def backward(image_gradient: Tensor, left_over_gradient: Tensor | None) -> Tensor:
-        if left_over_gradient is None:
-            left_over_gradient = torch.zeros_like(left_over)
+    def backward(by_image: Tensor, by_transmittance: Tensor | None) -> Tensor:
+        if by_transmittance is None:
+            by_transmittance = torch.zeros_like(transmittance)
+        # The kernel walks it back to the front in place.
+        walked = tile_transmittance.clone() if keeps_graph() else tile_transmittance
         scratch = rows(count), rows(channels, count), rows(TILE_SIZE), rows(TILE_SIZE), rows(channels + 6)
-        intersection_gradients = features.new_empty(lists.intersection_count, channels + 6)
+        by_intersection = features.new_empty(lists.intersection_count, channels + 6)
         launch(
             blend_cpu.backward_kernel(*kind),
             tile_count,
-            *(lists.ranges, lists.gaussians, unsorted.places, *records, *frame, last),
-            *(image_gradient.view(-1, channels), left_over_gradient, transmittance, *scratch, intersection_gradients),
+            *(lists.ranges, lists.gaussians, unsorted.places, shapes, ellipses, *frame, last),
+            *(by_image.view(-1, channels), by_transmittance, walked, *scratch, by_intersection),
             ranges=pieces,
         )
-        return gather_by_gaussian(unsorted, intersection_gradients)
+        return gather_by_gaussian(unsorted, by_intersection)
 
     return backward
 
 
 def halvings(alpha_threshold: float) -> int:
-    """How often the CPU's polynomial exponential halves its argument to reach down to log(alpha_threshold)."""
+    """Return how often the CPU's polynomial exponential halves its argument to reach down to log(alpha_threshold)."""
     return max(1, math.ceil(math.log2(-math.log(alpha_threshold) / 0.7)))
 
 
 def balanced_pieces(lists: TileLists) -> Tensor:
-    """[K + 1] int32: where ranges of tiles begin that hold about the same number of intersections each, and where the
-    last one ends."""
+    """Return [K + 1] int32: where ranges of tiles with about the same work begin, and where the last one ends."""
     tile_count = lists.ranges.shape[0]
     work = (lists.ranges[:, 1] - lists.ranges[:, 0]).add(16).cumsum(0).double()  # 16: a tile costs something in itself
     pieces = min(thread_count() * PIECES_PER_THREAD, tile_count)
@@ -148,60 +172,73 @@ def balanced_pieces(lists: TileLists) -> Tensor:
 
 
 def blend_on_cuda(
-    features, lists: TileLists, records, image, transmittance, alpha_threshold: float, deterministic: bool
+    features: Tensor,
+    lists: TileLists,
+    packed: PackedSplats,
+    image: Tensor,
+    transmittance: Tensor,
+    alpha_threshold: float,
+    deterministic: bool,
 ) -> Adjoint:
-    """Fill image [H, W, C] and transmittance [H, W] by block kernels (also on CPU fibers, where tests ask for them)."""
+    """Fill image [H, W, C] and transmittance [H, W] by block kernels (in tests also on fibers of the CPU)."""
     scalar, cuda = warp_scalar(features.dtype), features.device.type == "cuda"
     height, width, channels = image.shape
-    rows = padded(features)
-    last = blend_blocks(rows, lists, records, image, transmittance, alpha_threshold)
-    # Padded they are larger, and few are not padded again.
-    count, kept = len(features), rows if len(features) <= ONE_SORT else features
+    rows = pad_features(features)
+    last = blend_blocks(rows, lists, packed, image, transmittance, alpha_threshold)
+    # Padded features are larger; few are kept so that they need not be padded again.
+    count, features = len(features), rows if len(features) <= ONE_SORT else features
+    shapes, ellipses = packed.shapes, packed.ellipses
     del rows
 
-    def backward(image_gradient: Tensor, transmittance_gradient: Tensor | None) -> Tensor:
-        if transmittance_gradient is None:
-            transmittance_gradient = transmittance.view(-1)[:0]
+    def backward(by_image: Tensor, by_transmittance: Tensor | None) -> Tensor:
+        if by_transmittance is None:
+            by_transmittance = transmittance.view(-1)[:0]
         kernel = blend_cuda_adjoint.backward_kernel(scalar, channels, deterministic, cuda)
-        listed, frame = (lists.ranges, lists.gaussians, lists.corners), (lists.columns, width, height, alpha_threshold)
-        gradients, sizes = (image_gradient, transmittance_gradient), (blend_cuda_adjoint.ROWS, channels + 6)
-        given = *listed, *records, padded(kept).reshape(-1, 4), *frame, transmittance, last, *gradients, *sizes
+        columns = channels + 6
+        arguments = (
+            *(lists.ranges, lists.gaussians, lists.corners, shapes, ellipses, pad_features(features).reshape(-1, 4)),
+            *(lists.columns, width, height, alpha_threshold, transmittance, last, by_image, by_transmittance),
+            *(blend_cuda_adjoint.ROWS, columns),
+        )
         if not deterministic:
             by_rows = blend_cuda_adjoint.adds_rows(scalar, deterministic, cuda)
-            columns = channels + 6
             gathered = transmittance.new_zeros(count, blend_cuda.padded_channels(columns) if by_rows else columns)
-            launch_blocks(kernel, lists, blend_cuda.BLOCKS_PER_TILE, *given, 0, lists.gaussians, gathered)
+            launch_blocks(kernel, lists, blend_cuda.BLOCKS_PER_TILE, *arguments, 0, lists.gaussians, gathered)
             return gathered
-        unsorted, by_intersection = lists.unsorted, transmittance.new_zeros(lists.intersection_count, channels + 6)
+        unsorted, by_intersection = lists.unsorted, transmittance.new_zeros(lists.intersection_count, columns)
         assert unsorted is not None, "sums in a fixed order need the intersections as they were emitted"
         for corner in range(blend_cuda.BLOCKS_PER_TILE):
-            launch_blocks(kernel, lists, 1, *given, corner, unsorted.places, by_intersection)
+            launch_blocks(kernel, lists, 1, *arguments, corner, unsorted.places, by_intersection)
         return gather_by_gaussian(unsorted, by_intersection)
 
     return backward
 
 
-def blend_blocks(rows, lists: TileLists, records, image, transmittance, alpha_threshold: float) -> Tensor:
-    """Fill image [H, W, C] and transmittance [H, W] from padded() features. Returns [H W] int32, 1 + list place of the
-    last Gaussian that a pixel shows."""
-    assert lists.corners is not None, "a GPU's lists tell corners"
+def blend_blocks(
+    rows: Tensor, lists: TileLists, packed: PackedSplats, image: Tensor, transmittance: Tensor, alpha_threshold: float
+) -> Tensor:
+    """Fill image [H, W, C] and transmittance [H, W] from pad_features(); return the last Gaussian of each pixel.
+
+    That is [H W] int32, 1 + its place in the tile's list, or 0.
+    """
+    assert lists.corners is not None, "block kernels need lists with corners"
     height, width, channels = image.shape
     last = torch.empty(height * width, dtype=torch.int32, device=rows.device)
     kernel = blend_cuda.forward_kernel(warp_scalar(rows.dtype), channels, rows.device.type == "cuda")
     listed, frame = (lists.ranges, lists.gaussians, lists.corners), (lists.columns, width, height, alpha_threshold)
-    given = *listed, *records, rows.reshape(-1, 4), *frame, image, transmittance, last
-    launch_blocks(kernel, lists, blend_cuda.BLOCKS_PER_TILE, *given)
+    read = *listed, packed.shapes, packed.ellipses, rows.reshape(-1, 4), *frame
+    launch_blocks(kernel, lists, blend_cuda.BLOCKS_PER_TILE, *read, image, transmittance, last)
     return last
 
 
-def launch_blocks(kernel, lists: TileLists, blocks_per_tile: int, *arguments) -> None:
-    """Launches a block kernel over the tiles."""
+def launch_blocks(kernel: Any, lists: TileLists, blocks_per_tile: int, *arguments: Any) -> None:
+    """Launch a block kernel over the tiles."""
     block = blend_cuda.BLOCK_DIM
     launch(kernel, lists.columns * lists.rows * blocks_per_tile * block, *arguments, block_dim=block)
 
 
-def padded(features: Tensor) -> Tensor:
-    """Features [N, C] with columns for whole rows of four, which block kernels read at once."""
+def pad_features(features: Tensor) -> Tensor:
+    """Return features [N, C] with columns for whole rows of four, which block kernels read at once."""
     count, channels = features.shape
     if channels != (columns := blend_cuda.padded_channels(channels)):
         rows = features.new_empty(count, columns)
@@ -211,15 +248,15 @@ def padded(features: Tensor) -> Tensor:
 
 
 def gather_by_gaussian(unsorted: UnsortedIntersections, by_intersection: Tensor) -> Tensor:
-    """[N, columns]: for each Gaussian the sum of its rows of by_intersection [M, columns], front tile to last.
+    """Return [N, columns]: for each Gaussian the sum of its rows of by_intersection [M, columns], first tile to last.
 
-    by_intersection: rows in the order in which intersections were before the sort by tile.
+    by_intersection: rows in the order of intersections before the sort by tile.
     """
-    intersection_count, columns = by_intersection.shape
+    length, columns = by_intersection.shape
     count = unsorted.order.shape[0]
     gathered = by_intersection.new_zeros(count, columns)
-    if intersection_count:
-        ends = unsorted.ends.clamp(0, intersection_count)  # beyond a max_intersections there are no rows
+    if length:
+        ends = unsorted.ends.clamp(0, length)  # Beyond max_intersections there are no rows.
         kernel = tile_kernels(warp_scalar(by_intersection.dtype)).gather_intersections
         launch(kernel, count, unsorted.order, ends, by_intersection, columns, gathered)
     return gathered

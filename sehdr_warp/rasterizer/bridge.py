@@ -1,8 +1,8 @@
-"""Warp programs as differentiable torch operations: the one place where tapes meet autograd.
+"""Warp programs as differentiable torch operations.
 
-A *program* is a function that launches kernels on torch tensors, on a tape, and returns the tensors it wrote.
-`@differentiable` turns it into a torch operation: data is shared, never copied; launches go to torch's current stream;
-the tape is replayed when torch asks for gradients, and not recorded when nobody will.
+A *program* is a function that launches kernels on torch tensors and returns the tensors it wrote. `@differentiable`
+turns it into a torch operation: data is shared, never copied; launches go to torch's current stream; the generated
+adjoints of the kernels run when torch asks for gradients.
 
     @differentiable
     def scaled(program, values, *, gain):
@@ -15,109 +15,104 @@ Positional arguments are tensors and take part in autograd; keyword arguments ar
 
 from collections.abc import Callable, Sequence
 from functools import wraps
-from itertools import accumulate
-from typing import Any, Concatenate, ParamSpec, overload
+from typing import Any, Concatenate, NamedTuple, ParamSpec, overload
 
 import torch
-import warp as wp
 from torch import Tensor
 
+from .gradients import kernel_layout
+from .torch_contract import torch_operation
 from .warp_launch.launching import launch
-from .warp_launch.threads import torch_threads, whole
+from .warp_launch.threads import single_range
 
 P = ParamSpec("P")
 
 
-class Program:
-    """What a program sees while it runs: memory to write to, and a tape that takes its launches."""
+class _Place(int):
+    """Index of a tensor among those of a program."""
 
-    def __init__(self, tensors: Sequence[Tensor], recording: bool):
+
+class _Launch(NamedTuple):
+    """A launch that the backward pass repeats as its adjoint; tensors are given by their places."""
+
+    kernel: Any
+    dim: int | Sequence[int]
+    inputs: list[Any]
+    outputs: list[Any]
+
+
+class Program:
+    """Memory to write to and kernels to launch, as a program's first argument.
+
+    Attributes:
+        device: of the program's tensors.
+    """
+
+    def __init__(self, tensors: Sequence[Tensor], differentiable: bool) -> None:
         self.device = tensors[0].device
-        self.tape = wp.Tape() if recording else None
-        self.constant: set[int] = set()
-        self.gradients: dict[int, Tensor] = {}
-        """By place in `known`: the arguments, then what was written."""
-        self.known: list[Tensor] = []
-        self._places: dict[int, int] = {}
+        self._differentiable, self._launches = differentiable, list[_Launch]()
+        self._tensors: list[Tensor] = []
+        self._places: dict[int, _Place] = {}
+        self._written: set[int] = set()
+        self._constant: set[int] = set()
         for tensor in tensors:
-            self._know(tensor)
+            self._place(tensor)
 
     def write(self, shape: Sequence[int], dtype: torch.dtype = torch.float32, *, differentiable: bool = True) -> Tensor:
-        """A new tensor for one launch to write to. A vector type's components are its last dimension."""
+        """Return a new tensor for one launch to write to. A vector type's components are its last dimension."""
         tensor = torch.empty(tuple(shape), dtype=dtype, device=self.device)
-        if not differentiable:
-            self.constant.add(len(self.known))
-        self._know(tensor)
+        if self._differentiable:
+            place = self._place(tensor)
+            self._written.add(place)
+            if not differentiable or not dtype.is_floating_point:
+                self._constant.add(place)
         return tensor
 
-    def _know(self, tensor: Tensor) -> None:
-        self._places[id(tensor)] = len(self.known)
-        self.known.append(tensor)
-
     def launch(self, kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], outputs: Sequence[Any] = ()) -> None:
-        """Launch a kernel, tensors in the place of its arrays; its generated adjoint runs in the backward pass.
+        """Launch a kernel on tensors in the place of its arrays; its generated adjoint runs in the backward pass.
 
-        inputs: kept until then. outputs: what the kernel writes and does not read; the adjoint does without.
-        A vector or matrix type takes up a tensor's last one or two dimensions. Gradients reach the program's arguments
-        and what it wrote; other tensors are constants.
-        A kernel whose first parameter is an integer `first` adds it to its thread's index and writes only what belongs
-        to that item: it is given the start of a range, and on the CPU ranges run side by side, adjoint too, but for an
-        adjoint that adds to an input which items share.
+        Gradients reach the program's arguments and what it wrote; other tensors are constants.
+
+        A kernel whose first parameter is an integer `first` adds it to its thread index and writes only what belongs to
+        that index. On the CPU it then runs in parallel over ranges of indices, and so does its adjoint, unless that
+        adds to an input which indices share.
+
+        Args:
+            kernel: a Warp kernel, with backward enabled.
+            dim: number of threads.
+            inputs: the kernel's first arguments. A vector or matrix type takes up a tensor's last one or two
+                dimensions.
+            outputs: the kernel's last arguments, which it writes and does not read.
+
+        Raises:
+            TypeError: if a tensor's dtype or number of dimensions does not fit the kernel.
         """
+        _check_dimensions(kernel, (*inputs, *outputs))
         launch(kernel, dim, *inputs, *outputs)
-        if self.tape is None:
-            return
-        gradients, places = self.gradients, [self.place(argument) for argument in (*inputs, *outputs)]
-        kept = [*inputs, *(None,) * len(outputs)]
+        if self._differentiable:
+            places = [[self._place(v) if isinstance(v, Tensor) else v for v in part] for part in (inputs, outputs)]
+            self._launches.append(_Launch(kernel, dim, *places))
 
-        # The tape holds this. If it held the program or the tape, memory would wait for the garbage collector.
-        def adjoint() -> None:
-            given = [gradients.get(place) for place in places]
-            read = zip(inputs, given, strict=False)
-            shared = any(gradient is not None and len(tensor) != dim for tensor, gradient in read)
-            launch(kernel, dim, *kept, gradients=given, ranges=whole(dim) if shared and isinstance(dim, int) else None)
-
-        self.tape.record_func(adjoint, arrays=[])
-
-    def place(self, tensor: Any) -> int:
-        """Under which the gradient of an argument or of what was written is found; -1 for anything else."""
-        return self._places.get(id(tensor), -1)
+    def _place(self, tensor: Tensor) -> _Place:
+        """Return the tensor's place; one that is neither an argument nor written becomes a constant of the program."""
+        place = self._places.get(id(tensor))
+        if place is None:
+            place = self._places[id(tensor)] = _Place(len(self._tensors))
+            self._tensors.append(tensor)
+        return place
 
 
-def zero_gradients(tensors: Sequence[Tensor], needed: Sequence[bool], leaves: Sequence[bool]) -> list[Tensor | None]:
-    """For each tensor that needs a gradient zeros to add it to, for others None. leaves: which of them are leaves."""
-    made: dict[int, Tensor] = {}
-    device = tensors[0].device
-    if device.type != "cpu":
-        # Leaves, whose gradients stay, have them in one memory; others' are soon let go, each by itself.
-        kept = [place for place, need in enumerate(needed) if need and leaves[place]]
-        made.update(zip(kept, _zeros_together([tensors[place] for place in kept]), strict=False))
-    with torch_threads(device):
-        for place, need in enumerate(needed):
-            if need and place not in made:
-                made[place] = torch.zeros_like(tensors[place], memory_format=torch.contiguous_format)
-    return [made.get(place) for place in range(len(tensors))]
-
-
-def kernel_layout(gradient: Tensor | None) -> Tensor | None:
-    """A gradient as kernels read it: any rows, but a vector in one piece."""
-    if gradient is None or gradient.ndim < 2 or gradient.is_contiguous():
-        return gradient
-    if gradient.stride(1) == 1 if gradient.ndim == 2 else gradient[0].is_contiguous():
-        return gradient
-    return gradient.contiguous()
-
-
-def _zeros_together(tensors: list[Tensor]) -> list[Tensor]:
-    """Zeros of the tensors' shapes, filled by a single launch; none where they are not several of one type, each
-    contiguous."""
-    alike = len({tensor.dtype for tensor in tensors}) == 1 and all(tensor.is_contiguous() for tensor in tensors)
-    if len(tensors) < 2 or not alike:
-        return []
-    # Each starts at a multiple of 64 numbers, as memory of its own would.
-    rooms = [-(-tensor.numel() // 64) * 64 for tensor in tensors]
-    whole, starts = tensors[0].new_zeros(sum(rooms)), accumulate(rooms, initial=0)
-    return [whole.as_strided(t.shape, t.stride(), start) for t, start in zip(tensors, starts, strict=False)]
+def _check_dimensions(kernel: Any, values: Sequence[Any]) -> None:
+    """Raise TypeError for a tensor with more dimensions than the kernel's array."""
+    parameters = kernel.adj.args[-len(values) :] if values else []
+    for parameter, value in zip(parameters, values, strict=False):
+        if isinstance(value, Tensor) and hasattr(parameter.type, "dtype"):
+            expected = parameter.type.ndim + len(getattr(parameter.type.dtype, "_shape_", ()))
+            if value.ndim > expected:
+                raise TypeError(
+                    f"{kernel.key}(): {parameter.label} takes a tensor with {expected} dimensions, "
+                    f"got one of shape {list(value.shape)}"
+                )
 
 
 class _ProgramFunction(torch.autograd.Function):
@@ -127,32 +122,56 @@ class _ProgramFunction(torch.autograd.Function):
         program = Program(plain, True)
         result = body(program, *plain, **options)
         outputs = result if isinstance(result, tuple) else (result,)
-        places = [program.place(tensor) for tensor in outputs]
-        # torch makes this node the origin of what it is given: held by the tape as well, neither would ever be freed.
-        given = tuple(tensor.detach() for tensor in outputs)
-        ctx.mark_non_differentiable(*(t for t, place in zip(given, places, strict=True) if place in program.constant))
+        launches, known = program._launches, program._tensors
+        places = [program._places.get(id(tensor), -1) for tensor in outputs]
+        if not program._written.issuperset(places):
+            raise TypeError(f"{body.__name__}() returns a tensor that program.write() did not make")
+        # Torch makes this node the origin of what it returns; saved as well, neither would ever be freed.
+        returned = tuple(tensor.detach() for tensor in outputs)
+        ctx.mark_non_differentiable(
+            *(t for t, place in zip(returned, places, strict=True) if place in program._constant)
+        )
         ctx.set_materialize_grads(False)
-        ctx.tape, ctx.gradients, ctx.plain, ctx.places = program.tape, program.gradients, plain, places
-        ctx.leaves = [tensor.is_leaf for tensor in tensors]
-        passed = {*range(len(plain)), *places, *program.constant}
-        ctx.between = {place: t for place, t in enumerate(program.known) if place not in passed}
-        return given if isinstance(result, tuple) else given[0]
+        read = {value for each in launches for value in each.inputs if isinstance(value, _Place)}
+        ctx.save_for_backward(*(tensor if place in read else None for place, tensor in enumerate(known)))
+        ctx.launches, ctx.places = launches, places
+        ctx.argument_likes = [(tensor.shape, tensor.dtype) for tensor in plain]
+        ctx.between = (program._written - program._constant) & read
+        return returned if isinstance(result, tuple) else returned[0]
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, *upstream):
-        tape, plain, gradients = ctx.tape, ctx.plain, ctx.gradients
-        if tape is None:
-            raise RuntimeError("this Warp operation was already differentiated once; run its forward pass again")
-        ctx.tape = ctx.plain = ctx.gradients = None
-        gradients |= {
-            p: kernel_layout(given) for p, given in zip(ctx.places, upstream, strict=True) if given is not None
-        }
-        gradients |= {place: torch.zeros_like(tensor) for place, tensor in ctx.between.items()}
-        results = zero_gradients(plain, ctx.needs_input_grad[2:], ctx.leaves)
-        gradients |= {place: made for place, made in enumerate(results) if made is not None}
-        tape.backward()
-        return (None, None, *results)
+        saved, needed = ctx.saved_tensors, ctx.needs_input_grad[2:]
+        device = next((gradient.device for gradient in upstream if gradient is not None), None)
+        if device is None:
+            return (None,) * (2 + len(needed))
+        gradients: dict[int, Tensor] = {place: torch.zeros_like(saved[place]) for place in ctx.between}
+        for place, (shape, dtype) in enumerate(ctx.argument_likes):
+            if needed[place]:
+                gradients[place] = torch.zeros(shape, dtype=dtype, device=device)
+        for place, gradient in zip(ctx.places, upstream, strict=True):
+            if gradient is None:
+                continue
+            if place in gradients:  # The adjoint of a later launch adds to it, and torch's own must stay as it is.
+                gradients[place] += gradient
+            else:
+                gradients[place] = kernel_layout(gradient)
+        for each in reversed(ctx.launches):
+            _launch_adjoint(each, saved, gradients)
+        return None, None, *(gradients.get(place) if need else None for place, need in enumerate(needed))
+
+
+def _launch_adjoint(forward: _Launch, saved: Sequence[Tensor | None], gradients: dict[int, Tensor]) -> None:
+    kernel, dim, inputs, outputs = forward
+    values = [saved[value] if isinstance(value, _Place) else value for value in inputs]
+    by_value = [gradients.get(v) if isinstance(v, _Place) else None for v in (*inputs, *outputs)]
+    if all(gradient is None for gradient in by_value):
+        return
+    pairs = zip(values, by_value, strict=False)
+    shared = any(gradient is not None and len(tensor) != dim for tensor, gradient in pairs)
+    ranges = single_range(dim) if shared and isinstance(dim, int) else None
+    launch(kernel, dim, *values, *(None,) * len(outputs), gradients=by_value, ranges=ranges)
 
 
 @overload
@@ -166,17 +185,33 @@ def differentiable(body: Callable[Concatenate[Program, P], Tensor]) -> Callable[
 def differentiable(body: Callable[..., Any]) -> Callable[..., Any]:
     """Make a torch operation of a program.
 
-    The operation takes the tensors positionally (on one device) and the options by keyword, returns the tensors that
-    body returns, and can be differentiated once with respect to every positional tensor.
+    The operation takes the tensors positionally (on one device) and the options by keyword, and returns the tensors
+    that body returns. It can be differentiated once with respect to every positional tensor, also repeatedly through
+    a retained graph; a tensor that is changed in place before that raises torch's own error.
 
     Args:
         body: body(program, *tensors, **options) -> tensors made by program.write().
     """
 
+    @torch_operation
     @wraps(body)
     def operation(*tensors: Tensor, **options: Any) -> Any:
+        _check_tensors(body, tensors)
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
             return _ProgramFunction.apply(body, options, *tensors)
         return body(Program(tensors, False), *tensors, **options)
 
     return operation
+
+
+def _check_tensors(body: Callable[..., Any], tensors: Sequence[Any]) -> None:
+    name = getattr(body, "__name__", "the operation")
+    if not tensors:
+        raise TypeError(f"{name}() got no tensor, expected at least one positional argument")
+    for place, value in enumerate(tensors):
+        if not isinstance(value, Tensor):
+            raise TypeError(f"{name}(): argument {place} is a {type(value).__name__}, expected a torch tensor")
+        if value.device != tensors[0].device:
+            raise ValueError(
+                f"{name}(): argument {place} is on {value.device}, but argument 0 is on {tensors[0].device}"
+            )

@@ -11,7 +11,8 @@ from torch import Tensor
 from ..kernels.clipped_light import clipped_light_kernel, clipped_light_patch_kernel, clipped_logarithms_kernel
 from . import patches
 from .code_residual import CODES, WHITE
-from .warp_launch.launching import launch, scale_gradient, warp_scalar
+from .gradients import scale_gradient
+from .warp_launch.launching import launch, warp_scalar
 
 
 @dataclass(frozen=True)

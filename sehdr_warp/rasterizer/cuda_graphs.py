@@ -1,7 +1,7 @@
-"""Torch and Warp work recorded as one CUDA graph.
+"""Capture torch operations and Warp launches as one CUDA graph.
 
 A training step is some sixty kernels of a few microseconds each: launched one by one, the host takes several times as
-long as the GPU. Recorded once and replayed, the GPU sets the pace.
+long as the GPU. Captured once and replayed, the GPU sets the pace.
 """
 
 import gc
@@ -19,17 +19,20 @@ from .warp_launch.launching import torch_stream
 T = TypeVar("T")
 
 IDLE_BYTES = 1 << 30
-"""If more of torch's memory than this lies idle, it is given back before a recording is made: a recording has memory of
-its own, and while it is made torch can give nothing back."""
+"""If more of torch's memory than this is idle, it is freed before a capture: a graph has memory of its own, and during
+a capture torch can free nothing."""
 
-_one_at_a_time = threading.RLock()
-"""Recordings of several threads: the garbage collector that one switches off is everyone's."""
+_one_capture = threading.RLock()
+"""Held during a capture, which switches off the garbage collector of all threads."""
 
 
 @contextmanager
 def _no_collection():
-    """No garbage collection within this block. A recording that only the collector frees (trainings live in reference
-    cycles) takes its memory along, and in the middle of another recording that spoils both."""
+    """Switch off garbage collection within the block.
+
+    A graph that only the collector frees (trainings live in reference cycles) frees its memory too, and in the middle
+    of another capture that invalidates both.
+    """
     restore = gc.enable if gc.isenabled() else gc.disable
     gc.disable()
     try:
@@ -39,12 +42,13 @@ def _no_collection():
 
 
 def _one_thread():
-    """Backward passes run on this thread: torch's own lets go of a graph some time later, in mid-recording too."""
+    """Run backward passes on this thread: torch's own frees a graph some time later, also in the middle of a
+    capture."""
     return torch.autograd.set_multithreading_enabled(False)
 
 
 def is_capturing(device: torch.device) -> bool:
-    """Whether what is launched on a device now is recorded instead of done."""
+    """Return whether launches on a device are being captured in a CUDA graph instead of run."""
     return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
 
 
@@ -52,9 +56,11 @@ _idle_streams: dict[torch.device, list[torch.cuda.Stream]] = {}
 
 
 def _own_stream(owner, device: torch.device) -> torch.cuda.Stream:
-    """A stream on which nothing else records for as long as its owner lives. torch hands out 32 in turn, and in some of
-    its versions the end of one recording frees the cuBLAS workspace of every other on the same stream, whose replay is
-    then an illegal access (pytorch issue 193402)."""
+    """Return a stream on which nothing else captures for as long as its owner lives.
+
+    Torch hands out 32 streams in turn, and in some versions the end of one capture frees the cuBLAS workspace of every
+    other graph on the same stream, whose replay is then an illegal access (pytorch issue 193402).
+    """
     idle = _idle_streams.setdefault(device, [])
     stream = idle.pop() if idle else torch.cuda.Stream(device)
     weakref.finalize(owner, idle.append, stream).atexit = False
@@ -62,14 +68,19 @@ def _own_stream(owner, device: torch.device) -> torch.cuda.Stream:
 
 
 class CudaGraphRunner:
-    """Records a function of no arguments, its torch operations and Warp launches alike, and replays it.
+    """Captures a function without arguments, torch operations and Warp launches alike, as a CUDA graph and replays it.
 
-    The function works on fixed memory: what differs between replays it must read from tensors that are filled before.
+    The function works on fixed memory: it must read what differs between replays from tensors that are filled before.
     It must neither wait for the device nor copy from the host, and every kernel in it must have run once before. Its
     result must be tensors (or tuples of them), which the next replay overwrites.
 
-    device: a CUDA device; raises ValueError for another. stream: to record on, by default one of its own; what
-    continues another recording's work, as a backward pass does, must be recorded on the same.
+    Args:
+        device: a CUDA device.
+        stream: to capture on, by default one of its own. A function that continues another graph's work, as a backward
+            pass does, must be captured on the same stream.
+
+    Raises:
+        ValueError: if the device is not a CUDA device.
     """
 
     def __init__(self, device: torch.device | str, stream: torch.cuda.Stream | None = None) -> None:
@@ -82,15 +93,17 @@ class CudaGraphRunner:
         self._result: Any = None
         self.stream = stream or _own_stream(self, self.device)
         self._pool = torch.cuda.graph_pool_handle()
-        self._kept = 0
-        # Keeps the pool's memory between recordings: freed with the last graph of the pool, it would be allocated anew.
-        self._anchor = self._record(lambda: torch.zeros(1, device=self.device))
+        self._idle_after_capture = 0
+        # Keeps the pool's memory between captures: freed with the last graph of the pool, it would be allocated anew.
+        self._anchor = self._capture(lambda: torch.zeros(1, device=self.device))
 
     @contextmanager
-    def launching(self) -> Iterator[None]:
-        """Launches within this block go to the stream of the recordings, as must those of work that is recorded later:
-        torch keeps the stream on which a parameter's gradient was first summed for as long as any graph of it lives,
-        and a recording that meets another stream than its own is spoilt."""
+    def on_capture_stream(self) -> Iterator[None]:
+        """Launch on the capture stream within the block, as work must that is captured later.
+
+        Torch keeps the stream on which a parameter's gradient was first summed for as long as any graph of it lives,
+        and a capture that meets another stream than its own is invalid.
+        """
         current = torch.cuda.current_stream(self.device)
         self.stream.wait_stream(current)
         try:
@@ -100,40 +113,46 @@ class CudaGraphRunner:
             current.wait_stream(self.stream)
 
     def invalidate(self) -> None:
-        """Forget the recording: something that it holds fixed has changed."""
+        """Free the graph, because something that it holds fixed has changed."""
         self._key = self._modules = self._result = None
         if self._graph is not None:
             self._graph.reset()
             self._graph = None
 
     def run(self, key: Hashable, function: Callable[[], T]) -> T:
-        """Replay the recording made under `key`, after recording `function` if there is none; returns its result.
-        Raises RuntimeError if the function cannot be recorded."""
+        """Replay the graph captured under `key`, after capturing `function` if there is none; return its result.
+
+        Raises:
+            RuntimeError: if the function cannot be captured.
+        """
         if self._graph is None or key != self._key:
-            self.record(key, function)
+            self.capture(key, function)
         return self.replay()
 
-    def record(self, key: Hashable, function: Callable[[], T]) -> T:
-        """Record `function` without playing it, in the place of any other recording; returns what will be its result.
-        Raises RuntimeError if the function cannot be recorded."""
+    def capture(self, key: Hashable, function: Callable[[], T]) -> T:
+        """Capture `function` without running it, in the place of any other graph; return what will be its result.
+
+        Raises:
+            RuntimeError: if the function cannot be captured.
+        """
         self.invalidate()
-        self._graph, self._modules, self._result = self._record(function)
+        self._graph, self._modules, self._result = self._capture(function)
         self._key = key
         return self._result
 
     def replay(self) -> Any:
-        """Play the recording; returns its result."""
-        assert self._graph is not None, "nothing is recorded"
+        """Run the graph; return its result."""
+        assert self._graph is not None, "nothing is captured"
         self._graph.replay()
         return self._result
 
-    def _record(self, function: Callable):
-        with _one_at_a_time:
-            return self._record_alone(function)
+    def _capture(self, function: Callable):
+        with _one_capture:
+            return self._capture_alone(function)
 
-    def _record_alone(self, function: Callable):
-        if self._idle() > self._kept + IDLE_BYTES:
-            with suppress(RuntimeError):  # some versions of torch refuse while another thread records
+    def _capture_alone(self, function: Callable):
+        if self._idle() > self._idle_after_capture + IDLE_BYTES:
+            with suppress(RuntimeError):  # Some versions of torch refuse while another thread captures.
                 torch.cuda.empty_cache()
         graph = torch.cuda.CUDAGraph()
         current = torch.cuda.current_stream(self.device)
@@ -145,7 +164,7 @@ class CudaGraphRunner:
             try:
                 result = function()
             except BaseException:
-                # Leave both recordings; that they are spoilt is no news.
+                # End both captures; that they are invalid is known.
                 with suppress(RuntimeError):
                     wp.capture_end(stream=stream)
                 with suppress(RuntimeError):
@@ -154,11 +173,11 @@ class CudaGraphRunner:
             launched = wp.capture_end(stream=stream)
             graph.capture_end()
         current.wait_stream(self.stream)
-        # What recordings leave idle stays theirs.
-        self._kept = self._idle()
-        # Warp's part of the recording is empty but for the modules that it launched, which must stay loaded.
+        # Memory that graphs leave idle stays theirs.
+        self._idle_after_capture = self._idle()
+        # Warp's part of the capture holds only the modules that it launched, which must stay loaded.
         return graph, launched, result
 
     def _idle(self) -> int:
-        """Bytes of the device that torch holds without using them."""
+        """Return the bytes of the device that torch holds without using them."""
         return torch.cuda.memory_reserved(self.device) - torch.cuda.memory_allocated(self.device)

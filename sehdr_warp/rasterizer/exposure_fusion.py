@@ -5,7 +5,8 @@ from torch import Tensor
 
 from ..kernels.exposure_fusion import POINTS_PER_THREAD, fusion_kernels
 from .checks import check_tensors
-from .warp_launch.launching import launch, requires_ordered_sums, warp_scalar
+from .gradients import requires_ordered_sums
+from .warp_launch.launching import launch, warp_scalar
 
 MAX_LOG_SIGMA, MAX_DEVIATION = 30.0, 30.0  # Inside these exp(-d^2 / 2) and its gradient are finite in float32
 

@@ -1,8 +1,8 @@
-"""Drawings that are asked for again and again, replayed: at what the GPU needs instead of what Python needs.
+"""Replay renders that repeat as CUDA graphs: at the GPU's pace instead of Python's.
 
-Drawing projected Gaussians is some ten launches, and called one by one from Python they take longer than a small
-picture does. After a few calls with the same sizes what follows is recorded as CUDA graphs, on memory of its own:
-arguments are copied in, what a call returns is copied out.
+Rendering 2D Gaussians takes some ten launches; called from Python one by one, they take longer than a small image does.
+After a few calls with the same sizes the next one is captured as CUDA graphs on memory of its own: inputs are copied
+in, outputs are copied out.
 """
 
 import atexit
@@ -19,176 +19,192 @@ from torch import Tensor
 
 from .blending import Adjoint, BlendResult, blend_on_cuda
 from .cuda_graphs import CudaGraphRunner, is_capturing
-from .tile_lists import MAX_INTERSECTIONS, ONE_SORT, build_tile_lists, order_intersections, pack_gaussians
+from .tile_lists import (
+    MAX_INTERSECTIONS,
+    ONE_SORT,
+    IntersectionOffsets,
+    PackedSplats,
+    Splats,
+    build_tile_lists,
+    order_intersections,
+    pack_splats,
+)
 from .warp_launch.launching import stream_handle
 
 LOG = logging.getLogger(__name__)
 
-WARMUP_CALLS = 4  # Calls of a kind before it is recorded: a recording costs as much as some twenty of them
-KINDS = 3  # Kinds of calls that are remembered, the latest
-TOGETHER = 4  # Calls of a kind whose backward passes are still to come: each has a recording of its own
-LARGEST_IMAGE = 1 << 21  # In pixels; larger ones wait for the GPU as it is
-LARGEST_COUNT = 1 << 21  # Of Gaussians, without a backward pass; with one the host is behind only up to ONE_SORT
-ROOM = 1.25  # For this many times the (Gaussian, tile) pairs of the call that is recorded
-LEAST_ROOM = 1 << 12
+WARMUP_CALLS = 4  # Launched calls of a size before one is captured: a capture takes the time of some twenty of them.
+MAX_SIZES = 3  # Sizes of calls with graphs, the most recent ones.
+MAX_GRAPHS = 4  # Graphs of a size: each holds a render until its backward pass.
+MAX_PIXELS = 1 << 21  # Larger images keep the GPU busy without graphs.
+MAX_GAUSSIANS = 1 << 21  # Without a backward pass; with one the host is the bottleneck only up to ONE_SORT.
+HEADROOM = 1.25  # Memory for intersections, as a multiple of those of the captured call.
+MIN_INTERSECTIONS = 1 << 12
 
 
-class Given(NamedTuple):
-    """Projected Gaussians as they are drawn, float32 and contiguous: means2d [N, 2], conics [N, 3], opacities [N],
-    features [N, C], depths [N], extents [N, 2]."""
-
-    means2d: Tensor
-    conics: Tensor
-    opacities: Tensor
-    features: Tensor
-    depths: Tensor
-    extents: Tensor
-
-
-class Frame(NamedTuple):
-    """Size of the picture in pixels, and the alpha under which a Gaussian is left out."""
+class ImageSize(NamedTuple):
+    """Size of an image in pixels, and the alpha below which a contribution is left out."""
 
     width: int
     height: int
     alpha_threshold: float
 
 
-@torch.no_grad()
-def replayed(given: Given, frame: Frame, differentiable: bool) -> tuple[BlendResult, int] | None:
-    """The picture and the number of its (Gaussian, tile) pairs; None where the call is to be launched instead.
+class GraphRender(NamedTuple):
+    """A render by a CUDA graph, and its number of (Gaussian, tile) intersections."""
 
-    given: its extents become 0 where a feature is not finite.
-    differentiable: whether the picture's adjoint may be asked for.
+    result: BlendResult
+    intersections: int
+
+
+@torch.no_grad()
+def render_from_graph(splats: Splats, size: ImageSize, differentiable: bool) -> GraphRender | None:
+    """Render by a CUDA graph, or return None if the call is to be launched instead.
+
+    Sets splats.extents to 0 in place for Gaussians whose features are not finite.
+
+    Args:
+        splats: the 2D Gaussians, float32.
+        size: of the image.
+        differentiable: whether the adjoint may be called.
     """
-    features, device = given.features, given.features.device
-    small = 0 < len(features) <= (ONE_SORT if differentiable else LARGEST_COUNT)
-    small &= frame.width * frame.height <= LARGEST_IMAGE
-    if device.type != "cuda" or features.dtype != torch.float32 or not small or is_capturing(device):
+    features, device = splats.features, splats.features.device
+    if device.type != "cuda" or features.dtype != torch.float32:
         return None
-    kind = _kind((device, stream_handle(device), *features.shape, frame, differentiable))
-    recording = kind.take(lambda pairs: _Recording(given, frame, pairs))
-    if recording is None:
+    small = 0 < len(features) <= (ONE_SORT if differentiable else MAX_GAUSSIANS)
+    if not small or size.width * size.height > MAX_PIXELS or is_capturing(device):
         return None
-    image, transmittance, pairs = recording.play(given)
-    if pairs > recording.room:
-        kind.grow(pairs)
+    graphs = _graphs_of((device, stream_handle(device), *features.shape, size, differentiable))
+    graph = graphs.take(lambda intersections: _RenderGraph(splats, size, intersections))
+    if graph is None:
+        return None
+    image, transmittance, intersections = graph.replay(splats)
+    if intersections > graph.max_intersections:
+        graphs.grow(intersections)
         return None
     if not differentiable:
-        kind.idle.append(recording)
-        return BlendResult(image, transmittance, recording.adjoint), pairs
-    lease = _Lease(kind.idle, recording)
-    return BlendResult(image, transmittance, lease.adjoint), pairs
+        graphs.idle.append(graph)
+        return GraphRender(BlendResult(image, transmittance, graph.adjoint), intersections)
+    lease = _Lease(graphs.idle, graph)
+    return GraphRender(BlendResult(image, transmittance, lease.adjoint), intersections)
 
 
-class _Recording:
-    """One drawing on fixed memory, in two parts, between which the host learns how many pairs there are.
+class _RenderGraph:
+    """One render on fixed memory, in two graphs, between which the number of intersections is copied to the host.
 
-    pairs: room is made for so many at least."""
+    intersections: the least number to allocate memory for.
+    """
 
-    def __init__(self, given: Given, frame: Frame, pairs: int) -> None:
-        width, height, threshold = frame
-        self._given = Given(*(tensor.detach().clone() for tensor in given))
-        means2d, conics, opacities, features, depths, extents = self._given
+    def __init__(self, splats: Splats, size: ImageSize, intersections: int) -> None:
+        width, height, threshold = size
+        self._splats = Splats(*(tensor.detach().clone() for tensor in splats))
+        features, depths, extents = self._splats.features, self._splats.depths, self._splats.extents
         self._image = features.new_empty(height, width, features.shape[1])
         self._transmittance = features.new_empty(height, width)
-        self._pairs = torch.empty(1, dtype=torch.int64, pin_memory=True)
+        self._intersections = torch.empty(1, dtype=torch.int64, pin_memory=True)
         self._counted, self._stream = torch.cuda.Event(), torch.cuda.current_stream(features.device)
-        self._counter = CudaGraphRunner(features.device)
-        self._drawer = CudaGraphRunner(features.device, self._counter.stream)
+        self._counting = CudaGraphRunner(features.device)
+        self._blending = CudaGraphRunner(features.device, self._counting.stream)
 
-        def count():
-            records, counts = pack_gaussians(means2d, conics, opacities, extents, threshold, width, height, features)
-            numbered = order_intersections(counts, depths, extents, unsorted=False)
-            self._pairs.copy_(numbered[1][-1:], non_blocking=True)
-            return records, numbered
+        def count() -> tuple[PackedSplats, IntersectionOffsets]:
+            packed = pack_splats(self._splats, threshold, width, height)
+            offsets = order_intersections(packed.counts, depths, extents, unsorted=False)
+            self._intersections.copy_(offsets.ends[-1:], non_blocking=True)
+            return packed, offsets
 
-        def draw(records, numbered, room: int) -> Adjoint:
-            order, ends = numbered
-            lists = build_tile_lists(records, order, ends, depths, extents, width, height, room, unsorted=False)
-            return blend_on_cuda(features, lists, records, self._image, self._transmittance, threshold, False)
+        def blend(packed: PackedSplats, offsets: IntersectionOffsets, limit: int) -> Adjoint:
+            lists = build_tile_lists(packed, offsets, depths, extents, width, height, limit, unsorted=False)
+            return blend_on_cuda(features, lists, packed, self._image, self._transmittance, threshold, False)
 
-        # Launched once: nothing may be compiled or loaded during a recording, and it tells how much room is needed.
-        with self._counter.launching():
-            records, numbered = count()
-            room = int(ROOM * max(pairs, int(numbered[1][-1])))
-            self.room = min(max(LEAST_ROOM, room), MAX_INTERSECTIONS)
-            draw(records, numbered, self.room)
-            del records, numbered
-        records, numbered = self._counter.record(None, count)
-        self.adjoint: Adjoint = self._drawer.record(None, lambda: draw(records, numbered, self.room))
-        """Of the picture played last; one launch, which needs no recording."""
+        # Launched once: nothing may be compiled or loaded during a capture, and it tells how much memory is needed.
+        with self._counting.on_capture_stream():
+            packed, offsets = count()
+            limit = int(HEADROOM * max(intersections, int(offsets.ends[-1])))
+            self.max_intersections = min(max(MIN_INTERSECTIONS, limit), MAX_INTERSECTIONS)
+            blend(packed, offsets, self.max_intersections)
+            del packed, offsets
+        packed, offsets = self._counting.capture(None, count)
+        self.adjoint: Adjoint = self._blending.capture(None, lambda: blend(packed, offsets, self.max_intersections))
+        """Of the last render; one launch, which needs no graph."""
 
-    def play(self, given: Given) -> tuple[Tensor, Tensor, int]:
-        """Image, transmittance and the number of pairs, of which those beyond the room are not drawn."""
-        torch._foreach_copy_(list(self._given), list(given))  # pyright: ignore[reportPrivateImportUsage]
-        self._counter.replay()
+    def replay(self, splats: Splats) -> tuple[Tensor, Tensor, int]:
+        """Return image, transmittance and the number of intersections; those beyond max_intersections are left out."""
+        torch._foreach_copy_(list(self._splats), list(splats))  # pyright: ignore[reportPrivateImportUsage]
+        self._counting.replay()
         self._counted.record(self._stream)
-        self._drawer.replay()
-        drawn = [self._image, self._transmittance, self._given.extents]
+        self._blending.replay()
+        outputs = [self._image, self._transmittance, self._splats.extents]
         image, transmittance = torch.empty_like(self._image), torch.empty_like(self._transmittance)
-        torch._foreach_copy_([image, transmittance, given.extents], drawn)  # pyright: ignore[reportPrivateImportUsage]
+        torch._foreach_copy_([image, transmittance, splats.extents], outputs)  # pyright: ignore[reportPrivateImportUsage]
         self._counted.synchronize()
-        return image, transmittance, int(self._pairs)
+        return image, transmittance, int(self._intersections)
 
 
 @dataclass
-class _Kind:
-    """Calls with the same sizes: how many were launched, the recordings made, and those that no call holds."""
+class _SizeGraphs:
+    """The graphs of calls of one size.
+
+    Attributes:
+        launched: calls that were launched.
+        captured: graphs that were captured since the memory last grew.
+        intersections: the least number that the next graph allocates memory for.
+        idle: graphs that no call holds.
+    """
 
     launched: int = 0
-    made: int = 0
-    pairs: int = 0
-    idle: list[_Recording] = field(default_factory=list)
+    captured: int = 0
+    intersections: int = 0
+    idle: list[_RenderGraph] = field(default_factory=list)
 
-    def take(self, record: Callable[[int], _Recording]) -> _Recording | None:
-        """A recording that is the caller's until it is idle again; None for a call that is to be launched."""
+    def take(self, capture: Callable[[int], _RenderGraph]) -> _RenderGraph | None:
+        """Return a graph that is the caller's until it is idle again; None for a call that is to be launched."""
         with suppress(IndexError):
             return self.idle.pop()
         self.launched += 1
-        if self.launched <= WARMUP_CALLS or self.made >= TOGETHER:
+        if self.launched <= WARMUP_CALLS or self.captured >= MAX_GRAPHS:
             return None
-        self.made += 1
+        self.captured += 1
         try:
-            return record(self.pairs)
+            return capture(self.intersections)
         except RuntimeError:
-            LOG.debug("a drawing could not be recorded and is launched", exc_info=True)
-            self.made = TOGETHER
+            LOG.debug("a render could not be captured and is launched", exc_info=True)
+            self.captured = MAX_GRAPHS
             return None
 
-    def grow(self, pairs: int) -> None:
-        """A recording had no room for so many pairs: new ones shall be made."""
-        self.pairs, self.made, self.idle = max(pairs, self.pairs), 0, []
+    def grow(self, intersections: int) -> None:
+        """Let new graphs be captured, because one had too little memory for this many intersections."""
+        self.intersections, self.captured, self.idle = max(intersections, self.intersections), 0, []
 
 
 class _Lease:
-    """Keeps a recording from other calls for as long as it lives."""
+    """Keeps a graph from other calls for as long as it lives."""
 
-    def __init__(self, idle: list[_Recording], recording: _Recording) -> None:
-        self._idle, self._recording = idle, recording
+    def __init__(self, idle: list[_RenderGraph], graph: _RenderGraph) -> None:
+        self._idle, self._graph = idle, graph
 
     def adjoint(self, by_image: Tensor, by_transmittance: Tensor | None) -> Tensor:
-        return self._recording.adjoint(by_image, by_transmittance)
+        return self._graph.adjoint(by_image, by_transmittance)
 
     def __del__(self) -> None:
-        self._idle.append(self._recording)
+        self._idle.append(self._graph)
 
 
 _lock = threading.Lock()
-_kinds: OrderedDict[tuple, _Kind] = OrderedDict()
+_graphs: OrderedDict[tuple, _SizeGraphs] = OrderedDict()
 
 
-def forget() -> None:
-    """Lets go of all recordings and of their memory."""
-    _kinds.clear()
+def clear_graphs() -> None:
+    """Free all graphs and their memory."""
+    _graphs.clear()
 
 
-atexit.register(forget)  # Recordings must go before CUDA does.
+atexit.register(clear_graphs)  # Graphs must be freed before CUDA is.
 
 
-def _kind(key: tuple) -> _Kind:
+def _graphs_of(key: tuple) -> _SizeGraphs:
     with _lock:
-        kind = _kinds.setdefault(key, _Kind())
-        _kinds.move_to_end(key)
-        while len(_kinds) > KINDS:
-            _kinds.popitem(last=False)
-    return kind
+        graphs = _graphs.setdefault(key, _SizeGraphs())
+        _graphs.move_to_end(key)
+        while len(_graphs) > MAX_SIZES:
+            _graphs.popitem(last=False)
+    return graphs

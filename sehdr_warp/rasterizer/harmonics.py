@@ -16,11 +16,13 @@ from ..kernels.harmonics import (
     turns_adjoint_kernel,
 )
 from .checks import check_tensors, integer
+from .torch_contract import torch_operation
 from .warp_launch.launching import launch, warp_scalar
 
 MAX_DEGREE = 3
 
 
+@torch_operation
 def spherical_harmonics(
     degree: int, coefficients: Tensor | tuple[Tensor, Tensor], means: Tensor, camera_position: Tensor
 ) -> Tensor:

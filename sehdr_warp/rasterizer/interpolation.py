@@ -5,7 +5,8 @@ from torch import Tensor
 
 from ..kernels import interpolation
 from .checks import check_tensors
-from .warp_launch.launching import launch, requires_ordered_sums
+from .gradients import requires_ordered_sums
+from .warp_launch.launching import launch
 
 
 def interpolate(table: Tensor, low: float, step: float, positions: Tensor) -> Tensor:

@@ -6,9 +6,9 @@ from torch import Tensor
 
 from .clipped_light import ClippedWeights, add_clipped_light
 from .code_residual import CodeScale, check_codes, residual
+from .gradients import scale_gradient
 from .patches import total
 from .ssim import distance_terms
-from .warp_launch.launching import scale_gradient
 
 
 def photo_loss(

@@ -43,7 +43,7 @@ def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
     return [
         *(shared_ranges.share_ranges, plane_sweep_cpu.sweep_rows, plane_sweep.trust_depths, plane_sweep.place_matches),
         *(*blend, projection_kernel(real, antialiased), distance.compare),
-        *(harmonics.harmonics_kernel(real, 0), lists.pack_gaussians, lists.key_by_depth, lists.emit_intersections),
+        *(harmonics.harmonics_kernel(real, 0), lists.pack_splats, lists.key_by_depth, lists.emit_intersections),
         *(
             tiles.count_tiles,
             tiles.place_intersections,

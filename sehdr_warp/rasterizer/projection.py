@@ -6,9 +6,27 @@ import torch
 from torch import Tensor
 
 from ..kernels.project import projection_kernel
-from .bridge import kernel_layout, zero_gradients
+from .gradients import kernel_layout, zero_gradients
 from .warp_launch.launching import launch, warp_scalar
-from .warp_launch.threads import whole
+from .warp_launch.threads import single_range
+
+
+class ProjectedGaussians(NamedTuple):
+    """2D Gaussians of one camera. A culled Gaussian has extents 0 and no gradient.
+
+    Attributes:
+        means2d: [N, 2] centres in pixels.
+        conics: [N, 3] a, b, c of the inverse covariance, in 1 / square pixels.
+        depths: [N] along the camera's axis, in scene units.
+        opacities: [N], lowered if antialiased.
+        extents: [N, 2] half-width and half-height in pixels within which alpha reaches the threshold.
+    """
+
+    means2d: Tensor
+    conics: Tensor
+    depths: Tensor
+    opacities: Tensor
+    extents: Tensor
 
 
 def project(
@@ -25,61 +43,76 @@ def project(
     eps2d: float,
     alpha_threshold: float,
     antialiased: bool,
-) -> tuple[Tensor, ...]:
-    """The 2D Gaussians of one camera.
+) -> ProjectedGaussians:
+    """Project Gaussians to the image plane of one camera; all but the extents are differentiable.
 
-    means, log_scales [N, 3]; quaternions [N, 4] (w, x, y, z), any length; opacities [N] in [0, 1];
-    world_to_camera [4, 4]; intrinsics [4] (fx, fy, cx, cy) in pixels; all contiguous.
-
-    Returns means2d [N, 2] in pixels, conics [N, 3] (a, b, c of the inverse covariance), depths [N], opacities [N] and
-    extents [N, 2], the half-width and half-height in pixels within which alpha reaches alpha_threshold. A culled
-    Gaussian has extents 0. All but the extents are differentiable, once.
+    Args:
+        means: [N, 3]; this and all other tensors contiguous.
+        log_scales: [N, 3].
+        quaternions: [N, 4] (w, x, y, z), of any length.
+        opacities: [N].
+        world_to_camera: [4, 4].
+        intrinsics: [4] fx, fy, cx, cy in pixels.
+        width: of the image, pixels.
+        height: of the image, pixels.
+        near_plane: least depth, in scene units.
+        eps2d: variance in square pixels added to each 2D Gaussian.
+        alpha_threshold: alpha at which extents end.
+        antialiased: whether opacities are lowered so that the added variance keeps a Gaussian's energy.
     """
-    given = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
+    count = means.shape[0]
+    outputs = ProjectedGaussians(
+        means.new_empty(count, 2),
+        means.new_empty(count, 3),
+        means.new_empty(count),
+        means.new_empty(count),
+        means.new_empty(count, 2),
+    )
     kernel = projection_kernel(warp_scalar(means.dtype), antialiased)
-    task = _Task(kernel, (width, height, near_plane, eps2d, alpha_threshold))
-    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given):
-        return _Projection.apply(task, *given)
-    return task.run(given)
+    parameters = width, height, near_plane, eps2d, alpha_threshold
+    inputs = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
+    return ProjectedGaussians(*launch_projection(kernel, inputs, parameters, outputs))
 
 
-class _Task(NamedTuple):
-    """A projection but for its tensors: the kernel, and the numbers that it takes between tensors read and written."""
+def launch_projection(
+    kernel: Any, inputs: tuple[Tensor, ...], parameters: tuple, outputs: tuple[Tensor, ...]
+) -> tuple[Tensor, ...]:
+    """Fill the outputs by a projection kernel, one thread for each Gaussian, and return them, differentiable if needed.
 
-    kernel: Any
-    numbers: tuple
+    Does what bridge.differentiable() would, at half of its host time.
 
-    def run(self, given: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        means, count = given[0], given[0].shape[0]
-        results = tuple(means.new_empty(shape) for shape in ((count, 2), (count, 3), count, count, (count, 2)))
-        launch(self.kernel, count, *given, *self.numbers, *results)
-        return results
+    Args:
+        kernel: takes inputs, parameters, the last output (None in the forward pass), and outputs.
+        inputs: four tensors with a row for each Gaussian, then those that all share (the camera).
+        parameters: that are not tensors.
+        outputs: with a row for each Gaussian. The last one is 0 if a Gaussian is culled, and not differentiable.
+    """
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
+        return _Projection.apply(kernel, parameters, outputs, *inputs)
+    launch(kernel, inputs[0].shape[0], *inputs, *parameters, None, *outputs)
+    return outputs
 
 
 class _Projection(torch.autograd.Function):
-    """By hand what bridge.differentiable() makes of a program: half the host's time, which is most of a small picture's
-    where rasterize() is called by itself."""
-
     @staticmethod
-    def forward(ctx, task: _Task, *given: Tensor):
-        results = task.run(given)
-        ctx.task, ctx.given = task, tuple(tensor.detach() for tensor in given)
-        ctx.leaves = [tensor.is_leaf for tensor in given]
-        ctx.mark_non_differentiable(results[-1])
+    def forward(ctx, kernel, parameters, outputs, *inputs: Tensor):
+        launch(kernel, inputs[0].shape[0], *inputs, *parameters, None, *outputs)
+        ctx.kernel, ctx.parameters = kernel, parameters
+        ctx.leaves = [tensor.is_leaf for tensor in inputs]
+        ctx.save_for_backward(*inputs, outputs[-1])
+        ctx.mark_non_differentiable(outputs[-1])
         ctx.set_materialize_grads(False)
-        return results
+        return tuple(outputs)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, *upstream):
-        given, ctx.given, needed = ctx.given, None, ctx.needs_input_grad[1:]
-        if given is None:
-            raise RuntimeError("this projection was already differentiated once; run its forward pass again")
-        kernel, numbers = ctx.task
-        made = zero_gradients(given, needed, ctx.leaves)
-        count, unread = given[0].shape[0], (None,) * len(upstream)
-        gradients = *made, *(None,) * len(numbers), *map(kernel_layout, upstream)
+        *inputs, culling = ctx.saved_tensors
+        needed, parameters, count = ctx.needs_input_grad[3:], ctx.parameters, inputs[0].shape[0]
+        results = zero_gradients(inputs, needed, ctx.leaves)
+        gradients = *results, *(None,) * (len(parameters) + 1), *map(kernel_layout, upstream)
         # All Gaussians add to the camera's gradients: on the CPU one thread must.
-        alone = whole(count) if any(needed[4:]) else None
-        launch(kernel, count, *given, *numbers, *unread, gradients=gradients, ranges=alone)
-        return None, *made
+        ranges = single_range(count) if any(needed[4:]) else None
+        unread = (None,) * len(upstream)
+        launch(ctx.kernel, count, *inputs, *parameters, culling, *unread, gradients=gradients, ranges=ranges)
+        return None, None, None, *results

@@ -1,8 +1,8 @@
-"""Differentiable splatting of 3D Gaussians: project, order, bin, blend."""
+"""Differentiable rasterization of 3D Gaussians: project, order, list by tile, blend."""
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,30 +10,40 @@ from torch import Tensor
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
 from .blending import blend, with_gradient
 from .checks import check_opacities, check_tensors, integer
-from .graph_cache import Frame, Given, replayed
+from .cuda_graphs import is_capturing
+from .graph_cache import ImageSize, render_from_graph
 from .memory import oom_context
-from .projection import project
-from .tile_lists import MAX_INTERSECTIONS, build_tile_lists, order_intersections, pack_gaussians
+from .projection import ProjectedGaussians, project
+from .tile_lists import (
+    MAX_INTERSECTIONS,
+    PackedSplats,
+    Splats,
+    TileLists,
+    build_tile_lists,
+    order_intersections,
+    pack_splats,
+)
+from .torch_contract import torch_operation
 
-LARGEST_SIDE = 1 << 20  # of an image, in pixels
+MAX_SIDE = 1 << 20  # Of an image, in pixels.
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """One rendered view of N Gaussians; of B cameras in one call all but the last three begin with an axis of B.
+    """One rendered view of N Gaussians; for B cameras in one call, tensors begin with an axis of B unless noted.
 
     Attributes:
         image: [H, W, C] blended features over the background, or over zero.
-        transmittance: [H, W] in [0, 1], how much of each pixel's background is seen. The backward pass reads it: do not
-            write to it.
-        means2d: [N, 2] centres in pixels; part of the graph, so means2d.retain_grad() gives densification its signal.
-        depths: [N] along the camera's axis, in scene units; 0 where culled.
-        extents: [N, 2] half-width and half-height in pixels within which a Gaussian counts; 0 where culled.
-        intersection_count: (Gaussian, tile) pairs that there was room for.
-        overflow: scalar bool tensor, whether the given max_intersections left some of them out; None without a
-        max_intersections.
-        needed_intersections: scalar int64 tensor, how many there are; None without a max_intersections.
-        depth: [H, W] blended depths along the camera's axis over zero, where they were asked for; over alpha they are
+        transmittance: [H, W] in [0, 1], how much of each pixel's background is visible.
+        means2d: [N, 2] centres in pixels. They are part of the graph, so means2d.retain_grad() gives densification its
+            signal.
+        depths: [N] along the camera's axis, in scene units; 0 if culled.
+        extents: [N, 2] half-width and half-height in pixels within which a Gaussian counts; 0 if culled.
+        intersection_count: number of (Gaussian, tile) intersections that memory was allocated for: max_intersections
+            if that was given, else as many as there are, of all cameras.
+        overflow: scalar bool, whether max_intersections was too few and some were left out; None without it.
+        needed_intersections: scalar int64, how many there are, of all cameras; None without max_intersections.
+        depth: [H, W] blended depths along the camera's axis over zero if depth was requested. Divided by alpha it is
             the expected depth.
     """
 
@@ -49,20 +59,21 @@ class Rendering:
 
     @property
     def alpha(self) -> Tensor:
-        """[H, W] in [0, 1], how much of each pixel the Gaussians cover; made anew whenever it is asked for."""
+        """[H, W] in [0, 1], how much of each pixel the Gaussians cover; computed at each access."""
         return 1.0 - self.transmittance
 
     @property
     def radii(self) -> Tensor:
-        """[N] the longer of the two half-extents; made anew whenever it is asked for."""
+        """[N] the longer of the two half-extents, in pixels; computed at each access."""
         return self.extents.amax(dim=-1)
 
     @property
     def visible(self) -> Tensor:
-        """[N] bool: not culled."""
+        """[N] bool, whether a Gaussian was not culled; computed at each access."""
         return self.radii > 0
 
 
+@torch_operation
 def rasterize(
     means: Tensor,
     log_scales: Tensor,
@@ -83,140 +94,232 @@ def rasterize(
     max_intersections: int | None = None,
     deterministic: bool = False,
 ) -> Rendering:
-    """Splat Gaussians with any number of feature channels onto cameras' image planes (3DGS, Kerbl et al. 2023).
+    """Rasterize Gaussians with any number of feature channels to images of cameras (3DGS, Kerbl et al. 2023).
 
-    All tensors share one device (CPU or CUDA) and one dtype (float32 or float64). Differentiable with respect to every
-    tensor, camera included. On the CPU results repeat bit for bit, whatever the number of threads. A Gaussian whose
-    position or shape in the image, or a feature, is not finite is culled; a camera that is not finite culls them all.
-    Warns on the CPU of log_scales that look like sizes.
+    All tensors share one device (CPU or CUDA) and one dtype (float32 or float64). Differentiable once with respect to
+    every tensor, camera included; the graph can be retained. On the CPU results repeat bit for bit, whatever the number
+    of threads.
 
-    B cameras in one call: world_to_camera [B, 4, 4], intrinsics [B, 4]; features may then be [B, N, C], opacities [B,
-    N].
+    A Gaussian with a parameter or feature that is not finite is culled: it contributes nothing, and its gradients are
+    0. A camera that is not finite culls all.
+
+    B cameras in one call: world_to_camera [B, 4, 4], intrinsics [B, 4]; features may then be [B, N, C] and opacities
+    [B, N].
 
     Args:
         means: [N, 3] world coordinates.
         log_scales: [N, 3] natural logarithm of the standard deviations along the local axes, in scene units.
         quaternions: [N, 4] (w, x, y, z), of any length.
         opacities: [N] in [0, 1].
-        features: [N, C], any C >= 1 and any finite range; several color sets go side by side in one pass.
+        features: [N, C], any C >= 1 and any finite range. Several color sets can share one pass.
         world_to_camera: [4, 4], OpenCV convention.
         intrinsics: [4] fx, fy, cx, cy in pixels.
         width: of the image, pixels.
-        height: likewise.
-        near_plane: points nearer to the camera plane are culled; > 0.
-        eps2d: variance in square pixels added to each splat; >= 0.
-        alpha_threshold: contributions below it are left out, in (0, 1).
-        antialiased: keep a Gaussian's energy under the low pass by lowering its opacity.
-        background: [C] what shows through, or with B cameras [B, C].
-        depth: also blend depths, Rendering.depth.
-        max_intersections: room for this many (Gaussian, tile) pairs of a camera, from 1. On a GPU nothing then waits
-            for the device, so that the call can be part of a CUDA graph; Rendering.overflow says whether the room was
-            enough.
-        deterministic: on a GPU, sum gradients in a fixed order, so that the same input gives the same bits; slower, and
-            the gradients of every (Gaussian, tile) pair take memory.
+        height: of the image, pixels.
+        near_plane: least depth of a Gaussian's centre, in scene units; > 0.
+        eps2d: variance in square pixels added to each 2D Gaussian; >= 0.
+        alpha_threshold: contributions with a smaller alpha are left out; in (0, 1).
+        antialiased: lower opacities so that the variance of eps2d keeps a Gaussian's energy.
+        background: [C] color behind the Gaussians, or with B cameras [B, C].
+        depth: also blend depths, see Rendering.depth.
+        max_intersections: allocate memory for this many (Gaussian, tile) intersections of a camera, from 1. On a GPU
+            the host then never waits for the device, so the call can be part of a CUDA graph. Rendering.overflow tells
+            whether there were more.
+        deterministic: on a GPU, sum gradients in a fixed order, so that the same input gives the same bits. Slower, and
+            the gradients of every intersection take memory.
 
     Raises:
-        TypeError: for what is no tensor or no whole number.
-        ValueError: for shapes, dtypes, devices or options that do not fit, and on the CPU for opacities outside of [0,
-            1].
-        OutOfMemory: (an SehdrError), with the sizes, if memory does not suffice.
+        TypeError: if an argument is not a tensor or not an integer.
+        ValueError: if a shape, dtype, device or option does not fit, and on the CPU for opacities outside of [0, 1].
+        NotImplementedError: within torch.func and for forward-mode differentiation.
+        RuntimeError: while a CUDA graph is captured without max_intersections.
+        OutOfMemory: (a SehdrError) with the sizes, if memory does not suffice.
     """
     cameras: tuple[str, ...] = ("B",) if isinstance(world_to_camera, Tensor) and world_to_camera.ndim == 3 else ()
-    by_camera = [bool(cameras) and isinstance(t, Tensor) and t.ndim == n for t, n in ((opacities, 2), (features, 3))]
-    backgrounds = {} if background is None else {"background": (background, (*cameras[: background.ndim - 1], "C"))}
+    opacity_axes, feature_axes = (
+        cameras if isinstance(tensor, Tensor) and tensor.ndim == ndim else ()
+        for tensor, ndim in ((opacities, 2), (features, 3))
+    )
+    backgrounds = {}
+    if background is not None:
+        axes = cameras if isinstance(background, Tensor) and background.ndim == 2 else ()
+        backgrounds = {"background": (background, (*axes, "C"))}
     check_tensors(
         means=(means, ("N", 3)),
         log_scales=(log_scales, ("N", 3)),
         quaternions=(quaternions, ("N", 4)),
-        opacities=(opacities, (*cameras[: by_camera[0]], "N")),
-        features=(features, (*cameras[: by_camera[1]], "N", "C")),
+        opacities=(opacities, (*opacity_axes, "N")),
+        features=(features, (*feature_axes, "N", "C")),
         world_to_camera=(world_to_camera, (*cameras, 4, 4)),
         intrinsics=(intrinsics, (*cameras, 4)),
         **backgrounds,
     )
-    channels = features.shape[-1]
-    if not channels:
+    if not features.shape[-1]:
         raise ValueError(f"features has shape {list(features.shape)}, expected [N, C] with C >= 1")
+    if cameras and not len(world_to_camera):
+        raise ValueError("world_to_camera has no camera, expected [B, 4, 4] with B >= 1")
     check_opacities(opacities)
-    width = integer("width", width, 1, LARGEST_SIDE)
-    height = integer("height", height, 1, LARGEST_SIDE)
-    if max_intersections is not None:
-        max_intersections = integer("max_intersections", max_intersections, 1, MAX_INTERSECTIONS)
-    if not 0.0 < near_plane < math.inf:
-        raise ValueError(f"near_plane {near_plane} is not a positive number")
-    if not 0.0 <= eps2d < math.inf:
-        raise ValueError(f"eps2d {eps2d} is not a number from 0")
-    if not 0.0 < alpha_threshold < 1.0:
-        raise ValueError(f"alpha_threshold {alpha_threshold} is not between 0 and 1")
+    options = RenderOptions(
+        width, height, near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic
+    ).checked(means.device)
 
-    launched = max_intersections is not None or deterministic  # and never replayed
-
-    def projected(opacities: Tensor, pose: Tensor, lens: Tensor) -> tuple[Tensor, ...]:
-        tensors = (tensor.contiguous() for tensor in (means, log_scales, quaternions, opacities, pose, lens))
-        options = {
-            "near_plane": near_plane,
-            "eps2d": eps2d,
-            "alpha_threshold": alpha_threshold,
-            "antialiased": antialiased,
-        }
-        return project(*tensors, width=width, height=height, **options)
-
-    def drawn(features: Tensor, means2d, conics, depths, opacities, extents) -> Rendering:
-        features = (torch.cat([features, depths[:, None]], 1) if depth else features).contiguous()
-        leaves = means2d, conics, opacities, features
-        given = Given(
-            means2d.detach(), conics.detach(), opacities.detach(), features.detach(), depths.detach(), extents
-        )
-        differentiable = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in leaves)
-        again = None if launched else replayed(given, Frame(width, height, alpha_threshold), differentiable)
-        if again:
-            picture, pairs = again
-            image, transmittance = with_gradient(*leaves, picture)
-            numbers = pairs, None, None
+    with oom_context(means.device, lambda: (len(means), width, height, features.shape[-1])):
+        gaussians = means.contiguous(), log_scales.contiguous(), quaternions.contiguous()
+        if not cameras:
+            projected = project_to_camera(*gaussians, opacities, world_to_camera, intrinsics, options)
+            rendering = render_projected(projected, features, options)
         else:
-            records, counts = pack_gaussians(*given[:3], extents, alpha_threshold, width, height, given.features)
-            unsorted = features.device.type == "cpu" or deterministic
-            numbered = order_intersections(counts, given.depths, extents, unsorted=unsorted)
-            seen = records, *numbered, given.depths, extents, width, height
-            lists = build_tile_lists(*seen, max_intersections, unsorted=unsorted)
-            image, transmittance = blend(*leaves, lists, records, alpha_threshold, deterministic)
-            numbers = lists.intersection_count, lists.overflow, None if max_intersections is None else lists.total
-        last = image[..., -1] if depth else None
-        image = image[..., :-1] if depth else image
-        return Rendering(image, transmittance, means2d, depths, extents, *numbers, last)
-
-    with oom_context(means.device, lambda: (len(means), width, height, channels)):
-        if cameras:
-            count = len(world_to_camera)
-            if not count:
-                raise ValueError("world_to_camera has no camera, expected [B, 4, 4] with B >= 1")
-            opacities, features = (
-                tensor if own else tensor.expand(count, *tensor.shape)
-                for tensor, own in zip((opacities, features), by_camera, strict=True)
+            each = zip(
+                opacities if opacity_axes else [opacities] * len(world_to_camera),
+                world_to_camera,
+                intrinsics,
+                strict=True,
             )
-            seen = [projected(*each) for each in zip(opacities, world_to_camera, intrinsics, strict=True)]
-            # One tensor that every picture is drawn from, so that its gradient holds every camera's.
-            means2d = torch.stack([each[0] for each in seen])
-            each_seen = zip(features, means2d, seen, strict=True)
-            rendering = joined(means2d, [drawn(mine, own, *each[1:]) for mine, own, each in each_seen])
-        else:
-            rendering = drawn(features, *projected(opacities, world_to_camera, intrinsics))
+            views = [project_to_camera(*gaussians, *camera, options) for camera in each]
+            # One tensor that every image is rendered from, so that its gradient holds every camera's.
+            means2d = torch.stack([view.means2d for view in views])
+            renderings = [
+                render_projected(view._replace(means2d=own), own_features, options)
+                for view, own, own_features in zip(
+                    views, means2d, features if feature_axes else [features] * len(views), strict=True
+                )
+            ]
+            rendering = join_renderings(means2d, renderings)
         if background is None:
             return rendering
-        shown = background[:, None, None] if background.ndim == 2 else background
-        return replace(rendering, image=rendering.image + rendering.transmittance[..., None] * shown)
+        behind = background[:, None, None] if background.ndim == 2 else background
+        return replace(rendering, image=rendering.image + rendering.transmittance[..., None] * behind)
 
 
-def joined(means2d: Tensor, renderings: list[Rendering]) -> Rendering:
-    """One rendering of the cameras' own, drawn from means2d [B, N, 2]."""
+class RenderOptions(NamedTuple):
+    """The arguments of rasterize() that are not tensors."""
 
-    def stacked(name: str) -> Any:
+    width: int
+    height: int
+    near_plane: float = NEAR_PLANE
+    eps2d: float = EPS2D
+    alpha_threshold: float = ALPHA_THRESHOLD
+    antialiased: bool = False
+    depth: bool = False
+    max_intersections: int | None = None
+    deterministic: bool = False
+
+    def checked(self, device: torch.device) -> "RenderOptions":
+        """Return the options with sizes as plain integers; raise TypeError or ValueError for values out of range."""
+        limit = self.max_intersections
+        if limit is not None:
+            limit = integer("max_intersections", limit, 1, MAX_INTERSECTIONS)
+        elif is_capturing(device):
+            raise RuntimeError(
+                "rasterize() waits for the GPU to learn how much memory it needs, which a CUDA graph cannot; "
+                "give max_intersections"
+            )
+        if not 0.0 < self.near_plane < math.inf:
+            raise ValueError(f"near_plane {self.near_plane} is not a positive number")
+        if not 0.0 <= self.eps2d < math.inf:
+            raise ValueError(f"eps2d {self.eps2d} is not a number from 0")
+        if not 0.0 < self.alpha_threshold < 1.0:
+            raise ValueError(f"alpha_threshold {self.alpha_threshold} is not between 0 and 1")
+        width = integer("width", self.width, 1, MAX_SIDE)
+        height = integer("height", self.height, 1, MAX_SIDE)
+        if width is self.width and height is self.height and limit is self.max_intersections:
+            return self
+        return self._replace(width=width, height=height, max_intersections=limit)
+
+
+def project_to_camera(
+    means: Tensor,
+    log_scales: Tensor,
+    quaternions: Tensor,
+    opacities: Tensor,
+    world_to_camera: Tensor,
+    intrinsics: Tensor,
+    options: RenderOptions,
+) -> ProjectedGaussians:
+    """Project Gaussians, whose means, log_scales and quaternions are contiguous, to one camera; see project()."""
+    return project(
+        means,
+        log_scales,
+        quaternions,
+        opacities.contiguous(),
+        world_to_camera.contiguous(),
+        intrinsics.contiguous(),
+        width=options.width,
+        height=options.height,
+        near_plane=options.near_plane,
+        eps2d=options.eps2d,
+        alpha_threshold=options.alpha_threshold,
+        antialiased=options.antialiased,
+    )
+
+
+def render_projected(projected: ProjectedGaussians, features: Tensor, options: RenderOptions) -> Rendering:
+    """Render 2D Gaussians of one camera with features [N, C].
+
+    On a GPU, calls that repeat are replayed as CUDA graphs (graph_cache.py), unless max_intersections or deterministic
+    is given. Sets the extents of Gaussians whose features are not finite to 0, in place.
+    """
+    means2d, conics, depths, opacities, extents = projected
+    if options.depth:
+        features = torch.cat([features, depths[:, None]], 1)
+    features = features.contiguous()
+    # In place on memory that the projection's graph has saved: as data, so that it is no change of a saved tensor.
+    splats = Splats(
+        means2d.detach(), conics.detach(), opacities.detach(), features.detach(), depths.detach(), extents.data
+    )
+    repeated = None
+    if options.max_intersections is None and not options.deterministic:
+        differentiable = torch.is_grad_enabled() and (
+            features.requires_grad or means2d.requires_grad or conics.requires_grad or opacities.requires_grad
+        )
+        size = ImageSize(options.width, options.height, options.alpha_threshold)
+        repeated = render_from_graph(splats, size, differentiable)
+    if repeated is not None:
+        image, transmittance = with_gradient(means2d, conics, opacities, features, repeated.result)
+        count, overflow, needed = repeated.intersections, None, None
+    else:
+        lists, packed = list_splats(splats, options)
+        image, transmittance = blend(
+            means2d, conics, opacities, features, lists, packed, options.alpha_threshold, options.deterministic
+        )
+        count, overflow = lists.intersection_count, lists.overflow
+        needed = None if options.max_intersections is None else lists.total
+    blended_depth = image[..., -1] if options.depth else None
+    image = image[..., :-1] if options.depth else image
+    return Rendering(image, transmittance, means2d, depths, extents, count, overflow, needed, blended_depth)
+
+
+def list_splats(splats: Splats, options: RenderOptions, *, blocks: bool = False) -> tuple[TileLists, PackedSplats]:
+    """Return the tile lists of 2D Gaussians and their packed form, as blend() takes them.
+
+    blocks: make the lists of block kernels, which a GPU gets anyway unless options.deterministic.
+    """
+    width, height, threshold = options.width, options.height, options.alpha_threshold
+    unsorted = not blocks and (splats.features.device.type == "cpu" or options.deterministic)
+    packed = pack_splats(splats, threshold, width, height)
+    offsets = order_intersections(packed.counts, splats.depths, splats.extents, unsorted=unsorted)
+    lists = build_tile_lists(
+        packed, offsets, splats.depths, splats.extents, width, height, options.max_intersections, unsorted=unsorted
+    )
+    return lists, packed
+
+
+def join_renderings(means2d: Tensor, renderings: list[Rendering]) -> Rendering:
+    """Return one rendering with an axis of cameras of the cameras' own renderings, rendered from means2d [B, N, 2]."""
+
+    def stack(name: str) -> Any:
         values = [getattr(rendering, name) for rendering in renderings]
         return None if values[0] is None else torch.stack(values)
 
-    overflow, pairs = stacked("overflow"), stacked("needed_intersections")
+    overflow, needed = stack("overflow"), stack("needed_intersections")
     return Rendering(
-        stacked("image"), stacked("transmittance"), means2d, stacked("depths"), stacked("extents"),
-        sum(rendering.intersection_count for rendering in renderings), None if overflow is None else overflow.any(),
-        None if pairs is None else pairs.sum(), stacked("depth"),
-    )  # fmt: skip
+        image=stack("image"),
+        transmittance=stack("transmittance"),
+        means2d=means2d,
+        depths=stack("depths"),
+        extents=stack("extents"),
+        intersection_count=sum(rendering.intersection_count for rendering in renderings),
+        overflow=None if overflow is None else overflow.any(),
+        needed_intersections=None if needed is None else needed.sum(),
+        depth=stack("depth"),
+    )

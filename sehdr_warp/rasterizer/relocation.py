@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..kernels import relocation as kernels
 from .warp_launch.launching import launch
-from .warp_launch.threads import whole
+from .warp_launch.threads import single_range
 
 MOST_COPIES = 51
 """A Gaussian is shared by at most this many at once, as in the authors' code: the binomial sums stay exact."""
@@ -43,7 +43,7 @@ def count_copies(drawn: "Drawn", begin: Tensor, end: Tensor, changed: Tensor) ->
     at all are marked in changed [N] bool."""
     copies = torch.zeros(len(changed), dtype=torch.int32, device=changed.device)
     count = len(drawn.rows)
-    launch(kernels.count_copies, count, *drawn, begin, end, copies, changed, ranges=whole(count))
+    launch(kernels.count_copies, count, *drawn, begin, end, copies, changed, ranges=single_range(count))
     return copies
 
 

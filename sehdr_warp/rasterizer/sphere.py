@@ -1,6 +1,7 @@
 """Splats seen in any directions from one point: environment maps, as latitude and longitude or the faces of a cube."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -8,16 +9,18 @@ from torch import Tensor
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE, TILE_SIZE
 from ..kernels.sphere import BLOCK_TILES, projection_kernel, sphere_kernels
 from .blending import gather_by_gaussian
-from .bridge import Program, differentiable
 from .checks import check_opacities, check_tensors
 from .memory import oom_context
+from .projection import launch_projection
 from .tile_lists import UnsortedIntersections, check_intersection_count, depth_order, lists_by_tile
+from .torch_contract import torch_operation
 from .warp_launch.launching import launch, warp_scalar
 from .warp_launch.threads import even_ranges
 
 _PIXELS = TILE_SIZE * TILE_SIZE
 
 
+@torch_operation
 def rasterize_directions(
     means: Tensor,
     log_scales: Tensor,
@@ -73,41 +76,55 @@ def rasterize_directions(
     )
     check_opacities(opacities)
     height, width = directions.shape[:2]
+    if not height * width:
+        raise ValueError(f"directions has shape {list(directions.shape)}, expected [H, W, 3] with at least one pixel")
     footprint = EPS2D / focal_length**2
     smoothing = max(EPS2D * pixel_angle**2 - footprint, 0.0)
     with oom_context(means.device, lambda: (len(means), width, height, features.shape[1])):
-        given = (tensor.contiguous() for tensor in (means, log_scales, quaternions, opacities, position))
-        options = {
-            "near_plane": near_plane,
-            "footprint": footprint,
-            "smoothing": smoothing,
-            "alpha_threshold": alpha_threshold,
-        }
-        *shapes, opacities, distances = _project(*given, antialiased=antialiased, **options)
-        opacities = opacities.masked_fill(~features.isfinite().all(1), 0)
-        drawn = *shapes, opacities, features.contiguous()
-        recorded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in drawn)
-        lists = _list_tiles(shapes[0].detach(), distances, directions.contiguous(), means.is_cpu and recorded)
-        return _Blend.apply(*drawn, lists, alpha_threshold)
+        gaussians = tuple(tensor.contiguous() for tensor in (means, log_scales, quaternions, opacities, position))
+        parameters = near_plane, footprint, smoothing, alpha_threshold
+        splats = _project(gaussians, parameters, antialiased)
+        opacities = splats.opacities.masked_fill(~features.isfinite().all(1), 0)
+        blended = splats.caps, splats.across, splats.along, opacities, features.contiguous()
+        unsorted = means.is_cpu and torch.is_grad_enabled() and any(tensor.requires_grad for tensor in blended)
+        lists = _list_tiles(splats.caps.detach(), splats.distances, directions.contiguous(), unsorted)
+        return _Blend.apply(*blended, lists, alpha_threshold)
 
 
-@differentiable
-def _project(
-    program: Program, means: Tensor, *others: Tensor, antialiased: bool, near_plane: float, footprint: float,
-    smoothing: float, alpha_threshold: float,
-) -> tuple[Tensor, ...]:  # fmt: skip
-    """Caps [N, 4] (direction, angle), across, along [N, 3], opacities, distances [N]; angle 0 where not drawn."""
-    count, dtype = len(means), means.dtype
-    results = [program.write((count, *shape), dtype) for shape in ((4,), (3,), (3,), ())]
-    results.append(program.write((count,), dtype, differentiable=False))
-    given = means, *others, near_plane, footprint, smoothing, alpha_threshold
-    program.launch(projection_kernel(warp_scalar(dtype), antialiased), count, given, results)
-    return tuple(results)
+class _SphereSplats(NamedTuple):
+    """Gaussians on the unit sphere around a position.
+
+    Attributes:
+        caps: [N, 4] unit direction, and the angle around it within which a Gaussian counts; 0 if culled.
+        across: [N, 3], with `along` the root of the inverse covariance.
+        along: [N, 3].
+        opacities: [N].
+        distances: [N] from the position; 0 if culled.
+    """
+
+    caps: Tensor
+    across: Tensor
+    along: Tensor
+    opacities: Tensor
+    distances: Tensor
+
+
+def _project(inputs: tuple[Tensor, ...], parameters: tuple, antialiased: bool) -> _SphereSplats:
+    means, count = inputs[0], len(inputs[0])
+    outputs = _SphereSplats(
+        means.new_empty(count, 4),
+        means.new_empty(count, 3),
+        means.new_empty(count, 3),
+        means.new_empty(count),
+        means.new_empty(count),
+    )
+    kernel = projection_kernel(warp_scalar(means.dtype), antialiased)
+    return _SphereSplats(*launch_projection(kernel, inputs, parameters, outputs))
 
 
 @dataclass(frozen=True)
 class _Lists:
-    """As TileLists, of directions [H, W, 3]."""
+    """Tile lists of an image of directions [H, W, 3]; otherwise as TileLists."""
 
     directions: Tensor
     columns: int
@@ -118,7 +135,7 @@ class _Lists:
 
 @torch.no_grad()
 def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, unsorted: bool) -> _Lists:
-    """For each tile the Gaussians whose cap meets its own, by distance."""
+    """List for each tile the Gaussians whose cap meets the tile's own, by distance."""
     count, (height, width) = len(caps), directions.shape[:2]
     columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
     tile_caps, block_caps = (caps_of(directions, side * TILE_SIZE) for side in (1, BLOCK_TILES))
@@ -126,45 +143,45 @@ def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, unsorted: b
     order = depth_order(distances, caps[:, 3:].expand(-1, 2).contiguous())
     frame = order, caps, tile_caps, block_caps, columns, rows
     counts, none = torch.empty_like(order), order[:0]
-    launch(kernel, count, *frame, order, counts, none, none, smallest=256)
+    launch(kernel, count, *frame, order, counts, none, none, min_range=256)
     ends = counts.cumsum(0)
-    room = check_intersection_count(int(ends[-1]) if count else 0, count, columns, rows)
+    length = check_intersection_count(int(ends[-1]) if count else 0, count, columns, rows)
     starts = (ends - counts).int()
-    tiles, gaussians = (torch.empty(2 * room, dtype=torch.int32, device=order.device) for _ in range(2))
-    launch(kernel, count * bool(room), *frame, starts, counts, tiles, gaussians, smallest=256)
-    ranges, gaussians, _, places = lists_by_tile(tiles, gaussians, room, None, columns, rows, unsorted)
-    by_gaussian = None if places is None else UnsortedIntersections(order.clone(), ends, places)
-    return _Lists(directions, columns, ranges, gaussians, by_gaussian)
+    tiles, gaussians = (torch.empty(2 * length, dtype=torch.int32, device=order.device) for _ in range(2))
+    launch(kernel, count * bool(length), *frame, starts, counts, tiles, gaussians, min_range=256)
+    ranges, gaussians, _, places = lists_by_tile(tiles, gaussians, length, None, columns, rows, unsorted)
+    before = None if places is None else UnsortedIntersections(order.clone(), ends, places)
+    return _Lists(directions, columns, ranges, gaussians, before)
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, caps, across, along, opacities, features, lists: _Lists, alpha_threshold: float):
         (height, width), (_, channels) = lists.directions.shape[:2], features.shape
-        drawn = tuple(tensor.detach() for tensor in (caps, across, along, opacities, features))
+        splats = tuple(tensor.detach() for tensor in (caps, across, along, opacities, features))
         image, transmittance = features.new_empty(height, width, channels), features.new_empty(height, width)
         ends = torch.empty(height, width, dtype=torch.int32, device=image.device)
         ctx.frame = lists.columns, width, height, alpha_threshold
         ctx.kernels, ctx.lists = sphere_kernels(warp_scalar(features.dtype), channels), lists
         ctx.pixels = lists.ranges.shape[0] * _PIXELS
-        read = lists.ranges, lists.gaussians, lists.directions.view(-1, 3), *drawn
+        read = lists.ranges, lists.gaussians, lists.directions.view(-1, 3), *splats
         results = image.view(-1, channels), transmittance, ends
-        launch(ctx.kernels.blend, ctx.pixels, *read, *ctx.frame, *results, smallest=_PIXELS)
-        ctx.save_for_backward(*drawn, transmittance, ends)
+        launch(ctx.kernels.blend, ctx.pixels, *read, *ctx.frame, *results, min_range=_PIXELS)
+        ctx.save_for_backward(*splats, transmittance, ends)
         return image, transmittance
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, by_image, by_transmittance):
-        *drawn, transmittance, ends = ctx.saved_tensors
-        lists, unsorted, (count, channels) = ctx.lists, ctx.lists.unsorted, drawn[-1].shape
+        *splats, transmittance, ends = ctx.saved_tensors
+        lists, unsorted, (count, channels) = ctx.lists, ctx.lists.unsorted, splats[-1].shape
         # On the CPU each entry has a row, and whole tiles go to a thread: sums keep one order.
         places = lists.gaussians if unsorted is None else unsorted.places
         rows = by_image.new_zeros(count if unsorted is None else len(places), channels + 10)
         launch(
             ctx.kernels.blend_adjoint,
             ctx.pixels,
-            *(lists.ranges, lists.gaussians, lists.directions.view(-1, 3), *drawn, *ctx.frame),
+            *(lists.ranges, lists.gaussians, lists.directions.view(-1, 3), *splats, *ctx.frame),
             *(transmittance, ends, places, by_image.contiguous().view(-1, channels), by_transmittance.contiguous()),
             rows,
             ranges=even_ranges(ctx.pixels // _PIXELS, 1) * _PIXELS,
@@ -177,7 +194,8 @@ class _Blend(torch.autograd.Function):
 
 
 def caps_of(directions: Tensor, side: int) -> Tensor:
-    """[blocks, 4] by rows: the mean direction of each block of side x side pixels, and the largest angle from it."""
+    """Return [blocks, 4], by rows: the mean direction of each block of side x side pixels and the largest angle to
+    it."""
     height, width = directions.shape[:2]
     rows, columns = -(-height // side), -(-width // side)
     # What is missing at the end repeats the last pixels.

@@ -7,12 +7,15 @@ from ..kernels.ssim import RADIUS, ssim_kernels, window
 from ..kernels.ssim_cuda import ssim_patch_kernels
 from . import patches
 from .checks import check_tensors
-from .warp_launch.launching import constant, launch, one, scale_gradient, warp_scalar
+from .gradients import constant, scale_gradient, unit_gradient
+from .torch_contract import torch_operation
+from .warp_launch.launching import launch, warp_scalar
 
 CPU_LANES = 16  # Numbers that one step of the CPU kernels takes: one AVX-512 register of float32
 STEPS_PER_THREAD = 1024  # Smallest share of such steps that is worth handing to another thread: about 0.1 ms of work
 
 
+@torch_operation
 def ssim(a: Tensor, b: Tensor) -> Tensor:
     """Mean structural similarity (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5, data range 1.
 
@@ -33,6 +36,7 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
     return _Similarity.apply(a, b, True)
 
 
+@torch_operation
 def ssim_map(a: Tensor, b: Tensor) -> Tensor:
     """The [H, W, C] values whose mean is ssim(a, b); same arguments, same errors, differentiable as well."""
     return _Similarity.apply(a, b, False)
@@ -72,7 +76,7 @@ def distance_terms(
     weights = distance_weight / a.numel(), dissimilarity_weight / a.numel()
     terms, derivatives = _compare(a, b, weights)
     # Made at once: it takes a fifth of the memory of what it is made of.
-    return terms, _gradient(a, b, derivatives, one(a), weights, slopes) if wanted else None
+    return terms, _gradient(a, b, derivatives, unit_gradient(a), weights, slopes) if wanted else None
 
 
 class _Similarity(torch.autograd.Function):
@@ -188,4 +192,4 @@ class _Runs:
     def launch(self, kernel, inputs, results) -> None:
         """Launch a kernel over the whole image."""
         arguments = *inputs, self.weights, self.length, self.channels, *results
-        launch(kernel, self.rows * -(-self.length // self.lanes), *arguments, smallest=STEPS_PER_THREAD)
+        launch(kernel, self.rows * -(-self.length // self.lanes), *arguments, min_range=STEPS_PER_THREAD)

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from ..kernels import training_step as kernels
+from .gradients import unit_gradient
 from .harmonics import HarmonicsGradients
-from .warp_launch.launching import launch, one
+from .warp_launch.launching import launch
 from .warp_launch.threads import torch_threads
 
 
@@ -68,7 +69,7 @@ class _ByOne(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, upstream):
-        return one(upstream)
+        return unit_gradient(upstream)
 
 
 class AdamStep(NamedTuple):

@@ -1,37 +1,53 @@
-"""What the block kernels of a GPU have to do for a picture, counted."""
+"""Count what the block kernels of a GPU blend."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..kernels.blend_cuda import BLOCKS_PER_TILE
-from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE, TILE_SIZE
-from .blending import blend_blocks, padded
-from .projection import project
-from .tile_lists import build_tile_lists, order_intersections, pack_gaussians
+from ..kernels.constants import ALPHA_THRESHOLD, TILE_SIZE
+from .blending import blend_blocks, pad_features
+from .rasterization import RenderOptions, list_splats, project_to_camera
+from .tile_lists import Splats
+
+
+class Workload(NamedTuple):
+    """Work of one image.
+
+    Attributes:
+        intersections: (Gaussian, tile) pairs.
+        blended: (Gaussian, warp) pairs that are blended: the Gaussian touches the 8 x 4 pixels of the warp and is not
+            behind the last one that any of these shows.
+    """
+
+    intersections: int
+    blended: int
 
 
 @torch.no_grad()
-def count_blended_pairs(splats: Sequence[Tensor], width: int, height: int) -> tuple[int, int]:
-    """The (Gaussian, tile) pairs of a picture, and the (Gaussian, warp) pairs that are drawn: those that touch the 8 x
-    4 pixels of a warp and are not behind the last that any of these shows.
+def count_blended_pairs(arguments: Sequence[Tensor], width: int, height: int) -> Workload:
+    """Return the work of an image.
 
-    splats: the seven tensors that rasterize() takes first, for one camera, drawn with its own thresholds; on a GPU, or
-    where the CPU runs blocks of threads.
+    Args:
+        arguments: the seven tensors that rasterize() takes first, for one camera, on a GPU (or where the CPU runs
+            blocks of threads).
+        width: of the image, pixels.
+        height: of the image, pixels.
     """
-    given = (tensor.detach().contiguous() for tensor in splats)
-    means, log_scales, quaternions, opacities, features, pose, intrinsics = given
-    options = {"near_plane": NEAR_PLANE, "eps2d": EPS2D, "alpha_threshold": ALPHA_THRESHOLD, "antialiased": False}
-    shapes = means, log_scales, quaternions, opacities
-    projected = project(*shapes, pose, intrinsics, width=width, height=height, **options)
-    means2d, conics, depths, opacities, extents = projected
-    records, counts = pack_gaussians(means2d, conics, opacities, extents, ALPHA_THRESHOLD, width, height, features)
-    numbered = order_intersections(counts, depths, extents, unsorted=False)
-    lists = build_tile_lists(records, *numbered, depths, extents, width, height, unsorted=False)
-    assert lists.corners is not None, "so few Gaussians that one sort makes their lists, which tells corners"
+    means, log_scales, quaternions, opacities, features, pose, intrinsics = (
+        tensor.detach().contiguous() for tensor in arguments
+    )
+    options = RenderOptions(width, height)
+    projected = project_to_camera(means, log_scales, quaternions, opacities, pose, intrinsics, options)
+    splats = Splats(
+        projected.means2d, projected.conics, projected.opacities, features, projected.depths, projected.extents
+    )
+    lists, packed = list_splats(splats, options, blocks=True)
+    assert lists.corners is not None, "block kernels need lists with corners"
     image, left = features.new_empty(height, width, features.shape[1]), features.new_empty(height, width)
-    last = blend_blocks(padded(features), lists, records, image, left, ALPHA_THRESHOLD)
+    last = blend_blocks(pad_features(features), lists, packed, image, left, ALPHA_THRESHOLD)
     beyond = 0, lists.columns * TILE_SIZE - width, 0, lists.rows * TILE_SIZE - height
     last = torch.nn.functional.pad(last.view(height, width), beyond)
     # Rows of tiles, of their corners, of pixels; then columns of each.
@@ -42,5 +58,5 @@ def count_blended_pairs(splats: Sequence[Tensor], width: int, height: int) -> tu
     places = torch.arange(len(tiles), device=last.device) - (lengths.cumsum(0) - lengths)[tiles]
     intersections = lists.ranges[:, 0].long()[tiles] + places
     touched = (lists.corners[intersections, None].int() >> torch.arange(BLOCKS_PER_TILE, device=last.device)) & 1
-    drawn = touched.bool() & (places[:, None] < last[tiles])
-    return lists.intersection_count, int(drawn.sum())
+    blended = touched.bool() & (places[:, None] < last[tiles])
+    return Workload(lists.intersection_count, int(blended.sum()))

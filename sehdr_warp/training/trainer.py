@@ -301,7 +301,7 @@ class Trainer:
 
     def _launching(self):
         """Launched work shares stream and memory with recorded steps."""
-        return nullcontext() if self._recorder is None else self._recorder.launching()
+        return nullcontext() if self._recorder is None else self._recorder.on_capture_stream()
 
     def _replay(self, views: ViewStack | PhotoStream, index: int, watched: bool, kind) -> tuple[Tensor, Tensor]:
         capacity, recorder, follower = self._capacity.capacity(), self._recorder, self._follower

@@ -1,11 +1,12 @@
 """Small random scenes and error measures for the splatting tests."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 
 from sehdr_warp.rasterizer.projection import project
-from sehdr_warp.rasterizer.tile_lists import pack_gaussians
+from sehdr_warp.rasterizer.tile_lists import PackedSplats, Splats, pack_splats
 
 WIDTH, HEIGHT = 70, 50
 
@@ -62,10 +63,18 @@ def projected(scene: SplatInputs, threshold: float = 1 / 255) -> tuple[torch.Ten
         return project(*tensors, width=scene.width, height=scene.height, **options)
 
 
-def packed(scene: SplatInputs, threshold: float = 1 / 255):
-    """Records, counts, depths and extents of a scene, as build_tile_lists() takes them."""
+class PackedScene(NamedTuple):
+    """What build_tile_lists() takes of a scene."""
+
+    packed: PackedSplats
+    depths: torch.Tensor
+    extents: torch.Tensor
+
+
+def packed(scene: SplatInputs, threshold: float = 1 / 255) -> PackedScene:
     means2d, conics, depths, opacities, extents = projected(scene, threshold)
-    return *pack_gaussians(means2d, conics, opacities, extents, threshold, scene.width, scene.height), depths, extents
+    splats = Splats(means2d, conics, opacities, means2d.new_empty(len(means2d), 0), depths, extents)
+    return PackedScene(pack_splats(splats, threshold, scene.width, scene.height), depths, extents)
 
 
 def relative_error(value: torch.Tensor, truth: torch.Tensor) -> float:

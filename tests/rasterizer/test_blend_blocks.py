@@ -33,13 +33,14 @@ def fibers(monkeypatch):
 
 
 def leaves_and_lists(scene):
-    """What blend() takes: the leaves (means2d, conics, opacities, features), lists and records; and the extents."""
+    """What blend() takes: the leaves (means2d, conics, opacities, features), lists and packed Gaussians; and the
+    extents."""
     means2d, conics, _, opacities, _ = projected(scene)
-    records, counts, depths, extents = packed(scene)
-    numbered = order_intersections(counts, depths, extents)
-    lists = build_tile_lists(records, *numbered, depths, extents, scene.width, scene.height)
+    splats, depths, extents = packed(scene)
+    offsets = order_intersections(splats.counts, depths, extents)
+    lists = build_tile_lists(splats, offsets, depths, extents, scene.width, scene.height)
     leaves = [tensor.detach().requires_grad_() for tensor in (means2d, conics, opacities, scene.tensors[4])]
-    return leaves, [lists, records], extents
+    return leaves, [lists, splats], extents
 
 
 @pytest.mark.parametrize("dtype", BOUNDS, ids=["float64", "float32"])

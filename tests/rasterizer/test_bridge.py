@@ -25,7 +25,7 @@ def scale_kernel(
 
 
 ALIVE: list[weakref.ref] = []
-"""The tapes of the programs that have run."""
+"""The programs that have run."""
 
 
 @differentiable
@@ -34,7 +34,7 @@ def scale_and_square(program, values, gain):
     squared = program.write(values.shape)
     program.launch(scale_kernel, len(values), [values, gain], [scaled])
     program.launch(square_kernel, len(values), [scaled], [squared])
-    ALIVE.append(weakref.ref(program.tape))
+    ALIVE.append(weakref.ref(program))
     return scaled, squared
 
 
@@ -44,7 +44,7 @@ def leaves(device):
     return values, torch.tensor([1.7], device=device, requires_grad=True)
 
 
-def test_gradients_flow_through_the_tape(device):
+def test_gradients_flow_through_the_launches(device):
     values, gain = leaves(device)
     scaled, squared = scale_and_square(values, gain)
     (2.0 * scaled + squared).sum().backward()
@@ -74,12 +74,66 @@ def test_the_gradient_that_torch_hands_in_is_left_alone(device):
     torch.testing.assert_close(scaled.grad, torch.full_like(scaled, 3.0))
 
 
-def test_differentiating_twice_is_refused(device):
+def test_a_retained_graph_gives_the_same_gradients_again(device):
     values, gain = leaves(device)
-    loss = scale_and_square(values, gain)[0].sum()
-    loss.backward(retain_graph=True)
-    with pytest.raises(RuntimeError, match="already differentiated"):
+    scaled, squared = scale_and_square(values, gain)
+    loss = (2.0 * scaled + squared).sum()
+    first = torch.autograd.grad(loss, (values, gain), retain_graph=True)
+    second = torch.autograd.grad(loss, (values, gain))
+    for one, other in zip(first, second, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=0)
+    with pytest.raises(RuntimeError, match="second time"):
         loss.backward()
+
+
+def test_an_output_that_later_launches_read_gets_all_of_its_gradient(device):
+    values, gain = leaves(device)
+    scaled, squared = scale_and_square(values, gain)
+    scaled.retain_grad()
+    (3.0 * scaled + squared).sum().backward()
+    torch.testing.assert_close(scaled.grad, torch.full_like(scaled, 3.0))
+    torch.testing.assert_close(values.grad, 3.0 * gain + 2.0 * gain**2 * values)
+    by_squared = torch.autograd.grad(scale_and_square(values, gain)[1].sum(), values)[0]
+    torch.testing.assert_close(by_squared, 2.0 * gain**2 * values)
+
+
+@pytest.mark.parametrize("changed", [0, 1, "scaled"])
+def test_changes_in_place_before_the_backward_pass_raise_torchs_error(device, changed):
+    values, gain = leaves(device)
+    scaled, squared = scale_and_square(values, gain)
+    with torch.no_grad():
+        (scaled if changed == "scaled" else (values, gain)[changed]).mul_(2.0)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        squared.sum().backward()
+
+
+@pytest.mark.parametrize(
+    "arguments, error, message",
+    [
+        ((), TypeError, "scale_and_square.. got no tensor"),
+        ((3.0,), TypeError, "argument 0 is a float"),
+        ((torch.zeros(4, 3), [1.0]), TypeError, "argument 1 is a list"),
+        (
+            (torch.zeros(4, 3, device="meta"), torch.zeros(1)),
+            ValueError,
+            "argument 1 is on cpu, but argument 0 is on meta",
+        ),
+        ((torch.zeros(4, 3), torch.zeros(1, 1)), TypeError, "gain takes a tensor with 1 dimensions"),
+        ((torch.zeros(4, 3, dtype=torch.float64), torch.zeros(1)), TypeError, "float64"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments, error, message):
+    with pytest.raises(error, match=message):
+        scale_and_square(*arguments)
+
+
+def test_what_a_program_returns_it_must_have_written(device):
+    @differentiable
+    def same(program, tensor):
+        return tensor
+
+    with pytest.raises(TypeError, match="did not make"):
+        same(torch.zeros(3, device=device, requires_grad=True))
 
 
 def test_gradients_of_gradients_are_refused(device):
@@ -100,7 +154,7 @@ def test_memory_goes_with_the_result_without_the_garbage_collector(device, diffe
             if differentiated:
                 result[0].sum().backward()
             del result
-        assert [tape() for tape in ALIVE] == [None] * 3
+        assert [program() for program in ALIVE] == [None] * 3
     finally:
         gc.enable()
 

@@ -65,7 +65,7 @@ def test_a_launched_graph_that_lives_on_spoils_no_recording():
         loss.backward()
         return loss, values.grad
 
-    with recorder.launching():
+    with recorder.on_capture_stream():
         kept, _ = step()
     assert recorder.run("step", lambda: step()[1]).tolist() == [2.0] * 4
     assert kept.requires_grad

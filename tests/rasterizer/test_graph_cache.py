@@ -13,7 +13,7 @@ CALLS = graph_cache.WARMUP_CALLS + 3
 
 @pytest.fixture(autouse=True)
 def nothing_is_recorded():
-    graph_cache.forget()
+    graph_cache.clear_graphs()
 
 
 def launched(*arguments, **options):
@@ -26,7 +26,7 @@ def scene_of(count=300, channels=3):
 
 
 def recordings():
-    return sum(kind.made for kind in graph_cache._kinds.values())
+    return sum(size.captured for size in graph_cache._graphs.values())
 
 
 def values_and_gradients(splat, scene, *, by_alpha=True, **options):
@@ -70,14 +70,14 @@ def test_replays_follow_their_arguments_and_their_need_of_room(options):
 @needs_gpu
 def test_pictures_stay_and_backward_passes_come_in_any_order():
     scene = scene_of()
-    shifts = [0.02 * call for call in range(CALLS + graph_cache.TOGETHER)]
+    shifts = [0.02 * call for call in range(CALLS + graph_cache.MAX_GRAPHS)]
 
     def seen(splat, shift):
         return splat(scene.tensors[0] + shift, *scene.arguments[1:]).image
 
     images = [seen(rasterize, shift) for shift in shifts]
     truths = [seen(launched, shift) for shift in shifts]
-    assert recordings() == graph_cache.TOGETHER
+    assert recordings() == graph_cache.MAX_GRAPHS
     for place in (*range(1, len(shifts), 2), *range(0, len(shifts), 2)):
         pair = [
             torch.autograd.grad((i * random_like(i, place)).sum(), scene.tensors[:5])
@@ -129,11 +129,11 @@ def test_a_feature_that_is_not_finite_is_culled_in_a_replay_as_well():
 
 
 def test_calls_are_recorded_after_some_and_hold_what_they_were_given():
-    kind, made = graph_cache._Kind(), iter("abcdefgh")
+    kind, made = graph_cache._SizeGraphs(), iter("abcdefgh")
     assert [kind.take(lambda pairs: next(made)) for _ in range(graph_cache.WARMUP_CALLS)] == [
         None
     ] * graph_cache.WARMUP_CALLS
-    leases = [graph_cache._Lease(kind.idle, kind.take(lambda pairs: next(made))) for _ in range(graph_cache.TOGETHER)]
+    leases = [graph_cache._Lease(kind.idle, kind.take(lambda pairs: next(made))) for _ in range(graph_cache.MAX_GRAPHS)]
     assert kind.take(lambda pairs: next(made)) is None, "all are held"
     del leases[1]
     assert kind.take(lambda pairs: next(made)) == "b"
@@ -145,7 +145,7 @@ def test_calls_are_recorded_after_some_and_hold_what_they_were_given():
 
 
 def test_what_cannot_be_recorded_is_launched():
-    kind, asked = graph_cache._Kind(), []
+    kind, asked = graph_cache._SizeGraphs(), []
 
     def record(pairs):
         asked.append(pairs)
@@ -155,7 +155,7 @@ def test_what_cannot_be_recorded_is_launched():
 
 
 def test_only_the_latest_kinds_are_remembered():
-    kinds = [graph_cache._kind((n,)) for n in range(graph_cache.KINDS)]
-    assert graph_cache._kind((0,)) is kinds[0]
-    graph_cache._kind((graph_cache.KINDS,))
-    assert graph_cache._kind((0,)) is kinds[0] and graph_cache._kind((1,)) is not kinds[1]
+    kinds = [graph_cache._graphs_of((n,)) for n in range(graph_cache.MAX_SIZES)]
+    assert graph_cache._graphs_of((0,)) is kinds[0]
+    graph_cache._graphs_of((graph_cache.MAX_SIZES,))
+    assert graph_cache._graphs_of((0,)) is kinds[0] and graph_cache._graphs_of((1,)) is not kinds[1]

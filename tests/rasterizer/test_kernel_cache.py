@@ -16,7 +16,7 @@ def cache(tmp_path, monkeypatch):
         (tmp_path / module).mkdir()
         for end in (".o", ".meta"):
             (tmp_path / module / f"{module}{end}").write_text(module + end)
-    kernel_cache.check()
+    kernel_cache.discard_damaged()
     return tmp_path
 
 
@@ -27,12 +27,12 @@ def modules(cache):
 @pytest.mark.parametrize("damage", ["", "half", "wp_blend_0a1b2c3.O"])
 @pytest.mark.parametrize("end", [".o", ".meta"])
 def test_damaged_modules_go_and_are_told_once(cache, caplog, damage, end):
-    kernel_cache.check()
+    kernel_cache.discard_damaged()
     assert len(modules(cache)) == 3 and not caplog.text
     (cache / "wp_blend_0a1b2c3" / f"wp_blend_0a1b2c3{end}").write_text(damage)
-    kernel_cache.check()
+    kernel_cache.discard_damaged()
     assert modules(cache) == ["wp_sort_0123456", "wp_sort_0123456_p1_t2"]
-    kernel_cache.check()
+    kernel_cache.discard_damaged()
     assert caplog.text.count("1 damaged modules of the kernel cache are compiled again") == 1
 
 
@@ -42,6 +42,6 @@ def test_a_place_that_cannot_be_used_is_done_without(monkeypatch, caplog, place)
     monkeypatch.setattr(wp.config, "kernel_cache_dir", None)
     monkeypatch.setattr(kernel_cache.os, "environ", {"WARP_CACHE_PATH": place})
     monkeypatch.setattr(kernel_cache.atexit, "register", lambda *given, **_: made.append(given[1]))
-    kernel_cache.choose()
+    kernel_cache.select_folder()
     assert made == [wp.config.kernel_cache_dir] and "for this process alone" in caplog.text
     Path(made[0]).rmdir()

@@ -26,15 +26,15 @@ def three_threads(monkeypatch):
 def means(request, monkeypatch):
     """How threads are had: torch's OpenMP, where it has one, or helpers of our own."""
     if request.param == "helpers":
-        monkeypatch.setattr(threads, "_fork", lambda: 0)
-    elif not threads._fork():
+        monkeypatch.setattr(threads, "_openmp_fork", lambda: 0)
+    elif not threads._openmp_fork():
         pytest.skip("torch has no OpenMP here")
 
 
 def squares(count: int, ranges: torch.Tensor | None = None) -> bool:
     """Whether each of `count` values is squared once."""
     values, sums = torch.arange(count).float(), torch.zeros(count)
-    launch(add_squares, count, values, sums, ranges=ranges, smallest=1)
+    launch(add_squares, count, values, sums, ranges=ranges, min_range=1)
     return torch.equal(sums, values * values)
 
 
@@ -51,7 +51,7 @@ def test_adjoints_are_shared_too(means):
     values, sums = torch.arange(3000).float(), torch.zeros(3000)
     by_values = torch.zeros(3000)
     gradients = [by_values, torch.ones(3000)]
-    launch(add_squares, 3000, values, sums, gradients=gradients, smallest=1)
+    launch(add_squares, 3000, values, sums, gradients=gradients, min_range=1)
     assert torch.equal(by_values, 2 * values)
 
 
@@ -87,4 +87,4 @@ def test_ranges_cover_every_item_once(count):
 
 def test_many_items_make_ranges_for_all_threads():
     assert len(threads.even_ranges(1 << 20)) - 1 == 3 * threads.RANGES_PER_THREAD
-    assert len(threads.whole(1 << 20)) == 2
+    assert len(threads.single_range(1 << 20)) == 2

@@ -8,6 +8,7 @@ import torch
 from sehdr_warp.kernels.tiles import DEPTH_BITS
 from sehdr_warp.rasterizer import tile_lists
 from sehdr_warp.rasterizer.tile_lists import (
+    PackedSplats,
     build_tile_lists,
     depth_order,
     emit_intersections,
@@ -23,72 +24,73 @@ COLUMNS, ROWS, UNWRITTEN = 20, 15, -7
 
 
 def dense(device, count=20000):
-    """Records, counts, depths and extents of a scene dense enough that many ellipses end just at a tile's border."""
+    """A scene, packed, dense enough that many ellipses end just at a tile's border."""
     return packed(random_scene(count=count, width=16 * COLUMNS, height=16 * ROWS).to(torch.float32, device))
 
 
 def counted(*scene):
     """What emit_intersections() reads, and the counts in that order."""
-    records, counts, depths, extents = dense(*scene)
+    splats, depths, extents = dense(*scene)
     order = depth_order(depths, extents)
-    return (order, *records, extents, COLUMNS, ROWS), counts[order]
+    return (order, splats, extents, COLUMNS, ROWS), splats.counts[order]
 
 
-def built(records, counts, depths, extents, max_intersections=None, *, unsorted=True):
-    numbered = order_intersections(counts, depths, extents, unsorted=unsorted)
+def built(splats, depths, extents, max_intersections=None, *, unsorted=True):
+    offsets = order_intersections(splats.counts, depths, extents, unsorted=unsorted)
     size = 16 * COLUMNS, 16 * ROWS
-    return build_tile_lists(records, *numbered, depths, extents, *size, max_intersections, unsorted=unsorted)
+    return build_tile_lists(splats, offsets, depths, extents, *size, max_intersections, unsorted=unsorted)
 
 
-def emit(records, counts, monkeypatch):
+def emit(arguments, counts, monkeypatch):
     """Tiles and Gaussians of the intersections, in memory that holds what no tile and no Gaussian is."""
     empty = torch.empty
     monkeypatch.setattr(torch, "empty", lambda *a, **k: empty(*a, **k).fill_(UNWRITTEN))
     room = int(counts.sum())
-    tiles, gaussians = emit_intersections(*records, counts.cumsum(0), room)
+    tiles, gaussians = emit_intersections(*arguments, counts.cumsum(0), room)
     monkeypatch.undo()
     return tiles[:room], gaussians[:room]
 
 
 def test_each_counted_tile_is_emitted_once(device, monkeypatch):
-    records, counts = counted(device)
+    arguments, counts = counted(device)
     assert int(counts.sum()) > 200_000
-    tiles, gaussians = emit(records, counts, monkeypatch)
+    tiles, gaussians = emit(arguments, counts, monkeypatch)
     assert int(tiles.min()) >= 0 and int(tiles.max()) < COLUMNS * ROWS
-    assert torch.equal(gaussians, records[0].repeat_interleave(counts))
+    assert torch.equal(gaussians, arguments[0].repeat_interleave(counts))
     pairs = gaussians.long() * COLUMNS * ROWS + tiles
     assert len(pairs.unique()) == len(pairs)
 
 
 def test_an_entry_counted_too_much_is_no_tiles_and_one_too_few_costs_its_own_gaussian_only(device, monkeypatch):
-    records, counts = counted(device, 500)
-    true_tiles, _ = emit(records, counts, monkeypatch)
+    arguments, counts = counted(device, 500)
+    true_tiles, _ = emit(arguments, counts, monkeypatch)
     first, second = counts.nonzero()[[3, 40], 0].tolist()
     assert int(counts[second]) > 1
     wrong = counts.clone()
     wrong[first] += 2
     wrong[second] -= 1
-    tiles, gaussians = emit(records, wrong, monkeypatch)
-    assert torch.equal(gaussians, records[0].repeat_interleave(wrong))
+    tiles, gaussians = emit(arguments, wrong, monkeypatch)
+    assert torch.equal(gaussians, arguments[0].repeat_interleave(wrong))
     unused = tiles == COLUMNS * ROWS
-    assert int(unused.sum()) == 2 and set(gaussians[unused].tolist()) == {int(records[0][first])}
+    assert int(unused.sum()) == 2 and set(gaussians[unused].tolist()) == {int(arguments[0][first])}
     dropped = int(counts[: second + 1].sum()) - 1
     assert torch.equal(tiles[~unused], torch.cat([true_tiles[:dropped], true_tiles[dropped + 1 :]]))
     ordered = tiles.sort(stable=True)
-    ranges, _ = find_lists(ordered.values, gaussians[ordered.indices], records[1:3], COLUMNS, ROWS)
+    ranges, _ = find_lists(ordered.values, gaussians[ordered.indices], arguments[1], COLUMNS, ROWS)
     assert int((ranges[:, 1] - ranges[:, 0]).sum()) == len(tiles) - 2
 
 
 @pytest.mark.parametrize("spare", [0, 7, -1000])
 def test_one_sort_makes_the_lists_of_two(device, spare):
-    records, counts, depths, extents = dense(device)
+    splats, depths, extents = dense(device)
+    counts = splats.counts
     # Many at one depth: ties keep the order of indices.
     depths = (depths * 4).round().clamp_min(1) / 4
-    lists = built(records, counts, depths, extents)
+    lists = built(splats, depths, extents)
     room = lists.intersection_count + spare
-    given = *records, extents, depths, COLUMNS, ROWS, counts.cumsum(0), room
+    given = splats, extents, depths, COLUMNS, ROWS, counts.cumsum(0), room
     keys, gaussians = sort_keys(*emit_keys(*given), room, COLUMNS * ROWS)
-    ranges, corners = find_lists(keys, gaussians, records, COLUMNS, ROWS)
+    ranges, corners = find_lists(keys, gaussians, splats, COLUMNS, ROWS)
     if spare < 0:
         assert int(ranges[-1, 1]) == room and int(keys.max() >> DEPTH_BITS) < COLUMNS * ROWS
         return
@@ -100,11 +102,11 @@ def test_one_sort_makes_the_lists_of_two(device, spare):
 def test_corners_are_those_that_an_ellipse_touches(device):
     """Beside what all pixels of a corner see of a Gaussian, drawn alone."""
     scene = random_scene(count=40, width=32, height=32, spread=0.8, seed=3).to(torch.float32, device)
-    records, counts, depths, extents = packed(scene)
-    numbered = order_intersections(counts, depths, extents, unsorted=False)
-    lists = build_tile_lists(records, *numbered, depths, extents, 32, 32, unsorted=False)
+    splats, depths, extents = packed(scene)
+    offsets = order_intersections(splats.counts, depths, extents, unsorted=False)
+    lists = build_tile_lists(splats, offsets, depths, extents, 32, 32, unsorted=False)
     columns, rows = torch.meshgrid(torch.arange(32.0, device=device), torch.arange(32.0, device=device), indexing="xy")
-    (x, y, *_), (a, b, c, level) = (record[lists.gaussians.long()].t()[..., None, None] for record in records)
+    (x, y, *_), (a, b, c, level) = (record[lists.gaussians.long()].t()[..., None, None] for record in splats[:2])
     dx, dy = columns + 0.5 - x, rows + 0.5 - y
     seen = a * dx * dx + 2 * b * dx * dy + c * dy * dy <= level
     lengths = (lists.ranges[:, 1] - lists.ranges[:, 0]).long()
@@ -155,16 +157,16 @@ def test_lists_keep_no_more_memory_than_they_use(device, unsorted, spare):
 @pytest.mark.parametrize("unsorted", [True, False])
 @pytest.mark.parametrize("count, chunks", [(0, 1), (1, 3), (5000, 7)])
 def test_entries_counted_by_chunks_are_those_sorted(monkeypatch, count, chunks, unsorted):
-    monkeypatch.setattr(tile_lists, "SMALLEST_CHUNK", max(1, count // chunks))
+    monkeypatch.setattr(tile_lists, "MIN_CHUNK", max(1, count // chunks))
     monkeypatch.setenv("SEHDR_THREADS", str(chunks))
     generator, tiles = torch.Generator().manual_seed(count), 40
     # Some belong to no tile, and some tiles have none.
     given = [torch.randint(3, tiles + 1, (2 * count,), generator=generator, dtype=torch.int32)]
     given.append(torch.randint(1000, (2 * count,), generator=generator, dtype=torch.int32))
-    records = torch.zeros(1000, 4), torch.full((1000, 4), -1.0)
+    splats = PackedSplats(torch.zeros(1000, 4), torch.full((1000, 4), -1.0), torch.zeros(1000, dtype=torch.int64))
     counted = tile_lists._count_by_tile(*(tensor.clone() for tensor in given), count, tiles, unsorted)
     copies = (tensor.clone() for tensor in given)
-    ranges, ones, corners, places = tile_lists._sort_by_tile(*given, count, records, tiles, 1, unsorted)
+    ranges, ones, corners, places = tile_lists._sort_by_tile(*given, count, splats, tiles, 1, unsorted)
     alike, *_, without, _ = tile_lists._sort_by_tile(*copies, count, None, tiles, 1, unsorted)
     assert torch.equal(alike, ranges) and without is None and len(corners) == count
     for ours, sorted_ones in zip(counted, (ranges, ones, places), strict=True):

@@ -25,7 +25,7 @@ _log = logging.getLogger("sehdr_warp.rasterizer")
 _MODULE = re.compile(r"wp_.*_[0-9a-f]{7}")
 
 
-def choose() -> None:
+def select_folder() -> None:
     """Gives Warp a cache that can be used; before wp.init()."""
     stated = os.environ.get("WARP_CACHE_PATH")
     if wp.config.kernel_cache_dir or (stated is None and not sys.platform.startswith("linux")):
@@ -37,7 +37,7 @@ def choose() -> None:
         _log.warning("%s cannot be written to; kernels are compiled for this process alone", folder or "~/.cache")
 
 
-def check() -> None:
+def discard_damaged() -> None:
     """Discards what is damaged; after wp.init(), before the first launch."""
     cache = Path(wp.config.kernel_cache_dir or "")
     now, before = _lines(cache), listed(cache)

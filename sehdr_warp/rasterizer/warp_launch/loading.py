@@ -1,5 +1,6 @@
-"""Warp, ready for use, and its kernels for the CPU compiled and loaded."""
+"""Initialise Warp; compile and load its kernels for the CPU."""
 
+import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -13,30 +14,52 @@ from . import kernel_cache
 
 # The start-up banner, and the warning where there is no GPU, are not for a library to print.
 wp.config.log_level = wp.LOG_WARNING
-kernel_cache.choose()
+kernel_cache.select_folder()
 with silent_stderr():
     wp.init()
-kernel_cache.check()
+kernel_cache.discard_damaged()
 
-_loading = threading.Lock()  # Kernels that are launched are neither compiled nor loaded by two threads at once
-_compilers = {fused: ThreadPoolExecutor(1, thread_name_prefix="sehdr-warp compiles") for fused in (False, True)}
+_loading = threading.Lock()  # Two threads must not compile or load kernels at the same time.
+
+
+def _make_compilers() -> dict[bool, ThreadPoolExecutor]:
+    return {fused: ThreadPoolExecutor(1, thread_name_prefix="sehdr-warp compiles") for fused in (False, True)}
+
+
+_compilers = _make_compilers()
+
+
+def _renew_after_fork() -> None:
+    """Replace what a fork copied in an unusable state: executors without threads, and a lock perhaps held."""
+    global _loading, _compilers
+    _loading, _compilers = threading.Lock(), _make_compilers()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_renew_after_fork)
 
 
 def compile_for_cpu(kernel: Any) -> None:
-    """Compiles a kernel for the CPU, or finds it in the cache, on a thread for those that are compiled like it: Warp
-    reads its headers, which takes seconds, once on each thread for each kind."""
+    """Compile a kernel for the CPU or load it from the cache.
+
+    Kernels with the same compiler flags are compiled on one thread, because Warp reads its headers, which takes
+    seconds, once for each thread and set of flags.
+    """
     check_room_to_compile()
     compiler = _compilers[uses_fused_multiply_add(kernel)]
     compiler.submit(wp.load_module, kernel.module, device="cpu").result()
 
 
 def uses_fused_multiply_add(kernel: Any) -> bool:
-    """Whether the compiler may fuse the kernel's multiply-adds on the CPU."""
+    """Return whether the compiler may fuse the kernel's multiply-adds on the CPU."""
     return FUSED in (kernel.module.options["cpu_compiler_flags"] or "")
 
 
 def launch_object(kernel: Any, dim: Any, values: list, device: Any, **options: Any) -> Any:
-    """Warp's launch of a kernel as an object that can be launched with other parameters. Compiles or loads it."""
+    """Return Warp's launch of a kernel as an object that can be launched again with other parameters.
+
+    Compiles or loads the kernel first.
+    """
     check_room_to_compile()
     if device.is_cpu:
         compile_for_cpu(kernel)

@@ -1,11 +1,12 @@
-"""Warp's CPU launches spread over threads.
+"""Spread Warp's CPU launches over threads.
 
-Warp runs a CPU kernel as one serial loop, so independent ranges of one launch run side by side, on the OpenMP threads
-that torch has, with nothing of it in the interpreter (kernels/shared_ranges.py). No range writes what another writes,
-so results do not depend on the number of threads.
+Warp runs a CPU kernel as one serial loop, so independent ranges of one launch run in parallel, on the OpenMP threads
+that torch has and without the interpreter (kernels/shared_ranges.py). No range writes what another writes, so results
+do not depend on the number of threads.
 """
 
 import ctypes
+import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -22,21 +23,39 @@ from ...parallel import thread_count
 from .loading import launch_object
 
 RANGES_PER_THREAD = 8
-"""Threads do not end together: whoever is done earlier takes another one."""
+"""Ranges differ in work, so a thread that finishes early takes another one."""
+
+_forked = False
+"""Whether this process was forked from one that had loaded this module: OpenMP's threads are then gone for good."""
 
 
-def share(function: Any, bounds: ctypes.Structure, structures: Sequence[ctypes.Structure], ranges: Tensor) -> None:
-    """Run a compiled kernel of the CPU over ranges, from each of [K] int32 up to the next; returns when all are done.
+def _after_fork() -> None:
+    global _forked
+    _forked = True
+    torch.set_num_threads(1)  # Torch's own parallel loops would wait for the same threads.
 
-    bounds: Warp's, of one dimension; structures: the parameters, beginning with where a range begins, and for an
-    adjoint their gradients."""
-    size, places = ctypes.sizeof(structures[0]), [ctypes.addressof(part) for part in structures]
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
+def run_ranges(function: Any, bounds: ctypes.Structure, structures: Sequence[ctypes.Structure], ranges: Tensor) -> None:
+    """Run a compiled CPU kernel over ranges of thread indices, and return when all are done.
+
+    Args:
+        function: the compiled kernel or its adjoint.
+        bounds: Warp's launch bounds, of one dimension.
+        structures: the kernel's parameters, of which the first is where a range begins, and for an adjoint their
+            gradients.
+        ranges: [K + 1] int32, where ranges begin and where the last one ends.
+    """
+    size, addresses = ctypes.sizeof(structures[0]), [ctypes.addressof(part) for part in structures]
     if size > shared_ranges.LARGEST:
         raise ValueError(f"a kernel has {size} bytes of parameters; ranges are shared with {shared_ranges.LARGEST}")
-    count, threads = len(ranges) - 1, thread_count()
+    count, threads = len(ranges) - 1, 1 if _forked else thread_count()
     kernel = ctypes.cast(function, ctypes.c_void_p)
-    given, gradients = (*places, 0)[:2]
-    work = shared_ranges.Work(kernel, ctypes.addressof(bounds), given, gradients, size, ranges.data_ptr(), count)
+    parameters, gradients = (*addresses, 0)[:2]
+    work = shared_ranges.Work(kernel, ctypes.addressof(bounds), parameters, gradients, size, ranges.data_ptr(), count)
     once = _share_ranges()
 
     def take_part(fork: int = 0) -> None:
@@ -45,7 +64,7 @@ def share(function: Any, bounds: ctypes.Structure, structures: Sequence[ctypes.S
 
     if min(count, threads) < 2:
         take_part()
-    elif fork := _fork():
+    elif fork := _openmp_fork():
         take_part(fork)
     else:
         helpers = [_helpers(threads - 1).submit(take_part) for _ in range(threads - 1)]
@@ -58,14 +77,16 @@ def share(function: Any, bounds: ctypes.Structure, structures: Sequence[ctypes.S
 
 @cache
 def _share_ranges() -> Any:
-    """share_ranges() as Warp launches it once."""
+    """Return Warp's launch object of the kernel share_ranges(), which is launched once by each call."""
     return launch_object(shared_ranges.share_ranges, 1, [0, 0, 0], wp.get_device("cpu"))
 
 
 @cache
-def _fork() -> int:
-    """The place of GOMP_parallel() in the OpenMP library that torch has loaded; 0 where there is none, as on Windows.
-    Other libraries than GNU's have it too, for its sake."""
+def _openmp_fork() -> int:
+    """Return the address of GOMP_parallel() in torch's OpenMP library, or 0 if it has none, as on Windows.
+
+    OpenMP libraries other than GNU's export it too.
+    """
     for library in (Path(torch.__file__).parent / "lib").glob("libtorch_cpu.*"):
         try:
             return ctypes.cast(ctypes.CDLL(str(library)).GOMP_parallel, ctypes.c_void_p).value or 0
@@ -79,14 +100,16 @@ def _helpers(count: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(count, thread_name_prefix="sehdr-warp")
 
 
-def even_ranges(count: int, smallest: int = 1024) -> Tensor:
-    """[K + 1] int32: where ranges begin that cover `count` items, and where the last one ends. A few for each thread,
-    each of at least `smallest` items, or else one."""
-    return _even_ranges(count, max(1, min(thread_count() * RANGES_PER_THREAD, count // smallest)))
+def even_ranges(count: int, min_range: int = 1024) -> Tensor:
+    """Return [K + 1] int32, where even ranges of `count` indices begin and where the last one ends.
+
+    There are a few ranges for each thread, each of at least `min_range` indices, or else one.
+    """
+    return _even_ranges(count, max(1, min(thread_count() * RANGES_PER_THREAD, count // min_range)))
 
 
-def whole(count: int) -> Tensor:
-    """The one range of all `count` items, for what one thread must do."""
+def single_range(count: int) -> Tensor:
+    """Return the one range of all `count` indices, for work that one thread must do."""
     return _even_ranges(count, 1)
 
 
@@ -97,12 +120,14 @@ def _even_ranges(count: int, pieces: int) -> Tensor:
 
 @contextmanager
 def torch_threads(device: torch.device) -> Iterator[None]:
-    """torch on all threads of the CPU too, where there are some: for what no thread's share decides, each number by
-    itself and no sums."""
+    """Let torch use all threads of the CPU within the block.
+
+    For elementwise operations only: sums would depend on the number of threads.
+    """
     if device.type != "cpu":
         yield
         return
-    before, count = torch.get_num_threads(), thread_count()
+    before, count = torch.get_num_threads(), 1 if _forked else thread_count()
     if count <= max(before, 3):
         yield
         return
@@ -115,8 +140,10 @@ def torch_threads(device: torch.device) -> Iterator[None]:
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """torch on one thread of the CPU: for many small operations, between which its other threads spin and take the time
-    of whatever else is at work."""
+    """Let torch use one thread of the CPU within the block.
+
+    For many small operations, between which torch's other threads would spin and take time from other work.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,0 +1,71 @@
+"""Memory and layout of gradients, and scalars that cost no launch."""
+
+from collections.abc import Sequence
+from functools import cache
+from itertools import accumulate
+
+import torch
+from torch import Tensor
+
+from .warp_launch.threads import torch_threads
+
+
+def zero_gradients(tensors: Sequence[Tensor], needed: Sequence[bool], leaves: Sequence[bool]) -> list[Tensor | None]:
+    """Return zeros to accumulate into for each tensor that needs a gradient, and None for the others.
+
+    leaves: which tensors are leaves. On a GPU the gradients of leaves share one allocation, filled by one launch;
+    others are freed soon, each by itself.
+    """
+    zeros: dict[int, Tensor] = {}
+    device = tensors[0].device
+    if device.type != "cpu":
+        together = [place for place, need in enumerate(needed) if need and leaves[place]]
+        zeros.update(zip(together, _zeros_together([tensors[place] for place in together]), strict=False))
+    with torch_threads(device):
+        for place, need in enumerate(needed):
+            if need and place not in zeros:
+                zeros[place] = torch.zeros_like(tensors[place], memory_format=torch.contiguous_format)
+    return [zeros.get(place) for place in range(len(tensors))]
+
+
+def _zeros_together(tensors: list[Tensor]) -> list[Tensor]:
+    """Return zeros of the tensors' shapes in one allocation; none unless they are several, alike and contiguous."""
+    if len(tensors) < 2:
+        return []
+    alike = len({tensor.dtype for tensor in tensors}) == 1 and all(tensor.is_contiguous() for tensor in tensors)
+    if not alike:
+        return []
+    # Each starts at a multiple of 64 numbers, as memory of its own would.
+    lengths = [-(-tensor.numel() // 64) * 64 for tensor in tensors]
+    zeros, starts = tensors[0].new_zeros(sum(lengths)), accumulate(lengths, initial=0)
+    return [zeros.as_strided(t.shape, t.stride(), start) for t, start in zip(tensors, starts, strict=False)]
+
+
+def kernel_layout(gradient: Tensor | None) -> Tensor | None:
+    """Return a gradient with strides that kernels read: rows at any distance, but each vector contiguous."""
+    if gradient is None or gradient.ndim < 2 or gradient.is_contiguous():
+        return gradient
+    if gradient.stride(1) == 1 if gradient.ndim == 2 else gradient[0].is_contiguous():
+        return gradient
+    return gradient.contiguous()
+
+
+@cache
+def constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return a shared vector of these values, which nobody may change."""
+    return torch.tensor(values, dtype=dtype, device=device)
+
+
+def unit_gradient(like: Tensor) -> Tensor:
+    """Return the shared scalar 1 of a tensor's type and device, which scale_gradient() recognises."""
+    return constant((1.0,), like.dtype, like.device)[0]
+
+
+def scale_gradient(gradient: Tensor, upstream: Tensor) -> Tensor:
+    """Return gradient * upstream, or the gradient itself if the scalar upstream is unit_gradient()."""
+    return gradient if upstream.data_ptr() == unit_gradient(upstream).data_ptr() else gradient * upstream
+
+
+def requires_ordered_sums(device: torch.device) -> bool:
+    """Return whether sums must have a fixed order, which atomics of a GPU's threads do not keep."""
+    return device.type == "cuda" and torch.are_deterministic_algorithms_enabled()

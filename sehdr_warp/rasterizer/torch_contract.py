@@ -1,0 +1,87 @@
+"""Keep torch's contract at the border of an operation: compilation, autocast, transforms, and graphs kept for reuse."""
+
+import contextlib
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+try:
+    from torch._C._dynamo.eval_frame import _FrameAction, _FrameExecStrategy, set_code_exec_strategy
+except ImportError:  # torch 2.6
+    _FrameAction = _FrameExecStrategy = set_code_exec_strategy = None
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+HALF = torch.float16, torch.bfloat16
+
+_transforms_are_active = torch._C._are_functorch_transforms_active
+
+
+def _some_autocast() -> bool:
+    return torch.is_autocast_enabled("cuda") or torch.is_autocast_enabled("cpu")
+
+
+def torch_operation(function: Callable[P, T]) -> Callable[P, T]:
+    """Make a public operation of a function that launches kernels on tensors.
+
+    - torch.compile calls it as it is: the graph breaks there, nothing inside is traced.
+    - Under torch.autocast, half-precision tensors become float32, as torch.amp.custom_fwd(cast_inputs=...) does.
+    - torch.func transforms and forward-mode differentiation are refused by a sentence.
+
+    Raises:
+        NotImplementedError: within torch.func transforms, and for dual tensors of forward-mode differentiation.
+    """
+    name = function.__name__
+
+    @wraps(function)
+    def operation(*args: P.args, **kwargs: P.kwargs) -> T:
+        if _transforms_are_active():
+            raise NotImplementedError(f"{name}() does not support torch.func; use torch.autograd")
+        if forward_ad._current_level >= 0 and any(map(_has_tangent, (*args, *kwargs.values()))):
+            raise NotImplementedError(f"{name}() has no forward-mode derivative; use torch.autograd.grad()")
+        if _some_autocast():
+            return _without_autocast(function, args, kwargs)
+        return function(*args, **kwargs)
+
+    if set_code_exec_strategy is None or _FrameExecStrategy is None or _FrameAction is None:
+        return torch.compiler.disable(operation)
+    # What torch.compiler.disable() does, without its import of Dynamo, which takes two seconds.
+    operation._torchdynamo_disable = True  # pyright: ignore[reportFunctionMemberAccess]
+    operation._torchdynamo_disable_msg = "it launches Warp kernels"  # pyright: ignore[reportFunctionMemberAccess]
+    set_code_exec_strategy(operation.__code__, _FrameExecStrategy(_FrameAction.SKIP, _FrameAction.SKIP))
+    return operation
+
+
+def _has_tangent(value: Any) -> bool:
+    if isinstance(value, tuple | list):
+        return any(map(_has_tangent, value))
+    return isinstance(value, Tensor) and forward_ad.unpack_dual(value).tangent is not None
+
+
+def _without_autocast(function: Callable[..., T], args: tuple, kwargs: dict) -> T:
+    enabled = [device for device in ("cuda", "cpu") if torch.is_autocast_enabled(device)]
+
+    def cast(value: Any) -> Any:
+        if isinstance(value, tuple | list):
+            return type(value)(map(cast, value))
+        is_half = isinstance(value, Tensor) and value.dtype in HALF and value.device.type in enabled
+        return value.float() if is_half else value
+
+    with contextlib.ExitStack() as stack:
+        for device in enabled:
+            stack.enter_context(torch.autocast(device, enabled=False))
+        return function(*map(cast, args), **{name: cast(value) for name, value in kwargs.items()})
+
+
+def keeps_graph() -> bool:
+    """Return whether the backward pass that is running was asked to retain the graph.
+
+    If not, what a node holds beside its saved tensors can be freed: a further backward pass is refused by torch.
+    """
+    ask = getattr(torch._C._autograd, "_get_current_graph_task_keep_graph", None)
+    return True if ask is None else ask()
