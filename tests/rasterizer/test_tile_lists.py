@@ -169,6 +169,8 @@ def test_entries_counted_by_chunks_are_those_sorted(monkeypatch, count, chunks, 
     ranges, ones, corners, places = tile_lists._sort_by_tile(*given, count, splats, tiles, 1, unsorted)
     alike, *_, without, _ = tile_lists._sort_by_tile(*copies, count, None, tiles, 1, unsorted)
     assert torch.equal(alike, ranges) and without is None and len(corners) == count
-    for ours, sorted_ones in zip(counted, (ranges, ones, places), strict=True):
+    for ours, sorted_ones in zip(
+        (counted.ranges, counted.gaussians, counted.places), (ranges, ones, places), strict=True
+    ):
         assert (ours is None) == (sorted_ones is None)
         assert ours is None or torch.equal(ours, sorted_ones[: len(ours)])
