@@ -4,27 +4,28 @@ import base64
 import io
 import math
 from collections.abc import Mapping, Sequence
-from html import escape
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from PIL import Image
 
 from sehdr_warp.scene import Camera
 
 from .camera_paths import evenly
 from .charts import PANELS, training_points
+from .html import EMPTY, join, markup
 from .images import as_array, quantize
 
 LINE, COLORS = "var(--line)", ("var(--accent)", "var(--cool)")  # Of style.css
 _MAP_VIEWS, _MAP_SIZE, _SAMPLES = 12, 640, 200
 
 
-def training_svg(metrics: Sequence[Mapping]) -> str:
+def training_svg(metrics: Sequence[Mapping]) -> Markup:
     """Plot held-out PSNR in dB against training seconds, a line for each of PANELS; empty without figures."""
     lines = {title: points for key, title in PANELS.items() if (points := training_points(metrics, key))}
     if not lines:
-        return ""
+        return EMPTY
     points = [point for line in lines.values() for point in line]
     longest = max(seconds for seconds, _ in points) or 1.0
     low = math.floor(min(decibels for _, decibels in points))
@@ -37,23 +38,23 @@ def training_svg(metrics: Sequence[Mapping]) -> str:
     elements = []
     for decibels in range(low, high + 1, step):
         y = place(0, decibels)[1]
-        elements.append(f'<path d="M40 {y:.1f}H660" stroke="{LINE}"/><text x="0" y="{y + 4:.1f}">{decibels} dB</text>')
+        grid = '<path d="M40 {:.1f}H660" stroke="{}"/><text x="0" y="{:.1f}">{} dB</text>'
+        elements.append(markup(grid, y, LINE, y + 4, decibels))
     for seconds in np.linspace(0, longest, 5):
         x, anchor = place(seconds, low)[0], "middle" if 0 < seconds < longest else "start" if not seconds else "end"
-        elements.append(f'<text x="{x:.1f}" y="272" text-anchor="{anchor}">{seconds:.0f} s</text>')
+        elements.append(markup('<text x="{:.1f}" y="272" text-anchor="{}">{:.0f} s</text>', x, anchor, seconds))
     for color, (title, line) in zip(COLORS, lines.items()):
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*point) for point in line))
         x, y = place(*line[-1])
-        elements.append(f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="2"/>')
-        elements += [
-            f'<circle cx="{a:.1f}" cy="{b:.1f}" r="2.5" fill="{color}"/>' for a, b in (place(*p) for p in line)
-        ]
-        label = f"{escape(title)}: {line[-1][1]:.1f} dB"
-        elements.append(f'<text x="{x + 12:.1f}" y="{y + 4:.1f}" style="fill:{color}">{label}</text>')
+        elements.append(markup('<polyline points="{}" fill="none" stroke="{}" stroke-width="2"/>', path, color))
+        dot = '<circle cx="{:.1f}" cy="{:.1f}" r="2.5" fill="{}"/>'
+        elements += [markup(dot, *place(*point), color) for point in line]
+        label = '<text x="{:.1f}" y="{:.1f}" style="fill:{}">{}: {:.1f} dB</text>'
+        elements.append(markup(label, x + 12, y + 4, color, title, line[-1][1]))
     return _svg(860, 280, "Held-out PSNR against training time", elements)
 
 
-def camera_map(run: Any, tone_map: Any, names: Sequence[str] = ()) -> str:
+def camera_map(run: Any, tone_map: Any, names: Sequence[str] = ()) -> Markup:
     """Draw the scene from above as its training photos show it, with training and held-out cameras.
 
     Args:
@@ -66,7 +67,7 @@ def camera_map(run: Any, tone_map: Any, names: Sequence[str] = ()) -> str:
     """
     entries = run.cameras
     if not entries:
-        return ""
+        return EMPTY
     cameras = [entry.camera for entry in entries]
     up = -np.mean([camera.world_to_camera[1, :3] for camera in cameras], axis=0)
     up /= max(float(np.linalg.norm(up)), 1e-9)
@@ -95,15 +96,23 @@ def camera_map(run: Any, tone_map: Any, names: Sequence[str] = ()) -> str:
         corners = [plane @ (camera.world_to_camera[:3, :3].T @ [side * across, 0, 1]) for side in (-1, 1)]
         ends = [at + 26 * corner * [1, -1] / max(np.linalg.norm(corner), 1e-9) for corner in corners]
         wedge = " ".join(f"{x:.1f},{y:.1f}" for x, y in (at, *ends))
-        title = f"<title>{escape(entry.name)} ({entry.split})</title>"
-        elements.append(f'<g fill="{color}" stroke="{color}">{title}<polygon points="{wedge}" fill-opacity="0.18"/>')
-        elements.append(f'<circle cx="{at[0]:.1f}" cy="{at[1]:.1f}" r="3"/></g>')
+        elements.append(
+            markup(
+                '<g fill="{color}" stroke="{color}"><title>{name} ({split})</title>'
+                '<polygon points="{wedge}" fill-opacity="0.18"/><circle cx="{x:.1f}" cy="{y:.1f}" r="3"/></g>',
+                color=color,
+                name=entry.name,
+                split=entry.split,
+                wedge=wedge,
+                x=at[0],
+                y=at[1],
+            )
+        )
         if entry.name in names:
             style = "fill:var(--ink);stroke:var(--ground);stroke-width:3px;paint-order:stroke"
-            elements.append(
-                f'<text x="{at[0] + 7:.1f}" y="{at[1] - 6:.1f}" style="{style}">{escape(entry.name)}</text>'
-            )
-    return f'<div class="map">{_svg(round(width), round(height), "Cameras from above", elements)}</div>'
+            label = '<text x="{:.1f}" y="{:.1f}" style="{}">{}</text>'
+            elements.append(markup(label, at[0] + 7, at[1] - 6, style, entry.name))
+    return markup('<div class="map">{}</div>', _svg(round(width), round(height), "Cameras from above", elements))
 
 
 def _visible_points(cameras: Sequence[Camera], run: Any, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -127,7 +136,7 @@ def _visible_points(cameras: Sequence[Camera], run: Any, up: np.ndarray) -> tupl
     return all_points[below][order], light[below][order]
 
 
-def _ground(at: np.ndarray, colors: np.ndarray, width: int, height: int) -> str:
+def _ground(at: np.ndarray, colors: np.ndarray, width: int, height: int) -> Markup:
     """Draw points, in pixels, as an SVG <image>; later points cover earlier ones."""
     inside = ((at >= 0) & (at < [width - 1, height - 1])).all(axis=1)
     column, row = at[inside].astype(int).T
@@ -138,9 +147,9 @@ def _ground(at: np.ndarray, colors: np.ndarray, width: int, height: int) -> str:
     buffer = io.BytesIO()
     Image.fromarray(picture).quantize(128).save(buffer, "PNG", optimize=True)
     source = "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
-    return f'<image href="{source}" width="{width}" height="{height}"/>'
+    return markup('<image href="{}" width="{}" height="{}"/>', source, width, height)
 
 
-def _svg(width: int, height: int, title: str, parts: Sequence[str]) -> str:
-    label = f'role="img" aria-label="{title}"'
-    return f'<svg viewBox="0 0 {width} {height}" {label}>\n' + "\n".join(parts) + "\n</svg>"
+def _svg(width: int, height: int, title: str, parts: Sequence[Markup]) -> Markup:
+    template = '<svg viewBox="0 0 {} {}" role="img" aria-label="{}">\n{}\n</svg>'
+    return markup(template, width, height, title, join(parts, "\n"))

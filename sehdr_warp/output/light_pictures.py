@@ -5,24 +5,24 @@ import io
 import math
 import zlib
 from collections.abc import Mapping
-from html import escape
-from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
 import torch
+from markupsafe import Markup
 from PIL import Image
 
-from sehdr_warp import __version__
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import View
 
 from ..model.sensor_colors import rec709_of
+from .html import EMPTY, data_block, join, markup
 from .images import as_array, quantize
 from .tonemap import encode_srgb
 
 MIDDLE_GREY = 0.18
+SPLIT = markup('<div class="split" style="left: 50%"></div>')
+"""The handle between two pictures."""
 CURVE_STOPS, CURVE_SIZE = (-20.0, 20.0), 1024  # As light.js has them
 
 
@@ -85,11 +85,16 @@ def jpeg(encoded: np.ndarray, quality: int = 88) -> bytes:
     return buffer.getvalue()
 
 
-def img(data: bytes, alternative: str, size: tuple[int, int], **attributes: str) -> str:
+def img(data: bytes, alternative: str, size: tuple[int, int], **attributes: str) -> Markup:
     """Return an <img> that holds a JPEG; size is width and height."""
-    extra = "".join(f' {name.replace("_", "-")}="{escape(value)}"' for name, value in attributes.items())
-    source = "data:image/jpeg;base64," + base64.b64encode(data).decode()
-    return f'<img src="{source}" alt="{escape(alternative)}" width="{size[0]}" height="{size[1]}"{extra}>'
+    extra = join(markup(' {}="{}"', name.replace("_", "-"), value) for name, value in attributes.items())
+    template = '<img src="{}" alt="{}" width="{}" height="{}"{}>'
+    return markup(template, jpeg_source(data), alternative, *size, extra)
+
+
+def jpeg_source(data: bytes) -> str:
+    """Return the data URL of a JPEG."""
+    return "data:image/jpeg;base64," + base64.b64encode(data).decode()
 
 
 def packed_light(light: np.ndarray) -> str:
@@ -98,7 +103,7 @@ def packed_light(light: np.ndarray) -> str:
     return base64.b64encode(zlib.compress(half.tobytes(), 9)).decode()
 
 
-def dial(lights: Mapping[str, np.ndarray], base_time: float, gain: float, right: str, stops: float = 8.0) -> str:
+def dial(lights: Mapping[str, np.ndarray], base_time: float, gain: float, right: str, stops: float = 8.0) -> Markup:
     """Return HTML that shows pictures of one size under one exposure dial, two of them side by side.
 
     Args:
@@ -109,44 +114,31 @@ def dial(lights: Mapping[str, np.ndarray], base_time: float, gain: float, right:
         stops: Range of the dial.
     """
     height, width = next(iter(lights.values())).shape[:2]
-    scripts = "".join(
-        f'<script type="text/plain" data-light="{escape(name)}">{packed_light(light)}</script>\n'
-        for name, light in lights.items()
+    blocks = join(data_block(packed_light(light), data_light=name) + "\n" for name, light in lights.items())
+    pair = len(lights) > 1
+    return markup(
+        """<div class="dial" data-width="{width}" data-height="{height}" data-time="{time!r}" data-grey="{grey!r}" \
+style="--ratio: {ratio:.4f}">
+{blocks}{sides}<div class="stage"><canvas width="{width}" height="{height}"></canvas>{split}</div>
+<p class="exposure">Exposure <input type="range" min="-{stops}" max="{stops}" step="0.05" value="0" \
+aria-label="exposure in stops"><output>0 EV</output></p>
+</div>""",
+        width=width,
+        height=height,
+        time=float(base_time),
+        grey=float(gain),
+        ratio=width / height,
+        blocks=blocks,
+        sides=side_choices(list(lights), next(iter(lights)), right) if pair else EMPTY,
+        split=SPLIT if pair else EMPTY,
+        stops=stops,
     )
-    split = '<div class="split" style="left: 50%"></div>' if len(lights) > 1 else ""
-    sides = side_choices(list(lights), next(iter(lights)), right) if len(lights) > 1 else ""
-    facts = {"width": width, "height": height, "time": base_time, "grey": gain}
-    data = " ".join(f'data-{name}="{value!r}"' for name, value in facts.items())
-    span = f'min="{-stops}" max="{stops}" step="0.05" value="0" aria-label="exposure in stops"'
-    return f"""<div class="dial" {data} style="--ratio: {width / height:.4f}">
-{scripts}{sides}<div class="stage"><canvas width="{width}" height="{height}"></canvas>{split}</div>
-<p class="exposure">Exposure <input type="range" {span}><output>0 EV</output></p>
-</div>"""
 
 
-def side_choices(names: list[str], left: str, right: str) -> str:
+def side_choices(names: list[str], left: str, right: str) -> Markup:
     """Return the two <select> elements that choose what stands left and right of a split."""
-    choices = "".join(
-        f'<select aria-label="{side}">'
-        + "".join(f"<option{' selected' * (name == chosen)}>{escape(name)}</option>" for name in names)
-        + "</select>"
-        for side, chosen in (("left", left), ("right", right))
-    )
-    return f'<div class="sides">{choices}</div>\n'
-
-
-def page_file(name: str) -> str:
-    """Return the text of a file in the folder `page`."""
-    return Path(__file__).parent.joinpath("page", name).read_text(encoding="utf-8")
-
-
-def whole_page(title: str, style: str, body: str) -> str:
-    """Return a page that needs no other file.
-
-    Args:
-        title: Plain text.
-        style: A file of the folder `page`, placed after style.css.
-        body: HTML.
-    """
-    values = {"title": escape(title), "style": page_file("style.css") + page_file(style), "body": body}
-    return Template(page_file("page.html")).substitute(values, version=__version__)
+    selects = []
+    for side, chosen in (("left", left), ("right", right)):
+        options = (markup("<option{}>{}</option>", EMPTY if n != chosen else markup(" selected"), n) for n in names)
+        selects.append(markup('<select aria-label="{}">{}</select>', side, join(options)))
+    return markup('<div class="sides">{}</div>\n', join(selects))

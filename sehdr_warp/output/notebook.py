@@ -1,12 +1,12 @@
 """How a run shows itself in a notebook: its figures, and a view under an exposure slider that needs no kernel."""
 
-from html import escape
 from typing import Any
 
 import numpy as np
 
+from .html import markup, page_file, whole_page
 from .images import as_array
-from .light_pictures import dial, display_gain, page_file
+from .light_pictures import dial, display_gain
 from .report_page import duration
 
 _LONGEST = 420  # Pixels of a side of the picture, which the notebook keeps
@@ -23,16 +23,18 @@ def run_html(run: Any) -> str:
     scores = [line["psnr_ldr"] for line in run.metrics() if "psnr_ldr" in line]
     figures += [f"held-out PSNR {score:.1f} dB" for score in scores[-1:]]
     figures += [f"view {opening.name}"] if opening else []
-    body, height = f"<p><b>{escape(run.scene_name)}</b> &middot; {escape(' · '.join(figures))}</p>", 72
+    body, height = markup("<p><b>{}</b> &middot; {}</p>", run.scene_name, " · ".join(figures)), 72
     if opening is not None:
         camera = opening.camera.within(_LONGEST)
         light = as_array(run.render(camera).hdr) * np.float32(run.base_time)
         body += dial({"scene": light}, run.base_time, display_gain(run.response), "scene")
         height += 34 + round(_LONGEST * camera.height / camera.width)
     script = "".join(map(page_file, ("tables.js", "light.js")))
-    script = f"<script>{script}document.querySelectorAll('.dial').forEach(startDial);</script>"
-    style = f"<style>{page_file('style.css')}{_STYLE}</style>"
-    head = f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>run</title>{style}</head>'
-    page = f"{head}<body>{body}{script}</body></html>"
-    frame = f'width="{_LONGEST + 24}" height="{height}" style="border: 0; border-radius: 6px; max-width: 100%"'
-    return f'<iframe srcdoc="{escape(page)}" {frame}></iframe>'
+    script += "document.querySelectorAll('.dial').forEach(startDial);"
+    return markup(
+        '<iframe srcdoc="{}" width="{}" height="{}" sandbox="allow-scripts allow-downloads" '
+        'style="border: 0; border-radius: 6px; max-width: 100%"></iframe>',
+        str(whole_page(run.scene_name, _STYLE, body, [script])),
+        _LONGEST + 24,
+        height,
+    )

@@ -2,10 +2,10 @@
 
 import shlex
 from collections.abc import Mapping, Sequence
-from html import escape
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from sehdr_warp import __version__
 from sehdr_warp.scene import Scene
@@ -15,16 +15,17 @@ from sehdr_warp.scene.lens import area_average
 
 from .comparison import Comparison
 from .diagrams import camera_map, training_svg
+from .html import EMPTY, join, markup, page_file, whole_page
 from .light_pictures import (
+    SPLIT,
     dial,
     display_gain,
     img,
     jpeg,
-    page_file,
+    jpeg_source,
     photographed,
     shown_photo,
     side_choices,
-    whole_page,
 )
 from .tonemap import expose, fit_tone_map
 from .ultra_hdr import MOST_STOPS, ultra_hdr
@@ -72,27 +73,31 @@ def report_page(
         _map(run, comparisons),
         _footer(run, held_out),
     ]
-    main, script = "\n".join(filter(None, sections)), "".join(map(page_file, ("tables.js", "light.js", "report.js")))
-    body = f"<main>\n{main}\n</main>\n<script>\n{script}</script>"
-    return whole_page(f"{scene.name}: sehdr-warp report", "report.css", body)
+    body = markup("<main>\n{}\n</main>", join(filter(None, sections), "\n"))
+    script = "".join(map(page_file, ("tables.js", "light.js", "report.js")))
+    return whole_page(f"{scene.name}: sehdr-warp report", page_file("report.css"), body, [script])
 
 
-def _section(title: str, lead: str, body: str) -> str:
+def _section(title: str, lead: str | Markup, body: Markup) -> Markup:
     """Return a section of the page; empty without a body."""
-    return f"<section>\n<h2>{title}</h2>\n<p>{lead}</p>\n{body}\n</section>" if body else ""
+    return markup("<section>\n<h2>{}</h2>\n<p>{}</p>\n{}\n</section>", title, lead, body) if body else EMPTY
 
 
-def _figure(body: str, caption: str = "") -> str:
-    note = f"\n<figcaption>{caption}</figcaption>" if caption else ""
-    return f"<figure>\n{body}{note}\n</figure>" if body else ""
+def _figure(body: Markup, caption: str = "") -> Markup:
+    note = markup("\n<figcaption>{}</figcaption>", caption) if caption else EMPTY
+    return markup("<figure>\n{}{}\n</figure>", body, note) if body else EMPTY
 
 
-def _wide(body: str) -> str:
+def _views(figures: Sequence[Markup]) -> Markup:
+    return markup('<div class="views">{}</div>', join(figures))
+
+
+def _wide(body: Markup) -> Markup:
     """Wrap what a narrow window should scroll sideways rather than shrink."""
-    return f'<div class="wide">{body}</div>' if body else ""
+    return markup('<div class="wide">{}</div>', body) if body else EMPTY
 
 
-def _header(run: Any, scene: Scene) -> str:
+def _header(run: Any, scene: Scene) -> Markup:
     summary, last = run.summary(), next((line for line in reversed(run.metrics()) if "psnr_ldr" in line), {})
     camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
     times = sorted({view.exposure_time for view in scene.train_views or scene.views})
@@ -102,24 +107,27 @@ def _header(run: Any, scene: Scene) -> str:
         "photos held out": len(scene.test_views),
         "pixels each": f"{camera.width} \N{MULTIPLICATION SIGN} {camera.height}",
         "exposure" if run.photo_gains is None else "exposure, gains counted in": span.replace(" s to", " to"),
-        "response": escape(str(run.response.name)),
+        "response": run.response.name,
         "Gaussians": f"{run.gaussian_count:,}".replace(",", SPACE),
         "steps": run.iterations,
         "training": duration(run.train_seconds),
-        "held-out photos": f"{last['psnr_ldr']:.1f} dB" if "psnr_ldr" in last else None,
-        "held-out HDR, mu-law": f"{last['psnr_mu']:.1f} dB" if "psnr_mu" in last else None,
+        "held-out photos": _decibels(last, "psnr_ldr"),
+        "held-out HDR, mu-law": _decibels(last, "psnr_mu"),
     }
-    items = "".join(f"<li>{name}<b>{value}</b></li>" for name, value in facts.items() if value is not None)
-    notes = "".join(f"<li>{escape(note)}</li>" for note in scene.notes)
-    note = f"Trained on {escape(summary['device'])}." if "device" in summary else "The training has not ended."
-    return (
-        f'<header>\n<p class="quiet">sehdr-warp report</p>\n<h1>{escape(scene.name)}</h1>\n'
-        f'<p class="quiet">{note}</p>\n'
-        f'<ul class="facts">{items}</ul>{f"<ul>{notes}</ul>" if notes else ""}\n</header>'
+    items = join(markup("<li>{}<b>{}</b></li>", name, value) for name, value in facts.items() if value is not None)
+    notes = join(markup("<li>{}</li>", note) for note in scene.notes)
+    device = summary.get("device")
+    return markup(
+        '<header>\n<p class="quiet">sehdr-warp report</p>\n<h1>{}</h1>\n<p class="quiet">{}</p>\n'
+        '<ul class="facts">{}</ul>{}\n</header>',
+        scene.name,
+        f"Trained on {device}." if device else "The training has not ended.",
+        items,
+        markup("<ul>{}</ul>", notes) if notes else EMPTY,
     )
 
 
-def _pictures(run: Any, comparisons: Sequence[Comparison], times: Mapping[str, float], held_out: bool) -> str:
+def _pictures(run: Any, comparisons: Sequence[Comparison], times: Mapping[str, float], held_out: bool) -> Markup:
     """Photo, scene and truth, two at a time with a slider between them."""
     figures, gain = [], display_gain(run.response)
     for each in comparisons:
@@ -133,10 +141,9 @@ def _pictures(run: Any, comparisons: Sequence[Comparison], times: Mapping[str, f
                 exposure = smaller(light * times[each.name], _PICTURE)
                 data = ultra_hdr(exposure * gain, photographed(run, exposure))
             tags.append(img(data, f"{name} of {each.name}", size, data_name=name))
-        split = '<div class="split" style="left: 50%"></div>'
-        ratio = f'style="aspect-ratio: {size[0]} / {size[1]}" tabindex="0" role="group"'
-        pair = f'<div class="pair" {ratio}>' + "\n".join(tags) + split + "</div>"
-        figures.append(_figure(side_choices(list(lights), "Photo", "Scene") + pair, escape(each.name)))
+        pair = '<div class="pair" style="aspect-ratio: {} / {}" tabindex="0" role="group">{}{}</div>'
+        choices = side_choices(list(lights), "Photo", "Scene")
+        figures.append(_figure(choices + markup(pair, *size, join(tags, "\n"), SPLIT), each.name))
     what = (
         "Held-out views, which the training never saw" if held_out else "Views that were trained on; none is held out"
     )
@@ -146,93 +153,64 @@ def _pictures(run: Any, comparisons: Sequence[Comparison], times: Mapping[str, f
         f" {'Scene and truth are' if known else 'The scene is'} Ultra HDR: light up to {MOST_STOPS:g} stops over white "
     )
     lead += "on an HDR display, on any other what the camera would have shown."
-    return _section(
-        "Photo, scene, truth" if known else "Photo and scene", lead, f'<div class="views">{"".join(figures)}</div>'
-    )
+    return _section("Photo, scene, truth" if known else "Photo and scene", lead, _views(figures))
 
 
-def _brackets(comparison: Comparison, time: float, gain: float) -> str:
+def _brackets(comparison: Comparison, time: float, gain: float) -> Markup:
     sources = {"Photo alone": comparison.from_photo, "Scene": comparison.hdr, "Truth": comparison.truth}
     known = {name: light for name, light in sources.items() if light is not None}
     lights = {name: smaller(light * time, _DIAL) for name, light in known.items()}
-    cells = ["<span>&nbsp;</span>", *(f"<span>{stops_text(stop)}</span>" for stop in STOPS)]
+    cells = [markup("<span>&nbsp;</span>"), *(markup("<span>{}</span>", stops_text(stop)) for stop in STOPS)]
     for name, light in known.items():
         small = smaller(light, _STRIP)
-        cells.append(f'<span class="name">{name}</span>')
+        cells.append(markup('<span class="name">{}</span>', name))
         for stop in STOPS:
             picture = jpeg(expose(small, stop, scale=time * gain), 82)
             cells.append(img(picture, f"{name} at {stops_text(stop)}", (small.shape[1], small.shape[0])))
     lead = (
-        f"View {escape(comparison.name)}, re-exposed from {shutter(time)} (0 EV) and shown as a plain display does. "
+        f"View {comparison.name}, re-exposed from {shutter(time)} (0 EV) and shown as a plain display does. "
         "What the photo clipped stays flat; the scene keeps its light."
     )
-    body = _figure(dial(lights, time, gain, "Scene")) + _figure(_wide(f'<div class="strip">{"".join(cells)}</div>'))
+    body = _figure(dial(lights, time, gain, "Scene")) + _figure(
+        _wide(markup('<div class="strip">{}</div>', join(cells)))
+    )
     return _section("Brackets", lead, body)
 
 
-def _confidence(comparisons: Sequence[Comparison]) -> str:
+def _confidence(comparisons: Sequence[Comparison]) -> Markup:
     figures = [
         _figure(
             img(jpeg(smaller(np.repeat(each.confidence[..., None], 3, 2), 560)), f"confidence of {each.name}", size),
-            f"{escape(each.name)}: {float((each.confidence > 0.5).mean()):.0%} of the picture above a half",
+            f"{each.name}: {float((each.confidence > 0.5).mean()):.0%} of the picture above a half",
         )
         for each in comparisons
         if each.confidence is not None and (size := _size(each.photo, 560))
     ]
     if not figures:
-        return ""
-    ends = "<span>0: no photo tells</span><span>1: photos vouch for it</span>"
+        return EMPTY
+    scale = markup(
+        '<div class="scale"></div><div class="ends"><span>0: no photo tells</span>'
+        "<span>1: photos vouch for it</span></div>"
+    )
     lead = (
         "White where photos show the light unclipped and the scene agrees; a half where it is known to a factor of two."
     )
-    return _section(
-        "Confidence",
-        lead,
-        f'<div class="views">{"".join(figures)}</div><div class="scale"></div><div class="ends">{ends}</div>',
-    )
+    return _section("Confidence", lead, _views(figures) + scale)
 
 
-def _unexplained(run: Any, scene: Scene) -> str:
+def _unexplained(run: Any, scene: Scene) -> Markup:
     """Show the photos with the worst unexplained regions, each region in a box."""
     unexplained = run.summary().get("unexplained")
     if unexplained is None:
-        return ""
+        return EMPTY
     views, photos = {view.name: view for view in scene.views}, {}
     for region in unexplained["worst"]:
         if region["photo"] in views:
             photos.setdefault(region["photo"], []).append(region)
     figures = []
     for name, regions in list(photos.items())[:_MOST_PHOTOS]:
-        image = shown_photo(run, views[name])
-        (height, width), size = image.shape[:2], _size(image, _PICTURE)
-        # Lines and letters that look the same on any size of photo.
-        unit, boxes = width / 420, []
-        for region in regions:
-            side = region["pixels"] ** 0.5
-            left, top, wide, high = region.get("box") or (
-                region["column"] - side / 2,
-                region["row"] - side / 2,
-                side,
-                side,
-            )
-            color = "#ffb454" if region["stops"] > 0 else "#6cc7e8"
-            x, y, w, h = left - 3 * unit, top - 3 * unit, wide + 6 * unit, high + 6 * unit
-            place = f'x="{x:.1f}" y="{y:.1f}" width="{w:.1f}" height="{h:.1f}"'
-            boxes.append(f'<rect {place} fill="none" stroke="{color}" stroke-width="{1.6 * unit:.2f}"/>')
-            below = y < 16 * unit
-            at = f'x="{min(x, width - 60 * unit):.1f}" y="{y + h + 14 * unit if below else y - 5 * unit:.1f}"'
-            shadow = f"fill:{color};font-size:{15 * unit:.1f}px;"
-            shadow += f"paint-order:stroke;stroke:#000;stroke-width:{2.4 * unit:.2f}px"
-            boxes.append(f'<text {at} style="{shadow}">{stops_text(region["stops"]).removesuffix(" EV")}</text>')
-        picture = (
-            img(jpeg(smaller(image, _PICTURE), 84), "", size)
-            .replace("<img src=", "<image href=")
-            .replace(' alt=""', "")
-        )
-        picture = picture.replace(f'width="{size[0]}" height="{size[1]}">', f'width="{width}" height="{height}"/>')
-        label = f'role="img" aria-label="unexplained regions of {escape(name)}"'
-        svg = f'<svg viewBox="0 0 {width} {height}" {label}>{picture}{"".join(boxes)}</svg>'
-        figures.append(_figure(svg, f"{escape(name)}: {len(regions)} of the worst regions"))
+        svg = _boxed_photo(shown_photo(run, views[name]), name, regions)
+        figures.append(_figure(svg, f"{name}: {len(regions)} of the worst regions"))
     counted = (
         f"{unexplained['regions']} regions in {unexplained['photos']} training photos"
         if unexplained["regions"]
@@ -241,10 +219,39 @@ def _unexplained(run: Any, scene: Scene) -> str:
     lead = f"{counted}: places that photo and scene show at least a stop apart."
     if figures:
         lead += " Amber: the photo is brighter than the scene, by so many stops; blue: darker."
-    return _section("What stays unexplained", lead, f'<div class="views">{"".join(figures)}</div>')
+    return _section("What stays unexplained", lead, _views(figures))
 
 
-def _plan(decisions: Sequence[Mapping]) -> str:
+def _boxed_photo(image: np.ndarray, name: str, regions: Sequence[Mapping]) -> Markup:
+    """Draw a photo with a box around each region, and the stops beside it."""
+    height, width = image.shape[:2]
+    unit, boxes = width / 420, []  # Lines and letters look the same on any size of photo.
+    for region in regions:
+        left, top, wide, high = region["box"]
+        color = "#ffb454" if region["stops"] > 0 else "#6cc7e8"
+        x, y, w, h = left - 3 * unit, top - 3 * unit, wide + 6 * unit, high + 6 * unit
+        rect = (
+            '<rect x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" fill="none" stroke="{}" stroke-width="{:.2f}"/>'
+        )
+        boxes.append(markup(rect, x, y, w, h, color, 1.6 * unit))
+        text = '<text x="{:.1f}" y="{:.1f}" style="fill:{};font-size:{:.1f}px;paint-order:stroke;stroke:#000;'
+        text += 'stroke-width:{:.2f}px">{}</text>'
+        baseline = y + h + 14 * unit if y < 16 * unit else y - 5 * unit
+        stops = stops_text(region["stops"]).removesuffix(" EV")
+        boxes.append(markup(text, min(x, width - 60 * unit), baseline, color, 15 * unit, 2.4 * unit, stops))
+    source = jpeg_source(jpeg(smaller(image, _PICTURE), 84))
+    return markup(
+        '<svg viewBox="0 0 {width} {height}" role="img" aria-label="unexplained regions of {name}">'
+        '<image href="{source}" width="{width}" height="{height}"/>{boxes}</svg>',
+        width=width,
+        height=height,
+        name=name,
+        source=source,
+        boxes=join(boxes),
+    )
+
+
+def _plan(decisions: Sequence[Mapping]) -> Markup:
     rows = [(d["name"], d["choice"], d.get("reason", "")) for d in decisions]
     return _section(
         "What was left out, and why",
@@ -253,9 +260,9 @@ def _plan(decisions: Sequence[Mapping]) -> str:
     )
 
 
-def _table(evaluation: Mapping[str, Any] | None, held_out: bool) -> str:
+def _table(evaluation: Mapping[str, Any] | None, held_out: bool) -> Markup:
     if evaluation is None:
-        return ""
+        return EMPTY
     hdr = evaluation["protocol"]["gt-max"]
     known = hdr["psnr_mu"] is not None
 
@@ -273,15 +280,15 @@ def _table(evaluation: Mapping[str, Any] | None, held_out: bool) -> str:
         for name, values in evaluation["regions"].items()
     ]
     titles = ["part of the photos", "pixels", "photo PSNR, dB", *["HDR mu-law PSNR, dB"] * known]
-    body += "\n<br>\n" + _rows(titles, regions, first_number=1)
+    body += markup("\n<br>\n") + _rows(titles, regions, first_number=1)
     split = "Held-out views" if held_out else "Training views, since none is held out: figures flatter"
-    note = " HDR under the protocol gt-max; <code>sehdr-warp eval</code> has the others." if known else ""
-    return _section("Figures", f"{split}.{note}", body)
+    note = markup(" HDR under the protocol gt-max; <code>sehdr-warp eval</code> has the others.") if known else EMPTY
+    return _section("Figures", markup("{}.{}", split, note), body)
 
 
-def _map(run: Any, comparisons: Sequence[Comparison]) -> str:
+def _map(run: Any, comparisons: Sequence[Comparison]) -> Markup:
     tone_map = fit_tone_map([each.hdr for each in comparisons])
-    lead = (
+    lead = markup(
         'From above, as the photos see it. <span style="color: var(--accent)">Amber</span>: trained on. '
         '<span style="color: var(--cool)">Blue</span>: held out.'
     )
@@ -289,28 +296,31 @@ def _map(run: Any, comparisons: Sequence[Comparison]) -> str:
     return _section("Cameras", lead, _figure(svg))
 
 
-def _footer(run: Any, held_out: bool) -> str:
-    cameras = "" if held_out else " --cameras train"
-    path = escape(shlex.quote(str(run.path)))
-    return (
-        f"<footer>\n<p>sehdr-warp {__version__}. Brackets as OpenEXR: <code>sehdr-warp render {path} "
-        f"--out views{cameras} --evs=-4,-2,0,2,4</code></p>\n"
-        "<p>Radiance is relative, and clipped light is not in the photos.</p>\n</footer>"
+def _footer(run: Any, held_out: bool) -> Markup:
+    return markup(
+        "<footer>\n<p>sehdr-warp {}. Brackets as OpenEXR: <code>sehdr-warp render {} --out views{} --evs=-4,-2,0,2,4"
+        "</code></p>\n<p>Radiance is relative, and clipped light is not in the photos.</p>\n</footer>",
+        __version__,
+        shlex.quote(str(run.path)),
+        "" if held_out else " --cameras train",
     )
 
 
-def _rows(titles: Sequence[str], rows: Sequence[Sequence], mean: Sequence = (), first_number: int = 99) -> str:
+def _rows(titles: Sequence[str], rows: Sequence[Sequence], mean: Sequence = (), first_number: int = 99) -> Markup:
     """Return a table; columns from first_number on hold numbers. Empty without rows."""
     if not rows:
-        return ""
+        return EMPTY
 
-    def line(cells: Sequence, tag: str, mark: str = "") -> str:
-        kinds = [' class="number"' * (column >= first_number) for column in range(len(cells))]
-        return f"<tr{mark}>" + "".join(f"<{tag}{k}>{escape(str(c))}</{tag}>" for c, k in zip(cells, kinds)) + "</tr>"
+    def line(cells: Sequence, plain: str, numeric: str) -> Markup:
+        templates = [numeric if column >= first_number else plain for column in range(len(cells))]
+        return join(markup(template, cell) for template, cell in zip(templates, cells, strict=True))
 
-    body = [line(row, "td") for row in rows] + [line(mean, "td", ' class="mean"')] * bool(mean)
-    head = f'<div class="table"><table>\n<thead>{line(titles, "th")}</thead>'
-    return f"{head}\n<tbody>{''.join(body)}</tbody>\n</table></div>"
+    cell = "<td>{}</td>", '<td class="number">{}</td>'
+    head = markup("<tr>{}</tr>", line(titles, "<th>{}</th>", '<th class="number">{}</th>'))
+    body = [markup("<tr>{}</tr>", line(row, *cell)) for row in rows]
+    body += [markup('<tr class="mean">{}</tr>', line(mean, *cell))] if mean else []
+    template = '<div class="table"><table>\n<thead>{}</thead>\n<tbody>{}</tbody>\n</table></div>'
+    return markup(template, head, join(body))
 
 
 def smaller(picture: np.ndarray, longest: int) -> np.ndarray:
@@ -340,3 +350,8 @@ def duration(time: float) -> str:
 def number(value: float | None, digits: int) -> str:
     """Format a figure, or a dash if there is none."""
     return "\N{EN DASH}" if value is None else f"{value:.{digits}f}"
+
+
+def _decibels(line: Mapping[str, Any], key: str) -> str | None:
+    value = line.get(key)
+    return None if value is None else f"{value:.1f} dB"

@@ -5,11 +5,8 @@ are. It blends into half floats, which light.js exposes: light above white stays
 """
 
 import base64
-import json
 import zlib
-from html import escape
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -20,7 +17,8 @@ from ..files import atomic_path, check_absent
 from ..model.baking import gaussians_of
 from ..splats.arrays import HARMONIC_0
 from .camera_paths import facts_of_cameras
-from .light_pictures import curve_table, display_gain, page_file, whole_page
+from .html import data_block, join, json_block, page_file, page_markup, whole_page
+from .light_pictures import curve_table, display_gain
 
 _HALF = float(np.finfo(np.float16).max)
 
@@ -57,15 +55,17 @@ def write_scene_page(run: Any, path: Path | str, *, overwrite: bool = False) -> 
         "grey": display_gain(run.response),
         "curve": curve_table(run.response),
     }
-    body = Template(page_file("scene.html")).substitute(
-        title=escape(str(run.scene_name)),
-        facts=json.dumps(facts).replace("<", "\\u003c"),
-        means=_packed(values[:3].astype("<f4")),
-        rest=_packed(values[3:].astype("<f2")),
-        engine=page_file("playcanvas.min.js").replace("</script", "<\\/script"),
-        script="".join(map(page_file, ("tables.js", "light.js", "camera.js", "scene.js"))),
-    )
-    page = whole_page(str(run.scene_name), "scene.css", body)
+    blocks = [
+        json_block("facts", facts),
+        data_block(_packed(values[:3].astype("<f4")), id="means"),
+        data_block(_packed(values[3:].astype("<f2")), id="rest"),
+    ]
+    body = page_markup("scene.html", title=run.scene_name, data=join(blocks, "\n"))
+    scripts = [
+        page_file("playcanvas.min.js"),
+        "".join(map(page_file, ("tables.js", "light.js", "camera.js", "scene.js"))),
+    ]
+    page = whole_page(run.scene_name, page_file("scene.css"), body, scripts, workers=True)
     with atomic_path(path, overwrite) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return path

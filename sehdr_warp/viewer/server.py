@@ -25,8 +25,9 @@ from PIL import Image
 from ..errors import SehdrError
 from ..output.camera_paths import interpolate
 from ..output.film import write_film
+from ..output.html import page_file
 from ..output.images import quantize
-from ..output.light_pictures import page_file, shown_photo
+from ..output.light_pictures import shown_photo
 from ..output.render_views import render_views
 from .connections import SILENCE, BusyError, ClientGone, Connection, Connections
 from .frames import ViewerScene, camera_file, camera_of, frame_bytes

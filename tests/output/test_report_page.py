@@ -1,6 +1,8 @@
 """report.html as strangers meet it: valid, alone, small, and with the light that it says it has."""
 
+import ast
 import base64
+import hashlib
 import html
 import io
 import os
@@ -8,17 +10,22 @@ import re
 import shutil
 import subprocess
 import zlib
+from dataclasses import replace
+from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from sehdr_warp import output
 from sehdr_warp.output.light_pictures import dial, display_gain, jpeg, packed_light
 from sehdr_warp.output.notebook import run_html
 from sehdr_warp.output.report import write_report
 from sehdr_warp.output.report_page import smaller
 
+from ..viewer.browser import browser
 from .helpers import AnalyticRun
 from .test_report import make
 
@@ -36,7 +43,7 @@ EVALUATION = {
 def page(tmp_path, *, unexplained=True, **options):
     run, scene = make(tmp_path, **options)
     named = {"photo": "v_0", "column": 5.0, "row": 7.0, "pixels": 9, "stops": 1.25}
-    worst = [named | {"box": [4, 6, 3, 3]}, named | {"stops": -2.0}]
+    worst = [named | {"box": [4, 6, 3, 3]}, named | {"stops": -2.0, "box": [5, 7, 1, 1]}]
     run.summary = lambda: {"unexplained": {"regions": 2, "photos": 1, "worst": worst}} if unexplained else {}
     run.decisions = lambda: PLAN
     return write_report(run, scene, tmp_path / "report", evaluation=EVALUATION)[0].read_text()
@@ -125,7 +132,7 @@ def test_smaller_pictures_hold_means():
 def test_a_run_shows_itself_in_a_notebook():
     run = AnalyticRun()
     text = run_html(run)
-    page = html.unescape(re.fullmatch(r'<iframe srcdoc="([^"]*)" [^<>]*></iframe>', text)[1])
+    page = html.unescape(re.fullmatch(r'<iframe srcdoc="([^"]*)" [^<>]*sandbox[^<>]*></iframe>', text)[1])
     validate(page)
     assert "1,234 Gaussians" in page and "t_0" in page and not re.findall(r"https?://", page)
     packed = re.search(r'data-light="scene">([^<]*)<', page)[1]
@@ -133,3 +140,89 @@ def test_a_run_shows_itself_in_a_notebook():
     np.testing.assert_allclose(light, run.render(run.cameras[3].camera).hdr * 0.5, rtol=1e-3)
     run.cameras = []
     assert "dial" in run_html(run) and "data-light=" not in run_html(run).replace("script[data-light]", "")
+
+
+EVIL = """</script><script>window.PWNED=1</script><img src=x onerror="window.PWNED=1">'"&"""
+
+
+def evil_report(tmp_path):
+    """A report in which all that a run and its photos say is markup."""
+    run, scene = make(tmp_path)
+    run.response = SimpleNamespace(name=EVIL, encode=run.response.encode, decode=run.response.decode)
+    run.path, run.scene_name = EVIL, EVIL
+    for entry in run.cameras:
+        entry.name += EVIL
+    views = tuple(replace(view, name=f"{view.name}{EVIL}") for view in scene.views)
+    scene = replace(scene, name=EVIL, notes=(EVIL,), views=views)
+    region = {"photo": views[0].name, "column": 5.0, "row": 7.0, "pixels": 9, "stops": 1.25, "box": [4, 6, 3, 3]}
+    unexplained = {"regions": EVIL, "photos": EVIL, "worst": [region]}
+    run.summary = lambda: {"device": EVIL, "unexplained": unexplained}
+    run.decisions = lambda: [{"name": EVIL, "choice": EVIL, "reason": EVIL}]
+    evaluation = EVALUATION | {
+        "views": [EVALUATION["views"][0] | {"name": EVIL}],
+        "regions": {EVIL: EVALUATION["regions"]["clipped"]},
+    }
+    return run, write_report(run, scene, tmp_path / "report", evaluation=evaluation)[0]
+
+
+class _Elements(HTMLParser):
+    """The scripts of a page, and every attribute that is not one of ours."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.scripts, self.handlers, self.sources = [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        attributes = dict(attrs)
+        self.handlers += [name for name in attributes if name.startswith("on")]
+        self.sources += [attributes[name] for name in ("src", "href") if name in attributes]
+        if tag == "script" and attributes.get("type", "text/javascript") == "text/javascript":
+            self.scripts.append("")
+
+    def handle_data(self, data):
+        if self.lasttag == "script" and self.scripts and not self.scripts[-1]:
+            self.scripts[-1] = data
+
+
+def test_what_a_run_says_is_text_and_only_our_scripts_have_leave(tmp_path):
+    run, path = evil_report(tmp_path)
+    notebook = html.unescape(re.search(r'srcdoc="([^"]*)"', run_html(run))[1])
+    for text in (path.read_text(), notebook):
+        elements = _Elements(text)
+        assert not elements.handlers and len(elements.scripts) == 1
+        assert all(source.startswith("data:image/") for source in elements.sources)
+        digest = base64.b64encode(hashlib.sha256(elements.scripts[0].encode()).digest()).decode()
+        policy = html.unescape(re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1])
+        assert f"script-src 'sha256-{digest}';" in policy and policy.startswith("default-src 'none';")
+        assert "unsafe-inline" not in policy.replace("style-src 'unsafe-inline'", "")
+    assert path.read_text().count("PWNED") > 20
+
+
+def test_browsers_run_our_script_and_no_other(tmp_path):
+    _, path = evil_report(tmp_path)
+    text = path.read_text()
+    forced = tmp_path / "forced.html"  # As if one had come through all the same.
+    forced.write_text(text.replace("</main>", "<script>window.PWNED=1</script><img src=x onerror='PWNED=1'></main>"))
+    with browser() as made:
+        for file in (path, forced):
+            page = made.new_page()
+            page.goto(file.as_uri())
+            page.wait_for_timeout(500)
+            assert page.evaluate("typeof window.PWNED") == "undefined"
+            assert page.evaluate("typeof startDial") == "function"
+            assert page.evaluate("document.querySelectorAll('.dial canvas').length") == 1
+            page.close()
+
+
+@pytest.mark.parametrize("path", sorted(Path(output.__file__).parent.glob("*.py")), ids=lambda path: path.name)
+def test_no_markup_is_made_but_by_the_one_function(path):
+    """Of f-strings nothing escapes what goes in, and a template that is made of text is no template."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        for part in node.values if isinstance(node, ast.JoinedStr) else ():
+            if isinstance(part, ast.Constant):
+                assert not re.search(r"<[a-zA-Z/!]", part.value), f"{path.name}:{node.lineno}"
+        name = getattr(getattr(node, "func", None), "id", "")
+        if name == "markup":
+            assert isinstance(node.args[0], ast.Constant | ast.Name), f"{path.name}:{node.lineno}"
+        assert name != "Markup" or path.name == "html.py", f"{path.name}:{node.lineno}"
