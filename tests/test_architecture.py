@@ -30,7 +30,17 @@ ALLOWED = {
     "scene": ANY | {"response", "splats"},
     "prior": ANY,
     "model": ANY | {"scene", "response", "rasterizer", "splats"},
-    "output": ANY | {"runs", "scene", "response", "splats", "model.exposure", "model.baking", "model.sensor_colors"},
+    "output": ANY
+    | {
+        "runs",
+        "scene",
+        "response",
+        "splats",
+        "model.exposure",
+        "model.baking",
+        "model.sensor_colors",
+        "model.visibility",
+    },
     "viewer": ANY | {"runs", "scene", "output"},
     "evaluation": ANY | {"runs", "scene", "rasterizer.ssim", "output.names", "output.charts"},
     "runs": ANY | {"scene", "response", "model", "splats", "output.notebook"},

@@ -4,6 +4,7 @@ Each is a part of its own in the EXR file, tagged as data.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,45 +15,65 @@ from sehdr_warp.scene import Camera
 from .exr import Part, as_data
 from .images import as_array
 
+
+@dataclass(frozen=True)
+class ViewData:
+    """A rendered view.
+
+    Attributes:
+        run: Scene that it shows.
+        camera: In the scene's coordinates.
+        camera_in_file: The same camera in the coordinates of the file.
+        alpha: [H, W] coverage.
+        depth: [H, W] in the file's units, along the camera's axis; 0 where nothing is.
+    """
+
+    run: Any
+    camera: Camera
+    camera_in_file: Camera
+    alpha: np.ndarray
+    depth: np.ndarray
+
+
 Channels = Mapping[str, np.ndarray]
 
 
-def _depth(run, rendered, camera: Camera) -> Channels:
+def _depth(view: ViewData) -> Channels:
     """Return Z along the camera's axis and the distance from the camera; 0 where nothing is."""
-    depth = as_array(rendered.depth)
-    return {"Z": depth, "distance.Z": depth * np.linalg.norm(_rays(camera), axis=2)}
+    depth = view.depth
+    return {"Z": depth, "distance.Z": depth * np.linalg.norm(_rays(view.camera_in_file), axis=2)}
 
 
-def _position(run, rendered, camera: Camera) -> Channels:
-    points = _points(rendered, camera)
+def _position(view: ViewData) -> Channels:
+    points = _points(view)
     return {f"position.{axis}": points[..., i] for i, axis in enumerate("XYZ")}
 
 
-def _normals(run, rendered, camera: Camera) -> Channels:
+def _normals(view: ViewData) -> Channels:
     """Return surface normals from depth, towards the camera, in world axes; 0 where empty and at borders."""
-    points = _points(rendered, camera)
+    points = _points(view)
     down, right = (np.gradient(points, axis=axis) if points.shape[axis] > 1 else 0 * points for axis in (0, 1))
     normal = np.cross(down, right)
-    normal *= np.where((normal * (camera.position - points)).sum(2, keepdims=True) < 0, -1, 1)
+    normal *= np.where((normal * (view.camera_in_file.position - points)).sum(2, keepdims=True) < 0, -1, 1)
     length = np.linalg.norm(normal, axis=2, keepdims=True)
     # A difference with an empty pixel has no meaning.
-    covered = as_array(rendered.depth) > 0
+    covered = view.depth > 0
     whole = np.pad(covered, 1)
     whole = whole[1:-1, 1:-1] & whole[:-2, 1:-1] & whole[2:, 1:-1] & whole[1:-1, :-2] & whole[1:-1, 2:]
     normal = np.where(whole[..., None] & (length > 0), normal / np.where(length > 0, length, 1), 0)
     return {f"N.{axis}": normal[..., i] for i, axis in enumerate("XYZ")}
 
 
-def _alpha(run, rendered, camera: Camera) -> Channels:
-    return {"A": as_array(rendered.alpha)}
+def _alpha(view: ViewData) -> Channels:
+    return {"A": view.alpha}
 
 
-def _confidence(run, rendered, camera: Camera) -> Channels:
-    return {"confidence": _measured(run, run.render_confidence(camera))}
+def _confidence(view: ViewData) -> Channels:
+    return {"confidence": _measured(view.run, view.run.render_confidence(view.camera))}
 
 
-def _clipped(run, rendered, camera: Camera) -> Channels:
-    return {"clipped": _measured(run, run.render_clipped(camera))}
+def _clipped(view: ViewData) -> Channels:
+    return {"clipped": _measured(view.run, view.run.render_clipped(view.camera))}
 
 
 def _measured(run, values) -> np.ndarray:
@@ -61,7 +82,7 @@ def _measured(run, values) -> np.ndarray:
     return as_array(values)
 
 
-AOVS: Mapping[str, Callable[[Any, Any, Camera], Channels]] = {
+AOVS: Mapping[str, Callable[[ViewData], Channels]] = {
     "depth": _depth,
     "position": _position,
     "normals": _normals,
@@ -89,9 +110,9 @@ def read_aovs(names: str | Sequence[str]) -> tuple[str, ...]:
     return tuple(listed)
 
 
-def data_parts(names: Sequence[str], run: Any, rendered: Any, camera: Camera, header: Mapping[str, Any]) -> list[Part]:
+def data_parts(names: Sequence[str], view: ViewData, header: Mapping[str, Any]) -> list[Part]:
     """Return the parts of a file that hold AOVs of a rendered view; `header` is that of its picture."""
-    return [Part(AOVS[name](run, rendered, camera), as_data(header), name) for name in names]
+    return [Part(AOVS[name](view), as_data(header), name) for name in names]
 
 
 def _rays(camera: Camera) -> np.ndarray:
@@ -100,8 +121,8 @@ def _rays(camera: Camera) -> np.ndarray:
     return np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=2)
 
 
-def _points(rendered, camera: Camera) -> np.ndarray:
+def _points(view: ViewData) -> np.ndarray:
     """Return [H, W, 3] world coordinates of the visible surface; 0 where nothing is."""
-    depth = as_array(rendered.depth)[..., None]
+    camera, depth = view.camera_in_file, view.depth[..., None]
     points = (_rays(camera) * depth) @ camera.world_to_camera[:3, :3] + camera.position
     return np.where(depth > 0, points, 0)

@@ -49,6 +49,19 @@ class ViewFileOptions:
 
 
 @dataclass(frozen=True)
+class WorldOptions:
+    """Coordinates of the files."""
+
+    axes: Literal["upright", "scene"] = "upright"
+    """upright: +Y is up (in PLY -Y, as its viewers expect), the subject is in the middle. scene: the photos' own
+    coordinates."""
+    up: str | None = None
+    """The scene's up direction in its own coordinates, if the photos do not show it: x,y,z, or an axis such as -y."""
+    scale: float | None = None
+    """Meters for each unit of the scene; by default as kept by the viewer, else 1."""
+
+
+@dataclass(frozen=True)
 class FilmOptions:
     """Options of the film that render writes with --video."""
 
@@ -78,7 +91,9 @@ class Render:
     video: Path | None = None
     """A film of the cameras, such as orbit.mp4; without --out no pictures are written."""
     cameras: str = "test"
-    """test, train, all, orbit, interpolate, or your own cameras: JSON, OpenUSD, or the folder of a COLMAP model."""
+    """test, train, all, orbit, interpolate, or your cameras: OpenUSD, .chan, JSON, or a COLMAP model's folder."""
+    camera: str | None = None
+    """Only this camera of a file of several, by its name there."""
     count: int = 60
     """Views of an orbit or interpolation."""
     size: str | None = None
@@ -89,6 +104,7 @@ class Render:
     """cpu or cuda:N; by default the first GPU if there is one."""
     json: bool = False
     """Print the written files as JSON on standard output."""
+    world: WorldOptions = WorldOptions()
     pictures: ViewFileOptions = ViewFileOptions()
     film: FilmOptions = FilmOptions()
 
@@ -122,6 +138,20 @@ class SplatFileOptions:
     """Pad the harmonics with zeros up to this degree, for readers that take 3 alone."""
 
 
+@dataclass(frozen=True)
+class EditOptions:
+    """What the file leaves out."""
+
+    crop: str | None = None
+    """Keep only this region, in upright coordinates: sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1."""
+    cut: str | None = None
+    """Leave this region out, written as that of --crop."""
+    min_opacity: float = 1 / 255
+    """Least opacity; below 1/255 no program draws a Gaussian."""
+    min_views: int = 0
+    """Leave out what fewer training cameras show: 2 removes most floaters."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Export:
     """Write the Gaussians as PLY, OpenUSD or glTF, for viewers and other tools, or as a page that shows them in HDR."""
@@ -130,9 +160,13 @@ class Export:
     """Folder of a run, or a file of Gaussians."""
     out: Path
     """The file; its suffix decides: .ply, .glb (glTF), .usda, .usdc or .usdz (OpenUSD), .html (a page to send)."""
+    world: WorldOptions = WorldOptions()
+    edits: EditOptions = EditOptions()
+    merge: tuple[Path, ...] = ()
+    """Further runs or files in the same coordinates, which the file holds as well."""
     file: SplatFileOptions = SplatFileOptions()
     cameras: bool = False
-    """Also write cameras.json beside it, as viewers of the reference release read it."""
+    """Also write <name>.cameras.json beside it, in the form of the reference release of 3D Gaussian Splatting."""
     overwrite: bool = False
     """Replace files that exist."""
     device: str | None = None
@@ -171,7 +205,9 @@ class EnvironmentMap:
     layout: Literal["latlong", "cube"] = "latlong"
     """Latitude and longitude, twice as wide as high; or OpenEXR's six faces, one above the other."""
     axes: Literal["upright", "scene"] = "upright"
-    """upright: +Y is up in the photos, and what is ahead is in the middle. scene: the scene's own coordinates."""
+    """upright: turned as render and export turn the scene; +Y is up. scene: the scene's own coordinates."""
+    up: str | None = None
+    """The scene's up direction in its own coordinates, if the photos do not show it: x,y,z, or an axis such as -y."""
     inpaint: bool = False
     """Fill directions that no photo covers with the light around them; alpha still tells them."""
     colorspace: str = "rec709"
@@ -204,6 +240,7 @@ def run_environment_map(args: EnvironmentMap) -> None:
 def run_render(args: Render) -> None:
     """Run `sehdr-warp render`."""
     from .render_views import PATHS, framed, read_size, render_views, select_cameras
+    from .world_transform import world_transform
 
     if args.out is None and args.video is None:
         raise UsageError(
@@ -222,14 +259,17 @@ def run_render(args: Render) -> None:
         film_library()
         check_absent(args.video, args.overwrite)
     run = open_scene(args.run, args.device)
-    path = {"cameras": args.cameras, "count": args.count}
+    path = {"cameras": args.cameras, "camera": args.camera, "count": args.count}
     if args.out is not None:
-        files = render_views(run, args.out, **path, size=args.size, overwrite=args.overwrite, **vars(args.pictures))
+        files = render_views(
+            run, args.out, **path, size=args.size, overwrite=args.overwrite, **vars(args.world), **vars(args.pictures)
+        )
         summary = f"{args.out}: {len(files)} files"
     if args.video is not None:
         from .film import write_film
 
-        cameras = [camera for _, camera in select_cameras(run, **path)]
+        transform = world_transform(run, **vars(args.world))
+        cameras = [camera for _, camera in select_cameras(run, **path, transform=transform)]
         if args.size is not None:
             cameras = [framed(camera, *read_size(args.size)) for camera in cameras]
         film = {"fps": positive("--fps", args.film.fps), "transfer": args.film.transfer, "ev_ramp": ramp}
@@ -276,7 +316,9 @@ def run_export(args: Export) -> None:
             raise UsageError("a page has its exposure, cameras and harmonics; --out alone goes with .html")
         print(write_scene_page(open_scene(args.run, args.device), args.out, overwrite=args.overwrite))
         return
-    _export(args.run, args.out, args.file, args.device, cameras=args.cameras, overwrite=args.overwrite)
+    flags = {"cameras": args.cameras, "overwrite": args.overwrite}
+    options = {"world": args.world, "edits": args.edits, "merge": args.merge}
+    _export(args.run, args.out, args.file, args.device, **options, **flags)
 
 
 def run_convert(args: Convert) -> None:
@@ -287,12 +329,27 @@ def run_convert(args: Convert) -> None:
     _export(args.source, args.out, args.file, args.device, overwrite=args.overwrite)
 
 
-def _export(source: Path, out: Path, options: SplatFileOptions, device: str | None, **flags: bool) -> None:
+def _export(
+    source: Path,
+    out: Path,
+    options: SplatFileOptions,
+    device: str | None,
+    *,
+    world: WorldOptions | None = None,
+    edits: EditOptions | None = None,
+    merge: tuple[Path, ...] = (),
+    **flags: bool,
+) -> None:
     from ..model.exposure import exposure_times
     from ..splats import check_suffix
     from .export import export
+    from .splat_edits import SplatEdits
 
     check_suffix(out)  # Before the scene is opened.
+    splat_edits = SplatEdits(**vars(edits)) if edits else SplatEdits(min_opacity=0)
     run = open_scene(source, device)
+    others = [open_scene(path, device) for path in merge]
     time = None if options.exposure is None else exposure_times(run.base_time, options.exposure)[0]
-    print(export(run, out, kind=options.kind, exposure_time=time, degree=options.degree, **flags))
+    frame = {"axes": None} if world is None else vars(world)
+    colors = {"kind": options.kind, "exposure_time": time, "degree": options.degree}
+    print(export(run, out, **colors, **frame, edits=splat_edits, merge=others, **flags))

@@ -12,17 +12,16 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera
 
 from ..files import check_absent
-from .camera_paths import mean_up
 from .colorspace import from_rec709
 from .exr import Part, as_data, exr_header, rgb_channels, write_multipart_exr
 from .images import as_array
 from .light_pictures import exposure_of_white
 from .radiance_file import write_radiance
 from .render_views import provenance
+from .world_transform import AXES, world_transform
 
 log = logging.getLogger(__name__)
 LAYOUTS = ("latlong", "cube")
-AXES = ("upright", "scene")
 SUFFIXES = (".exr", ".hdr")
 # A direction counts as covered above this alpha. A covered share below _LEAST_COVERED gives a warning, as do surfaces
 # nearer than _NEAR times the spread of the cameras in more than half of all directions: the point is inside something.
@@ -50,6 +49,7 @@ def write_environment_map(
     size: int = 2048,
     layout: str = "latlong",
     axes: str = "upright",
+    up: str | tuple[float, float, float] | None = None,
     inpaint: bool = False,
     colorspace: str = "rec709",
     reference_white: float | None = None,
@@ -66,8 +66,9 @@ def write_environment_map(
         size: Pixels across; for a cube those of one face.
         layout: "latlong": size x size / 2, the left edge at longitude pi, +Z in the middle, +X at a quarter, +Y up.
             "cube": OpenEXR's six faces, one above the other.
-        axes: "upright": +Y is up in the photos, +Z is ahead of the named camera or of the middle one. "scene": the
-            scene's coordinates.
+        axes: "upright": turned as render and export turn the scene (see world_transform), so that the map lights its
+            Gaussians as they stand: +Y is up and +Z is ahead of the middle camera. "scene": the scene's coordinates.
+        up: As in world_transform.
         inpaint: Fill directions that no photo covers with the light around them, as far as A is below 1; A still tells
             them.
         colorspace: Primaries of the file.
@@ -88,12 +89,13 @@ def write_environment_map(
             raise SehdrError(f"{name} {value!r} is not one of {', '.join(known)}")
     if size < 16 or size % 2 or size > _LARGEST:
         raise SehdrError(f"size {size} cannot be; give an even number of pixels from 16 to {_LARGEST}")
+    transform = world_transform(run, axes, up=up)
     exposure = exposure_of_white(run, reference_white)
     check_absent(path, overwrite)
     cameras = {entry.name: entry.camera for entry in run.cameras}
     photos = [entry.camera for entry in run.cameras if entry.split == "train"]
-    position, ahead = _point(at, cameras, photos)
-    to_world = np.eye(3) if axes == "scene" else _upright(photos, ahead)
+    position = _point(at, cameras, photos)
+    to_world = transform.rotation.T
     directions = (latlong if layout == "latlong" else cube)(size) @ to_world.T
     pixel_angle = 2 * np.pi / size if layout == "latlong" else 2 / size
     focal = float(np.median([np.sqrt(c.fx * c.fy) for c in photos])) if photos else 1 / pixel_angle
@@ -110,7 +112,7 @@ def write_environment_map(
     if path.suffix.lower() == ".hdr":
         write_radiance(path, hdr, exposure=exposure, overwrite=overwrite)
         return path
-    data = {"distance.Z": distance}
+    data = {"distance.Z": distance * transform.scale}
     if surroundings.confidence is not None:
         data["confidence"] = as_array(surroundings.confidence)
     facts = {**provenance(run), "position": json.dumps(position.tolist()), "axes": axes}
@@ -182,42 +184,25 @@ def inpainted(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, weight
     return np.stack([map_coordinates(wrapped[..., i], at, order=1, mode="nearest") for i in range(3)], axis=2)
 
 
-def _point(at, cameras: dict[str, Camera], photos: list[Camera]) -> tuple[np.ndarray, Camera | None]:
-    """Return the point, and the camera that defines what is ahead."""
-    middle = None
-    if photos:
-        places = np.stack([camera.position for camera in photos])
-        middle = photos[int(np.argmin(np.linalg.norm(places - np.median(places, axis=0), axis=1)))]
+def _point(at: str | tuple[float, float, float], cameras: dict[str, Camera], photos: list[Camera]) -> np.ndarray:
+    """Return the point [3] that `at` names, in the scene's coordinates."""
     if isinstance(at, str) and at == "center":
-        if middle is None:
+        if not photos:
             raise SehdrError("the scene has no cameras, so no center; say where with --at x,y,z")
-        return np.mean([camera.position for camera in photos], axis=0), middle
+        return np.mean([camera.position for camera in photos], axis=0)
     if isinstance(at, str) and at.startswith("camera:"):
         name = at.partition(":")[2]
         if name not in cameras:
             some = ", ".join(list(cameras)[:5])
             raise SehdrError(f"camera {name!r} is none of the scene's ({some} ...); see scene.json of the run")
-        return cameras[name].position, cameras[name]
+        return cameras[name].position
     try:
         position = np.array([float(v) for v in (at.split(",") if isinstance(at, str) else at)])
     except (ValueError, TypeError):
         position = np.array([])
     if position.shape != (3,) or not np.isfinite(position).all():
         raise SehdrError(f"point {at!r} is neither x,y,z nor camera:NAME nor center")
-    return position, middle
-
-
-def _upright(photos: list[Camera], ahead: Camera | None) -> np.ndarray:
-    """Return [3, 3] map to world axes; its columns are +X (left of what is ahead), +Y (up) and +Z (ahead)."""
-    if ahead is None:
-        return np.eye(3)
-    up = mean_up(photos or [ahead])
-    forward = ahead.world_to_camera[2, :3]
-    forward = forward - up * (forward @ up)
-    if np.linalg.norm(forward) < 1e-3:  # It looks straight up or down.
-        forward = np.linalg.svd(up[None])[2][1]
-    forward /= np.linalg.norm(forward)
-    return np.stack([np.cross(up, forward), up, forward], axis=1)
+    return position
 
 
 def _judge(run, position, photos: list[Camera], alpha: np.ndarray, distance: np.ndarray, weight: np.ndarray) -> None:

@@ -4,6 +4,7 @@ import json
 import logging
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,17 @@ from sehdr_warp.scene import Camera
 from sehdr_warp.scene.exposure import shutter
 
 from ..files import atomic_path, check_absent
-from ..model.baking import agreement, gaussians_of, refine
-from ..splats import check_suffix, color_model_of, write_gaussians
+from ..model.baking import agreement, field_of, gaussians_of, refine
+from ..runs.run import Splats
+from ..splats import GaussianArrays, check_suffix, color_model_of, path_is_lossy, read_gaussians, write_gaussians
+from .splat_edits import SplatEdits, merged, without_strays
+from .world_transform import WorldTransform, file_transform, is_y_down, world_transform
 
 log = logging.getLogger(__name__)
 KINDS = ("ldr", "hdr")
 _JUDGED = 8  # Views that tell what a file kept
 _DARKER = 4  # Stops below the photos' exposure, where light above their white shows
+_WORDS = ((42.0, "no visible loss"), (36.0, "close copy"), (30.0, "small differences"))  # From this many dB on
 
 
 def export(
@@ -31,6 +36,11 @@ def export(
     exposure_time: float | None = None,
     degree: int | None = None,
     cameras: bool = False,
+    axes: str | None = "upright",
+    up: str | Sequence[float] | None = None,
+    scale: float | None = None,
+    edits: SplatEdits | None = None,
+    merge: Sequence[Any] = (),
     overwrite: bool = False,
 ) -> Path:
     """Write the Gaussians of a trained run; return the path.
@@ -39,41 +49,83 @@ def export(
 
     Args:
         run: From load_run, train or load_splats.
-        path: The file; its suffix decides: .ply, .glb (glTF), .usda, .usdc, .usdz (OpenUSD).
+        path: The file; its suffix decides: see sehdr_warp.splats.SUFFIXES.
         kind: "ldr" for the colors of a photo, which viewers show, refined to the run's own pictures; "hdr" for
             scene-linear radiance. None: hdr for USD, else ldr.
         exposure_time: Seconds, of ldr colors; by default the scene's.
         degree: Pad harmonics with zeros up to this degree, for readers that take no other; at most 3.
-        cameras: Also write `cameras.json` beside it, as the reference release of 3D Gaussian Splatting does.
+        cameras: Also write `<stem>.cameras.json` beside it, in the form of the reference release of 3D Gaussian
+            Splatting.
+        axes: "upright" or "scene" (see world_transform); None keeps the coordinates of a file of Gaussians, and only
+            turns them over if one file has +Y up and the other -Y.
+        up: As in world_transform.
+        scale: As in world_transform.
+        edits: What the file leaves out; by default Gaussians too faint to be drawn.
+        merge: Further runs or files of Gaussians in the same coordinates, which the file holds as well.
         overwrite: Replace files that exist.
 
     Raises:
-        SehdrError: For options that do not fit.
+        SehdrError: For options that do not fit, or edits that leave nothing.
         InputError: For an unknown suffix, if a file exists, or if a value is not finite.
     """
-    path = Path(path)
+    path, edits = Path(path), edits or SplatEdits()
     held = color_model_of(path)
     kind = kind or ("hdr" if held == "linear" else "ldr")
     _check(path, kind, held, exposure_time, degree)
-    beside = path.with_name("cameras.json")
+    beside = path.with_name(f"{path.stem}.cameras.json")
     for file in (path, *[beside] * cameras):
         check_absent(file, overwrite)  # Before minutes of fitting.
-    photos = [entry.camera for entry in run.cameras if entry.split == "train"]
-    positions = np.array([camera.position for camera in photos]).reshape(-1, 3)
-    if kind == "ldr":
-        time = run.base_time if exposure_time is None else float(exposure_time)
-        gaussians = gaussians_of(run.model, "display", positions, time, run.color_matrix)
-        if gaussians.color_model != run.model.color_model.name:
-            gaussians = refine(gaussians, _photographed(run, time), photos)
+    if axes is None:
+        turn = np.diag([-1.0, -1.0, 1.0]) if is_y_down(run.path) != is_y_down(path) else np.eye(3)
+        upright = to_file = WorldTransform(turn, np.zeros(3))
     else:
-        color_model = held or ("linear" if run.model.color_model.name == "linear" else "log")
-        gaussians = gaussians_of(run.model, color_model, positions, color_matrix=run.color_matrix)
-    gaussians = gaussians.padded(degree or 0)
-    write_gaussians(path, gaussians, overwrite=overwrite)
+        upright = world_transform(run, axes, up=up, scale=scale)
+        to_file = file_transform(upright, path) if axes == "upright" else upright
+    time = run.base_time if exposure_time is None else float(exposure_time)
+    radiance = held or ("linear" if run.model.color_model.name == "linear" else "log")
+    color_model = "display" if kind == "ldr" else radiance
+    whole, parts = [], []
+    for scene in (run, *merge):
+        gaussians = _converted(scene, color_model, time)
+        whole.append(gaussians)
+        mask = edits.mask(gaussians, upright.points(gaussians.means), scene)
+        parts.append(without_strays(gaussians.rows(mask), training_cameras(scene)))
+    gaussians = merged(parts)
+    delivered = gaussians if to_file.is_identity else gaussians.transformed(to_file.matrix)
+    if isinstance(run, Splats) and run.world_matrix is not None:
+        delivered = replace(delivered, world_matrix=to_file.matrix @ run.world_matrix)
+    write_gaussians(path, delivered.padded(degree or 0), overwrite=overwrite)
     if cameras:
-        _write_cameras(beside, run, overwrite)
-    _tell(path, run, gaussians, kind, exposure_time)
+        _write_cameras(beside, run, to_file, overwrite)
+    meaning = f"display colors of {shutter(time)}" if kind == "ldr" else "scene-linear radiance"
+    count, harmonics = delivered.count, max(delivered.degree, degree or 0)
+    log.info("%s: %d Gaussians, harmonics of degree %d, %s", path.name, count, harmonics, meaning)
+    if not merge:
+        reference = gaussians if edits.changes_pictures else None
+        _log_loss(path, run, whole[0] if edits.changes_pictures else gaussians, kind, time)
+        if path_is_lossy(path):
+            _log_file_loss(path, run, reference, to_file, kind, time)
     return path
+
+
+def training_cameras(run: Any) -> list[Camera]:
+    """Return the training cameras of a run."""
+    return [entry.camera for entry in run.cameras if entry.split == "train"]
+
+
+def _converted(run: Any, color_model: str, time: float) -> GaussianArrays:
+    """Return the Gaussians of a run in its own coordinates and in the colors of a file.
+
+    Display colors are those of a photo of `time` seconds.
+    """
+    photos = training_cameras(run)
+    positions = np.array([camera.position for camera in photos]).reshape(-1, 3)
+    if color_model != "display":
+        return gaussians_of(run.model, color_model, positions, color_matrix=run.color_matrix)
+    gaussians = gaussians_of(run.model, "display", positions, time, run.color_matrix)
+    if gaussians.color_model != run.model.color_model.name:
+        return refine(gaussians, _photographed(run, time), photos)
+    return gaussians
 
 
 def _check(path: Path, kind: str, held: str | None, exposure_time: float | None, degree: int | None) -> None:
@@ -90,21 +142,48 @@ def _check(path: Path, kind: str, held: str | None, exposure_time: float | None,
         raise SehdrError(f"harmonics of degree {degree} cannot be; give 0 to 3")
 
 
-def _tell(path: Path, run, gaussians, kind: str, exposure_time: float | None) -> None:
-    time = exposure_time or run.base_time
-    meaning = f"display colors of {shutter(time)}" if kind == "ldr" else "scene-linear radiance"
-    log.info("%s: %d Gaussians, harmonics of degree %d, %s", path.name, gaussians.count, gaussians.degree, meaning)
+def loss_in_words(decibels: float) -> str:
+    """Return what a PSNR of pictures means to the eye."""
+    for least, words in _WORDS:
+        if decibels >= least:
+            return words
+    return "visible loss"
+
+
+def _log_loss(path: Path, run: Any, gaussians: GaussianArrays, kind: str, time: float) -> None:
+    """Measure and log how well Gaussians in the scene's own coordinates show the scene."""
     views = _judged(run)
     where = f"{len(views)} view{'s' * (len(views) != 1)}"
     if not views:
         log.info("it is not compared with the scene, which has no cameras of its own")
     elif kind == "ldr":
         kept = agreement(gaussians, _photographed(run, time), views, time)
-        log.info("kept: %.1f dB of the scene's own pictures in %s; lost: light above white", kept, where)
+        words = loss_in_words(kept)
+        log.info("kept: %.1f dB of the scene's own pictures in %s (%s); lost: light above white", kept, where, words)
     else:
         dark = time / 2**_DARKER
-        kept = [agreement(gaussians, _shown(run, t), views, t) for t in (time, dark)]
-        log.info("kept: %.1f dB of the scene at 0 EV, %.1f dB at -%d EV, in %s", *kept, _DARKER, where)
+        bright, dim = (agreement(gaussians, _shown(run, t), views, t) for t in (time, dark))
+        words = loss_in_words(min(bright, dim))
+        text = "kept: %.1f dB of the scene at 0 EV, %.1f dB at -%d EV, in %s (%s)"
+        log.info(text, bright, dim, _DARKER, where, words)
+
+
+def _log_file_loss(
+    path: Path, run: Any, reference: GaussianArrays | None, to_file: WorldTransform, kind: str, time: float
+) -> None:
+    """Measure and log what a compressed file loses, read back, beside the scene or the edited Gaussians."""
+    views = _judged(run)
+    if not views:
+        return
+    gaussians = read_gaussians(path).transformed(to_file.inverse().matrix)
+    if reference is None:
+        picture, beside = _photographed(run, time), "the scene"
+    else:
+        field, beside = field_of(reference), "what was exported"
+        picture = lambda camera: field.render_ldr(camera, time)  # noqa: E731
+    kept = agreement(gaussians, picture, views, time)
+    size = path.stat().st_size / 1e6
+    log.info("compressed: %.1f dB beside %s (%s), %.2f MB", kept, beside, loss_in_words(kept), size)
 
 
 def _judged(run) -> Sequence[Camera]:
@@ -126,10 +205,11 @@ def _shown(run, time: float) -> Callable:
     return lambda camera: encode(run.render(camera).hdr * time)
 
 
-def _write_cameras(path: Path, run, overwrite: bool) -> None:
+def _write_cameras(path: Path, run: Any, transform: WorldTransform, overwrite: bool) -> None:
     described = []
     for index, entry in enumerate(run.cameras):
-        camera, pose = entry.camera, entry.camera.camera_to_world
+        camera = transform.camera(entry.camera)
+        pose = camera.camera_to_world
         size = {"width": camera.width, "height": camera.height}
         place = {"position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist()}
         described.append({"id": index, "img_name": entry.name, **size, **place, "fy": camera.fy, "fx": camera.fx})

@@ -1,6 +1,7 @@
 """Pictures of a trained scene: HDR files, previews and exposure brackets, for any set of cameras."""
 
 import logging
+import re
 from collections.abc import Sequence
 from contextlib import ExitStack
 from datetime import datetime
@@ -9,14 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from sehdr_warp.errors import SehdrError
+from sehdr_warp.errors import InputError, SehdrError, did_you_mean
 from sehdr_warp.scene import Camera, load_cameras
+from sehdr_warp.scene.exchange_cameras import EXCHANGE_SUFFIXES, read_exchange_cameras
 from sehdr_warp.scene.images import MAX_PIXELS
 
 from ..files import atomic_folder, atomic_path
 from ..model.exposure import Items
-from .aovs import data_parts, read_aovs
+from .aovs import ViewData, data_parts, read_aovs
 from .brackets import Brackets, bracket_exposures
+from .camera_exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
 from .camera_paths import evenly, interpolate, orbit
 from .colorspace import from_rec709
 from .exr import Part, rgb_channels, write_multipart_exr
@@ -25,7 +28,7 @@ from .light_pictures import exposure_of_white
 from .names import safe_names
 from .ocio import ocio_view
 from .tonemap import ToneMap, fit_tone_map
-from .usd_cameras import usd_cameras
+from .world_transform import WorldTransform, describe, world_transform
 
 log = logging.getLogger(__name__)
 SPLITS = ("train", "test", "all")
@@ -40,6 +43,7 @@ def render_views(
     out: Path | str,
     *,
     cameras: str | Path = "test",
+    camera: str | None = None,
     count: int = 60,
     evs: Items | None = None,
     exposures: Items | None = None,
@@ -54,17 +58,22 @@ def render_views(
     size: str | tuple[int, int] | None = None,
     ocio: str | None = None,
     view: str | None = None,
+    axes: str = "upright",
+    up: str | Sequence[float] | None = None,
+    scale: float | None = None,
 ) -> list[Path]:
     """Render views of a run into files and return their paths. All files appear when the last view is complete.
 
     Always written: `hdr/<view>.exr` (R, G, B scene-linear radiance; A coverage; Z distance along the axis, 0 where
-    empty; confidence, if the run has it), `preview/<view>.png` (tone-mapped, sRGB) and `cameras.usda`. A warning names
-    cameras that show nothing of the scene.
+    empty; confidence, if the run has it), `preview/<view>.png` (tone-mapped, sRGB) and `cameras.usda`, in which a path
+    of cameras is one moving camera. For a path also `cameras.chan` (Nuke) and `camera_path.json` (nerfstudio, in the
+    set's own coordinates). A warning names cameras that show nothing of the scene.
 
     Args:
         run: From load_run, train or load_splats.
         out: Folder for the files.
         cameras: "train", "test", "all", "orbit", "interpolate", or a file (see load_cameras).
+        camera: Only this camera of a file, by its name there; a moving one with all its frames.
         count: Views of an orbit or interpolation.
         evs: Brackets, as in write_brackets, through the run's response.
         exposures: Brackets, as in write_brackets.
@@ -79,7 +88,12 @@ def render_views(
             `hdr/<view>.exr`.
         size: Width and height in pixels, or "1920x1080", instead of the cameras' own. The vertical field of view stays.
         ocio: OpenColorIO config for the previews (see ocio_view).
-        view: View in that config.
+        view: ViewData in that config.
+        axes: Coordinates of camera matrices, positions, normals and depths in the files, and of cameras read from
+            OpenUSD and .chan files: "upright" (see world_transform) or "scene". Camera files of other kinds are in the
+            scene's own coordinates.
+        up: As in world_transform.
+        scale: As in world_transform.
 
     Raises:
         SehdrError: For unusable options or an empty set of cameras.
@@ -106,14 +120,16 @@ def render_views(
         raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")
     look = None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
     aovs = read_aovs(aovs) if aovs else ()
-    views = select_cameras(run, cameras, count=count)
+    transform = world_transform(run, axes, up=up, scale=scale)
+    views = select_cameras(run, cameras, camera=camera, count=count, transform=transform)
     if size is not None:
         width, height = read_size(size)
         views = [(name, framed(camera, width, height)) for name, camera in views]
+    camera_files = _camera_files(views, transform, moving=str(cameras) not in SPLITS)
     empty = []
     with ExitStack() as stack:
-        stage = stack.enter_context(atomic_path(out / "cameras.usda", overwrite))
-        stage.write_text(usd_cameras(views), encoding="utf-8")
+        for name, text in camera_files.items():
+            stack.enter_context(atomic_path(out / name, overwrite)).write_text(text, encoding="utf-8")
         hdr_folder = stack.enter_context(atomic_folder(out / "hdr", overwrite))
         preview_folder = stack.enter_context(atomic_folder(out / "preview", overwrite))
         bracket_writer = stack.enter_context(brackets.open(out, overwrite)) if bracketed else None
@@ -123,18 +139,20 @@ def render_views(
             hdr = as_array(rendered.hdr)
             if confidence is None and index == 1:
                 log.info("without a confidence channel: `sehdr-warp report` measures it, from the photos")
-            header = brackets.header(name, exposure, camera)
+            camera_in_file = transform.camera(camera)
+            depth = as_array(rendered.depth) * np.float32(transform.scale)
+            header = brackets.header(name, exposure, camera_in_file, worldMatrix=describe(transform))
             channels = rgb_channels(from_rec709(hdr, colorspace) * exposure)
-            channels |= {"A": as_array(rendered.alpha), "Z": as_array(rendered.depth)}
+            channels |= {"A": as_array(rendered.alpha), "Z": depth}
             if confidence is not None:
                 channels["confidence"] = as_array(confidence)
             parts = [Part(channels, header, "rgba" if aovs else "")]
-            parts += data_parts(aovs, run, rendered, camera, header)
+            parts += data_parts(aovs, ViewData(run, camera, camera_in_file, channels["A"], depth), header)
             if write_multipart_exr(hdr_folder / f"{name}.exr", parts, pixel=pixel) != pixel:
                 log.info("%s: holds values above 65504, which half cannot; written as float", name)
             write_picture(preview_folder / f"{name}.png", quantize(tone_map(hdr)))
             if bracket_writer is not None:
-                bracket_writer.write(name, hdr, camera)
+                bracket_writer.write(name, hdr, camera_in_file)
             if channels["A"].mean() < _LEAST_ALPHA:
                 empty.append(name)
             log.info("%s (%d of %d)", name, index, len(views))
@@ -145,7 +163,25 @@ def render_views(
     files = [out / place.format(name) for place in ("hdr/{}.exr", "preview/{}.png") for name, _ in views]
     if bracket_writer is not None:
         files += [*bracket_writer.files(), out / "brackets.json"]
-    return [*files, out / "cameras.usda"]
+    return [*files, *(out / name for name in camera_files)]
+
+
+def _camera_files(views: Sequence[tuple[str, Camera]], transform: WorldTransform, *, moving: bool) -> dict[str, str]:
+    """Return the names and texts of the files that hold the cameras of a render.
+
+    Args:
+        views: Names and cameras in the scene's own coordinates.
+        transform: To the coordinates of files.
+        moving: Whether the cameras may be frames of one that moves; photos are not, whatever their names.
+    """
+    placed = [(name, transform.camera(camera)) for name, camera in views]
+    path = camera_path(placed) if moving else None
+    files = {"cameras.usda": usd_cameras(placed, transform, path=path)}
+    if path is not None:
+        files["cameras.chan"] = chan_cameras(path)
+        # In the set's own coordinates, which nerfstudio's dataparser_transforms.json starts from.
+        files["camera_path.json"] = nerfstudio_path(path._replace(cameras=[camera for _, camera in views]))
+    return files
 
 
 def shared_tone_map(run: Any, cameras: Sequence[Camera]) -> ToneMap:
@@ -174,13 +210,30 @@ def framed(camera: Camera, width: int, height: int) -> Camera:
     return Camera(width, height, camera.fx * scale, camera.fy * scale, cx, camera.cy * scale, camera.world_to_camera)
 
 
-def select_cameras(run, cameras: str | Path, *, count: int = 60) -> list[tuple[str, Camera]]:
-    """Return named cameras; the names are safe for files and all different.
+def select_cameras(
+    run,
+    cameras: str | Path,
+    *,
+    camera: str | None = None,
+    count: int = 60,
+    transform: WorldTransform | None = None,
+) -> list[tuple[str, Camera]]:
+    """Return named cameras in the scene's own coordinates; the names are safe for files and all different.
+
+    Args:
+        run: From load_run, train or load_splats.
+        cameras: "train", "test", "all", "orbit", "interpolate", or a file (see load_cameras).
+        camera: Only this camera of a file.
+        count: Views of an orbit or interpolation.
+        transform: From the scene's coordinates to those of camera files that other programs write (OpenUSD, .chan); by
+            default that to upright coordinates.
 
     Raises:
         SehdrError: If there are none, or `cameras` is neither a known name nor a file.
     """
     text, known = str(cameras), ", ".join(SPLITS + PATHS)
+    if camera is not None and text in SPLITS + PATHS:
+        raise SehdrError(f"--camera {camera}: chooses from a file of cameras, and --cameras {text} is none")
     if text in SPLITS:
         named = [(entry.name, entry.camera) for entry in run.cameras if text in (entry.split, "all")]
         if not named:
@@ -194,10 +247,34 @@ def select_cameras(run, cameras: str | Path, *, count: int = 60) -> list[tuple[s
         digits = max(3, len(str(count - 1)))
         return [(f"{text}_{index:0{digits}d}", camera) for index, camera in enumerate(path)]
     elif Path(cameras).exists():
-        named = load_cameras(Path(cameras))
+        named = _from_file(run, Path(cameras), transform)
+        if camera is not None:
+            names = [name for name, _ in named]
+            named = [
+                (name, each)
+                for name, each in named
+                if name == camera or re.fullmatch(re.escape(camera) + r"_[\d.]+", name)
+            ]
+            if not named:
+                raise SehdrError(f"{cameras}: has no camera {camera!r}{did_you_mean(camera, names)}")
     else:
-        raise SehdrError(f"cameras {text!r} are neither a file nor one of {known}")
+        hint = did_you_mean(text, SPLITS + PATHS)
+        raise SehdrError(f"cameras {text!r} are neither a file nor one of {known}{hint}")
     return list(zip(safe_names([name for name, _ in named]), [camera for _, camera in named], strict=True))
+
+
+def _from_file(run: Any, path: Path, transform: WorldTransform | None) -> list[tuple[str, Camera]]:
+    """Return the cameras of a file in the scene's own coordinates."""
+    named = load_cameras(path)
+    if path.suffix.lower() not in EXCHANGE_SUFFIXES:
+        return named
+    matrix = read_exchange_cameras(path).world_matrix
+    try:
+        to_file = None if matrix is None else WorldTransform.from_matrix(matrix)
+    except ValueError as error:
+        raise InputError(path, f"its sehdr:worldMatrix {error}", "leave that entry out of the file") from None
+    back = (to_file or transform or world_transform(run)).inverse()
+    return [(name, back.camera(camera)) for name, camera in named]
 
 
 def provenance(run) -> dict[str, str]:

@@ -96,14 +96,21 @@ class Splats(_Rendered):
         path: of the file.
         model: the RadianceField.
         base_time: seconds, as the file states it, else 1.
-        cameras: those of a cameras.json beside the file, as the reference release of 3D Gaussian Splatting writes it;
-            else none.
+        cameras: Views listed in a `<stem>.cameras.json` beside the file, as export writes it, or in a cameras.json, as
+            the reference release of 3D Gaussian Splatting writes it; else none.
+        world_matrix: [4, 4] from the scene's own coordinates to the file's, if the file states it; else None.
     """
 
     iterations = None
 
-    def __init__(self, path: Path, model: RadianceField, cameras: tuple[CameraEntry, ...]):
-        self.path, self.model, self.cameras = path, model, cameras
+    def __init__(
+        self,
+        path: Path,
+        model: RadianceField,
+        cameras: tuple[CameraEntry, ...],
+        world_matrix: np.ndarray | None = None,
+    ):
+        self.path, self.model, self.cameras, self.world_matrix = path, model, cameras, world_matrix
         self.response, self.base_time, self.degree = model.response, model.base_time, model.gaussians.degree
         self.scene_name = path.stem
 
@@ -119,12 +126,18 @@ def load_splats(path: Path | str, *, device: str | torch.device = "cpu") -> Spla
         InputError: where the file, or the cameras.json beside it, is missing, damaged or of another kind.
     """
     path = Path(path)
-    model = field_of(read_gaussians(path)).to(device)
-    beside, cameras = path.with_name("cameras.json"), ()
-    if beside.is_file():
+    gaussians = read_gaussians(path)
+    model = field_of(gaussians).to(device)
+    own, shared, cameras = path.with_name(f"{path.stem}.cameras.json"), path.with_name("cameras.json"), ()
+    beside = next((file for file in (own, shared) if file.is_file()), None)
+    if beside is not None:
         named = load_cameras(beside)
+        if beside == shared:
+            log.info(
+                "%s: %d cameras from %s beside it, which does not say what it belongs to", path, len(named), beside
+            )
         cameras = tuple(CameraEntry(name, "train", camera, model.base_time) for name, camera in named)
-    return Splats(path, model, cameras)
+    return Splats(path, model, cameras, gaussians.world_matrix)
 
 
 class Run(_Rendered):

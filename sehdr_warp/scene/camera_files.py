@@ -8,22 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from ..apart import read_apart
 from ..errors import InputError
 from ..files import read_json, read_text
-from ..splats.usd import open_stage, pxr
 from .camera import Camera
 from .colmap_model import find_model, read_model
 from .dataparser import pose_from_camera_to_world
+from .exchange_cameras import EXCHANGE_SUFFIXES, read_exchange_cameras
 from .images import MAX_PIXELS
 from .names import natural_key
 from .read_transforms import frame_lens, frame_pose, frames_of, pose_from_opengl
 
 log = logging.getLogger(__name__)
-USD_SUFFIXES = (".usda", ".usdc", ".usd", ".usdz")
-USD_SIZE = ("sehdr:width", "sehdr:height")
-"""Attributes of a UsdGeomCamera for its picture's size in pixels, for which USD has none."""
-_USD_WIDTH = 1920
 _DATAPARSER = "dataparser_transforms.json"
 
 
@@ -42,8 +37,8 @@ def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
     path = Path(path)
     if path.is_dir():
         cameras = _of_colmap(path)
-    elif path.suffix.lower() in USD_SUFFIXES:
-        cameras = _of_usd(path)
+    elif path.suffix.lower() in EXCHANGE_SUFFIXES:
+        cameras = read_exchange_cameras(path).cameras
     else:
         cameras = _of_json(path)
     if not cameras:
@@ -141,54 +136,3 @@ def _of_colmap(folder: Path) -> list[tuple[str, Camera]]:
         raise InputError(folder, "holds no COLMAP model", "give cameras.bin or .txt and its kin, or a camera file")
     images = sorted(read_model(source).images, key=lambda image: natural_key(image.name))
     return [(Path(image.name).stem, image.lens.pinhole(image.world_to_camera)) for image in images]
-
-
-def _of_usd(path: Path) -> list[tuple[str, Camera]]:
-    """Read every UsdGeomCamera, at each frame of the stage if it moves; 1920 pixels wide if it states no size."""
-    pxr("Usd")
-    stored = read_apart(usd_camera_arrays, path, "USD", "export it again")
-    read = lambda entry, _: (str(entry[0]), _usd_camera(entry[1], entry[2], path, str(entry[0])))  # noqa: E731
-    return _listed(path, list(zip(stored["names"], stored["lenses"], stored["matrices"], strict=True)), read)
-
-
-def usd_camera_arrays(path: Path) -> dict[str, Any]:
-    """Read the cameras of a stage as arrays.
-
-    Returns:
-        names [n]; lenses [n, 7] of width and height in pixels (0 if not stated), focal length, horizontal and vertical
-        aperture and their offsets in one unit; matrices [n, 4, 4], which act on row vectors.
-    """
-    Usd, UsdGeom = pxr("Usd"), pxr("UsdGeom")
-    stage = open_stage(path)
-    names, lenses, matrices = [], [], []
-    for prim in stage.Traverse():
-        if not prim.IsA(UsdGeom.Camera):
-            continue
-        camera, frames = UsdGeom.Camera(prim), [Usd.TimeCode.Default()]
-        if moving := camera.TransformMightBeTimeVarying():
-            first, last = int(stage.GetStartTimeCode()), int(stage.GetEndTimeCode())
-            frames = map(Usd.TimeCode, range(first, last + 1))
-        size = [(prim.GetAttribute(name).Get() if prim.HasAttribute(name) else 0) or 0 for name in USD_SIZE]
-        for frame in frames:
-            state = camera.GetCamera(frame)
-            names.append(f"{prim.GetName()}_{int(frame.GetValue()):04d}" if moving else prim.GetName())
-            offsets = state.horizontalApertureOffset, state.verticalApertureOffset
-            lenses.append([*size, state.focalLength, state.horizontalAperture, state.verticalAperture, *offsets])
-            matrices.append(np.array(state.transform, np.float64))
-    shapes = ("names", names, str, (-1,)), ("lenses", lenses, float, (-1, 7)), ("matrices", matrices, float, (-1, 4, 4))
-    return {name: np.array(values, kind).reshape(shape) for name, values, kind, shape in shapes}
-
-
-def _usd_camera(lens: np.ndarray, matrix: np.ndarray, path: Path, name: str) -> Camera:
-    """Return the camera of a row of usd_camera_arrays; USD's axes are OpenGL's."""
-    size, (focal, aperture, vertical, right, up) = lens[:2], lens[2:].tolist()
-    width = int(size[0] or _USD_WIDTH)
-    height = int(size[1] or round(width * vertical / aperture))
-    fx, fy = focal / aperture * width, focal / vertical * height
-    matrix = matrix.T.copy()
-    scale = np.linalg.norm(matrix[:3, :3], axis=0)
-    matrix[:3, :3] /= np.where(scale > 0, scale, 1)
-    pose = pose_from_opengl(matrix, path, name)
-    return Camera(
-        width, height, fx, fy, width / 2 - right / aperture * width, height / 2 + up / vertical * height, pose
-    )

@@ -14,6 +14,7 @@ from .usd import read_usd, write_usd
 USD_SUFFIXES = (".usda", ".usdc", ".usd", ".usdz")
 SUFFIXES = (".ply", *USD_SUFFIXES, ".glb")
 """Of the files that are read and written."""
+LOSSY_SUFFIXES: tuple[str, ...] = ()
 _OTHER = {
     ".splat": "holds 8 bits and no harmonics",
     ".ksplat": "holds a viewer's own compression",
@@ -34,6 +35,11 @@ def check_suffix(path: Path | str, *others: str) -> str:
         why = f"{suffix} is not read or written here: it {_OTHER[suffix]}" if suffix in _OTHER else "is no splat file"
         raise InputError(path, why, f"use one of {' '.join((*SUFFIXES, *others))}")
     return suffix
+
+
+def path_is_lossy(path: Path | str) -> bool:
+    """Return whether a file of this suffix holds rounded numbers."""
+    return check_suffix(path) in LOSSY_SUFFIXES
 
 
 def color_model_of(path: Path | str) -> str | None:
@@ -78,6 +84,7 @@ __all__ = [
     "GaussianArrays",
     "check_suffix",
     "color_model_of",
+    "path_is_lossy",
     "read_gaussians",
     "write_gaussians",
 ]

@@ -1,9 +1,11 @@
 """Gaussians as plain arrays, and their harmonics as functions of a direction."""
 
+import json
 import logging
 import math
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +37,7 @@ class GaussianArrays:
             0).
         base_time: Seconds at which the scene was photographed; for display colors, the exposure time of the photo that
             they show.
+    world_matrix: [4, 4] float64 from the scene's own coordinates to these; None if they are the same.
     """
 
     means: np.ndarray
@@ -44,6 +47,7 @@ class GaussianArrays:
     harmonics: np.ndarray
     color_model: str
     base_time: float
+    world_matrix: np.ndarray | None = None
 
     @property
     def count(self) -> int:
@@ -74,6 +78,27 @@ class GaussianArrays:
         """Return a copy with harmonics up to `degree`, zero beyond its own; never fewer."""
         missing = max((degree + 1) ** 2 - self.harmonics.shape[1], 0)
         return replace(self, harmonics=np.pad(self.harmonics, ((0, 0), (0, missing), (0, 0))))
+
+    def transformed(self, matrix: np.ndarray) -> "GaussianArrays":
+        """Return a copy moved by a similarity, with turned harmonics; `world_matrix` then includes the move.
+
+        Args:
+            matrix: [4, 4] that acts on column vectors: one scale, a proper rotation and a translation.
+        """
+        from scipy.spatial.transform import Rotation
+
+        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        rotation = matrix[:3, :3] / scale
+        turned = Rotation.from_matrix(rotation) * Rotation.from_quat(np.roll(self.unit_quaternions, -1, axis=1))
+        before = np.eye(4) if self.world_matrix is None else self.world_matrix
+        return replace(
+            self,
+            means=(self.means.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32),
+            log_scales=(self.log_scales + np.log(scale)).astype(np.float32),
+            quaternions=np.roll(turned.as_quat(), 1, axis=1).astype(np.float32),
+            harmonics=rotate_harmonics(self.harmonics, rotation),
+            world_matrix=matrix @ before,
+        )
 
     def rows(self, index: np.ndarray) -> "GaussianArrays":
         """Return the Gaussians at an index or mask [N]."""
@@ -124,6 +149,25 @@ def degree_of(coefficients: float, path: Path) -> int:
     return degree
 
 
+def read_matrix(value: Any, path: Path) -> np.ndarray | None:
+    """Return a stored world_matrix, which may be JSON text or nested numbers; None for None.
+
+    Raises:
+        InputError: If it is not a similarity.
+    """
+    if value is None:
+        return None
+    try:
+        matrix = np.array(json.loads(value) if isinstance(value, str) else value, np.float64).reshape(4, 4)
+        square = matrix[:3, :3] @ matrix[:3, :3].T
+        one_scale = np.allclose(square, np.eye(3) * np.trace(square) / 3, rtol=1e-4, atol=1e-4 * np.trace(square))
+        if one_scale and np.linalg.det(matrix[:3, :3]) > 0 and (matrix[3] == (0, 0, 0, 1)).all():
+            return matrix
+    except (ValueError, TypeError, RecursionError):
+        pass
+    raise InputError(path, "its world_matrix is not a similarity", "leave that entry out of the file")
+
+
 def harmonic_basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """Return [..., (degree + 1)^2] float64 real spherical harmonics of unit directions [..., 3].
 
@@ -140,6 +184,19 @@ def harmonic_basis(directions: np.ndarray, degree: int) -> np.ndarray:
             value = sph_harm_y(order, abs(m), polar, azimuth)
             basis.append(value.real if m == 0 else np.sqrt(2) * (value.real if m > 0 else value.imag))
     return np.stack(basis, axis=-1)
+
+
+def rotate_harmonics(harmonics: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Return harmonics [N, K, 3] of functions turned by a rotation [3, 3]: f'(rotation @ d) = f(d).
+
+    Harmonics of one degree turn into harmonics of that degree, so the matrix between them follows exactly from as many
+    directions as there are coefficients, or more.
+    """
+    degree = math.isqrt(harmonics.shape[1]) - 1
+    directions = np.random.default_rng(0).normal(size=(64, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    turned = np.linalg.pinv(harmonic_basis(directions @ rotation.T, degree)) @ harmonic_basis(directions, degree)
+    return np.einsum("ij,njc->nic", turned, harmonics.astype(np.float64)).astype(np.float32)
 
 
 def evaluate_colors(gaussians: GaussianArrays, directions: np.ndarray) -> np.ndarray:

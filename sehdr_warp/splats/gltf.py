@@ -13,7 +13,7 @@ import numpy as np
 from .. import __version__
 from ..errors import InputError
 from ..files import atomic_path, read_bytes
-from .arrays import HARMONIC_0, GaussianArrays, degree_of
+from .arrays import HARMONIC_0, GaussianArrays, degree_of, read_matrix
 
 EXTENSION = "KHR_gaussian_splatting"
 _SPACE = "srgb_rec709_display"
@@ -51,13 +51,16 @@ def write_glb(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
         "attributes": {name: index for index, name in enumerate(attributes)},
         "extensions": {EXTENSION: extension},
     }
+    extras: dict[str, Any] = {"base_exposure_time": gaussians.base_time}
+    if gaussians.world_matrix is not None:
+        extras["world_matrix"] = gaussians.world_matrix.tolist()
     described = {
         "asset": {"version": "2.0", "generator": f"sehdr-warp {__version__}"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive], "extras": {"base_exposure_time": gaussians.base_time}}],
+        "meshes": [{"primitives": [primitive], "extras": extras}],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": offset}],
@@ -100,12 +103,23 @@ def read_glb(path: Path) -> GaussianArrays:
         quaternions = np.roll(values(f"{EXTENSION}:ROTATION", 4), 1, axis=1)
         opacities = values(f"{EXTENSION}:OPACITY", 1)[:, 0]
         harmonics = np.stack([values(name, 3) for name in _harmonic_names(degree)], axis=1)
-        base_time = float(mesh.get("extras", {}).get("base_exposure_time", 1.0))
+        extras = mesh.get("extras", {})
+        base_time = float(extras.get("base_exposure_time", 1.0))
+        world_matrix = read_matrix(extras.get("world_matrix"), path)
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise InputError(path, f"is damaged glTF ({error!r:.120})", _DAMAGED) from None
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales, logits = np.log(scales), np.log(opacities) - np.log1p(-opacities)
-    return GaussianArrays(means, log_scales, quaternions, logits, harmonics, "display", base_time)
+    return GaussianArrays(
+        means=means,
+        log_scales=log_scales,
+        quaternions=quaternions,
+        opacity_logits=logits,
+        harmonics=harmonics,
+        color_model="display",
+        base_time=base_time,
+        world_matrix=world_matrix,
+    )
 
 
 def _harmonic_names(degree: int) -> list[str]:

@@ -5,14 +5,16 @@ blue), opacity (logit), scale_0..2 (logarithm), rot_0..3 (w x y z). The color mo
 `comment sehdr:...` lines of the header; a file without them holds display colors.
 """
 
+import json
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import InputError
 from ..files import atomic_path, plain_size
-from .arrays import GaussianArrays, degree_of
+from .arrays import GaussianArrays, degree_of, read_matrix
 
 _DAMAGED = "copy or export the file again"
 _COLOR_MODELS = ("display", "log", "linear")
@@ -39,6 +41,8 @@ def write_ply(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
     for name, values in columns:
         table[name] = values
     facts = {"color_model": gaussians.color_model, "base_exposure_time": repr(gaussians.base_time)}
+    if gaussians.world_matrix is not None:
+        facts["world_matrix"] = json.dumps(gaussians.world_matrix.tolist(), separators=(",", ":"))
     comments = [f"sehdr:{name} {value}" for name, value in facts.items()]
     with atomic_path(path, overwrite) as temporary, temporary.open("wb") as file:
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=comments).write(file)
@@ -68,7 +72,17 @@ def read_ply(path: Path) -> GaussianArrays:
     means, log_scales, quaternions, opacity, constant, higher = columns
     higher = higher.reshape(len(means), 3, len(rest) // 3).swapaxes(1, 2)
     harmonics = np.concatenate([constant[:, None], higher], axis=1)
-    return GaussianArrays(means, log_scales, quaternions, opacity[:, 0], harmonics, *_facts(read.comments, path))
+    facts = _facts(read.comments, path)
+    return GaussianArrays(
+        means=means,
+        log_scales=log_scales,
+        quaternions=quaternions,
+        opacity_logits=opacity[:, 0],
+        harmonics=harmonics,
+        color_model=facts.color_model,
+        base_time=facts.base_time,
+        world_matrix=facts.world_matrix,
+    )
 
 
 def _columns(columns: list[np.ndarray]) -> np.ndarray:
@@ -111,8 +125,16 @@ def _without(missing: list[str], names: set[str]) -> str:
     return f"has no {', '.join(missing[:4])}"
 
 
-def _facts(comments: list[str], path: Path) -> tuple[str, float]:
-    """Return the color model and the base exposure time that the header states."""
+class _Facts(NamedTuple):
+    """What the header states in comments of this package."""
+
+    color_model: str
+    base_time: float
+    world_matrix: np.ndarray | None
+
+
+def _facts(comments: list[str], path: Path) -> _Facts:
+    """Return what the header states; raise InputError for values that cannot be."""
     facts = dict(line.removeprefix("sehdr:").split(maxsplit=1) for line in comments if re.match(r"sehdr:\w+ \S", line))
     color_model = facts.get("color_model", "display")
     try:
@@ -122,4 +144,4 @@ def _facts(comments: list[str], path: Path) -> tuple[str, float]:
     if color_model not in _COLOR_MODELS or not 0 < base_time < np.inf:
         problem = f"its header states color model {color_model!r:.40} at {base_time} s"
         raise InputError(path, problem, f"state one of {', '.join(_COLOR_MODELS)} and a positive time")
-    return color_model, base_time
+    return _Facts(color_model, base_time, read_matrix(facts.get("world_matrix"), path))

@@ -12,10 +12,11 @@ import numpy as np
 from ..apart import read_apart
 from ..errors import InputError, SehdrError
 from ..files import atomic_path
-from .arrays import HARMONIC_0, GaussianArrays, degree_of
+from .arrays import HARMONIC_0, GaussianArrays, degree_of, read_matrix
 
 COLOR_SPACE = "lin_rec709_scene"
-_BASE_TIME, _HARMONICS = "sehdr:baseExposureTime", "radiance:sphericalHarmonicsCoefficients"
+_BASE_TIME, _WORLD_MATRIX = "sehdr:baseExposureTime", "sehdr:worldMatrix"
+_HARMONICS = "radiance:sphericalHarmonicsCoefficients"
 _BIAS = 0.5 / HARMONIC_0
 # The extent that viewers clip by: three standard deviations hold 99.7 % of a Gaussian.
 _DEVIATIONS = 3.0
@@ -58,6 +59,9 @@ def write_usd(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
         stage.SetDefaultPrim(prim)
         Usd.ColorSpaceAPI.Apply(prim).CreateColorSpaceNameAttr(COLOR_SPACE)
         prim.CreateAttribute(_BASE_TIME, Sdf.ValueTypeNames.Double, True).Set(gaussians.base_time)
+        if gaussians.world_matrix is not None:
+            matrix = pxr("Gf").Matrix4d(gaussians.world_matrix.T.tolist())  # USD's matrices act on row vectors.
+            prim.CreateAttribute(_WORLD_MATRIX, Sdf.ValueTypeNames.Matrix4d, True).Set(matrix)
         harmonics = gaussians.harmonics.astype(np.float32, copy=True)
         harmonics[:, 0] -= _BIAS
         splat.CreatePositionsAttr(_array("Vec3fArray", gaussians.means))
@@ -107,7 +111,17 @@ def read_usd(path: Path) -> GaussianArrays:
     harmonics[:, 0] += _BIAS
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales, logits = np.log(scales), np.log(opacities) - np.log1p(-opacities)
-    return GaussianArrays(means, log_scales, quaternions, logits, harmonics, "linear", float(stored["base_time"]))
+    matrix = read_matrix(stored["world_matrix"], path)
+    return GaussianArrays(
+        means=means,
+        log_scales=log_scales,
+        quaternions=quaternions,
+        opacity_logits=logits,
+        harmonics=harmonics,
+        color_model="linear",
+        base_time=float(stored["base_time"]),
+        world_matrix=None if np.array_equal(matrix, np.eye(4)) else matrix,
+    )
 
 
 def usd_arrays(path: Path) -> dict[str, Any]:
@@ -123,6 +137,7 @@ def usd_arrays(path: Path) -> dict[str, Any]:
         "space": str(Usd.ColorSpaceAPI.ComputeColorSpaceName(prim, None) or ""),
         "matrix": np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())),
         "degree": int(splat.GetRadianceSphericalHarmonicsDegreeAttr().Get()),
+        "world_matrix": np.array(world.Get()).T if (world := prim.GetAttribute(_WORLD_MATRIX)) else np.eye(4),
         "base_time": float(prim.GetAttribute(_BASE_TIME).Get()) if prim.HasAttribute(_BASE_TIME) else 1.0,
     }
     for name in ("positions", "scales", "orientations", "opacities", _HARMONICS):

@@ -21,8 +21,9 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.files import LIST
 from sehdr_warp.model.confidence import Evidence
 from sehdr_warp.model.gaussians import Gaussians
+from sehdr_warp.output.camera_exchange import usd_cameras
 from sehdr_warp.output.exr import Part, write_exr, write_multipart_exr
-from sehdr_warp.output.usd_cameras import usd_cameras
+from sehdr_warp.output.world_transform import WorldTransform
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import assemble_field, load_run
@@ -233,7 +234,9 @@ def _splats(*suffixes: str) -> Callable[[Path], None]:
                 folder / f"a{suffix}", GaussianArrays(*arrays, {".glb": "display"}.get(suffix, "linear"), 0.5)
             )
         if ".usda" in suffixes:
-            (folder / "b.usda").write_text(usd_cameras([("a", camera(16, 12)), ("b", camera(8, 8))]))
+            (folder / "b.usda").write_text(
+                usd_cameras([("a", camera(16, 12)), ("b", camera(8, 8))], WorldTransform.identity())
+            )
         (folder / LIST).unlink()
 
     return make

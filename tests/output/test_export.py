@@ -27,7 +27,7 @@ def test_suffix_and_kind_decide(tmp_path, run, logged):
         read = read_gaussians(tmp_path / name)
         assert (read.color_model, read.degree, read.count) == (color_model, 3, 50)
     assert "b.ply: 50 Gaussians, harmonics of degree 3, scene-linear radiance" in logged
-    assert "kept: 120.0 dB of the scene at 0 EV, 120.0 dB at -4 EV, in 3 views" in logged
+    assert "kept: 120.0 dB of the scene at 0 EV, 120.0 dB at -4 EV, in 3 views (no visible loss)" in logged
     assert sum(line.startswith("kept:") for line in logged) == 3
 
 
@@ -53,13 +53,14 @@ def test_exposure_of_display_colors(tmp_path, run, logged):
 
 
 def test_cameras_beside_are_read_again(tmp_path, run):
-    export(run, tmp_path / "a.ply", kind="hdr", cameras=True)
-    first = json.loads((tmp_path / "cameras.json").read_text())[1]
+    export(run, tmp_path / "a.ply", kind="hdr", cameras=True, axes="scene")
+    first = json.loads((tmp_path / "a.cameras.json").read_text())[1]
     assert set(first) == {"id", "img_name", "width", "height", "position", "rotation", "fy", "fx"}
     splats = load_splats(tmp_path / "a.ply")
     for entry, given in zip(splats.cameras, run.cameras, strict=True):
         np.testing.assert_allclose(entry.camera.world_to_camera, given.camera.world_to_camera, atol=1e-9)
-    assert [name for name, _ in load_cameras(tmp_path / "cameras.json")] == ["0", "1", "2"]
+    assert [name for name, _ in load_cameras(tmp_path / "a.cameras.json")] == ["0", "1", "2"]
+    (tmp_path / "b.cameras.json").write_text("mine")
     with pytest.raises(InputError, match=r"cameras.json: exists already"):
         export(run, tmp_path / "b.ply", cameras=True)
     assert not (tmp_path / "b.ply").exists()

@@ -40,7 +40,7 @@ def test_brackets_cost_no_render(tmp_path):
 
 def test_hdr_file_holds_what_was_rendered(tmp_path):
     run = AnalyticRun()
-    render_views(run, tmp_path, pixel="float")
+    render_views(run, tmp_path, pixel="float", axes="scene")
     entry = run.cameras[3]
     pixels, names, header = read_exr(tmp_path / "hdr" / "t_0.exr")
     rendered = run.render(entry.camera)
@@ -225,10 +225,10 @@ def test_paths_need_cameras():
         orbit(arc(3, 30), 0, 1)
 
 
-def test_passes_are_parts_of_their_own(tmp_path):
+def test_aovs_are_parts_of_their_own(tmp_path):
     OpenEXR = pytest.importorskip("OpenEXR")
     run = AnalyticRun()
-    render_views(run, tmp_path, aovs="depth,position,normals,alpha,confidence,clipped")
+    render_views(run, tmp_path, aovs="all", axes="scene")
     view, rendered = run.cameras[3].camera, run.render(run.cameras[3].camera)
     with OpenEXR.File(str(tmp_path / "hdr" / "t_0.exr"), separate_channels=True) as file:
         headers = {part.name(): dict(part.header) for part in file.parts}
@@ -254,7 +254,7 @@ def test_passes_are_parts_of_their_own(tmp_path):
 def test_cameras_go_to_usd_and_come_back(tmp_path):
     pytest.importorskip("pxr")
     run = AnalyticRun([("a 1", "train"), ("a_1", "train"), ("2", "train")])
-    render_views(run, tmp_path, cameras="train")
+    render_views(run, tmp_path, cameras="train", axes="scene")
     read = load_cameras(tmp_path / "cameras.usda")
     assert [name for name, _ in read] == ["a_1", "a_1_2", "_2"]
     for entry, (_, camera_) in zip(run.cameras, read, strict=True):

@@ -1,0 +1,181 @@
+"""Edits of Gaussians on their way into a file: what is never drawn, strays, crops, and what too few photos show."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.scene import Camera
+
+from ..model.visibility import count_views
+from ..splats import GaussianArrays
+from .camera_paths import common_focus
+
+log = logging.getLogger(__name__)
+LEAST_OPACITY = 1 / 255
+"""Opacity below which 3DGS rasterizers, this one included, draw nothing."""
+# Gaussians farther from the cameras than this many times their reach are moved to that distance and shrunk alike: as
+# seen from the middle nothing changes, and from the other cameras it shifts by less than 1/100 rad. Viewers sort by
+# depth over a file's whole extent, so a single stray would cost the rest its order.
+FAR = 100.0
+_FAINT = 0.05  # Strays of less opacity than this are dropped instead
+_SEEN_PIXELS = (
+    0.05  # Blending weight, in pixels of a view of _VIEW_SIZE, with which a view counts as showing a Gaussian
+)
+_VIEW_SIZE = 320
+_MOST_VIEWS = 100
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box; `low` and `high` are [3]."""
+
+    low: np.ndarray
+    high: np.ndarray
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Return [N] whether points [N, 3] are inside."""
+        return ((points >= self.low) & (points <= self.high)).all(axis=1)
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere; `center` is [3]."""
+
+    center: np.ndarray
+    radius: float
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Return [N] whether points [N, 3] are inside."""
+        return np.linalg.norm(points - self.center, axis=1) <= self.radius
+
+
+def read_region(text: str) -> Box | Sphere:
+    """Return the region that "box:x0,y0,z0,x1,y1,z1" or "sphere:x,y,z,radius" describes.
+
+    Raises:
+        SehdrError: If it is neither, or is empty.
+    """
+    kind, _, numbers = text.partition(":")
+    try:
+        values = np.array([float(number) for number in numbers.split(",")])
+    except ValueError:
+        values = np.array([])
+    if np.isfinite(values).all():
+        if kind == "sphere" and values.shape == (4,) and values[3] > 0:
+            return Sphere(values[:3], float(values[3]))
+        if kind == "box" and values.shape == (6,) and (values[:3] != values[3:]).all():
+            return Box(np.minimum(values[:3], values[3:]), np.maximum(values[:3], values[3:]))
+    raise SehdrError(f"region {text!r} is not box:x0,y0,z0,x1,y1,z1 or sphere:x,y,z,radius")
+
+
+@dataclass(frozen=True)
+class SplatEdits:
+    """What a file leaves out.
+
+    Attributes:
+        crop: Region to keep (see read_region), in upright coordinates.
+        cut: Region to leave out.
+        min_opacity: Least opacity of a Gaussian, in [0, 1).
+        min_views: Least number of training cameras that show a Gaussian; 2 removes most floaters.
+    """
+
+    crop: str | None = None
+    cut: str | None = None
+    min_opacity: float = LEAST_OPACITY
+    min_views: int = 0
+
+    def __post_init__(self):
+        """Raise SehdrError for values that cannot be."""
+        for region in filter(None, (self.crop, self.cut)):
+            read_region(region)
+        if not 0 <= self.min_opacity < 1:
+            raise SehdrError(f"min_opacity {self.min_opacity} is not at least 0 and below 1")
+        if self.min_views < 0:
+            raise SehdrError(f"min_views {self.min_views} is negative; 2 leaves out what a single camera shows")
+
+    @property
+    def changes_pictures(self) -> bool:
+        """Whether the file is meant to show something else than the scene."""
+        return bool(self.crop or self.cut or self.min_views or self.min_opacity > LEAST_OPACITY)
+
+    def mask(self, gaussians: GaussianArrays, upright_means: np.ndarray, run: Any) -> np.ndarray:
+        """Return [N], which Gaussians stay.
+
+        Args:
+            gaussians: Of the run, in its order.
+            upright_means: [N, 3] their positions in upright coordinates.
+            run: The scene, whose training cameras count views.
+
+        Raises:
+            SehdrError: If none stays, or views are to be counted and the scene has no cameras.
+        """
+        steps = {"fainter than min_opacity": gaussians.opacities < self.min_opacity}
+        if self.crop:
+            steps[f"outside of {self.crop}"] = ~read_region(self.crop).contains(upright_means)
+        if self.cut:
+            steps[f"inside of {self.cut}"] = read_region(self.cut).contains(upright_means)
+        if self.min_views:
+            cameras = [entry.camera for entry in run.cameras if entry.split == "train"]
+            if not cameras:
+                raise SehdrError(f"{run.path}: has no training cameras to count views of; leave min_views out")
+            views = count_views(run.model, cameras).cpu().numpy()
+            steps[f"shown by fewer than {self.min_views} cameras"] = views < self.min_views
+        stays = np.ones(gaussians.count, bool)
+        for reason, goes in steps.items():
+            stays &= ~goes
+            if goes.any():
+                log.info("left out: %d Gaussians (%.0f %%) %s", goes.sum(), 100 * goes.mean(), reason)
+        if not stays.any():
+            low, high = (np.percentile(upright_means, q, axis=0) for q in (2, 98))
+            extent = " to ".join(", ".join(f"{v:.3g}" for v in corner) for corner in (low, high))
+            raise SehdrError(f"these edits leave no Gaussian; the scene lies at {extent} in upright coordinates")
+        return stays
+
+
+def without_strays(gaussians: GaussianArrays, cameras: Sequence[Camera]) -> GaussianArrays:
+    """Return Gaussians without strays: beyond FAR times the cameras' reach faint ones go and others come nearer.
+
+    Args:
+        gaussians: In the coordinates of the cameras.
+        cameras: Training cameras; with none, nothing changes.
+    """
+    if not cameras:
+        return gaussians
+    places = np.stack([camera.position for camera in cameras])
+    center = np.median(places, axis=0)
+    reach = float(np.percentile(np.linalg.norm(places - center, axis=1), 90))
+    focus = common_focus(cameras)
+    if focus is not None:
+        reach = max(reach, float(np.linalg.norm(focus - center)))
+    offsets = gaussians.means.astype(np.float64) - center
+    distance, limit = np.linalg.norm(offsets, axis=1), FAR * reach
+    far = distance > limit
+    if limit <= 0 or not far.any():
+        return gaussians
+    faint = far & (gaussians.opacities < _FAINT)
+    factor = np.where(far, limit / np.maximum(distance, 1e-12), 1.0)
+    moved = replace(
+        gaussians,
+        means=(center + offsets * factor[:, None]).astype(np.float32),
+        log_scales=(gaussians.log_scales + np.log(factor)[:, None]).astype(np.float32),
+    )
+    log.info(
+        "strays: %d Gaussians beyond %.3g units: %d faint ones left out, %d moved there",
+        far.sum(),
+        limit,
+        faint.sum(),
+        (far & ~faint).sum(),
+    )
+    return moved.rows(~faint)
+
+
+def merged(parts: Sequence[GaussianArrays]) -> GaussianArrays:
+    """Return several sets of Gaussians in one space, of one color model and exposure, as one."""
+    degree = max(part.degree for part in parts)
+    padded = [part.padded(degree) for part in parts]
+    names = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics")
+    return replace(parts[0], **{name: np.concatenate([getattr(part, name) for part in padded]) for name in names})

@@ -1,0 +1,286 @@
+"""The one similarity between a scene's own coordinates and those of delivered files: upright, and scaled to meters.
+
+render, export, envmap and cameras.usda share it, so that pictures, Gaussians, maps and cameras line up in another
+program. It depends on the cameras of the scene alone, so that it stays the same when a training goes on. Every file
+stores it; its inverse leads back to the scene's own coordinates.
+"""
+
+import json
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.scene import Camera
+
+from ..files import read_json, write_json
+from .camera_paths import common_focus
+
+log = logging.getLogger(__name__)
+AXES = ("upright", "scene")
+Y_DOWN_SUFFIXES = (".ply", ".sog", ".spz")
+ORIENTATION_FILE = "orientation.json"
+"""File in a run's folder that keeps an up direction and a scale set for it; they then need no options."""
+# Weight of the mean up of the pictures beside the horizon of the cameras. Cameras that all look one way say nothing of
+# their pitch by their horizon; then the pictures' mean decides. Where they look around, it moves up by less than 1/10
+# of the cameras' mean pitch.
+_MEAN_UP_WEIGHT = 0.005
+_WORST_ROLL = math.radians(12)  # Median roll about the common up above which the cameras are said to have none
+_DOWN = 0.2  # Mean of the pictures' up along the common up below which the viewing directions decide its sign
+_LARGEST_SCALE = 1e6
+
+
+@dataclass(frozen=True)
+class WorldTransform:
+    """A similarity: y = scale * rotation @ x + translation, from a scene's own coordinates to a file's.
+
+    Attributes:
+        rotation: [3, 3] float64, proper.
+        translation: [3] float64.
+        scale: Positive factor; meters for each unit of the scene if it was set, else 1.
+    """
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    scale: float = 1.0
+
+    @staticmethod
+    def identity() -> "WorldTransform":
+        """Return the transform that changes nothing."""
+        return WorldTransform(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_matrix(matrix: Any) -> "WorldTransform":
+        """Return the transform of a 4 x 4 matrix that acts on column vectors; raise ValueError for another kind."""
+        values = np.array(matrix, np.float64)
+        if values.shape != (4, 4) or not np.isfinite(values).all() or not np.allclose(values[3], (0, 0, 0, 1)):
+            raise ValueError("is not an affine 4 x 4 matrix")
+        scale = np.cbrt(np.linalg.det(values[:3, :3]))
+        if not 1 / _LARGEST_SCALE <= scale <= _LARGEST_SCALE:
+            raise ValueError("does not keep orientation or size")
+        rotation = values[:3, :3] / scale
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
+            raise ValueError("is not a rotation with one scale")
+        return WorldTransform(rotation, values[:3, 3], float(scale))
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """[4, 4] float64 that acts on column vectors."""
+        result = np.eye(4)
+        result[:3, :3], result[:3, 3] = self.scale * self.rotation, self.translation
+        return result
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether nothing changes."""
+        return bool(np.array_equal(self.matrix, np.eye(4)))
+
+    def inverse(self) -> "WorldTransform":
+        """Return the transform back to the scene's own coordinates."""
+        rotation = self.rotation.T
+        return WorldTransform(rotation, -rotation @ self.translation / self.scale, 1 / self.scale)
+
+    def points(self, points: np.ndarray) -> np.ndarray:
+        """Transform points [..., 3]."""
+        return self.scale * (np.asarray(points, np.float64) @ self.rotation.T) + self.translation
+
+    def camera(self, camera: Camera) -> Camera:
+        """Transform a camera; what it sees stays."""
+        if self.is_identity:
+            return camera  # To the last bit
+        pose = np.eye(4)
+        pose[:3, :3] = camera.world_to_camera[:3, :3] @ self.rotation.T
+        pose[:3, 3] = -pose[:3, :3] @ self.points(camera.position)
+        values = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        return Camera(*values, world_to_camera=pose)
+
+
+def world_transform(
+    run: Any, axes: str = "upright", *, up: str | Sequence[float] | None = None, scale: float | None = None
+) -> WorldTransform:
+    """Return the transform from a scene's own coordinates to those of its files.
+
+    upright: +Y is up, and the origin is the point that most cameras look at, or else their middle. The camera in the
+    middle looks along +Z, as far as that is horizontal. Gaussians from a file that states its transform are upright
+    already and stay as they are.
+
+    Args:
+        run: From load_run, train or load_splats.
+        axes: "upright" or "scene", the scene's own coordinates.
+        up: The scene's up direction in its own coordinates, as "x,y,z", three numbers, or an axis such as "-y"; None
+            for the one kept with the run, or else gravity as the cameras show it.
+        scale: Meters for each unit of the scene; None for the one kept with the run, or else 1.
+
+    Raises:
+        SehdrError: For values that cannot be, or options that exclude each other.
+    """
+    if axes not in AXES:
+        raise SehdrError(f"axes {axes!r} is not one of {', '.join(AXES)}")
+    matrix = getattr(run, "world_matrix", None)
+    orientation = read_orientation(run)
+    if axes == "scene":
+        if up is not None:
+            raise SehdrError("--up turns the scene upright, and --axes scene leaves it as it is; leave one of them out")
+        factor = _checked_scale(scale)
+        back = WorldTransform.identity() if matrix is None else WorldTransform.from_matrix(matrix).inverse()
+        return WorldTransform(back.rotation, factor * back.translation, factor * back.scale)
+    factor = _checked_scale(orientation.scale if scale is None else scale)
+    direction = read_direction(up) if up is not None else orientation.up
+    cameras = [entry.camera for entry in run.cameras if entry.split == "train"] or [e.camera for e in run.cameras]
+    if direction is None and (matrix is not None or not cameras):
+        # Turned about the axis of view, so that what is ahead stays ahead.
+        rotation = np.diag([-1.0, -1.0, 1.0]) if is_y_down(run.path) else np.eye(3)
+        return WorldTransform(rotation, np.zeros(3), factor)
+    if direction is None:
+        direction = up_direction(cameras)
+    rotation, origin = _rotation(direction, middle_camera(cameras) if cameras else None), np.zeros(3)
+    if cameras:
+        focus = common_focus(cameras)
+        origin = np.mean([camera.position for camera in cameras], axis=0) if focus is None else focus
+    return WorldTransform(rotation, -factor * (rotation @ origin), factor)
+
+
+def is_y_down(path: Path | str) -> bool:
+    """Return whether programs expect the Gaussians in a file of this suffix with -Y up.
+
+    Viewers of 3D Gaussian Splatting turn PLY, SOG and SPZ over, as COLMAP's axes make photos' scenes have -Y up; glTF
+    and OpenUSD define +Y.
+    """
+    return Path(path).suffix.lower() in Y_DOWN_SUFFIXES
+
+
+def file_transform(transform: WorldTransform, path: Path | str) -> WorldTransform:
+    """Return a transform to upright coordinates, turned over for a file whose readers expect -Y up."""
+    if not is_y_down(path):
+        return transform
+    turn = np.diag([-1.0, -1.0, 1.0])
+    return WorldTransform(turn @ transform.rotation, turn @ transform.translation, transform.scale)
+
+
+def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the unit vector [3] against gravity that the poses of photos show.
+
+    People hold cameras level: the horizontal axis of a picture, or the vertical one of a picture taken with the camera
+    turned by a quarter, is horizontal. Up is the direction nearest to orthogonal to all of them (least squares). A
+    warning says if the photos have no common up.
+    """
+    axes = np.stack([camera.world_to_camera[:3, :3] for camera in cameras])
+    mean_up, forward = -axes[:, 1].mean(axis=0), axes[:, 2].mean(axis=0)
+    anchor = mean_up if np.linalg.norm(mean_up) > 1e-6 else -axes[0, 1]
+    up = anchor / np.linalg.norm(anchor)
+    pull = _MEAN_UP_WEIGHT * np.outer(mean_up, mean_up)
+    for _ in range(4):
+        # Of each camera the axis of the picture that is level.
+        level = np.where((np.abs(axes[:, 0] @ up) <= np.abs(axes[:, 1] @ up))[:, None], axes[:, 0], axes[:, 1])
+        spread = (level[:, :, None] * level[:, None, :]).mean(axis=0)
+        candidate = np.linalg.eigh(spread - pull)[1][:, 0]
+        up = candidate if candidate @ up >= 0 else -candidate
+    along = float(mean_up @ up)
+    if abs(along) < _DOWN and abs(forward @ up) > _DOWN:  # Photos from the air look down.
+        up = -np.sign(forward @ up) * up
+    elif along < 0:
+        up = -up
+    roll = float(np.median(np.arcsin(np.clip(np.abs(level @ up), 0, 1))))
+    if roll > _WORST_ROLL:
+        degrees = math.degrees(roll)
+        log.warning(
+            "the photos share no up direction (typically %.0f degrees off); set --up x,y,z, or --axes scene",
+            degrees,
+        )
+    return up
+
+
+def middle_camera(cameras: Sequence[Camera]) -> Camera:
+    """Return the camera nearest to the median position."""
+    places = np.stack([camera.position for camera in cameras])
+    return cameras[int(np.argmin(np.linalg.norm(places - np.median(places, axis=0), axis=1)))]
+
+
+def read_direction(text: str | Sequence[float]) -> np.ndarray:
+    """Return a unit vector from "x,y,z", three numbers, or an axis such as "y", "+z" or "-y"."""
+    try:
+        if isinstance(text, str) and text.strip().lower().lstrip("+-") in ("x", "y", "z"):
+            name = text.strip().lower()
+            values = np.eye(3)["xyz".index(name[-1])] * (-1 if name[0] == "-" else 1)
+        else:
+            values = np.array([float(v) for v in (text.split(",") if isinstance(text, str) else text)])
+        length = np.linalg.norm(values)
+        if values.shape == (3,) and np.isfinite(length) and length > 0:
+            return values / length
+    except (ValueError, TypeError):
+        pass
+    raise SehdrError(f"up {text!r} is not a direction; write x,y,z in the scene's coordinates, or an axis such as -y")
+
+
+class Orientation(NamedTuple):
+    """Up direction [3] in a scene's own coordinates, and meters for each unit of it; None if not set."""
+
+    up: np.ndarray | None = None
+    scale: float | None = None
+
+
+def read_orientation(run: Any) -> Orientation:
+    """Return the up direction and the scale that are kept with a run.
+
+    Raises:
+        InputError: If the file is damaged.
+    """
+    path = Path(run.path) / ORIENTATION_FILE
+    if not path.is_file():
+        return Orientation()
+    values = read_json(path)
+    try:
+        up = None if values.get("up") is None else read_direction(values["up"])
+        scale = None if values.get("scale") is None else _checked_scale(values["scale"])
+    except (SehdrError, AttributeError) as error:
+        raise InputError(path, f"cannot be used ({error})", "delete the file, or set up and scale again") from None
+    return Orientation(up, scale)
+
+
+def write_orientation(run: Any, *, up: Sequence[float] | None = None, scale: float | None = None) -> Path:
+    """Keep an up direction and a scale with a run; None leaves what is kept. Return the file.
+
+    Args:
+        run: From load_run.
+        up: [3] in the scene's own coordinates.
+        scale: Meters for each unit of the scene.
+    """
+    path = Path(run.path) / ORIENTATION_FILE
+    if not path.parent.is_dir():
+        raise SehdrError(f"{run.path}: is not a run; up and scale of a file of Gaussians are set by --up and --scale")
+    before = read_orientation(run)
+    direction = before.up if up is None else read_direction(up)
+    values = {
+        "up": None if direction is None else direction.tolist(),
+        "scale": before.scale if scale is None else _checked_scale(scale),
+    }
+    write_json(path, values, ours=True)
+    return path
+
+
+def describe(transform: WorldTransform) -> str:
+    """Return a transform as the text of its 4 x 4 matrix that files store."""
+    return json.dumps(transform.matrix.tolist())
+
+
+def _checked_scale(scale: Any) -> float:
+    if scale is None:
+        return 1.0
+    if not isinstance(scale, int | float) or not 1 / _LARGEST_SCALE <= scale <= _LARGEST_SCALE:
+        raise SehdrError(f"scale {scale} is not between 1e-6 and 1e6 meters for each unit of the scene")
+    return float(scale)
+
+
+def _rotation(up: np.ndarray, ahead: Camera | None) -> np.ndarray:
+    """Return [3, 3] whose rows are the file's +X, +Y (up) and +Z (ahead) in the scene's coordinates."""
+    forward = np.array([0.0, 0, 1]) if ahead is None else ahead.world_to_camera[2, :3]
+    forward = forward - up * (forward @ up)
+    if np.linalg.norm(forward) < 1e-3:  # It looks straight up or down.
+        forward = np.linalg.svd(up[None])[2][1]
+    forward /= np.linalg.norm(forward)
+    return np.stack([np.cross(up, forward), up, forward])

@@ -1,0 +1,113 @@
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.output.export import export
+from sehdr_warp.output.splat_edits import Box, Sphere, SplatEdits, read_region, without_strays
+from sehdr_warp.runs.run import load_splats
+from sehdr_warp.splats import GaussianArrays, read_gaussians, write_gaussians
+
+from .helpers import Entry, camera
+
+
+def splats(means, opacities, scale=0.1):
+    """Grey Gaussians of display colors."""
+    count = len(means)
+    opacities = np.asarray(opacities, np.float64)
+    return GaussianArrays(
+        means=np.asarray(means, np.float32),
+        log_scales=np.full((count, 3), np.log(scale), np.float32),
+        quaternions=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        opacity_logits=np.log(opacities / (1 - opacities)).astype(np.float32),
+        harmonics=np.full((count, 1, 3), 0.5, np.float32),
+        color_model="display",
+        base_time=1.0,
+    )
+
+
+def run_of(tmp_path, gaussians, name="s"):
+    write_gaussians(tmp_path / f"{name}.ply", gaussians)
+    run = load_splats(tmp_path / f"{name}.ply")
+    run.cameras = tuple(Entry(str(i), "train", camera(position=(i - 1, 0, -6))) for i in range(3))
+    return run
+
+
+@pytest.fixture
+def run(tmp_path):
+    """In view of three cameras: one in the middle, one at the side, a faint one; and one behind the cameras."""
+    return run_of(tmp_path, splats([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, -20)], [0.9, 0.9, 0.002, 0.9]))
+
+
+def export_means(run, path, **edits):
+    export(run, path, axes="scene", edits=SplatEdits(**edits))
+    return sorted(map(tuple, read_gaussians(path).means.round(3).tolist()))
+
+
+def test_what_no_program_draws_is_left_out(tmp_path, run, logged):
+    assert len(export_means(run, tmp_path / "a.ply")) == 3
+    assert "left out: 1 Gaussians (25 %) fainter than min_opacity" in logged
+    assert len(export_means(run, tmp_path / "b.ply", min_opacity=0)) == 4
+
+
+def test_regions(tmp_path, run):
+    assert export_means(run, tmp_path / "a.ply", crop="sphere:0,0,0,0.5") == [(0, 0, 0)]
+    assert export_means(run, tmp_path / "b.ply", cut="box:-0.5,-0.5,-0.5,0.5,0.5,0.5") == [(0, 0, -20), (1, 0, 0)]
+    crop, cut = "box:-2,-2,-2,2,2,2", "sphere:1,0,0,0.1"
+    assert export_means(run, tmp_path / "c.ply", crop=crop, cut=cut) == [(0, 0, 0)]
+    box, sphere = read_region("box:1,0,0,-1,2,3"), read_region("sphere:0,0,0,2")
+    assert isinstance(box, Box) and box.low.tolist() == [-1, 0, 0] and box.high.tolist() == [1, 2, 3]
+    assert isinstance(sphere, Sphere) and sphere.contains(np.array([[0, 0, 1.9], [0, 0, 2.1]])).tolist() == [
+        True,
+        False,
+    ]
+    for text in ("box:1,2,3", "sphere:0,0,0,-1", "sphere:0,0,0,nan", "ball:0,0,0,1", "box:0,0,0,0,1,1", "1,2,3"):
+        with pytest.raises(SehdrError, match="is not box:x0,y0,z0,x1,y1,z1 or sphere"):
+            SplatEdits(crop=text)
+
+
+def test_crops_are_in_upright_coordinates(tmp_path, run):
+    """-Y is up in the photos, so what lies at y = 0 and x = 1 of the scene is turned about the axis of view."""
+    export(run, tmp_path / "a.glb", edits=SplatEdits(crop="sphere:-1,0,0,0.3"), scale=1.0)
+    [mean] = read_gaussians(tmp_path / "a.glb").means
+    np.testing.assert_allclose(mean, (-1, 0, 0), atol=0.2)
+
+
+def test_views_that_show_a_gaussian_are_counted(tmp_path, run, logged):
+    assert export_means(run, tmp_path / "a.ply", min_views=1) == [(0, 0, 0), (1, 0, 0)]
+    assert any("shown by fewer than 1 cameras" in line for line in logged)
+    run.cameras = ()
+    with pytest.raises(SehdrError, match="has no training cameras"):
+        export(run, tmp_path / "b.ply", edits=SplatEdits(min_views=1))
+
+
+def test_edits_that_leave_nothing_say_where_the_scene_is(tmp_path, run):
+    with pytest.raises(SehdrError, match=r"leave no Gaussian; the scene lies at .* in upright coordinates"):
+        export(run, tmp_path / "a.ply", edits=SplatEdits(crop="sphere:99,0,0,1"))
+    assert not (tmp_path / "a.ply").exists()
+    for options in ({"min_opacity": 1.0}, {"min_opacity": -0.1}, {"min_views": -1}):
+        with pytest.raises(SehdrError, match=next(iter(options))):
+            SplatEdits(**options)
+
+
+def test_strays_come_near_or_go(tmp_path, logged):
+    cameras = [camera(position=(i - 1, 0, -6)) for i in range(3)]
+    given = splats([(0, 0, 0), (0, 0, 1e5), (0, 1e6, 0)], [0.9, 0.9, 0.007], scale=10.0)
+    result = without_strays(given, cameras)
+    assert result.count == 2 and np.abs(result.means).max() < 700
+    # As seen from the middle camera it has the size and the place that it had.
+    offset = result.means[1] - cameras[1].position
+    assert np.exp(result.log_scales[1, 0]) / np.linalg.norm(offset) == pytest.approx(10 / 1e5, rel=1e-3)
+    assert any("2 Gaussians beyond" in line and "1 faint ones left out, 1 moved" in line for line in logged)
+    near = splats([(0, 0, 0), (5, 5, 5)], [0.9, 0.9])
+    assert without_strays(near, cameras) is near and without_strays(given, []) is given
+
+
+def test_merged_runs_show_both(tmp_path, run):
+    other = run_of(tmp_path, splats([(-1, 0, 0)], [0.9]), "other")
+    export(run, tmp_path / "both.ply", axes="scene", merge=[other])
+    both = load_splats(tmp_path / "both.ply")
+    assert both.gaussian_count == 4
+    view = run.cameras[1].camera
+    alone = [torch.as_tensor(each.render(view).alpha) for each in (run, other)]
+    np.testing.assert_allclose(both.render(view).alpha, torch.maximum(*alone), atol=0.02)

@@ -1,0 +1,232 @@
+import json
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.output.camera_exchange import camera_path
+from sehdr_warp.output.export import export
+from sehdr_warp.output.render_views import render_views, select_cameras
+from sehdr_warp.output.world_transform import WorldTransform, up_direction, world_transform, write_orientation
+from sehdr_warp.runs.run import Splats, load_splats
+from sehdr_warp.scene import Camera, load_cameras, look_at
+from sehdr_warp.splats import read_gaussians, write_gaussians
+
+from ..splats.test_splat_files import gaussians
+from .helpers import AnalyticRun, Entry, camera, read_exr
+
+
+def photos(up, positions, target, *, roll=0.0, turned=0, seed=0):
+    """Cameras that look at a target; hands roll by some degrees, and some hold the camera upright."""
+    random = np.random.default_rng(seed)
+    cameras = []
+    for index, position in enumerate(positions):
+        pose = look_at(position, target, up=up)
+        angle = math.radians(random.normal(0, roll) + (90 if turned and index % turned == 0 else 0))
+        turn = np.eye(4)
+        turn[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+        cameras.append(Camera(32, 24, 40, 40, 16, 12, turn @ pose))
+    return cameras
+
+
+def degrees(a, b):
+    return math.degrees(math.acos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1, 1)))
+
+
+def ring(count, radius, height, span=360):
+    azimuth = np.radians(np.linspace(0, span, count, endpoint=False))
+    return np.stack([radius * np.cos(azimuth), np.full(count, height), radius * np.sin(azimuth)], axis=1)
+
+
+@pytest.mark.parametrize(
+    "name, positions, target, options",
+    [
+        ("a walk around, looking down", ring(40, 4, 3), (0, 0, 0), {}),
+        ("hands", ring(60, 4, 2), (0, 0, 0), {"roll": 3}),
+        ("half an arc, looking down", ring(30, 4, 2, span=150), (0, 0, 0), {"roll": 2}),
+        ("some turned by a quarter", ring(60, 4, 1), (0, 0, 0), {"roll": 2, "turned": 3}),
+    ],
+)
+def test_up_is_within_three_degrees(name, positions, target, options):
+    turn = Rotation.from_euler("xyz", [40, 70, 110], degrees=True).as_matrix()
+    up = turn @ [0, 1, 0]
+    cameras = photos(up, positions @ turn.T, turn @ np.array(target), **options)
+    assert degrees(up_direction(cameras), up) < 3, name
+
+
+def test_up_of_a_flight_that_looks_straight_down():
+    positions = [(x, 30.0, z) for x in range(4) for z in range(4)]
+    cameras = []
+    for index, position in enumerate(positions):
+        heading = math.radians(90 * (index % 4))
+        ahead = (math.cos(heading), 0, math.sin(heading))
+        cameras.append(Camera(32, 24, 40, 40, 16, 12, look_at(position, np.array(position) - (0, 9, 0), up=ahead)))
+    assert degrees(up_direction(cameras), np.array([0, 1, 0])) < 1
+
+
+def test_photos_without_a_common_up_are_named(logged):
+    random = np.random.default_rng(0)
+    poses = Rotation.random(30, random_state=0).as_matrix()
+    cameras = []
+    for pose, position in zip(poses, random.normal(size=(30, 3))):
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = pose, -pose @ position
+        cameras.append(Camera(32, 24, 40, 40, 16, 12, matrix))
+    up_direction(cameras)
+    assert any("share no up direction" in line and "--up x,y,z" in line for line in logged)
+
+
+def test_a_transform_keeps_what_cameras_see_and_can_be_undone():
+    matrix = np.eye(4)
+    matrix[:3, :3] = 2.5 * Rotation.from_euler("xyz", [10, 20, 30], degrees=True).as_matrix()
+    matrix[:3, 3] = 1, -2, 3
+    transform, view, points = WorldTransform.from_matrix(matrix), camera(), np.random.default_rng(0).normal(size=(9, 3))
+
+    def pixels(camera_, at):
+        local = at @ camera_.world_to_camera[:3, :3].T + camera_.world_to_camera[:3, 3]
+        return local[:, :2] / local[:, 2:]
+
+    np.testing.assert_allclose(pixels(transform.camera(view), transform.points(points)), pixels(view, points))
+    np.testing.assert_allclose(transform.inverse().points(transform.points(points)), points, atol=1e-12)
+    np.testing.assert_allclose(transform.inverse().matrix @ transform.matrix, np.eye(4), atol=1e-12)
+    for wrong in (np.diag([1, -1, 1, 1]), np.diag([1, 2, 1, 1]), np.full((4, 4), np.nan), np.eye(3)):
+        with pytest.raises(ValueError, match="is not|does not"):
+            WorldTransform.from_matrix(wrong)
+
+
+@pytest.mark.parametrize("suffix, kind", [(".ply", "ldr"), (".ply", "hdr"), (".glb", "ldr"), (".usdc", "hdr")])
+def test_gaussians_look_alike_from_transformed_cameras(tmp_path, suffix, kind):
+    """Also their harmonics are turned: what a camera sees of an upright file is what it saw of the scene."""
+    if suffix == ".usdc":
+        pytest.importorskip("pxr")
+    source = tmp_path / "source.ply"
+    write_gaussians(source, gaussians(degree=3, color_model="display" if kind == "ldr" else "linear"))
+    run = load_splats(source)
+    run.cameras = tuple(Entry(str(i), "train", camera(position=(i - 1, -1, -6))) for i in range(3))
+    export(run, tmp_path / f"a{suffix}", kind=kind, cameras=True, scale=2.0)
+    upright = load_splats(tmp_path / f"a{suffix}")
+    for before, after in zip(run.cameras, upright.cameras, strict=True):
+        assert not np.allclose(before.camera.world_to_camera, after.camera.world_to_camera)
+        # Cameras of the reference release's form have their principal point in the middle.
+        centered = Camera(32, 24, 40, 44, 16, 12, before.camera.world_to_camera)
+        a, b = run.render(centered), upright.render(after.camera)
+        np.testing.assert_allclose(b.hdr, a.hdr, rtol=2e-2, atol=2e-3 * float(a.hdr.max()))
+        np.testing.assert_allclose(b.depth, 2 * a.depth, rtol=1e-2, atol=1e-2)
+    # And back: the file states how it was turned.
+    export(upright, tmp_path / f"back{suffix}", kind=kind, axes="scene", scale=1.0)
+    back = load_splats(tmp_path / f"back{suffix}")
+    rendered = back.render(run.cameras[0].camera).hdr
+    expected = run.render(run.cameras[0].camera).hdr
+    np.testing.assert_allclose(rendered, expected, rtol=2e-2, atol=2e-3 * float(expected.max()))
+
+
+def test_upright_files_have_their_up_where_readers_expect_it(tmp_path):
+    pytest.importorskip("pxr")
+    write_gaussians(tmp_path / "s.ply", gaussians(color_model="display"))
+    run = load_splats(tmp_path / "s.ply")
+    run.cameras = tuple(
+        Entry(str(i), "train", c) for i, c in enumerate(photos((0, 0, 1), ring(9, 4, 1)[:, [0, 2, 1]], (0, 0, 0)))
+    )
+    heights = {}
+    for name in ("a.ply", "a.glb", "a.usdc"):
+        export(run, tmp_path / name)
+        heights[name] = read_gaussians(tmp_path / name).means[:, 1]
+    z = run.model.gaussians.means[:, 2].numpy()
+    np.testing.assert_allclose(heights["a.glb"] - heights["a.glb"].mean(), z - z.mean(), atol=1e-3)
+    np.testing.assert_allclose(heights["a.usdc"], heights["a.glb"], atol=1e-4)
+    np.testing.assert_allclose(heights["a.ply"], -heights["a.glb"], atol=1e-4)
+
+
+def test_pictures_and_cameras_are_in_one_space(tmp_path):
+    run = AnalyticRun()
+    render_views(run, tmp_path, aovs="position", scale=3.0)
+    header = read_exr(tmp_path / "hdr" / "t_0.exr")[2]
+    transform = WorldTransform.from_matrix(json.loads(header["sehdr:worldMatrix"]))
+    assert transform.scale == pytest.approx(3)
+    stored = Camera.from_dict(json.loads(header["sehdr:camera"]))
+    source = run.cameras[3].camera
+    np.testing.assert_allclose(stored.position, transform.points(source.position), atol=1e-9)
+    # cameras.usda of that space leads back to the scene's own, whatever the axes are then.
+    for axes in ("upright", "scene"):
+        frame = world_transform(run, axes)
+        back = select_cameras(run, tmp_path / "cameras.usda", transform=frame)
+        np.testing.assert_allclose(back[0][1].position, source.position, atol=1e-6)
+
+
+def test_kept_orientation_and_options(tmp_path):
+    run = AnalyticRun()
+    run.path = tmp_path
+    before = world_transform(run)
+    write_orientation(run, up=(0, 0, 2))
+    assert write_orientation(run, scale=0.5).read_text()
+    kept = world_transform(run)
+    np.testing.assert_allclose(kept.rotation @ [0, 0, 1], [0, 1, 0], atol=1e-12)
+    assert (before.scale, kept.scale) == (1, 0.5)
+    np.testing.assert_allclose(world_transform(run, up="-y").rotation @ [0, -1, 0], [0, 1, 0], atol=1e-12)
+    assert world_transform(run, "scene").is_identity
+    for options, words in (
+        ({"up": "1,2"}, "is not a direction"),
+        ({"up": "0,0,0"}, "is not a direction"),
+        ({"scale": -1.0}, "scale -1.0 is not between"),
+        ({"axes": "sideways"}, "is not one of upright, scene"),
+        ({"axes": "scene", "up": "y"}, "leave one of them out"),
+    ):
+        with pytest.raises(SehdrError, match=words):
+            world_transform(run, **options)
+    (tmp_path / "orientation.json").write_text('{"up": [0, 0]}')
+    with pytest.raises(InputError, match="orientation.json: cannot be used"):
+        world_transform(run)
+
+
+def test_a_path_is_one_moving_camera(tmp_path):
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    run = AnalyticRun()
+    render_views(run, tmp_path, cameras="orbit", count=5, size="32x18")
+    stage = Usd.Stage.Open(str(tmp_path / "cameras.usda"))
+    prims = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
+    assert [prim.GetName() for prim in prims] == ["orbit"]
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (0, 4, 24)
+    expected = select_cameras(run, "orbit", count=5)
+    for name in ("cameras.usda", "cameras.chan", "camera_path.json"):
+        read = select_cameras(run, tmp_path / name)
+        assert len(read) == 5
+        for (_, a), (_, b) in zip(expected, read, strict=True):
+            np.testing.assert_allclose(b.position, a.position, atol=1e-5)
+            np.testing.assert_allclose(b.world_to_camera, a.world_to_camera, atol=1e-5)
+            assert b.fy / b.height == pytest.approx(a.fy / a.height, rel=1e-5)
+
+
+def test_only_numbered_views_of_one_size_are_a_path():
+    views = [(f"shot_{i:04d}", camera()) for i in range(1001, 1004)]
+    path = camera_path(views)
+    assert path is not None and (path.name, path.frames) == ("shot", [1001, 1002, 1003])
+    assert camera_path(views[:1]) is None
+    assert camera_path([*views[:2], ("shot_1009", camera())]) is None
+    assert camera_path([*views[:2], ("other_1003", camera())]) is None
+    assert camera_path([*views[:2], ("shot_1003", camera(width=64))]) is None
+    assert camera_path([("left", camera()), ("right", camera())]) is None
+
+
+def test_several_cameras_are_chosen_from_by_name(tmp_path):
+    run = AnalyticRun()
+    entries = [{"name": name, **camera().to_dict()} for name in ("a", "b_0001", "b_0002")]
+    (tmp_path / "c.json").write_text(json.dumps({"cameras": entries}))
+    assert [name for name, _ in select_cameras(run, tmp_path / "c.json", camera="b")] == ["b_0001", "b_0002"]
+    assert [name for name, _ in select_cameras(run, tmp_path / "c.json", camera="a")] == ["a"]
+    with pytest.raises(SehdrError, match="has no camera 'c'"):
+        select_cameras(run, tmp_path / "c.json", camera="c")
+    with pytest.raises(SehdrError, match="chooses from a file"):
+        select_cameras(run, "test", camera="a")
+    assert len(load_cameras(tmp_path / "c.json")) == 3
+
+
+def test_splats_without_cameras_keep_their_place(tmp_path):
+    write_gaussians(tmp_path / "s.ply", gaussians(color_model="display"))
+    run = load_splats(tmp_path / "s.ply")
+    assert isinstance(run, Splats)
+    np.testing.assert_array_equal(world_transform(run).matrix, np.diag([-1, -1, 1, 1]))
+    assert world_transform(run, "scene").is_identity
