@@ -5,7 +5,7 @@ import shutil
 import sys
 
 from sehdr_warp.arguments import parse
-from sehdr_warp.errors import UsageError, surroundings_told
+from sehdr_warp.errors import UsageError, as_user_error
 from sehdr_warp.process import calm_threads
 
 PROGRAM = "python -m benchmarks"
@@ -30,7 +30,7 @@ def main(words: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     except Exception as error:
-        message = surroundings_told(error)
+        message = as_user_error(error)
         if message is None:
             raise
         print(f"benchmarks: {str(message).removeprefix(PROGRAM + ' ')}", file=sys.stderr)

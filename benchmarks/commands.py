@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from sehdr_warp.arguments import numbers, positive
+from sehdr_warp.arguments import parse_numbers, require_positive
 from sehdr_warp.errors import InputError
 
 
@@ -39,7 +39,7 @@ class Timed(Output):
     def timing(self) -> dict:
         from sehdr_warp.runs.device import pick_device
 
-        return {"device": pick_device(self.device), "repetitions": positive("--repetitions", self.repetitions)}
+        return {"device": pick_device(self.device), "repetitions": require_positive("--repetitions", self.repetitions)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,7 @@ class Kernels(Timed):
         timing = self.timing()
         default = {"cuda": "50k@400x400,200k@800x800,1M@1600x1200", "cpu": "5k@200x200,20k@200x200"}
         sizes = [parse_size(item) for item in (self.sizes or default[timing["device"].type]).split(",")]
-        return bench_kernels(sizes, numbers("--channels", self.channels, int, least=1), **timing)
+        return bench_kernels(sizes, parse_numbers("--channels", self.channels, int, minimum=1), **timing)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,10 +152,10 @@ class Quality(Output):
             name: _words(getattr(self, name)) for name in ("scenes", "methods", "curves", "responses")
         }
         for name in ("exposures", "seeds"):
-            asked[name] = tuple(dict.fromkeys(numbers(f"--{name}", getattr(self, name), int, least=0)))
-        iterations = self.iterations and positive("--iterations", self.iterations)
+            asked[name] = tuple(dict.fromkeys(parse_numbers(f"--{name}", getattr(self, name), int, minimum=0)))
+        iterations = self.iterations and require_positive("--iterations", self.iterations)
         jobs = plan_jobs(**asked, iterations=iterations, max_size=self.max_size, device=device, lpips=lpips is not None)
-        how = {"at_once": positive("--jobs", self.jobs), "slurm": _pairs("--slurm", self.slurm)}
+        how = {"at_once": require_positive("--jobs", self.jobs), "slurm": _pairs("--slurm", self.slurm)}
         rows = run_jobs(jobs, self.out, device=device, lpips=lpips and os.path.abspath(lpips), **how)
         result = new_result("quality", torch.device(device), {"jobs": self.jobs})
         result["rows"] = [row for row in rows if "error" not in row]
@@ -181,7 +181,7 @@ class Responses(Output):
     def measure(self):
         from .response import bench_response
 
-        exposures = positive("--exposures", self.exposures)
+        exposures = require_positive("--exposures", self.exposures)
         return bench_response(self.data, _words(self.curves), exposures=exposures, max_size=self.max_size)
 
 

@@ -6,8 +6,8 @@
     run = sw.train(scene, "run/")
     sw.render_views(run, "renders/", cameras="test", evs=(-4, -2, 0, 2, 4))
 
-Names load their modules when they are first used, so importing the package costs next to nothing. `__init__.pyi` states
-the same names for editors and type checkers.
+A name loads its module when it is first used, so importing the package takes a fraction of a second. `__init__.pyi`
+lists the same names for editors and type checkers.
 """
 
 from importlib import import_module
@@ -18,7 +18,7 @@ _HOMES = {
     "errors": ("InputError", "SehdrError"),
     "evaluation.compare": ("compare_runs",),
     "evaluation.evaluate": ("evaluate",),
-    "evaluation.score": ("score_folder",),
+    "evaluation.folder": ("evaluate_folder",),
     "output.brackets": ("write_brackets",),
     "output.export": ("export",),
     "output.environment_map": ("write_environment_map",),
@@ -39,7 +39,12 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = sorted(_HOME_OF)  # noqa: PLE0605 # pyright: ignore[reportUnsupportedDunderAll]
 
 
+_RENAMED = {"score_folder": "evaluate_folder", "write_panorama": "write_environment_map"}
+
+
 def __getattr__(name: str):
+    if name in _RENAMED:
+        raise AttributeError(f"{__name__}.{name} is now {__name__}.{_RENAMED[name]}")
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)

@@ -3,7 +3,7 @@
 from .errors import InputError, SehdrError
 from .evaluation.compare import compare_runs
 from .evaluation.evaluate import evaluate
-from .evaluation.score import score_folder
+from .evaluation.folder import evaluate_folder
 from .output.brackets import write_brackets
 from .output.environment_map import write_environment_map
 from .output.export import export
@@ -39,6 +39,7 @@ __all__ = [
     "differentiable",
     "embedded_scenes",
     "evaluate",
+    "evaluate_folder",
     "export",
     "load_cameras",
     "load_config",
@@ -53,7 +54,6 @@ __all__ = [
     "render_views",
     "response_by_name",
     "response_names",
-    "score_folder",
     "spherical_harmonics",
     "ssim",
     "train",

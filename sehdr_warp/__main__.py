@@ -5,7 +5,7 @@ import sys
 
 
 def run() -> None:
-    """Runs the command line of this process and exits, see cli.main()."""
+    """Run the command line of this process and exit, see cli.main()."""
     interrupted = bool
     try:
         from .process import interrupted, prepare
@@ -15,13 +15,13 @@ def run() -> None:
 
         main()
     except BaseException as error:
-        # While modules load, in main's last words, or as what a library made of an interrupt.
+        # An interrupt while modules load or main() ends, or an exception into which a library turned it.
         if isinstance(error, KeyboardInterrupt) or (interrupted() and not isinstance(error, SystemExit)):
             print("sehdr-warp: interrupted", file=sys.stderr)
             sys.exit(130)
         raise
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Python's own end shows tracebacks.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # An interrupt while Python ends would show a traceback.
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What the command lines of all rooms share: parsing with tyro, refusals in one line, and lists of numbers."""
+"""What the command lines of all rooms share: parsing with tyro, one-line usage errors, and lists of numbers."""
 
 import dataclasses
 import inspect
@@ -24,22 +24,27 @@ MARKERS = (
 
 
 def parse(options: type[Options], words: list[str], program: str) -> Options:
-    """The options that the words of a command line state.
+    """Parse the words of a command line into options.
 
-    options: a dataclass; its docstring and its fields' are the help. A field may be a dataclass, whose fields form a
-    group of the help, a TypedDict, whose fields are in --help-all alone, or a union of dataclasses, which are
-    subcommands. A class attribute `gone` may say of flags of earlier versions what to do now.
-    program: what stands before the words, such as `sehdr-warp train`.
+    Args:
+        options: a dataclass; its docstring and those of its fields are the help. A field may be a dataclass, whose
+            fields form a group of the help; a TypedDict, whose fields are shown by --help-all alone; or a union of
+            dataclasses, which are subcommands. A class attribute `removed_flags` may map flags of earlier versions
+            to what to do instead.
+        words: the words after the command.
+        program: what stands before the words, such as `sehdr-warp train`.
 
-    Raises UsageError, with the nearest right word, for one that is no option, and SystemExit after --help.
+    Raises:
+        UsageError: for words that are not options, with the most similar option.
+        SystemExit: after --help.
     """
     _hide_empty_defaults(options)
-    details = {name: hint for name, hint in _hints(options).items() if typing.is_typeddict(_plain(hint))}
-    if details and "--help-all" in words:
+    long_groups = {name: hint for name, hint in _hints(options).items() if typing.is_typeddict(_unwrap(hint))}
+    if long_groups and "--help-all" in words:
         words = ["--help"]
-    elif details and {"-h", "--help"} & set(words):
-        none = dataclasses.field(default_factory=dict)
-        hidden = [(name, tyro.conf.Suppress[hint], none) for name, hint in details.items()]
+    elif long_groups and {"-h", "--help"} & set(words):
+        empty = dataclasses.field(default_factory=dict)
+        hidden = [(name, tyro.conf.Suppress[hint], empty) for name, hint in long_groups.items()]
         short = dataclasses.make_dataclass(options.__name__, hidden, bases=(options,), frozen=True)
         short.__doc__ = options.__doc__
         try:
@@ -47,60 +52,65 @@ def parse(options: type[Options], words: list[str], program: str) -> Options:
         finally:
             print(f"{program} --help-all adds every field of the config, as --loss.ssim-weight 0.2.")
     _check_flags(options, words, program)
-    told = io.StringIO()
+    output = io.StringIO()
     try:
-        with redirect_stderr(told):
+        with redirect_stderr(output):
             return tyro.cli(options, prog=program, args=words, config=MARKERS)
     except SystemExit as end:
         if not end.code:
             raise
-    raise UsageError(f"{_one_line(told.getvalue())}; see {program} --help")
+    raise UsageError(f"{_one_line(output.getvalue())}; see {program} --help")
 
 
 def _check_flags(options: type, words: list[str], program: str) -> None:
-    """Refuses words that are no subcommand or no flag of the options."""
-    if (below := subcommands(options)) and words and not words[0].startswith("-"):
-        if words[0] not in below:
-            hint = did_you_mean(words[0], below) or f"; there are {', '.join(below)}"
+    """Raise UsageError for words that are not a subcommand or a flag of the options."""
+    if (commands := subcommands(options)) and words and not words[0].startswith("-"):
+        if words[0] not in commands:
+            hint = did_you_mean(words[0], commands) or f"; there are {', '.join(commands)}"
             raise UsageError(f"{program} {words[0]}: no such command{hint}")
-        _check_flags(below[words[0]], words[1:], f"{program} {words[0]}")
+        _check_flags(commands[words[0]], words[1:], f"{program} {words[0]}")
         return
     known, bare = {"--help", *flags(options)}, {"--" + name for name in positional(options)}
+    removed = getattr(options, "removed_flags", {})
     for word in words:
         flag = word.partition("=")[0].replace("_", "-")
         if not re.match(r"--[a-z]", flag) or flag in known:
             continue
         if flag in bare:
             raise UsageError(f"{program} takes {flag[2:].upper()} without {flag}; see {program} --help")
-        if flag in getattr(options, "gone", {}):
-            raise UsageError(f"{flag} is gone: {options.gone[flag]}")
-        # A field's own name is nearer than its part's: --los.clipping, --clipping.
-        tails = {name.rpartition(".")[2].removeprefix("--"): name for name in known if "." in name}
-        hint = did_you_mean(flag, known) or (f", did you mean {tails[flag[2:]]}?" if flag[2:] in tails else "")
+        if flag in removed:
+            raise UsageError(f"{flag} is gone: {removed[flag]}")
+        # A mistyped part of a dotted flag (--los.clipping) is similar to the flag; a missing part (--clipping) is not.
+        by_field = {name.rpartition(".")[2].removeprefix("--"): name for name in known if "." in name}
+        hint = did_you_mean(flag, known) or (f", did you mean {by_field[flag[2:]]}?" if flag[2:] in by_field else "")
         raise UsageError(f"{program} has no {flag}{hint or f'; see {program} --help'}")
 
 
 def _hints(options: type) -> dict[str, typing.Any]:
+    """Return the type hints of a dataclass with their annotations."""
     return typing.get_type_hints(options, include_extras=True)
 
 
-def _plain(hint) -> typing.Any:
+def _unwrap(hint: typing.Any) -> typing.Any:
+    """Return a type hint without its annotations."""
     return hint.__origin__ if typing.get_origin(hint) is typing.Annotated else hint
 
 
 def subcommands(options: type) -> dict[str, type]:
-    """The subcommands of options by name."""
-    choices = (choice for hint in _hints(options).values() for choice in typing.get_args(_plain(hint)))
-    below = (choice for choice in choices if dataclasses.is_dataclass(_plain(choice)))
-    return {mark.name: _plain(choice) for choice in below for mark in choice.__metadata__ if getattr(mark, "name", 0)}
+    """Return the subcommands of options by name."""
+    choices = (choice for hint in _hints(options).values() for choice in typing.get_args(_unwrap(hint)))
+    commands = (choice for choice in choices if dataclasses.is_dataclass(_unwrap(choice)))
+    return {
+        mark.name: _unwrap(choice) for choice in commands for mark in choice.__metadata__ if getattr(mark, "name", 0)
+    }
 
 
 def flags(options: typing.Any) -> Iterator[str]:
-    """The flags of options, without those of their subcommands."""
-    without = set(positional(options))
+    """Yield the flags of options, without those of their subcommands."""
+    bare = set(positional(options))
     for name, hint in _hints(options).items():
-        kind = _plain(hint)
-        if name in without:
+        kind = _unwrap(hint)
+        if name in bare:
             continue
         if dataclasses.is_dataclass(kind) or typing.is_typeddict(kind):
             yield from flags(kind)
@@ -109,70 +119,93 @@ def flags(options: typing.Any) -> Iterator[str]:
 
 
 def positional(options: typing.Any) -> list[str]:
-    """The options that stand on a command line without a flag."""
+    """Return the names of the options that stand on a command line without a flag."""
     return [name for name, hint in _hints(options).items() if tyro.conf.Positional in getattr(hint, "__metadata__", ())]
 
 
 def _hide_empty_defaults(options: type) -> None:
-    """Leaves `(default: None)` and `(default: False)`, which say nothing, out of the help of options."""
+    """Leave `(default: None)` and `(default: False)`, which say nothing, out of the help of options."""
     for field in dataclasses.fields(options) if dataclasses.is_dataclass(options) else ():
         owner = next(kind for kind in options.__mro__ if field.name in inspect.get_annotations(kind))
         hint = owner.__annotations__[field.name]
-        for part in (hint, *typing.get_args(_plain(hint))):
-            if dataclasses.is_dataclass(_plain(part)):
-                _hide_empty_defaults(_plain(part))
+        for part in (hint, *typing.get_args(_unwrap(hint))):
+            if dataclasses.is_dataclass(_unwrap(part)):
+                _hide_empty_defaults(_unwrap(part))
         marks = getattr(hint, "__metadata__", ())
         if field.default in (None, False, (), "") and not any(hasattr(mark, "help_behavior_hint") for mark in marks):
-            quiet = tyro.conf.arg(help_behavior_hint="")
-            owner.__annotations__[field.name] = typing.Annotated[hint, quiet]
+            without_default = tyro.conf.arg(help_behavior_hint="")
+            owner.__annotations__[field.name] = typing.Annotated[hint, without_default]
 
 
-def _sorted_choices(match: re.Match) -> str:
-    """A refused choice; of a flag that need not be given, tyro lists them in any order, with a None that none types."""
-    return f"{match[2]} {match[1]}: is none of {', '.join(sorted({*match[3].split(', ')} - {repr('None')}))}"
+def _invalid_choice(match: re.Match) -> str:
+    """Shorten tyro's message about an invalid choice.
+
+    tyro lists the choices of an optional flag in any order, and with a None that nobody can type.
+    """
+    choices = ", ".join(sorted({*match[3].split(", ")} - {repr("None")}))
+    return f"{match[2]} {match[1]}: not one of {choices}"
 
 
-# What tyro says, and the same in fewer words; a text in none of these forms is passed on as it is.
+def _invalid_type(match: re.Match) -> str:
+    """Shorten tyro's message about a value of the wrong type."""
+    name = {"INT": "whole number", "FLOAT": "number"}.get(match[2], match[2])
+    return f"{match[1]} {match[3]}: not a {name}"
+
+
 _SHORTER = (
     (r"Missing value for argument '(\S+)'.*", r"\1 needs a value"),
-    (r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*?),?\) ?\.", _sorted_choices),
-    (r"Error parsing (\S+): no type matching (.+) could be instantiated from \['(.*?)'\].*", r"\1 \3: is no \2"),
-    (r"Error parsing (\S+): .*: '(.*)'", r"\1 \2: is no number"),
+    (r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*?),?\) ?\.", _invalid_choice),
+    (r"Error parsing (\S+): no type matching (.+) could be instantiated from \['(.*?)'\].*", _invalid_type),
+    (r"Error parsing (\S+): .*: '(.*)'", r"\1 \2: not a number"),
     (r"Expected one of \{(.*)\} ?\.", r"needs one of \1"),
-    (r"Unrecognized options: (.*)", r"\1: more than is asked for"),
+    (r"Unrecognized options: (.*)", r"\1: unexpected argument"),
 )
+"""Patterns of tyro's messages and shorter ones; a message that matches none is passed on as it is."""
 
 
-def _one_line(told: str) -> str:
-    """What tyro says in a box, above the first rule, as one line."""
-    title, *lines = re.sub(r"\x1b\[[0-9;]*m", "", told).splitlines() or [""]
-    # Two columns of border, drawn or blank; without drawing there is a rule below the title.
+def _one_line(text: str) -> str:
+    """Return the message in a box that tyro printed, above its first rule, as one line."""
+    title, *lines = re.sub(r"\x1b\[[0-9;]*m", "", text).splitlines() or [""]
+    # The border takes two columns, drawn or blank; if it is blank, a rule follows the title.
     lines = [line[2:].rstrip(" │") for line in lines]
     lines = lines[not lines[0].strip("-") :]
     lines = list(itertools.takewhile(lambda line: not re.match("[-─]{4}", line), lines))
     if "Required options" in title:
-        # Names stand four columns in, their help deeper.
+        # Names are indented by four columns, their help by more.
         names = [line.strip() for line in lines if re.match(r" {4}\S", line)]
         return f"{lines[0].strip(' :').replace('Missing from ', '')} needs {', '.join(names)}"
-    text = " ".join(" ".join(lines).split())
-    shorter = (re.sub(pattern, said, text) for pattern, said in _SHORTER if re.fullmatch(pattern, text))
-    return next(shorter, text)
+    message = " ".join(" ".join(lines).split())
+    shorter = (re.sub(pattern, by, message) for pattern, by in _SHORTER if re.fullmatch(pattern, message))
+    return next(shorter, message)
 
 
-def numbers(flag: str, text: str, kind: type = float, least: float = -math.inf) -> tuple:
-    """The numbers of a list such as 0.125,0.5,2; raises InputError, with the flag, for anything else and for a number
-    below `least`."""
+def parse_numbers(flag: str, text: str, kind: type = float, minimum: float = -math.inf) -> tuple:
+    """Return the numbers of a list such as 0.125,0.5,2.
+
+    Args:
+        flag: the flag that takes the list, for the error message.
+        text: the list.
+        kind: int or float.
+        minimum: the least number that is allowed.
+
+    Raises:
+        InputError: for anything else, and for a number below the minimum.
+    """
     with suppress(ValueError):
-        found = tuple(kind(item) for item in text.split(","))
-        if min(found) >= least:
-            return found
-    wanted = "whole numbers" if kind is int else "numbers"
-    wanted += f" from {least:g}" if least > -math.inf else ""
-    raise InputError(f"{flag} {text}", f"not {wanted} separated by commas", f"write for example {flag}=1,2")
+        values = tuple(kind(item) for item in text.split(","))
+        if min(values) >= minimum:
+            return values
+    expected = "whole numbers" if kind is int else "numbers"
+    expected += f" from {minimum:g}" if minimum > -math.inf else ""
+    raise InputError(f"{flag} {text}", f"not {expected} separated by commas", f"write for example {flag}=1,2")
 
 
-def positive(flag: str, value):
-    """The value, if it is above 0; raises InputError, with the flag, if it is not."""
+def require_positive(flag: str, value):
+    """Return the value of a flag if it is above 0.
+
+    Raises:
+        InputError: if it is not.
+    """
     if not value > 0:
         raise InputError(f"{flag} {value}", "not positive", "give a number above 0")
     return value

@@ -1,111 +1,155 @@
-"""The command `sehdr-warp`: finds the command, parses, calls, and says in one line what went wrong.
+"""The command `sehdr-warp`: find the command, parse its options, call it, and print errors as one line.
 
-Each command is a dataclass of options and a function that takes it, in the `commands` module of its room; a new one is
-a line of COMMANDS. Modules are imported by the commands that need them: nothing here needs torch.
+Each command is a dataclass of options and a function that takes them, in the `commands` module of its room. To add one,
+add a line to COMMANDS. A module is imported when its command runs, so nothing here imports torch.
 """
 
+import inspect
 import os
 import shutil
 import sys
 from collections.abc import Callable
 from importlib import import_module
+from typing import Any, NamedTuple
 
 from . import __version__
-from .errors import SehdrError, UsageError, did_you_mean, surroundings_told
+from .errors import SehdrError, UsageError, as_user_error, did_you_mean
 
 PROGRAM = "sehdr-warp"
-LEAST_COLUMNS = 40
+MIN_COLUMNS = 40
+"""Columns of the narrowest terminal that help tables are laid out for; a narrower one takes minutes."""
+
+
+class Command(NamedTuple):
+    """Where a command is defined."""
+
+    module: str
+    """Module below the package."""
+    options: str
+    """Dataclass of its options; the first sentence of its docstring is the command's summary."""
+    run: str
+    """Function that takes the options, and the words of the command line if it has a parameter `argv`."""
+
+
 COMMANDS = {
     "train and use a scene": {
-        "train": ("training.commands", "Train", "run_train"),
-        "render": ("output.commands", "Render", "run_render"),
-        "view": ("viewer.commands", "View", "run_view"),
-        "eval": ("evaluation.commands", "Evaluate", "run_evaluate"),
-        "report": ("output.commands", "Report", "run_report"),
-        "envmap": ("output.commands", "EnvironmentMap", "run_environment_map"),
-        "export": ("output.commands", "Export", "run_export"),
-        "convert": ("output.commands", "Convert", "run_convert"),
-        "compare": ("evaluation.commands", "Compare", "run_compare"),
-        "score": ("evaluation.commands", "Score", "run_score"),
+        "train": Command("training.commands", "Train", "run_train"),
+        "render": Command("output.commands", "Render", "run_render"),
+        "view": Command("viewer.commands", "View", "run_view"),
+        "eval": Command("evaluation.commands", "Evaluate", "run_evaluate"),
+        "compare": Command("evaluation.commands", "Compare", "run_compare"),
+        "report": Command("output.commands", "Report", "run_report"),
+        "envmap": Command("output.commands", "EnvironmentMap", "run_environment_map"),
+        "export": Command("output.commands", "Export", "run_export"),
+        "convert": Command("output.commands", "Convert", "run_convert"),
     },
-    "what there is to choose from": {
-        "presets": ("training.commands", "Presets", "run_presets"),
-        "config": ("training.commands", "ShowConfig", "run_config"),
-        "calibrate": ("scene.commands", "Calibrate", "run_calibrate"),
-        "responses": ("scene.commands", "Responses", "run_responses"),
-        "scenes": ("scene.commands", "Scenes", "run_scenes"),
+    "choose and calibrate": {
+        "presets": Command("training.commands", "Presets", "run_presets"),
+        "config": Command("training.commands", "ShowConfig", "run_config"),
+        "calibrate": Command("scene.commands", "Calibrate", "run_calibrate"),
+        "responses": Command("scene.commands", "Responses", "run_responses"),
+        "scenes": Command("scene.commands", "Scenes", "run_scenes"),
     },
-    "measure and make": {
-        "check": ("check.commands", "Check", "run_check"),
-        "synth": ("synth.commands", "Synth", "run_synth"),
-        "completion": ("completion", "Completion", "run_completion"),
+    "other tools": {
+        "check": Command("check.commands", "Check", "run_check"),
+        "synth": Command("synth.commands", "Synth", "run_synth"),
+        "completion": Command("completion", "Completion", "run_completion"),
     },
 }
-"""Every command, under the headings of the help: its module, dataclass of options, and the function that runs them."""
-words_given: list[str] = []
-"""The words of the command line that is run."""
+"""Every command by name, under the headings of the help."""
+_COMMANDS = {name: command for group in COMMANDS.values() for name, command in group.items()}
 _RENAMED = {
     "panorama": f"the command is {PROGRAM} envmap",
-    "resume": f"{PROGRAM} train --resume --out RUN goes on with a training",
+    "resume": f"{PROGRAM} train --resume --out RUN continues a training",
+    "score": f"the command is {PROGRAM} eval FOLDER --truth SET",
+    "bench": "it left the installed program; in a checkout, run python -m benchmarks",
 }
 """What to type for commands of earlier versions, and for words that people expect to be commands."""
-_LIGHT = {"presets", "config", "responses", "scenes", "completion"}
-"""Commands that load no torch."""
-_LEAST_ADDRESS_SPACE = 1536 << 20
+_WITHOUT_TORCH = {"presets", "config", "responses", "scenes", "completion"}
+"""Commands that do not load torch, and so run in little address space."""
+_MIN_ADDRESS_SPACE = 1536 << 20
+"""Bytes below which native libraries fail to reserve memory and crash with confusing messages."""
 _reserve = [bytearray(4 << 20)]
-"""Memory for the last words of a command that finds no more."""
-_MODULES = {name: command for group in COMMANDS.values() for name, command in group.items()}
+"""Memory that is released to print an error when a command has run out of memory."""
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Runs a command line and exits: 0 done, 1 an error the user can act on, 2 wrong usage, 130 interrupted, 141 nobody
-    reads its output any more."""
+    """Run a command line and exit.
+
+    Args:
+        arguments: the words after the program's name; by default those of this process.
+
+    Raises:
+        SystemExit: with status 0 for success, 1 for an error that the user can act on, 2 for wrong usage, 130 for an
+            interrupt, and 141 if nobody reads the output any more.
+    """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    words_given[:] = words
     try:
         try:
-            _run([word for word in words if word != "--debug"])
+            _run(words)
         finally:
             sys.stdout.flush()
     except KeyboardInterrupt:
-        _tell(f"{PROGRAM}: interrupted")
+        _print_error(f"{PROGRAM}: interrupted")
         sys.exit(130)
     except BrokenPipeError:
-        # As of `sehdr-warp ... | head`; Python would complain again when it closes what nobody reads.
+        # The reader has gone, as in `sehdr-warp ... | head`. Python's own flush at exit would fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
     except Exception as error:
         _reserve.clear()
-        told = surroundings_told(error)
-        if told is None:
+        message = as_user_error(error)
+        if message is None:
             raise
         if "--debug" in words:
             import traceback
 
             traceback.print_exc()
-        _tell(f"{PROGRAM}: {str(told).removeprefix(PROGRAM + ' ')}")
-        sys.exit(2 if isinstance(told, UsageError) else 1)
+        _print_error(f"{PROGRAM}: {str(message).removeprefix(PROGRAM + ' ')}")
+        sys.exit(2 if isinstance(message, UsageError) else 1)
     sys.exit(0)
 
 
 def command_options() -> dict[str, type]:
-    """The dataclass of options of every command, by its name."""
-    return {name: _load(name)[0] for name in _MODULES}
+    """Return the dataclass of options of every command, by the command's name."""
+    return {name: _load(command)[0] for name, command in _COMMANDS.items()}
 
 
-def _run(words: list[str]) -> None:
+def parse_command(words: list[str]) -> tuple[Callable, Any]:
+    """Parse a command line without the flags that all commands share.
+
+    Returns:
+        The function that runs the command, and its options.
+
+    Raises:
+        UsageError: for an unknown command, or options that cannot be parsed.
+        SystemExit: after --help.
+    """
+    from .arguments import parse
+
+    name, *rest = words
+    if name in _RENAMED:
+        raise UsageError(f"no command {name}: {_RENAMED[name]}")
+    if name not in _COMMANDS:
+        raise UsageError(f"no command {name}{did_you_mean(name, _COMMANDS)}; {PROGRAM} --help lists them")
+    options, run = _load(_COMMANDS[name])
+    return run, parse(options, rest, f"{PROGRAM} {name}")
+
+
+def _run(argv: list[str]) -> None:
+    """Set the process up and run a command line."""
     from .process import calm_threads
 
     calm_threads()
-    if shutil.get_terminal_size().columns < LEAST_COLUMNS:  # No table fits, and to try takes minutes.
-        os.environ["COLUMNS"] = str(LEAST_COLUMNS)
+    if shutil.get_terminal_size().columns < MIN_COLUMNS:
+        os.environ["COLUMNS"] = str(MIN_COLUMNS)
     from .console import show_logs
     from .quiet import silence_exit
 
     silence_exit()
-    quiet, verbose = {"-q", "--quiet"} & set(words), "--verbose" in words
+    quiet, verbose = {"-q", "--quiet"} & {*argv}, "--verbose" in argv
     show_logs("warning" if quiet else "debug" if verbose else "info")
-    words = [word for word in words if word not in ("-q", "--quiet", "--verbose")]
+    words = [word for word in argv if word not in ("-q", "--quiet", "--verbose", "--debug")]
     if not words or words[0] in ("-h", "--help"):
         print(_help())
         return
@@ -113,13 +157,16 @@ def _run(words: list[str]) -> None:
         print(f"{PROGRAM} {__version__}")
         return
     run, options = parse_command(words)
-    if words[0] not in _LIGHT:
+    if words[0] not in _WITHOUT_TORCH:
         _check_address_space()
-    run(options)
+    if "argv" in inspect.signature(run).parameters:
+        run(options, argv=argv)
+    else:
+        run(options)
 
 
 def _check_address_space() -> None:
-    """Where libraries may not reserve what they ask for, they crash, or end the process with words of their own."""
+    """Raise SehdrError under a low `ulimit -v`, where native libraries would crash with confusing messages."""
     try:
         import resource
     except ImportError:
@@ -127,36 +174,20 @@ def _check_address_space() -> None:
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit == resource.RLIM_INFINITY:
         return
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # It reserves for each.
-    if limit < _LEAST_ADDRESS_SPACE:
-        told = f"{limit >> 20} MiB of address space, and {_LEAST_ADDRESS_SPACE >> 20} are the least"
-        raise SehdrError(f"out of memory: this process is limited to {told}; raise the limit (ulimit -v)")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # OpenBLAS reserves address space for each thread.
+    if limit < _MIN_ADDRESS_SPACE:
+        limits = f"{limit >> 20} MiB of address space, but needs at least {_MIN_ADDRESS_SPACE >> 20}"
+        raise SehdrError(f"out of memory: this process is limited to {limits}; raise the limit (ulimit -v)")
 
 
-def parse_command(words: list[str]) -> tuple[Callable, object]:
-    """The function that runs a command, and its options; raises UsageError, and SystemExit after --help."""
-    from .arguments import parse
-
-    name, *rest = words
-    if name == "bench":
-        program = " ".join(["python -m benchmarks", *rest])
-        raise UsageError(f"bench is not part of the installed program; in a checkout, run {program}")
-    if name in _RENAMED:
-        raise UsageError(f"no command {name}: {_RENAMED[name]}")
-    if name not in _MODULES:
-        raise UsageError(f"no command {name}{did_you_mean(name, _MODULES)}; {PROGRAM} --help lists them")
-    options, run = _load(name)
-    return run, parse(options, rest, f"{PROGRAM} {name}")
-
-
-def _load(name: str):
-    module, options, run = _MODULES[name]
-    found = import_module(f".{module}", __package__)
-    return getattr(found, options), getattr(found, run)
+def _load(command: Command) -> tuple[type, Callable]:
+    """Import a command's dataclass of options and its function."""
+    module = import_module(f".{command.module}", __package__)
+    return getattr(module, command.options), getattr(module, command.run)
 
 
 def _help() -> str:
-    """The commands under their headings, each with the first sentence of its help."""
+    """Return the commands under their headings, each with its summary."""
     import textwrap
 
     width = min(shutil.get_terminal_size().columns, 100)
@@ -164,29 +195,31 @@ def _help() -> str:
     for heading, group in COMMANDS.items():
         lines.append(f"{heading}:")
         for name, command in group.items():
-            told = _summary(*command[:2])
-            lines += textwrap.wrap(told, width, initial_indent=f"  {name:<12}", subsequent_indent=" " * 14)
+            summary = _summary(command)
+            lines += textwrap.wrap(summary, width, initial_indent=f"  {name:<12}", subsequent_indent=" " * 14)
         lines.append("")
     return (
         "\n".join(lines)
         + f"""
 First try:  {PROGRAM} train embedded --out runs/first
-{PROGRAM} COMMAND --help explains it. Every command takes -q (quiet),
---verbose, and --debug (where an error comes from). --version prints it."""
+{PROGRAM} COMMAND --help explains a command. Every command takes -q (quiet),
+--verbose, and --debug (where an error comes from). --version prints the version."""
     )
 
 
-def _summary(module: str, options: str) -> str:
-    """The first sentence of a command's help, read from the source: importing every room takes seconds."""
+def _summary(command: Command) -> str:
+    """Return the first sentence of a command's help, read from its source because importing all rooms takes seconds."""
     import ast
     from pathlib import Path
 
-    source = Path(__file__).parent.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8")
-    defined = next(node for node in ast.parse(source).body if isinstance(node, ast.ClassDef) and node.name == options)
-    return " ".join((ast.get_docstring(defined) or "").split()).partition(". ")[0].removesuffix(".")
+    path = Path(__file__).parent.joinpath(*command.module.split(".")).with_suffix(".py")
+    classes = (node for node in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(node, ast.ClassDef))
+    docstring = next(ast.get_docstring(node) for node in classes if node.name == command.options)
+    return " ".join((docstring or "").split()).partition(". ")[0].removesuffix(".")
 
 
-def _tell(line: str) -> None:
+def _print_error(line: str) -> None:
+    """Print a line on standard error, or nothing if nobody reads it."""
     try:
         print(line, file=sys.stderr, flush=True)
     except BrokenPipeError:

@@ -1,4 +1,4 @@
-"""The command line of `sehdr-warp completion`: what a shell needs to complete commands and flags."""
+"""The command line of `sehdr-warp completion`: a script with which a shell completes commands and flags."""
 
 import os
 from contextlib import suppress
@@ -10,10 +10,14 @@ import tyro
 
 from .arguments import MARKERS
 
+_SHELLS = ("bash", "zsh", "fish", "tcsh")
+_COMMON_FLAGS = {"quiet": ["-q"], "verbose": None, "debug": None}
+"""Flags that every command takes, with their short forms; cli.py reads them before the command does."""
+
 
 @dataclass(frozen=True)
 class Completion:
-    """Print a script by which a shell completes commands and flags.
+    """Print a script with which a shell completes commands and flags.
 
     bash: sehdr-warp completion bash > ~/.local/share/bash-completion/completions/sehdr-warp
 
@@ -26,18 +30,20 @@ class Completion:
     """Which shell; by default the one of $SHELL."""
 
 
-def run_completion(asked: Completion) -> None:
+def run_completion(options: Completion) -> None:
+    """Print the script."""
     from .cli import PROGRAM, command_options
 
-    own = Path(os.environ.get("SHELL", "bash")).name
-    shell = asked.shell or (own if own in ("bash", "zsh", "fish", "tcsh") else "bash")
-    # What every command takes; cli.py reads these flags before a command does.
-    short = {"quiet": ["-q"], "verbose": None, "debug": None}
-    common = [(name, Annotated[bool, tyro.conf.arg(aliases=of)], field(default=False)) for name, of in short.items()]
+    login_shell = Path(os.environ.get("SHELL", "bash")).name
+    shell = options.shell or (login_shell if login_shell in _SHELLS else "bash")
+    common = [
+        (name, Annotated[bool, tyro.conf.arg(aliases=aliases)], field(default=False))
+        for name, aliases in _COMMON_FLAGS.items()
+    ]
     commands = {}
-    for name, options in command_options().items():
-        commands[name] = make_dataclass(options.__name__, common, bases=(options,), frozen=True, kw_only=True)
-        commands[name].__doc__ = options.__doc__
-    asked_for = ["--tyro-write-completion", shell, "-"]
+    for name, command in command_options().items():
+        commands[name] = make_dataclass(command.__name__, common, bases=(command,), frozen=True, kw_only=True)
+        commands[name].__doc__ = command.__doc__
+    words = ["--tyro-write-completion", shell, "-"]
     with suppress(SystemExit):
-        tyro.extras.subcommand_cli_from_dict(commands, prog=PROGRAM, args=asked_for, config=MARKERS)
+        tyro.extras.subcommand_cli_from_dict(commands, prog=PROGRAM, args=words, config=MARKERS)

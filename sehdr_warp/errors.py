@@ -1,10 +1,13 @@
-"""The errors a user can act on, and the nearest right word for a wrong one."""
+"""The errors a user can act on, and suggestions for mistyped words."""
 
 import difflib
 import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
+
+MAX_MESSAGE_PART = 400
+"""Characters of a path and of a problem that a message shows; both may come from a damaged file."""
 
 
 class SehdrError(Exception):
@@ -15,56 +18,62 @@ class SehdrError(Exception):
 
 
 class UsageError(SehdrError):
-    """A command line that cannot be read: a wrong command, flag or value. Exits with status 2."""
-
-
-LONGEST_PART = 400
-"""Characters of a path and of a problem that a message tells."""
+    """A command line that cannot be read: a wrong command, flag or value. The exit status is 2."""
 
 
 class InputError(SehdrError):
-    """A file or a value that was handed in cannot be used.
+    """A file or a value that cannot be used.
 
     The message reads `<path>: <problem>; <remedy>`, on one line.
+
+    Attributes:
+        path: the file, folder, flag or value.
+        problem: what is wrong with it.
     """
 
     def __init__(self, path: Path | str, problem: str, remedy: str):
+        """Compose the message; remedy says what to do."""
         self.path, self.problem = str(path), problem
-        # A problem may quote a file, which may hold anything; names of files may come from files as well.
-        place, problem = (
-            text if len(text) <= LONGEST_PART else text[:LONGEST_PART] + " ..." for text in (str(path), problem)
-        )
-        super().__init__(" ".join(f"{place}: {problem}; {remedy}".split()))
+        parts = [_shorten(self.path), _shorten(problem)]
+        super().__init__(" ".join(f"{parts[0]}: {parts[1]}; {remedy}".split()))
+
+
+def _shorten(text: str) -> str:
+    return text if len(text) <= MAX_MESSAGE_PART else text[:MAX_MESSAGE_PART] + " ..."
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """The known word that a mistyped one most likely stands for; None if none is near."""
-    found = difflib.get_close_matches(word.lower(), sorted(known), 1)
-    return found[0] if found else None
+    """Return the known word that a mistyped one most likely stands for, or None if none is similar."""
+    matches = difflib.get_close_matches(word.lower(), sorted(known), 1)
+    return matches[0] if matches else None
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """`, did you mean X?` for the nearest known word, or nothing: to be put behind a message."""
-    near = nearest(word, known)
-    return f", did you mean {near}?" if near else ""
+    """Return `, did you mean X?` for the most similar known word, or "" if none is similar."""
+    suggestion = nearest(word, known)
+    return f", did you mean {suggestion}?" if suggestion else ""
 
 
-_NO_MEMORY = re.compile(r"allocate memory|[Ff]ailed to allocate|bad_alloc|out of memory|map segment|start new thread")
+_OUT_OF_MEMORY = re.compile(
+    r"allocate memory|[Ff]ailed to allocate|bad_alloc|out of memory|map segment|start new thread"
+)
 
 
-def surroundings_told(error: Exception) -> SehdrError | None:
-    """What went wrong around the program, as an error of one line: a path that the system refuses, a name that is no
-    text, no memory. None for what is a defect."""
+def as_user_error(error: Exception) -> SehdrError | None:
+    """Return an exception as an error of one line if its cause is outside the program, else None.
+
+    Such causes are a path that the system refuses, a file name that is not text, and exhausted memory.
+    """
     if isinstance(error, SehdrError):
         return error
-    said = f"{error} {error.__cause__ or error.__context__ or ''}"
-    short = isinstance(error, RuntimeError | ImportError | OSError) and _NO_MEMORY.search(said)
-    if short or isinstance(error, MemoryError):
-        told = (str(error).splitlines() or ["no more"])[0]
-        return SehdrError(f"out of memory ({told}); use smaller photos (--max-size) or a larger machine")
+    text = f"{error} {error.__cause__ or error.__context__ or ''}"
+    out_of_memory = isinstance(error, RuntimeError | ImportError | OSError) and _OUT_OF_MEMORY.search(text)
+    if out_of_memory or isinstance(error, MemoryError):
+        reason = (str(error).splitlines() or ["no more"])[0]
+        return SehdrError(f"out of memory ({reason}); use smaller photos (--max-size) or a larger machine")
     if isinstance(error, OSError) and error.strerror:
-        place = error.filename if isinstance(error.filename, str | bytes) else "a file"
-        return InputError(os.fsdecode(place), f"cannot be used ({error.strerror})", "check the path and its rights")
+        path = error.filename if isinstance(error.filename, str | bytes) else "a file"
+        return InputError(os.fsdecode(path), f"cannot be used ({error.strerror})", "check the path and its permissions")
     if isinstance(error, UnicodeEncodeError):
         return InputError(ascii(error.object), "is a name that is not UTF-8 text", "rename it")
     return None

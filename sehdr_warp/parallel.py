@@ -1,4 +1,4 @@
-"""How many threads there are, and work that they do ahead of whoever takes it."""
+"""The number of threads, and results that threads compute ahead."""
 
 import os
 from collections import deque
@@ -7,30 +7,37 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 Item = TypeVar("Item")
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 
 
 def thread_count() -> int:
-    """Threads used on the CPU: SEHDR_THREADS if set, else the processors this process may run on."""
+    """Return the threads to use on the CPU: SEHDR_THREADS if set, else the processors this process may run on."""
     requested = os.environ.get("SEHDR_THREADS", "")
     if requested.isdigit() and int(requested) > 0:
         return int(requested)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
-def made_ahead(make: Callable[[Item], Made], items: Iterable[Item], most: int) -> Iterator[Made]:
-    """make(item) of each item in their order, up to `most` of them at work or waiting to be taken. For what leaves the
-    interpreter's lock, as decoding does. An exception comes where its item's turn is."""
-    most = min(most, thread_count())
-    if most < 2:
-        yield from map(make, items)
+def prefetch_map(function: Callable[[Item], Result], items: Iterable[Item], ahead: int) -> Iterator[Result]:
+    """Yield function(item) for each item in order, computed ahead on threads.
+
+    It is of use if the function releases the interpreter's lock, as decoding of images does.
+
+    Args:
+        function: what is computed. Its exception is raised when the item's result is due.
+        items: the items.
+        ahead: results that are computed or wait to be taken, at most.
+    """
+    ahead = min(ahead, thread_count())
+    if ahead < 2:
+        yield from map(function, items)
         return
-    with ThreadPoolExecutor(most, thread_name_prefix="sehdr-warp reads") as pool:
+    with ThreadPoolExecutor(ahead, thread_name_prefix="sehdr-warp reads") as pool:
         waiting: deque = deque()
         try:
             for item in items:
-                waiting.append(pool.submit(make, item))
-                if len(waiting) >= most:
+                waiting.append(pool.submit(function, item))
+                if len(waiting) >= ahead:
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()

@@ -93,7 +93,7 @@ def test_help_is_quick_and_needs_no_torch(words, most):
     pytest.fail(f"{seconds} s")
 
 
-@pytest.mark.parametrize("line", ["report run --out", "score pictures --truth embedded --json"])
+@pytest.mark.parametrize("line", ["report run --out", "eval pictures --truth embedded --json"])
 def test_what_cannot_be_written_is_said_before_the_work(line, tmp_path, capsys):
     (tmp_path / "file").touch()
     assert call(*line.split(), str(tmp_path / "file" / "out")) == 1
@@ -108,14 +108,14 @@ def test_what_cannot_be_written_is_said_before_the_work(line, tmp_path, capsys):
         ("--out x", "no command --out"),
         ("train", "train needs --out"),
         ("train --out y", "train needs SCENE"),
-        ("train x y --out z", "y: more than is asked for"),
+        ("train x y --out z", "y: unexpected argument"),
         ("train x --out", "--out needs a value"),
         ("eval --run x", "eval takes RUN without --run"),
         ("convert x --out y", "convert takes OUT without --out"),
         ("train x --otu y", "train has no --otu, did you mean --out?"),
         ("train x --los.clipping false", "did you mean --loss.clipping?"),
         ("train x --clipping=false", "did you mean --loss.clipping?"),
-        ("train x --out y --seed one", "--seed one: is no INT"),
+        ("train x --out y --seed one", "--seed one: not a whole number"),
         ("train x --out y --plan", "--plan is gone: it is the default"),
         ("train x --out y --set loss.clipping=false", "--set is gone: every field is a flag"),
         ("train x --out y --loss.knee 3", "--loss.knee is gone: it always is"),
@@ -123,9 +123,12 @@ def test_what_cannot_be_written_is_said_before_the_work(line, tmp_path, capsys):
         ("train x --out y --loss.predictor net.pt", "--loss.predictor is gone: it gained nothing"),
         ("train x --out y --response.form mlp", 'write response.name = "learned"'),
         ("render x", "render needs --out, a folder"),
-        ("render x --out y --pixel byte", "--pixel byte: is none of 'float', 'half'"),
-        ("bench step", "bench is not part of the installed program; in a checkout, run python -m benchmarks step"),
-        ("completion tsch", "shell tsch: is none of 'bash', 'fish', 'tcsh', 'zsh'"),
+        ("render x --out y --pixel byte", "--pixel byte: not one of 'float', 'half'"),
+        ("bench step", "no command bench: it left the installed program; in a checkout, run python -m benchmarks"),
+        ("score x --truth y", "no command score: the command is sehdr-warp eval FOLDER --truth SET"),
+        ("eval x --max-size 9", "--max-size needs --truth"),
+        ("eval x --truth y --data z", "--data belongs to runs"),
+        ("completion tsch", "shell tsch: not one of 'bash', 'fish', 'tcsh', 'zsh'"),
     ],
 )
 def test_wrong_usage_is_one_line_with_the_nearest_right_word(line, told, capsys):
@@ -341,8 +344,8 @@ def test_score_parts_photos_into_the_regions_of_eval(run, tmp_path, capsys):
     shutil.copytree(outside, inside)
     capsys.readouterr()
     wanted, options = shares("eval", run, "--device", "cpu"), ("--truth", "embedded", "--max-size", 48)
-    assert wanted == shares("score", inside / "hdr", *options) == shares("score", outside / "hdr", *options)
-    assert wanted != shares("score", inside / "hdr", *options, "--response", "srgb")
+    assert wanted == shares("eval", inside / "hdr", *options) == shares("eval", outside / "hdr", *options)
+    assert wanted != shares("eval", inside / "hdr", *options, "--response", "srgb")
     assert enclosing_run_response(outside / "hdr") is None
     assert getattr(enclosing_run_response(inside / "hdr"), "name", None) == "hdr-nerf"
 

@@ -4,11 +4,11 @@ import threading
 
 import pytest
 
-from sehdr_warp.parallel import made_ahead, thread_count
+from sehdr_warp.parallel import prefetch_map, thread_count
 
 
 @pytest.mark.parametrize("threads", ["1", "3"])
-def test_order_is_kept_and_no_more_than_so_many_are_made_ahead(monkeypatch, threads):
+def test_order_is_kept_and_at_most_ahead_are_computed(monkeypatch, threads):
     monkeypatch.setenv("SEHDR_THREADS", threads)
     assert thread_count() == int(threads)
     begun, first_may_end = [], threading.Event()
@@ -21,7 +21,7 @@ def test_order_is_kept_and_no_more_than_so_many_are_made_ahead(monkeypatch, thre
             first_may_end.set()
         return item * item
 
-    made = made_ahead(make, range(8), 3)
+    made = prefetch_map(make, range(8), 3)
     assert next(made) == 0
     assert len(begun) <= int(threads)
     assert list(made) == [item * item for item in range(1, 8)]
@@ -29,7 +29,7 @@ def test_order_is_kept_and_no_more_than_so_many_are_made_ahead(monkeypatch, thre
 
 def test_an_exception_comes_where_its_turn_is(monkeypatch):
     monkeypatch.setenv("SEHDR_THREADS", "4")
-    made = made_ahead(lambda item: 1 / item, [1, 2, 0, 4], 4)
+    made = prefetch_map(lambda item: 1 / item, [1, 2, 0, 4], 4)
     assert [next(made), next(made)] == [1, 0.5]
     with pytest.raises(ZeroDivisionError):
         next(made)

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from sehdr_warp import process
-from sehdr_warp.errors import SehdrError, UsageError, surroundings_told
+from sehdr_warp.errors import SehdrError, UsageError, as_user_error
 from sehdr_warp.process import _Stream, collect_late
 from sehdr_warp.training.machine import interruptible
 
@@ -122,7 +122,7 @@ def test_the_first_signal_waits_for_the_end_of_the_block_and_the_second_does_not
     ],
 )
 def test_what_the_surroundings_refuse_is_one_line(error, told):
-    found = surroundings_told(error)
+    found = as_user_error(error)
     assert found is None if told is None else str(found).startswith(told)
 
 

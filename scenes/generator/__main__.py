@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from sehdr_warp.arguments import numbers, parse
+from sehdr_warp.arguments import parse, parse_numbers
 from sehdr_warp.errors import SehdrError
 
 from .light import render_light
@@ -102,7 +102,7 @@ def render(asked: Render) -> None:
     width, _, height = asked.size.partition("x")
     if not (width.isdecimal() and height.isdecimal()):
         raise SehdrError(f"--size {asked.size}: is not WIDTHxHEIGHT in pixels; write for example --size 200x200")
-    views = None if asked.views is None else numbers("--views", asked.views, int)
+    views = None if asked.views is None else parse_numbers("--views", asked.views, int)
     settings = Settings(int(width), int(height), asked.samples, asked.seed, views, asked.denoise)
     mi = load_mitsuba(asked.variant)
     LOG.info("Mitsuba %s, %s", mi.__version__, mi.variant())

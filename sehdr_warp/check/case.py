@@ -1,9 +1,9 @@
-"""A case of the catalogue, what it measures, and how an error bound is derived.
+"""A case, what it measures, and how the bound of its error is derived.
 
-Bounds come from Monte Carlo arithmetic (Parker 1997; Vignes' CESTAC before): the float64 truth is computed again with
+Bounds come from Monte Carlo arithmetic (Parker 1997; earlier Vignes' CESTAC). The float64 truth is computed again with
 every number at the interfaces of the stages disturbed at random by ROUNDINGS units of float32's rounding, forwards and
-backwards. How far that moves the result is what float32 may cost here, whatever the order of the operations; a kernel
-passes if its error stays within it. Nothing of the kernel's own result enters its bound.
+backwards. The change of the result is the error that float32 may cause in any order of operations. A kernel passes if
+its error stays below it. The kernel's own result does not enter the bound.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -14,15 +14,18 @@ import torch
 from torch import Tensor
 
 UNIT = 2.0**-24
+"""float32's unit of rounding."""
 TINY = torch.finfo(torch.float32).tiny
-"""float32's unit of rounding, and its smallest normal number."""
-ROUNDINGS = 8  # Between two interfaces: project(), the longest chain, has about 40 in a row, which partly cancel
-DRAWS = 4  # The bound is twice the largest effect of so many disturbances, plus ROUNDINGS units of the result itself
+"""float32's smallest normal number."""
+ROUNDINGS = 8
+"""Units of rounding between two interfaces. project(), the longest chain, has about 40, which partly cancel."""
+DRAWS = 4
+"""Random disturbances. The bound is twice their largest effect, plus ROUNDINGS units of the result itself."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """One measured quantity. error and bound in one unit, relative to the truth's norm where not said otherwise."""
+    """One measured quantity; error and bound are relative to the truth's norm unless the quantity names a unit."""
 
     quantity: str
     error: float
@@ -30,7 +33,8 @@ class Reading:
 
     @property
     def holds(self) -> bool:
-        return self.error <= self.bound  # as NaN is not
+        """Return whether the error stays within the bound; NaN does not."""
+        return self.error <= self.bound
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ class Case:
 
 
 def _disturbed(values: Tensor, generator: torch.Generator) -> Tensor:
-    """x (1 + r) forwards and g (1 + r') backwards, r uniform within ROUNDINGS units."""
+    """Return x (1 + r), whose gradient is g (1 + r'), with r uniform within ROUNDINGS units."""
 
     def factor(of: Tensor) -> Tensor:
         noise = torch.rand(of.shape, generator=generator, dtype=torch.float64)
@@ -68,22 +72,30 @@ def _disturbed(values: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def as_float32(tensors: Iterable[Tensor]) -> list[Tensor]:
-    """float64 tensors of numbers that float32 holds exactly: both precisions then get the same problem."""
+    """Round to numbers that float32 holds exactly, as float64, so that both precisions get the same problem."""
     return [tensor.float().double() for tensor in tensors]
 
 
-def _results(function, tensors: list[Tensor], wanted: dict[str, int]) -> dict[str, Tensor]:
-    """The results of function(*tensors) by name, then the gradients by the wanted tensors (by name, with their place)
-    of the results' sum with fixed weights in [0.5, 1.5]; all float64 on the CPU."""
-    leaves = [t.detach().clone().requires_grad_(i in wanted.values()) for i, t in enumerate(tensors)]
+def _results(function: Callable, tensors: list[Tensor], gradients: dict[str, int]) -> dict[str, Tensor]:
+    """Return the results of function(*tensors) by name, and gradients of their weighted sum as "d/d NAME".
+
+    Args:
+        function: takes the tensors, returns tensors by name.
+        tensors: the arguments.
+        gradients: names and places of the arguments to differentiate by. Weights are fixed, in [0.5, 1.5].
+
+    Returns:
+        float64 tensors on the CPU.
+    """
+    leaves = [t.detach().clone().requires_grad_(i in gradients.values()) for i, t in enumerate(tensors)]
     outputs = function(*leaves)
-    if wanted:
+    if gradients:
         total = torch.zeros(())
         for seed, out in enumerate(outputs.values(), 7):
             weights = torch.rand(out.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
             total = total + (out * (0.5 + weights).to(out)).sum()
         total.backward()
-    for name, place in wanted.items():
+    for name, place in gradients.items():
         gradient = leaves[place].grad
         outputs = outputs | {f"d/d {name}": torch.zeros_like(leaves[place]) if gradient is None else gradient}
     return {name: value.detach().double().cpu() for name, value in outputs.items()}
@@ -101,14 +113,23 @@ def compare(
     extra: float = 0.0,
     label: str = "{}",
 ) -> list[Reading]:
-    """Readings of function in float32 on the device against truth in float64.
+    """Compare a function in float32 on the device with its truth in float64.
 
-    function(*tensors) -> dict of results by name. tensors: float64 values by name. gradients: names by which the
-    derivative is compared too. truth(disturb, *tensors) -> the same, which passes what crosses a stage's border through
-    disturb; by default the function itself, disturbed in its arguments alone. elementwise: the largest relative error
-    of any number, rather than the relative error of the whole in norm. floor: numbers below it are compared absolutely,
-    in units of it. extra: added to every bound, for what the kernel's arithmetic costs beside disturbed interfaces; the
-    case says why. label: what becomes of a quantity's name.
+    Args:
+        function: takes the tensors, returns results by name.
+        tensors: float64 values by name.
+        device: where float32 is computed.
+        truth: takes `disturb` and the tensors, returns the same results; it passes what crosses a stage's border
+            through disturb. By default the function itself, disturbed in its arguments alone.
+        gradients: names of the tensors whose gradients are compared too.
+        elementwise: measure the largest relative error of a number, rather than the relative error of the whole in
+            norm.
+        floor: numbers below it are compared absolutely, in units of it.
+        extra: added to every bound, for errors that disturbed interfaces do not cover; the case says why.
+        label: format of a quantity's name.
+
+    Returns:
+        A reading for each result and gradient.
     """
 
     def error(value: Tensor, exact: Tensor) -> float:
@@ -119,12 +140,12 @@ def compare(
     def run(draw: int) -> dict[str, Tensor]:
         generator = torch.Generator().manual_seed(draw)
         disturb = partial(_disturbed, generator=generator) if draw else lambda x: x
-        return _results(lambda *t: by_stages(disturb, *map(disturb, t)), values, wanted)
+        return _results(lambda *t: by_stages(disturb, *map(disturb, t)), values, places)
 
     by_stages = truth or (lambda _, *t: function(*t))
     names, values = list(tensors), as_float32(tensors.values())
-    wanted = {name: names.index(name) for name in gradients}
-    ours = _results(function, [v.to(device, torch.float32) for v in values], wanted)
+    places = {name: names.index(name) for name in gradients}
+    ours = _results(function, [v.to(device, torch.float32) for v in values], places)
     exact, *disturbed = map(run, range(DRAWS + 1))
     readings = []
     for name, value in exact.items():
@@ -134,10 +155,10 @@ def compare(
 
 
 def count(quantity: str, wrong: int | Tensor) -> Reading:
-    """A reading that counts what must not be."""
+    """Return a reading of a count that must be zero."""
     return Reading(quantity, float(wrong), 0.0)
 
 
 def not_finite(*tensors: Tensor | None) -> int:
-    """How many numbers of the tensors that there are are NaN or infinite."""
+    """Return how many numbers are NaN or infinite; None counts as no numbers."""
     return sum(int((~torch.isfinite(t.detach())).sum()) for t in tensors if t is not None)

@@ -18,7 +18,7 @@ class Check:
     overwrite: bool = False
     """Replace the file of --json."""
 
-    gone: ClassVar[dict[str, str]] = {
+    removed_flags: ClassVar[dict[str, str]] = {
         "--quick": "every check is quick now",
         "--cases": "in a checkout, python -m benchmarks stability --cases chooses among more cases",
     }

@@ -20,23 +20,37 @@ POISON = (math.nan, math.inf, -math.inf, 3e38, -3e38, 1e-40)
 
 
 class Splats:
-    """Arguments of rasterize() in float64, by its names, to be changed by a case, and how they are compared.
+    """Arguments of rasterize() in float64, which a case may change.
 
-    scales: of every Gaussian. radiance: from 10^low to 10^high in an order by chance. ties: depths are equal, and their
-    order is by index: they are not disturbed. label, extra: as compare() takes them.
+    Attributes:
+        ties: depths are equal and ordered by index, so they are not disturbed.
+        extra: as of compare().
+        label: as of compare().
+        options: further arguments of the rasterizer.
     """
 
     ties, extra = False, 0.0
 
     def __init__(self, count=40, width=40, height=30, *, spread=2.0, scales=None, radiance=None, label="{}"):
-        given: dict[str, Any] = {"generator": torch.Generator().manual_seed(0), "dtype": torch.float64}
+        """Place random Gaussians before a camera.
+
+        Args:
+            count: number of Gaussians.
+            width: of the image, pixels.
+            height: of the image, pixels.
+            spread: extent of the means in x and y.
+            scales: standard deviations of every Gaussian, instead of random ones.
+            radiance: low and high; radiance from 10^low to 10^high in a random order.
+            label: as of compare().
+        """
+        random: dict[str, Any] = {"generator": torch.Generator().manual_seed(0), "dtype": torch.float64}
         self.width, self.height, self.label = width, height, label
-        self.means = (torch.rand(count, 3, **given) - 0.5) * torch.tensor([spread, spread, 2.0])
+        self.means = (torch.rand(count, 3, **random) - 0.5) * torch.tensor([spread, spread, 2.0])
         self.means[:, 2] += 3
-        self.log_scales = torch.log(0.05 + 0.25 * torch.rand(count, 3, **given))
-        self.quaternions = torch.randn(count, 4, **given)
-        self.opacities = 0.05 + 0.9 * torch.rand(count, **given)
-        self.features = torch.exp(torch.randn(count, 3, **given))
+        self.log_scales = torch.log(0.05 + 0.25 * torch.rand(count, 3, **random))
+        self.quaternions = torch.randn(count, 4, **random)
+        self.opacities = 0.05 + 0.9 * torch.rand(count, **random)
+        self.features = torch.exp(torch.randn(count, 3, **random))
         self.world_to_camera = torch.eye(4, dtype=torch.float64)
         focal = 0.9 * max(width, height)
         self.intrinsics = torch.tensor([focal, focal, width / 2 + 0.3, height / 2 - 0.2], dtype=torch.float64)
@@ -55,25 +69,28 @@ class Splats:
 
     @property
     def tensors(self) -> dict[str, Tensor]:
+        """Return the tensor arguments by name."""
         return {name: getattr(self, name) for name in NAMES}
 
     def float32(self, device) -> list[Tensor]:
+        """Return the tensor arguments in float32 on a device."""
         return [tensor.to(device, torch.float32) for tensor in self.tensors.values()]
 
-    def draw(self, *tensors: Tensor):
+    def render(self, *tensors: Tensor):
+        """Rasterize tensor arguments at the size of the image."""
         return rasterize(*tensors, width=self.width, height=self.height)
 
 
 def compare_splats(splats: Splats, device: torch.device) -> list[Reading]:
-    """Image, alpha and gradients of rasterize() against the float64 reference."""
-    size, given = {"width": splats.width, "height": splats.height}, splats.options
+    """Compare image, alpha and gradients of rasterize() with the float64 reference."""
+    size, settings = {"width": splats.width, "height": splats.height}, splats.options
 
     def ours(*tensors):
-        rendering = rasterize(*tensors, **size, **given)
+        rendering = rasterize(*tensors, **size, **settings)
         return {"image": rendering.image, "alpha": rendering.alpha}
 
     def project(means, log_scales, quaternions, opacities, features, pose, intrinsics):
-        return project_reference(means, log_scales, quaternions, opacities, pose, intrinsics, **size, **given)
+        return project_reference(means, log_scales, quaternions, opacities, pose, intrinsics, **size, **settings)
 
     exact_depths = project(*as_float32(splats.tensors.values()))[2]
 
@@ -81,7 +98,7 @@ def compare_splats(splats: Splats, device: torch.device) -> list[Reading]:
         means2d, conics, depths, opacities2d, extents = project(*tensors)
         depths = exact_depths if splats.ties else disturb(depths.detach())
         crossing = disturb(means2d), disturb(conics), disturb(opacities2d), tensors[4], depths, extents
-        image, transmittance = blend_reference(*crossing, **size, alpha_threshold=given["alpha_threshold"])
+        image, transmittance = blend_reference(*crossing, **size, alpha_threshold=settings["alpha_threshold"])
         return {"image": image, "alpha": 1.0 - transmittance}
 
     options = {"gradients": NAMES[:5], "label": splats.label, "extra": splats.extra}
@@ -89,22 +106,23 @@ def compare_splats(splats: Splats, device: torch.device) -> list[Reading]:
 
 
 def compared(make: Callable[[], Splats | Iterable[Splats]]) -> Callable[[torch.device], Iterator[Reading]]:
-    """The measure of a case that compares what a function makes."""
+    """Return a measure that compares the splats, one or several, that a function makes."""
 
     def measure(device):
-        for splats in (made,) if isinstance(made := make(), Splats) else made:
+        group = make()
+        for splats in (group,) if isinstance(group, Splats) else group:
             yield from compare_splats(splats, device)
 
     return measure
 
 
 def overlap(number: int, opacity: float, threshold: float) -> Splats:
-    """Gaussians one behind the other in one tile."""
+    """Place Gaussians one behind the other in one tile."""
     splats = Splats(number, width=4, height=4, spread=0.2, scales=(0.3, 0.5, 0.7))
     splats.opacities[:] = opacity
     splats.means[:, 2] = torch.linspace(2.0, 6.0, number, dtype=torch.float64)
     splats.options["alpha_threshold"] = threshold
-    # Each rounds the pixel's transmittance once, a random walk of as many steps as are counted.
+    # Each counted Gaussian rounds the pixel's transmittance once: a random walk.
     steps = min(number, math.log(1 / TRANSMITTANCE_MIN) / opacity)
     splats.ties, splats.extra = True, ROUNDINGS * UNIT * math.sqrt(steps)
     return splats
@@ -120,8 +138,8 @@ def _mixed_scales() -> Splats:
 
 def _near_threshold() -> Splats:
     splats, step = Splats(12), ALPHA_THRESHOLD
-    given = [0.0, 0.5 * step, step * (1 - 1e-6), step, step * (1 + 1e-3), 0.5, 0.998, 0.999, 0.9995, 1.0, 1.0, 0.1]
-    splats.opacities[:] = torch.tensor(given, dtype=torch.float64)
+    opacities = [0.0, 0.5 * step, step * (1 - 1e-6), step, step * (1 + 1e-3), 0.5, 0.998, 0.999, 0.9995, 1.0, 1.0, 0.1]
+    splats.opacities[:] = torch.tensor(opacities, dtype=torch.float64)
     return splats
 
 
@@ -133,7 +151,7 @@ def _far_away() -> Splats:
 
 
 def _light_behind() -> Iterator[Splats]:
-    """Dim Gaussians, whose own gradients are to stay, before a bright one; and before one as dim."""
+    """Place dim Gaussians, whose gradients must survive, before a bright one, and before a dim one."""
     for radiance, label in ((1e8, "{}"), (1e-8, "{}, dim alone")):
         splats = Splats(30, spread=0.8, label=label)
         splats.opacities *= 0.4
@@ -153,7 +171,7 @@ def _on_borders() -> Splats:
 
 
 def _near_plane(device):
-    """What is behind the near plane is culled exactly."""
+    """Compare Gaussians around the near plane, and count those behind it that are drawn."""
     splats = Splats(16, spread=0.001)
     near = torch.tensor(NEAR_PLANE, dtype=torch.float32).item()
     # Float32's own roundings of a depth are 1e-9 here: nearer than 1e-6 there is no telling before from behind.
@@ -165,42 +183,42 @@ def _near_plane(device):
     yield from compare_splats(splats, device)
     splats.means[0, 2] = near
     behind = splats.means[:, 2].float() <= near
-    yield count("drawn behind the near plane", (splats.draw(*splats.float32(device)).visible.cpu() & behind).sum())
+    yield count("drawn behind the near plane", (splats.render(*splats.float32(device)).visible.cpu() & behind).sum())
 
 
 def _equal_depths(device):
-    """Their order is that of their indices, on every device and in every run."""
+    """Compare Gaussians at one depth, which are ordered by index on every device and in every run."""
     splats = Splats(60)
     splats.means[:, 2] = 3.0
     splats.ties = True
     yield from compare_splats(splats, device)
-    first, again = (splats.draw(*splats.float32(device)).image for _ in range(2))
+    first, again = (splats.render(*splats.float32(device)).image for _ in range(2))
     yield count("numbers that differ between two runs", (first != again).sum())
 
 
 def _quaternions(device):
-    """Lengths from 1e-12 to 1e15 turn as unit ones do; the gradient scales with 1 / length."""
+    """Compare quaternions with lengths from 1e-12 to 1e15, and zero with the identity."""
     splats = Splats(20)
     for length in (1e-12, 1e-6, 1e6, 1e15):
         splats.quaternions *= length / splats.quaternions.norm(dim=1, keepdim=True)
         splats.label = f"{{}} at {length:g}"
         yield from compare_splats(splats, device)
     splats.quaternions[:] = 0.0
-    zero = splats.draw(*splats.float32(device)).image
+    zero = splats.render(*splats.float32(device)).image
     splats.quaternions[:, 0] = 1.0
-    wrong = (zero != splats.draw(*splats.float32(device)).image).sum()
+    wrong = (zero != splats.render(*splats.float32(device)).image).sum()
     yield count("numbers in which zero differs from the identity", wrong)
 
 
 def _far(distance: float, device):
-    """Places in the image, in pixels, of a scene far from the origin before a camera that is turned."""
+    """Compare centers, in pixels, of a scene far from the origin before a rotated camera."""
     splats = Splats(30)
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64))[0]
     turn = turn * torch.linalg.det(turn)
     offset = torch.tensor([distance, -0.7 * distance, 0.4 * distance], dtype=torch.float64)
     splats.means = ((splats.means + offset) @ turn).float().double()
     splats.world_to_camera[:3, :3], splats.world_to_camera[:3, 3] = turn.float().double(), -offset.float().double()
-    rendering = splats.draw(*splats.float32(device))
+    rendering = splats.render(*splats.float32(device))
     exact = as_float32(splats.tensors.values())
     truth = rasterize_reference(*exact, width=splats.width, height=splats.height)
     both = rendering.visible.cpu() & truth.visible
@@ -213,13 +231,14 @@ def _far(distance: float, device):
 
 
 def _harmonics(device):
-    """Degree 3 from all around; and at the very place of the camera, which is finite."""
-    given: dict[str, Any] = {"generator": torch.Generator().manual_seed(3), "dtype": torch.float64}
-    offsets = torch.randn(60, 3, **given) * torch.logspace(-6, 6, 60, dtype=torch.float64)[:, None]
-    coefficients, position = torch.randn(60, 16, 3, **given), torch.zeros(3, dtype=torch.float64)
+    """Compare degree 3 from all directions, and count numbers that are not finite at the camera's own position."""
+    random: dict[str, Any] = {"generator": torch.Generator().manual_seed(3), "dtype": torch.float64}
+    offsets = torch.randn(60, 3, **random) * torch.logspace(-6, 6, 60, dtype=torch.float64)[:, None]
+    coefficients, position = torch.randn(60, 16, 3, **random), torch.zeros(3, dtype=torch.float64)
     tensors = {"coefficients": coefficients, "means": offsets, "camera_position": position}
-    wanted = ("coefficients", "means")
-    yield from compare(lambda *t: {"values": spherical_harmonics(3, *t)}, tensors, device, gradients=wanted)
+    yield from compare(
+        lambda *t: {"values": spherical_harmonics(3, *t)}, tensors, device, gradients=("coefficients", "means")
+    )
     at_camera = [t.to(device, torch.float32).requires_grad_() for t in (coefficients[:1], torch.zeros(1, 3), position)]
     value = spherical_harmonics(3, *at_camera)
     value.sum().backward()
@@ -227,7 +246,7 @@ def _harmonics(device):
 
 
 def _poisoned_gaussians(device):
-    """One poisoned number of one Gaussian at a time: it is drawn rightly or culled, and the others do not notice."""
+    """Poison one number of one Gaussian at a time, and count effects on the others."""
     leaked = gradients = changed = 0
     others = torch.arange(12, device=device) != 5
     for (which, name), value in product(enumerate(NAMES[:5]), POISON):
@@ -237,15 +256,15 @@ def _poisoned_gaussians(device):
         tensors = splats.float32(device)
         tensors[which].view(12, -1)[5, 0] = value
         leaves = [tensor.clone().requires_grad_() for tensor in tensors]
-        rendering = splats.draw(*leaves)
+        rendering = splats.render(*leaves)
         slopes = torch.autograd.grad(rendering.image.sum() + rendering.alpha.sum(), leaves[:5])
         # A feature near float32's limit may overflow in the pixels that show it; nothing else may.
         if not (name == "features" and math.isfinite(value)):
             leaked += not_finite(rendering.image, rendering.alpha)
             gradients += not_finite(*(slope[others] for slope in slopes))
         if not bool(rendering.visible[5]):
-            kept = [tensor[others] for tensor in tensors[:5]]
-            without = splats.draw(*kept, *tensors[5:])
+            remaining = [tensor[others] for tensor in tensors[:5]]
+            without = splats.render(*remaining, *tensors[5:])
             changed += int((without.image != rendering.image).sum())
     yield count("pixels not finite", leaked)
     yield count("gradients of others not finite", gradients)
@@ -253,29 +272,29 @@ def _poisoned_gaussians(device):
 
 
 def _poisoned_camera(device):
-    """A camera that is not finite shows nothing; a huge one shows nothing that is not finite."""
+    """Poison one number of the camera at a time: nothing may be shown if it is not finite, and no NaN in any case."""
     wrong = 0
     for which, value, place in product((5, 6), POISON, range(4)):
         splats = Splats(12, 20, 18)
         tensors = splats.float32(device)
         tensors[which].view(-1)[place] = value
-        rendering = splats.draw(*tensors)
+        rendering = splats.render(*tensors)
         wrong += not_finite(rendering.image, rendering.alpha)
         wrong += 0 if math.isfinite(value) else int(rendering.image.count_nonzero())
     yield count("pixels shown or not finite", wrong)
 
 
 def _poisoned_others(device):
-    """NaN stays with its own row or window."""
+    """Poison one number of harmonics or images, and count effects outside of its row or window."""
     generator = torch.Generator().manual_seed(0)
     coefficients = torch.randn(8, 16, 3, generator=generator).to(device)
     means = torch.randn(8, 3, generator=generator).to(device)
     rows = pixels = 0
     for value in POISON:
         for poisoned in (0, 1):
-            given = [coefficients.clone(), means.clone()]
-            given[poisoned][3].view(-1)[0] = value
-            result = spherical_harmonics(3, *given, camera_position=torch.zeros(3, device=device))
+            arguments = [coefficients.clone(), means.clone()]
+            arguments[poisoned][3].view(-1)[0] = value
+            result = spherical_harmonics(3, *arguments, camera_position=torch.zeros(3, device=device))
             rows += not_finite(torch.cat([result[:3], result[4:]]))
         image = torch.rand(30, 30, 3, generator=generator).to(device)
         spoiled = image.clone()

@@ -1,20 +1,44 @@
-"""The command lines of `sehdr-warp eval`, `compare` and `score`. torch is imported when they run."""
+"""The command lines of `sehdr-warp eval` and `compare`. torch is imported when they run."""
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from tyro.conf import Positional
 
-from ..errors import InputError
+from ..errors import InputError, UsageError
 from ..runs.open import enclosing_run_response, load_run_photos_with_confidence, open_run
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Figures:
+class RunOptions:
+    """For a run."""
+
+    data: str | None = None
+    """The photos, if they have moved since the training."""
+    device: str | None = None
+    """cpu or cuda:N; by default the first GPU if there is one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureOptions:
+    """For a folder of EXR pictures, scene-linear with Rec.709 primaries and named as the views of the set."""
+
+    truth: str | None = None
+    """The set to compare with: a folder with HDR truth, or an embedded scene."""
+    max_size: int | None = None
+    """Longest side of the truth in pixels, if the pictures are smaller than the set's; the truth is reduced."""
+    response: str | None = None
+    """The response by which photos are reduced: a name, a file or auto; by default that of the run around the folder,
+    else auto."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultOptions:
+    """What to write."""
+
     json: Path | None = None
     """Also write the figures to this file; - prints them on standard output in place of the table."""
     lpips: Path | None = None
@@ -22,35 +46,21 @@ class _Figures:
     overwrite: bool = False
     """Replace the file of --json."""
 
-    def tell(self, figures: Callable[[], dict]) -> None:
-        """Computes once it is known that the result can be written; prints and writes it."""
-        from ..files import check_absent, write_json
-        from .table import format_table
-
-        file = self.json if str(self.json) != "-" else None
-        if file is not None:
-            check_absent(file, self.overwrite)
-        result = figures()
-        if file is not None:
-            write_json(file, result, self.overwrite)
-        print(format_table(result) if file == self.json else json.dumps(result))
-
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(_Figures):
-    """Compare a trained scene with its held-out photos and, where there is some, with HDR truth."""
+class Evaluate:
+    """Compare a trained scene, or a folder of EXR pictures, with held-out photos and HDR truth."""
 
-    run: Positional[Path]
-    """Folder of a run."""
-    data: str | None = None
-    """The photos, if they have moved since the training."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
+    folder: Annotated[Positional[Path], tyro.conf.arg(metavar="RUN|PICTURES")]
+    """Folder of a run; or of EXR pictures of any origin, with --truth."""
+    run: RunOptions = RunOptions()
+    pictures: PictureOptions = PictureOptions()
+    result: ResultOptions = ResultOptions()
 
 
 @dataclass(frozen=True)
 class Compare:
-    """Compare trained runs in one table; runs that differ by their seed alone become a mean with its spread."""
+    """Compare trained runs in one table; runs that differ by their seed alone become a mean with its deviation."""
 
     runs: Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN ...", help_behavior_hint="")]
     """Folders of runs."""
@@ -64,64 +74,75 @@ class Compare:
     """Replace files that exist."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Score(_Figures):
-    """Score a folder of EXR pictures of any origin against the HDR truth of a set."""
+def run_evaluate(options: Evaluate) -> None:
+    """Evaluate, print the figures and write them."""
+    from ..files import check_absent, write_json
+    from .table import format_table
 
-    folder: Positional[Path]
-    """EXR files of scene-linear radiance, Rec.709 primaries, named as the set's views."""
-    truth: str
-    """The set: a folder with HDR truth, or an embedded scene."""
-    max_size: int | None = None
-    """Longest side of the truth in pixels, as the pictures have it; larger truth is reduced."""
-    response: str | None = None
-    """The response by which photos are reduced: a name, a file or auto; by default that of the run that FOLDER lies in,
-    else auto."""
+    if options.pictures.truth is None:
+        _refuse_unused(options.pictures, PictureOptions(), "needs --truth, the set to compare pictures with")
+    else:
+        _refuse_unused(options.run, RunOptions(), "belongs to runs; pictures with --truth do not take it")
+    result = options.result
+    file = None if result.json is None or str(result.json) == "-" else result.json
+    if file is not None:
+        check_absent(file, result.overwrite)
+    if options.pictures.truth is None:
+        figures = _evaluate_run(options)
+    else:
+        figures = _evaluate_pictures(options, options.pictures.truth)
+    if file is not None:
+        write_json(file, figures, result.overwrite)
+    print(format_table(figures) if file == result.json else json.dumps(figures))
 
 
-def run_evaluate(asked: Evaluate) -> None:
+def _refuse_unused(group: Any, defaults: Any, problem: str) -> None:
+    """Raise UsageError if an option of a group is set."""
+    for name, value in vars(group).items():
+        if value != getattr(defaults, name):
+            raise UsageError(f"--{name.replace('_', '-')} {problem}")
+
+
+def _evaluate_run(options: Evaluate) -> dict[str, Any]:
     from .evaluate import evaluate
 
-    def figures():
-        run = open_run(asked.run, asked.device)
-        return evaluate(run, load_run_photos_with_confidence(run, asked.data), lpips_weights=asked.lpips)
-
-    asked.tell(figures)
+    run = open_run(options.folder, options.run.device)
+    scene = load_run_photos_with_confidence(run, options.run.data)
+    return evaluate(run, scene, lpips_weights=options.result.lpips)
 
 
-def run_score(asked: Score) -> None:
+def _evaluate_pictures(options: Evaluate, truth_path: str) -> dict[str, Any]:
     from ..scene import load_scene
     from ..scene.load import parse_dataset
-    from .score import score_folder
+    from .folder import evaluate_folder
 
-    def figures():
-        response = asked.response or enclosing_run_response(asked.folder)
-        if response is None:
-            dataset = parse_dataset(asked.truth)
-            bent = dataset.alpha == "background" or not all(record.lens.is_pinhole for record in dataset.records)
-            # Photos that keep their codes are clipped and dark where they are by any response.
-            response = "auto" if bent or asked.max_size is not None else "srgb"
-        truth = load_scene(asked.truth, response=response, max_size=asked.max_size)
-        return score_folder(asked.folder, truth, lpips_weights=asked.lpips)
-
-    asked.tell(figures)
+    max_size = options.pictures.max_size
+    response = options.pictures.response or enclosing_run_response(options.folder)
+    if response is None:
+        dataset = parse_dataset(truth_path)
+        resampled = dataset.alpha == "background" or not all(record.lens.is_pinhole for record in dataset.records)
+        # Photos that are not resampled keep their codes, so every response finds the same regions clipped and dark.
+        response = "auto" if resampled or max_size is not None else "srgb"
+    truth = load_scene(truth_path, response=response, max_size=max_size)
+    return evaluate_folder(options.folder, truth, lpips_weights=options.result.lpips)
 
 
-def run_compare(asked: Compare) -> None:
+def run_compare(options: Compare) -> None:
+    """Print the table and write the files that are asked for."""
     from ..files import atomic_path, check_absent
     from ..output.charts import save_picture, training_chart
     from .compare import compare_runs, comparison_csv, comparison_latex, comparison_table
 
-    if asked.plot is not None and asked.plot.suffix.lower() != ".png":
-        raise InputError(asked.plot, "the chart is a PNG file", f"name it {asked.plot.with_suffix('.png').name}")
-    for path in filter(None, (asked.plot, asked.csv, asked.latex)):
-        check_absent(path, asked.overwrite)
-    rows = compare_runs([open_run(path, "cpu") for path in asked.runs])
-    for path, text in ((asked.csv, comparison_csv), (asked.latex, comparison_latex)):
+    if options.plot is not None and options.plot.suffix.lower() != ".png":
+        raise InputError(options.plot, "the chart is a PNG file", f"name it {options.plot.with_suffix('.png').name}")
+    for path in filter(None, (options.plot, options.csv, options.latex)):
+        check_absent(path, options.overwrite)
+    rows = compare_runs([open_run(path, "cpu") for path in options.runs])
+    for path, format_rows in ((options.csv, comparison_csv), (options.latex, comparison_latex)):
         if path is not None:
-            with atomic_path(path, asked.overwrite) as file:
-                file.write_text(text(rows), encoding="utf-8")
-    if asked.plot is not None:
-        with atomic_path(asked.plot, asked.overwrite) as file:
+            with atomic_path(path, options.overwrite) as file:
+                file.write_text(format_rows(rows), encoding="utf-8")
+    if options.plot is not None:
+        with atomic_path(options.plot, options.overwrite) as file:
             save_picture(training_chart({row.label: row.curves for row in rows}), file, 140)
     print(comparison_table(rows))

@@ -1,4 +1,4 @@
-"""Trained runs side by side: their figures, means over seeds, and held-out error against time."""
+"""Compare trained runs: figures, means over seeds, and held-out error against time."""
 
 import csv
 import io
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import SehdrError
-from .table import columns, number
+from .table import columns, format_figure
 
 COLUMNS = {
     "iterations": ("iterations", 0),
@@ -20,14 +20,18 @@ COLUMNS = {
     "psnr_ldr": ("LDR, dB", 2),
     "psnr_mu": ("HDR mu-law, dB", 2),
 }
-"""Figures of a row: their heading and digits. HDR is the mu-law PSNR under the protocol gt-max."""
+"""Heading and digits of each figure of a row. HDR is the mu-law PSNR under the protocol gt-max."""
 
 
 @dataclass(frozen=True)
 class ComparedRuns:
     """Runs that differ by nothing but their seed: a row of a comparison.
 
-    figures: {column: one value for each run}; None where a run has none. curves: each run's lines of metrics.jsonl.
+    Attributes:
+        label: name of the first run's folder.
+        scene: name of the scene.
+        figures: by column, one value for each run; None if the run has none.
+        curves: the lines of each run's metrics.jsonl.
     """
 
     label: str
@@ -37,60 +41,63 @@ class ComparedRuns:
 
     @property
     def count(self) -> int:
+        """Return the number of runs."""
         return len(self.curves)
 
     def mean(self, column: str) -> float | None:
-        """The mean over the runs; None where one lacks it."""
+        """Return the mean over the runs; None if one lacks the figure."""
         values = [value for value in self.figures[column] if value is not None]
         return statistics.fmean(values) if len(values) == self.count else None
 
-    def spread(self, column: str) -> float | None:
-        """The sample's standard deviation; None for one run, or where one lacks the figure."""
+    def deviation(self, column: str) -> float | None:
+        """Return the sample's standard deviation; None for one run, or if one lacks the figure."""
         values = [value for value in self.figures[column] if value is not None]
         return statistics.stdev(values) if len(values) == self.count > 1 else None
 
 
 def compare_runs(runs: Sequence[Any]) -> list[ComparedRuns]:
-    """Rows of a comparison, in the order of the runs; runs of one scene and config but for the seed share a row.
+    """Return the rows of a comparison, in the order of the runs.
+
+    Runs of one scene whose configs differ by the seed alone share a row.
 
     Args:
-        runs: of load_run.
+        runs: trained runs, as load_run() returns them.
 
     Raises:
-        SehdrError: without runs, for a run that is given twice, or one without evaluations in its metrics.
+        SehdrError: without runs, for a run that is named twice, or one without evaluations in its metrics.
     """
     if not runs:
-        raise SehdrError("compare: no runs are given; give their folders")
+        raise SehdrError("compare: no runs; name their folders")
     groups: dict[str, list] = {}
-    places = [Path(run.path).resolve() for run in runs]
-    for run, place in zip(runs, places, strict=True):
-        if places.count(place) > 1:
-            raise SehdrError(f"compare: {run.path} is given twice; leave one out")
+    paths = [Path(run.path).resolve() for run in runs]
+    for run, path in zip(runs, paths, strict=True):
+        if paths.count(path) > 1:
+            raise SehdrError(f"compare: {run.path} is named twice; leave one out")
         if not run.metrics():
             problem = f"{run.path}: has no evaluations of held-out views"
             raise SehdrError(f"{problem}; train it with some held out (--holdout 8), or further")
         config = run.config.model_dump(mode="json", exclude={"seed"})
         groups.setdefault(json.dumps([run.scene_name, run.data, config], sort_keys=True, default=str), []).append(run)
-    return [_compared(members) for members in groups.values()]
+    return [_row(members) for members in groups.values()]
 
 
-def _compared(runs: Sequence) -> ComparedRuns:
+def _row(runs: Sequence) -> ComparedRuns:
     names = {"iterations": "iterations", "gaussians": "gaussian_count", "seconds": "train_seconds"}
     last = [run.metrics()[-1] | {column: getattr(run, name) for column, name in names.items()} for run in runs]
     figures = {column: [line.get(column) for line in last] for column in COLUMNS}
     label = Path(runs[0].path).name + (f" and {len(runs) - 1} more" if len(runs) > 1 else "")
-    if stopped := sum(run.iterations < run.config.schedule.iterations for run in runs):
-        label += " (not ended)" if len(runs) == 1 else f" ({stopped} not ended)"
+    if unfinished := sum(run.iterations < run.config.schedule.iterations for run in runs):
+        label += " (unfinished)" if len(runs) == 1 else f" ({unfinished} unfinished)"
     return ComparedRuns(label, runs[0].scene_name, figures, [run.metrics() for run in runs])
 
 
 def comparison_table(rows: Sequence[ComparedRuns]) -> str:
-    """For a terminal: means with their standard deviation over seeds."""
+    """Return means with their standard deviation over seeds, for a terminal."""
     return "\n".join(columns(_cells(rows), left=2))
 
 
 def comparison_latex(rows: Sequence[ComparedRuns]) -> str:
-    """The same as a booktabs table."""
+    """Return the same as a LaTeX table (booktabs)."""
     escaped = [[re.sub(r"([&%$#_{}])", r"\\\1", cell) for cell in line] for line in _cells(rows)]
     heading, *lines = [" & ".join(line).replace(" ± ", r" $\pm$ ") + r" \\" for line in escaped]
     begin = rf"\begin{{tabular}}{{ll{'r' * (len(COLUMNS) + 1)}}}"
@@ -102,17 +109,19 @@ def _cells(rows: Sequence[ComparedRuns]) -> list[list[str]]:
     for row in rows:
         cells.append([row.label, row.scene, str(row.count)])
         for column, (_, digits) in COLUMNS.items():
-            spread = row.spread(column)
-            cells[-1].append(number(row.mean(column), digits) + (f" ± {spread:.{digits}f}" if spread else ""))
+            deviation = row.deviation(column)
+            cells[-1].append(
+                format_figure(row.mean(column), digits) + (f" ± {deviation:.{digits}f}" if deviation else "")
+            )
     return cells
 
 
 def comparison_csv(rows: Sequence[ComparedRuns]) -> str:
-    """Means and standard deviations, full precision; empty where there is none."""
+    """Return means and standard deviations in full precision; a missing one is empty."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["run", "scene", "seeds", *(name for column in COLUMNS for name in (column, f"{column}_sd"))])
     for row in rows:
-        values = [value for column in COLUMNS for value in (row.mean(column), row.spread(column))]
+        values = [value for column in COLUMNS for value in (row.mean(column), row.deviation(column))]
         writer.writerow([row.label, row.scene, row.count, *values])
     return text.getvalue()

@@ -1,10 +1,11 @@
-"""Held-out evaluation of a trained run: every figure with its protocol's name, or null with a reason."""
+"""Held-out evaluation of a trained run: every figure has its protocol's name, or is None with a reason."""
 
 import logging
 import math
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -15,37 +16,67 @@ from ..scene import Scene, View
 from . import metrics
 from .lights import LightRegion, count_lights, light_regions
 from .perceptual import BACKBONE, SMALLEST_EDGE, load_lpips
-from .protocols import PROTOCOLS, fit_scale, normalise, tone_map, tone_mapped_psnr
+from .protocols import PROTOCOLS, fit_scale, normalize, tone_map, tone_mapped_psnr
 from .ranking import DARKEST_CODE, ErrorRanking
 
-# cd/m^2 at which the brightest value of a view's truth is shown for PU21: the peak of a common HDR display.
 PEAK_LUMINANCE = 1000.0
+"""cd/m^2 at which PU21 shows the brightest value of a view's truth: the peak of a common HDR display."""
 HDR_FIGURES = ("psnr_mu", "ssim_mu", "lpips_mu")
-PERFECT = "there is no error at all, so the PSNR is infinite"
+INFINITE_PSNR = "there is no error at all, so the PSNR is infinite"
 log = logging.getLogger(__name__)
 
 
-class RunPictures:
-    """What a trained run predicts for views, [H, W, 3]: radiance, and the simulated photo in [0, 1] or None. facts:
-    plain values for the result."""
+class Doubt(NamedTuple):
+    """How reliable a prediction is."""
 
-    def __init__(self, run):
+    confidence: Tensor
+    """[H, W] in [0, 1]."""
+    black: float
+    """Radiance that the photo shows as black."""
+
+
+class Predictions(Protocol):
+    """What is predicted for the views of a scene."""
+
+    facts: dict[str, Any]
+    """Plain values for the result."""
+
+    def hdr(self, view: View) -> Tensor:
+        """Return the radiance, [H, W, 3]."""
+        ...
+
+    def ldr(self, view: View) -> Tensor | None:
+        """Return the simulated photo, [H, W, 3] in [0, 1]; None if there is none."""
+        ...
+
+    def confidence(self, view: View) -> Doubt | None:
+        """Return how reliable the prediction is; None if that is not known."""
+        ...
+
+
+class RunPredictions:
+    """The predictions of a trained run."""
+
+    def __init__(self, run: Any):
+        """Take a Run."""
         self.run = run
         self.facts = {"train_seconds": run.train_seconds, "gaussians": run.gaussian_count, "iterations": run.iterations}
 
     def hdr(self, view: View) -> Tensor:
+        """Return the radiance, [H, W, 3]."""
         return self.run.render(view.camera).hdr
 
     def ldr(self, view: View) -> Tensor | None:
+        """Return the simulated photo, [H, W, 3] in [0, 1]."""
         return self.run.render_ldr(view.camera, view.exposure_time)
 
-    def doubt(self, view: View) -> tuple[Tensor, float] | None:
-        """Confidence [H, W] in [0, 1], and the radiance that a photo shows as black; None where it is not known."""
+    def confidence(self, view: View) -> Doubt | None:
+        """Return how reliable the prediction is; None if the run's confidence was not measured."""
         confidence = self.run.render_confidence(view.camera)
         if confidence is None:
             return None
         black = self.run.response.decode(torch.full((1, 3), DARKEST_CODE, device=confidence.device))
-        return confidence, float(black.mean()) / view.exposure_time
+        return Doubt(confidence, float(black.mean()) / view.exposure_time)
 
 
 @torch.no_grad()
@@ -62,40 +93,55 @@ def evaluate(run: Any, scene: Scene, *, lpips_weights: Path | str | None = None)
         "aligned"; "pu21": {name: psnr, ssim}; "ldr": psnr, ssim, lpips of the simulated photo, unquantised; "regions":
         {region: fraction, psnr_ldr, psnr_mu}, pooled over views; "lights": count and lost, see lights.py;
         "confidence": see ranking.py; "views": the same for each view; "split", "lpips_backbone" and the run's facts.
-        What cannot be computed is null with "reason" (or "lpips_reason") beside it. Outside a view's mask the
-        prediction counts as right and nothing is averaged, but by LPIPS; views with an empty mask are left out.
+        A figure that cannot be computed is None with "reason" (or "lpips_reason") beside it. Pixels outside a view's
+        mask are not averaged, except by LPIPS, for which the prediction equals the truth there; views with an empty
+        mask are left out.
 
     Raises:
         SehdrError: for a scene without views, images that disagree with their camera or a render that is not finite.
         InputError: for LPIPS weights that cannot be read.
     """
-    return Evaluation(RunPictures(run), run.normalize_photos(scene), run.device, lpips_weights).result()
+    return Evaluation(RunPredictions(run), run.normalize_photos(scene), run.device, lpips_weights).result()
 
 
 class Evaluation:
-    """One comparison of pictures, which predict like RunPictures, with a scene's views.
+    """Compares predictions with the views of a scene."""
 
-    views: by default the test views, else the training views. scale_views: those that tell the scale of "aligned", by
-    default the training views. The rest is as of evaluate().
-    """
+    def __init__(
+        self,
+        predictions: Predictions,
+        scene: Scene,
+        device: torch.device | str,
+        lpips_weights: Path | str | None,
+        views: Sequence[View] = (),
+        scale_views: Sequence[View] = (),
+    ):
+        """Choose the views.
 
-    def __init__(self, pictures, scene: Scene, device, lpips_weights, views=(), scale_views=()):
-        self.pictures, self.scene, self.device = pictures, scene, torch.device(device)
+        Args:
+            predictions: what is compared.
+            scene: its photos and truth.
+            device: where the figures are computed.
+            lpips_weights: a folder, see load_lpips; None for the one of SEHDR_LPIPS.
+            views: what is compared; by default the test views, or the training views if there are none.
+            scale_views: views to fit the scale of "aligned" on; by default the training views.
+        """
+        self.predictions, self.scene, self.device = predictions, scene, torch.device(device)
         self.split = "test" if scene.test_views else "train"
-        given = views or scene.test_views or scene.train_views
-        self.views = [view for view in given if view.mask is None or view.mask.any()]
+        candidates = views or scene.test_views or scene.train_views
+        self.views = [view for view in candidates if view.mask is None or view.mask.any()]
         if not self.views:
             raise SehdrError(f"scene {scene.name!r} has no views to evaluate; check its splits and masks")
         self.scale_views = [view for view in scale_views or scene.train_views if view.hdr is not None]
         self.lpips, self.lpips_reason = load_lpips(lpips_weights, self.device)
-        # By region and name: weighted squared error and weight, pooled over views, which may have none of a region; and
-        # under "share" the pixels of the region, and all.
-        self.pooled: dict[tuple[str, str], np.ndarray] = defaultdict(lambda: np.zeros(2))
+        # By region and figure: the weighted squared error and the weight, summed over views because a view may have no
+        # pixel of a region. Under "share": the pixels of the region, and all pixels.
+        self.sums: dict[tuple[str, str], np.ndarray] = defaultdict(lambda: np.zeros(2))
         self.ranking = ErrorRanking()
         self.lights: list[LightRegion] = []
 
     def result(self) -> dict:
-        """The figures, as evaluate() describes them."""
+        """Return the figures that evaluate() describes."""
         truths = [view.hdr is not None for view in self.views]
         kind = "training" if self.split == "train" else self.split
         missing = None if any(truths) else f"the {kind} views hold no HDR truth"
@@ -103,22 +149,22 @@ class Evaluation:
         rows = []
         for number, view in enumerate(self.views, 1):
             rows.append(self._view(view, scale))
-            told = {"LDR": rows[-1]["ldr"]["psnr"]}
-            told |= {f"HDR {name}": figures["psnr_mu"] for name, figures in rows[-1]["protocol"].items()}
-            figures = ", ".join(f"{name} {value:.2f} dB" for name, value in told.items() if value is not None)
+            psnr = {"LDR": rows[-1]["ldr"]["psnr"]}
+            psnr |= {f"HDR {name}": figures["psnr_mu"] for name, figures in rows[-1]["protocol"].items()}
+            figures = ", ".join(f"{name} {value:.2f} dB" for name, value in psnr.items() if value is not None)
             log.info("view %d/%d %s: %s", number, len(self.views), view.name, figures)
         hdr, pu21 = {}, {}
         for name in PROTOCOLS:
             reason = scale_reason if name == "aligned" else missing
-            why = {"reason": reason} if reason else {}
-            counted = [] if reason else [row for row, known in zip(rows, truths) if known]
+            missing_reason = {"reason": reason} if reason else {}
+            counted = [] if reason else [row for row, has_truth in zip(rows, truths) if has_truth]
             figures = _mean([row["protocol"][name] for row in counted], *HDR_FIGURES)
-            hdr[name] = figures | {"views": len(counted)} | (why or self._reasons(figures))
-            pu21[name] = _mean([row["pu21"][name] for row in counted], "psnr", "ssim") | why
+            hdr[name] = figures | {"views": len(counted)} | (missing_reason or self._lpips_reason(figures))
+            pu21[name] = _mean([row["pu21"][name] for row in counted], "psnr", "ssim") | missing_reason
         hdr["aligned"]["scale"] = scale
         ldr = _mean([row["ldr"] for row in rows], "psnr", "ssim", "lpips")
-        unseen = ldr["psnr"] is None
-        ldr |= {"reason": "the folder holds radiance, no simulated photos"} if unseen else self._reasons(ldr)
+        without_photos = {"reason": "the folder holds radiance, no simulated photos"}
+        ldr |= without_photos if ldr["psnr"] is None else self._lpips_reason(ldr)
         result = {
             "scene": self.scene.name,
             "split": self.split,
@@ -131,22 +177,22 @@ class Evaluation:
             "views": rows,
             "lpips_backbone": BACKBONE if self.lpips else None,
         }
-        return _plain(result | self.pictures.facts)
+        return _plain(result | self.predictions.facts)
 
     def _scale(self) -> tuple[float | None, str | None]:
-        """The factor for `aligned`, or why there is none."""
+        """Return the factor of "aligned", or None and the reason."""
         if not self.scale_views:
             return None, "no training view holds HDR truth to fit the scale on"
         log.info("fitting the scale on %d views", len(self.scale_views))
         scale = fit_scale(
             (*self._render(view), self._tensor(view.mask), self._tensor(view.image)) for view in self.scale_views
         )
-        return scale, None if scale else "the pictures hold no light to fit the scale on"
+        return scale, None if scale else "the predictions hold no light to fit the scale on"
 
     def _render(self, view: View) -> tuple[Tensor, Any]:
-        """Prediction and truth (or None), [H, W, 3] float32 on the device each."""
+        """Return prediction and truth, [H, W, 3] float32 on the device each; the truth may be None."""
         size = (view.camera.height, view.camera.width, 3)
-        prediction = self.pictures.hdr(view).detach()
+        prediction = self.predictions.hdr(view).detach()
         for what, image in (("photo", view.codes), ("HDR truth", view.hdr), ("picture", prediction)):
             if image is not None and tuple(image.shape) != size:
                 sizes = f"its {what} is {image.shape[1]} x {image.shape[0]}, its camera {size[1]} x {size[0]}"
@@ -161,76 +207,80 @@ class Evaluation:
         return None if array is None else torch.tensor(array, dtype=torch.float32, device=self.device)
 
     def _view(self, view: View, scale: float | None) -> dict:
-        """The figures of one view; its part in the regions and the ranking is added to theirs."""
+        """Return the figures of one view, and add it to the regions, the lights and the ranking."""
         hdr, truth = self._render(view)
         photo, mask = self._tensor(view.image), self._tensor(view.mask)
         ldr, protocol, pu21 = dict.fromkeys(("psnr", "ssim", "lpips")), {}, {}
-        regions, pooled = metrics.region_masks(photo), []
-        if (encoded := self.pictures.ldr(view)) is not None:
+        regions, compared = metrics.region_masks(photo), []
+        if (encoded := self.predictions.ldr(view)) is not None:
             pair = _inside((encoded.detach().float(), photo), mask)
             figures = metrics.psnr(*pair, mask), metrics.ssim(*pair, mask), self._lpips(*pair)
             ldr = dict(zip(ldr, figures, strict=True))
-            pooled.append(("ldr", *pair))
-        if truth is not None and (doubt := self.pictures.doubt(view)):
-            self.ranking.add(doubt[0], hdr, truth, regions["well-exposed"], doubt[1], mask)
+            compared.append(("ldr", *pair))
+        if truth is not None and (doubt := self.predictions.confidence(view)):
+            self.ranking.add(doubt.confidence, hdr, truth, regions["well-exposed"], doubt.black, mask)
         if truth is not None:
-            light, shown = (image.mean(2).cpu().numpy() for image in (truth, hdr * (scale or 1.0)))
-            self.lights += light_regions(light, shown, view.camera)
+            true_light, light = (image.mean(2).cpu().numpy() for image in (truth, hdr * (scale or 1.0)))
+            self.lights += light_regions(true_light, light, view.camera)
         for name in PROTOCOLS:
             if truth is None or (name == "aligned" and scale is None):
                 continue
-            linear = normalise(name, hdr, truth, mask, scale=scale)
+            linear = normalize(name, hdr, truth, mask, scale=scale)
             pair, linear = _inside(tone_map(name, *linear), mask), _inside(linear, mask)
             figures = tone_mapped_psnr(name, *pair, mask), metrics.ssim(*pair, mask), self._lpips(*pair)
             protocol[name] = dict(zip(HDR_FIGURES, figures, strict=True))
             pu21[name] = metrics.pu21_metrics(*linear, mask, peak_luminance=PEAK_LUMINANCE)
-            pooled.append((name, *pair))
+            compared.append((name, *pair))
         for region, inside in regions.items():
             weight = inside if mask is None else inside * mask
             counted = weight.numel() if mask is None else float(mask.sum())
-            self.pooled[region, "share"] += float(weight.sum()), counted
-            for name, prediction, goal in pooled:
+            self.sums[region, "share"] += float(weight.sum()), counted
+            for name, prediction, goal in compared:
                 error, total = metrics.squared_error(prediction, goal, weight)
-                self.pooled[region, name] += float(error.mean()), total
+                self.sums[region, name] += float(error.mean()), total
         return {"name": view.name, "ldr": ldr, "protocol": protocol, "pu21": pu21}
 
     def _region(self, region: str, missing: str | None) -> dict:
-        inside, counted = self.pooled[region, "share"]
+        """Return the figures of a region over all views; missing: why there is no truth, or None."""
+        inside, counted = self.sums[region, "share"]
         reason = missing if inside else "no pixel of the photos lies in this region"
-        sums = {name: self.pooled[region, name] for name in ("ldr", *PROTOCOLS)}
-        found = {
+        sums = {name: self.sums[region, name] for name in ("ldr", *PROTOCOLS)}
+        psnr = {
             name: metrics.decibels(error / weight if weight else math.nan) for name, (error, weight) in sums.items()
         }
-        figures = {"fraction": float(inside / counted), "psnr_ldr": found.pop("ldr"), "psnr_mu": found}
+        figures = {"fraction": float(inside / counted), "psnr_ldr": psnr.pop("ldr"), "psnr_mu": psnr}
         return figures | ({"reason": reason} if reason else {})
 
     def _lpips(self, prediction, truth) -> float | None:
         return self.lpips(prediction, truth) if self.lpips and min(truth.shape[:2]) >= SMALLEST_EDGE else None
 
-    def _reasons(self, figures: dict) -> dict:
-        """Why LPIPS is missing."""
+    def _lpips_reason(self, figures: dict) -> dict:
+        """Return {"lpips_reason": why LPIPS is missing}, or {} if it is there."""
         reason = self.lpips_reason or f"a view is smaller than {SMALLEST_EDGE} pixels"
         return {"lpips_reason": reason} if None in (figures.get("lpips", 0), figures.get("lpips_mu", 0)) else {}
 
 
 def _inside(pair: tuple[Tensor, Tensor], mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Prediction and truth, the prediction as the truth outside the mask: windows across its border see no error."""
+    """Return prediction and truth with the prediction set to the truth outside the mask.
+
+    Windows across the border of the mask then contain no error from outside.
+    """
     prediction, truth = pair
     return (prediction if mask is None else torch.lerp(truth, prediction, mask[..., None].to(truth))), truth
 
 
 def _mean(rows: list[dict], *names: str) -> dict[str, float | None]:
-    """The mean of each figure over views; None without views, or where one lacks it."""
+    """Return the mean of each figure over views; None without views, or if a view lacks it."""
     lacking = {name for name in names if not rows or any(row[name] is None for row in rows)}
     return {name: None if name in lacking else math.fsum(row[name] for row in rows) / len(rows) for name in names}
 
 
 def _plain(value) -> Any:
-    """The same tree without NaN and infinity, which JSON does not know; an infinite PSNR gets a reason beside it."""
+    """Return a tree of values with None for NaN and infinity, which JSON lacks; an infinite PSNR gets a reason."""
     if isinstance(value, dict):
         figures = [item for key, item in value.items() if key.startswith("psnr")]
         perfect = any(math.inf in (item.values() if isinstance(item, dict) else [item]) for item in figures)
-        reason = {"reason": PERFECT} if perfect and "reason" not in value else {}
+        reason = {"reason": INFINITE_PSNR} if perfect and "reason" not in value else {}
         return {key: _plain(item) for key, item in value.items()} | reason
     if isinstance(value, list):
         return [_plain(item) for item in value]

@@ -1,4 +1,7 @@
-"""Which lights of the truth a trained scene holds: bright regions of the views, joined by the places they point at."""
+"""Count the lights of the truth that a trained scene lost.
+
+Lights are bright regions of the views, joined across views by the points in space that they show.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -7,88 +10,111 @@ import numpy as np
 
 from ..scene import Camera
 
-BRIGHT = 10.0  # Times the view's mean, from which a pixel belongs to a light
-LEAST_PIXELS = 6
-LEAST_SHARE = 0.5  # Of its radiance that a region must be rendered with
-LARGEST_RATIO = 3.3  # Between the areas of two regions of one light
-TOLERANCE = 1.0, 0.35  # Pixels, and parts of a region's radius, by which a light's place may miss the region's middle
+BRIGHT = 10.0
+"""A pixel belongs to a light if its radiance is above this multiple of its view's mean."""
+MIN_PIXELS = 6
+"""Pixels of the smallest region that counts as a light."""
+MIN_SHARE = 0.5
+"""Part of its radiance with which a region must be rendered, else it counts as lost."""
+MAX_AREA_RATIO = 3.3
+"""Largest ratio between the areas of two regions that can show the same light."""
+TOLERANCE_PIXELS, TOLERANCE_RADII = 1.0, 0.35
+"""How far a light's point may lie from the center of its region: pixels, plus this part of the region's radius."""
 
 
 @dataclass(frozen=True, eq=False)
 class LightRegion:
-    """A connected bright region of a camera's view: its middle and area in pixels, the direction from the camera to it,
-    and the share of its radiance that is rendered."""
+    """A connected bright region in one view.
+
+    Attributes:
+        camera: of the view.
+        center: x and y, pixels.
+        area: pixels.
+        direction: unit vector from the camera to the center, in the scene's axes.
+        share: the part of its radiance that is rendered.
+    """
 
     camera: Camera
-    middle: np.ndarray
+    center: np.ndarray
     area: int
     direction: np.ndarray
     share: float
 
 
 def light_regions(truth: np.ndarray, render: np.ndarray, camera: Camera) -> list[LightRegion]:
-    """The regions of at least LEAST_PIXELS connected pixels above BRIGHT times the mean of a view's truth.
+    """Find the regions of at least MIN_PIXELS connected pixels above BRIGHT times the mean of a view's truth.
 
-    truth, render: [H, W] radiance in one unit.
+    Args:
+        truth: radiance, [H, W].
+        render: radiance in the same unit, [H, W].
+        camera: of the view.
     """
     from scipy import ndimage
 
-    found = []
+    regions = []
     labels = np.empty(truth.shape, np.int32)
     ndimage.label(truth > BRIGHT * truth.mean(), np.ones((3, 3)), output=labels)
-    for index, place in enumerate(ndimage.find_objects(labels), start=1):
-        inside = labels[place] == index
-        if (area := int(inside.sum())) >= LEAST_PIXELS:
-            row, column = (axis.mean() + part.start + 0.5 for axis, part in zip(np.nonzero(inside), place, strict=True))
+    for index, window in enumerate(ndimage.find_objects(labels), start=1):
+        inside = labels[window] == index
+        if (area := int(inside.sum())) >= MIN_PIXELS:
+            offsets = zip(np.nonzero(inside), window, strict=True)
+            row, column = (axis.mean() + part.start + 0.5 for axis, part in offsets)
             ray = np.array([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, 1.0])
             direction = camera.world_to_camera[:3, :3].T @ (ray / np.linalg.norm(ray))
-            share = float(render[place][inside].mean() / truth[place][inside].mean())
-            found.append(LightRegion(camera, np.array([column, row]), area, direction, share))
-    return found
+            share = float(render[window][inside].mean() / truth[window][inside].mean())
+            regions.append(LightRegion(camera, np.array([column, row]), area, direction, share))
+    return regions
 
 
 def count_lights(regions: Sequence[LightRegion]) -> dict[str, int]:
-    """{"count": lights that two views or more show, "lost": how many of them the renders do not hold}.
+    """Count the lights that two views or more show, and those that the renders lost.
 
-    A light is lost whose regions are rendered at less than half their radiance in more than half of the views that
-    show it. regions: those of all views.
+    A light is lost if more than half of its regions are rendered with less than MIN_SHARE of their radiance.
+
+    Args:
+        regions: of all views.
+
+    Returns:
+        "count" and "lost".
     """
-    left, lights = list(regions), []
-    while left:
-        largest = max(left, key=lambda region: region.area)
-        groups = [_pointed_at(place, left) for place in _meetings(largest, left)]
+    remaining, lights = list(regions), []
+    while remaining:
+        largest = max(remaining, key=lambda region: region.area)
+        groups = [_regions_at(point, remaining) for point in _intersections(largest, remaining)]
         lights.append(max((group for group in groups if largest in group), key=len, default=[largest]))
-        left = [region for region in left if region not in lights[-1]]
-    seen = [light for light in lights if len(light) > 1]
-    lost = sum(np.mean([region.share < LEAST_SHARE for region in light]) > 0.5 for light in seen)
-    return {"count": len(seen), "lost": int(lost)}
+        remaining = [region for region in remaining if region not in lights[-1]]
+    confirmed = [light for light in lights if len(light) > 1]
+    lost = sum(np.mean([region.share < MIN_SHARE for region in light]) > 0.5 for light in confirmed)
+    return {"count": len(confirmed), "lost": int(lost)}
 
 
-def _meetings(one: LightRegion, regions: Sequence[LightRegion]) -> Iterator[np.ndarray]:
-    """Where the rays of a region and of each region of another view and of like area come nearest to each other."""
-    for other in regions:
-        normal = np.cross(one.direction, other.direction)
-        square, apart = float(normal @ normal), other.camera.position - one.camera.position
-        alike = 1 / LARGEST_RATIO < other.area / one.area < LARGEST_RATIO
-        if other.camera is one.camera or not alike or square < 1e-6:
+def _intersections(region: LightRegion, others: Sequence[LightRegion]) -> Iterator[np.ndarray]:
+    """Yield the points where a region's ray comes nearest to the rays of regions of similar area in other views."""
+    for other in others:
+        normal = np.cross(region.direction, other.direction)
+        square, offset = float(normal @ normal), other.camera.position - region.camera.position
+        similar = 1 / MAX_AREA_RATIO < other.area / region.area < MAX_AREA_RATIO
+        if other.camera is region.camera or not similar or square < 1e-6:
             continue
-        depths = [np.cross(apart, ray) @ normal / square for ray in (other.direction, one.direction)]
-        if min(depths) > 0:
-            ends = [r.camera.position + depth * r.direction for r, depth in zip((one, other), depths, strict=True)]
-            yield np.mean(ends, axis=0)
+        depth = np.cross(offset, other.direction) @ normal / square
+        other_depth = np.cross(offset, region.direction) @ normal / square
+        if min(depth, other_depth) > 0:
+            nearest = region.camera.position + depth * region.direction
+            other_nearest = other.camera.position + other_depth * other.direction
+            yield np.mean([nearest, other_nearest], axis=0)
 
 
-def _pointed_at(place: np.ndarray, regions: Sequence[LightRegion]) -> list[LightRegion]:
-    """The region of each view, if there is one, that lies over a place."""
+def _regions_at(point: np.ndarray, regions: Sequence[LightRegion]) -> list[LightRegion]:
+    """Return the region of each view that shows a point, if there is one."""
     nearest: dict[int, tuple[float, LightRegion]] = {}
     for region in regions:
         camera = region.camera
-        x, y, depth = camera.world_to_camera[:3, :3] @ place + camera.world_to_camera[:3, 3]
+        x, y, depth = camera.world_to_camera[:3, :3] @ point + camera.world_to_camera[:3, 3]
         if depth <= 0:
             continue
-        seen = np.array([camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy])
-        miss = float(np.linalg.norm(seen - region.middle))
-        allowed = TOLERANCE[0] + TOLERANCE[1] * np.sqrt(region.area / np.pi)
-        if miss < min(allowed, nearest.get(id(camera), (np.inf,))[0]):
-            nearest[id(camera)] = (miss, region)
+        projected = np.array([camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy])
+        distance = float(np.linalg.norm(projected - region.center))
+        tolerance = TOLERANCE_PIXELS + TOLERANCE_RADII * np.sqrt(region.area / np.pi)
+        if distance < min(tolerance, nearest.get(id(camera), (np.inf,))[0]):
+            nearest[id(camera)] = (distance, region)
     return [region for _, region in nearest.values()]

@@ -1,6 +1,6 @@
-"""LPIPS v0.1 (Zhang et al. 2018) on SqueezeNet 1.1 features, by weights that the user has.
+"""LPIPS v0.1 (Zhang et al. 2018) on SqueezeNet 1.1 features, with weights from a folder.
 
-Their folder, given by the caller or by the environment variable SEHDR_LPIPS, holds `squeeze.pth` (the v0.1 linear heads
+The folder is an argument or the environment variable SEHDR_LPIPS. It holds `squeeze.pth` (the v0.1 linear heads
 of the lpips package) and SqueezeNet 1.1 as `squeezenet1_1_features.pth` (features only) or under torchvision's own name
 `squeezenet1_1-*.pth`.
 """
@@ -15,11 +15,12 @@ from ..errors import InputError
 
 VARIABLE = "SEHDR_LPIPS"
 BACKBONE = "squeeze v0.1"
-# Below this many pixels along an edge the last pooling finds nothing.
 SMALLEST_EDGE = 17
-# Features after which the network is tapped, and their channels.
+"""Pixels of the shortest edge for which the last pooling has an output."""
 TAPS, WIDTHS = (1, 4, 7, 9, 10, 11, 12), (64, 128, 256, 384, 384, 512, 512)
+"""Layers whose outputs are compared, and their channels."""
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+"""Normalisation of the input, as in the lpips package."""
 
 
 class _Fire(nn.Module):
@@ -31,15 +32,16 @@ class _Fire(nn.Module):
         self.expand1x1 = nn.Conv2d(squeezed, expanded, 1)
         self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
 
-    def forward(self, x):
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the joined expansions."""
         x = self.squeeze(x).relu()
         return torch.cat([self.expand1x1(x).relu(), self.expand3x3(x).relu()], 1)
 
 
 def _squeezenet_features() -> nn.Sequential:
-    """SqueezeNet 1.1 up to its last fire module, layers numbered as in torchvision."""
+    """Return SqueezeNet 1.1 up to its last fire module, with layers numbered as in torchvision."""
     channels, layers = 64, [nn.Conv2d(3, 64, 3, stride=2), nn.ReLU()]
-    for widths in ((64, 64), (128, 128), (192, 192, 256, 256)):  # Of the fires between two poolings.
+    for widths in ((64, 64), (128, 128), (192, 192, 256, 256)):  # Widths of the fire modules between two poolings.
         layers.append(nn.MaxPool2d(3, 2, ceil_mode=True))
         for width in widths:
             layers.append(_Fire(channels, width // 4, width))
@@ -48,15 +50,20 @@ def _squeezenet_features() -> nn.Sequential:
 
 
 class Lpips:
-    """The distance itself: call it with two [H, W, 3] images in [0, 1]; 0 for equal images, larger for less alike."""
+    """The distance of two images: 0 for equal ones, larger for less similar ones."""
 
     def __init__(self, features: nn.Sequential, heads: list[Tensor], device: torch.device | str = "cpu"):
+        """Take the backbone, and the weights of the channels of each tap, [C, 1, 1] each."""
         self.features = features.to(device).eval().requires_grad_(False)
         self.heads = [head.to(device) for head in heads]
 
     @torch.no_grad()
     def __call__(self, prediction: Tensor, truth: Tensor) -> float:
-        """Raises ValueError for images of different sizes or with an edge below 17 pixels."""
+        """Return the distance of two images [H, W, 3] in [0, 1].
+
+        Raises:
+            ValueError: for images of different sizes, or with an edge below SMALLEST_EDGE.
+        """
         if prediction.shape != truth.shape or min(prediction.shape[:2]) < SMALLEST_EDGE:
             raise ValueError(f"LPIPS takes two images of one size from {SMALLEST_EDGE} pixels on")
         pair = torch.stack([prediction, truth]).to(self.heads[0]).permute(0, 3, 1, 2)
@@ -73,9 +80,17 @@ class Lpips:
 
 
 def load_lpips(folder: Path | str | None = None, device: torch.device | str = "cpu") -> tuple[Lpips | None, str | None]:
-    """(metric, None), or (None, the reason) where no usable set of weights is there. folder: by default SEHDR_LPIPS.
+    """Load the weights.
 
-    Raises InputError for a folder that does not exist or a file that is not what its name says.
+    Args:
+        folder: of the weights; by default the one of SEHDR_LPIPS.
+        device: where distances are computed.
+
+    Returns:
+        The metric and None; or None and the reason if there are no weights.
+
+    Raises:
+        InputError: for a folder that does not exist, or a file that does not hold what its name says.
     """
     folder = folder or os.environ.get(VARIABLE)
     if not folder:
@@ -89,9 +104,9 @@ def load_lpips(folder: Path | str | None = None, device: torch.device | str = "c
         missing = "squeeze.pth" if backbones else "a SqueezeNet 1.1 backbone (squeezenet1_1_features.pth)"
         return None, f"{folder} lacks {missing}"
     features, state = _squeezenet_features(), _tensors(backbones[0])
-    kept = {name.removeprefix("features."): state[name] for name in state if not name.startswith("classifier.")}
+    backbone = {name.removeprefix("features."): state[name] for name in state if not name.startswith("classifier.")}
     try:
-        features.load_state_dict(kept)
+        features.load_state_dict(backbone)
     except RuntimeError as error:
         raise InputError(backbones[0], "is not SqueezeNet 1.1", "take torchvision's squeezenet1_1 weights") from error
     state = _tensors(heads)
@@ -102,6 +117,7 @@ def load_lpips(folder: Path | str | None = None, device: torch.device | str = "c
 
 
 def _tensors(path: Path) -> dict[str, Tensor]:
+    """Read a table of tensors; raise InputError for any other file."""
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)  # Plain tensors, which cannot run code.
     except Exception as error:  # torch reports damaged archives, pickles and missing files in many ways

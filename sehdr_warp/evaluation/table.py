@@ -1,32 +1,32 @@
-"""Figures as text in columns."""
+"""Figures as text in aligned columns."""
 
 from collections.abc import Sequence
 from itertools import zip_longest
 
 
 def columns(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
-    """One line a row: cells under each other, the first `left` of them flush left, the others flush right."""
+    """Return one line for each row, with aligned cells: the first `left` flush left, the others flush right."""
     widths = [max(map(len, cells)) for cells in zip_longest(*rows, fillvalue="")]
     sides = [str.ljust] * left + [str.rjust] * (len(widths) - left)
     return ["  ".join(side(cell, width) for side, cell, width in zip(sides, row, widths)) for row in rows]
 
 
 def format_table(result: dict) -> str:
-    """The figures of evaluate() as a table for a terminal; missing ones are dashes, with the reasons below."""
+    """Return the figures of evaluate() as a table for a terminal; missing ones are dashes, with the reasons below."""
     origin = result.get("folder") or (
         f"{result['gaussians']:,} Gaussians, {result['iterations']:,} iterations in {result['train_seconds']:.1f} s"
     )
     rows = [["", "PSNR", "SSIM", "LPIPS"]]
     if "folder" not in result:
         rows.append(_row("LDR", result["ldr"]))
-    # Sets without truth have no HDR figures: seven lines of dashes would say less than the reason below.
+    # Without truth there are no HDR figures, and the reason below says so once.
     names = list(result["protocol"]) if any(figures["views"] for figures in result["protocol"].values()) else []
     rows += [_row(f"HDR mu-law {name}", result["protocol"][name], "_mu") for name in names]
     rows += [_row(f"HDR PU21 {name}", result["pu21"][name]) for name in names]
     regions = [["region of the photo", "share", "LDR", *names]]
     for region, figures in result["regions"].items():
         values = [figures["psnr_ldr"], *(figures["psnr_mu"][name] for name in names)]
-        regions.append([region, f"{figures['fraction']:.1%}", *(number(value, 2) for value in values)])
+        regions.append([region, f"{figures['fraction']:.1%}", *(format_figure(value, 2) for value in values)])
     count, split = len(result["views"]), {"train": "training"}.get(result["split"], result["split"])
     lines = [f"{result['scene']}: {count} {split} view{'s' * (count != 1)}, {origin}", "", *columns(rows)]
     lines += ["", *columns(regions)]
@@ -41,10 +41,11 @@ def format_table(result: dict) -> str:
 
 def _row(label: str, figures: dict, suffix: str = "") -> list[str]:
     digits = {f"psnr{suffix}": 2, f"ssim{suffix}": 4, f"lpips{suffix}": 4}
-    return [label, *(number(figures[key], count) for key, count in digits.items() if key in figures)]
+    return [label, *(format_figure(figures[key], count) for key, count in digits.items() if key in figures)]
 
 
-def number(value: float | None, digits: int) -> str:
+def format_figure(value: float | None, digits: int) -> str:
+    """Return a figure with so many digits after the point, or a dash for None."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 

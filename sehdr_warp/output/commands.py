@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal
 
 from tyro.conf import Positional
 
-from ..arguments import positive
+from ..arguments import require_positive
 from ..errors import InputError, UsageError
 from ..files import check_absent
 from ..runs.open import load_run_photos_with_confidence, open_run, open_scene
@@ -78,7 +78,7 @@ class FilmOptions:
 class Render:
     """Render HDR EXR, previews and exposure brackets of a trained scene, or a film. Needs no photos."""
 
-    gone: ClassVar = {
+    removed_flags: ClassVar = {
         "--passes": "the option is --aovs",
         "--by": "the option is --group-by",
         "--white": "the option is --reference-white",
@@ -192,7 +192,7 @@ class Convert:
 class EnvironmentMap:
     """Write an environment map: the light that reaches a point of the scene from all directions."""
 
-    gone: ClassVar = {"--fill": "the option is --inpaint", "--white": "the option is --reference-white"}
+    removed_flags: ClassVar = {"--fill": "the option is --inpaint", "--white": "the option is --reference-white"}
 
     run: Positional[Path]
     """Folder of a run, or a file of Gaussians."""
@@ -272,7 +272,7 @@ def run_render(args: Render) -> None:
         cameras = [camera for _, camera in select_cameras(run, **path, transform=transform)]
         if args.size is not None:
             cameras = [framed(camera, *read_size(args.size)) for camera in cameras]
-        film = {"fps": positive("--fps", args.film.fps), "transfer": args.film.transfer, "ev_ramp": ramp}
+        film = {"fps": require_positive("--fps", args.film.fps), "transfer": args.film.transfer, "ev_ramp": ramp}
         files.append(write_film(run, args.video, cameras, **film, overwrite=args.overwrite))
         if len(cameras) == 1:
             log.warning("%s: '%s' is one camera, so one frame; --cameras orbit is a path", args.video, args.cameras)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..parallel import made_ahead
+from ..parallel import prefetch_map
 from ..response import Response
 from .exposure import exif_lens
 from .photo_file import PhotoKeeper
@@ -101,7 +101,7 @@ class ExposureCompensation:
             return scene
         # Codes of 16 bits take up to twice the memory of the photos.
         keeper = PhotoKeeper("auto", len(scene.views), sum(view.codes.size // 3 for view in scene.views))
-        normalized = made_ahead(lambda view: self._view(view, response), scene.views, AT_ONCE)
+        normalized = prefetch_map(lambda view: self._view(view, response), scene.views, AT_ONCE)
         views = tuple(keeper.store(view) for view in normalized)
         if keeper.note:
             _log.info("%s", keeper.note)

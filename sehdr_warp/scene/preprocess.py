@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError
-from ..parallel import made_ahead
+from ..parallel import prefetch_map
 from .camera import Camera
 from .dataparser import DataparserOutputs, ImageRecord, reinhard_gamma
 from .gain_map import has_gain_map, light_of, read_gain_map, with_light_above_white
@@ -54,7 +54,7 @@ def preprocess(
     quiet = any(record.hdr is not None or kind_of(record.image) != "encoded" for record in dataset.records)
     most = 1 if quiet else _PIXELS_AT_ONCE // max(record.lens.width * record.lens.height for record in dataset.records)
     jobs = ((record, names[i]) for i, record in log_progress("reading views", dataset.records))
-    views = [keeper.store(view) for view in made_ahead(lambda job: preprocessor.view(*job), jobs, most)]
+    views = [keeper.store(view) for view in prefetch_map(lambda job: preprocessor.view(*job), jobs, most)]
     deque(
         require_content(((view.codes, view.mask) for view in views if view.split == "train"), dataset.folder), maxlen=0
     )

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import tyro
 
-from ..arguments import numbers
+from ..arguments import parse_numbers
 from ..errors import SehdrError
 
 LOG = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ def run_synth(asked: Synth) -> None:
         LOG.info("%s", note)
     noise = None
     if asked.noise is not None:
-        figures = numbers("--noise", asked.noise)
+        figures = parse_numbers("--noise", asked.noise)
         if len(figures) != 2:
             raise SehdrError(f"--noise {asked.noise}: give two numbers, full well and read noise in electrons")
         noise = SensorNoise(*figures)

@@ -6,7 +6,7 @@ torch is imported when they run.
 import json
 import logging
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -82,7 +82,7 @@ class MachineOptions:
 class Train:
     """Train a scene from photos of one exposure. What the scene does not need is left out; what you name stays."""
 
-    gone: ClassVar[Mapping[str, str]] = {
+    removed_flags: ClassVar[Mapping[str, str]] = {
         **{configs.flag_of(path): advice for path, advice in configs.GONE.items()},
         **{configs.flag_of(path): f"write {configs.flag_of(name)}" for path, name in configs.RENAMED.items()},
         "--plan": "it is the default; --plan.enabled false trains without",
@@ -119,19 +119,23 @@ class ShowConfig:
     """Print it as JSON."""
 
 
-def run_train(asked: Train) -> None:
-    """Trains, or prints the plan, and says what was made and what to do next."""
+def run_train(asked: Train, argv: Sequence[str]) -> None:
+    """Train, or print the plan, and print what was written and what to do next.
+
+    Args:
+        asked: the options.
+        argv: the words of the command line, with which --gpus starts the other ranks.
+    """
     from .ranks import device_of_rank, joined, stated
 
     gpus, place = asked.machine.gpus, stated()
     if gpus < 1:
         raise UsageError(f"--gpus {gpus} is not 1 or more")
     if place is None and gpus > 1 and not asked.training.plan_only:
-        from ..cli import words_given
         from .launch import launch
 
         device_of_rank(gpus - 1, asked.machine.device)
-        launch(gpus, _run_as_rank, list(words_given))
+        launch(gpus, _run_as_rank, list(argv))
     elif place is None or asked.training.plan_only:
         _train(asked)
     elif gpus not in (1, place[1]):

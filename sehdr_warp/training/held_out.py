@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import torch
 
 from ..evaluation.metrics import psnr
-from ..evaluation.protocols import normalise, tone_map
+from ..evaluation.protocols import normalize, tone_map
 from ..model.radiance_field import RadianceField
 from ..scene import View
 
@@ -29,7 +29,7 @@ def evaluate_views(field: RadianceField, views: tuple[View, ...], degree: int) -
         scores.setdefault("psnr_ldr", []).append(min(psnr(predicted, photo, mask), BEST))
         if view.hdr is not None:
             hdr = field.render(view.camera, degree=degree).hdr
-            images = normalise("gt-max", hdr, torch.tensor(view.hdr, device=device), mask)
+            images = normalize("gt-max", hdr, torch.tensor(view.hdr, device=device), mask)
             scores.setdefault("psnr_mu", []).append(min(psnr(*tone_map("gt-max", *images), mask), BEST))
     return {name: sum(values) / len(values) for name, values in scores.items()}
 

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from ..parallel import made_ahead
+from ..parallel import prefetch_map
 from ..rasterizer.plane_sweep import BORDER, NEIGHBORS, PhotoSet, matched_points, matching_costs, trusted_depths
 from ..response import Response
 from ..scene import Camera, View, codes_of
@@ -53,7 +53,7 @@ class Matcher:
     def __init__(self, views: Sequence[View], response: Response, focus: float, device: torch.device | str):
         base = float(np.median([view.exposure_time for view in views]))
         tables = [_as_if(view.exposure_time / base, response) for view in views]
-        matchable = made_ahead(lambda given: _matchable(*given), zip(views, tables, strict=True), len(views))
+        matchable = prefetch_map(lambda given: _matchable(*given), zip(views, tables, strict=True), len(views))
         self._images, cameras = zip(*matchable, strict=True)
         self._cameras, self._masks = cameras, [view.mask for view in views]
         self.device = torch.device(device)
@@ -77,7 +77,7 @@ class Matcher:
         size, drawn by their gradients and light: edges can be matched, and lamps are small."""
         side = max(1.0, (sum(image.shape[0] * image.shape[1] for image in self._images) / count) ** 0.5)
         photos = zip(self._images, self._masks, strict=True)
-        chances = made_ahead(lambda photo: _chances(*photo), photos, len(self._images))
+        chances = prefetch_map(lambda photo: _chances(*photo), photos, len(self._images))
         chosen = [_one_for_each_square(chance, side, rng, index) for index, chance in enumerate(chances)]
         return torch.from_numpy(np.concatenate(chosen).astype(np.int32)).to(self.device)
 

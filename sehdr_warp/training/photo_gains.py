@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from ..parallel import made_ahead
+from ..parallel import prefetch_map
 from ..response import Response
 from ..runs.config import Config
 from ..scene import Scene, View
@@ -72,7 +72,7 @@ def find_gains(
         return None, matcher, Decision("photo-gains", {}, "none", f"matched points {reason}")
 
     # Photos are matched small: thousands of large ones would be read, evened and held again and again.
-    small = replace(scene, views=tuple(made_ahead(at_matching_size, views, MOST_AT_ONCE)))
+    small = replace(scene, views=tuple(prefetch_map(at_matching_size, views, MOST_AT_ONCE)))
     matcher = make(small)
     if stated:
         few = points_of(matcher, FEW_POINTS)

@@ -23,7 +23,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from ..errors import InputError, SehdrError, surroundings_told
+from ..errors import InputError, SehdrError, as_user_error
 from ..parallel import thread_count
 from ..scene.photo_file import PhotoFile, can_share, open_shared
 
@@ -265,7 +265,7 @@ def joined(rank: int, count: int, device: torch.device) -> Iterator[Ranks]:
     except BaseException as error:
         ranks.abandon()
         _end_soon(error)
-        first, told = ranks.ends_first(), isinstance(error, Exception) and surroundings_told(error)
+        first, told = ranks.ends_first(), isinstance(error, Exception) and as_user_error(error)
         if told and not first:
             raise SystemExit(1) from None
         if rank and isinstance(error, KeyboardInterrupt):

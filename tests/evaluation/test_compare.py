@@ -38,8 +38,8 @@ def test_runs_that_differ_by_their_seed_share_a_row(tmp_path):
     ]
     rows = compare_runs(runs)
     assert [(row.label, row.count) for row in rows] == [("a and 1 more", 2), ("long", 1)]
-    assert rows[0].mean("psnr_ldr") == 26 and rows[0].spread("psnr_ldr") == pytest.approx(2**0.5)
-    assert rows[1].spread("psnr_ldr") is None
+    assert rows[0].mean("psnr_ldr") == 26 and rows[0].deviation("psnr_ldr") == pytest.approx(2**0.5)
+    assert rows[1].deviation("psnr_ldr") is None
     table = comparison_table(rows)
     assert "26.00 ± 1.41" in table and "30.00" in table and "100 ±" not in table and len(table.splitlines()) == 3
     found = list(csv.DictReader(comparison_csv(rows).splitlines()))
@@ -51,14 +51,14 @@ def test_runs_that_differ_by_their_seed_share_a_row(tmp_path):
 def test_runs_that_have_not_ended_are_marked(tmp_path):
     stopped, whole = trained(tmp_path / "a"), trained(tmp_path / "b", seed=1)
     stopped.iterations = 60
-    assert compare_runs([stopped])[0].label == "a (not ended)"
-    assert compare_runs([stopped, whole])[0].label == "a and 1 more (1 not ended)"
+    assert compare_runs([stopped])[0].label == "a (unfinished)"
+    assert compare_runs([stopped, whole])[0].label == "a and 1 more (1 unfinished)"
 
 
 def test_what_cannot_be_compared_is_one_line(tmp_path):
     one = trained(tmp_path / "a")
     empty = trained(tmp_path / "b", ldr=(), mu=())
-    for runs, words in (([], "no runs"), ([one, one], "given twice"), ([one, empty], "b: has no evaluations")):
+    for runs, words in (([], "no runs"), ([one, one], "named twice"), ([one, empty], "b: has no evaluations")):
         with pytest.raises(SehdrError, match=words):
             compare_runs(runs)
     assert compare_runs([trained(tmp_path / "c", mu=(None, None))])[0].mean("psnr_mu") is None
@@ -74,7 +74,7 @@ def write_pictures(folder, factors):
 
 def test_a_folder_scores_as_a_run_that_renders_it(tmp_path, logged):
     folder = write_pictures(tmp_path / "out", dict.fromkeys(range(4), 0.5))
-    ours, theirs = sw.score_folder(folder, scene(VIEWS)), evaluate(run(lambda hdr: hdr * 0.5), scene(VIEWS))
+    ours, theirs = sw.evaluate_folder(folder, scene(VIEWS)), evaluate(run(lambda hdr: hdr * 0.5), scene(VIEWS))
     for name, figures in theirs["protocol"].items():
         assert ours["protocol"][name] == pytest.approx(figures, nan_ok=True)
     assert ours["pu21"] == theirs["pu21"] and ours["scale_from"] == "train"
@@ -88,11 +88,11 @@ def test_a_folder_scores_as_a_run_that_renders_it(tmp_path, logged):
 
 def test_missing_and_extra_files_are_said(tmp_path, logged):
     folder = write_pictures(tmp_path / "out", {3: 1.0, 9: 1.0})
-    result = sw.score_folder(folder, scene(VIEWS))
+    result = sw.evaluate_folder(folder, scene(VIEWS))
     assert (result["missing"], result["extra"], result["scale_from"]) == (["r_2"], ["r_9"], "scored")
     assert [row["name"] for row in result["views"]] == ["r_3"]
     assert any("1 views have no file: r_2" in line for line in logged)
-    assert any("files are of no view: r_9" in line for line in logged)
+    assert any("files belong to no view: r_9" in line for line in logged)
     assert "fitted on what the scored views" in format_table(result)
 
 
@@ -101,12 +101,12 @@ def test_folders_that_cannot_be_scored(tmp_path):
     bare = scene([view(0, "train", truth=False), view(1, "test", truth=False)])
     for place, truth, words in (
         (folder, scene(VIEWS), "holds no r_2.exr"),
-        (tmp_path / "none", scene(VIEWS), "is no folder"),
+        (tmp_path / "none", scene(VIEWS), "is not a folder"),
         (folder, bare, "no HDR truth"),
     ):
         with pytest.raises(InputError, match=words):
-            sw.score_folder(place, truth)
+            sw.evaluate_folder(place, truth)
     small = write_pictures(tmp_path / "small", {2: 1.0})
     write_exr(small / "r_2.exr", dict.fromkeys("RGB", np.ones((4, 5))), overwrite=True)
     with pytest.raises(SehdrError, match="its picture is 5 x 4.*: --max-size reduces the truth"):
-        sw.score_folder(small, scene(VIEWS))
+        sw.evaluate_folder(small, scene(VIEWS))

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sehdr_warp.evaluation.metrics import psnr
-from sehdr_warp.evaluation.protocols import PROTOCOLS, fit_scale, normalise, tone_map, tone_mapped_psnr
+from sehdr_warp.evaluation.protocols import PROTOCOLS, fit_scale, normalize, tone_map, tone_mapped_psnr
 
 
 def radiance(seed=0, shape=(40, 50, 3), decades=3.0):
@@ -20,7 +20,7 @@ def radiance(seed=0, shape=(40, 50, 3), decades=3.0):
 
 
 def figure(protocol, prediction, truth, scale=1.0):
-    return tone_mapped_psnr(protocol, *tone_map(protocol, *normalise(protocol, prediction, truth, scale=scale)))
+    return tone_mapped_psnr(protocol, *tone_map(protocol, *normalize(protocol, prediction, truth, scale=scale)))
 
 
 @pytest.mark.parametrize("factor, decibels", [(1.1, 39.0), (1.5, 26.5), (2.0, 21.8), (4.0, 15.8)])
@@ -33,7 +33,7 @@ def test_an_error_of_scale_costs_under_gt_max_what_the_mu_law_says(factor, decib
 
 def test_self_max_cuts_the_truth_down_to_codes_and_averages_channels():
     truth, prediction = radiance(1), radiance(2) * 5
-    a, b = tone_map("self-max", *normalise("self-max", prediction, truth))
+    a, b = tone_map("self-max", *normalize("self-max", prediction, truth))
     codes = b * 255
     assert torch.allclose(codes, codes.round(), atol=1e-9) and not torch.allclose(a * 255, (a * 255).round(), atol=1e-2)
     exact = torch.log1p(5000 * truth / truth.max()) / math.log(5001)
@@ -84,7 +84,7 @@ def test_masked_pixels_have_no_vote_and_no_maximum():
     truth[:30], mask[:30] = 1e6, 0
     assert fit_scale([(prediction, truth, mask, None)]) == pytest.approx(2.0)
     for protocol in PROTOCOLS:
-        a, b = normalise(protocol, prediction, truth, mask)
+        a, b = normalize(protocol, prediction, truth, mask)
         assert b[30:].max().item() == 1.0
         assert a[30:].max().item() == pytest.approx(1.0 if protocol == "self-max" else 0.5)
 
@@ -93,7 +93,7 @@ def test_black_images_stay_black():
     black, truth = torch.zeros(5, 5, 3), radiance(8, (5, 5, 3))
     for protocol in PROTOCOLS:
         for prediction, target in ((black, truth), (truth, black), (black, black)):
-            a, b = tone_map(protocol, *normalise(protocol, prediction, target))
+            a, b = tone_map(protocol, *normalize(protocol, prediction, target))
             assert torch.isfinite(a).all() and torch.isfinite(b).all()
     assert fit_scale([(black, truth, None, None)]) is None and fit_scale([]) is None
 
@@ -106,7 +106,7 @@ values = st.floats(width=32, allow_nan=True, allow_infinity=True)
 def test_any_prediction_has_a_figure(numbers, protocol):
     prediction = torch.tensor(numbers).reshape(2, 2, 3)
     truth = torch.linspace(0.0, 4.0, 12).reshape(2, 2, 3)
-    ours, reference = tone_map(protocol, *normalise(protocol, prediction, truth))
+    ours, reference = tone_map(protocol, *normalize(protocol, prediction, truth))
     assert ours.shape == reference.shape == (2, 2, 3)
     assert bool(((reference >= 0) & (reference <= 1)).all())
     inside = ours[~ours.isnan()]
