@@ -3,7 +3,7 @@
 python -m benchmarks.large 1M@1600x1200 --json docs/reports/results/large.json
 
 Both start from the scene's points, one Gaussian each, and move those that nobody needs. Photos stay codes on the GPU
-for both. gsplat (1.5.3) is trained as in captures.py.
+for both. gsplat (1.5.3) is trained as in gsplat_trainer.py.
 """
 
 import logging
@@ -22,15 +22,19 @@ from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.scene import Scene
+from sehdr_warp.scene.normalization import normalization_of
 from sehdr_warp.training.train import Training
 
-from .captures import WARM_UP, figures, photographed, train_gsplat
+from .captures import figures, photographed
+from .gsplat_trainer import GsplatScene, Snapshot, train_gsplat
 from .results import finish, new_result
 from .splats import Size, make_photo_scene, parse_size
 from .timing import forget_peaks, held_memory, wait
 
 LOG = logging.getLogger("large")
 RESPONSE = "srgb"
+WARM_UP = 5
+"""The first of so many parts of a training does not count for the time: kernels load, photos are matched."""
 HELD_OUT = 8
 """Of so many photos one is held out."""
 
@@ -78,11 +82,18 @@ def _train(scene: Scene, config: Config, device: str) -> dict:
 
 
 def _train_gsplat(scene: Scene, config: Config, device: str) -> dict:
-    torch.manual_seed(0)
-    trained = train_gsplat(scene, "mcmc", config, config.densification.cap_max, device)
-    row = {"method": "gsplat mcmc", "gaussians": trained.count(), "seconds": trained.loop_seconds}
+    normalized, steps, seconds = normalization_of(scene), config.schedule.iterations, []
+
+    def look(model: GsplatScene, snapshot: Snapshot) -> None:
+        seconds.append(snapshot.seconds)
+
+    options = {"steps": steps, "fewest_points": 0, "cap_max": config.densification.cap_max}
+    looks = {"look_at": (steps // WARM_UP, steps), "look": look}
+    trained = train_gsplat(normalized.scene(scene), "mcmc", device, **options, **looks)
+    row = {"method": "gsplat mcmc", "gaussians": trained.count, "seconds": seconds[1] - seconds[0]}
     row["memory"] = torch.cuda.max_memory_allocated(device)
-    return row | _means(trained, scene, device)
+    with torch.no_grad():
+        return row | _means(lambda view: trained.render(normalized.camera(view.camera))[0], scene, device)
 
 
 def _means(render: Callable, scene: Scene, device: str) -> dict[str, float]:

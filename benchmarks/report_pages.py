@@ -292,7 +292,7 @@ def _panorama_tables(result: dict) -> Iterable[str]:
 
 def _captures_tables(result: dict) -> Iterable[str]:
     table, figures = [], ("psnr", "psnr_fitted", "ssim", "lpips", "seconds", "memory", "gaussians")
-    for rows in groups(result["rows"], "capture", "method").values():
+    for rows in groups(result["rows"], "capture", "method", "iterations").values():
         means = {name: fmean(row[name] for row in rows) for name in figures}
         spread = stdev(row["psnr"] for row in rows) if len(rows) > 1 else None
         counts = {"gaussians": round(means["gaussians"]), "seeds": len(rows), "spread": spread}
