@@ -216,14 +216,11 @@ def read_photos(folder: Path, cache: Path | str | None = None) -> DataparserOutp
     if kind == "raw":
         color_matrix(photos)  # Refuse photos of several cameras before minutes of matching.
     refuse_stack(photos, folder)
-    model, records, lost = reconstruct(photos, cache), [], []
-    placed = {int(Path(image.name).stem): image for image in model.images}
-    for i, photo in enumerate(photos):
-        if (image := placed.get(i)) is None:
-            lost.append(photo.name)
-            continue
-        records.append(ImageRecord(photo.stem, photo, image.lens, image.world_to_camera, oriented=True))
-    notes = ()
-    if lost:
-        notes = (f"{len(lost)} of {len(photos)} photos could not be placed and were left out: {', '.join(lost[:5])}",)
-    return DataparserOutputs("photos", tuple(records), cloud=model.cloud, notes=notes)
+    found = reconstruct(photos, cache)
+    images = sorted(found.model.images, key=lambda image: image.name)
+    files = [photos[int(Path(image.name).stem)] for image in images]
+    records = tuple(
+        ImageRecord(photo.stem, photo, image.lens, image.world_to_camera, oriented=True)
+        for photo, image in zip(files, images, strict=True)
+    )
+    return DataparserOutputs("photos", records, cloud=found.model.cloud, notes=found.notes(photos))

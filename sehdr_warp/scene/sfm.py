@@ -14,7 +14,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,12 +33,50 @@ _log = logging.getLogger("sehdr_warp.scene")
 # SIFT finds little more above this size, and extraction time grows with the area.
 MAX_SIDE = 1200
 _SEED = 0
+FEWEST_SHARED = 60  # Points of a photo with fewer shared ones place it badly; sound photos have hundreds
+MOST_ERROR = 1.0  # Pixels; sound sets have 0.2 to 0.8
 _VERSION = 3
 # Up to so many photos every pair is matched; in larger sets each photo is matched with its neighbors by name.
 _EXHAUSTIVE_LIMIT = 150
 
 
-def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> SparseModel:
+@dataclass(frozen=True)
+class Reconstruction:
+    """What structure from motion found.
+
+    Attributes:
+        model: cameras, poses and points. Names are the photos' indices (`00003.png` is photos[3]); photos that could
+            not be placed are missing.
+        error: mean reprojection error in pixels, at photos of at most MAX_SIDE pixels.
+        weak: indices of the photos that share fewer than FEWEST_SHARED points with others.
+    """
+
+    model: SparseModel
+    error: float
+    weak: tuple[int, ...]
+
+    def notes(self, photos: Sequence[Path]) -> tuple[str, ...]:
+        """Return a line for each reason not to trust the places of the cameras, with the photos concerned."""
+        placed = {int(Path(image.name).stem) for image in self.model.images}
+        lost, notes = [photo.name for i, photo in enumerate(photos) if i not in placed], []
+        if lost:
+            first = ", ".join(lost[:5]) + (", ..." if len(lost) > 5 else "")
+            notes.append(f"{len(lost)} of {len(photos)} photos could not be placed and were left out: {first}")
+        if self.weak:
+            first = ", ".join(photos[i].name for i in self.weak[:5]) + (", ..." if len(self.weak) > 5 else "")
+            notes.append(
+                f"{len(self.weak)} photos share few points with others, so their places are uncertain: {first}; "
+                "more photos in between help"
+            )
+        if self.error > MOST_ERROR:
+            notes.append(
+                f"the cameras' places are uncertain: points miss their photos by {self.error:.1f} pixels in the mean; "
+                "sharper photos, less motion in the scene and one lens and zoom help"
+            )
+        return tuple(notes)
+
+
+def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Reconstruction:
     """Find cameras (SIMPLE_RADIAL, at the photos' oriented size), poses and points of photos.
 
     Args:
@@ -46,7 +84,7 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Spar
         cache: a folder for results, None for the user's; the same photos are solved once, wherever they lie.
 
     Returns:
-        A model whose names are the photos' indices (`00003.png` is photos[3]), without photos that could not be placed.
+        The model and how far it can be trusted.
 
     Raises:
         InputError: if fewer than two photos can be placed.
@@ -70,8 +108,20 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Spar
     with _cached(cache, f"sfm-{key}", solve) as folder:
         model = read_model(folder)
         sizes = json.loads((folder / "sizes.json").read_text())
+        error, weak = _placement(folder)
     images = (replace(image, lens=image.lens.resized(*sizes[int(Path(image.name).stem)])) for image in model.images)
-    return SparseModel(tuple(images), model.cloud)
+    return Reconstruction(SparseModel(tuple(images), model.cloud), error, weak)
+
+
+def _placement(folder: Path) -> tuple[float, tuple[int, ...]]:
+    """Return the mean reprojection error of a result of ours, and the indices of photos with few shared points."""
+    import pycolmap
+
+    with _quiet():
+        found = pycolmap.Reconstruction(str(folder))
+        shared = {int(Path(found.images[i].name).stem): found.images[i].num_points3D for i in found.reg_image_ids()}
+        error = float(found.compute_mean_reprojection_error())
+    return error, tuple(sorted(index for index, count in shared.items() if count < FEWEST_SHARED))
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,12 +16,13 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.files import LIST
 from sehdr_warp.scene import load_scene, sfm
-from sehdr_warp.scene.dataparser import ImageRecord
+from sehdr_warp.scene.colmap_model import ModelImage, SparseModel
+from sehdr_warp.scene.dataparser import ImageRecord, PointCloud
 from sehdr_warp.scene.exposure import shutter
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import _held_out
 from sehdr_warp.scene.names import natural_key, unique_names
-from sehdr_warp.scene.sfm import reconstruct
+from sehdr_warp.scene.sfm import MOST_ERROR, Reconstruction, reconstruct
 from tests.make_scenes import load, write_blender, write_colmap, write_ply
 
 _TIME, _NUMBER, _ISO, _APEX = 33434, 33437, 34855, 37377
@@ -196,8 +198,20 @@ def test_photos_of_several_cameras_get_their_own_lenses(tmp_path, shared):
     for i, photo in enumerate(photos):
         with Image.open(photo) as image:
             image.reduce(4 if i < 3 else 5).save(tmp_path / photo.name, quality=95)
-    model = reconstruct(sorted(tmp_path.glob("*.JPG")), tmp_path / "cache")
-    assert {(image.lens.width, image.lens.height) for image in model.images} == {(567, 426), (708, 532)}
+    found = reconstruct(sorted(tmp_path.glob("*.JPG")), tmp_path / "cache")
+    assert {(image.lens.width, image.lens.height) for image in found.model.images} == {(567, 426), (708, 532)}
+    assert 0 < found.error < MOST_ERROR and not found.notes(photos)
+
+
+def test_poor_placement_is_named_with_its_photos():
+    photos = [Path(f"{index}.jpg") for index in range(8)]
+    lens = Lens("PINHOLE", 8, 6, (7.0, 7.0, 4.0, 3.0), Path("cameras.bin"))
+    images = tuple(ModelImage(f"{index:05d}.png", lens, np.eye(4)) for index in range(6))
+    model = SparseModel(images, PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32)))
+    lost, weak, error = Reconstruction(model, 1.4, (2, 4)).notes(photos)
+    assert lost == "2 of 8 photos could not be placed and were left out: 6.jpg, 7.jpg"
+    assert weak.startswith("2 photos share few points with others, so their places are uncertain: 2.jpg, 4.jpg;")
+    assert "1.4 pixels" in error
 
 
 def test_embedded_scene_loads():
