@@ -21,7 +21,8 @@ from itertools import takewhile
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
-from sehdr_warp.errors import InputError, SehdrError
+from .errors import InputError, SehdrError
+from .own_files import first_foreign, list_file, seal
 
 _REFUSALS = "ENOSPC EDQUOT EFBIG EROFS EACCES EPERM EIO ENAMETOOLONG ENOTDIR EISDIR EMFILE"
 _WRITE_ERRORS = {getattr(errno, name) for name in _REFUSALS.split() if hasattr(errno, name)}
@@ -30,8 +31,6 @@ _WRITE_ERRORS = {getattr(errno, name) for name in _REFUSALS.split() if hasattr(e
 MAX_FILE_BYTES = 4 << 30
 MAX_JSON_BYTES = 256 << 20
 _MAX_LINE = 16 << 20
-LIST = ".sehdr-warp"
-"""The list of a folder: a line `SHA-256  name` for each file that this program has written there."""
 
 
 @contextmanager
@@ -75,7 +74,7 @@ def _written_beside(path: Path, overwrite: bool, ours: bool, folder: bool) -> It
                 _sync(written)
             check_absent(path, overwrite, folder=folder, ours=ours)
             if not (folder or ours):
-                _list(temporary, path)
+                list_file(temporary, path)
             _put(temporary, path)
         except BaseException as error:
             if isinstance(error, SehdrError):
@@ -99,57 +98,22 @@ def write_json(path: Path | str, value: Any, overwrite: bool = False, *, ours: b
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
-def seal(folder: Path) -> None:
-    """Lists all files of a folder as they are, for foreign() and is_sealed()."""
-    (folder / LIST).write_bytes(b"".join(line + b"\n" for line in _lines(folder)))
+class UnreadableError(InputError):
+    """A file that the system does not let this user read; its content is not at fault."""
+
+    def __init__(self, path: Path | str, error: OSError):
+        super().__init__(path, f"cannot be read ({error.strerror})", "check its rights")
 
 
-def is_sealed(folder: Path) -> bool:
-    """Whether a folder holds the files of its list, all of them as they were."""
-    with suppress(OSError):
-        return set() != listed(folder) <= set(_lines(folder))
-    return False
-
-
-def foreign(path: Path) -> Path | None:
-    """The first file at or in `path` that this program did not write, or that was changed since; None if there is
-    none."""
-    folder = path if path.is_dir() else path.parent
-    known = listed(folder)
-    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-        if file.is_symlink() or not (file.is_dir() or file == folder / LIST):
-            name = file.relative_to(folder).as_posix()
-            if file.is_symlink() or not file.is_file() or hash_line(file, name) not in known:
-                return file
-    return None
-
-
-def hash_line(file: Path, name: str) -> bytes:
-    """A file as its line in a list has it, without the end of the line."""
-    with open(file, "rb") as opened:
-        digest = hashlib.file_digest(opened, "sha256").hexdigest()
-    return os.fsencode(f"{digest}  {name}".replace("\n", "\\n"))
-
-
-def _lines(folder: Path) -> list[bytes]:
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != LIST)
-    return [hash_line(path, path.relative_to(folder).as_posix()) for path in files]
-
-
-def listed(folder: Path) -> set[bytes]:
-    """The lines of a folder's list; none where it cannot be read."""
-    with suppress(OSError, InputError):
-        return set(read_bytes(folder / LIST, MAX_JSON_BYTES).split(b"\n")) - {b""}
-    return set()
-
-
-def _list(temporary: Path, path: Path) -> None:
-    """Adds a file that is about to get its name to the list of its folder, in one write, as others may list theirs."""
-    handle = os.open(path.parent / LIST, os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
-    try:
-        os.write(handle, hash_line(temporary, path.name) + b"\n")
-    finally:
-        os.close(handle)
+def refuse_links(path: Path, folder: Path) -> None:
+    """Raise InputError if a path in a folder, or a folder between the two, is a link."""
+    for place in (path, *path.parents):
+        if place == folder:
+            return
+        if place.is_symlink():
+            raise InputError(
+                place, "is a link, and links in it are not followed", "copy what it leads to into its place"
+            )
 
 
 def plain_size(path: Path) -> int:
@@ -167,18 +131,22 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
             problem = f"{size} bytes is more than the limit of {limit}"
             raise InputError(path, problem, "check that this is the right file")
         data = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(path, "file not found", "check the name") from None
     except OSError as error:
-        problem = "file not found" if isinstance(error, FileNotFoundError) else f"cannot be read ({error.strerror})"
-        raise InputError(path, problem, "check the name and its rights") from None
+        raise UnreadableError(path, error) from None
     if not data:
         raise InputError(path, "file is empty", "copy or export the file again")
     return data
 
 
-def read_text(path: Path, limit: int = MAX_FILE_BYTES) -> str:
-    """The whole file as UTF-8 text; raises InputError as read_bytes does, and where it is not text."""
+def read_text(path: Path, limit: int = MAX_FILE_BYTES, errors: str = "strict") -> str:
+    """Return the whole file as UTF-8 text; raise InputError as read_bytes does, and if it is not text.
+
+    errors: of bytes.decode.
+    """
     try:
-        return read_bytes(path, limit).decode("utf-8-sig")
+        return read_bytes(path, limit).decode("utf-8-sig", errors)
     except UnicodeDecodeError as error:
         raise InputError(path, f"is not UTF-8 text (byte {error.start})", "export the file again") from None
 
@@ -200,9 +168,9 @@ def read_lines(path: Path) -> Iterator[str]:
         raise InputError(path, problem, "check the data folder") from None
 
 
-def read_json(path: Path) -> dict:
-    """The JSON object in a file; raises InputError where it is missing, broken or not an object."""
-    text = read_text(path, MAX_JSON_BYTES)
+def read_json(path: Path, limit: int = MAX_JSON_BYTES) -> dict:
+    """Return the JSON object in a file; raise InputError if it is missing, too large, broken or not an object."""
+    text = read_text(path, limit)
     try:
         values = json.loads(text, object_pairs_hook=_unique)
     except (ValueError, RecursionError) as error:
@@ -258,7 +226,7 @@ def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = Fa
         return
     if not overwrite:
         raise InputError(path, "exists already", "choose another place, or ask for it to be replaced (--overwrite)")
-    if (other := foreign(path)) is not None:
+    if (other := first_foreign(path)) is not None:
         problem = "was not written by sehdr-warp, or was changed since, and is never replaced"
         raise InputError(other, problem, "move it away, or choose another place")
 

@@ -13,7 +13,7 @@ PACKAGE = ROOT / "sehdr_warp"
 
 # What each room may import of the others: training -> runs -> model -> response -> rasterizer -> kernels, and below
 # them all what any room may use.
-ANY = {"errors", "quiet", "arguments", "files", "console", "apart", "parallel", "caches"}
+ANY = {"errors", "quiet", "arguments", "files", "own_files", "console", "apart", "parallel", "caches"}
 ALLOWED = {
     "kernels": set(),
     "errors": set(),
@@ -21,7 +21,8 @@ ALLOWED = {
     "apart": {"errors"},
     "parallel": set(),
     "caches": set(),
-    "files": {"errors"},
+    "files": {"errors", "own_files"},
+    "own_files": set(),
     "arguments": {"errors"},
     "splats": ANY,
     "rasterizer": ANY | {"kernels"},

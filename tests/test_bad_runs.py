@@ -10,6 +10,7 @@ import pytest
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.runs.run_folder import RunFolder
+from sehdr_warp.runs.run_writer import RunWriter
 
 from .full_disk import full_disk
 from .refusals import call, refused
@@ -341,6 +342,6 @@ def test_kill_while_a_checkpoint_is_written(trained, tmp_path):
 def test_a_folder_that_is_no_run_is_not_replaced_and_the_remedy_says_so(tmp_path):
     (tmp_path / "report.html").write_text("mine")
     with pytest.raises(InputError, match="is not a run .*; choose another folder for the run"):
-        RunFolder(tmp_path).check(resume=False, overwrite=True)
+        RunWriter(tmp_path).check(resume=False, overwrite=True)
     with pytest.raises(InputError, match="is not a run .*; give the folder that"):
-        RunFolder(tmp_path).check(resume=True, overwrite=False)
+        RunWriter(tmp_path).check(resume=True, overwrite=False)

@@ -9,16 +9,14 @@ import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.files import (
-    LIST,
     atomic_folder,
     atomic_path,
-    is_sealed,
     read_bytes,
     read_json,
     read_lines,
-    seal,
     write_json,
 )
+from sehdr_warp.own_files import LIST, is_sealed, seal
 from sehdr_warp.splats import read_gaussians
 
 from .full_disk import full_disk

@@ -9,7 +9,7 @@ import torch
 from sehdr_warp.check.case import ROUNDINGS, UNIT, Case, Reading, compare, count, not_finite
 from sehdr_warp.model.color_models import EXPOSURE_FLOOR
 from sehdr_warp.model.fusion import NeuralExposureFusion
-from sehdr_warp.model.radiance_field import Photograph
+from sehdr_warp.model.radiance_field import TrainRender
 from sehdr_warp.rasterizer import ssim
 from sehdr_warp.rasterizer.clipped_light import ClippedWeights, clipped_light_energy
 from sehdr_warp.response import Response, response_by_name
@@ -143,7 +143,7 @@ def _loss(prediction, photo):
     """The training's loss between encoded values of a simulated photo [H, W, 3] and a photo of black and white."""
     codes = (255 * photo).to(prediction.device, torch.uint8)
     target = Target(codes, code_scale(255, None, prediction.device, dtype=prediction.dtype))
-    shown = Photograph(prediction, None, None, None)  # pyright: ignore[reportArgumentType]
+    shown = TrainRender(prediction, None, None, None)  # pyright: ignore[reportArgumentType]
     return ldr_loss(shown, target, LossConfig())
 
 

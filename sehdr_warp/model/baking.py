@@ -1,8 +1,8 @@
-"""Trained scenes as Gaussians whose harmonics mean what a file can say, and back.
+"""Conversion between trained scenes and Gaussians whose harmonics mean what a file format can state.
 
-A response and the fusion of brackets act on the light of a direction, and viewers blend what a photo shows instead of
-light: no harmonics are exactly the scene's. They are fitted for each Gaussian by itself (bake), then all together to
-the scene's own pictures (refine).
+A response and the fusion of brackets act on the light of a direction, and viewers blend encoded colors instead of
+light, so no harmonics represent the scene exactly. They are fitted for each Gaussian separately (bake), then jointly to
+rendered images of the scene (refine).
 """
 
 import math
@@ -22,7 +22,7 @@ from .gaussians import Gaussians
 from .radiance_field import RadianceField
 from .sensor_colors import rec709_of
 
-# Radiance below this counts as this: its logarithm must be finite.
+# Smallest radiance whose logarithm is taken.
 DARKEST = 1e-12
 STEPS = 150
 RATES = {"harmonics_dc": 0.03, "harmonics_rest": 0.01, "opacity_logits": 0.3}
@@ -35,54 +35,60 @@ Colors = Callable[[np.ndarray], np.ndarray]
 
 
 def field_of(gaussians: GaussianArrays) -> RadianceField:
-    """The field that a file of Gaussians is; its response is sRGB."""
+    """Return the field that a file of Gaussians represents; its response is sRGB."""
     harmonics = gaussians.harmonics.astype(np.float64)
     if gaussians.color_model == "log":
         harmonics[:, 0] += np.log(gaussians.base_time) / HARMONIC_0
     elif gaussians.color_model == "linear":
         harmonics *= gaussians.base_time
     harmonics = torch.from_numpy(harmonics.astype(np.float32))
-    given = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits)
-    tensors = [torch.from_numpy(np.array(values, np.float32)) for values in given]
-    made = Gaussians(*tensors, harmonics[:, :1], harmonics[:, 1:])  # pyright: ignore[reportCallIssue]
+    means, log_scales, quaternions, logits = (
+        torch.from_numpy(np.array(values, np.float32))
+        for values in (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits)
+    )
+    model = Gaussians(means, log_scales, quaternions, logits, harmonics[:, :1], harmonics[:, 1:])
     options = {"base_time": gaussians.base_time, "radiance": gaussians.color_model}
-    return RadianceField(made, response_by_name("srgb"), **options).requires_grad_(False)
+    return RadianceField(model, response_by_name("srgb"), **options).requires_grad_(False)
 
 
 def gaussians_of(
     field: RadianceField,
     color_model: str,
-    seen_from: np.ndarray,
+    camera_positions: np.ndarray,
     exposure_time: float | None = None,
     color_matrix: np.ndarray | None = None,
 ) -> GaussianArrays:
-    """A field's Gaussians in the colors of a file.
+    """Return a field's Gaussians in the colors of a file.
 
-    color_model: "log" or "linear" for scene-linear radiance, "display" for what the field's response makes of it at
-    exposure_time: seconds, by default the base time. seen_from: [C, 3] where the scene was photographed from.
-    color_matrix: [3, 3] from the field's colors to linear Rec.709, if they are others.
+    Exact if the field's own harmonics have that meaning; else fitted for each Gaussian (see bake). The result is in the
+    coordinates of the scene, like camera_positions.
 
-    Exact where the field's own harmonics mean that; else fitted for each Gaussian (see bake). The result is in the
-    coordinates of the scene, as seen_from is.
+    Args:
+        field: A trained field.
+        color_model: "log" or "linear" for scene-linear radiance, "display" for values encoded by the field's response.
+        camera_positions: [C, 3] positions that the scene was photographed from.
+        exposure_time: Seconds for "display", by default the base time.
+        color_matrix: [3, 3] from the field's colors to linear Rec.709, if they are not Rec.709.
     """
-    seen_from = field.normalization.points(seen_from)
-    stored = _in_colors(field, color_model, seen_from, exposure_time, color_matrix)
+    camera_positions = field.normalization.points(camera_positions)
+    stored = _in_colors(field, color_model, camera_positions, exposure_time, color_matrix)
     return to_scene(stored, field.normalization)
 
 
 def to_normalized(gaussians: GaussianArrays, normalization: Normalization) -> GaussianArrays:
     """Return Gaussians of scene coordinates in normalized ones."""
-    return _moved(gaussians, normalization.points(gaussians.means), -math.log(normalization.unit))
+    return _transformed(gaussians, normalization.points(gaussians.means), -math.log(normalization.unit))
 
 
 def to_scene(gaussians: GaussianArrays, normalization: Normalization) -> GaussianArrays:
     """Return Gaussians of normalized coordinates in those of the scene."""
     if normalization.is_identity:
         return gaussians
-    return _moved(gaussians, normalization.scene_points(gaussians.means), math.log(normalization.unit))
+    return _transformed(gaussians, normalization.scene_points(gaussians.means), math.log(normalization.unit))
 
 
-def _moved(gaussians: GaussianArrays, means: np.ndarray, log_scale: float) -> GaussianArrays:
+def _transformed(gaussians: GaussianArrays, means: np.ndarray, log_scale: float) -> GaussianArrays:
+    """Return Gaussians at other means [N, 3], with sizes multiplied by exp(log_scale)."""
     sizes = gaussians.log_scales.astype(np.float64) + log_scale
     return replace(gaussians, means=means.astype(np.float32), log_scales=sizes.astype(np.float32))
 
@@ -90,11 +96,11 @@ def _moved(gaussians: GaussianArrays, means: np.ndarray, log_scale: float) -> Ga
 def _in_colors(
     field: RadianceField,
     color_model: str,
-    seen_from: np.ndarray,
+    camera_positions: np.ndarray,
     exposure_time: float | None,
     color_matrix: np.ndarray | None,
 ) -> GaussianArrays:
-    """Return gaussians_of() in the field's own coordinates, as seen_from is."""
+    """Return gaussians_of() in the field's own coordinates, like camera_positions."""
     stored, to_radiance = _stored(field)
     if color_matrix is not None:
         to_radiance = _in_rec709(to_radiance or (lambda x: x / field.base_time), color_matrix, field.base_time)
@@ -103,8 +109,10 @@ def _in_colors(
         if stored.color_model == "display" and time == field.base_time and color_matrix is None:
             return stored
         radiance = to_radiance or (lambda exposure: exposure / field.base_time)
-        shown = bake(stored, lambda colors: field.response.encode(radiance(colors) * time), "display", seen_from)
-        return replace(shown, base_time=time)  # By which their light is found again.
+        encoded = bake(
+            stored, lambda colors: field.response.encode(radiance(colors) * time), "display", camera_positions
+        )
+        return replace(encoded, base_time=time)  # The exposure that readers need to recover radiance.
     if to_radiance is None and color_model == stored.color_model:
         harmonics = stored.harmonics.astype(np.float64)
         if color_model == "linear":
@@ -113,16 +121,17 @@ def _in_colors(
         return stored.with_colors(harmonics, "log")
     radiance = to_radiance or (lambda exposure: exposure / field.base_time)
     if color_model == "linear":
-        return bake(stored, radiance, "linear", seen_from)
-    return bake(stored, lambda colors: np.log(np.maximum(radiance(colors), DARKEST)), "log", seen_from)
+        return bake(stored, radiance, "linear", camera_positions)
+    return bake(stored, lambda colors: np.log(np.maximum(radiance(colors), DARKEST)), "log", camera_positions)
 
 
 def _in_rec709(native: Colors, matrix: np.ndarray, base_time: float) -> Colors:
+    """Return a function of colors that converts the radiance of another one to Rec.709."""
     return lambda colors: rec709_of(torch.from_numpy(np.asarray(native(colors))), matrix, base_time).numpy()
 
 
 def _stored(field: RadianceField) -> tuple[GaussianArrays, Colors | None]:
-    """The Gaussians in the field's own colors, and how these become radiance; None where they are exposures."""
+    """Return the Gaussians in the field's own colors, and their conversion to radiance (None if they are exposures)."""
     tensors = {name: value.cpu().numpy() for name, value in field.gaussians.tensors().items()}
     harmonics = np.concatenate([tensors.pop("harmonics_dc"), tensors.pop("harmonics_rest")], axis=1)
     name = field.color_model.name
@@ -134,7 +143,7 @@ def _stored(field: RadianceField) -> tuple[GaussianArrays, Colors | None]:
 
 @torch.no_grad()
 def _fuse(field: RadianceField, exposure: np.ndarray) -> np.ndarray:
-    """[N, D, 3] radiance of [N, D, 3] exposures at the base time."""
+    """Return fused radiance [N, D, 3] of exposures [N, D, 3] at the base time."""
     assert field.fusion is not None
     logs = torch.from_numpy(np.log(np.maximum(exposure, DARKEST)).reshape(-1, 3).astype(np.float32))
     fused = field.fusion(logs.to(field.gaussians.means.device))
@@ -142,7 +151,7 @@ def _fuse(field: RadianceField, exposure: np.ndarray) -> np.ndarray:
 
 
 def sphere_directions(count: int = _SPHERE_DIRECTIONS) -> np.ndarray:
-    """[count, 3] unit vectors, evenly over the sphere (a Fibonacci lattice)."""
+    """Return [count, 3] unit vectors, evenly spread over the sphere (a Fibonacci lattice)."""
     index = np.arange(count) + 0.5
     z = 1 - 2 * index / count
     azimuth, ring = np.pi * (1 + np.sqrt(5)) * index, np.sqrt(1 - z * z)
@@ -150,13 +159,16 @@ def sphere_directions(count: int = _SPHERE_DIRECTIONS) -> np.ndarray:
 
 
 def bake(gaussians: GaussianArrays, change: Colors, color_model: str, camera_positions: np.ndarray) -> GaussianArrays:
-    """The same Gaussians with harmonics of the same degree fitted to changed colors by least squares.
+    """Fit harmonics of the same degree to changed colors of each Gaussian, by least squares.
 
-    Directions in which a Gaussian was photographed count most, since elsewhere its harmonics were never held to
-    anything; an even cover of the sphere keeps the fit bounded there.
+    Directions in which a Gaussian was photographed count most, because its harmonics were not constrained elsewhere; an
+    even cover of the sphere keeps the fit bounded there.
 
-    change: [N, D, 3] colors of the present model -> [N, D, 3] of color_model. camera_positions: [C, 3] from where the
-    scene was photographed; with none, all directions weigh alike.
+    Args:
+        gaussians: Gaussians in their present color model.
+        change: Function from colors [N, D, 3] of the present model to colors [N, D, 3] of color_model.
+        color_model: Color model of the result.
+        camera_positions: [C, 3] positions that the scene was photographed from; with none, all directions weigh alike.
     """
     count = min(len(camera_positions), _MAX_CAMERAS)
     cameras = camera_positions[np.linspace(0, len(camera_positions) - 1, count).round().astype(int)]
@@ -167,41 +179,44 @@ def bake(gaussians: GaussianArrays, change: Colors, color_model: str, camera_pos
     for start in range(0, len(gaussians.means), _CHUNK):
         rows = slice(start, start + _CHUNK)
         part = replace(gaussians, means=gaussians.means[rows], harmonics=gaussians.harmonics[rows])
-        seen = part.means[:, None].astype(np.float64) - cameras
-        seen /= np.maximum(np.linalg.norm(seen, axis=2, keepdims=True), 1e-12)
-        directions = np.concatenate([np.broadcast_to(sphere, (len(seen), *sphere.shape)), seen], axis=1)
-        wanted = change(evaluate_colors(part, directions)) - offset
+        rays = part.means[:, None].astype(np.float64) - cameras
+        rays /= np.maximum(np.linalg.norm(rays, axis=2, keepdims=True), 1e-12)
+        directions = np.concatenate([np.broadcast_to(sphere, (len(rays), *sphere.shape)), rays], axis=1)
+        target = change(evaluate_colors(part, directions)) - offset
         basis = harmonic_basis(directions, gaussians.degree)
         weighted = (basis * weights[:, None]).swapaxes(1, 2)
-        fitted[rows] = np.linalg.solve(weighted @ basis, weighted @ wanted)
+        fitted[rows] = np.linalg.solve(weighted @ basis, weighted @ target)
     return gaussians.with_colors(fitted, color_model)
 
 
 def refine(
     gaussians: GaussianArrays, picture: Callable[[Camera], Tensor], cameras: Sequence[Camera], *, steps: int = STEPS
 ) -> GaussianArrays:
-    """Gaussians of display colors whose harmonics and opacities are fitted to pictures by Adam; shapes stay.
+    """Fit harmonics and opacities of display-color Gaussians to images by Adam; shapes stay.
 
-    picture: the encoded picture [H, W, 3] in [0, 1] that a camera is to see. cameras: visited in an order of a fixed
-    seed, each as often as the others.
+    Args:
+        gaussians: Gaussians of display colors.
+        picture: Function from a camera to the encoded image [H, W, 3] in [0, 1] to fit.
+        cameras: Cameras, visited equally often in an order of a fixed seed.
+        steps: Number of Adam steps.
     """
     random = np.random.default_rng(0)
     order = [int(i) for _ in range(-(-steps // max(len(cameras), 1))) for i in random.permutation(len(cameras))][:steps]
     if not order:
         return gaussians
-    wanted = {index: picture(cameras[index]) for index in sorted(set(order))}
-    device = next(iter(wanted.values())).device
+    targets = {index: picture(cameras[index]) for index in sorted(set(order))}
+    device = next(iter(targets.values())).device
     field = field_of(gaussians).to(device)
-    changed = {name: getattr(field.gaussians, name).requires_grad_() for name in RATES}
-    optimizer = Adam([{"params": [value]} for value in changed.values()])
+    fitted = {name: getattr(field.gaussians, name).requires_grad_() for name in RATES}
+    optimizer = Adam([{"params": [value]} for value in fitted.values()])
     for step, index in enumerate(order):
-        fading = 0.5 * (1 + math.cos(math.pi * step / len(order)))
+        decay = 0.5 * (1 + math.cos(math.pi * step / len(order)))
         for group, rate in zip(optimizer.param_groups, RATES.values(), strict=True):
-            group["lr"] = rate * fading
-        shown = field.photograph(field.camera_tensors(cameras[index]), field.base_time).encoded
-        assert shown is not None
+            group["lr"] = rate * decay
+        rendered = field.render_train_view(field.camera_tensors(cameras[index]), field.base_time).encoded
+        assert rendered is not None
         optimizer.zero_grad()
-        (shown.clamp(0, 1) - wanted[index]).square().mean().backward()
+        (rendered.clamp(0, 1) - targets[index]).square().mean().backward()
         optimizer.step()
     return to_scene(_stored(field)[0], field.normalization)
 
@@ -210,11 +225,17 @@ def refine(
 def agreement(
     gaussians: GaussianArrays, picture: Callable[[Camera], Tensor], cameras: Sequence[Camera], time: float
 ) -> float:
-    """dB, at most 120: the PSNR of pictures of Gaussians, encoded by sRGB at an exposure time, against those of
-    picture(), over all pixels of some cameras."""
+    """Return the PSNR of rendered Gaussians against images, dB, at most 120, over all pixels of some cameras.
+
+    Args:
+        gaussians: Gaussians to render, encoded by sRGB.
+        picture: Function from a camera to the encoded reference image [H, W, 3].
+        cameras: Cameras to compare.
+        time: Exposure time, seconds.
+    """
     field, errors = field_of(gaussians), []
     for camera in cameras:
-        wanted = picture(camera)
-        shown = field.to(wanted.device).render_ldr(camera, time)
-        errors.append(float((shown - wanted).square().mean()))
+        target = picture(camera)
+        rendered = field.to(target.device).render_ldr(camera, time)
+        errors.append(float((rendered - target).square().mean()))
     return -10 * math.log10(max(float(np.mean(errors)), 1e-12))

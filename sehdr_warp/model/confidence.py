@@ -1,8 +1,8 @@
-"""How far the photos vouch for a scene's light: what each Gaussian's weight fell on in the training views.
+"""Confidence in a scene's light, per Gaussian, from the pixels that it contributes to in the training views.
 
-The sum over a photo's pixels of (weight of a Gaussian) x (number at the pixel) is the derivative of the blend with
-respect to that Gaussian's feature, so the splat's own adjoint gathers it for all Gaussians in one pass a view. The
-number is how uncertain the pixel leaves its light, in stops; see pixel_uncertainty.
+The sum over a photo's pixels of (blending weight of a Gaussian) x (value of the pixel) is the derivative of the blended
+image with respect to that Gaussian's feature, so one backward pass per view gathers it for all Gaussians. The value is
+the uncertainty of the pixel's light in stops; see pixel_uncertainty.
 """
 
 from collections.abc import Sequence
@@ -15,22 +15,25 @@ from ..response import Response
 from ..response.curve import HALF_CODE
 from ..scene import View
 from .radiance_field import RadianceField
-from .unexplained import MOST_VIEWS, unexplained_pixels
+from .residual_regions import MAX_VIEWS, high_residual_mask
 
-CLIPPED_STOPS = 1.0  # Uncertainty of a pixel that is clipped in all channels
-PARTLY_CLIPPED_STOPS = 0.25  # Of a clipped channel beside others, which say where the light is, and it the hue
-MOST_STOPS = 4.0  # A misfit counts no more than this: 1/16 of the confidence already says that nothing is known
-LEAST_SEEN = 0.01  # Pixels of blending weight, over all photos, at which half of the confidence that they give counts
-LEAST_CONTRIBUTION = 1 / 255  # Pixels of blending weight in one photo: what has less is not part of the scene
-UNEXPLAINED = 8.0  # Times that a pixel counts of what the scene lacks: places behind it are hidden in few photos each
+CLIPPED_STOPS = 1.0  # Uncertainty of a pixel that is clipped in all channels, stops
+PARTLY_CLIPPED_STOPS = 0.25  # Uncertainty of a clipped channel next to unclipped ones, which bound the brightness
+MAX_STOPS = 4.0  # Largest misfit that counts; a confidence of 1/16 already means unknown
+HALF_CONFIDENCE_PIXELS = 0.01  # Sum of blending weights over all photos, in pixels, at which the confidence is halved
+MIN_CONTRIBUTION = 1 / 255  # Blending weight in one photo, pixels; a Gaussian with less is not part of the scene
+RESIDUAL_WEIGHT = 8.0  # Weight of pixels that the scene does not reproduce: what they hide is seen in other photos
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the training photos say of each of N Gaussians; [N] each.
+    """Evidence of the training photos for N Gaussians; tensors [N].
 
-    seen: pixels, the sum of its blending weights, UNEXPLAINED times where a photo shows what the scene lacks. stops:
-    their mean uncertainty. clipped: the share of their values. peak: pixels, as seen, in the photo that shows it most.
+    Attributes:
+        seen: Sum of blending weights over pixels, RESIDUAL_WEIGHT times in regions that the scene does not reproduce.
+        stops: Mean uncertainty in stops.
+        clipped: Fraction of clipped values.
+        peak: Sum of blending weights, as in seen, in the photo in which it is largest.
     """
 
     seen: Tensor
@@ -40,37 +43,46 @@ class Evidence:
 
     @property
     def contributes(self) -> Tensor:
-        """[N] bool: whether a Gaussian changes any photo by more than a code of 8 bits, summed over its pixels."""
-        return self.peak > LEAST_CONTRIBUTION
+        """[N] bool, whether a Gaussian changes any photo by more than an 8-bit code, summed over its pixels."""
+        return self.peak > MIN_CONTRIBUTION
 
     def rows(self, index: Tensor) -> "Evidence":
         """Return the evidence of the Gaussians at an index or mask [N]."""
         return Evidence(self.seen[index], self.stops[index], self.clipped[index], self.peak[index])
 
     def confidence(self) -> Tensor:
-        """[N] in [0, 1]. 1: observed unclipped, and the scene agrees; 1/2: known to a factor of two; 0: never seen."""
-        return torch.exp2(-self.stops) * self.seen / (self.seen + LEAST_SEEN)
+        """Return [N] in [0, 1]: 1 observed unclipped and reproduced, 1/2 known to a factor of two, 0 never seen."""
+        return torch.exp2(-self.stops) * self.seen / (self.seen + HALF_CONFIDENCE_PIXELS)
 
 
 def pixel_uncertainty(photo: Tensor, exposure: Tensor, response: Response) -> tuple[Tensor, Tensor]:
-    """Stops of doubt that a photo leaves about the light at its pixels, and the clipped share of each; [H, W] both.
+    """Return the uncertainty of the light at a photo's pixels, in stops, and the clipped fraction of each pixel.
 
-    photo: [H, W, 3] encoded, in [0, 1]. exposure: [H, W, 3] what the scene shows there, E dt. Mean over channels of
+    The uncertainty is the mean over channels of
 
-        an unclipped channel    |log2(exposure / decoded value)|, the misfit, plus a quarter of the width of its
-                                8-bit code's interval in stops (the mean distance from its middle), at most 1
-        a clipped channel       by how much the exposure falls short of white, if it does, plus CLIPPED_STOPS where all
-                                channels are clipped, else PARTLY_CLIPPED_STOPS
-        a black channel         by how much the exposure is above half a code, if it is, plus 1
+        unclipped channel   |log2(exposure / decoded value)|, the misfit, plus a quarter of the width of its 8-bit
+        code's
+                            interval in stops (the mean distance from its middle), at most 1
+        clipped channel     the stops by which the exposure falls short of white, plus CLIPPED_STOPS if all channels are
+                            clipped, else PARTLY_CLIPPED_STOPS
+        black channel       the stops by which the exposure is above half a code, plus 1
+
+    Args:
+        photo: [H, W, 3] encoded, in [0, 1].
+        exposure: [H, W, 3] exposure E dt of the rendered scene.
+        response: The camera response.
+
+    Returns:
+        Two tensors [H, W].
     """
-    dark = response.decode(photo.new_full((1, 3), HALF_CODE))
+    half_code = response.decode(photo.new_full((1, 3), HALF_CODE))
     white = response.white
     clipped, black = photo >= 1 - HALF_CODE, photo <= HALF_CODE
-    # Below half a code two exposures are the same to the photo.
-    lit = torch.maximum(exposure, dark)
-    misfit = (lit / torch.maximum(response.decode(photo), dark)).log2().abs()
-    misfit = torch.where(clipped, (white / lit).log2().clamp_min(0), misfit)
-    misfit = torch.where(black, (lit / dark).log2(), misfit).clamp_max(MOST_STOPS)
+    # A photo does not distinguish exposures below half a code.
+    lifted = torch.maximum(exposure, half_code)
+    misfit = (lifted / torch.maximum(response.decode(photo), half_code)).log2().abs()
+    misfit = torch.where(clipped, (white / lifted).log2().clamp_min(0), misfit)
+    misfit = torch.where(black, (lifted / half_code).log2(), misfit).clamp_max(MAX_STOPS)
     low, high = (response.decode((photo + offset).clamp(0, 1)) for offset in (-HALF_CODE, HALF_CODE))
     rounding = ((high.clamp_min(1e-12) / low.clamp_min(1e-12)).log2() / 4).clamp(0, 1)
     unknown = torch.where(clipped.all(2, keepdim=True), CLIPPED_STOPS, PARTLY_CLIPPED_STOPS).expand_as(photo)
@@ -82,31 +94,35 @@ def pixel_uncertainty(photo: Tensor, exposure: Tensor, response: Response) -> tu
 def gather_evidence(
     field: RadianceField, views: Sequence[View], *, degree: int | None = None, truth: bool = False
 ) -> Evidence:
-    """What the photos of some views say of a field's Gaussians; where a view has a mask, only where it counts.
+    """Gather the evidence of photos for the Gaussians of a field.
 
-    truth: the field was trained on HDR truth, which is then what was observed where a view has it: nothing is clipped,
-    and the misfit is all the doubt.
+    Args:
+        field: The trained field.
+        views: Training views; pixels that a mask excludes do not count.
+        degree: Highest SH degree, by default all.
+        truth: The field was trained on HDR truth. If a view has it, it replaces the photo: nothing is clipped and the
+            misfit is the whole uncertainty.
     """
     device = field.gaussians.means.device
     total = torch.zeros(field.gaussians.count, 3, device=device)
     peak = torch.zeros(field.gaussians.count, device=device)
-    every = -(-len(views) // MOST_VIEWS) or 1
+    every = -(-len(views) // MAX_VIEWS) or 1
     for index, view in enumerate(views):
         if index % every:
-            peak = torch.maximum(peak, _weight(field, view))
+            peak = torch.maximum(peak, _blending_weights(field, view))
             continue
         exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time
-        counted = torch.ones_like(exposure[..., 0])
+        weight = torch.ones_like(exposure[..., 0])
         if truth and view.hdr is not None:
             observed = torch.tensor(view.hdr, device=device) * view.exposure_time
-            stops = (exposure.clamp_min(1e-9) / observed.clamp_min(1e-9)).log2().abs().clamp_max(MOST_STOPS).mean(2)
+            stops = (exposure.clamp_min(1e-9) / observed.clamp_min(1e-9)).log2().abs().clamp_max(MAX_STOPS).mean(2)
             clipped = torch.zeros_like(stops)
         else:
             stops, clipped = pixel_uncertainty(torch.tensor(view.image, device=device), exposure, field.response)
-            counted = counted + (UNEXPLAINED - 1) * unexplained_pixels(view, exposure, field.response)
+            weight = weight + (RESIDUAL_WEIGHT - 1) * high_residual_mask(view, exposure, field.response)
         if view.mask is not None:
-            counted = counted * torch.tensor(view.mask, device=device)
-        images = torch.stack([counted, counted * stops, counted * clipped], dim=2)
+            weight = weight * torch.tensor(view.mask, device=device)
+        images = torch.stack([weight, weight * stops, weight * clipped], dim=2)
         sums = field.weighted_sums(field.camera_tensors(view.camera), images)
         total += sums
         peak = torch.maximum(peak, sums[:, 0])
@@ -115,12 +131,12 @@ def gather_evidence(
     return Evidence(seen, means[:, 0].clamp_min(0), means[:, 1].clamp(0, 1), peak)
 
 
-def _weight(field: RadianceField, view: View) -> Tensor:
-    """Return [N], pixels: the sum of each Gaussian's blending weights in a view, where its mask counts."""
+def _blending_weights(field: RadianceField, view: View) -> Tensor:
+    """Return the sum [N] of each Gaussian's blending weights in a view inside its mask, pixels."""
     device = field.gaussians.means.device
-    counted = torch.ones(view.camera.height, view.camera.width, device=device)
+    weight = torch.ones(view.camera.height, view.camera.width, device=device)
     if view.mask is not None:
-        counted = torch.tensor(view.mask, device=device)
-    # As wide as a training's features: no further kernel is compiled.
-    images = counted[..., None].expand(-1, -1, 3).contiguous()
+        weight = torch.tensor(view.mask, device=device)
+    # Three channels like a training's features, so that no further kernel is compiled.
+    images = weight[..., None].expand(-1, -1, 3).contiguous()
     return field.weighted_sums(field.camera_tensors(view.camera), images)[:, 0]

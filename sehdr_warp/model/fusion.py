@@ -1,8 +1,9 @@
 """From base radiance to HDR radiance: neural exposure fusion (SeHDR, section 3.3).
 
 Every bracket is the base scaled by a known ratio, so the fused value is a function of one number: the log radiance of
-the base, for each channel by itself. The equations are evaluated on a table over that number and interpolated, at a
-cost that does not grow with the Gaussians; gradients reach the MLPs, the sigmas and the radiances through the table.
+the base, for each channel separately. The equations are evaluated on a table over that number and interpolated, so that
+the cost does not grow with the number of Gaussians; gradients reach the MLPs, the sigmas and the radiances through the
+table.
 """
 
 import math
@@ -28,16 +29,24 @@ NODES = 1024
 class NeuralExposureFusion(nn.Module):
     """NeEF: c^h = radiance_scale * sum_p w_p f(c^{l_p}), w = softmax over p of MLP_c(gamma_p, f(c^{l_p})) gamma_p.
 
-    gamma = exp(-(f(c^{l_p}) - 0.5)^2 / (2 sigma_c^2)), sigma_c learnable for each channel, and one MLP a channel:
+    gamma = exp(-(f(c^{l_p}) - 0.5)^2 / (2 sigma_c^2)), with a learnable sigma_c per channel, and one MLP per channel:
     2 -> width -> 1 with ReLU between and no function at the end.
 
-    response: f, with its extension beyond the clip point. times: n exposure times, seconds; base_time: dt_1.
-    radiance_scale: what the fused value, which is at most 1, is multiplied by; > 0. seed: of the MLPs' start.
-    width: hidden units of each MLP, as in HDR-GS's tone mapper. sigma: initial standard deviation.
-
     forward() applies the equations to NODES values of the log radiance, with Catmull-Rom interpolation between them,
-    constant below and a line above; exact() to every Gaussian. Parameters: log_sigma [3]; weights and biases, one stack
-    over the three channels for each layer. Raises SehdrError for times or a scale that are not positive.
+    constant below and linear above; exact() applies them to every Gaussian. Parameters: log_sigma [3]; weights and
+    biases, one stack over the three channels per layer.
+
+    Args:
+        response: The curve f, with its extension beyond the clip point.
+        times: Exposure times of the n brackets, seconds.
+        base_time: Exposure time dt_1 of the photos, seconds.
+        radiance_scale: Factor on the fused value, which is at most 1; > 0.
+        seed: Seed of the MLPs' start values.
+        width: Hidden units of each MLP, as in HDR-GS's tone mapper.
+        sigma: Initial standard deviation.
+
+    Raises:
+        SehdrError: If a time or the scale is not positive.
     """
 
     def __init__(
@@ -51,6 +60,7 @@ class NeuralExposureFusion(nn.Module):
         width: int = 128,
         sigma: float = 0.2,
     ):
+        """Create the fusion with seeded MLPs; arguments as in the class."""
         super().__init__()
         if not (math.isfinite(radiance_scale) and radiance_scale > 0):
             raise SehdrError(f"fusion: radiance_scale = {radiance_scale!r} is not positive")
@@ -62,53 +72,53 @@ class NeuralExposureFusion(nn.Module):
         self.weights, self.biases = _channel_layers([2, width, 1], seed)
         brackets = [math.log(time / self.base_time) for time in self.times]
         self._low = math.log(response.decode(response.black + DARKEST_VALUE)) - max(brackets)
-        self._kept_nodes = {}
+        self._node_cache = {}
         self._high = math.log(response.white) + OCTAVES_ABOVE_WHITE * math.log(2) - min(brackets)
 
     def forward(self, log_base: Tensor) -> Tensor:
-        """[N, 3] scene-linear radiance c^h from [N, 3] log c^{l_1}, the log of the radiance at the input exposure."""
+        """Return scene-linear radiance c^h [N, 3] of log c^{l_1} [N, 3], the log radiance at the input exposure."""
         step = (self._high - self._low) / (NODES - 1)
         table = fuse_exposures(self._encoded_at_nodes(log_base, step), *self._learned(), scale=self.radiance_scale)
         return interpolate(table, self._low, step, log_base)
 
     def exact(self, log_base: Tensor) -> Tensor:
-        """As forward, by the equations themselves for every Gaussian: what the table stands for."""
+        """Return the same as forward(), without the table."""
         weights, encoded = self.fusion_weights(log_base)
         return self.radiance_scale * (weights * encoded).sum(dim=0)
 
     def fusion_weights(self, log_base: Tensor) -> tuple[Tensor, Tensor]:
-        """The weights w and the encoded brackets f(c^{l_p}) behind the sum, each [n, N, 3], for [N, 3] log c^{l_1}."""
+        """Return the weights w and the encoded brackets f(c^{l_p}), each [n, N, 3], of log c^{l_1} [N, 3]."""
         encoded = self._encode(log_base)
         return fusion_weights(encoded, *self._learned()), encoded
 
     def _encode(self, log_base):
-        """[n, N, 3] the encoded brackets of log_base [N, 3]."""
+        """Return the encoded brackets [n, N, 3] of log_base [N, 3]."""
         return self.response.encode_extended(bracket_log_radiance(log_base, self.times, self.base_time).exp())
 
     def _learned(self):
-        """What fuse_exposures() takes behind the brackets."""
+        """Return the learnable arguments of fuse_exposures()."""
         return self.log_sigma, *(part for layer in zip(self.weights, self.biases, strict=True) for part in layer)
 
     def _encoded_at_nodes(self, like, step):
-        """[n, nodes + 2, 3] the encoded brackets at the table's nodes; kept, unless the curve is itself learned."""
+        """Return the encoded brackets [n, nodes + 2, 3] at the table's nodes; cached unless the curve is learned."""
         key = self.response, like.device, like.dtype
-        if key in self._kept_nodes:
-            return self._kept_nodes[key]
-        # One node more at either end gives every cell its four.
+        if key in self._node_cache:
+            return self._node_cache[key]
+        # One more node at either end, so that every cell has four.
         grid = torch.arange(-1, NODES + 1, dtype=like.dtype, device=like.device) * step + self._low
         encoded = self._encode(grid[:, None].expand(-1, 3))
-        # What is made while a step is recorded has no content before the first replay, and dies with the recording.
+        # A tensor created during CUDA graph capture is undefined before the first replay, so it is not cached.
         if not self.response.learnable and not is_capturing(like.device):
-            self._kept_nodes[key] = encoded
+            self._node_cache[key] = encoded
         return encoded
 
 
 def _channel_layers(sizes: list[int], seed: int) -> tuple[nn.ParameterList, nn.ParameterList]:
-    """Weights [3, in, out] and biases [3, 1, out], uniform within 1 / sqrt(in) as torch.nn.Linear starts."""
+    """Return weights [3, in, out] and biases [3, 1, out], uniform within 1 / sqrt(in) as torch.nn.Linear starts."""
     generator = torch.Generator().manual_seed(seed)
 
     def layers(rows):
-        drawn = (torch.rand(3, rows or a, b, generator=generator) for a, b in pairwise(sizes))
-        return nn.ParameterList((2.0 * part - 1.0) * a**-0.5 for part, a in zip(drawn, sizes, strict=False))
+        uniform = (torch.rand(3, rows or a, b, generator=generator) for a, b in pairwise(sizes))
+        return nn.ParameterList((2.0 * part - 1.0) * a**-0.5 for part, a in zip(uniform, sizes, strict=False))
 
     return layers(None), layers(1)

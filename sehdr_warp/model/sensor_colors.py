@@ -1,22 +1,30 @@
-"""From the light of a sensor's three channels to Rec.709."""
+"""Conversion of sensor RGB to linear Rec.709."""
 
 import numpy as np
 import torch
 from torch import Tensor
 
-# Of a channel's white level: between these its value goes from what was seen to what must at least have been there.
+# Fractions of the white level between which a channel's value blends from its own to the clipped estimate.
 _CLIPPED = 0.75, 0.95
 
 
 def rec709_of(radiance: Tensor, matrix: np.ndarray, base_time: float) -> Tensor:
-    """[..., 3] linear Rec.709 of light in a sensor's own colors, whose channels are white at 1 / base_time.
+    """Convert radiance in a sensor's own RGB to linear Rec.709.
 
-    matrix: [3, 3], white balance included. Channels clip at one value, which white-balanced is none: bare, what is
-    clipped in all would come out magenta. So a channel at its white level counts as at least as bright as the brightest
-    of the three, white-balanced. Colors out of Rec.709's gamut have negative parts, which no light has: they become 0.
+    All channels of a sensor clip at the same value, so a pixel clipped in all of them would turn magenta by white
+    balance alone. A channel near its white level therefore counts as at least as bright as the brightest of the three
+    after white balance. Colors outside the Rec.709 gamut have negative components, which are set to 0.
+
+    Args:
+        radiance: [..., 3] sensor RGB, in which white is 1 / base_time.
+        matrix: [3, 3] from sensor RGB to linear Rec.709, white balance included.
+        base_time: Exposure time of the photos, seconds.
+
+    Returns:
+        [..., 3] linear Rec.709, >= 0.
     """
-    given = torch.tensor(matrix, dtype=radiance.dtype, device=radiance.device)
-    neutral = torch.linalg.solve(given, torch.ones_like(given[0]))
+    to_rec709 = torch.tensor(matrix, dtype=radiance.dtype, device=radiance.device)
+    neutral = torch.linalg.solve(to_rec709, torch.ones_like(to_rec709[0]))
     neutral = neutral / neutral.max()
     exposure = radiance * base_time
     low, high = _CLIPPED
@@ -24,4 +32,4 @@ def rec709_of(radiance: Tensor, matrix: np.ndarray, base_time: float) -> Tensor:
     clipped = clipped * clipped * (3 - 2 * clipped)
     balanced = exposure / neutral
     balanced = balanced + clipped * (balanced.amax(dim=-1, keepdim=True) - balanced)
-    return ((balanced * neutral / base_time) @ given.T).clamp_min(0)
+    return ((balanced * neutral / base_time) @ to_rec709.T).clamp_min(0)

@@ -24,6 +24,7 @@ from ..splats import read_gaussians
 from .checkpoint import Checkpoint, under
 from .config import Config
 from .run_folder import CameraEntry, RunFolder
+from .run_writer import write_confidence
 
 log = logging.getLogger(__name__)
 
@@ -288,6 +289,6 @@ def ensure_confidence(run: Run, scene: Scene) -> None:
     log.info("measuring confidence on the training photos")
     evidence = run.measure_confidence(scene)
     try:
-        run.folder.write_confidence(evidence, run.checkpoint_hash)
+        write_confidence(run.folder, evidence, run.checkpoint_hash)
     except SehdrError as error:
         log.warning("confidence is not kept: %s", error)

@@ -22,7 +22,8 @@ from PIL import Image
 
 from ..caches import usable, user_cache
 from ..errors import InputError, SehdrError
-from ..files import atomic_folder, is_sealed
+from ..files import atomic_folder
+from ..own_files import is_sealed
 from .colmap_model import SparseModel, read_model
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
 from .photos import read_photo

@@ -161,7 +161,7 @@ def _run_as_rank(words: list[str]) -> None:
 
 def _train(asked: Train, ranks=None) -> None:
     from ..runs.device import pick_device
-    from ..runs.run_folder import RunFolder
+    from ..runs.run_writer import RunWriter
 
     output, resumed = asked.output, None
     out, how = output.out, {"resume": output.resume, "overwrite": output.overwrite}
@@ -170,8 +170,10 @@ def _train(asked: Train, ranks=None) -> None:
     elif out is None:
         raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
     # What can be refused is refused before the photos are read, which may take minutes.
-    elif (folder := RunFolder(out)).check(**how):
+    elif (folder := RunWriter(out)).check(**how):
         resumed = folder
+    elif output.resume:
+        log.info("%s holds no run yet: a training begins there", out)
     data = _data(asked, resumed)
     config = _config(asked, resumed)
     device = pick_device(asked.machine.device) if ranks is None else ranks.device

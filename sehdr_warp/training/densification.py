@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..model.gaussians import PARAMETER_NAMES, Gaussians
-from ..model.spare_rows import moments_of
+from ..model.reserved_rows import moments_of
 from ..rasterizer import Rendering
 from ..rasterizer.relocation import Drawn, clear_rows, copy_rows, count_copies, number_places, share_opacities
 from ..rasterizer.training_step import add_gradient_statistics, add_position_noise

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..model.radiance_field import Photograph, RadianceField
+from ..model.radiance_field import RadianceField, TrainRender
 from ..rasterizer.clipped_light import ClippedWeights, clipped_light_energy
 from ..rasterizer.code_residual import CodeScale, code_residual, code_values
 from ..rasterizer.photo_loss import photo_loss
@@ -107,7 +107,7 @@ def _distance_weight(form: str, weight: float) -> float:
     return 1.0 if form == "sum" else 1 - weight
 
 
-def ldr_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor:
+def ldr_loss(photo: TrainRender, target: Target, config: LossConfig) -> Tensor:
     """L_LDR, on the target's scale, as far as the photo can tell; where exposures are compared, the light of clipped
     pixels, which it does not tell, is as smooth as it can be."""
     image = photo.light if target.scale.mu else photo.encoded
@@ -152,7 +152,7 @@ def anchor_loss(mapper: ToneMapper) -> Tensor:
     return (mapper.encode_log(mapper.weights[0].new_zeros(1, 3)) - ANCHOR).square().mean()
 
 
-def linear_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor | None:
+def linear_loss(photo: TrainRender, target: Target, config: LossConfig) -> Tensor | None:
     """SeHDR's L_linear: base exposure against the true one where hdr_truth is on and there is any, else against the
     fused one; None where there is nothing to compare."""
     truth = target.exposure_truth if config.hdr_truth else None
@@ -166,7 +166,7 @@ def linear_loss(photo: Photograph, target: Target, config: LossConfig) -> Tensor
     return image_loss(photo.base, truth, target.mask, config.form, config.ssim_weight)
 
 
-def hdr_loss(photo: Photograph, target: Target, config: LossConfig, largest: float) -> Tensor:
+def hdr_loss(photo: TrainRender, target: Target, config: LossConfig, largest: float) -> Tensor:
     """The HDR color's exposure against the true one, both divided by the greatest of all views, in the mu-law. HDR-GS
     divides each image by its own maximum, and with that leaves the scale of the scene open."""
     assert photo.exposure is not None and target.exposure_truth is not None
@@ -175,7 +175,7 @@ def hdr_loss(photo: Photograph, target: Target, config: LossConfig, largest: flo
 
 
 def needed_colours(config: LossConfig, has_truth: bool) -> frozenset[str]:
-    """What photograph() must render besides the photo for data_loss of a view with or without HDR truth."""
+    """What render_train_view() must render besides the photo for data_loss of a view with or without HDR truth."""
     wanted = {"exposure"} if config.hdr_weight > 0 and has_truth else set()
     if config.linear_weight > 0:
         wanted |= {"base"} if config.hdr_truth and has_truth else {"base", "exposure"}
@@ -183,7 +183,7 @@ def needed_colours(config: LossConfig, has_truth: bool) -> frozenset[str]:
 
 
 def data_loss(
-    field: RadianceField, photo: Photograph, target: Target, config: LossConfig, largest_truth: float = 1.0
+    field: RadianceField, photo: TrainRender, target: Target, config: LossConfig, largest_truth: float = 1.0
 ) -> Tensor:
     """L_LDR + beta L_linear (equation 13), the HDR loss and the anchor, each where it has a weight."""
     loss = ldr_loss(photo, target, config) if config.ldr_weight > 0 else 0.0
@@ -200,7 +200,6 @@ def data_loss(
     return loss
 
 
-def regularised(loss: Tensor, photo: Photograph) -> Tensor:
-    """The loss and what the Gaussians themselves cost, whatever the view: the opacities, where photograph() was given
-    a weight for them."""
-    return loss if photo.opacity_cost is None else loss + photo.opacity_cost
+def regularised(loss: Tensor, photo: TrainRender) -> Tensor:
+    """Return the loss plus the opacity penalty, if the view was rendered with an opacity weight."""
+    return loss if photo.opacity_penalty is None else loss + photo.opacity_penalty

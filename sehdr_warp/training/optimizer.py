@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
-from ..model.adam import BETAS, FIRST_COEFFICIENT, Adam
+from ..model.adam import BETAS, FIRST_HARMONIC, Adam
 from ..model.gaussians import PARAMETER_NAMES
 from ..model.radiance_field import RadianceField
 from ..rasterizer import HarmonicsGradients
@@ -92,7 +92,7 @@ class FlatGradients:
             parameter
             for name, parameters in groups.items()
             for parameter in parameters
-            if not (factored and name in FIRST_COEFFICIENT)
+            if not (factored and name in FIRST_HARMONIC)
         ]
         self._means, self._place, self._count = groups["means"][0], place, count
         shapes = [parameter.shape for parameter in self.parameters]

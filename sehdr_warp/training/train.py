@@ -16,7 +16,7 @@ import torch
 from ..errors import InputError, SehdrError
 from ..model.confidence import Evidence, gather_evidence
 from ..model.radiance_field import RenderedView
-from ..model.unexplained import MOST_NAMED, told, unexplained_regions
+from ..model.residual_regions import MAX_LISTED, find_residual_regions, regions_to_dict
 from ..rasterizer.memory import oom_context
 from ..response import Response
 from ..runs.checkpoint import first_not_finite
@@ -24,7 +24,7 @@ from ..runs.config import Config
 from ..runs.config_files import as_config, config_fields, override_config
 from ..runs.device import pick_device
 from ..runs.run import Run, as_rec709, field_from_checkpoint, load_run, photo_gains
-from ..runs.run_folder import RunFolder
+from ..runs.run_writer import RunWriter, write_confidence
 from ..scene import Camera, Scene
 from ..scene.exposure_compensation import ExposureCompensation
 from ..scene.normalization import normalization_of
@@ -115,7 +115,7 @@ class Training:
         data: dict[str, Any] | None = None,
         ranks: Ranks | None = None,
     ):
-        self.folder, self.ranks = RunFolder(out), ranks
+        self.folder, self.ranks = RunWriter(out), ranks
         self.device = pick_device(device)
         make_writer = summary_writer() if tensorboard else None
         config = as_config(config)
@@ -204,7 +204,7 @@ class Training:
             run = self.run
             evidence = run.measure_confidence(self.scene) if self._evidence is None else self._evidence
             run.model.confidence = evidence.confidence()
-            self.folder.write_confidence(evidence, run.checkpoint_hash)
+            write_confidence(self.folder, evidence, run.checkpoint_hash)
             self._tell_unexplained(run)
 
     def pause(self) -> None:
@@ -294,15 +294,15 @@ class Training:
 
     def _tell_unexplained(self, run: Run) -> None:
         """Compares the training photos with the scene, and names what is missing in the summary and in a line."""
-        regions = unexplained_regions(run.model, self.scene.train_views, degree=run.degree)
-        self.folder.write_summary(run.summary() | {"unexplained": told(regions)})
+        regions = find_residual_regions(run.model, self.scene.train_views, degree=run.degree)
+        self.folder.write_summary(run.summary() | {"unexplained": regions_to_dict(regions)})
         if regions:
             worst, photos = regions[0], len({region.photo for region in regions})
             log.warning(
                 "%d regions in %d photos are not explained by the scene; the worst: %s at column %.0f, row %.0f, "
                 "%d pixels %.1f stops %s than the photo (summary.json names %d)",
                 *(len(regions), photos, worst.photo, worst.column, worst.row, worst.pixels, abs(worst.stops)),
-                *("darker" if worst.stops > 0 else "brighter", min(len(regions), MOST_NAMED)),
+                *("darker" if worst.stops > 0 else "brighter", min(len(regions), MAX_LISTED)),
             )
 
     def _evaluate(self) -> None:
@@ -410,10 +410,7 @@ def train(
         scene: of load_scene.
         out: the folder of the run.
         config: as of Training.
-        options: the other arguments of Training.
-
-    Raises:
-        KeyboardInterrupt: with a usable checkpoint left; and what Training raises.
+        options: the other arguments of Training, whose errors are raised.
     """
     training = Training(scene, out, config, **options)
     for _ in training:

@@ -113,7 +113,7 @@ class Trainer:
         """dB, of the last step's view as the scene shows it now, against its photo, where the mask counts."""
         view = self._training_views()[self._last_index]
         with self._launching():
-            photo = self.field.photograph(view.camera, view.exposure_time, degree=self.degree).encoded
+            photo = self.field.render_train_view(view.camera, view.exposure_time, degree=self.degree).encoded
         assert photo is not None
         return view.target.psnr(photo)
 
@@ -149,7 +149,7 @@ class Trainer:
         adam.set_means_rate(self.optimizer, rate)
         # The last: few are ordered otherwise, and a learned response encodes few otherwise, by kernels of their own.
         kind = (self.degree, watched, rows < EXACT_BELOW, rows <= ONE_SORT)
-        self._last_index, count, moves = index, gaussians.count, gaussians.moves
+        self._last_index, count, moves = index, gaussians.count, gaussians.reallocations
         if self._can_record(views, kind):
             self._loss, self._shown = self._replay(views, index, watched, kind)
             if isinstance(views, PhotoStream):
@@ -160,7 +160,7 @@ class Trainer:
         self.densification.perturb(self.iteration, gaussians, rate)
         if self._change() and self._recorder is not None:
             # Other Gaussians need about so many times the room.
-            growth, stayed = gaussians.count / max(1, count), gaussians.moves == moves
+            growth, stayed = gaussians.count / max(1, count), gaussians.reallocations == moves
             if not self._capacity.change(growth, keep=stayed):
                 self._invalidate()
         self._averaging.follow(self.iteration, self.photos, gaussians)
@@ -236,14 +236,14 @@ class Trainer:
             return apply(seen), seen.image
 
     def _gradients(self, view: TrainingView, watched: bool, capacity: int | None = None) -> "_Seen":
-        """Photograph, compare, differentiate. With a capacity all of it works on fixed memory and nothing waits for the
+        """Render, compare, differentiate. With a capacity all of it works on fixed memory and nothing waits for the
         device."""
         target, camera, time, field = view.target, view.camera, view.exposure_time, self.field
         also = needed_colours(self.config.loss, target.exposure_truth is not None)
         options = {"degree": self.degree, "also": also, "max_intersections": capacity, "encode": self._encoded}
         options |= {"factored": self._factored, "opacity_weight": self.config.loss.opacity_weight}
-        photo = field.photograph(camera, time, **options)
-        by_harmonics = photo.by_harmonics
+        photo = field.render_train_view(camera, time, **options)
+        harmonics_gradients = photo.harmonics_gradients
         # What the backward pass does not read, or only its first part does, must not stay until the end of the step.
         kept = {"means2d", "extents"} if watched else set()
         unread = {"image", "transmittance", "depths", "means2d", "extents"} - kept
@@ -257,7 +257,7 @@ class Trainer:
         differentiate(loss)
         harmonics = None
         if self._factored:
-            values = by_harmonics[0].contiguous()
+            values = harmonics_gradients[0].contiguous()
             harmonics = HarmonicsGradients(values[None], camera.position[None], field.gaussians.means, self.degree)
         if self.ranks is not None:
             self._flattened().take(loss, rendering.overflow, harmonics)

@@ -18,16 +18,17 @@ from plyfile import PlyData, PlyElement
 from scipy.io import savemat
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.files import LIST
 from sehdr_warp.model.confidence import Evidence
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.output.camera_exchange import usd_cameras
 from sehdr_warp.output.exr import Part, write_exr, write_multipart_exr
 from sehdr_warp.output.world_transform import WorldTransform
+from sehdr_warp.own_files import LIST
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import assemble_field, load_run
 from sehdr_warp.runs.run_folder import RunFolder
+from sehdr_warp.runs.run_writer import RunWriter, write_confidence
 from sehdr_warp.scene import load_cameras, load_scene
 from sehdr_warp.scene.colmap_model import read_ply_points
 from sehdr_warp.scene.exposure import exif_exposure
@@ -142,28 +143,34 @@ def _config(folder: Path) -> None:
     (folder / "all.toml").write_text((resources.files("sehdr_warp.configs") / "default.toml").read_text())
 
 
+PLAN = {"decisions": [{"name": "brackets", "choice": "plain scaling", "reason": "8 bits", "fields": {"seed": 3}}]}
+REGION = {"photo": "r_0", "pixels": 9, "column": 3.0, "row": 4.0, "stops": 1.5, "box": [1, 2, 3, 4]}
+SUMMARY = {"iteration": 10, "train_seconds": 2.0, "finished": True, "gaussians": 4, "device": "cpu (1 threads)"}
+SUMMARY |= {"plan": {"brackets": "plain"}, "unexplained": {"regions": 1, "photos": 1, "worst": [REGION]}}
+
+
 def _run(folder: Path) -> None:
     config = load_config("paper", {"schedule.iterations": 10})
     gaussians = Gaussians.from_points(torch.rand(4, 3), torch.zeros(4, 3), 3)
     scene = toy_scene(2, 8)
     field = assemble_field(gaussians, config, response_by_name("srgb"), 0.25)
-    run = RunFolder(folder)
+    run = RunWriter(folder)
     tensors, values = Trainer(scene, config, field).state()
-    run.begin(scene, config, field, {"path": "embedded"}, None, (tensors, values | {"seconds": 1.0}))
+    run.begin(scene, config, field, {"path": "embedded"}, PLAN, (tensors, values | {"seconds": 1.0}))
     run.unlock()
     run.append_metrics({"iteration": 1, "seconds": 0.5, "psnr_ldr": 20.0})
-    run.write_summary({"iteration": 10, "train_seconds": 2.0})
+    run.write_summary(SUMMARY)
 
 
 def _read_run(folder: Path):
     run = load_run(folder)
-    return run.metrics(), run.summary(), run.degree
+    return run.metrics(), run.summary(), run.decisions(), run.degree
 
 
 def _confidence(folder: Path) -> None:
     _run(folder)
     checkpoint = RunFolder(folder).newest_checkpoint()
-    RunFolder(folder).write_confidence(Evidence(*torch.rand(4, 4)), checkpoint.values["sha256"])
+    write_confidence(RunFolder(folder), Evidence(*torch.rand(4, 4)), checkpoint.values["sha256"])
 
 
 def _read_confidence(folder: Path):

@@ -6,8 +6,8 @@ import torch
 
 from sehdr_warp.model.confidence import (
     CLIPPED_STOPS,
-    LEAST_SEEN,
-    MOST_STOPS,
+    HALF_CONFIDENCE_PIXELS,
+    MAX_STOPS,
     PARTLY_CLIPPED_STOPS,
     Evidence,
     gather_evidence,
@@ -39,7 +39,7 @@ def test_doubt_of_single_pixels():
     assert stops == pytest.approx((PARTLY_CLIPPED_STOPS + 2 * exact) / 3, abs=1e-5)
     assert clipped == pytest.approx(1 / 3)
     assert doubt([0.0] * 3, [0.0] * 3)[0] == pytest.approx(1.0)
-    assert doubt([0.0] * 3, [0.3] * 3)[0] == pytest.approx(MOST_STOPS + 1)
+    assert doubt([0.0] * 3, [0.3] * 3)[0] == pytest.approx(MAX_STOPS + 1)
 
 
 def wall(x, exposure):
@@ -98,7 +98,7 @@ def test_truth_is_not_clipped():
 
 def test_confidence_of_evidence():
     evidence = Evidence(
-        torch.tensor([0.0, LEAST_SEEN, 1e6]), torch.tensor([0.0, 1.0, 1.0]), torch.zeros(3), torch.ones(3)
+        torch.tensor([0.0, HALF_CONFIDENCE_PIXELS, 1e6]), torch.tensor([0.0, 1.0, 1.0]), torch.zeros(3), torch.ones(3)
     )
     torch.testing.assert_close(evidence.confidence(), torch.tensor([0.0, 0.25, 0.5]))
 

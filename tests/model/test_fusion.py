@@ -133,10 +133,10 @@ def test_nodes_made_while_a_step_is_recorded_are_not_kept(monkeypatch):
     fusion, colours = make_fusion(), torch.zeros(4, 3, dtype=torch.float64)
     monkeypatch.setattr("sehdr_warp.model.fusion.is_capturing", lambda device: True)
     recorded = fusion(colours)
-    assert not fusion._kept_nodes
+    assert not fusion._node_cache
     monkeypatch.setattr("sehdr_warp.model.fusion.is_capturing", lambda device: False)
     torch.testing.assert_close(fusion(colours), recorded, rtol=0, atol=0)
-    assert len(fusion._kept_nodes) == 1
+    assert len(fusion._node_cache) == 1
 
 
 def test_highlights_keep_a_gradient():

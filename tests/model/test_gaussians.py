@@ -74,11 +74,11 @@ def test_keep_and_append_carry_adams_state():
     assert [p is getattr(gaussians, g["name"]) for g in optimizer.param_groups for p in g["params"]] == [True] * 6
 
 
-def test_spare_rows_keep_gaussians_where_they_are_and_change_nothing_else():
+def test_reserved_rows_keep_gaussians_where_they_are_and_change_nothing_else():
     plain, roomy = (Gaussians.from_points(grid(2), torch.zeros(8, 3), 1) for _ in range(2))
     optimizers = adam(plain), adam(roomy)
     roomy.reserve(11, optimizers[1])
-    moves = roomy.moves
+    moves = roomy.reallocations
     with roomy.all_rows(optimizers[1]):
         held = {name: getattr(roomy, name).data_ptr() for name in PARAMETER_NAMES}
         assert roomy.means.shape == (11, 3) and roomy.live.tolist() == [8]
@@ -106,9 +106,9 @@ def test_spare_rows_keep_gaussians_where_they_are_and_change_nothing_else():
             assert torch.equal(ours, theirs) and ours.data_ptr() == held[name]
             for key, moment in optimizers[0].state[theirs].items():
                 assert torch.equal(optimizers[1].state[ours][key], moment)
-    assert roomy.moves == moves and len(optimizers[1].state) == len(PARAMETER_NAMES)
+    assert roomy.reallocations == moves and len(optimizers[1].state) == len(PARAMETER_NAMES)
     roomy.append(roomy.rows(torch.tensor([0, 1])), optimizers[1])
-    assert roomy.moves > moves and roomy.reserved == roomy.count == 12
+    assert roomy.reallocations > moves and roomy.reserved == roomy.count == 12
 
 
 def test_overwrite_forgets_where_it_wrote():

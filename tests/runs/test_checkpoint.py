@@ -11,11 +11,12 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.files import _beside
 from sehdr_warp.runs.checkpoint import read_checkpoint
 from sehdr_warp.runs.run_folder import RunFolder
+from sehdr_warp.runs.run_writer import RunWriter
 
 
 @pytest.fixture
 def folder(tmp_path):
-    return RunFolder(tmp_path)
+    return RunWriter(tmp_path)
 
 
 def state(iteration):

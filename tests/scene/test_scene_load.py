@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.files import LIST
+from sehdr_warp.own_files import LIST
 from sehdr_warp.scene import load_scene, sfm
 from sehdr_warp.scene.colmap_model import ModelImage, SparseModel
 from sehdr_warp.scene.dataparser import ImageRecord, PointCloud

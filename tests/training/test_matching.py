@@ -89,7 +89,7 @@ def test_gaussians_are_born_where_the_photos_are_not_explained(device):
     with torch.no_grad():
         # Opaque, so that the wall is explained from the start.
         field.gaussians.opacity_logits.fill_(4.0)
-        shown = field.photograph(views[0].camera, views[0].exposure_time, degree=0).encoded
+        shown = field.render_train_view(views[0].camera, views[0].exposure_time, degree=0).encoded
     wanted = torch.tensor(200, device=device)
     given = field, matcher, shown, views[0], 0
     (rows, born), (again, roomy) = (born_rows(*given, wanted, room, seed=3) for room in (200, 300))

@@ -18,7 +18,8 @@ import warp as wp
 
 from ...caches import usable, user_cache
 from ...errors import SehdrError
-from ...files import LIST, atomic_path, hash_line, listed
+from ...files import atomic_path
+from ...own_files import LIST, hash_line, listed
 
 _log = logging.getLogger("sehdr_warp.rasterizer")
 # Named by their content; neither what is being compiled nor what Warp compiles anew in its place.

@@ -15,15 +15,15 @@ def trained_steps(scene, config, device, reserves):
     training = trainer.Trainer(scene, config, make_field(scene, config, choose_response(scene, config), device))
     training._reserves, gaussians, moves = reserves, training.field.gaussians, []
     for _ in range(60):
-        count, before = gaussians.count, gaussians.moves
+        count, before = gaussians.count, gaussians.reallocations
         training.step()
         if gaussians.count != count:
-            moves.append(gaussians.moves > before)
+            moves.append(gaussians.reallocations > before)
     return training, moves
 
 
 @pytest.mark.parametrize("variant", ["default", "adc"])
-def test_spare_rows_change_nothing_of_a_training(scene, device, variant, monkeypatch):
+def test_reserved_rows_change_nothing_of_a_training(scene, device, variant, monkeypatch):
     monkeypatch.setattr(densification, "SPARE", 8.0)  # So few Gaussians become many at once.
     monkeypatch.setattr(trainer, "MOST_ROOM", 8.0)
     config = override_config(VARIANTS[variant], {"deterministic": True, "schedule.use_cuda_graph": False})

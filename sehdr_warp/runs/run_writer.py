@@ -1,0 +1,260 @@
+"""The folder of a run, as one training writes it.
+
+A checkpoint is written beside its final place, flushed to the disk and renamed, so what a killed process leaves is
+never mistaken for one. A new run, too, is complete with a checkpoint of its start before it replaces another. Only the
+names that RunFolder lists are ever replaced, only by the training that holds the lock, and never through a link.
+"""
+
+import hashlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+from torch import Tensor
+
+from ..errors import InputError, SehdrError
+from ..files import atomic_folder, atomic_path, make_parents, remove_stale, write_json, writing
+from ..model.confidence import Evidence
+from ..model.radiance_field import RadianceField
+from ..scene import Scene
+from ..scene.exposure_compensation import ExposureCompensation
+from .checkpoint import TENSORS, VALUES, read_checkpoint, remove_checkpoint
+from .config import Config
+from .run_folder import NEW, READY, RunFolder, confidence_metadata, describe_scene
+from .values import FORMAT, read_object
+
+_LOCK = ".lock"
+_NEW_NAMES = re.compile(
+    r"(config|scene|run|plan)\.json|checkpoints(/iteration_[0-9]{8}(/(state\.safetensors|checkpoint\.json))?)?"
+)
+"""What is in a new run before it takes its place."""
+_CHOOSE_OTHER = "choose another folder, or remove this one yourself"
+
+
+class RunWriter(RunFolder):
+    """The files of a run, which this process writes.
+
+    Raises what RunFolder does, and SehdrError for what cannot be written.
+    """
+
+    def __init__(self, path: Path | str):
+        super().__init__(path)
+        self._lock = FileLock(self.path / _LOCK, thread_local=False)
+        self._lock_identity: tuple[int, int] | None = None
+
+    def lock(self) -> None:
+        """Lock the folder, which is made if it is missing, until unlock() or the end of the process.
+
+        Raises InputError if another training holds the lock.
+        """
+        if self._lock.is_locked:
+            return
+        file = self.path / _LOCK
+        self.refuse_links()
+        with writing(self.path):
+            make_parents(file)
+            try:
+                self._lock.acquire(timeout=0)
+            except Timeout:
+                problem = "another training is at work in it"
+                raise InputError(self.path, problem, "wait for its end, or choose another folder") from None
+            self._lock_identity = _identity(file)
+
+    def unlock(self) -> None:
+        """Release the lock, and remove the folder if no run was begun in it."""
+        if self._lock.is_locked:
+            self._lock.release()
+            with suppress(OSError):
+                if self._is_empty():
+                    (self.path / _LOCK).unlink()
+                    self.path.rmdir()
+
+    def check(self, *, resume: bool, overwrite: bool) -> bool:
+        """Return whether there is a run to continue, after finishing what a killed training had begun.
+
+        Raises InputError if the folder holds something other than a run, if neither resume nor overwrite was asked
+        for, or if another training is at work in it.
+        """
+        if self.path.exists() and not self.path.is_dir():
+            raise InputError(self.path, "is a file", "choose another folder for the run")
+        self.refuse_links()
+        remove_stale(self.config)
+        if not self.path.exists() or self._is_empty():
+            return False
+        if not resume and not overwrite:
+            raise InputError(self.path, "exists and is not empty", "choose another, or use --resume or --overwrite")
+        if any((self.path / name).is_dir() for name in (NEW, READY)):
+            with self._locked():
+                self._settle()
+        if resume:
+            self.require()
+        else:
+            self.require("choose another folder for the run; --overwrite replaces runs alone")
+        if not {"format", "base_time", "response"} <= self._read(self.info, _read_own).keys():
+            raise InputError(self.info, "is not that of a run of sehdr-warp", _CHOOSE_OTHER)
+        with self._locked():  # Only to see that no other training holds it.
+            return resume
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Hold the lock meanwhile, and release it if it was not held before."""
+        held = self._lock.is_locked
+        self.lock()
+        try:
+            yield
+        finally:
+            if not held:
+                self.unlock()
+
+    def begin(
+        self,
+        scene: Scene,
+        config: Config,
+        field: RadianceField,
+        data: dict,
+        plan: dict | None,
+        state: tuple[dict[str, Tensor], dict],
+        *,
+        gains: ExposureCompensation | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        """Lock the folder and write all that does not change during the training, and a checkpoint of the start.
+
+        All of it is on the disk before anything of a run to be overwritten is removed.
+        """
+        from .. import __version__
+
+        self.lock()
+        self.check(resume=False, overwrite=overwrite)  # Reading the photos took time.
+        info = {"format": FORMAT, "version": __version__, "scene": scene.name, "data": data}
+        info |= {"base_time": field.base_time, "response": field.response.to_dict()}
+        info["normalization"] = field.normalization.to_dict()
+        if scene.color_matrix is not None:
+            info["color_matrix"] = scene.color_matrix.tolist()
+        if gains is not None:
+            info["photo_gains"] = gains.to_dict()
+        with atomic_folder(self.path / NEW, ours=True) as beside:
+            new = RunWriter(beside)
+            if plan is not None:
+                write_json(new.plan, plan)
+            write_json(new.scene, describe_scene(scene))
+            write_json(new.info, info)
+            write_json(new.config, config.model_dump())
+            new.write_checkpoint(*state, kept=1)
+        self._settle()
+        self._hashes = new._hashes
+
+    def _settle(self) -> None:
+        """Replace the run by a new one that is complete. Each step can be repeated after a kill."""
+        new, ready = self.path / NEW, self.path / READY
+        self._hold()
+        for folder in (new, ready):
+            _refuse_foreign(folder)
+        with writing(self.path):
+            if new.is_dir():
+                for name in ("summary", "metrics", "confidence", "plan", "scene", "info", "config"):
+                    getattr(self, name).unlink(missing_ok=True)
+                for checkpoint in self._checkpoint_folders():
+                    remove_checkpoint(checkpoint)
+                os.rename(new, ready)
+            if ready.is_dir():
+                self.checkpoints.mkdir(exist_ok=True)
+                for part in (*ready.glob("checkpoints/*"), *(path for path in ready.iterdir() if path.is_file())):
+                    os.replace(part, self.path / part.relative_to(ready))
+                shutil.rmtree(ready)
+
+    def _hold(self) -> None:
+        """Raise SehdrError if the lock file was removed or replaced: another training may be at work here by now."""
+        if self._lock.is_locked and _identity(self.path / _LOCK) != self._lock_identity:
+            raise SehdrError(
+                f"{self.path / _LOCK}: was removed during the training, and another may have begun here; nothing more "
+                "is written; train again in a folder of its own"
+            )
+
+    def _is_empty(self) -> bool:
+        return not {path.name for path in self.path.iterdir()} - {_LOCK}
+
+    def write_summary(self, values: dict) -> None:
+        """Write times, memory and counts of the training; see SummaryValues."""
+        self._hold()
+        write_json(self.summary, values, ours=True)
+
+    def append_metrics(self, line: dict) -> None:
+        """Add the figures of an evaluation; see MetricsValues."""
+        self._hold()
+        with writing(self.metrics), open(self.metrics, "a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def rewind_metrics(self, iteration: int) -> None:
+        """Remove the evaluations after an iteration, because a resumed training makes them again."""
+        self._hold()
+        lines = [line for line in self.read_metrics() if line["iteration"] <= iteration]
+        with atomic_path(self.metrics, ours=True) as beside:
+            beside.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+
+    def write_checkpoint(self, tensors: dict[str, Tensor], values: dict, *, kept: int) -> Path:
+        """Write the checkpoint of a state unless it is there and sound; return its folder.
+
+        Deletes all but the newest `kept`, and those of later iterations, which were damaged if a training goes on from
+        this one. values: plain values, with the "iteration".
+        """
+        from safetensors.torch import save
+
+        self._hold()
+        final = self.checkpoints / f"iteration_{values['iteration']:08d}"
+        try:
+            read_checkpoint(final)
+        except InputError:
+            self._hashes = self._hashes or self.hashes()
+            data = save({name: value.detach().cpu().contiguous() for name, value in tensors.items()})
+            plain = values | {"format": FORMAT, "sha256": hashlib.sha256(data).hexdigest(), "run": self._hashes}
+            remove_checkpoint(final)
+            with atomic_folder(final, ours=True) as beside:
+                (beside / TENSORS).write_bytes(data)
+                (beside / VALUES).write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
+        folders = self._checkpoint_folders()
+        end = folders.index(final) + 1
+        for other in folders[: max(0, end - kept)] + folders[end:]:
+            remove_checkpoint(other)
+        return final
+
+
+def write_confidence(folder: RunFolder, evidence: Evidence, checkpoint_hash: str) -> None:
+    """Write the confidence of a checkpoint's Gaussians, in place of an earlier one.
+
+    Not only a training does: a report measures what a run lacks, once it has the photos.
+    """
+    from safetensors.torch import save
+
+    folder.refuse_links()
+    tensors = {**vars(evidence), "confidence": evidence.confidence()}
+    # One key: safetensors writes several in any order, and the same run is to give the same file.
+    metadata = {"sehdr_warp": json.dumps(confidence_metadata(checkpoint_hash), sort_keys=True)}
+    data = save({name: value.float().cpu().contiguous() for name, value in tensors.items()}, metadata)
+    with atomic_path(folder.confidence, ours=True) as beside:
+        beside.write_bytes(data)
+
+
+def _refuse_foreign(folder: Path) -> None:
+    """Raise InputError if a folder with the name of a new run holds something that a training does not write."""
+    for path in sorted(folder.rglob("*")):
+        if not _NEW_NAMES.fullmatch(path.relative_to(folder).as_posix()):
+            raise InputError(path, "is in the place of a new run, but is not of one", "move it away")
+
+
+def _read_own(path: Path) -> dict:
+    return read_object(path, _CHOOSE_OTHER)
+
+
+def _identity(file: Path) -> tuple[int, int] | None:
+    """Return device and inode of a file, None if it is missing."""
+    try:
+        status = os.stat(file, follow_symlinks=False)
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
