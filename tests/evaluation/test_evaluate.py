@@ -46,7 +46,7 @@ def run(change=lambda hdr: hdr):
         return torch.tensor(encoded_values(codes_of(photo, 16)))
 
     numbers = {"train_seconds": 12.5, "gaussian_count": 4321, "iterations": 700}
-    sure = {"response": RESPONSE, "render_confidence": lambda camera: None, "even": lambda scene: scene}
+    sure = {"response": RESPONSE, "render_confidence": lambda camera: None, "normalize_photos": lambda scene: scene}
     return SimpleNamespace(render=render, render_ldr=render_ldr, device="cpu", **sure, **numbers)
 
 
