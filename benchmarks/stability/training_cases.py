@@ -16,7 +16,7 @@ from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.scene import Scene
 from sehdr_warp.training.initialization import make_field
-from sehdr_warp.training.losses import data_loss, regularised
+from sehdr_warp.training.losses import data_loss, with_opacity_penalty
 from sehdr_warp.training.targets import training_views
 from sehdr_warp.training.trainer import Trainer
 
@@ -75,7 +75,7 @@ def _gradient_norms(device):
         config = load_config("default", {"loss.ssim_weight": ssim, "loss.opacity_weight": opacity}).loss
         photo = field.render_train_view(view.camera, view.exposure_time, opacity_weight=config.opacity_weight)
         field.zero_grad(set_to_none=True)
-        regularised(data_loss(field, photo, view.target, config), photo).backward()
+        with_opacity_penalty(data_loss(field, photo, view.target, config), photo).backward()
         gradients = [p.grad for p in field.gaussians.parameters() if p.grad is not None]
         broken += not_finite(*gradients)
         norms[name] = math.sqrt(sum(float(gradient.square().sum()) for gradient in gradients))

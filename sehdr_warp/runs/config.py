@@ -1,6 +1,6 @@
-"""Every choice of a training: a tree of frozen, validated models, each field with its meaning, range and default.
+"""The options of a training: tables of frozen, validated fields, each with meaning, range and default.
 
-The defaults are the `default` preset. Iteration numbers other than `schedule.iterations` are stated for a training of
+The defaults are the `default` preset. Iteration numbers other than `schedule.iterations` are for a training of
 `REFERENCE_ITERATIONS` and scale with it, so a shorter training is the same training, compressed.
 """
 
@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ..errors import SehdrError
 
-REFERENCE_ITERATIONS = 30_000  # The length of training for which iteration numbers are stated: 3DGS's
+REFERENCE_ITERATIONS = 30_000  # Length of a training, as in 3DGS, that iteration numbers of a config refer to
 
 Part = Annotated[float, Field(ge=0.0, le=1.0)]
 Weight = Annotated[float, Field(ge=0.0, le=100.0)]
@@ -20,15 +20,15 @@ Rate = Annotated[float, Field(gt=0.0, le=1.0)]
 Iteration = Annotated[int, Field(ge=1, le=10**12)]
 Positive = Annotated[float, Field(gt=0.0, le=1e6)]
 Name = Annotated[str, Field(min_length=1)]
-Many = Field(strict=False)  # Lists, as TOML and JSON have them, are tuples here
+AsTuple = Field(strict=False)  # Lists of TOML and JSON become tuples
 
 
 class ConfigError(SehdrError):
-    """Fields of a config contradict each other; names field, value and what is allowed."""
+    """An error that names two fields of a config that contradict each other, and what is allowed."""
 
 
 class _Table(BaseModel):
-    """A table of the config: immutable, no unknown fields, no silent conversions but of whole numbers to floats."""
+    """A table of the config: immutable, without unknown fields or conversions other than int to float."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -36,89 +36,90 @@ class _Table(BaseModel):
 
 
 class ModelConfig(_Table):
-    """What a Gaussian's color means and how an image comes of it."""
+    """What the color of a Gaussian means, how images are made of it, and what a training starts from."""
 
     radiance: Literal["log", "linear", "display"] = "log"
-    """log: log exposure is a harmonic series, so radiance is always positive; linear: exposure itself is (SeHDR);
-    display: encoded values are, with 3DGS's offset of 0.5"""
+    """what the spherical harmonics represent; log: log exposure, so that radiance is positive; linear: exposure
+    (SeHDR); display: encoded values, with 3DGS's offset of 0.5"""
     tone_map: Literal["pixel", "gaussian"] = "pixel"
     """pixel: composite radiance, then apply the response to each pixel; gaussian: apply it to each Gaussian (SeHDR)"""
     sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
     """highest degree of the spherical harmonics"""
     initial_density: Annotated[float, Field(ge=0.0, le=1000.0)] = 20.0
-    """Gaussians to start from, times the square root of the training photos' pixels: the scene's points and, up to so
-    many, points matched between the photos; 0: the scene's points alone"""
+    """initial number of Gaussians, as a multiple of the square root of the training photos' pixels: the scene's points,
+    filled up with points matched between photos; 0 uses the scene's points alone"""
     exposure_compensation: Literal["auto", "unstated", "always", "never"] = "auto"
-    """take out of the photos what the camera changed between them (exposure, white balance, falloff towards the
-    corners), where points that they share show that it did; auto: exposure only where photos state no times, or times
-    that the points contradict; unstated: only photos that state none; needs the plan and matched points"""
+    """correct changes of exposure, white balance and vignetting between photos, measured at points that they share;
+    auto: exposure only if photos state no times, or times that the points contradict; unstated: only photos without
+    times; needs the plan and matched points"""
     init_file: str = ""
-    """a file of Gaussians to start from in place of points, in the scene's coordinates: PLY, OpenUSD or glTF;
-    empty: none"""
+    """file of Gaussians (PLY, OpenUSD, glTF) in the scene's coordinates to start from instead of points; empty: none"""
     antialiased: bool = False
-    """lower opacity where the low-pass filter widens a small Gaussian (Mip-Splatting)"""
+    """lower the opacity of Gaussians that the low-pass filter widens (Mip-Splatting)"""
 
 
 class ResponseConfig(_Table):
-    """The camera response f: exposure (radiance x seconds) to encoded values."""
+    """The camera response f, from exposure (radiance x seconds) to encoded values."""
 
     name: Name = "auto"
-    """a response's name, a file, auto: the one that fits the photos best, or learned: a perceptron for each channel,
+    """name of a response, or a file; auto: the response that fits the photos best; learned: one perceptron per channel,
     trained with the scene (HDR-GS)"""
     method: Literal["posterior", "paper"] = "posterior"
-    """how auto chooses; posterior: by edges, by the spread of light and by what cameras do; paper: dynamic range and
-    smoothness on one random training photo (SeHDR)"""
-    candidates: Annotated[tuple[Name, ...], Many] = ()
-    """what auto chooses from: names, and files of one curve or many; empty: the built-in ones and those between"""
+    """how auto chooses; posterior: by edges, the distribution of light and typical curves of cameras; paper: by dynamic
+    range and smoothness on one random training photo (SeHDR)"""
+    candidates: Annotated[tuple[Name, ...], AsTuple] = ()
+    """responses that auto chooses from: names, and files of one curve or several; empty: built-in curves and their
+    interpolations"""
 
 
 class FusionConfig(_Table):
     """Exposure brackets and their neural fusion (SeHDR, equations 6 to 9)."""
 
     enabled: bool = False
-    """fuse exposure brackets into the HDR color; off, the base color is the HDR color"""
-    exposures: Annotated[tuple[Name, ...], Many] = ("1/8x", "1/4x", "1x", "8x", "16x")
+    """fuse exposure brackets into the HDR color; else the base color is the HDR color"""
+    exposures: Annotated[tuple[Name, ...], AsTuple] = ("1/8x", "1/4x", "1x", "8x", "16x")
     """exposures of the brackets: multiples of the photos' own (1/8x), stops from it (-3ev) or seconds (1/125)"""
     radiance_scale: Literal["unit", "base"] = "unit"
-    """the radiance of a fused value of 1; unit: 1, as printed in the paper; base: 1 / dt_1, an exposure of 1"""
+    """radiance of a fused value of 1; unit: 1, as printed in the paper; base: 1 / dt_1, an exposure of 1"""
 
 
 class LossConfig(_Table):
-    """What the renders are compared with, and how."""
+    """The terms of the loss and their weights."""
 
     form: Literal["sum", "blend"] = "sum"
     """sum: L1 + w (1 - SSIM), SeHDR; blend: (1 - w) L1 + w (1 - SSIM), 3DGS"""
     ssim_weight: Part = 0.2
-    """w above"""
+    """w in the formulas of form"""
     ldr_weight: Weight = 1.0
-    """weight of the photos; 0 leaves them out"""
+    """weight of the photos; 0 disables"""
     hdr_weight: Weight = 0.0
-    """weight of the HDR color against HDR truth in the mu-law, where a view has it (HDR-GS: 0.6)"""
+    """weight of the HDR color against HDR truth in the mu-law, for views that have it (HDR-GS: 0.6)"""
     clipping: bool = True
-    """a clipped pixel only says `at least`, a black one only `at most`; where exposures are compared, in the last part
-    of a training a code that stands for much light says no more than that; off: all are plain values"""
+    """treat saturated pixels as a lower bound and black pixels as an upper bound of radiance; if exposures are
+    compared, bright codes are intervals too in the last part of a training; false: plain values"""
     clipped_smoothness: Weight = 0.001
-    """weight of how far the log light of a clipped pixel is from the mean of those around it, squared, where exposures
-    are compared"""
+    """weight of the squared difference between the log light of a clipped pixel and the mean around it; applies if
+    exposures are compared"""
     clipped_lift: Weight = 0.0003
-    """weight of the log light of clipped pixels beside others, which goes up: the blur of Gaussians takes from it"""
+    """weight of a term that raises the light of clipped pixels at the border of a highlight, to compensate for the
+    light that the blur of Gaussians removes there"""
     clipped_estimate: Weight = 0.003
-    """weight of the squared distance of the log light of clipped pixels from its estimates, in their deviations, where
-    exposures are compared; estimates come from the learned prior and from gain maps"""
+    """weight of the squared distance between the log light of clipped pixels and its estimate, in standard deviations;
+    applies if exposures are compared; estimates come from the learned prior and from gain maps"""
     light_prior: bool = False
-    """estimate the light of clipped pixels from the rest of each photo, by a learned prior; off: gain maps alone"""
+    """estimate the light of clipped pixels from the rest of each photo by a learned prior; false: gain maps alone"""
     linear_weight: Weight = 0.0
     """weight of the linear loss (SeHDR: 0.5)"""
     hdr_truth: bool = False
-    """compare the base color with HDR truth in the linear loss, where a view has it"""
+    """compare the base color with HDR truth in the linear loss, for views that have it"""
     anchor_weight: Weight = 0.0
-    """learned response: weight of (f(1) - 1/2)^2, which holds the scale (HDR-NeRF: 0.5)"""
+    """learned response: weight of (f(1) - 1/2)^2, which fixes the scale of exposure (HDR-NeRF: 0.5)"""
     opacity_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 0.01
     """weight of the mean opacity, which lets unneeded Gaussians fade for mcmc to relocate (3DGS-MCMC: 0.01)"""
 
     @property
     def uses_hdr(self) -> bool:
-        """Whether HDR truth of the training views takes part in the loss."""
+        """True if the loss compares with HDR truth of the training views."""
         return self.hdr_weight > 0 or (self.linear_weight > 0 and self.hdr_truth)
 
 
@@ -173,14 +174,14 @@ class AdcConfig(_Table):
 
 
 class OptimizerConfig(_Table):
-    """Adam's learning rates. Positions are in units of the scene's extent."""
+    """Learning rates of Adam. Those of positions are in units of the scene's extent."""
 
     means: Rate = 1.6e-4
     """positions, at the start"""
     means_final: Rate = 1.6e-6
     """positions, at the end; exponential in between"""
     log_scales: Rate = 5e-3
-    """logarithms of the sizes"""
+    """logarithms of the standard deviations"""
     quaternions: Rate = 1e-3
     """rotations"""
     opacity_logits: Rate = 5e-2
@@ -192,42 +193,52 @@ class OptimizerConfig(_Table):
     fusion: Rate = 1e-3
     """perceptrons and widths of the fusion"""
     response: Rate = 5e-4
-    """what a learned response is made of (HDR-GS: 0.0005)"""
+    """parameters of a learned response (HDR-GS: 0.0005)"""
 
 
 class ScheduleConfig(_Table):
-    """When things happen."""
+    """Length of a training, and what happens when."""
 
     iterations: Annotated[int, Field(ge=1, le=10_000_000)] = 30_000
-    """training steps; one photo each"""
+    """number of steps, of one photo each"""
     sh_degree_interval: Iteration = 1000
-    """iterations between degrees of the harmonics; degree 0 first"""
+    """iterations after which the SH degree increases by one, from 0"""
     ema_window: Annotated[int, Field(ge=0, le=10**12)] = 750
-    """the scene is the mean over about so many of the last iterations, the later the more; 0: the last alone"""
-    evaluate_at: Annotated[tuple[Iteration, ...], Many] = (500, 1000, 2000, 4000, 7000, 10_000, 14_000, 20_000, 30_000)
-    """iterations that test the held-out views; the last always does"""
+    """the trained scene is the exponential moving average over about this many of the last iterations; 0 disables"""
+    evaluate_at: Annotated[tuple[Iteration, ...], AsTuple] = (
+        500,
+        1000,
+        2000,
+        4000,
+        7000,
+        10_000,
+        14_000,
+        20_000,
+        30_000,
+    )
+    """iterations at which held-out views are evaluated; the last one always is"""
     checkpoint_every: Iteration = 5000
     """iterations between checkpoints; one is always written at the end"""
     keep_checkpoints: Annotated[int, Field(ge=1, le=1000)] = 1
-    """older checkpoints are deleted"""
+    """number of checkpoints in the run folder; older ones are deleted"""
     photo_cache: Literal["auto", "device", "memory", "disk"] = "auto"
-    """where photos are kept: on the device, in memory and copied to the device a step ahead, on the disk and read from
-    there, or as far down as they must be to fit; on a CPU device and memory are one"""
+    """where photos are stored: on the device; in memory, copied to the device a step ahead; on the disk; auto: the
+    first of these that they fit in; on a CPU, device and memory are the same"""
     use_cuda_graph: bool = True
-    """on a GPU, replay training steps as CUDA graphs; off, launch each: much slower"""
+    """on a GPU, capture training steps as CUDA graphs; false is much slower"""
 
 
 class PlanConfig(_Table):
-    """What is left out because the scene does not need it."""
+    """Automatic choice of options from the photos."""
 
     enabled: bool = True
-    """read the scene before the training and leave out what it does not need"""
-    keep: Annotated[tuple[Name, ...], Many] = ()
-    """fields that the plan leaves as they are, such as those given on the command line"""
+    """measure the photos before the training, and leave out what they do not need"""
+    keep: Annotated[tuple[Name, ...], AsTuple] = ()
+    """fields that the plan does not change, such as those of the command line"""
 
 
 class Config(_Table):
-    """Every choice of a training; see the parts."""
+    """The options of a training; see the tables."""
 
     model: ModelConfig = ModelConfig()
     response: ResponseConfig = ResponseConfig()
@@ -240,27 +251,28 @@ class Config(_Table):
     schedule: ScheduleConfig = ScheduleConfig()
     plan: PlanConfig = PlanConfig()
     seed: Annotated[int, Field(ge=0, le=2**62)] = 0
-    """of every random number in the training"""
+    """seed of all random numbers of the training"""
     deterministic: bool = False
-    """on a GPU, the same bits every time, for some speed and memory; a CPU always does"""
+    """on a GPU, repeat bit for bit, at some cost of speed and memory; on a CPU a training always does"""
 
     @model_validator(mode="after")
-    def _fits_together(self) -> "Config":
+    def _check_contradictions(self) -> "Config":
+        """Raise ConfigError if fields contradict each other."""
         if problem := next(_contradictions(self), None):
             raise ConfigError(problem)
         return self
 
     def scaled(self, iteration: int) -> int:
-        """An iteration number of the config as a number of this training's iterations, at least 1."""
+        """Scale an iteration number of the config to the length of this training, at least 1."""
         return max(1, round(iteration * self.schedule.iterations / REFERENCE_ITERATIONS))
 
     def degree_at(self, iteration: int) -> int:
-        """The degree of the harmonics that a step after so many uses: one more every sh_degree_interval."""
+        """Return the SH degree that the step after `iteration` steps uses: one more every sh_degree_interval."""
         return min(self.model.sh_degree, iteration // self.scaled(self.schedule.sh_degree_interval))
 
 
 def _contradictions(config: Config) -> Iterator[str]:
-    """One line for each pair of fields that contradict each other."""
+    """Yield one line for each pair of fields that contradict each other."""
     model, fusion, loss = config.model, config.fusion, config.loss
     learned, display = config.response.name == "learned", model.radiance == "display"
     if fusion.enabled and len(fusion.exposures) < 2:
@@ -273,11 +285,11 @@ def _contradictions(config: Config) -> Iterator[str]:
         field = "model.radiance = 'display'" if display else "fusion.enabled = True"
         yield f'{field} needs a known response: response.name = "learned" has none'
     if loss.linear_weight > 0 and not (fusion.enabled or loss.hdr_truth):
-        given = f"loss.linear_weight = {loss.linear_weight}"
-        yield f"{given} has nothing to compare: needs fusion.enabled or loss.hdr_truth"
+        setting = f"loss.linear_weight = {loss.linear_weight}"
+        yield f"{setting} has nothing to compare: needs fusion.enabled or loss.hdr_truth"
     if loss.ldr_weight == loss.hdr_weight == loss.linear_weight == 0:
-        yield "loss.ldr_weight = 0.0 leaves nothing to compare: give loss.hdr_weight or loss.ldr_weight"
+        yield "loss.ldr_weight = 0.0 leaves nothing to compare: set loss.hdr_weight or loss.ldr_weight"
     if loss.anchor_weight > 0 and not learned:
-        yield f'loss.anchor_weight = {loss.anchor_weight} is for nothing: needs response.name = "learned"'
+        yield f'loss.anchor_weight = {loss.anchor_weight} has no effect: needs response.name = "learned"'
     if config.optimizer.means_final > config.optimizer.means:
         yield f"optimizer.means_final = {config.optimizer.means_final} is greater than optimizer.means"

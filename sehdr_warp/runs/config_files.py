@@ -1,4 +1,4 @@
-"""Configs as files and as flags, field by field, and what became of the fields of earlier versions."""
+"""Configs as files and as flags, and the names of fields in earlier versions."""
 
 import json
 import reprlib
@@ -21,7 +21,7 @@ from ..errors import InputError, did_you_mean
 from ..files import read_text
 from .config import Config, ConfigError
 
-_LARGEST_FILE = 1 << 20
+_MAX_FILE_BYTES = 1 << 20
 _REMEDY = "`sehdr-warp config` lists every field with its meaning"
 _GONE = tomllib.loads((resources.files("sehdr_warp.runs") / "gone.toml").read_text(encoding="utf-8"))
 RENAMED: dict[str, str] = _GONE.pop("renamed")
@@ -32,49 +32,58 @@ _RENAMED_VALUES = {"densification.strategy": {"relocation": "mcmc", "gradient": 
 
 
 def preset_names() -> list[str]:
-    """Names of the presets that ship with the package."""
+    """Return the names of the presets that ship with the package."""
     folder = resources.files("sehdr_warp.configs")
     return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
 
 
 def preset_purpose(name: str) -> str:
-    """What a preset is for: the first line of its file."""
-    return read_text(_locate(name), _LARGEST_FILE).partition("\n")[0].strip("# .")
+    """Return the purpose of a preset: the first line of its file."""
+    return read_text(_locate(name), _MAX_FILE_BYTES).partition("\n")[0].strip("# .")
 
 
 def load_config(
     preset: str | Path = "default", overrides: dict[str, Any] | None = None, flags: Mapping[str, str] | None = None
 ) -> Config:
-    """The config of a preset or of a TOML file.
+    """Load the config of a preset or of a TOML file.
 
     Args:
-        preset: a name of preset_names(), or a file.
-        overrides: dotted field names and values that replace the file's, e.g. {"schedule.iterations": 500}.
-        flags: what these are called in errors, where they are flags of a command line.
+        preset: A name of preset_names(), or a file.
+        overrides: Dotted field names and values that replace those of the file, e.g. {"schedule.iterations": 500}.
+        flags: For each overridden field the command-line flag that error messages name.
 
     Raises:
-        InputError: with file, field and value, for what is missing, unknown or wrong.
+        InputError: With file, field and value, for anything missing, unknown or wrong.
     """
     config = config_from_dict(*_read(preset))
     return override_config(config, overrides or {}, "overrides", flags)
 
 
 def as_config(config: object) -> Config | None:
-    """A config in any of the forms that Training takes."""
+    """Convert any of the forms that Training takes to a Config; None stays None."""
     if config is None or isinstance(config, Config):
         return config
     if isinstance(config, str | Path):
         return load_config(config)
     if isinstance(config, Mapping):
         return override_config(Config(), dict(config), "overrides")
-    raise InputError("config", f"is {type(config).__name__}", "give a preset's name, a dict of fields or a Config")
+    raise InputError("config", f"is {type(config).__name__}", "pass a preset's name, a dict of fields or a Config")
 
 
 def override_config(
     config: Config, overrides: dict, source: Path | str = "the config", flags: Mapping[str, str] | None = None
 ) -> Config:
-    """A config with some fields replaced, given as for load_config. Raises InputError that blames the override, by its
-    flag where it has one, else as of `source`."""
+    """Return a config with some fields replaced.
+
+    Args:
+        config: The config to change.
+        overrides: Dotted field names and values, as in load_config.
+        source: What error messages name if a field has no flag.
+        flags: As in load_config.
+
+    Raises:
+        InputError: If a field is unknown or its value is wrong.
+    """
     values = config.model_dump()
     for path, value in overrides.items():
         part, _, name = path.rpartition(".")
@@ -86,8 +95,12 @@ def override_config(
 
 
 def config_as_toml(config: Config, differing: bool = False) -> str:
-    """A config as a TOML file: every field with its meaning, and marked where it is not the default's; or, differing,
-    just these, which load_config takes."""
+    """Return a config as the text of a TOML file.
+
+    Args:
+        config: The config.
+        differing: Write only the fields that differ from the default preset, without their meanings.
+    """
     lines, table = ['base = "default"'] if differing else [], ""
     for path, item in config_fields():
         part, _, name = path.rpartition(".")
@@ -98,8 +111,8 @@ def config_as_toml(config: Config, differing: bool = False) -> str:
             lines += ["", f"[{part}]"]
             table = part
         if not differing:
-            told = " ".join((item.description or "").split())
-            lines += textwrap.wrap(told, 116, initial_indent="# ", subsequent_indent="# ")
+            meaning = " ".join((item.description or "").split())
+            lines += textwrap.wrap(meaning, 116, initial_indent="# ", subsequent_indent="# ")
         changed = "" if differing or value == item.default else f"  # default: {json.dumps(item.default)}"
         # JSON's strings, numbers, booleans and lists are TOML's as well.
         lines.append(f"{name} = {json.dumps(value)}{changed}")
@@ -107,18 +120,24 @@ def config_as_toml(config: Config, differing: bool = False) -> str:
 
 
 def value_of(path: str, text: str):
-    """A field's value as written behind its flag, lists separated by commas; what is none stays text, of which the
-    config says what it takes in its place."""
+    """Parse the text behind the flag of a field; lists are separated by commas.
+
+    Text that cannot be parsed is returned as it is, so that the validation of the config explains what is allowed.
+    """
     kind: Any = dict(config_fields())[path].annotation
-    given = [item for item in map(str.strip, text.split(",")) if item] if get_origin(kind) is tuple else text
+    value = [item for item in map(str.strip, text.split(",")) if item] if get_origin(kind) is tuple else text
     with suppress(ValidationError):
-        return TypeAdapter(kind).validate_python(given)
-    return given
+        return TypeAdapter(kind).validate_python(value)
+    return value
 
 
 def config_from_dict(values: dict, source: Path | str = "config", flags: Mapping[str, str] | None = None) -> Config:
-    """The config of nested values, as its model_dump() gives them and JSON holds them. Raises InputError that blames a
-    field by its flag, else as of `source`, and says of one of an earlier version what to do."""
+    """Validate nested values, as Config.model_dump() returns them and JSON stores them.
+
+    Raises:
+        InputError: With the flag of the wrong field, or else `source`. For a field of an earlier version it names the
+            new field, or what to do instead.
+    """
     try:
         return Config.model_validate(values)
     except ValidationError as error:
@@ -126,7 +145,7 @@ def config_from_dict(values: dict, source: Path | str = "config", flags: Mapping
     except ConfigError as error:
         path, problem = "", str(error)
     flag = (flags or {}).get(path)
-    if flag is None and flags and not path:  # Fields that contradict each other: the first that was named.
+    if flag is None and flags and not path:  # Contradicting fields: name the flag of the first.
         flag = next((flag for path, flag in flags.items() if path in problem), None)
     if path in GONE:
         raise InputError(source, f"{problem} of an earlier version is gone", GONE[path])
@@ -135,9 +154,9 @@ def config_from_dict(values: dict, source: Path | str = "config", flags: Mapping
     raise InputError(flag or source, problem, _REMEDY)
 
 
-def field_and_problem(found: ValidationError) -> tuple[str, str]:
-    """The first field that is wrong, and `field = value: what is allowed`; of an unknown one, what is near."""
-    error = found.errors()[0]
+def field_and_problem(validation: ValidationError) -> tuple[str, str]:
+    """Return the path of the first wrong field, and `field = value: what is allowed` or a similar known field."""
+    error = validation.errors()[0]
     path, value = ".".join(str(part) for part in error["loc"] if isinstance(part, str)), error["input"]
     unknown = error["type"] == "extra_forbidden"
     if unknown and isinstance(value, dict) and value:
@@ -155,13 +174,13 @@ def field_and_problem(found: ValidationError) -> tuple[str, str]:
 
 
 def _read(preset: str | Path) -> tuple[dict, Path]:
-    """The values of a file on top of those of its bases, and its path."""
+    """Return the values of a file merged over those of its bases, and its path."""
     path, chain = _locate(preset), {}
     while path is not None:
         if path in chain:
             raise InputError(path, "its bases lead back to itself", "remove the key `base` from one of the files")
         try:
-            values = chain[path] = tomllib.loads(read_text(path, _LARGEST_FILE))
+            values = chain[path] = tomllib.loads(read_text(path, _MAX_FILE_BYTES))
         except (ValueError, RecursionError) as error:
             raise InputError(path, f"not valid TOML ({error})", _REMEDY) from None
         base = values.pop("base", None)
@@ -172,10 +191,11 @@ def _read(preset: str | Path) -> tuple[dict, Path]:
 
 
 def _locate(preset: str | Path, beside: Path | None = None) -> Path:
+    """Return the path of a preset or file; raises InputError if there is none."""
     if str(preset) in preset_names():
         return Path(str(resources.files("sehdr_warp.configs") / f"{preset}.toml"))
     path = Path(preset) if beside is None else beside / preset
-    with suppress(OSError, ValueError):  # A name that no file can have.
+    with suppress(OSError, ValueError):  # Text that cannot be a file name.
         if path.is_file():
             return path
     problem = f"no such preset or file{did_you_mean(str(preset), preset_names())}"
@@ -183,12 +203,13 @@ def _locate(preset: str | Path, beside: Path | None = None) -> Path:
 
 
 def _merged(below: dict, above: dict) -> dict:
+    """Merge two levels of tables; values of `above` win."""
     both = {key for key in above if isinstance(above[key], dict) and isinstance(below.get(key), dict)}
     return below | above | {key: below[key] | above[key] for key in both}
 
 
 def config_fields(kind: Any = Config, prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Dotted name and declaration of every field, those of the config itself first."""
+    """Yield dotted name and declaration of every field, first those outside of tables."""
     tables = {name: item for name, item in kind.model_fields.items() if isinstance(item.annotation, type(BaseModel))}
     yield from ((prefix + name, item) for name, item in kind.model_fields.items() if name not in tables)
     for name, item in tables.items():
@@ -196,23 +217,23 @@ def config_fields(kind: Any = Config, prefix: str = "") -> Iterator[tuple[str, F
 
 
 def flag_of(path: str) -> str:
-    """The flag of a field: `--loss.ssim-weight` for loss.ssim_weight."""
+    """Return the flag of a field: `--loss.ssim-weight` for loss.ssim_weight."""
     return "--" + path.replace("_", "-")
 
 
 def flags_type() -> type:
-    """A TypedDict of every field, for tyro: nothing but what was named is in it, as text."""
+    """Return a TypedDict of all fields for tyro; after parsing it contains only the flags that were used, as text."""
     tables: dict[str, dict[str, Any]] = {}
     for path, item in config_fields():
         if path == "seed":  # A flag of its own, in every help.
             continue
-        # Arguments, how help calls them, and text as it is in both directions.
+        # Number of arguments, placeholder, and text without conversion in both directions.
         text = lambda words: words[0], lambda value: isinstance(value, str), lambda value: [value]
         spec = PrimitiveConstructorSpec(1, _metavar(item.annotation), *text)
-        told = tyro.conf.arg(
-            help=" ".join((item.description or "").split()), help_behavior_hint=f"(default: {_shown(item.default)})"
+        argument = tyro.conf.arg(
+            help=" ".join((item.description or "").split()), help_behavior_hint=f"(default: {_flag_text(item.default)})"
         )
-        tables.setdefault(path.rpartition(".")[0], {})[path] = Annotated[str, spec, told]
+        tables.setdefault(path.rpartition(".")[0], {})[path] = Annotated[str, spec, argument]
     parts = {
         part: Annotated[TypedDict(part, fields, total=False), tyro.conf.arg(name=part)]  # type: ignore[misc]
         for part, fields in tables.items()
@@ -222,21 +243,22 @@ def flags_type() -> type:
 
 
 def named_fields(values: dict) -> dict[str, str]:
-    """The flat names and texts of what flags_type() read."""
-    found: dict[str, str] = {}
+    """Return the dotted names and texts in a parsed flags_type()."""
+    fields: dict[str, str] = {}
     for name, value in values.items():
-        found |= named_fields(value) if isinstance(value, dict) else {name: value}
-    return found
+        fields |= named_fields(value) if isinstance(value, dict) else {name: value}
+    return fields
 
 
-def _shown(value) -> str:
-    """A field's value as its flag takes it."""
+def _flag_text(value) -> str:
+    """Return a field's value as its flag takes it."""
     if isinstance(value, tuple):
         value = ",".join(map(str, value))
     return str(value).lower() if isinstance(value, bool) else f"{value}" or "none"
 
 
 def _metavar(kind) -> str:
+    """Return the placeholder of a field's value in the help."""
     if get_origin(kind) is Literal:
         return "|".join(get_args(kind))
     if get_origin(kind) is Annotated:

@@ -296,9 +296,9 @@ def _cost(config) -> str:
 
 def _ending(path: Path, summary: dict) -> str:
     """What was made, and what to type next."""
-    from .held_out import figures_told
+    from .held_out import format_scores
 
-    told = [figures for line in summary["metrics"] if (figures := figures_told(line))]
+    told = [figures for line in summary["metrics"] if (figures := format_scores(line))]
     heldout = f", {told[-1]}" if told else ""
     made = f"{summary['iteration']} iterations, {summary['gaussians']} Gaussians{heldout}"
     run, views, report = (shlex.quote(str(place)) for place in (path, path / "views", path / "report"))

@@ -1,74 +1,92 @@
-"""How much room for (Gaussian, tile) pairs recorded steps get: fixed when they are recorded, while photos differ."""
+"""How many Gaussian-tile intersections a captured training step has memory for.
+
+A CUDA graph fixes the size of its memory when it is captured, while photos differ in their number of intersections.
+"""
 
 import math
 
 import torch
 
-ROOM = 1.25  # Room in multiples of the most pairs seen: photos of a scene differ by up to 1.32 in theirs
-ENOUGH = 1.08  # Of the pairs that are expected of changed Gaussians: with less room steps are recorded anew
-KEPT = 0.97  # Of the room, at least, when Gaussians change: after a reset of opacities pairs are few for a while
-LEAST_ROOM = 1 << 14
+HEADROOM = 1.25  # Capacity as a multiple of the largest count; the photos of a scene differ by a factor of up to 1.32
+MIN_HEADROOM = 1.08  # After densification, a capacity below this multiple of the expected count is replaced
+MIN_SHRINK = 0.97  # Smallest factor of the count after densification: a reset of opacities lowers it only for a while
+MIN_CAPACITY = 1 << 14
 
 
 class GraphCapacity:
-    """Says how many pairs the next recording gets room for, from what steps count on the device.
+    """Chooses the intersection capacity of the next capture from counts that steps keep on the device.
 
-    tally: [3] int64, of all steps so far: how many were not finite; the most pairs that one needed, 0 again when
-    Gaussians change; how many lacked room. training_step.judge_step() counts.
+    Attributes:
+        tally: [3] int64, kept by training_step.judge_step(): steps that were not finite; largest number of
+            intersections, reset when Gaussians rescale; steps that overflows capacity.
     """
 
     def __init__(self, device: torch.device | str):
+        """Start without counts."""
         self.tally = torch.zeros(3, dtype=torch.int64, device=device)
-        self._pairs = self._given = self._noted = 0
-        self._seen, self._copied = self.tally, None
+        self._intersections = self._capacity = self._largest = 0
+        self._host_tally, self._copied = self.tally, None
         if self.tally.device.type == "cuda":
-            self._seen = torch.zeros(3, dtype=torch.int64, pin_memory=True)
+            self._host_tally = torch.zeros(3, dtype=torch.int64, pin_memory=True)
             self._copied = torch.cuda.Event()
 
     @property
     def known(self) -> bool:
-        """Whether any step was launched whose pairs were counted exactly."""
-        return self._pairs > 0
+        """True after a observe step whose intersections were counted exactly."""
+        return self._intersections > 0
 
-    def launched(self, pairs: int) -> None:
-        """A step was launched with exactly so many pairs."""
-        self._pairs = max(self._pairs, pairs)
+    def observe(self, intersections: int) -> None:
+        """Record that a step was observe with exactly `intersections` intersections."""
+        self._intersections = max(self._intersections, intersections)
 
     @property
-    def lacked(self) -> int:
-        """Steps that lacked room so far. Waits for the device."""
+    def overflows(self) -> int:
+        """Number of steps that overflows capacity. Waits for the device."""
         return int(self.tally[2])
 
     def capacity(self) -> int:
-        """The room for pairs of the step that is recorded or replayed now; stays until one of the calls below."""
-        self._given = self._given or max(LEAST_ROOM, math.ceil(ROOM * self._pairs))
-        return self._given
+        """Return the capacity for the step that is captured or replayed now; it stays until poll() or rescale()."""
+        self._capacity = self._capacity or max(MIN_CAPACITY, math.ceil(HEADROOM * self._intersections))
+        return self._capacity
 
-    def look(self, *, wait: bool = True) -> tuple[int, bool]:
-        """Steps that were not finite, and whether the room was too little: the next recording then has what steps
-        needed. wait: False asks a GPU what it had counted at the last such look, and does not wait for it."""
+    def poll(self, *, wait: bool = True) -> tuple[int, bool]:
+        """Read the counts, and raise the capacity of the next capture if it was too small.
+
+        Args:
+            wait: If False, a GPU returns what it had counted at the previous call, and is not waited for.
+
+        Returns:
+            The number of steps that were not finite, and whether the capacity was too small.
+        """
         if wait or self._copied is None:
             skipped, needed, _ = self.tally.tolist()
         else:
             self._copied.synchronize()
-            skipped, needed, _ = self._seen.tolist()
-            self._seen.copy_(self.tally, non_blocking=True)
+            skipped, needed, _ = self._host_tally.tolist()
+            self._host_tally.copy_(self.tally, non_blocking=True)
             self._copied.record(torch.cuda.current_stream(self.tally.device))
-        self._noted = needed
-        if not 0 < self._given < needed:
+        self._largest = needed
+        if not 0 < self._capacity < needed:
             return skipped, False
-        self._pairs, self._given = needed, 0
+        self._intersections, self._capacity = needed, 0
         return skipped, True
 
-    def change(self, growth: float, *, keep: bool) -> bool:
-        """The Gaussians are others, `growth` times as many: whether the room stays as it is, which it does where
-        `keep` asks for that and it is enough."""
-        needed = self._noted or int(self.tally[1]) or self._pairs
-        # The kept part does not grow: new Gaussians are smaller, and pairs grow more slowly than their number.
-        self._pairs = math.ceil(max(needed * growth, KEPT * self._pairs))
+    def rescale(self, growth: float, *, keep: bool) -> bool:
+        """Adapt the capacity after densification changed the count by the factor `growth`.
+
+        Args:
+            growth: New count divided by the old one.
+            keep: Keep the current capacity if it suffices.
+
+        Returns:
+            True if the current capacity, and with it the captured graphs, can be kept.
+        """
+        needed = self._largest or int(self.tally[1]) or self._intersections
+        # The lower bound does not grow: new Gaussians are small, so intersections grow more slowly than the count.
+        self._intersections = math.ceil(max(needed * growth, MIN_SHRINK * self._intersections))
         self.tally[1].zero_()
-        self._noted = 0
-        if keep and self._given >= ENOUGH * self._pairs:
+        self._largest = 0
+        if keep and self._capacity >= MIN_HEADROOM * self._intersections:
             return True
-        self._given = 0
+        self._capacity = 0
         return False

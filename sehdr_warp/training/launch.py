@@ -1,4 +1,4 @@
-"""Starts the ranks of a training, one for each GPU, as processes of this machine, and ends them together."""
+"""Start the ranks of a multi-GPU training as processes of this machine, and end them together."""
 
 import logging
 import os
@@ -14,22 +14,30 @@ import torch.multiprocessing as processes
 
 from ..errors import SehdrError
 
-GRACE = 5.0  # Seconds for the others to end by themselves once one has, and again after SIGTERM
+GRACE = 5.0  # Seconds that other ranks have to end after one has ended, and again after SIGTERM
 
 
 def launch(count: int, run: Callable[[list[str]], None], words: list[str]) -> None:
-    """Runs the command line of these words in `count` processes, each by run(words), and exits as they do. Raises
-    SehdrError where one is killed."""
+    """Run a command line in `count` processes, one per rank, and exit with their status.
+
+    Args:
+        count: Number of ranks.
+        run: Function that runs a command line in a process.
+        words: The command line.
+
+    Raises:
+        SehdrError: If a rank is killed.
+    """
     for name in ("torch.multiprocessing.spawn", "torch.multiprocessing"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # It tells whom it ends, which is no news.
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # Silence its lines about the processes it ends.
     with tempfile.TemporaryDirectory(prefix="sehdr-warp-") as folder:
-        meeting = str(Path(folder) / "ranks")
-        store = dist.FileStore(meeting, count + 1)
+        store_path = str(Path(folder) / "ranks")
+        store = dist.FileStore(store_path, count + 1)
         context = processes.start_processes(
-            _rank, (count, run, words, meeting), count, join=False, start_method="spawn"
+            _rank, (count, run, words, store_path), count, join=False, start_method="spawn"
         )
         assert context is not None
-        _pass_signals_on(context)
+        _forward_signals(context)
         killed = None
         try:
             while True:
@@ -38,27 +46,28 @@ def launch(count: int, run: Callable[[list[str]], None], words: list[str]) -> No
                     assert process is not None
                     process.join()
                     code = process.exitcode or 0
-                    # Before the others are waited for: they would tell less.
+                    # Set before the other ranks report a lost connection, which says less.
                     if code < 0 and store.add("ended", 1) == 1:
                         killed = f"rank {rank} of {count} was killed ({signal.Signals(-code).name})"
                 if context.join(grace_period=GRACE):
                     return
         except processes.ProcessExitedException as ended:
             if killed:
-                remedy = "all end; the last checkpoint is whole, --resume goes on from it"
+                remedy = "all ranks end; the last checkpoint is complete, --resume continues from it"
                 raise SehdrError(f"{killed}: {remedy}") from None
             sys.exit(ended.exit_code if ended.exit_code > 0 else 1)
 
 
-def _rank(rank: int, count: int, run: Callable[[list[str]], None], words: list[str], meeting: str) -> None:
-    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(count), "SEHDR_RANKS": meeting}
+def _rank(rank: int, count: int, run: Callable[[list[str]], None], words: list[str], store_path: str) -> None:
+    """Run one rank with the environment variables that torchrun sets."""
+    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(count), "SEHDR_RANKS": store_path}
     run(words)
 
 
-def _pass_signals_on(context) -> None:
-    """What would end this process ends the ranks, which save first; a terminal's Ctrl-C reaches them by itself."""
+def _forward_signals(context) -> None:
+    """Forward signals that end this process to the ranks, which save first; a terminal sends Ctrl-C to them itself."""
 
-    def pass_on(number: int, _) -> None:
+    def forward(number: int, _) -> None:
         for process in context.processes:
             if process.is_alive():
                 os.kill(process.pid, number)
@@ -66,4 +75,4 @@ def _pass_signals_on(context) -> None:
     signal.signal(signal.SIGINT, lambda *_: None)
     for name in ("SIGTERM", "SIGHUP"):
         if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is not signal.SIG_IGN:
-            signal.signal(getattr(signal, name), pass_on)
+            signal.signal(getattr(signal, name), forward)

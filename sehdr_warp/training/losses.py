@@ -1,4 +1,4 @@
-"""What a training minimises: photos against photos, exposures against exposures."""
+"""The loss of a training step: photos against rendered photos, HDR truth against exposures."""
 
 import math
 from dataclasses import dataclass
@@ -15,21 +15,25 @@ from ..response import Response, ToneMapper
 from ..runs.config import LossConfig
 
 CODE = 1 / 255  # One step of an 8-bit photo
-MU = 5000.0  # Of the mu-law in which HDR images are compared
-KNEE = 8.0  # The code of 255 at white / mu in the mu-law of photos: light below counts as light, above as its logarithm
+MU = 5000.0  # Parameter of the mu-law in which HDR images are compared
+KNEE = 8.0  # Code of 255 at white / mu in the mu-law of photos, linear below and logarithmic above
 INTERVALS_FROM = 0.85
-"""Of a training, the part after which codes that stand for much light are intervals: where they were from the start,
-clipped light would have fewer pixels around it that hold it."""
-ANCHOR = 0.5  # What anchor_loss wants the unit exposure encoded as: the middle of the encoded range
+"""Fraction of a training after which bright codes are intervals. From the start, clipped light would have fewer pixels
+around it that determine it."""
+ANCHOR = 0.5  # Encoded value of the unit exposure that anchor_loss aims at: the middle of the range
 
 
 @dataclass(frozen=True)
 class Target:
     """One training photo on the device.
 
-    codes: [H, W, 3] as code_tensor() holds them; or with an index [1], int64, a stack [V, H, W, 3] that has the photo
-    there. scale: what they are worth. mask: [H, W, 1] in [0, 1]. exposure_truth: [H, W, 3] radiance times base time.
-    estimates: of the light of clipped pixels, as clipped_light_energy() takes them.
+    Attributes:
+        codes: [H, W, 3] as from code_tensor(); or, with an index, a stack [V, H, W, 3] that contains the photo.
+        scale: Values and intervals that the codes stand for.
+        mask: [H, W, 1] in [0, 1].
+        exposure_truth: [H, W, 3] radiance of HDR truth times the base time.
+        estimates: Estimates of the light of clipped pixels, as in clipped_light_energy().
+        index: [1] int64, position of the photo in the stack.
     """
 
     codes: Tensor
@@ -41,32 +45,39 @@ class Target:
 
     @property
     def encoded(self) -> Tensor:
-        """[H, W, 3] in [0, 1], made of the codes whenever it is asked for."""
-        return code_values(one_of(self.codes, self.index))
+        """Encoded values [H, W, 3] in [0, 1], computed from the codes at each access."""
+        return code_values(select_view(self.codes, self.index))
 
     def psnr(self, encoded: Tensor) -> float:
-        """dB, of encoded values [H, W, 3] against the photo, where the mask counts."""
+        """Return the PSNR of encoded values [H, W, 3] against the photo inside the mask, dB."""
         squared = (encoded.clamp(0, 1) - self.encoded).square().mean(2, keepdim=True)
         weights = torch.ones_like(squared) if self.mask is None else self.mask
         mean = (squared * weights).sum() / weights.sum().clamp_min(1e-6)
         return float(-10 * mean.clamp_min(1e-10).log10())
 
 
-def one_of(stack: Tensor, index: Tensor | None) -> Tensor:
-    """A copy of the one of a stack [V, ...] that is at index [1], on its device; without an index the tensor itself."""
+def select_view(stack: Tensor, index: Tensor | None) -> Tensor:
+    """Return a copy of element index [1] of a stack [V, ...], on its device; without an index the tensor itself."""
     return stack if index is None else stack.index_select(0, index)[0]
 
 
 def code_scale(
     largest: int, response: Response | None, device, *, clipping: bool = True, dtype: torch.dtype = torch.float32
 ) -> CodeScale:
-    """How photos are compared: in the mu-law of the exposures that the response decodes, or without one as encoded.
+    """Return how photos are compared: in the mu-law of decoded exposures, or without a response as encoded values.
 
-    largest: code, 255 or 65535. clipping: it says `at least white less half a code`, and 0 says `at most half a code`;
-    the half, of 8 bits for 16 too, keeps a response that never quite reaches white from being pulled up. Of exposures a
-    code is worth the middle of what it stands for, which near white may be stops of light: with clipping, an exposure
-    anywhere within is as good once the scale is widened, but for the finest step of 8 bits at its ends: fine codes stay
+    With `clipping`, white means at least white less half an 8-bit code, and 0 at most half a code; the half code, for
+    16 bits too, keeps a response that never quite reaches white from being pulled up. If exposures are compared, a code
+    stands for the middle of its interval, which near white may span stops of light: once the scale is widened, any
+    exposure within the interval is equally good, except for the finest 8-bit step at its ends, so that fine codes stay
     values.
+
+    Args:
+        largest: Largest code, 255 or 65535.
+        response: Response that decodes the codes; None to compare encoded values.
+        device: Torch device of the tables.
+        clipping: Treat the smallest and the largest code as intervals.
+        dtype: Type of the tables.
     """
     mu, white = (0.0, 1.0) if response is None else (mu_of_knee(response), response.white)
 
@@ -74,10 +85,10 @@ def code_scale(
         return encoded if response is None else mu_law(response.decode(encoded), white, mu)
 
     values = torch.arange(largest + 1, dtype=torch.float64) / largest
-    worth, between = compared(values), compared(values[:-1] + 0.5 / largest)
+    centers, between = compared(values), compared(values[:-1] + 0.5 / largest)
     if response is not None:
-        worth[1:-1] = (between[1:] + between[:-1]) / 2
-    table, wide = torch.stack([worth, worth, worth], 1), None
+        centers[1:-1] = (between[1:] + between[:-1]) / 2
+    table, wide = torch.stack([centers, centers, centers], 1), None
     if clipping:
         table[0, 1], table[-1, 2] = -math.inf, math.inf
         table[0, 2], table[-1, 1] = compared(values.new_tensor([CODE / 2, 1 - CODE / 2]))
@@ -91,8 +102,15 @@ def code_scale(
 
 
 def image_loss(prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str, weight: float) -> Tensor:
-    """L1 + weight (1 - SSIM) ("sum", SeHDR's equation 11) or (1 - weight) L1 + weight (1 - SSIM) ("blend", 3DGS), of
-    [H, W, 3]; pixels outside of the mask [H, W, 1] count nothing in L1 and as equal in SSIM."""
+    """Return the loss between two images [H, W, 3]; pixels outside of the mask [H, W, 1] do not count.
+
+    Args:
+        prediction: Rendered image.
+        truth: Reference.
+        mask: Weights in [0, 1]; SSIM sees masked pixels as equal.
+        form: "sum": L1 + weight (1 - SSIM) (SeHDR, equation 11); "blend": (1 - weight) L1 + weight (1 - SSIM) (3DGS).
+        weight: Weight of SSIM.
+    """
     distance_weight = _distance_weight(form, weight)
     if mask is None and weight:
         return image_distance(prediction, truth, distance_weight, weight)
@@ -104,12 +122,15 @@ def image_loss(prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str
 
 
 def _distance_weight(form: str, weight: float) -> float:
+    """Return the weight of L1."""
     return 1.0 if form == "sum" else 1 - weight
 
 
 def ldr_loss(photo: TrainRender, target: Target, config: LossConfig) -> Tensor:
-    """L_LDR, on the target's scale, as far as the photo can tell; where exposures are compared, the light of clipped
-    pixels, which it does not tell, is as smooth as it can be."""
+    """Return L_LDR on the target's scale.
+
+    If exposures are compared, the light of clipped pixels, which the photo does not determine, is smoothed and lifted.
+    """
     image = photo.light if target.scale.mu else photo.encoded
     assert image is not None
     codes, scale, index, weight = target.codes, target.scale, target.index, config.ssim_weight
@@ -117,65 +138,70 @@ def ldr_loss(photo: TrainRender, target: Target, config: LossConfig) -> Tensor:
     if target.mask is None and weight:
         weights = {"distance_weight": _distance_weight(config.form, weight), "dissimilarity_weight": weight}
         return photo_loss(image, codes, scale, index, **weights, clipped=clipped, estimates=target.estimates)
-    seen, truth = code_residual(image, codes, scale, index)
-    loss = image_loss(seen, truth, target.mask, config.form, weight)
+    prediction, truth = code_residual(image, codes, scale, index)
+    loss = image_loss(prediction, truth, target.mask, config.form, weight)
     if clipped:
         loss = loss + clipped_light_energy(image, codes, scale.white, clipped, index, target.mask, target.estimates)
     return loss
 
 
 def clipped_weights(config: LossConfig, target: Target) -> ClippedWeights:
-    """Return the weights of the parts of a loss that shape clipped light; without estimates nothing holds it."""
+    """Return the weights of the terms for clipped light; without estimates, the third is 0."""
     hold = 0.0 if target.estimates is None else config.clipped_estimate
     return ClippedWeights(config.clipped_smoothness, config.clipped_lift, hold)
 
 
-def compares_light(config: LossConfig, field: RadianceField) -> bool:
-    """Whether ldr_loss compares exposures: where pixels have one and the curve is known."""
+def compares_exposures(config: LossConfig, field: RadianceField) -> bool:
+    """Return whether ldr_loss compares exposures: if each pixel has one and the response is known."""
     decodable = not field.color_model.encoded and field.tone_map == "pixel" and not field.response.learnable
     return config.ldr_weight > 0 and decodable
 
 
 def mu_of_knee(response: Response) -> float:
-    """The mu whose knee, white / mu, is the exposure of code KNEE of 255, for any curve."""
+    """Return the mu whose knee, white / mu, is the exposure of code KNEE of 255, for any response."""
     return response.white / max(float(response.decode(KNEE / 255)), 1e-12)
 
 
 def mu_law(exposure: Tensor, white: float, mu: float = MU) -> Tensor:
-    """log(1 + mu x / white) / log(1 + mu): 0 for no light, 1 for the exposure that photos show as white."""
+    """Return log(1 + mu x / white) / log(1 + mu): 0 for no light, 1 for the exposure that photos show as white."""
     return torch.log1p(exposure * (mu / white)) / math.log1p(mu)
 
 
 def anchor_loss(mapper: ToneMapper) -> Tensor:
-    """Mean over channels of (f(1) - ANCHOR)^2: photos of one exposure leave a learned f's scale open, and it drifts.
-    Source: the unit exposure loss of HDR-NeRF (CVPR 2022)."""
+    """Return the mean over channels of (f(1) - ANCHOR)^2.
+
+    Photos of one exposure do not determine the scale of a learned f, which drifts without this term. Source: the unit
+    exposure loss of HDR-NeRF (CVPR 2022).
+    """
     return (mapper.encode_log(mapper.weights[0].new_zeros(1, 3)) - ANCHOR).square().mean()
 
 
 def linear_loss(photo: TrainRender, target: Target, config: LossConfig) -> Tensor | None:
-    """SeHDR's L_linear: base exposure against the true one where hdr_truth is on and there is any, else against the
-    fused one; None where there is nothing to compare."""
+    """Return SeHDR's L_linear: base exposure against HDR truth or the fused exposure; None without a reference."""
     truth = target.exposure_truth if config.hdr_truth else None
     if truth is None and photo.base is photo.exposure:
         return None
     assert photo.base is not None
     if truth is None:
         assert photo.exposure is not None
-        # The base follows: without the detached side both would settle on what is easiest to agree on.
+        # Detached, so that the base follows the fused exposure; else both would drift to a trivial agreement.
         truth = photo.exposure.detach()
     return image_loss(photo.base, truth, target.mask, config.form, config.ssim_weight)
 
 
 def hdr_loss(photo: TrainRender, target: Target, config: LossConfig, largest: float) -> Tensor:
-    """The HDR color's exposure against the true one, both divided by the greatest of all views, in the mu-law. HDR-GS
-    divides each image by its own maximum, and with that leaves the scale of the scene open."""
+    """Return the loss of the HDR color's exposure against HDR truth in the mu-law.
+
+    Both are divided by the largest truth of all views. HDR-GS divides each image by its own maximum, which leaves the
+    scale of the scene undetermined.
+    """
     assert photo.exposure is not None and target.exposure_truth is not None
-    shown, truth = (mu_law(image / largest, 1.0) for image in (photo.exposure, target.exposure_truth))
-    return image_loss(shown, truth, target.mask, config.form, config.ssim_weight)
+    prediction, truth = (mu_law(image / largest, 1.0) for image in (photo.exposure, target.exposure_truth))
+    return image_loss(prediction, truth, target.mask, config.form, config.ssim_weight)
 
 
-def needed_colours(config: LossConfig, has_truth: bool) -> frozenset[str]:
-    """What render_train_view() must render besides the photo for data_loss of a view with or without HDR truth."""
+def extra_images(config: LossConfig, has_truth: bool) -> frozenset[str]:
+    """Return the extra images that render_train_view() must render for data_loss."""
     wanted = {"exposure"} if config.hdr_weight > 0 and has_truth else set()
     if config.linear_weight > 0:
         wanted |= {"base"} if config.hdr_truth and has_truth else {"base", "exposure"}
@@ -185,7 +211,7 @@ def needed_colours(config: LossConfig, has_truth: bool) -> frozenset[str]:
 def data_loss(
     field: RadianceField, photo: TrainRender, target: Target, config: LossConfig, largest_truth: float = 1.0
 ) -> Tensor:
-    """L_LDR + beta L_linear (equation 13), the HDR loss and the anchor, each where it has a weight."""
+    """Return L_LDR + beta L_linear (equation 13) + the HDR loss + the anchor, each if it has a weight."""
     loss = ldr_loss(photo, target, config) if config.ldr_weight > 0 else 0.0
     if config.ldr_weight not in (0, 1):
         loss = config.ldr_weight * loss
@@ -200,6 +226,6 @@ def data_loss(
     return loss
 
 
-def regularised(loss: Tensor, photo: TrainRender) -> Tensor:
+def with_opacity_penalty(loss: Tensor, photo: TrainRender) -> Tensor:
     """Return the loss plus the opacity penalty, if the view was rendered with an opacity weight."""
     return loss if photo.opacity_penalty is None else loss + photo.opacity_penalty

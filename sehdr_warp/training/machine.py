@@ -1,4 +1,4 @@
-"""What a training asks of the machine: a device, torch's settings, the memory used, and tidy interrupts."""
+"""Process settings of a training: torch's settings, memory figures, and tidy interrupts."""
 
 import os
 import signal
@@ -13,13 +13,11 @@ import torch
 from ..errors import SehdrError
 from ..parallel import thread_count
 
-SWITCH_SECONDS = (
-    2e-4  # A thread that waits for the interpreter asks for it after so long, where Python's 5 ms are a kernel
-)
+SWITCH_SECONDS = 2e-4  # Interval after which a waiting thread requests the interpreter's lock; Python's 5 ms are long
 
 
 def machine_figures(device: torch.device) -> dict:
-    """The device's name, and the largest memory so far, bytes: of this process, and on a GPU of torch's tensors."""
+    """Return the device's name and the peak memory in bytes, of this process and of torch's tensors on a GPU."""
     cuda = device.type == "cuda"
     figures: dict = {"device": torch.cuda.get_device_name(device) if cuda else f"cpu ({thread_count()} threads)"}
     if sys.platform != "win32":
@@ -34,9 +32,14 @@ def machine_figures(device: torch.device) -> dict:
 
 @contextmanager
 def torch_settings(deterministic: bool) -> Iterator[None]:
-    """torch on one thread, so that its sums do not depend on the machine's cores, which costs nothing: the kernels have
-    threads of their own, which hand on the interpreter's lock sooner. deterministic: also its sums on a GPU in a fixed
-    order."""
+    """Apply torch's settings for a training within this block.
+
+    torch runs on one thread, so that its sums do not depend on the number of cores; this costs nothing, because the
+    kernels have their own threads, and the interpreter's lock is handed over sooner.
+
+    Args:
+        deterministic: Also give sums on a GPU a fixed order.
+    """
     threads, ordered = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     memory: Any = torch.utils.deterministic
     filled = memory.fill_uninitialized_memory
@@ -45,7 +48,7 @@ def torch_settings(deterministic: bool) -> Iterator[None]:
     sys.setswitchinterval(SWITCH_SECONDS)
     _keep_memory(True)
     if deterministic:
-        # cuBLAS repeats itself only with a workspace of its own; it reads this when it is first used.
+        # cuBLAS is deterministic only with a fixed workspace; it reads this variable at its first use.
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
         torch.use_deterministic_algorithms(True)
         memory.fill_uninitialized_memory = False
@@ -55,14 +58,17 @@ def torch_settings(deterministic: bool) -> Iterator[None]:
         torch.set_num_threads(threads)
         sys.setswitchinterval(interval)
         _keep_memory(False)
-        if deterministic:  # The call alone loads torch's compiler, two seconds.
+        if deterministic:  # Guarded, because the call loads torch's compiler, two seconds.
             torch.use_deterministic_algorithms(ordered)
         memory.fill_uninitialized_memory = filled
 
 
 def _keep_memory(keep: bool) -> None:
-    """Whether large memory stays the process's when it is let go. A step of a training asks for what the one before let
-    go, and new memory the system fills with zeros, page by page, on one thread. glibc's; nothing elsewhere."""
+    """Set whether glibc keeps freed large memory in the process.
+
+    A step requests the memory that the previous one freed, and the system zeroes new memory page by page on one thread.
+    Does nothing on other systems.
+    """
     if sys.platform != "linux":
         return
     import ctypes
@@ -78,15 +84,17 @@ def _keep_memory(keep: bool) -> None:
 
 @contextmanager
 def interruptible() -> Iterator[threading.Event]:
-    """An event that the first signal to end (Ctrl-C, SLURM's and containers' SIGTERM, the SIGHUP of a terminal that
-    closes) sets, so that a step is never cut in two. It takes effect when the block ends, a second one at once."""
+    """Yield an event that is set by the first signal to end: SIGINT, SIGTERM or SIGHUP.
+
+    A step is then never interrupted in the middle. The signal takes effect when the block ends, a second one at once.
+    """
     event = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield event
         return
     signals = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    # What nohup or a shell's background ignores stays ignored.
-    previous = {each: kept for each in signals if (kept := signal.getsignal(each)) not in (signal.SIG_IGN, None)}
+    # Signals that nohup or a background shell ignores stay ignored.
+    previous = {each: old for each in signals if (old := signal.getsignal(each)) not in (signal.SIG_IGN, None)}
     caught = []
 
     def restore():
@@ -103,7 +111,7 @@ def interruptible() -> Iterator[threading.Event]:
     try:
         yield event
     except Exception:
-        caught.clear()  # What went wrong is to be told.
+        caught.clear()  # The exception is reported instead of the signal.
         raise
     finally:
         restore()
@@ -112,7 +120,7 @@ def interruptible() -> Iterator[threading.Event]:
 
 
 def summary_writer() -> type:
-    """TensorBoard's; SehdrError where it is not installed."""
+    """Return TensorBoard's SummaryWriter; raises SehdrError if it is not installed."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:

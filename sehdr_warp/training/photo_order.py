@@ -1,4 +1,4 @@
-"""Which photo is next: every photo once in random order, then again in another."""
+"""The order of training photos: all photos in random order, then again in another order."""
 
 import operator
 
@@ -7,36 +7,41 @@ from torch import Tensor
 
 
 class PhotoOrder:
-    """The order of `count` photos for several processes that train together, all of which draw it alike.
-
-    rank, ranks: the number of this process, and how many there are.
-    """
+    """The order of `count` photos; all ranks draw the same order, and each takes its own photo of a step."""
 
     def __init__(self, count: int, seed: int, rank: int = 0, ranks: int = 1):
+        """Create an order.
+
+        Args:
+            count: Number of photos.
+            seed: Seed of the order.
+            rank: Number of this process.
+            ranks: Number of processes that train together.
+        """
         self._count, self._rank, self._ranks = count, rank, ranks
-        self._left: list[int] = []
+        self._remaining: list[int] = []
         self._generator = torch.Generator().manual_seed(seed)
 
     def next(self) -> int:
-        """This process's photo, where each takes one."""
+        """Return the index of this rank's next photo."""
         chosen = []
         for _ in range(self._ranks):
-            if not self._left:
-                self._left = torch.randperm(self._count, generator=self._generator).tolist()
-            chosen.append(self._left.pop())
+            if not self._remaining:
+                self._remaining = torch.randperm(self._count, generator=self._generator).tolist()
+            chosen.append(self._remaining.pop())
         return chosen[self._rank]
 
-    def following(self) -> int | None:
-        """What next() will say; None where the order is not drawn yet."""
-        return self._left[-1 - self._rank] if self._rank < len(self._left) else None
+    def peek(self) -> int | None:
+        """Return what next() will return, or None if a new order has to be drawn first."""
+        return self._remaining[-1 - self._rank] if self._rank < len(self._remaining) else None
 
     def state(self) -> tuple[Tensor, list[int]]:
-        """The generator's state and the photos that are left."""
-        return self._generator.get_state(), list(self._left)
+        """Return the generator's state and the photos that remain of this order."""
+        return self._generator.get_state(), list(self._remaining)
 
-    def load_state(self, generator: Tensor, left: list) -> None:
-        """Takes up what state() gave. Raises ValueError where it names photos that there are not."""
+    def load_state(self, generator: Tensor, remaining: list) -> None:
+        """Continue from state(); raises ValueError if it names photos that do not exist."""
         self._generator.set_state(generator.cpu())
-        self._left = [operator.index(place) for place in left]
-        if not all(0 <= place < self._count for place in self._left):
+        self._remaining = [operator.index(place) for place in remaining]
+        if not all(0 <= place < self._count for place in self._remaining):
             raise ValueError(f"the order of the photos names others than the {self._count} there are")

@@ -1,7 +1,7 @@
-"""Photos that come to the device as steps need them, where it has no room for all.
+"""Training photos that are copied to the device as steps need them, if the device has no memory for all.
 
-A recorded step reads its photo at a place in a ring of a few. A thread copies the next one, from memory or a mapped
-file, to pinned memory and from there on a stream of its own, while the step before it is at work.
+A captured step reads its photo from one of a few slots. A thread copies the next photo, from memory or a mapped file,
+to pinned memory and from there to the device on a stream of its own, while the step before it runs.
 """
 
 import logging
@@ -15,50 +15,59 @@ import torch
 from torch import Tensor
 
 from ..model.radiance_field import CameraTensors
-from .losses import Target, one_of
+from .losses import Target, select_view
 from .targets import PhotoSource, TrainingView, ViewStack
 
 log = logging.getLogger(__name__)
 
-SLOTS = 3  # One is read, one is being filled, and one may still be read by a step that is not done
-SHARE = 0.4
-"""Of the device's free memory, photos stay on it up to so much: to stack them takes as much again for a while."""
+SLOTS = 3  # One is read, one is filled, and one may still be read by a step that has not finished
+SHARE = 0.4  # Largest fraction of the device's free memory for photos; stacking them takes as much again for a while
 
 
 def fits_device(source: PhotoSource, device: torch.device) -> bool:
-    """Whether all photos may stay on a GPU."""
+    """Return whether all photos may stay on a GPU."""
     return source.bytes <= SHARE * torch.cuda.mem_get_info(device)[0]
 
 
-def held_views(source: PhotoSource, where: str, recorded: bool) -> "ViewStack | PhotoStream | Sequence[TrainingView]":
-    """The views of a source as steps take them. where: schedule.photo_cache. recorded: whether steps are."""
+def make_view_source(
+    source: PhotoSource, where: str, recorded: bool
+) -> "ViewStack | PhotoStream | Sequence[TrainingView]":
+    """Return the views of a source in the form that steps take.
+
+    Args:
+        source: The photos.
+        where: Value of schedule.photo_cache.
+        recorded: Whether steps are captured as CUDA graphs.
+    """
     device = torch.device(source.device)
     if device.type == "cpu":  # Memory is the device's, or a file is mapped into it.
         return source
     if where in ("memory", "disk") or (where == "auto" and not fits_device(source, device)):
         log.info("plan: photos: %.3g GB go to %s one by one, a step ahead", source.bytes / 1e9, device)
-        return _streamed(source) if recorded else source
+        return _stream_or_source(source) if recorded else source
     views = list(source)
-    # Only recorded steps need what they read in one place.
+    # Only captured steps need all photos in one tensor.
     return (ViewStack.of(views) if recorded else None) or views
 
 
-def _streamed(source: PhotoSource) -> "PhotoStream | PhotoSource":
+def _stream_or_source(source: PhotoSource) -> "PhotoStream | PhotoSource":
+    """Return a PhotoStream, or the source itself if its photos cannot share slots."""
     try:
         return PhotoStream(source)
     except ValueError as error:
-        log.info("%s: they are copied one by one, and steps are not recorded", error)
+        log.info("%s: they are copied one by one, and steps are not captured as CUDA graphs", error)
         return source
 
 
 class PhotoStream:
-    """What ViewStack is, with SLOTS photos on the device. bring() a view before at() is asked for it, and say used()
-    once what reads it is launched; [i] is view i, made anew.
+    """A replacement of ViewStack with SLOTS photos on the device.
 
-    Views are of one size; raises ValueError otherwise, and where only some have HDR truth.
+    Call bring() for a view before at() returns it, and release() once the kernels that read it are launched. [i] is a
+    copy of view i.
     """
 
     def __init__(self, source: PhotoSource):
+        """Allocate the slots; raises ValueError if views differ in size, or only some have HDR truth."""
         views, self._source = source.views, source
         first = source[0]
         kinds = {(v.camera.width, v.camera.height, source.truth and v.hdr is not None) for v in views}
@@ -71,49 +80,53 @@ class PhotoStream:
         shapes["estimates"] = first.target.estimates
         shapes["mask"] = torch.empty(first.camera.height, first.camera.width, 1) if masked else None
         self._parts = {name: like for name, like in shapes.items() if like is not None}
-        self._slots = {name: self._room(like, SLOTS, self._device) for name, like in self._parts.items()}
+        self._slots = {name: self._allocate(like, SLOTS, self._device) for name, like in self._parts.items()}
         self._pinned = (
-            {name: self._room(like, SLOTS, "cpu") for name, like in self._parts.items()} if self._cuda else {}
+            {name: self._allocate(like, SLOTS, "cpu") for name, like in self._parts.items()} if self._cuda else {}
         )
-        # Cameras of all; photos of none.
+        # Cameras of all views, without photos.
         blank = Target(first.target.codes[:0, :0], first.target.scale)
         cameras = [TrainingView(CameraTensors.of(v.camera, self._device), v.exposure_time, blank) for v in views]
         stack = ViewStack.of(cameras)
         assert stack is not None
         self._cameras = stack
         self._place = torch.zeros(1, dtype=torch.int64, device=self._device)
-        self._held: list[int | None] = [None] * SLOTS
+        self._slot_views: list[int | None] = [None] * SLOTS
         self._filling: list[Future | None] = [None] * SLOTS
-        self._now = 0
+        self._current = 0
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="sehdr-warp photos")
         if self._cuda:
             self._stream = torch.cuda.Stream(self._device)
             self._filled, self._free = ([torch.cuda.Event() for _ in range(SLOTS)] for _ in range(2))
 
-    def _room(self, like: Tensor, count: int, device: Any) -> Tensor:
+    def _allocate(self, like: Tensor, count: int, device: Any) -> Tensor:
+        """Allocate `count` slots like a tensor."""
         pinned = self._cuda and torch.device(device).type == "cpu"
         return torch.zeros((count, *like.shape), dtype=like.dtype, device=device, pin_memory=pinned)
 
     def __len__(self) -> int:
+        """Return the number of views."""
         return len(self._source)
 
     def __getitem__(self, index: int) -> TrainingView:
+        """Return a copy of a view on the device."""
         return self._source[index]
 
     @property
     def times(self) -> Tensor | float:
+        """Exposure times, as in ViewStack."""
         return self._cameras.times
 
     def at(self, index: Tensor) -> TrainingView:
-        """The view whose number is in index [1], which was brought; as of ViewStack."""
+        """Return the view whose number is in index [1], as in ViewStack; bring() must have been called for it."""
         view = self._cameras.at(index)
-        parts = {name: one_of(slots, self._place) for name, slots in self._slots.items() if name != "codes"}
+        parts = {name: select_view(slots, self._place) for name, slots in self._slots.items() if name != "codes"}
         return replace(view, target=replace(view.target, codes=self._slots["codes"], index=self._place, **parts))
 
     def bring(self, index: int) -> None:
-        """Has a view in its place on the device for what is launched next."""
+        """Make a view available to the kernels that are launched next."""
         self._fetch(index)
-        self._now = slot = self._held.index(index)
+        self._current = slot = self._slot_views.index(index)
         filling = self._filling[slot]
         assert filling is not None
         filling.result()
@@ -121,25 +134,27 @@ class PhotoStream:
             torch.cuda.current_stream(self._device).wait_event(self._filled[slot])
         self._place.fill_(slot)
 
-    def used(self, following: int | None) -> None:
-        """What reads the view that was brought is launched; the one that will follow is fetched meanwhile."""
+    def release(self, following: int | None) -> None:
+        """Mark the view of bring() as read by launched kernels, and start to fetch the one that follows."""
         if self._cuda:
-            self._free[self._now].record(torch.cuda.current_stream(self._device))
+            self._free[self._current].record(torch.cuda.current_stream(self._device))
         if following is not None:
             self._fetch(following)
 
     def _fetch(self, index: int) -> None:
-        if index not in self._held:
-            slot = (self._now + 1) % SLOTS
-            self._held[slot] = index
+        """Start to fill a slot with a view unless one holds it."""
+        if index not in self._slot_views:
+            slot = (self._current + 1) % SLOTS
+            self._slot_views[slot] = index
             self._filling[slot] = self._thread.submit(self._fill, slot, index)
 
     def _fill(self, slot: int, index: int) -> None:
+        """Copy a view to its slot; runs on the thread."""
         for name, array in self._arrays(index).items():
             if not self._cuda:
                 self._slots[name][slot].copy_(array)
                 continue
-            self._filled[slot].synchronize()  # What was there before has left the pinned memory.
+            self._filled[slot].synchronize()  # The previous copy from pinned memory is done.
             self._pinned[name][slot].copy_(array)
         if self._cuda:
             with torch.cuda.stream(self._stream):
@@ -149,15 +164,15 @@ class PhotoStream:
                 self._filled[slot].record(self._stream)
 
     def _arrays(self, index: int) -> dict[str, Tensor]:
-        """A photo's codes, truth as exposure and mask, on the CPU."""
+        """Return a photo's codes, HDR truth as exposure, and mask, on the CPU."""
         view, codes = self._source.views[index], self._source.codes(index)
-        found = {"codes": torch.from_numpy(codes.view(np.int16) if codes.dtype == np.uint16 else codes)}
+        arrays = {"codes": torch.from_numpy(codes.view(np.int16) if codes.dtype == np.uint16 else codes)}
         if "exposure_truth" in self._parts:
             assert view.hdr is not None
-            found["exposure_truth"] = torch.from_numpy(np.asarray(view.hdr, np.float32)) * self._source.base_time
+            arrays["exposure_truth"] = torch.from_numpy(np.asarray(view.hdr, np.float32)) * self._source.base_time
         if self._source.estimates is not None:
-            found["estimates"] = self._source.estimates[index]
-        if "mask" in self._parts:  # One without a mask counts everywhere.
+            arrays["estimates"] = self._source.estimates[index]
+        if "mask" in self._parts:  # A view without a mask counts everywhere.
             whole = np.ones(view.codes.shape[:2], np.float32) if view.mask is None else view.mask
-            found["mask"] = torch.from_numpy(np.asarray(whole, np.float32))[..., None]
-        return found
+            arrays["mask"] = torch.from_numpy(np.asarray(whole, np.float32))[..., None]
+        return arrays

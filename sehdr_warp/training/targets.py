@@ -1,4 +1,4 @@
-"""The training photos on the device, uploaded once."""
+"""Training views: photos, cameras and HDR truth as tensors on the device."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,14 +14,20 @@ from ..rasterizer.code_residual import CodeScale, code_tensor
 from ..response import Response
 from ..runs.config import LossConfig
 from ..scene import Scene, View
-from .losses import Target, code_scale, one_of
+from .losses import Target, code_scale, select_view
 
 _TRUTH_REMEDY = "take a scene with HDR truth, or a preset that needs none"
 
 
 @dataclass(frozen=True)
 class TrainingView:
-    """A photo to train on: camera, exposure time in seconds, and what is compared with it, at the camera's size."""
+    """A photo to train on.
+
+    Attributes:
+        camera: Camera on the device.
+        exposure_time: Seconds.
+        target: The image to compare with, at the camera's size.
+    """
 
     camera: CameraTensors
     exposure_time: float | Tensor
@@ -30,10 +36,14 @@ class TrainingView:
 
 @dataclass(frozen=True)
 class ViewStack:
-    """V training views of one size in shared memory: [i] is view i; at() takes the view whose number is on the device.
+    """V training views of one size in shared tensors: [i] is view i; at() selects by an index on the device.
 
-    cameras: [V, 24], each view's pose [4, 4], intrinsics [4], position [3] and a 0. times: seconds [V], or one float
-    where all are equal. targets: as of one view, each of its images [V, ...].
+    Attributes:
+        width: Pixels.
+        height: Pixels.
+        cameras: [V, 24], each view's pose [4, 4], intrinsics [4], position [3] and a 0.
+        times: Exposure times [V] in seconds, or one float if all are equal.
+        targets: Target whose images are stacked, [V, ...].
     """
 
     width: int
@@ -44,17 +54,17 @@ class ViewStack:
 
     @staticmethod
     def of(views: Sequence[TrainingView]) -> "ViewStack | None":
-        """The views stacked; None where their sizes differ or only some have HDR truth."""
+        """Stack views; returns None if their sizes differ or only some have HDR truth."""
         kinds = {(view.camera.width, view.camera.height, view.target.exposure_truth is None) for view in views}
         if len(kinds) > 1:
             return None
         cameras, targets, times = zip(*((v.camera, v.target, v.exposure_time) for v in views), strict=True)
         masks, truths = [t.mask for t in targets], [t.exposure_truth for t in targets]
         if any(mask is not None for mask in masks):
-            # One without a mask counts everywhere.
+            # A view without a mask counts everywhere.
             whole = torch.ones(cameras[0].height, cameras[0].width, 1, device=targets[0].codes.device)
             masks = [whole if mask is None else mask for mask in masks]
-        # A multiple of 16 bytes each: kernels may read four numbers at once.
+        # Rows of a multiple of 16 bytes, because kernels may read four floats at once.
         rows = [torch.cat([c.world_to_camera.flatten(), c.intrinsics, c.position]) for c in cameras]
         stacked = functional.pad(torch.stack(rows), (0, 1))
         time = times[0] if len(set(times)) == 1 else torch.tensor(times, device=stacked.device)
@@ -65,22 +75,26 @@ class ViewStack:
         return ViewStack(cameras[0].width, cameras[0].height, stacked, time, target)
 
     def __len__(self) -> int:
+        """Return the number of views."""
         return len(self.cameras)
 
     def __getitem__(self, index: int) -> TrainingView:
+        """Return view `index` without copying its photo."""
         time = float(self.times[index]) if isinstance(self.times, Tensor) else self.times
         view = self._view(lambda values: values[index], time)
         return replace(view, target=replace(view.target, codes=self.targets.codes[index]))
 
     def at(self, index: Tensor) -> TrainingView:
-        """The view whose number is in index [1], int64, on the views' device. The photo stays in the stack until it is
-        asked for: here taking is copying."""
-        time = one_of(self.times, index) if isinstance(self.times, Tensor) else self.times
-        view = self._view(lambda values: one_of(values, index), time)
+        """Return the view whose number is in index [1], int64, on the views' device.
+
+        The photo stays in the stack, because selecting it here would copy it; kernels select it by the index.
+        """
+        time = select_view(self.times, index) if isinstance(self.times, Tensor) else self.times
+        view = self._view(lambda values: select_view(values, index), time)
         return replace(view, target=replace(view.target, index=index))
 
     def _view(self, take: Callable[[Tensor], Tensor], time: float | Tensor) -> TrainingView:
-        """All of a view but its codes. take: gives one of a tensor [V, ...]."""
+        """Return a view without its codes; `take` selects one of a tensor [V, ...]."""
         pose, intrinsics, position = take(self.cameras)[:23].split((16, 4, 3))
         camera = CameraTensors(self.width, self.height, pose.view(4, 4), intrinsics, position)
         names = "mask", "exposure_truth", "estimates"
@@ -89,13 +103,16 @@ class ViewStack:
 
 
 def largest_truth(scene: Scene, loss: LossConfig) -> float:
-    """The greatest radiance in the HDR truth of the training views, where it counts; 1.0 where the loss needs none.
-    Raises InputError naming scene and field where truth that the loss needs is missing or black."""
+    """Return the largest radiance in the HDR truth of the training views inside masks; 1.0 if the loss needs none.
+
+    Raises:
+        InputError: With scene and field, if truth that the loss needs is missing or black.
+    """
     check_truth(scene.name, [(view.name, view.hdr is not None) for view in scene.train_views], loss)
     if not loss.uses_hdr:
         return 1.0
-    given = [(view.hdr, view.mask) for view in scene.train_views if view.hdr is not None]
-    counted = (hdr if mask is None else hdr[mask > 0] for hdr, mask in given)
+    truths = [(view.hdr, view.mask) for view in scene.train_views if view.hdr is not None]
+    counted = (hdr if mask is None else hdr[mask > 0] for hdr, mask in truths)
     largest = max((float(radiance.max()) for radiance in counted if radiance.size), default=0.0)
     if not largest > 0:
         problem = f"the HDR truth that {_truth_field(loss)} needs is black in every training view"
@@ -104,8 +121,13 @@ def largest_truth(scene: Scene, loss: LossConfig) -> float:
 
 
 def check_truth(scene: str, views: Sequence[tuple[str, bool]], loss: LossConfig) -> None:
-    """Raises InputError naming scene and field where truth that the loss needs is missing. views: the training views'
-    names, and whether they have truth."""
+    """Raise InputError, with scene and field, if HDR truth that the loss needs is missing.
+
+    Args:
+        scene: Name of the scene.
+        views: For each training view its name and whether it has HDR truth.
+        loss: The loss.
+    """
     if not loss.uses_hdr:
         return
     if not any(known for _, known in views):
@@ -117,22 +139,39 @@ def check_truth(scene: str, views: Sequence[tuple[str, bool]], loss: LossConfig)
 
 
 def _truth_field(loss: LossConfig) -> str:
+    """Return the field of the loss that needs HDR truth, with its value."""
     return f"loss.hdr_weight = {loss.hdr_weight}" if loss.hdr_weight > 0 else "loss.hdr_truth = true"
 
 
 def training_views(
     views: Sequence[View], base_time: float, device, *, truth: bool, clipping=True, light: Response | None = None
 ) -> list[TrainingView]:
-    """The views on a device. truth: also upload HDR truth; light: the response by which exposures are compared."""
+    """Upload views to a device.
+
+    Args:
+        views: The training views.
+        base_time: Exposure time dt_1 of the field, seconds.
+        device: Torch device.
+        truth: Also upload HDR truth.
+        clipping: Treat clipped codes as intervals.
+        light: Response by which exposures are compared, None to compare encoded values.
+    """
     return list(photo_source(views, base_time, device, truth=truth, clipping=clipping, light=light))
 
 
 def photo_source(
     views, base_time: float, device, *, truth: bool, clipping=True, light=None, estimates: list[Tensor] | None = None
 ) -> "PhotoSource":
-    """Return training_views() that are made one by one, whenever one is asked for.
+    """Return the views of training_views() as a sequence that uploads each on access.
 
-    estimates: of each view's clipped light, as Target has them.
+    Args:
+        views: The training views.
+        base_time: Exposure time dt_1 of the field, seconds.
+        device: Torch device.
+        truth: Also upload HDR truth.
+        clipping: Treat clipped codes as intervals.
+        light: Response by which exposures are compared, None to compare encoded values.
+        estimates: For each view estimates of the light of clipped pixels, as in Target.
     """
     deep = any(view.codes.dtype == np.uint16 for view in views)
     scale = code_scale(65535 if deep else 255, light, device, clipping=clipping)
@@ -140,7 +179,7 @@ def photo_source(
 
 
 class PhotoSource(Sequence[TrainingView]):
-    """Training views whose photos stay where they are, in memory or in a file, until one is asked for."""
+    """Training views whose photos stay in memory or in a file until they are accessed."""
 
     def __init__(
         self,
@@ -152,13 +191,16 @@ class PhotoSource(Sequence[TrainingView]):
         scale: CodeScale,
         estimates: list[Tensor] | None = None,
     ):
+        """Wrap views; `deep` says that codes have 16 bits, `truth` that HDR truth is uploaded."""
         self.views, self.base_time, self.device = views, base_time, device
         self.truth, self._deep, self.scale, self.estimates = truth, deep, scale, estimates
 
     def __len__(self) -> int:
+        """Return the number of views."""
         return len(self.views)
 
     def __getitem__(self, index: int) -> TrainingView:
+        """Upload a view to the device."""
         view = self.views[index]
         mask, radiance = (
             None
@@ -173,14 +215,14 @@ class PhotoSource(Sequence[TrainingView]):
         return TrainingView(CameraTensors.of(view.camera, self.device), view.exposure_time, target)
 
     def codes(self, index: int) -> np.ndarray:
-        """The codes of a photo, all of one type."""
+        """Return the codes of a photo, all of one type."""
         codes = self.views[index].codes
-        # 257 takes white to white and each value to itself.
+        # A factor of 257 maps 8-bit white to 16-bit white and keeps every value.
         return codes.astype(np.uint16) * np.uint16(257) if self._deep and codes.dtype == np.uint8 else codes
 
     @property
     def bytes(self) -> int:
-        """What all of them would take on the device."""
+        """Memory that all views would take on the device."""
         parts = (
             (v.camera.width * v.camera.height, v.mask is not None, self.truth and v.hdr is not None) for v in self.views
         )

@@ -28,11 +28,11 @@ from ..runs.run_writer import RunWriter, write_confidence
 from ..scene import Camera, Scene
 from ..scene.exposure_compensation import ExposureCompensation
 from ..scene.normalization import normalization_of
+from .compensation import estimate_compensation, estimates_compensation
 from .following import hand_on, told_of_ranks
-from .held_out import evaluate_views, figures_told, warn_of_fall
+from .held_out import evaluate_views, format_scores, warn_of_overfitting
 from .initialization import choose_response, make_field, make_matcher, sizes_of
 from .machine import interruptible, machine_figures, summary_writer, torch_settings
-from .photo_gains import evens, find_gains
 from .plan import apply_plan
 from .ranks import END, GO, WAIT, Ranks
 from .targets import check_truth
@@ -275,7 +275,7 @@ class Training:
             "steps_without_room": trainer.steps_without_room,
         }
         self.folder.write_summary(summary | machine_figures(self.device))
-        warn_of_fall(self.folder.read_metrics())
+        warn_of_overfitting(self.folder.read_metrics())
         if self._writer is not None:
             self._writer.close()
 
@@ -311,7 +311,7 @@ class Training:
         line |= {name: round(value, 4) for name, value in scores.items()}
         self.folder.append_metrics(line | {"gaussians": self.trainer.field.gaussians.count})
         self._log("test", scores)
-        log.info("iteration %d: %s, after %.1f s", self.iteration, figures_told(scores), self.seconds)
+        log.info("iteration %d: %s, after %.1f s", self.iteration, format_scores(scores), self.seconds)
 
     def _checkpoint(self) -> None:
         """Saves the state, unless the training has diverged: the last good checkpoint then stays the newest."""
@@ -339,9 +339,9 @@ class Training:
         check_truth(scene.name, [(view.name, view.hdr is not None) for view in scene.train_views], config.loss)
         response = choose_response(scene, config)
         matcher, gains = cache(partial(make_matcher, normalized, response, self.device)), None
-        if plan is not None and evens(scene, config, response):
-            gains, found, decision = self.timed(partial(find_gains, normalized, config, response, self.device))
-            matcher, plan = (lambda: found), plan.with_decision(decision)
+        if plan is not None and estimates_compensation(scene, config, response):
+            found = self.timed(partial(estimate_compensation, normalized, config, response, self.device))
+            gains, matcher, plan = found.gains, (lambda: found.matcher), plan.with_decision(found.decision)
         evened = self._even(scene, gains, response)
         field = self.timed(partial(make_field, evened, config, response, self.device, matcher))
         trainer = Trainer(evened, config, field, matcher, self.ranks)

@@ -21,16 +21,16 @@ from ..runs.checkpoint import under
 from ..runs.config import Config
 from ..scene import Camera, Scene
 from . import optimizer as adam
-from .averaging import Averaging
 from .births import born_rows
 from .densification import SEED_STEP, make_densification
 from .graph_capacity import GraphCapacity
 from .initialization import make_matcher, scene_extent
 from .light_estimates import light_estimates
-from .losses import INTERVALS_FROM, compares_light, data_loss, needed_colours, regularised
+from .losses import INTERVALS_FROM, compares_exposures, data_loss, extra_images, with_opacity_penalty
 from .matching import Matcher
+from .moving_average import MovingAverage
 from .photo_order import PhotoOrder
-from .photo_stream import PhotoStream, held_views
+from .photo_stream import PhotoStream, make_view_source
 from .ranks import Ranks
 from .targets import TrainingView, ViewStack, largest_truth, photo_source
 
@@ -70,11 +70,11 @@ class Trainer:
         pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
         places = torch.tensor([view.camera.position.tolist() for view in scene.train_views], device=self.device)
         self.densification = make_densification(config, self.extent, pixels, places)
-        self._averaging = Averaging(config, self.densification.stop)
+        self._averaging = MovingAverage(config, self.densification.stop)
         self._views = scene.train_views
         self._matcher = matcher or cache(partial(make_matcher, scene, field.response, self.device))
         # Where light is compared, nothing needs the photo encoded.
-        self._encoded = not compares_light(config.loss, field)
+        self._encoded = not compares_exposures(config.loss, field)
         self._largest_truth = largest_truth(scene, config.loss) * field.base_time
         self._stack: ViewStack | PhotoStream | Sequence[TrainingView] | None = None
         self._scale = CodeScale(torch.empty(0))  # What codes are worth
@@ -130,7 +130,7 @@ class Trainer:
     @property
     def steps_without_room(self) -> int:
         """Recorded steps of this process that were left out because a photo needed more room than they had."""
-        return self._capacity.lacked
+        return self._capacity.overflows
 
     def step(self) -> None:
         """One photo on each rank, one step. Raises SehdrError if more than MOST_SKIPPED steps had to be skipped."""
@@ -153,7 +153,7 @@ class Trainer:
         if self._can_record(views, kind):
             self._loss, self._shown = self._replay(views, index, watched, kind)
             if isinstance(views, PhotoStream):
-                views.used(self._order.following())
+                views.release(self._order.peek())
         else:
             with self._launching():
                 self._loss, self._shown = self._step(lambda: self._gradients(views[index], watched), self._apply)
@@ -161,9 +161,9 @@ class Trainer:
         if self._change() and self._recorder is not None:
             # Other Gaussians need about so many times the room.
             growth, stayed = gaussians.count / max(1, count), gaussians.reallocations == moves
-            if not self._capacity.change(growth, keep=stayed):
+            if not self._capacity.rescale(growth, keep=stayed):
                 self._invalidate()
-        self._averaging.follow(self.iteration, self.photos, gaussians)
+        self._averaging.update(self.iteration, self.photos, gaussians)
         if self.came_to(CHECK_EVERY):
             self.check(wait=False)
         if self.came_to(COMPARE_EVERY):
@@ -239,7 +239,7 @@ class Trainer:
         """Render, compare, differentiate. With a capacity all of it works on fixed memory and nothing waits for the
         device."""
         target, camera, time, field = view.target, view.camera, view.exposure_time, self.field
-        also = needed_colours(self.config.loss, target.exposure_truth is not None)
+        also = extra_images(self.config.loss, target.exposure_truth is not None)
         options = {"degree": self.degree, "also": also, "max_intersections": capacity, "encode": self._encoded}
         options |= {"factored": self._factored, "opacity_weight": self.config.loss.opacity_weight}
         photo = field.render_train_view(camera, time, **options)
@@ -250,7 +250,7 @@ class Trainer:
         rendering = replace(photo.rendering, **dict.fromkeys(unread))
         if watched:
             rendering.means2d.retain_grad()
-        loss = regularised(data_loss(field, photo, target, self.config.loss, self._largest_truth), photo)
+        loss = with_opacity_penalty(data_loss(field, photo, target, self.config.loss, self._largest_truth), photo)
         image = photo.encoded if self._encoded else photo.light
         assert image is not None
         del photo, target, view
@@ -279,7 +279,7 @@ class Trainer:
             self.densification.observe(rendering, width, height, made)
         self.optimizer.zero_grad()
         if rendering.needed_intersections is None:
-            self._capacity.launched(rendering.intersection_count)
+            self._capacity.observe(rendering.intersection_count)
         return loss
 
     def _flattened(self) -> adam.FlatGradients:
@@ -331,7 +331,7 @@ class Trainer:
 
     def check(self, *, wait: bool = True) -> None:
         """Raises SehdrError if more than MOST_SKIPPED steps were skipped. wait: False leaves out the latest."""
-        skipped, lacking = self._capacity.look(wait=wait)
+        skipped, lacking = self._capacity.poll(wait=wait)
         if skipped > MOST_SKIPPED:
             raise SehdrError(
                 f"iteration {self.iteration}: {skipped} steps had a loss or gradient that is not finite, "
@@ -377,11 +377,11 @@ class Trainer:
     def _training_views(self) -> ViewStack | PhotoStream | Sequence[TrainingView]:
         if self._stack is None:
             given, loss = (self._views, self.field.base_time, self.device), self.config.loss
-            light = self.field.response if compares_light(loss, self.field) else None
+            light = self.field.response if compares_exposures(loss, self.field) else None
             estimates = light_estimates(self._views, light, loss, self.device)
             options = {"clipping": loss.clipping, "light": light, "estimates": estimates}
             source = photo_source(*given, truth=loss.uses_hdr, **options)
-            self._stack = held_views(source, self.config.schedule.photo_cache, self._recorder is not None)
+            self._stack = make_view_source(source, self.config.schedule.photo_cache, self._recorder is not None)
             self._scale = source.scale
         if self._fine and self.iteration > INTERVALS_FROM * self.config.schedule.iterations:
             self._fine = False

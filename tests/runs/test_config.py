@@ -190,7 +190,7 @@ def test_base_and_overrides(tmp_path):
         ({"fusion.enabled": True, "fusion.exposures": ["1x"]}, "two or more"),
         ({"response.name": "learned", "fusion.enabled": True}, "fusion.enabled = .* needs a known response"),
         ({"response.name": "learned", "model.radiance": "display"}, "model.radiance = .* needs a known response"),
-        ({"loss.anchor_weight": 0.5}, r'anchor_weight = 0\.5 is for nothing: needs response.name = "learned"'),
+        ({"loss.anchor_weight": 0.5}, r'anchor_weight = 0\.5 has no effect: needs response.name = "learned"'),
     ],
 )
 def test_contradictions_are_refused(fields, words):

@@ -22,10 +22,10 @@ def test_ranks_share_one_order():
 
 def test_what_follows_is_told_where_it_is_drawn():
     order = PhotoOrder(3, seed=0)
-    assert order.following() is None
+    assert order.peek() is None
     for _ in range(7):
         order.next()
-        told = order.following()
+        told = order.peek()
         state = order.state()
         assert told in (None, order.next())
         order.load_state(*state)

@@ -30,7 +30,7 @@ def test_what_is_brought_is_the_view(device, truth):
         stream.bring(index)
         seen, whole = stream.at(torch.tensor([index], device=device)), source[index]
         encoded, mask = seen.target.encoded, seen.target.mask
-        stream.used(following)
+        stream.release(following)
         assert torch.equal(encoded, whole.target.encoded) and float(seen.exposure_time) == whole.exposure_time
         assert torch.equal(seen.camera.world_to_camera, whole.camera.world_to_camera)
         assert torch.equal(mask, torch.ones_like(mask) if whole.target.mask is None else whole.target.mask)

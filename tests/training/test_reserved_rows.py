@@ -41,7 +41,7 @@ def test_reserved_rows_change_nothing_of_a_training(scene, device, variant, monk
 def test_recorded_steps_go_on_through_changes_and_do_not_wait(scene, monkeypatch):
     monkeypatch.setattr(densification, "SPARE", 8.0)
     monkeypatch.setattr(trainer, "MOST_ROOM", 8.0)
-    monkeypatch.setattr(graph_capacity, "ENOUGH", 0.0)
+    monkeypatch.setattr(graph_capacity, "MIN_HEADROOM", 0.0)
     config = VARIANTS["default"]
     training = trainer.Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cuda:0"))
     for _ in range(48):

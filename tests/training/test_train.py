@@ -318,7 +318,7 @@ def test_held_out_photos_that_get_worse_are_told(scene, tmp_path, caplog):
     training.folder.append_metrics({"iteration": 2, "psnr_ldr": 99.0})
     for _ in training:
         pass
-    assert "held-out photos were best at iteration 2 (99.00 dB), now" in caplog.text
+    assert "held-out photos scored best at iteration 2 (99.00 dB), now" in caplog.text
 
 
 def test_a_run_of_an_earlier_version_is_refused_in_one_line(scene, tmp_path):

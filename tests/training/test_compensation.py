@@ -10,9 +10,9 @@ from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene import codes_of
 from sehdr_warp.scene.exposure_compensation import ExposureCompensation
-from sehdr_warp.training import photo_gains as gains_of_a_training
+from sehdr_warp.training import compensation
+from sehdr_warp.training.compensation import estimate_compensation, estimates_compensation
 from sehdr_warp.training.matching import LARGEST_SIDE, at_matching_size
-from sehdr_warp.training.photo_gains import evens, find_gains
 from sehdr_warp.training.train import Training
 
 from .wall_and_lamp import WALL, photographed, texture, wall_and_lamp
@@ -30,9 +30,14 @@ def drifting():
     return replace(scene, views=views, exposure_times_known=False), [view.exposure_time for view in scene.views]
 
 
+def found_in(*args):
+    result = estimate_compensation(*args)
+    return result.gains, result.matcher, result.decision
+
+
 def test_drift_is_found_where_there_is_some(device):
     scene, times = drifting()
-    gains, matcher, _ = find_gains(scene, CONFIG, LINEAR, device)
+    gains, matcher, _ = found_in(scene, CONFIG, LINEAR, device)
     found = np.array([gains.gains[view.name] for view in scene.views])
     np.testing.assert_allclose(
         found, np.repeat(np.array(times)[:, None], 3, 1) / np.exp(np.log(times).mean()), rtol=0.03
@@ -42,12 +47,12 @@ def test_drift_is_found_where_there_is_some(device):
 
 def test_stated_times_are_doubted_where_photos_contradict_them(device):
     scene, _ = drifting()
-    gains, _, decision = find_gains(replace(scene, exposure_times_known=True), CONFIG, LINEAR, device)
+    gains, _, decision = found_in(replace(scene, exposure_times_known=True), CONFIG, LINEAR, device)
     assert gains.stops > 0.4 and "over the times they state" in decision.choice and decision.told
     right = wall_and_lamp(TIMES)
     # A curve that is not the photos' makes right times look wrong, and evened photos would not agree.
     for curve in (LINEAR, response_by_name("gamma")):
-        gains, _, decision = find_gains(right, CONFIG, curve, device)
+        gains, _, decision = found_in(right, CONFIG, curve, device)
         assert gains is None and "do not contradict" in decision.reason
 
 
@@ -61,12 +66,12 @@ def test_stated_times_stay_where_colors_or_corners_alone_drift(device):
     for view, white_balance in zip(views, light, strict=True):
         tinted.append(replace(view, codes=codes_of(view.image * 2**white_balance, 8)))
         darkened.append(replace(view, codes=codes_of(view.image * corners, 8)))
-    gains, _, decision = find_gains(replace(scene, views=tuple(tinted)), CONFIG, LINEAR, device)
+    gains, _, decision = found_in(replace(scene, views=tuple(tinted)), CONFIG, LINEAR, device)
     assert "stay as stated" in decision.choice and "white balance" in decision.reason and gains.corner_loss == 0
     found = np.log2([gains.gains[view.name] for view in views])
     np.testing.assert_allclose(found, light, atol=0.06)
     assert (found[:, 1] == 0).all()
-    gains, _, decision = find_gains(replace(scene, views=tuple(darkened)), CONFIG, LINEAR, device)
+    gains, _, decision = found_in(replace(scene, views=tuple(darkened)), CONFIG, LINEAR, device)
     assert "stay as stated" in decision.choice and gains.corner_loss == pytest.approx(0.5, abs=0.1) and not gains.stops
 
 
@@ -75,7 +80,7 @@ def test_times_that_a_camera_rounds_are_put_right(device):
     off = np.array([0.15, -0.2, 0.05, 0.1, -0.1, -0.15, 0.2, 0.0, -0.05])
     scene = wall_and_lamp(TIMES)
     views = [replace(v, exposure_time=v.exposure_time * 2**-e) for v, e in zip(scene.views, off, strict=True)]
-    gains, _, decision = find_gains(replace(scene, views=tuple(views)), CONFIG, LINEAR, device)
+    gains, _, decision = found_in(replace(scene, views=tuple(views)), CONFIG, LINEAR, device)
     assert "over the times they state" in decision.choice and "white balance" not in decision.reason
     found = np.log2([gains.gains[view.name] for view in views])
     np.testing.assert_allclose(found, (off - off.mean())[:, None].repeat(3, 1), atol=0.03)
@@ -88,21 +93,22 @@ def test_a_wall_that_is_brighter_from_one_side_is_no_drift(device):
         ahead = rays[..., :2] / rays[..., 2:]
         return 0.5 * texture(position[:2] + ahead * WALL) * 2 ** (2 * ahead[..., :1] - ahead[..., 1:])
 
-    gains, _, decision = find_gains(photographed(light_at, TIMES), CONFIG, LINEAR, device)
+    gains, _, decision = found_in(photographed(light_at, TIMES), CONFIG, LINEAR, device)
     assert gains is None and "do not contradict" in decision.reason
 
 
 def test_no_gains_are_fitted_where_a_rough_look_finds_none(device, monkeypatch):
     """A wrong curve makes gains that follow the stated times, which the look leaves out."""
-    monkeypatch.setattr(gains_of_a_training, "fit_gains", lambda *_: pytest.fail("fitted"))
+    monkeypatch.setattr(compensation, "fit_gains", lambda *_: pytest.fail("fitted"))
     right = wall_and_lamp(TIMES)
     for scene, curve in ((wall_and_lamp(), LINEAR), (right, LINEAR), (right, response_by_name("gamma"))):
-        assert find_gains(scene, CONFIG, curve, device)[0] is None
+        assert estimate_compensation(scene, CONFIG, curve, device).gains is None
 
 
 def test_halves_are_compared_only_where_drift_is_large_enough(device, monkeypatch):
-    monkeypatch.setattr(gains_of_a_training, "_left_of_others", lambda *_: pytest.fail("compared"))
-    assert find_gains(replace(wall_and_lamp(), exposure_times_known=False), CONFIG, LINEAR, device)[0] is None
+    monkeypatch.setattr(compensation, "_cross_validate", lambda *_: pytest.fail("compared"))
+    scene = replace(wall_and_lamp(), exposure_times_known=False)
+    assert estimate_compensation(scene, CONFIG, LINEAR, device).gains is None
 
 
 def test_a_lamp_that_moves_is_no_drift(device):
@@ -113,7 +119,7 @@ def test_a_lamp_that_moves_is_no_drift(device):
         side = 1 if position[1] > 0.1 else -1
         return texture(places) * (0.7 + 0.5 * np.tanh(1.5 * side * places[..., :1]))
 
-    assert find_gains(photographed(light_at), CONFIG, LINEAR, device)[0] is None
+    assert estimate_compensation(photographed(light_at), CONFIG, LINEAR, device).gains is None
 
 
 def test_a_clear_sky_is_no_drift(device):
@@ -124,7 +130,7 @@ def test_a_clear_sky_is_no_drift(device):
         return 0.04 + 0.6 * np.exp(-(away**2).sum(-1, keepdims=True) / 0.2) * [0.7, 0.8, 1]
 
     scene = replace(photographed(light_at, turn=0.3), exposure_times_known=False)
-    assert find_gains(scene, CONFIG, LINEAR, device)[0] is None
+    assert estimate_compensation(scene, CONFIG, LINEAR, device).gains is None
 
 
 def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
@@ -146,7 +152,7 @@ def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
         assert [view.exposure_time for view in views] == pytest.approx([view.exposure_time for view in evened.views])
     for value, known, asked in (("never", False, False), ("unstated", True, False), ("unstated", False, True)):
         config = load_config("default", {"model.exposure_compensation": value})
-        assert evens(replace(scene, exposure_times_known=known), config, LINEAR) == asked
+        assert estimates_compensation(replace(scene, exposure_times_known=known), config, LINEAR) == asked
 
 
 def test_large_photos_are_matched_and_evened_small(monkeypatch):
@@ -167,7 +173,7 @@ def test_large_photos_are_matched_and_evened_small(monkeypatch):
         return even(gains, view, response)
 
     monkeypatch.setattr(ExposureCompensation, "_view", watched)
-    gains, matcher, _ = find_gains(replace(scene, views=large), CONFIG, LINEAR, "cpu")
+    gains, matcher, _ = found_in(replace(scene, views=large), CONFIG, LINEAR, "cpu")
     assert gains is not None and max(large[0].codes.shape) > LARGEST_SIDE
     assert sizes and max(sizes) <= LARGEST_SIDE
     assert max(matcher.size(0)) <= LARGEST_SIDE

@@ -6,7 +6,7 @@ import torch
 from sehdr_warp.runs.checkpoint import Checkpoint
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run_folder import RunFolder
-from sehdr_warp.training.averaging import SPANS, Averaging
+from sehdr_warp.training.moving_average import WINDOWS, MovingAverage
 from sehdr_warp.training.train import Training, train
 
 from .toy import QUICK, load_unscaled
@@ -28,21 +28,21 @@ class Moving:
 def test_the_mean_is_as_old_as_its_span(average):
     iterations = 6000
     config = load_config("default", {"schedule.iterations": iterations, "schedule.ema_window": 5 * average})
-    averaging, gaussians = Averaging(config, 500), Moving()
-    begin = max(iterations - SPANS * average, 500) + average // 10
+    moving_average, gaussians = MovingAverage(config, 500), Moving()
+    begin = max(iterations - WINDOWS * average, 500) + average // 10
     for iteration in range(1, iterations + 1):
         gaussians.value.fill_(iteration)
-        averaging.follow(iteration, 1, gaussians)
+        moving_average.update(iteration, 1, gaussians)
         if iteration < iterations:
             assert (gaussians.value == iteration).all()
-            assert bool(averaging.state()) == (average > 0 and iteration >= begin)
+            assert bool(moving_average.state()) == (average > 0 and iteration >= begin)
     age = iterations - float(gaussians.value[0])
-    assert age == (0 if not average else pytest.approx(0.9 * average, rel=0.1)) and not averaging.state()
+    assert age == (0 if not average else pytest.approx(0.9 * average, rel=0.1)) and not moving_average.state()
 
 
 def test_means_begin_when_the_count_stays():
     config = load_config("default", {"schedule.iterations": 1000, "schedule.ema_window": 15_000})
-    assert Averaging(config, 500).first == 500
+    assert MovingAverage(config, 500).first == 500
 
 
 def test_a_training_that_stops_in_between_ends_in_the_same_bits(scene, tmp_path):

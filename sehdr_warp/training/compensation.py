@@ -1,0 +1,222 @@
+"""Decide whether a camera changed exposure, white balance or vignetting between photos without stating it.
+
+The evidence is the light of points that several photos show: the gains that explain its differences are estimated by
+scene.exposure_compensation, and only the parts that clearly explain them are corrected.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from ..parallel import prefetch_map
+from ..response import Response
+from ..runs.config import Config
+from ..scene import Scene, View
+from ..scene.exposure_compensation import (
+    ExposureCompensation,
+    disagreement,
+    fit_gains,
+    initial_gains,
+    remaining_vignetting,
+    rough_gains,
+)
+from .initialization import make_matcher
+from .matching import Matcher, at_matching_size
+from .plan import Decision
+
+RESIZED_AT_ONCE = 8  # Photos that are resized in parallel
+POINTS, ROUGH_POINTS = 1500, 500  # Pixels to match for the fit, and for a rough one
+MIN_STOPS, MIN_WHITE_BALANCE, MIN_CORNER_LOSS = 0.15, 0.1, 0.15
+"""Smallest corrections: stops of exposure, stops of white balance, fraction of light missing in the corners. Smaller
+ones are within the error of the fit on scenes with shiny surfaces."""
+MIN_DISAGREEMENT = 0.12
+"""Median disagreement between photos, stops, that can be drift. Wrong matches along a clear sky stay below it, although
+gains explain them well."""
+MAX_REMAINING, MAX_REMAINING_VIGNETTING = 0.9, 0.85
+"""Largest fraction of the disagreement that may remain after a correction of exposure, or of vignetting."""
+MIN_UNEXPLAINED_STOPS = 0.05
+"""Smallest drift in stops, not explained by stated times or camera positions, for which stated times are corrected."""
+MAX_REMAINING_CROSS, MAX_REMAINING_WHITE_BALANCE = 0.95, 0.75
+"""The same as MAX_REMAINING in cross validation: gains are fitted to half of the points and evaluated on the others.
+Used for corrections of stated times, beyond what stated times and positions explain, and of white balance. EXIF rounds
+times and sensitivities, and cameras tone each photo by itself; shiny surfaces and a wrong response explain nothing at
+other points. Ground that is brighter from one side is explained by gains that grow along a flight, but there the
+harmonics represent it."""
+ENOUGH_MATCHES = 0.4  # Fraction of pixels that must match for photos to count as similar in brightness
+MIN_POINTS = 100  # Fewest points for a fit
+
+
+@dataclass(frozen=True)
+class SharedPoints:
+    """Points that several photos show.
+
+    Attributes:
+        points: [P, 3] world coordinates.
+        visible: [V, P] bool, which of the training and then the other views show each point.
+    """
+
+    points: np.ndarray
+    visible: np.ndarray
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.points)
+
+    def subset(self, part: slice) -> "SharedPoints":
+        """Return some of the points."""
+        return SharedPoints(self.points[part], self.visible[:, part])
+
+    def disagreement(
+        self, views: Sequence[View], response: Response, gains: ExposureCompensation | None, *, colors: bool = False
+    ) -> float:
+        """Return the median disagreement of photos at the points after a correction, stops."""
+        return disagreement(views, self.points, self.visible[: len(views)], response, gains, colors=colors)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Which parts of a compensation to apply."""
+
+    exposure: bool
+    white_balance: bool
+    vignetting: bool
+
+    def of(self, gains: ExposureCompensation) -> ExposureCompensation:
+        """Return gains with these parts alone."""
+        return gains.parts(exposure=self.exposure, white_balance=self.white_balance, vignetting=self.vignetting)
+
+
+@dataclass(frozen=True)
+class Compensation:
+    """Result of estimate_compensation.
+
+    Attributes:
+        gains: The compensation to apply to the photos; None if there is no drift.
+        matcher: Matcher of the corrected training photos.
+        decision: Line of the plan.
+    """
+
+    gains: ExposureCompensation | None
+    matcher: Matcher
+    decision: Decision
+
+
+def estimates_compensation(scene: Scene, config: Config, response: Response) -> bool:
+    """Return whether a training estimates a compensation: if allowed, and if it matches points and knows exposures."""
+    option = config.model.exposure_compensation
+    allowed = option in ("auto", "always") or (option == "unstated" and not scene.exposure_times_known)
+    return allowed and config.model.initial_density > 0 and not response.learnable
+
+
+def estimate_compensation(scene: Scene, config: Config, response: Response, device: torch.device | str) -> Compensation:
+    """Match points between the photos of a scene and estimate the compensation that explains their differences."""
+    stated = scene.exposure_times_known and config.model.exposure_compensation != "always"
+    views, others = scene.train_views, scene.test_views
+    cameras = [view.camera for view in others]
+
+    def matcher_of(scene: Scene) -> Matcher:
+        return make_matcher(scene, response, device)
+
+    def match(matcher: Matcher, count: int = POINTS) -> SharedPoints:
+        matches = matcher.match(matcher.pixels(count, np.random.default_rng(0)))
+        visible = matcher.near(cameras)[:, matches.views.cpu().numpy()]
+        return SharedPoints(matches.points.double().cpu().numpy(), visible)
+
+    def fit(shared: SharedPoints) -> ExposureCompensation:
+        return fit_gains(views, others, shared.points, shared.visible, response)
+
+    def no_drift(matcher: Matcher) -> Compensation:
+        least = f"{MIN_STOPS} stops between photos, or {MIN_CORNER_LOSS:.0%} towards the corners"
+        reason = "do not contradict the stated times" if stated else f"differ by less than {least}"
+        return Compensation(None, matcher, Decision("photo-gains", {}, "none", f"matched points {reason}"))
+
+    # Resized once, because the photos are read and corrected several times.
+    small = replace(scene, views=tuple(prefetch_map(at_matching_size, views, RESIZED_AT_ONCE)))
+    matcher = matcher_of(small)
+    if stated and not _may_drift(views, match(matcher, ROUGH_POINTS), response):
+        return no_drift(matcher)
+    shared, guess = match(matcher), initial_gains(small.views, response)
+    if not stated and len(shared) < ENOUGH_MATCHES * POINTS and guess.stops > MIN_STOPS:
+        shared = max(shared, match(matcher_of(guess.normalize_photos(small, response))), key=len)
+    if len(shared) < MIN_POINTS:
+        return no_drift(matcher)
+    gains = fit(shared)
+    parts = _explanatory_parts(gains, views, shared, response, stated)
+    if not (parts.exposure or parts.white_balance or parts.vignetting):
+        return no_drift(matcher)
+    # Match again in photos that are already similar: more points are found.
+    matcher = matcher_of(parts.of(gains).normalize_photos(small, response))
+    gains = parts.of(fit(match(matcher)))
+    return Compensation(gains, matcher_of(gains.normalize_photos(small, response)), _decision(gains, parts, stated))
+
+
+def _may_drift(views: Sequence[View], shared: SharedPoints, response: Response) -> bool:
+    """Return whether photos with stated times may drift, by a rough fit to few points."""
+    rough = rough_gains(views, shared.points, shared.visible, response)
+    if _exceeds_stated(rough, views):
+        return True
+    remaining = remaining_vignetting(views, shared.points, shared.visible, response, rough)
+    return rough.corner_loss >= MIN_CORNER_LOSS and remaining < 1
+
+
+def _explanatory_parts(
+    gains: ExposureCompensation, views: Sequence[View], shared: SharedPoints, response: Response, stated: bool
+) -> Parts:
+    """Return the parts of gains that explain how photos differ at shared points."""
+    before = shared.disagreement(views, response, None)
+    after = shared.disagreement(views, response, gains.parts(vignetting=False))
+    explains = before >= MIN_DISAGREEMENT and after <= MAX_REMAINING * before
+    exposure = white_balance = not stated and gains.stops >= MIN_STOPS and explains
+    if not exposure and (gains.white_balance >= MIN_WHITE_BALANCE or (stated and _exceeds_stated(gains, views))):
+        drift, colors = _cross_validate(views, shared, response)
+        exposure = stated and gains.unexplained_stops(views) >= MIN_UNEXPLAINED_STOPS and drift <= MAX_REMAINING_CROSS
+        white_balance = (exposure or gains.white_balance >= MIN_WHITE_BALANCE) and colors <= MAX_REMAINING_WHITE_BALANCE
+    vignetting = gains.corner_loss >= MIN_CORNER_LOSS
+    if vignetting:
+        remaining = remaining_vignetting(views, shared.points, shared.visible, response, gains)
+        vignetting = remaining <= MAX_REMAINING_VIGNETTING
+    return Parts(exposure, white_balance, vignetting)
+
+
+def _exceeds_stated(gains: ExposureCompensation, views: Sequence[View]) -> bool:
+    """Return whether gains, beyond what stated times and positions explain, are large enough to be considered."""
+    return gains.unexplained_stops(views) >= MIN_UNEXPLAINED_STOPS or gains.white_balance >= MIN_WHITE_BALANCE
+
+
+def _cross_validate(views: Sequence[View], shared: SharedPoints, response: Response) -> tuple[float, float]:
+    """Return the fractions of the disagreement at half of the points that gains of the other half leave.
+
+    Returns:
+        For exposure, relative to gains that follow stated times and positions; and for white balance, by colors.
+    """
+    halves, remaining = (slice(0, None, 2), slice(1, None, 2)), []
+    for fitted, evaluated in (halves, halves[::-1]):
+        part, rest = shared.subset(fitted), shared.subset(evaluated)
+        drift = fit_gains(views, (), part.points, part.visible[: len(views)], response).parts(vignetting=False)
+        exposure = (
+            rest.disagreement(views, response, drift),
+            rest.disagreement(views, response, drift.explained_part(views)),
+        )
+        colors = (
+            rest.disagreement(views, response, drift.parts(exposure=False), colors=True),
+            rest.disagreement(views, response, None, colors=True),
+        )
+        remaining.append([after / before if before else 1.0 for after, before in (exposure, colors)])
+    drift, colors = np.mean(remaining, 0)
+    return float(drift), float(colors)
+
+
+def _decision(gains: ExposureCompensation, parts: Parts, stated: bool) -> Decision:
+    """Return the line of the plan for gains that are corrected."""
+    figures = []
+    if parts.exposure:
+        figures.append(f"{gains.stops:.2f} stops between photos")
+    if parts.white_balance and gains.white_balance >= MIN_WHITE_BALANCE:
+        figures.append(f"{gains.white_balance:.2f} stops of white balance between photos")
+    if parts.vignetting:
+        figures.append(f"{gains.corner_loss:.0%} towards the corners")
+    over = ", over the times they state" if parts.exposure else ", exposures stay as stated"
+    choice = f"taken out of the photos{over if stated else ''}"
+    return Decision("photo-gains", {}, choice, f"matched points differ by {', '.join(figures)}", told=True)
