@@ -1,7 +1,5 @@
 """Encoded pictures: PNG with 8 or 16 bits and JPEG, with EXIF exposure times. Reading is in scene/images.py."""
 
-import struct
-import zlib
 from datetime import datetime
 from fractions import Fraction
 from pathlib import Path
@@ -12,6 +10,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from ..files import atomic_path
+from ..scene.png16 import png16
 
 _EXIF_IFD, _EXPOSURE_TIME, _EXPOSURE_BIAS, _SOFTWARE, _DATE = 0x8769, 0x829A, 0x9204, 0x0131, 0x9003
 EXIF_TIME = "%Y:%m:%d %H:%M:%S"
@@ -58,7 +57,7 @@ def write_picture(path: Path | str, codes: np.ndarray, *, exif: Image.Exif | Non
     options: dict[str, Any] = {"quality": 98, "subsampling": 0} if jpeg else {}
     with atomic_path(path) as temporary:
         if codes.dtype == np.uint16:
-            temporary.write_bytes(_png16(codes, exif))
+            temporary.write_bytes(png16(codes, None if exif is None else exif.tobytes().removeprefix(b"Exif\0\0")))
         else:
             Image.fromarray(codes).save(temporary, exif=exif or Image.Exif(), **options)
 
@@ -66,17 +65,3 @@ def write_picture(path: Path | str, codes: np.ndarray, *, exif: Image.Exif | Non
 def as_array(value) -> np.ndarray:
     """Return a torch tensor on any device, or an array, as an array."""
     return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
-
-
-def _png16(codes: np.ndarray, exif: Image.Exif | None) -> bytes:
-    """Return a 16-bit color PNG, which Pillow cannot write (PNG specification, 3rd edition: 5, 9 and 11.3.3)."""
-    height, width = codes.shape[:2]
-    rows = codes.astype(">u2").reshape(height, -1).view(np.uint8)
-    # Each row's filter, 2, is "Up": each byte less the one above it.
-    filtered = np.insert(np.diff(rows, axis=0, prepend=np.uint8(0)), 0, 2, axis=1)
-    header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
-    exif_data = {} if exif is None else {b"eXIf": exif.tobytes().removeprefix(b"Exif\0\0")}
-    written = b"\x89PNG\r\n\x1a\n"
-    for kind, data in {b"IHDR": header, **exif_data, b"IDAT": zlib.compress(filtered.tobytes()), b"IEND": b""}.items():
-        written += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-    return written

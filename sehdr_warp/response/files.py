@@ -65,9 +65,12 @@ def colour_response(encoding: str) -> Response:
         hint = f"did you mean {known[near]}?" if near else "colour.CCTF_ENCODINGS lists them"
         raise SehdrError(f"response 'colour:{encoding:.60}': colour-science has no such encoding; {hint}")
 
+    # Of HLG and PQ colour-science knows a camera's encoding of scene light and a display's of its own: the camera's.
+    encoding_of = colour.OETFS.get(name, colour.CCTF_ENCODINGS[name])
+
     def encode(exposure):
         with np.errstate(all="ignore"), suppress_warnings(colour_warnings=True):
-            return np.asarray(colour.CCTF_ENCODINGS[name](np.asarray(exposure, np.float64)), np.float64)
+            return np.asarray(encoding_of(np.asarray(exposure, np.float64)), np.float64)
 
     # White: between the first of these stops at which the encoding reaches 1, and the one before.
     bright = np.exp2(np.linspace(-10, 20, 30 * 32 + 1))

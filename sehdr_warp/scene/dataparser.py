@@ -91,6 +91,8 @@ class DataparserOutputs:
         name: what the user asked for.
         folder: where the set lies.
         times_known: False if no file states exposure times.
+        stated_response: name of the response that the files state (a video's log curve); None if they do not.
+        color_matrix: [3, 3] from the colors of the photos' light to linear Rec.709; None if they are Rec.709.
         kind: of the photos: encoded, linear, gain-map, raw or float; see linear_photos.py.
     """
 
@@ -104,6 +106,8 @@ class DataparserOutputs:
     folder: Path = Path()
     times_known: bool = True
     kind: str = "encoded"
+    stated_response: str | None = None
+    color_matrix: np.ndarray | None = None
 
     @property
     def training(self) -> tuple[ImageRecord, ...]:

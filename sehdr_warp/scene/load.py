@@ -31,6 +31,8 @@ from .read_folders import (
 )
 from .read_transforms import read_hdr_nerf, read_transforms
 from .types import Scene
+from .video import is_video
+from .video_frames import read_video
 
 if TYPE_CHECKING:
     from ..response import Response
@@ -58,7 +60,8 @@ def load_scene(
 
     Args:
         path: a folder (COLMAP, transforms.json, HDR-NeRF synthetic or real, HDR-GS, LLFF, or bare photos), "embedded"
-            for the room that comes with the package, or "embedded:NAME" for another of embedded_scenes().
+            for the room that comes with the package, or "embedded:NAME" for another of embedded_scenes(); or a video
+            file, of whose frames the sharpest are taken.
         response: the camera's: a name, a file or an object; "auto" chooses it from the training photos' codes;
             "learned" stands for sRGB here. "linear" is of photos whose 16-bit codes are proportional to light. The
             light of RAW files, OpenEXR and Radiance pictures is known: they take none.
@@ -88,6 +91,8 @@ def load_scene(
         raise InputError(path, f"longest side of {max_size} pixels asked for", "give at least 1 pixel")
     dataset = parse_dataset(path, exposure_index=exposure_index, holdout=holdout, cache=cache)
     chosen_by = None
+    if dataset.stated_response is not None and str(response) == "auto":
+        response = dataset.stated_response
     if dataset.kind == "encoded" and str(response) == "linear":
         dataset = as_linear(dataset)
         response = "auto" if dataset.kind == "linear" else response
@@ -104,7 +109,8 @@ def load_scene(
         response, chosen_by = choose_response(dataset, method, candidates), (method, tuple(map(str, candidates)))
     elif isinstance(response, str | Path):
         response = response_by_name("srgb" if response == "learned" else response)
-    return replace(preprocess(dataset, response, max_size, photos), chosen_by=chosen_by)
+    scene = preprocess(dataset, response, max_size, photos)
+    return replace(scene, chosen_by=chosen_by, color_matrix=dataset.color_matrix)
 
 
 def parse_dataset(
@@ -115,7 +121,9 @@ def parse_dataset(
     if holdout is not None and holdout < 0:
         raise InputError(path, f"every {holdout}th view asked for as test view", "give 0 (none) or more")
     folder = _folder(path)
-    dataset = _read(folder, cache)
+    dataset = read_video(folder, cache) if is_video(folder) else _read(folder, cache)
+    name = str(path) if is_embedded(path) else folder.resolve().name
+    folder = folder if folder.is_dir() else dataset.folder
     if not dataset.records:
         raise InputError(folder, "has no views", "check the data folder")
     records, masks = assign_masks(dataset.records, folder)
@@ -137,7 +145,6 @@ def parse_dataset(
         if not record.derived:
             fitted_lens(record)
     notes = (*dataset.notes, *masks, *notes, *more, *split)
-    name = str(path) if is_embedded(path) else folder.resolve().name
     told = {"notes": notes, "name": name, "folder": folder, "times_known": times_known, "kind": kind}
     return replace(dataset, records=tuple(records), **told)
 
@@ -215,6 +222,8 @@ def _folder(path: Path | str) -> Path:
     if is_embedded(path):
         return embedded_folder(str(path))
     folder = Path(path)
+    if is_video(folder):
+        return folder
     try:
         empty = not any(folder.iterdir())
     except FileNotFoundError:

@@ -90,7 +90,7 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Reco
     Raises:
         InputError: if fewer than two photos can be placed.
     """
-    key = _key("photos", MAX_SIDE, _SEED, [(photo.name, _digest(photo)) for photo in photos])
+    key = _key("photos", MAX_SIDE, _SEED, [(photo.name, file_digest(photo)) for photo in photos])
 
     def solve(work: Path, result: Path) -> None:
         sizes, small = _write_photos(photos, work / "images")
@@ -157,7 +157,8 @@ def _cached(cache: Path | str | None, name: str, solve: Callable[[Path, Path], N
         yield place
 
 
-def _digest(path: Path) -> str:
+def file_digest(path: Path) -> str:
+    """Return a hash of a file's content, or raise InputError if it cannot be read."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "blake2b").hexdigest()[:32]

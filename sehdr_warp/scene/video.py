@@ -1,0 +1,304 @@
+"""Video as photos: a clip's color as its stream states it, and frames of it as upright RGB codes.
+
+PyAV (FFmpeg) decodes. Luma and chroma are converted here, with the stream's matrix and range and all of its bits. A
+stream that states HLG, PQ or a camera's log curve has a known response. One that states an SDR curve was developed by
+the camera, and its response is found as for photos.
+"""
+
+import logging
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError, SehdrError
+from .images import check_size
+
+_log = logging.getLogger("sehdr_warp.scene")
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".mxf")
+_REMEDY = "copy the clip again, or convert it with FFmpeg"
+# Codes of ITU-T H.273: transfer characteristics, color primaries and matrix coefficients.
+_HLG, _PQ, _LOG100, _LOG316 = 18, 16, 9, 10
+_UNSPECIFIED = 2
+_STATED_CURVES = {_HLG: "colour:ITU-R BT.2100 HLG", _PQ: "colour:ST 2084"}
+_CURVE_NAMES = {
+    1: "Rec.709",
+    4: "gamma 2.2",
+    6: "Rec.601",
+    8: "linear",
+    13: "sRGB",
+    14: "Rec.2020",
+    15: "Rec.2020",
+    16: "PQ",
+    18: "HLG",
+}
+_PRIMARIES = {5: "ITU-R BT.470 - 625", 6: "SMPTE C", 9: "ITU-R BT.2020", 11: "DCI-P3", 12: "Display P3"}
+_LUMA = {
+    1: (0.2126, 0.0722),
+    4: (0.30, 0.11),
+    5: (0.299, 0.114),
+    6: (0.299, 0.114),
+    7: (0.212, 0.087),
+    9: (0.2627, 0.0593),
+    10: (0.2627, 0.0593),
+}
+_RGB_MATRIX = 0
+_FULL_RANGE = 2
+# What makers call their log curves in a clip's metadata: colour-science's curve, and the primaries that belong to it.
+_LOGS = {
+    "applelog": ("Apple Log Profile", "ITU-R BT.2020"),
+    "slog3": ("S-Log3", "S-Gamut3.Cine"),
+    "slog2": ("S-Log2", "S-Gamut"),
+    "vlog": ("V-Log", "V-Gamut"),
+    "canonlog3": ("Canon Log 3", "Cinema Gamut"),
+    "canonlog2": ("Canon Log 2", "Cinema Gamut"),
+    "clog3": ("Canon Log 3", "Cinema Gamut"),
+    "clog2": ("Canon Log 2", "Cinema Gamut"),
+    "dlog": ("D-Log", "DJI D-Gamut"),
+    "nlog": ("N-Log", "N-Gamut"),
+    "flog2": ("F-Log2", "F-Gamut"),
+    "flog": ("F-Log", "F-Gamut"),
+    "llog": ("L-Log", "ITU-R BT.2020"),
+    "logc4": ("ARRI LogC4", "ARRI Wide Gamut 4"),
+    "logc3": ("ARRI LogC3", "ARRI Wide Gamut 3"),
+    "log3g10": ("Log3G10", "REDWideGamutRGB"),
+}
+
+
+@dataclass(frozen=True)
+class VideoColor:
+    """What a clip states of its colors.
+
+    Attributes:
+        curve: of its codes, in words.
+        response: name of the response that the curve stands for; None for a camera's own development (SDR).
+        primaries: name of the primaries in colour-science; None for Rec.709.
+        matrix: (kr, kb) of the luma that the codes were made with; None for stored RGB.
+        full_range: whether codes use the whole range.
+        bits: of a sample.
+    """
+
+    curve: str
+    response: str | None
+    primaries: str | None
+    matrix: tuple[float, float] | None
+    full_range: bool
+    bits: int
+
+    def to_rec709(self) -> np.ndarray | None:
+        """Return [3, 3] from the clip's linear colors to linear Rec.709, or None if they are Rec.709."""
+        if self.primaries is None:
+            return None
+        import colour
+
+        spaces = colour.RGB_COLOURSPACES
+        matrix = colour.matrix_RGB_to_RGB(spaces[self.primaries], spaces["ITU-R BT.709"])
+        return np.asarray(matrix, np.float64)
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A video file that was opened once.
+
+    Attributes:
+        path: the file.
+        size: (width, height) of a frame, upright.
+        seconds: its length as the file states it; 0 if it does not.
+        color: what the stream states.
+        spherical: whether the file says that frames are equirectangular.
+    """
+
+    path: Path
+    size: tuple[int, int]
+    seconds: float
+    color: VideoColor
+    spherical: bool = False
+
+
+def is_video(path: Path) -> bool:
+    """Return whether a path names a video file."""
+    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+
+
+def open_clip(path: Path) -> Clip:
+    """Return what a video file states.
+
+    Raises:
+        InputError: if it cannot be read, has no picture, or its frames are too large.
+        SehdrError: if PyAV is not installed.
+    """
+    with _container(path) as container:
+        stream = _stream(container, path)
+        try:
+            frame = next(iter(container.decode(stream)))
+        except StopIteration:
+            raise InputError(path, "has no frames", _REMEDY) from None
+        width, height = frame.width, frame.height
+        check_size(path, width, height)
+        size = (height, width) if _rotation(frame) % 180 else (width, height)
+        seconds = float(container.duration or 0) / 1e6
+        kinds = {str(getattr(data.type, "name", data.type)).upper() for data in frame.side_data}
+        spherical = "SPHERICAL" in kinds or size[0] == 2 * size[1]
+        return Clip(path, size, seconds, _color(container, stream, frame), spherical)
+
+
+def decode(clip: Clip, counts: Any = None) -> Iterator[tuple[int, Any]]:
+    """Yield the frames of a clip with their numbers, from the first.
+
+    A clip that ends early, or is damaged in the middle, yields what can be decoded, and a line says so.
+
+    Args:
+        clip: the clip.
+        counts: container of frame numbers; others are decoded, but not yielded. None yields all.
+    """
+    import av
+
+    number = -1
+    with _container(clip.path) as container:
+        stream = _stream(container, clip.path)
+        packets = container.demux(stream)
+        while True:
+            try:
+                packet = next(packets)
+                frames = packet.decode()
+            except StopIteration:
+                return
+            except (av.error.EOFError, av.error.InvalidDataError) as error:
+                if isinstance(error, EOFError) or number < 0:
+                    return
+                _log.warning("%s: is damaged or ends early behind frame %d", clip.path, number + 1)
+                return
+            for frame in frames:
+                number += 1
+                if counts is None or number in counts:
+                    yield number, frame
+
+
+def grey(frame: Any, width: int) -> np.ndarray:
+    """Return [h, w] float32 codes in [0, 1] of a frame's luma, as stored, at most `width` pixels wide."""
+    width = min(width, frame.width)
+    height = max(2, round(width * frame.height / frame.width))
+    small = frame.reformat(width=width, height=height, format="gray")
+    return small.to_ndarray().astype(np.float32) / np.float32(255)
+
+
+def codes(frame: Any, color: VideoColor) -> np.ndarray:
+    """Return [H, W, 3] codes of a frame, upright: uint8 for 8 bits, else uint16."""
+    from av.video.reformatter import ColorRange, Interpolation
+
+    planar = "rgb48le" if color.matrix is None else "yuv444p16le"
+    same = ColorRange.JPEG if color.full_range else ColorRange.MPEG
+    stored = frame.reformat(
+        format=planar, src_color_range=same, dst_color_range=same, interpolation=Interpolation.BICUBIC
+    ).to_ndarray()
+    values = stored.astype(np.float32)
+    top = float((2**color.bits - 1) << (16 - color.bits))  # The largest code, as it stands in 16 bits
+    if color.matrix is None:
+        rgb = values / np.float32(values.max(initial=0) if color.bits == 16 else 65535)
+    else:
+        kr, kb = color.matrix
+        unit = 256.0
+        low, luma, chroma = (0.0, top, top) if color.full_range else (16 * unit, 219 * unit, 224 * unit)
+        y, u, v = (values[..., 0] - low) / luma, (values[..., 1] - 32768) / chroma, (values[..., 2] - 32768) / chroma
+        red, blue = y + 2 * (1 - kr) * v, y + 2 * (1 - kb) * u
+        rgb = np.stack([red, (y - kr * red - kb * blue) / (1 - kr - kb), blue], axis=2)
+    levels, kind = (255, np.uint8) if color.bits == 8 else (65535, np.uint16)
+    upright = np.rot90(rgb, _rotation(frame) // 90)
+    return np.ascontiguousarray(np.rint(np.clip(upright, 0, 1) * levels).astype(kind))
+
+
+def _rotation(frame: Any) -> int:
+    """Return degrees that a frame is to be turned counterclockwise to be upright."""
+    return round(getattr(frame, "rotation", 0) or 0) % 360
+
+
+def _container(path: Path) -> Any:
+    """Return PyAV's open container. Raises InputError for a file that is none, SehdrError without PyAV."""
+    try:
+        import av
+    except ImportError:
+        raise SehdrError(f"{path}: video needs PyAV; run `pip install sehdr-warp[film]`") from None
+    try:
+        container = av.open(str(path))
+        for stream in container.streams.video:
+            stream.thread_type = "AUTO"
+        return container
+    except (OSError, av.error.FFmpegError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(path, f"cannot be read as video ({reason:.80})", _REMEDY) from None
+
+
+def _stream(container: Any, path: Path) -> Any:
+    if not container.streams.video:
+        raise InputError(path, "has no picture", "give a clip with video")
+    return container.streams.best("video") or container.streams.video[0]
+
+
+def _color(container: Any, stream: Any, frame: Any) -> VideoColor:
+    """Return the colors that stream, frame and metadata state."""
+    context = stream.codec_context
+    transfer, primaries, matrix = (
+        int(getattr(context, name, _UNSPECIFIED) or _UNSPECIFIED)
+        for name in ("color_trc", "color_primaries", "colorspace")
+    )
+    bits = max((component.bits for component in frame.format.components), default=8)
+    bits = min(max(bits, 8), 16)
+    full = int(context.color_range or 0) == _FULL_RANGE or frame.format.name.startswith("yuvj")
+    luma = None if frame.format.is_rgb else _LUMA.get(matrix, _LUMA[1 if frame.height > 576 else 5])
+    texts = [*container.metadata.items(), *stream.metadata.items()]
+    stated = VideoColor("", None, _PRIMARIES.get(primaries), luma, full, bits)
+    if log := _log_curve(texts, transfer, primaries, bits):
+        return replace(stated, curve=log[0], response=f"colour:{log[0]}", primaries=log[1])
+    if transfer in _STATED_CURVES:
+        # Where a clip states HLG or PQ alone, its primaries are those of BT.2100.
+        known = stated.primaries or (None if primaries == 1 else "ITU-R BT.2020")
+        return replace(stated, curve=_CURVE_NAMES[transfer], response=_STATED_CURVES[transfer], primaries=known)
+    if transfer == 8:
+        return replace(stated, curve="linear", response="linear")
+    return replace(stated, curve=_CURVE_NAMES.get(transfer, "no stated curve"))
+
+
+def _log_curve(texts: list[tuple[str, str]], transfer: int, primaries: int, bits: int) -> tuple[str, str] | None:
+    """Return colour-science's names of a log curve and its primaries if a clip states them."""
+    for _, text in texts:
+        plain = "".join(letter for letter in text.lower() if letter.isalnum())
+        for name, found in _LOGS.items():
+            if plain == name or plain.endswith(name) or f"gamma{name}" in plain:
+                return found
+    makers = {text.lower() for key, text in texts if key.lower().endswith("make")}
+    # iPhones leave the transfer function of Apple Log open, and state BT.2020 with 10 bits.
+    if transfer == _UNSPECIFIED and primaries == 9 and bits >= 10 and "apple" in makers:
+        return _LOGS["applelog"]
+    return None
+
+
+def sharpness(picture: np.ndarray) -> float:
+    """Return the mean size of the Laplacian of a grey picture [h, w], relative to its brightness."""
+    inner = picture[1:-1, 1:-1]
+    around = picture[:-2, 1:-1] + picture[2:, 1:-1] + picture[1:-1, :-2] + picture[1:-1, 2:]
+    return float(np.abs(around - 4 * inner).mean() / (inner.mean() + 1e-3))
+
+
+def shift(first: np.ndarray, second: np.ndarray, block: int = 64) -> float:
+    """Return how far two grey pictures [h, w] are moved, in parts of the width: the median over blocks.
+
+    Phase correlation (Kuglin and Hines 1975). 0 if blocks agree on no movement.
+    """
+    height, width = first.shape
+    side = min(block, height, width)
+    window = np.outer(np.hanning(side), np.hanning(side))
+    lengths = []
+    for top in np.linspace(0, height - side, max(1, round(height / side))).astype(int):
+        for left in np.linspace(0, width - side, max(1, round(width / side))).astype(int):
+            parts = [image[top : top + side, left : left + side] for image in (first, second)]
+            spectra = [np.fft.rfft2((part - part.mean()) * window) for part in parts]
+            cross = spectra[0] * spectra[1].conj()
+            peak = np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-9), s=(side, side))
+            place = np.array(np.unravel_index(int(peak.argmax()), peak.shape))
+            place = np.where(place > side // 2, place - side, place)
+            lengths.append(math.hypot(*place))
+    return float(np.median(lengths)) / width

@@ -1,0 +1,164 @@
+"""Frames of a clip to train on: of equal camera movement the sharpest each, kept in the cache as PNG files."""
+
+import json
+import logging
+import os
+import shutil
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from ..caches import usable, user_cache
+from ..errors import InputError, SehdrError
+from ..files import atomic_folder
+from ..own_files import is_sealed
+from .dataparser import DataparserOutputs
+from .names import list_images
+from .png16 import png16
+from .read_folders import read_photos
+from .sfm import file_digest
+from .video import Clip, codes, decode, grey, open_clip, sharpness, shift
+
+_log = logging.getLogger("sehdr_warp.scene")
+
+_VERSION = 1
+_STEP = 0.08
+"""Movement between two frames in parts of the width: neighbors overlap by more than nine tenths."""
+_FEWEST, _MOST = 24, 240  # Frames of a clip
+_LEAST_MOVEMENT = 0.05  # In parts of the width, of a whole clip: less shows no depth
+_MOST_LOOKED_AT = 3000
+_SHARPNESS_WIDTH, _MOVEMENT_WIDTH = 640, 192
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """Which frames of a clip are used.
+
+    Attributes:
+        numbers: of the chosen frames, in order.
+        total: frames that were decoded.
+        movement: of the whole clip, in widths of the picture.
+    """
+
+    numbers: tuple[int, ...]
+    total: int
+    movement: float
+
+
+def choose_frames(clip: Clip) -> FrameChoice:
+    """Return the sharpest frame of each interval of equal movement.
+
+    Raises:
+        InputError: if the clip has fewer than three frames, or its camera does not move.
+    """
+    stride = max(1, round(clip.seconds * 30 / _MOST_LOOKED_AT))
+    numbers, sharp, moved = [], [], [0.0]
+    last: np.ndarray | None = None
+    total = 0
+    for number, frame in decode(clip):
+        total = number + 1
+        if number % stride:
+            continue
+        if number % (100 * stride) == 0:
+            _log.info("looking at frame %d", number + 1)
+        small = grey(frame, _SHARPNESS_WIDTH)
+        tiny = grey(frame, _MOVEMENT_WIDTH)
+        if last is not None:
+            moved.append(moved[-1] + shift(last, tiny))
+        numbers.append(number)
+        sharp.append(sharpness(small))
+        last = tiny
+    if len(numbers) < 3:
+        raise InputError(clip.path, f"holds {total} frames that can be decoded", "give a longer clip")
+    movement = moved[-1]
+    if movement < _LEAST_MOVEMENT:
+        problem = f"its camera hardly moves ({100 * movement:.1f} % of the picture's width): that shows no depth"
+        raise InputError(clip.path, problem, "walk with the camera while you film")
+    count = int(np.clip(round(movement / _STEP), min(_FEWEST, len(numbers)), min(_MOST, len(numbers))))
+    # By movement; frames of a camera that rests share an interval.
+    intervals = np.minimum(np.array(moved) / movement * count, count - 1e-6).astype(int)
+    best = {int(i): max(np.flatnonzero(intervals == i), key=lambda k: sharp[k]) for i in np.unique(intervals)}
+    return FrameChoice(tuple(numbers[k] for k in sorted(best.values())), total, movement)
+
+
+def frames_folder(clip: Clip, cache: Path | str | None = None) -> Path:
+    """Return a folder of the chosen frames, made once for a clip's content.
+
+    Args:
+        clip: the clip.
+        cache: where it lies; None is the user's cache ($SEHDR_CACHE), or a temporary folder that lasts as long as the
+            process if that cannot be written.
+    """
+    named = f"video-{file_digest(clip.path)[:16]}-{_VERSION}"
+    stated = cache or os.environ.get("SEHDR_CACHE")
+    folder = user_cache("sehdr-warp") if stated is None else Path(stated)
+    if folder is None or not usable(folder):
+        if cache is not None:
+            raise InputError(folder, "the frames cannot be kept there", "name a folder that can be written")
+        folder = _temporary()
+    place = folder / named
+    if place.is_dir() and is_sealed(place):
+        _log.info("using the cached frames %s", place)
+        return place
+    if place.is_dir():
+        _log.warning("%s is damaged and is made again", place)
+        shutil.rmtree(place, ignore_errors=True)
+    choice = choose_frames(clip)
+    try:
+        with atomic_folder(place) as result:
+            _write_frames(clip, choice, result)
+    except SehdrError:
+        if not (place.is_dir() and is_sealed(place)):  # Else another process was first; its frames are as good.
+            raise
+    return place
+
+
+_temporaries: list[tempfile.TemporaryDirectory] = []
+
+
+def _temporary() -> Path:
+    """Return a folder that goes with the process."""
+    if not _temporaries:
+        _temporaries.append(tempfile.TemporaryDirectory(prefix="sehdr-video-"))
+    return Path(_temporaries[0].name)
+
+
+def _write_frames(clip: Clip, choice: FrameChoice, folder: Path) -> None:
+    wanted = frozenset(choice.numbers)
+    for done, (number, frame) in enumerate(decode(clip, wanted)):
+        if done % 10 == 0:
+            _log.info("keeping frames %d to %d of %d", done + 1, min(done + 10, len(wanted)), len(wanted))
+        pixels, file = codes(frame, clip.color), folder / f"frame_{number:06d}.png"
+        if pixels.dtype == np.uint8:
+            Image.fromarray(pixels).save(file, compress_level=1)
+        else:
+            file.write_bytes(png16(pixels, level=1))
+    facts = {"total": choice.total, "movement": choice.movement}
+    (folder / "frames.json").write_text(json.dumps(facts))
+
+
+def read_video(path: Path, cache: Path | str | None = None) -> DataparserOutputs:
+    """Parse a clip: a record for each chosen frame that structure from motion places.
+
+    Raises:
+        InputError: if the clip cannot be read, its camera does not move, or its frames cannot be placed.
+    """
+    clip = open_clip(path)
+    folder = frames_folder(clip, cache)
+    facts = json.loads((folder / "frames.json").read_text())
+    dataset = read_photos(folder, cache)
+    kept = len(list_images(folder, (".png",)))
+    color = clip.color
+    known = f"its response is {color.response}" if color.response else "its response is chosen as for photos"
+    note = f"video: the sharpest {kept} of {facts['total']} frames are used; its curve is {color.curve}: {known}"
+    return replace(
+        dataset,
+        format="video",
+        notes=(note, *dataset.notes),
+        folder=folder,
+        stated_response=color.response,
+        color_matrix=color.to_rec709(),
+    )

@@ -1,0 +1,133 @@
+"""Clips that the test encodes: what their streams state, and which of their frames are used."""
+
+import logging
+
+import numpy as np
+import pytest
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.response import response_by_name
+from sehdr_warp.scene.images import read_ldr
+from sehdr_warp.scene.names import list_images
+from sehdr_warp.scene.video import codes, decode, open_clip
+from sehdr_warp.scene.video_frames import choose_frames, frames_folder
+
+from .clips import pan, write_clip
+
+pytest.importorskip("av")
+
+
+def still(value=None, height=48, width=64):
+    """One frame: a ramp of grey beside patches of color, or one value."""
+    frame = np.repeat(np.linspace(0.02, 0.98, width)[None, :, None], height, 0).repeat(3, 2)
+    frame[height // 2 :, :16], frame[height // 2 :, 16:32] = (0.7, 0.2, 0.1), (0.1, 0.3, 0.8)
+    return [frame if value is None else np.full((height, width, 3), value)] * 3
+
+
+@pytest.mark.parametrize("tags, metadata, curve, response", [
+    ((18, 9, 9), {}, "HLG", "colour:ITU-R BT.2100 HLG"),
+    ((16, 9, 9), {}, "PQ", "colour:ST 2084"),
+    ((2, 9, 9), {"com.apple.quicktime.make": "Apple"}, "Apple Log Profile", "colour:Apple Log Profile"),
+    ((2, 9, 9), {"comment": "Apple Log"}, "Apple Log Profile", "colour:Apple Log Profile"),
+    ((1, 1, 1), {"comment": "S-Log3"}, "S-Log3", "colour:S-Log3"),
+    ((1, 1, 1), {}, "Rec.709", None),
+])  # fmt: skip
+@pytest.mark.parametrize("full", [False, True])
+def test_ten_bits_and_the_curve_that_a_stream_states(tmp_path, tags, metadata, curve, response, full):
+    file, frames = tmp_path / "a.mov", still()
+    write_clip(file, frames, tags=tags, metadata=metadata, full=full)
+    clip = open_clip(file)
+    assert (clip.color.curve, clip.color.response, clip.color.bits) == (curve, response, 10)
+    found = codes(next(decode(clip))[1], clip.color) / 65535
+    inside = np.s_[4:20, 4:-4], np.s_[28:44, 4:12], np.s_[28:44, 20:28]
+    for part in inside:
+        assert np.abs(found[part] - frames[0][part]).max() < 0.01
+        assert np.abs(found[part] - frames[0][part]).mean() < 1.5 / 1023
+    if response is not None:
+        light = response_by_name(response).decode(frames[0][10, 4:-4])
+        np.testing.assert_allclose(response_by_name(response).decode(found[10, 4:-4]), light, rtol=0.08, atol=2e-3)
+
+
+def test_primaries_lead_to_rec709(tmp_path):
+    write_clip(tmp_path / "a.mov", still(), tags=(18, 9, 9))
+    matrix = open_clip(tmp_path / "a.mov").color.to_rec709()
+    np.testing.assert_allclose(matrix.sum(1), 1, atol=1e-3)
+    np.testing.assert_allclose(matrix[0], [1.6605, -0.5876, -0.0728], atol=2e-3)
+    write_clip(tmp_path / "b.mov", still(), tags=(1, 1, 1))
+    assert open_clip(tmp_path / "b.mov").color.to_rec709() is None
+
+
+def test_eight_bits_stay_eight(tmp_path):
+    write_clip(tmp_path / "a.mp4", still(), pixels="yuv444p", codec="libx264")
+    clip = open_clip(tmp_path / "a.mp4")
+    found = codes(next(decode(clip))[1], clip.color)
+    assert found.dtype == np.uint8
+    assert np.abs(found[10, 4:-4] / 255 - still()[0][10, 4:-4]).max() < 0.015
+
+
+def test_frames_are_upright(tmp_path):
+    write_clip(tmp_path / "a.mp4", still(), rotation=90)
+    clip = open_clip(tmp_path / "a.mp4")
+    found = codes(next(decode(clip))[1], clip.color)
+    assert clip.size == (48, 64) and found.shape == (64, 48, 3)
+    expected = np.rot90(still()[0], 1)
+    assert np.abs(found / 65535 - expected).mean() < 0.01
+
+
+def test_the_sharpest_frame_of_each_interval_of_movement(tmp_path):
+    blur = {i for i in range(60) if i % 3}
+    write_clip(tmp_path / "a.mp4", pan(60, blur=blur), codec="libx264", pixels="yuv420p")
+    choice = choose_frames(open_clip(tmp_path / "a.mp4"))
+    # 59 steps of 4 of 128 pixels are 1.84 widths.
+    assert choice.total == 60 and choice.movement == pytest.approx(59 * 4 / 128, rel=0.05)
+    assert 20 <= len(choice.numbers) <= 24
+    assert np.mean([number % 3 == 0 for number in choice.numbers]) > 0.8
+
+
+def test_a_resting_camera_gives_no_frames(tmp_path):
+    frames = list(pan(30))
+    write_clip(tmp_path / "a.mp4", frames[:15] + [frames[15]] * 60 + frames[15:], codec="libx264", pixels="yuv420p")
+    choice = choose_frames(open_clip(tmp_path / "a.mp4"))
+    assert sum(17 <= number <= 73 for number in choice.numbers) <= 2
+
+
+def test_frames_are_kept_in_the_cache(tmp_path, caplog):
+    write_clip(tmp_path / "a.mp4", pan(30), tags=(18, 9, 9))
+    clip = open_clip(tmp_path / "a.mp4")
+    folder = frames_folder(clip, tmp_path / "cache")
+    files = list_images(folder, (".png",))
+    assert len(files) == 24 and read_ldr(files[0]).pixels.dtype == np.uint16
+    with caplog.at_level(logging.INFO, "sehdr_warp.scene"):
+        assert frames_folder(clip, tmp_path / "cache") == folder
+    assert "using the cached frames" in caplog.text
+    files[0].write_bytes(b"")
+    assert frames_folder(clip, tmp_path / "cache") == folder and files[0].stat().st_size > 0
+
+
+def test_clips_that_cannot_be_used(tmp_path):
+    def refused(match, data=None):
+        if data is not None:
+            (tmp_path / "a.mp4").write_bytes(data)
+        with pytest.raises(InputError, match=match):
+            choose_frames(open_clip(tmp_path / "a.mp4"))
+
+    refused("cannot be read as video", b"\0\0\0\x18ftypisom" + bytes(500))
+    write_clip(tmp_path / "a.mp4", [next(iter(pan(1)))] * 30, codec="libx264", pixels="yuv420p")
+    refused("its camera hardly moves .* that shows no depth; walk with the camera")
+    write_clip(tmp_path / "a.mp4", pan(2), codec="libx264", pixels="yuv420p")
+    refused("holds 2 frames")
+
+
+def test_a_clip_that_ends_early_gives_what_it_has(tmp_path):
+    write_clip(tmp_path / "a.mkv", pan(60), codec="libx264", pixels="yuv420p")
+    data = (tmp_path / "a.mkv").read_bytes()
+    (tmp_path / "b.mkv").write_bytes(data[: len(data) * 6 // 10])
+    choice = choose_frames(open_clip(tmp_path / "b.mkv"))
+    assert 20 < choice.total < 60 and choice.movement < 1.5
+
+
+def test_a_variable_frame_rate(tmp_path):
+    times = np.cumsum(np.random.default_rng(0).integers(1, 9, 40)).tolist()
+    write_clip(tmp_path / "a.mp4", pan(40), times=times, codec="libx264", pixels="yuv420p")
+    choice = choose_frames(open_clip(tmp_path / "a.mp4"))
+    assert choice.total == 40 and choice.movement == pytest.approx(39 * 4 / 128, rel=0.05)
