@@ -177,11 +177,14 @@ def _whole_by_seed(rows: Sequence[Mapping]) -> Iterable[str]:
         yield markdown_table(table, {"method": "", "seed": "d", "gt-max dB": ".2f", "to U": "+.2f"})
 
 
-SHORT = {"method": "", "HDR dB": ".1f", "photos dB": ".1f", "lost": ""}
+SHORT = {"method": "", "HDR dB": ".1f", "photos dB": ".1f", "lost": "", "irradiance off": ".0%"}
 
 
 def in_short(rows: Sequence[Mapping]) -> list[dict]:
-    """A row for each method: means over scenes of one seed at the middle exposure, told the curve."""
+    """Return a row for each method: means over scenes of one seed at the middle exposure, with the curve known.
+
+    "irradiance off" is a median over scenes, because one lost lamp decides the mean; None without figures.
+    """
     middle = [row for row in rows if (row["exposure"], row["seed"]) == (EXPOSURES // 2, rows[0]["seed"])]
     return [
         {
@@ -189,10 +192,17 @@ def in_short(rows: Sequence[Mapping]) -> list[dict]:
             "HDR dB": fmean(row["gt_max"] for row in mine),
             "photos dB": fmean(row["ldr"] for row in mine),
             "lost": f"{sum(row['lights_lost'] for row in mine)} of {sum(row['lights_count'] for row in mine)} lights",
+            "irradiance off": _median_of(mine, "irradiance"),
         }
         for (method, response), mine in groups(middle, "method", "response").items()
         if response in (KNOWN, LEARNED)
     ]
+
+
+def _median_of(rows: Sequence[Mapping], field: str) -> float | None:
+    """Return the median of a field over the rows that have it."""
+    values = [row[field] for row in rows if row.get(field) is not None]
+    return median(values) if values else None
 
 
 def _irradiance_tables(rows: Sequence[Mapping]) -> Iterable[str]:
@@ -219,7 +229,7 @@ def _irradiance_tables(rows: Sequence[Mapping]) -> Iterable[str]:
 
 
 def write_readme(path: Path, result: dict) -> None:
-    """Puts the figures of the page of quality into the table of the README."""
+    """Write the figures of the page of quality into the table of the README."""
     text, table = path.read_text(encoding="utf-8"), readme_table(result["rows"])
     start = text.index(table.partition("\n")[0])
     with atomic_path(path, ours=True) as temporary:
@@ -227,13 +237,15 @@ def write_readme(path: Path, result: dict) -> None:
 
 
 def readme_table(rows: Sequence[Mapping]) -> str:
-    """The rows of in_short() that the README shows."""
+    """Return the rows of in_short() that the README shows, as Markdown."""
     short, lines = {row["method"]: row for row in in_short(rows)}, []
     for method, named in PAGES["quality"]["readme"].items():
         row = short[method]
-        cells = named, f"{row['HDR dB']:.1f} dB", f"{row['photos dB']:.1f} dB", row["lost"].removesuffix(" lights")
+        off = "-" if row["irradiance off"] is None else f"{row['irradiance off']:.0%}"
+        cells = named, f"{row['HDR dB']:.1f} dB", f"{row['photos dB']:.1f} dB", row["lost"].removesuffix(" lights"), off
         lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(["| trained by | HDR | photos | lights lost |", "| --- | -: | -: | -: |", *lines])
+    heading = "| trained by | HDR | photos | lights lost | irradiance off |"
+    return "\n".join([heading, "| --- | -: | -: | -: | -: |", *lines])
 
 
 def _seeds_tables(result: dict) -> Iterable[str]:
