@@ -64,8 +64,7 @@ def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[
     horizontal = np.hypot(offsets @ back, offsets @ right)
     azimuths = np.arctan2(offsets @ right, offsets @ back)
     turn = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    ordered = np.sort(azimuths)
-    if np.diff(ordered, append=ordered[0] + 2 * np.pi).max() < _ROUND_GAP:
+    if _go_round(azimuths):
         azimuth = turn
         ring, height = np.full(count, horizontal.mean()), np.full(count, (offsets @ up).mean())
     else:
@@ -76,7 +75,22 @@ def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[
         distance = _along(azimuths, np.linalg.norm(offsets, axis=1), azimuth)[0]
         ring, height = distance * np.cos(elevation), distance * np.sin(elevation)
     directions = np.cos(azimuth)[:, None] * back + np.sin(azimuth)[:, None] * right
-    return [_moved(middle, _look_at(p, focus, up)) for p in focus + ring[:, None] * directions + height[:, None] * up]
+    return [
+        _moved(middle, look_at_pose(p, focus, up)) for p in focus + ring[:, None] * directions + height[:, None] * up
+    ]
+
+
+def surround(cameras: Sequence[Camera], focus: np.ndarray) -> bool:
+    """Return whether cameras stand all around a point, as seen from above."""
+    up = mean_up(cameras)
+    east = np.linalg.svd(up[None])[2][1]
+    offsets = _positions(cameras) - focus
+    return _go_round(np.arctan2(offsets @ np.cross(up, east), offsets @ east))
+
+
+def _go_round(azimuths: np.ndarray) -> bool:
+    ordered = np.sort(azimuths)
+    return bool(np.diff(ordered, append=ordered[0] + 2 * np.pi).max() < _ROUND_GAP)
 
 
 def _along(azimuths: np.ndarray, values: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, float]:
@@ -167,7 +181,7 @@ def _unit(vector: np.ndarray, *, fallback: np.ndarray) -> np.ndarray:
     return vector / length if length > 1e-6 else fallback / np.linalg.norm(fallback)
 
 
-def _look_at(position: np.ndarray, focus: np.ndarray, up: np.ndarray) -> np.ndarray:
+def look_at_pose(position: np.ndarray, focus: np.ndarray, up: np.ndarray) -> np.ndarray:
     """[4, 4] camera to world, OpenCV axes."""
     forward = _unit(focus - position, fallback=np.array([0.0, 0, 1]))
     right = _unit(np.cross(forward, up), fallback=np.linalg.svd(forward[None])[2][1])

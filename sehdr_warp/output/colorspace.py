@@ -34,7 +34,7 @@ SPACES = (
     ColorSpace("dci-p3", "DCI-P3", None),
 )
 _ALIASES = {
-    "bt709": "rec709", "srgb": "rec709", "bt2020": "rec2020",
+    "bt709": "rec709", "bt2020": "rec2020",
     "ap1": "acescg", "ap0": "aces2065-1", "p3-d65": "display-p3",
 }  # fmt: skip
 
@@ -46,6 +46,8 @@ def color_space(name: str) -> ColorSpace:
         SehdrError: For an unknown name.
     """
     key = name.strip().lower()
+    if key == "srgb":
+        raise SehdrError("color space 'srgb' is an encoding, and files hold linear light; rec709 has its primaries")
     for space in SPACES:
         if space.name == _ALIASES.get(key, key):
             return space

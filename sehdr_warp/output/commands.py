@@ -239,7 +239,7 @@ def run_environment_map(args: EnvironmentMap) -> None:
 
 def run_render(args: Render) -> None:
     """Run `sehdr-warp render`."""
-    from .render_views import PATHS, framed, read_size, render_views, select_cameras
+    from .render_views import PATHS, check_cameras, framed, read_size, render_views, select_cameras
     from .world_transform import world_transform
 
     if args.out is None and args.video is None:
@@ -250,6 +250,7 @@ def run_render(args: Render) -> None:
         raise UsageError(f"{', '.join(flags)}: set for a film; name it with --video")
     if args.out is None and (flags := changed_flags(args.pictures)):
         raise UsageError(f"{', '.join(flags)}: set for pictures, which only --out writes")
+    check_cameras(args.cameras)
     if args.count != Render.count and args.cameras not in PATHS:
         raise UsageError(f"--count {args.count}: set for an orbit or interpolation; name one with --cameras")
     files, ramp, summary = [], _ramp(args.film.ev_ramp), ""
@@ -325,6 +326,12 @@ def run_convert(args: Convert) -> None:
     """Run `sehdr-warp convert`."""
     from ..splats import check_suffix
 
+    if args.out.suffix.lower() == ".html":
+        raise UsageError(f"{args.out}: pages are written by sehdr-warp export {args.source} --out {args.out}")
+    if args.source.is_dir():
+        raise UsageError(
+            f"{args.source}: is a folder; runs are written by sehdr-warp export {args.source} --out {args.out}"
+        )
     check_suffix(args.source)
     _export(args.source, args.out, args.file, args.device, overwrite=args.overwrite)
 

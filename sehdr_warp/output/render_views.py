@@ -23,6 +23,7 @@ from .camera_exchange import camera_path, chan_cameras, nerfstudio_path, usd_cam
 from .camera_paths import evenly, interpolate, orbit
 from .colorspace import from_rec709
 from .exr import Part, rgb_channels, write_multipart_exr
+from .framing import film_camera, frame_subject
 from .images import as_array, quantize, write_picture
 from .light_pictures import exposure_of_white
 from .names import safe_names
@@ -210,6 +211,14 @@ def framed(camera: Camera, width: int, height: int) -> Camera:
     return Camera(width, height, camera.fx * scale, camera.fy * scale, cx, camera.cy * scale, camera.world_to_camera)
 
 
+def check_cameras(cameras: str | Path) -> None:
+    """Raise SehdrError if a choice of cameras is neither a known word nor a file."""
+    words = (*SPLITS, *PATHS)
+    if str(cameras) not in words and not Path(cameras).exists():
+        hint = did_you_mean(str(cameras), words)
+        raise SehdrError(f"cameras {str(cameras)!r} are neither a file nor one of {', '.join(words)}{hint}")
+
+
 def select_cameras(
     run,
     cameras: str | Path,
@@ -231,6 +240,7 @@ def select_cameras(
     Raises:
         SehdrError: If there are none, or `cameras` is neither a known name nor a file.
     """
+    check_cameras(cameras)
     text, known = str(cameras), ", ".join(SPLITS + PATHS)
     if camera is not None and text in SPLITS + PATHS:
         raise SehdrError(f"--camera {camera}: chooses from a file of cameras, and --cameras {text} is none")
@@ -241,12 +251,13 @@ def select_cameras(
             raise SehdrError(f"the run has no {text} views; choose other cameras ({others}, a file)")
     elif text in PATHS:
         photos = [entry.camera for entry in run.cameras if entry.split == "train"]
-        path = (
-            interpolate(photos, count) if text == "interpolate" else orbit(photos, count, _focus_distance(run, photos))
-        )
+        orbiting = text == "orbit"
+        path = orbit(photos, count, _focus_distance(run, photos)) if orbiting else interpolate(photos, count)
+        path = [film_camera(camera, photos) for camera in path]
+        path = frame_subject(run, path, photos) if orbiting else path
         digits = max(3, len(str(count - 1)))
         return [(f"{text}_{index:0{digits}d}", camera) for index, camera in enumerate(path)]
-    elif Path(cameras).exists():
+    else:
         named = _from_file(run, Path(cameras), transform)
         if camera is not None:
             names = [name for name, _ in named]
@@ -257,9 +268,6 @@ def select_cameras(
             ]
             if not named:
                 raise SehdrError(f"{cameras}: has no camera {camera!r}{did_you_mean(camera, names)}")
-    else:
-        hint = did_you_mean(text, SPLITS + PATHS)
-        raise SehdrError(f"cameras {text!r} are neither a file nor one of {known}{hint}")
     return list(zip(safe_names([name for name, _ in named]), [camera for _, camera in named], strict=True))
 
 

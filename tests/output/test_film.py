@@ -1,12 +1,15 @@
 """Films read back by FFmpeg: frames, tags, and the light in their codes."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from sehdr_warp.cli import parse_command
 from sehdr_warp.errors import InputError, SehdrError, UsageError
 from sehdr_warp.output import film
-from sehdr_warp.output.commands import FilmOptions, Render, ViewFileOptions, _ramp, run_render
+from sehdr_warp.output.colorspace import color_space
+from sehdr_warp.output.commands import Convert, FilmOptions, Render, ViewFileOptions, _ramp, run_convert, run_render
 from sehdr_warp.output.film import encode, write_film
 from sehdr_warp.output.light_pictures import display_gain
 
@@ -116,6 +119,19 @@ def test_refusals(tmp_path, monkeypatch):
     monkeypatch.setattr(film, "film_library", missing)
     with pytest.raises(SehdrError, match="pip install"):
         write_film(run, tmp_path / "new.mp4", cameras)
+
+
+def test_words_that_people_type_find_what_they_mean(tmp_path):
+    with pytest.raises(UsageError, match="no command resume: sehdr-warp train --resume --out RUN goes on"):
+        parse_command(["resume", str(tmp_path)])
+    with pytest.raises(SehdrError, match="cameras 'orbt' are neither .*, did you mean orbit"):
+        run_render(Render(run=tmp_path, out=tmp_path / "out", cameras="orbt", count=1))
+    with pytest.raises(UsageError, match="pages are written by sehdr-warp export head.ply --out x.html"):
+        run_convert(Convert(source=Path("head.ply"), out=Path("x.html")))
+    with pytest.raises(UsageError, match="is a folder; runs are written by sehdr-warp export"):
+        run_convert(Convert(source=tmp_path, out=tmp_path / "x.ply"))
+    with pytest.raises(SehdrError, match="'srgb' is an encoding"):
+        color_space("sRGB")
 
 
 def test_old_flags_name_the_new_ones(tmp_path):

@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+
+from sehdr_warp.output.camera_paths import orbit
+from sehdr_warp.output.framing import film_camera, film_size, frame_subject, subject_radius
+from sehdr_warp.runs.run import load_splats
+from sehdr_warp.scene import Camera, look_at
+from sehdr_warp.splats import write_gaussians
+
+from .helpers import AnalyticRun, camera
+from .test_splat_edits import splats
+
+
+def around(count, radius, span=360, fov=30):
+    """Cameras on a circle or an arc about the origin, with -Y up."""
+    focal = 30 / np.tan(np.radians(fov) / 2)
+    angles = np.radians(np.linspace(0, span, count, endpoint=False))
+    places = [(radius * np.cos(angle), -0.3 * radius, radius * np.sin(angle)) for angle in angles]
+    return [Camera(80, 60, focal, focal, 40, 30, look_at(place, up=(0, -1, 0))) for place in places]
+
+
+def ball(tmp_path, extra=()):
+    """A ball of radius 1 about the origin, and a few large Gaussians elsewhere."""
+    points = np.random.default_rng(0).normal(size=(1500, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    means, scales = np.concatenate([points, *([place] for place, _ in extra)]), [0.05] * 1500
+    gaussians = splats(means, [0.95] * len(means))
+    gaussians.log_scales[:] = np.log(scales + [size for _, size in extra])[:, None]
+    write_gaussians(tmp_path / "ball.ply", gaussians)
+    return load_splats(tmp_path / "ball.ply")
+
+
+def test_the_subject_fits_into_every_picture(tmp_path):
+    run, photos = ball(tmp_path), around(24, 4)
+    assert subject_radius(run, photos, np.zeros(3)) == pytest.approx(1, abs=0.15)
+    # These photos show a third of the ball at a time.
+    photos = around(24, 4, fov=12)
+    path = [film_camera(each, photos) for each in orbit(photos, 8, 1.0)]
+    edge = np.array([np.asarray(run.render(each.within(96)).alpha)[0].max() for each in path])
+    assert edge.min() > 0.5
+    framed = frame_subject(run, path, photos)
+    for each in framed:
+        alpha = np.asarray(run.render(each.within(96)).alpha)
+        assert max(alpha[0].max(), alpha[-1].max()) < 0.5 and 0.15 < alpha.mean() < 0.6
+    assert len({round(each.fx, 6) for each in framed}) == 1
+
+
+def test_an_arc_shows_no_more_than_its_photos(tmp_path):
+    run, photos = ball(tmp_path), around(12, 4, span=90, fov=12)
+    path = [film_camera(each, photos) for each in orbit(photos, 6, 1.0)]
+    for before, after in zip(path, frame_subject(run, path, photos), strict=True):
+        assert after.fx == before.fx and after.width / after.fx <= photos[0].width / photos[0].fx * 1.001
+
+
+def test_a_floater_in_the_way_is_passed(tmp_path, logged):
+    photos = around(24, 4)
+    path = [film_camera(each, photos) for each in orbit(photos, 24, 1.0)]
+    # Just in front of one camera of the path.
+    run = ball(tmp_path, extra=[(0.92 * path[6].position, 0.15)])
+    framed = frame_subject(run, path, photos)
+    assert any("something near blocked" in line for line in logged)
+    depth = np.asarray(run.render(framed[6].within(96)).depth)
+    assert np.percentile(depth[depth > 0], 10) > 1
+    assert np.linalg.norm(framed[18].position - path[18].position) < 1e-6
+    moves = np.array([np.linalg.norm(a.position - b.position) for a, b in zip(path, framed, strict=True)])
+    assert np.abs(np.diff(moves, append=moves[0])).max() < 0.35
+
+
+@pytest.mark.parametrize(
+    "short, size", [(24, (640, 360)), (480, (1280, 720)), (900, (1920, 1080)), (3000, (1920, 1080))]
+)
+def test_sizes_of_films(short, size):
+    assert film_size([camera(width=short * 2, height=short)]) == size
+
+
+def test_a_scene_without_a_focus_keeps_its_path():
+    run = AnalyticRun()
+    photos = [camera(position=(i, 0, 0), target=(i, 0, 5)) for i in range(4)]
+    path = orbit(photos, 4, 2.0)
+    assert frame_subject(run, path, photos) == path
