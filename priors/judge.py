@@ -72,7 +72,8 @@ def _collect(network: LightNetwork, pack: Pack, chosen: np.ndarray, seed: int, d
         mean, deviation = network(network_input(photos.exposure, photos.clipped))
         for k in range(BATCH):
             clipped = photos.clipped[k] > 0
-            if int(clipped.sum()) < 5:
+            middle, share = float(photos.exposure[k].amax(0).median()), float(clipped.any(0).float().mean())
+            if int(clipped.sum()) < 5 or (plain and not (0.01 < middle < 0.7 and share >= 0.001)):
                 continue
             truth = photos.truth[k][clipped].cpu().numpy()
             found["truth"].append(truth)

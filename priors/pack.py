@@ -44,7 +44,7 @@ def room_views(data: Path):
 
 
 def curves(measured: Path) -> np.ndarray:
-    """Return [C, STEPS + 1] increasing curves from 0 to 1: DoRF's, and formulas that count for a quarter of all."""
+    """Return [C, STEPS + 1] increasing curves from 0 to 1: sRGB, DoRF's, and formulas, a quarter of all."""
     exposure = np.linspace(0, 1, STEPS + 1) ** 3
     found = []
     if measured.is_file():
@@ -60,7 +60,7 @@ def curves(measured: Path) -> np.ndarray:
         curve = (x / (1 + x)) ** (1 / 2.2)
         formulas.append(curve / curve[-1])
     found += formulas * max(1, len(found) // (3 * len(formulas)))
-    steps = np.maximum.accumulate(np.array(found), 1) + 1e-7 * np.arange(STEPS + 1)
+    steps = np.maximum.accumulate(np.array([srgb, *found]), 1) + 1e-7 * np.arange(STEPS + 1)
     return ((steps - steps[:, :1]) / (steps[:, -1:] - steps[:, :1])).astype(np.float32)
 
 

@@ -30,7 +30,7 @@ class Pack:
 
     panoramas: [P, H, 2 H, 3] float32 radiance. held_out: [P] bool. names: of the panoramas.
     rooms: [R, L, S, S, 3] float32 radiance of each view in each of L groups of lights. curves: [C, K] encoded values
-    at K even steps of the cube root of exposure, from 0 to 1.
+    at K even steps of the cube root of exposure, from 0 to 1; the first is sRGB.
     """
 
     panoramas: np.ndarray

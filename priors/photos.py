@@ -13,6 +13,7 @@ from .panoramas import Pack
 SIZES = (64, 80, 96, 128)  # Height and width of a batch's photos
 MOST_CLIPPED, LEAST_CLIPPED = 0.7, 5e-4  # Shares of a photo's pixels
 ROOM_SHARE = 0.35  # Of the photos of a training
+PLAIN_SHARES = (0.002, 0.01, 0.02, 0.05, 0.1, 0.2)  # Of the pixels of a plain photo that clip
 LEVELS = 255
 
 
@@ -52,7 +53,7 @@ class Camera:
         self.dct = _dct(8).to(self.device)
 
     def take(self, count: int, size: int | None = None, *, plain: bool = False) -> Photos:
-        """Return `count` photos of one size; plain: without noise, JPEG and errors of the curve."""
+        """Return `count` photos of one size; plain: by sRGB, without noise, JPEG, white balance and errors."""
         size = size or int(self.random.choice(SIZES))
         rooms = 0 if self.rooms is None else int(self.random.binomial(count, ROOM_SHARE))
         views = [self._panorama_views(count - rooms, size)]
@@ -106,15 +107,18 @@ class Camera:
     def _expose(self, radiance: Tensor, plain: bool) -> Photos:
         """Photograph radiance [B, 3, S, S] at random exposures."""
         count = len(radiance)
-        radiance = radiance * 2 ** self._uniform(count, -0.5, 0.5, 3)  # White balance
+        if not plain:
+            radiance = radiance * 2 ** self._uniform(count, -0.5, 0.5, 3)  # White balance
         brightest = radiance.amax(1).flatten(1)
         # Half of the photos choose white by the share that clips, half by a distance from the middle grey.
         share = 2.0 ** self._uniform(count, math.log2(LEAST_CLIPPED), math.log2(MOST_CLIPPED / 2))[:, 0, 0, 0]
+        if plain:
+            share = torch.from_numpy(self.random.choice(PLAIN_SHARES, count)).to(share)
         ranks = ((1 - share) * (brightest.shape[1] - 1)).long()
         by_share = brightest.sort(1).values.gather(1, ranks[:, None])
         by_middle = brightest.median(1, keepdim=True).values * 2 ** self._uniform(count, 0.5, 9)[:, 0, 0]
         most = brightest.sort(1).values[:, int((1 - LEAST_CLIPPED) * (brightest.shape[1] - 1)), None]
-        first = torch.rand(count, 1, generator=self.generator, device=self.device) < 0.5
+        first = (torch.rand(count, 1, generator=self.generator, device=self.device) < 0.5) | plain
         white = torch.where(first, by_share, torch.minimum(by_middle, most)).clamp_min(1e-12)
         exposure = radiance / white[:, :, None, None]
         truth = exposure.clamp_min(1).log2()
@@ -123,7 +127,8 @@ class Camera:
             noise = torch.randn(exposure.shape, generator=self.generator, device=self.device)
             strength = 2.0 ** self._uniform(count, -14, -7)
             seen = (seen + noise * (strength * (seen.clamp(0, 1) + 0.01)).sqrt()).clamp_min(0)
-        curves = self.curves[torch.from_numpy(self.random.integers(len(self.curves), size=count)).to(self.device)]
+        chosen = np.zeros(count, int) if plain else self.random.integers(len(self.curves), size=count)
+        curves = self.curves[torch.from_numpy(chosen).to(self.device)]
         encoded = _interpolate(curves, seen.clamp(0, 1))
         if not plain:
             encoded = self._jpeg(encoded)

@@ -23,24 +23,27 @@ from .photos import Camera, Photos
 BATCH = 32
 RATE = 2e-3
 ENERGY_WEIGHT = 0.15  # Of the error of a photo's total light beside the pixels' likelihood
-LEAST_PIXELS = 20.0  # A photo with fewer clipped values counts less
+LEAST_PIXELS = 20.0  # A photo with fewer clipped values counts as if it had so many, and some not
+USUAL_PIXELS = 800.0  # Clipped values of a photo that counts once
+SHARING = 0.6  # 1: photos count alike; 0: clipped values do
 SCALE_PHOTOS = 256  # On which the deviations are scaled
 
 
 def pixel_loss(mean: Tensor, deviation: Tensor, photos: Photos) -> Tensor:
     """Return the negative log likelihood of the clipped values, the mean over photos, and the error of their light.
 
-    Each photo counts alike, however many values it clips, but for those with fewer than LEAST_PIXELS.
+    A photo counts by the number of its clipped values to the power of 1 - SHARING.
     """
     clipped, truth = photos.clipped, photos.truth.clamp_max(STOPS)
-    weight = clipped / clipped.sum((1, 2, 3), keepdim=True).clamp_min(LEAST_PIXELS)
+    weight = clipped / clipped.sum((1, 2, 3), keepdim=True).clamp_min(LEAST_PIXELS) ** SHARING
+    weight = weight * (USUAL_PIXELS ** (SHARING - 1))
     likelihood = 0.5 * ((truth - mean) / deviation).square() + deviation.log()
     # Times the deviation as it is, so that unsure pixels still teach the mean (beta-NLL, Seitzer et al. 2022).
     likelihood = (weight * deviation.detach() * likelihood).sum((1, 2, 3))
     light = (clipped * torch.exp2(mean.clamp_max(STOPS))).sum((1, 2, 3)).clamp_min(1).log2()
     true_light = (clipped * torch.exp2(truth)).sum((1, 2, 3)).clamp_min(1).log2()
     energy = torch.nn.functional.smooth_l1_loss(light, true_light, reduction="none")
-    return (likelihood + ENERGY_WEIGHT * energy * weight.sum((1, 2, 3))).mean()
+    return (likelihood + ENERGY_WEIGHT * energy * (clipped.sum((1, 2, 3)) >= LEAST_PIXELS)).mean()
 
 
 def train(pack: Pack, chosen: np.ndarray, *, steps: int, seconds: float, seed: int, device: str) -> LightNetwork:

@@ -95,12 +95,15 @@ class Surroundings:
         alpha: [H, W] as in RenderedView.
         distance: [H, W] mean distance if alpha is above 0.001, else 0; world units.
         confidence: [H, W] in [0, 1], as from render_confidence; None if it was not measured.
+        clipped: [H, W] in [0, 1], the mean of the shares that render_directions() was called with, weighted by light;
+            None without shares.
     """
 
     hdr: Tensor
     alpha: Tensor
     distance: Tensor
     confidence: Tensor | None
+    clipped: Tensor | None = None
 
 
 class RadianceField(nn.Module):
@@ -239,6 +242,9 @@ class RadianceField(nn.Module):
         focal_length: float,
         pixel_angle: float,
         degree: int | None = None,
+        beyond: float = 0.0,
+        dark: Tensor | None = None,
+        shares: Tensor | None = None,
     ) -> Surroundings:
         """Render along unit directions from a position.
 
@@ -248,27 +254,39 @@ class RadianceField(nn.Module):
             focal_length: Pixels, as in rasterize_directions().
             pixel_angle: Radians, as in rasterize_directions().
             degree: Highest SH degree, by default all.
+            beyond: Gaussians whose centers are nearer than this distance are left out; scene units.
+            dark: [N] bool, Gaussians that hide what is behind them and give no light.
+            shares: [N] in [0, 1], of each Gaussian's light, such as the clipped share.
         """
         gaussians = self.gaussians
         origin = self.normalization.points(position)
         origin = torch.tensor(origin, dtype=torch.float32, device=gaussians.means.device)
         encoded, values = self.color_model.encoded, self._values(origin, degree)
         colors = self.color_model.colors(values) if encoded else self._exposures(values)[1]
+        if dark is not None:
+            colors = colors.masked_fill(dark[:, None], 0.0)
         features = [colors, (gaussians.means - origin).norm(dim=1, keepdim=True)]
         if self.confidence is not None:
             features.append(self.confidence[:, None])
+        if shares is not None:
+            features.append(colors.mean(1, keepdim=True) * shares[:, None])
         image, transmittance = rasterize_directions(
             *(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacities()),
             *(torch.cat(features, dim=1), origin, directions),
             focal_length=focal_length,
             pixel_angle=pixel_angle,
             antialiased=self.antialiased,
+            **({"near_plane": beyond / self.normalization.unit} if beyond else {}),
         )
+        clipped = None
+        if shares is not None:
+            clipped = (image[..., -1] / image[..., :3].mean(2).clamp_min(1e-30)).clamp(0, 1)
+            image = image[..., :-1]
         alpha, colors = 1 - transmittance, image[..., :3]
         colors = self.response.decode(colors.clamp(0, 1)) if encoded else colors
         distance, *confidence = (_unpremultiply(image[..., i], alpha) for i in range(3, image.shape[2]))
         confidence = confidence[0].clamp(0, 1) if confidence else None
-        return Surroundings(colors / self.base_time, alpha, distance * self.normalization.unit, confidence)
+        return Surroundings(colors / self.base_time, alpha, distance * self.normalization.unit, confidence, clipped)
 
     @torch.no_grad()
     def render_ldr(self, camera: Camera, exposure_time: float | None = None, *, degree: int | None = None) -> Tensor:

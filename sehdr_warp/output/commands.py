@@ -199,7 +199,8 @@ class EnvironmentMap:
     out: Path
     """The file: .exr, or .hdr without alpha and confidence."""
     at: str = "center"
-    """x,y,z in the scene's coordinates, camera:NAME, or center: the middle of the training cameras."""
+    """x,y,z in the scene's coordinates, camera:NAME, or center: the middle of the training cameras, or what they walk
+    around."""
     size: int = 2048
     """Pixels across; for a cube those of one face."""
     layout: Literal["latlong", "cube"] = "latlong"
@@ -208,6 +209,10 @@ class EnvironmentMap:
     """upright: turned as render and export turn the scene; +Y is up. scene: the scene's own coordinates."""
     up: str | None = None
     """The scene's up direction in its own coordinates, if the photos do not show it: x,y,z, or an axis such as -y."""
+    beyond: float | None = None
+    """Leave out what is nearer than this distance, in the scene's units: a CG object then stands in the place of the
+    photographed one. By default 0, or, for the center of a walk around something, half the distance of the nearest
+    photo."""
     inpaint: bool = False
     """Fill directions that no photo covers with the light around them; alpha still tells them."""
     colorspace: str = "rec709"

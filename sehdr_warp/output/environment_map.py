@@ -2,6 +2,7 @@
 
 import json
 import logging
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,12 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera
 
 from ..files import check_absent
+from .camera_paths import common_focus
 from .colorspace import from_rec709
 from .exr import Part, as_data, exr_header, rgb_channels, write_multipart_exr
 from .images import as_array
 from .light_pictures import exposure_of_white
+from .light_shares import light_shares
 from .radiance_file import write_radiance
 from .render_views import provenance
 from .world_transform import AXES, world_transform
@@ -26,6 +29,9 @@ SUFFIXES = (".exr", ".hdr")
 # A direction counts as covered above this alpha. A covered share below _LEAST_COVERED gives a warning, as do surfaces
 # nearer than _NEAR times the spread of the cameras in more than half of all directions: the point is inside something.
 _COVERED, _LEAST_COVERED, _NEAR, _LARGEST = 0.5, 0.1, 0.02, 1 << 15
+# Photos walk around what they look at if most of them look at it within this cosine and they stand on all sides of it;
+# what is nearer to it than this part of the distance of the nearest camera is then left out of a map at the center.
+_FACING, _SIDES, _CLEARANCE = 0.7, 0.5, 0.5
 _COARSE, _DARKEST = 128, 1e-9  # Inpainting: columns of the coarse map, and the least light
 # The nearest axes of a cube's faces in OpenEXR's order (+X -X +Y -Y +Z -Z): to the right, down, and out.
 _FACES = np.array(
@@ -50,6 +56,7 @@ def write_environment_map(
     layout: str = "latlong",
     axes: str = "upright",
     up: str | tuple[float, float, float] | None = None,
+    beyond: float | None = None,
     inpaint: bool = False,
     colorspace: str = "rec709",
     reference_white: float | None = None,
@@ -61,14 +68,18 @@ def write_environment_map(
     Args:
         run: From load_run, train or load_splats.
         path: .exr (R, G, B radiance; A coverage; in a second part, `data`, distance.Z and, if the run has it,
-            confidence; attribute `envmap`) or .hdr (Radiance: R, G, B only).
-        at: A point in the scene's coordinates, "camera:NAME", or "center": the mean of the training cameras.
+            confidence and clipped; attribute `envmap`) or .hdr (Radiance: R, G, B only).
+        at: A point in the scene's coordinates, "camera:NAME", or "center": the mean of the training cameras, or, if
+            they walk around something, the point that they look at.
         size: Pixels across; for a cube those of one face.
         layout: "latlong": size x size / 2, the left edge at longitude pi, +Z in the middle, +X at a quarter, +Y up.
             "cube": OpenEXR's six faces, one above the other.
         axes: "upright": turned as render and export turn the scene (see world_transform), so that the map lights its
             Gaussians as they stand: +Y is up and +Z is ahead of the middle camera. "scene": the scene's coordinates.
         up: As in world_transform.
+        beyond: Leave out what is nearer than this distance, in the scene's units, so that a CG object can stand in the
+            place of a photographed one. None: 0, or for the center of a walk around something half the distance of the
+            nearest camera.
         inpaint: Fill directions that no photo covers with the light around them, as far as A is below 1; A still tells
             them.
         colorspace: Primaries of the file.
@@ -91,31 +102,52 @@ def write_environment_map(
         raise SehdrError(f"size {size} cannot be; give an even number of pixels from 16 to {_LARGEST}")
     transform = world_transform(run, axes, up=up)
     exposure = exposure_of_white(run, reference_white)
+    if beyond is not None and not 0 <= beyond < np.inf:
+        raise SehdrError(f"beyond {beyond:g} is not a distance; give 0 or more, in the scene's units")
     check_absent(path, overwrite)
     cameras = {entry.name: entry.camera for entry in run.cameras}
     photos = [entry.camera for entry in run.cameras if entry.split == "train"]
     position = _point(at, cameras, photos)
+    if beyond is None:
+        beyond = 0.0
+        if isinstance(at, str) and at == "center" and (focus := walked_around(photos)) is not None:
+            position = focus
+            beyond = _CLEARANCE * min(float(np.linalg.norm(camera.position - focus)) for camera in photos)
+            place = ", ".join(f"{value:.4g}" for value in focus)
+            log.info(
+                "the photos walk around (%s): the map is what surrounds that point beyond %.3g; --beyond changes it",
+                *(place, beyond),
+            )
     to_world = transform.rotation.T
     directions = (latlong if layout == "latlong" else cube)(size) @ to_world.T
     pixel_angle = 2 * np.pi / size if layout == "latlong" else 2 / size
     focal = float(np.median([np.sqrt(c.fx * c.fy) for c in photos])) if photos else 1 / pixel_angle
-    surroundings = run.render_directions(position, directions, focal_length=focal, pixel_angle=pixel_angle)
+    options = {"focal_length": focal, "pixel_angle": pixel_angle, "beyond": beyond, "shares": run.clipped_share()}
+    surroundings = run.render_directions(position, directions, **options)
     hdr, alpha, distance = (
         as_array(values) for values in (surroundings.hdr, surroundings.alpha, surroundings.distance)
     )
     weight = solid_angles(size, layout)
     _judge(run, position, photos, alpha, distance, weight)
+    added = np.zeros_like(hdr)
     if inpaint:
-        hdr = hdr + (1 - alpha[..., None]) * inpainted(hdr, alpha, directions, weight)
-    log.info("%s: %.0f %% of all directions seen", path.name, 100 * weight[alpha > _COVERED].sum() / weight.sum())
-    hdr = exposure * from_rec709(hdr, colorspace)
+        added = (1 - alpha[..., None]) * inpainted(hdr, alpha, directions, weight)
+    clipped = None if surroundings.clipped is None else as_array(surroundings.clipped)
+    shares = light_shares(hdr, added, clipped, weight, run.response.white / run.base_time)
+    seen = 100 * weight[alpha > _COVERED].sum() / weight.sum()
+    log.info("%s: %.0f %% of all directions seen", path.name, seen)
+    log.info("its light is\n%s", shares.table())
+    hdr = exposure * from_rec709(hdr + added, colorspace)
     if path.suffix.lower() == ".hdr":
         write_radiance(path, hdr, exposure=exposure, overwrite=overwrite)
         return path
     data = {"distance.Z": distance * transform.scale}
     if surroundings.confidence is not None:
         data["confidence"] = as_array(surroundings.confidence)
+    if clipped is not None:
+        data["clipped"] = clipped
     facts = {**provenance(run), "position": json.dumps(position.tolist()), "axes": axes}
+    facts |= {"beyond": repr(float(beyond)), "lightShares": json.dumps(asdict(shares))}
     header = exr_header(colorspace, exposure, None, datetime.now().replace(microsecond=0), facts)
     header |= {"sehdr:mapToWorld": json.dumps(to_world.tolist()), "envmap": envmap(layout)}
     # In a part of their own: Mitsuba takes a map with a fifth channel for no map at all.
@@ -203,6 +235,22 @@ def _point(at: str | tuple[float, float, float], cameras: dict[str, Camera], pho
     if position.shape != (3,) or not np.isfinite(position).all():
         raise SehdrError(f"point {at!r} is neither x,y,z nor camera:NAME nor center")
     return position
+
+
+def walked_around(photos: list[Camera]) -> np.ndarray | None:
+    """Return the point that cameras stand around and look at; None if they do not, as in a room seen from within."""
+    focus = common_focus(photos) if len(photos) > 3 else None
+    if focus is None:
+        return None
+    offsets = np.stack([camera.position for camera in photos]) - focus
+    distances = np.linalg.norm(offsets, axis=1, keepdims=True)
+    if distances.min() <= 1e-6 * distances.max():
+        return None
+    towards = -offsets / distances
+    facing = np.sum(towards * np.stack([camera.world_to_camera[2, :3] for camera in photos]), axis=1)
+    # Cameras on one side have a mean direction of nearly unit length, cameras all around one of nearly zero.
+    around = np.linalg.norm(towards.mean(0)) < _SIDES
+    return focus if np.mean(facing > _FACING) > 0.8 and around else None
 
 
 def _judge(run, position, photos: list[Camera], alpha: np.ndarray, distance: np.ndarray, weight: np.ndarray) -> None:

@@ -3,6 +3,7 @@
 import logging
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -59,11 +60,14 @@ class _Rendered:
         return as_rec709(self.model.render(camera, degree=self.degree), self.color_matrix, self.base_time)
 
     def render_directions(
-        self, position: np.ndarray, directions: np.ndarray, *, focal_length: float, pixel_angle: float
+        self, position: np.ndarray, directions: np.ndarray, *, focal_length: float, pixel_angle: float, **more: Any
     ) -> Surroundings:
-        """What is seen along unit directions [H, W, 3] from a position [3], as of RadianceField.render_directions."""
+        """Return what is seen along unit directions [H, W, 3] from a position [3].
+
+        more: other options of RadianceField.render_directions().
+        """
         rays = torch.tensor(directions, dtype=torch.float32, device=self.device)
-        options = {"focal_length": focal_length, "pixel_angle": pixel_angle, "degree": self.degree}
+        options = {"focal_length": focal_length, "pixel_angle": pixel_angle, "degree": self.degree, **more}
         surroundings = self.model.render_directions(position, rays, **options)
         return replace(surroundings, hdr=self.in_rec709(surroundings.hdr))
 

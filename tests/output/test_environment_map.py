@@ -1,13 +1,21 @@
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.baking import field_of
-from sehdr_warp.output.environment_map import cube, inpainted, latlong, solid_angles, write_environment_map
+from sehdr_warp.output.environment_map import (
+    cube,
+    inpainted,
+    latlong,
+    solid_angles,
+    walked_around,
+    write_environment_map,
+)
 from sehdr_warp.output.radiance_file import write_radiance
 from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene.hdr_files import read_exr_channels, read_hdr
@@ -226,3 +234,53 @@ def test_a_point_inside_of_something_is_warned_of(tmp_path, run, logged):
     run.cameras = tuple(Entry(str(x), "train", camera(position=(x, 0, 0), target=(x, 0, 9))) for x in (-2e3, 2e3))
     write_environment_map(run, tmp_path / "a.exr", at=(0, 0, 0), size=64)
     assert any("inside of something" in line for line in logged)
+
+
+def around(count=12, radius=4.0):
+    """Cameras on a circle about (0, 0, 0), which all look at it."""
+    turns = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return [camera(position=(radius * np.sin(t), 0.3, radius * np.cos(t)), target=(0, 0, 0)) for t in turns]
+
+
+def test_beyond_leaves_out_what_is_nearer(tmp_path, run):
+    import OpenEXR
+
+    near, far = lamps(), lamps()
+    near.means[:] *= 0.2
+    both = {name: np.concatenate([getattr(a, name) for a in (near, far)]) for name in ("means", "log_scales")}
+    both["log_scales"][:6] += np.log(0.2)
+    both |= {name: np.concatenate([getattr(far, name)] * 2) for name in ("quaternions", "opacity_logits", "harmonics")}
+    scene = Splats(tmp_path / "run", field_of(replace(far, **both)), run.cameras)
+    for name, beyond in (("all", 0.0), ("far", 2.0)):
+        write_environment_map(scene, tmp_path / f"{name}.exr", at=(0, 0, 0), size=64, axes="scene", beyond=beyond)
+    _, channels, header = read(tmp_path / "far.exr")
+    with OpenEXR.File(str(tmp_path / "far.exr"), separate_channels=True) as file:
+        distance = file.channels(1)["distance.Z"].pixels
+    assert distance[channels["A"] > 0.5] == pytest.approx(5, rel=1e-3) and header["sehdr:beyond"] == "2.0"
+    with OpenEXR.File(str(tmp_path / "all.exr"), separate_channels=True) as file:
+        assert file.channels(1)["distance.Z"].pixels[16, 16] < 2.5
+
+
+def test_a_walk_around_something_is_seen_from_its_middle_without_it(tmp_path, run, caplog):
+    caplog.set_level("INFO")
+    cameras = tuple(Entry(str(i), "train", each) for i, each in enumerate(around()))
+    scene = Splats(tmp_path / "run", run.model, cameras)
+    write_environment_map(scene, tmp_path / "env.exr", size=64)
+    header = read(tmp_path / "env.exr")[2]
+    assert np.abs(json.loads(header["sehdr:position"])).max() < 0.1
+    assert float(header["sehdr:beyond"]) == pytest.approx(2, rel=0.01)
+    assert "walk around" in caplog.text and "--beyond" in caplog.text
+
+
+def test_cameras_that_look_outward_or_stand_on_one_side_walk_around_nothing():
+    turns = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    outward = [camera(position=(0, 0, 0.1 * t), target=(np.sin(t), 0, 5 * np.cos(t))) for t in turns]
+    one_side = [camera(position=(x, 0, -4), target=(0, 0, 0)) for x in np.linspace(-1, 1, 9)]
+    assert walked_around(outward) is None and walked_around(one_side) is None
+    assert walked_around(around()) == pytest.approx([0, 0, 0], abs=0.05)
+
+
+@pytest.mark.parametrize("beyond", [-1.0, np.inf, np.nan])
+def test_a_distance_that_is_none_is_refused(tmp_path, run, beyond):
+    with pytest.raises(SehdrError, match="not a distance"):
+        write_environment_map(run, tmp_path / "env.exr", at=(0, 0, 0), size=64, beyond=beyond)

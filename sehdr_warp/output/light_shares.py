@@ -1,0 +1,58 @@
+"""Shares of an environment map's light: measured by photos, a lower bound, an estimate, or filled in."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class LightShares:
+    """Parts of the light that reaches a point from all directions; they add up to 1 if there is light.
+
+    Attributes:
+        measured: shown by photos below their white.
+        bound: of clipped light, what reaches up to the photos' white: at least so much is there.
+        estimated: of clipped light, what the scene holds above the photos' white.
+        inpainted: directions that no photo shows.
+        clipped_known: False if the scene does not state what clipped; then measured holds the first three.
+    """
+
+    measured: float
+    bound: float
+    estimated: float
+    inpainted: float
+    clipped_known: bool
+
+    def table(self) -> str:
+        """Return the shares as lines of text."""
+        rows = [(self.measured, "measured", "photos show it below their white")]
+        if self.clipped_known:
+            rows += [
+                (self.bound, "at least", "photos clip: so much of it is certain"),
+                (self.estimated, "estimated", "photos clip: above their white"),
+            ]
+        else:
+            rows = [(self.measured, "shown by photos", "the scene does not state what of it clipped")]
+        rows.append((self.inpainted, "filled in", "no photo shows it"))
+        width = max(len(name) for _, name, _ in rows)
+        return "\n".join(f"  {100 * share:5.1f} %  {name:{width}}  {meaning}" for share, name, meaning in rows)
+
+
+def light_shares(
+    radiance: np.ndarray, inpainted: np.ndarray, clipped: np.ndarray | None, weight: np.ndarray, white: float
+) -> LightShares:
+    """Return the shares of an environment map's light.
+
+    Args:
+        radiance: [H, W, 3] of the scene, without what was filled in.
+        inpainted: [H, W, 3] that was filled in.
+        clipped: [H, W] in [0, 1], the share of a direction's light that photos clipped; None if it is not known.
+        weight: [H, W] solid angle of each pixel, up to scale.
+        white: radiance that the photos show as white.
+    """
+    light, added = (np.maximum(image, 0).mean(2) * weight for image in (radiance, inpainted))
+    unsure = np.zeros_like(light) if clipped is None else light * clipped
+    bound = np.minimum(unsure, weight * white * (0 if clipped is None else clipped))
+    total = max(float(light.sum() + added.sum()), np.finfo(np.float64).tiny)
+    parts = (light - unsure).sum(), bound.sum(), (unsure - bound).sum(), added.sum()
+    return LightShares(*(float(part) / total for part in parts), clipped_known=clipped is not None)
