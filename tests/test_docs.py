@@ -14,6 +14,7 @@ from packaging.requirements import Requirement
 from packaging.version import Version
 
 import sehdr_warp
+from benchmarks.commands import Benchmarks
 from sehdr_warp import cli
 from sehdr_warp.arguments import flags, subcommands
 from sehdr_warp.runs.config_files import GONE, RENAMED, config_fields
@@ -85,7 +86,7 @@ def flags_of(options):
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_flags_and_fields_on_the_pages_exist(page):
     text = page.read_text()
-    known = {flag for options in cli.command_options().values() for flag in flags_of(options)}
+    known = {flag for options in (*cli.command_options().values(), Benchmarks) for flag in flags_of(options)}
     others = {"--version", "--help", "--help-all", "--debug", "--set", "--plan", "--predict-hdr"}  # the last are gone
     others |= {
         "--index-url",

@@ -65,7 +65,7 @@ def test_expose_tells_what_was_repaired_in_a_response_file(truth, tmp_path, capf
 def test_expose_refuses_in_a_line(truth, tmp_path, capfd):
     out = tmp_path / "photos"
     assert "--exposures" in refused(capfd, truth, "--out", out, "--exposures", "fast")
-    assert "no exposure above 0" in refused(capfd, truth, "--out", out, "--exposures", "0")
+    assert "not an exposure above 0" in refused(capfd, truth, "--out", out, "--exposures", "0")
     assert "--noise" in refused(capfd, truth, "--out", out, "--noise", "100")
     assert "kodak" in refused(capfd, truth, "--out", out, "--response", "kodak")
     assert "not found" in refused(capfd, tmp_path / "none", "--out", out)
