@@ -269,11 +269,8 @@ class Trainer:
         incomplete = rendering.overflow
         if self._flat is not None:
             loss, incomplete, harmonics = self._flat.give()
-        counted = {
-            "tally": self._capacity.tally,
-            "pairs": rendering.needed_intersections,
-            "live": self.field.gaussians.live,
-        }
+        tally, needed = self._capacity.tally, rendering.needed_intersections
+        counted = {"tally": tally, "pairs": needed, "live": self.field.gaussians.live}
         made = adam.guarded_step(self.optimizer, loss, incomplete, harmonics, **counted)
         if seen.watched:
             self.densification.observe(rendering, width, height, made)

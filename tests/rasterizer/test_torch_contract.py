@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+import torch.utils.checkpoint
 import warp as wp
 
 from sehdr_warp.rasterizer import differentiable, rasterize, rasterize_directions, spherical_harmonics, ssim, ssim_map
@@ -263,3 +264,12 @@ def test_no_gaussians_at_all_have_gradients(what, device):
     leaves = [tensor.detach().requires_grad_() for tensor in (*tensors, *scene.tensors[5:])]
     rasterize(*leaves, *SIZE, background=torch.ones(3, device=device)).image.sum().backward()
     assert all(bool((leaf.grad == 0).all()) for leaf in leaves)
+
+
+def test_checkpointing_and_inference_mode_work():
+    leaves = splats(dtype=torch.float32)
+    truth = torch.autograd.grad(rasterize(*leaves, *SIZE).image.square().sum(), leaves)
+    image = torch.utils.checkpoint.checkpoint(lambda *t: rasterize(*t, *SIZE).image, *leaves, use_reentrant=False)
+    assert all(map(torch.equal, torch.autograd.grad(image.square().sum(), leaves), truth))
+    with torch.inference_mode():
+        assert torch.equal(rasterize(*leaves, *SIZE).image, image)

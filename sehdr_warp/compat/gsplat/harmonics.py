@@ -1,0 +1,36 @@
+"""gsplat's spherical_harmonics()."""
+
+import torch
+from torch import Tensor
+
+from ...rasterizer import spherical_harmonics as evaluate
+from ...rasterizer.harmonics import MAX_DEGREE
+
+
+def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
+    """Evaluate spherical harmonics along directions.
+
+    Args:
+        degrees_to_use: 0 to 3.
+        dirs: [..., 3], of any length.
+        coeffs: [..., K, 3] with K >= (degrees_to_use + 1)^2.
+        masks: [...] bool, where values are wanted; elsewhere they are 0.
+
+    Returns:
+        [..., 3].
+
+    Raises:
+        ValueError: for a degree above 3, and for shapes that do not fit.
+    """
+    check_degree("degrees_to_use", degrees_to_use)
+    shape = dirs.shape
+    origin = dirs.new_zeros(3)
+    values = evaluate(degrees_to_use, coeffs.reshape(-1, *coeffs.shape[-2:]), dirs.reshape(-1, 3), origin)
+    values = values.reshape(shape)
+    return values if masks is None else torch.where(masks[..., None], values, 0.0)
+
+
+def check_degree(name: str, degree: int) -> None:
+    """Raise ValueError for a degree that gsplat has and the rasterizer does not."""
+    if degree > MAX_DEGREE:
+        raise ValueError(f"{name} {degree} is not supported, expected 0 to {MAX_DEGREE}")

@@ -1,0 +1,143 @@
+"""The arguments of rasterization(): checked, and taken apart by camera."""
+
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...rasterizer import spherical_harmonics
+from ...rasterizer.checks import check_tensors, integer
+from .harmonics import check_degree
+
+UNSUPPORTED = {
+    "sparse_grad": False,
+    "distributed": False,
+    "with_ut": False,
+    "with_eval3d": False,
+    "radial_coeffs": None,
+    "tangential_coeffs": None,
+    "thin_prism_coeffs": None,
+    "ftheta_coeffs": None,
+    "viewmats_rs": None,
+}
+"""gsplat's arguments that have one value here."""
+
+
+def check_supported(values: dict[str, Any], rolling_shutter: Any) -> None:
+    """Raise ValueError, by its name, for an argument with another value than UNSUPPORTED has."""
+    for name, value in values.items():
+        if value is not UNSUPPORTED[name] and (isinstance(value, Tensor) or value != UNSUPPORTED[name]):
+            actual = f"a tensor of shape {list(value.shape)}" if isinstance(value, Tensor) else f"{value!r:.60}"
+            raise ValueError(f"{name} = {actual} is not supported, expected {UNSUPPORTED[name]!r}")
+    if rolling_shutter is not None and getattr(rolling_shutter, "name", None) != "GLOBAL":
+        raise ValueError(f"rolling_shutter = {rolling_shutter!r:.60} is not supported, expected a global shutter")
+
+
+class View(NamedTuple):
+    """The inputs of one camera of one batch."""
+
+    means: Tensor
+    quats: Tensor | None
+    scales: Tensor | None
+    covars: Tensor | None
+    opacities: Tensor
+    colors: Tensor
+    viewmat: Tensor
+    K: Tensor
+    position: Tensor
+    background: Tensor | None
+
+    def features(self, sh_degree: int | None, has_color: bool, rows: Tensor | None) -> Tensor:
+        """Return the colors [N, D] of the Gaussians (of `rows` if given), or [N, 0] without has_color."""
+        means, colors = (self.means, self.colors) if rows is None else (self.means[rows], self.colors[rows])
+        if not has_color:
+            return means.new_empty(len(means), 0)
+        if sh_degree is None:
+            return colors
+        return (spherical_harmonics(sh_degree, colors, means, self.position) + 0.5).clamp_min(0.0)
+
+
+class Inputs(NamedTuple):
+    """The arguments with one batch axis of B."""
+
+    means: Tensor
+    quats: Tensor | None
+    scales: Tensor | None
+    covars: Tensor | None
+    opacities: Tensor
+    colors: Tensor
+    viewmats: Tensor
+    Ks: Tensor
+    backgrounds: Tensor | None
+    colors_by_camera: bool
+
+    @staticmethod
+    def flattened(
+        means: Any,
+        quats: Any,
+        scales: Any,
+        opacities: Any,
+        colors: Any,
+        viewmats: Any,
+        Ks: Any,
+        backgrounds: Any,
+        covars: Any,
+        sh_degree: int | None,
+    ) -> "Inputs":
+        """Check the arguments' shapes, types and devices, and flatten their batch axes to one."""
+        batch = tuple(means.shape[:-2]) if isinstance(means, Tensor) else ()
+        inner: tuple[int | str, ...] = ("N", "D")
+        if sh_degree is not None:
+            check_degree("sh_degree", integer("sh_degree", sh_degree, 0, 4))
+            inner = ("N", "K", 3)
+        by_camera = isinstance(colors, Tensor) and colors.ndim == len(batch) + len(inner) + 1
+        shapes = {} if covars is None else {"covars": (covars, (*batch, "N", 3, 3))}
+        if covars is None:
+            shapes = {"quats": (quats, (*batch, "N", 4)), "scales": (scales, (*batch, "N", 3))}
+        behind = {}
+        if backgrounds is not None:
+            behind = {"backgrounds": (backgrounds, (*batch, "C", 3 if sh_degree is not None else "D"))}
+        check_tensors(
+            means=(means, (*batch, "N", 3)),
+            **shapes,
+            opacities=(opacities, (*batch, "N")),
+            viewmats=(viewmats, (*batch, "C", 4, 4)),
+            Ks=(Ks, (*batch, "C", 3, 3)),
+            colors=(colors, (*batch, *(("C",) if by_camera else ()), *inner)),
+            **behind,
+        )
+        if sh_degree is not None and colors.shape[-2] < (sh_degree + 1) ** 2:
+            raise ValueError(
+                f"colors has shape {list(colors.shape)}, but sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} "
+                "coefficients"
+            )
+        if not viewmats.shape[-3]:
+            raise ValueError("viewmats has no camera, expected [..., C, 4, 4] with C >= 1")
+
+        def flat(tensor: Tensor | None) -> Tensor | None:
+            if tensor is None or len(batch) == 1:
+                return tensor
+            return tensor.reshape(math.prod(batch), *tensor.shape[len(batch) :])
+
+        values = means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds
+        return Inputs(*map(flat, values), by_camera)  # pyright: ignore[reportArgumentType]
+
+    def views(self) -> Iterator[View]:
+        """Yield the inputs of each camera, batch by batch."""
+        inverse, _ = torch.linalg.inv_ex(self.viewmats)  # Of a singular matrix not finite: it then shows nothing.
+        for batch in range(len(self.means)):
+            for camera in range(self.viewmats.shape[1]):
+                yield View(
+                    self.means[batch],
+                    None if self.quats is None else self.quats[batch],
+                    None if self.scales is None else self.scales[batch],
+                    None if self.covars is None else self.covars[batch],
+                    self.opacities[batch],
+                    self.colors[batch, camera] if self.colors_by_camera else self.colors[batch],
+                    self.viewmats[batch, camera],
+                    self.Ks[batch, camera],
+                    inverse[batch, camera, :3, 3],
+                    None if self.backgrounds is None else self.backgrounds[batch, camera],
+                )

@@ -1,0 +1,26 @@
+"""Relocation and noise of 3DGS-MCMC (Kheradmand et al. 2024) in torch, on either device."""
+
+import torch
+from torch import Tensor
+
+from ...rasterizer.relocation import MOST_COPIES, relocation_sums
+
+
+@torch.no_grad()
+def compute_relocation(
+    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return opacities and sizes with which `ratios` Gaussians at one place look as one did (equation 9).
+
+    Args:
+        opacities: [N] in (0, 1).
+        scales: [N, 3].
+        ratios: [N], from 1; more than 51 count as 51.
+        binoms: has no effect; gsplat's table of binomials.
+    """
+    count = ratios.long().clamp(1, MOST_COPIES)
+    shared = 1 - (1 - opacities.double()).pow(1 / count)
+    powers = shared[:, None] ** torch.arange(1, MOST_COPIES + 1, device=opacities.device)
+    denominators = (relocation_sums(opacities.device)[count - 1] * powers).sum(1)
+    factors = (opacities.double() / denominators).to(scales.dtype)
+    return shared.to(opacities.dtype), scales * factors[:, None]

@@ -1,0 +1,190 @@
+"""gsplat's rasterization() made of the rasterizer's stages."""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from ...rasterizer.absolute_gradient import watch_absolute_gradients
+from ...rasterizer.blending import blend
+from ...rasterizer.checks import integer
+from ...rasterizer.memory import oom_context
+from ...rasterizer.projection import ProjectedGaussians
+from ...rasterizer.rasterization import MAX_SIDE, RenderOptions, list_splats, render_projected
+from ...rasterizer.tile_lists import Splats
+from ...rasterizer.torch_contract import torch_operation
+from .inputs import UNSUPPORTED, Inputs, check_supported
+from .projection import ALPHA_THRESHOLD, CAMERA_MODELS, CameraModel, Culling, project_gaussians
+from .splats import JoinedSplats, make_meta
+
+RENDER_MODES = "RGB", "D", "ED", "RGB+D", "RGB+ED"
+RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+
+
+@torch_operation
+def rasterization(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,
+    render_mode: RenderMode = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: CameraModel = "pinhole",
+    segmented: bool = False,
+    covars: Tensor | None = None,
+    with_ut: bool = False,
+    with_eval3d: bool = False,
+    radial_coeffs: Tensor | None = None,
+    tangential_coeffs: Tensor | None = None,
+    thin_prism_coeffs: Tensor | None = None,
+    ftheta_coeffs: Any = None,
+    rolling_shutter: Any = None,
+    viewmats_rs: Tensor | None = None,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Rasterize N Gaussians to the images of C cameras, with gsplat's arguments and results.
+
+    Args:
+        means: [..., N, 3]; "..." are batch axes, which all tensors share.
+        quats: [..., N, 4] (w, x, y, z); None with covars.
+        scales: [..., N, 3]; None with covars.
+        opacities: [..., N]; above 1 they saturate as in gsplat.
+        colors: [..., N, D] or [..., C, N, D]; with sh_degree coefficients [..., N, K, 3] or [..., C, N, K, 3].
+        viewmats: [..., C, 4, 4] world to camera.
+        Ks: [..., C, 3, 3].
+        width: of the images, pixels.
+        height: of the images, pixels.
+        near_plane: least depth, scene units.
+        far_plane: largest depth, scene units.
+        radius_clip: Gaussians whose radii in pixels are not larger are left out.
+        eps2d: variance in square pixels added to each 2D Gaussian.
+        sh_degree: 0 to 3, of the harmonics; None for plain colors.
+        packed: return the visible Gaussians alone in the third result.
+        tile_size: of the third result's intersections; rendering has its own.
+        backgrounds: [..., C, D].
+        render_mode: "RGB", "D", "ED", "RGB+D" or "RGB+ED".
+        sparse_grad: must be False.
+        absgrad: the backward pass writes meta["means2d"].absgrad, the sums over pixels of absolute gradients.
+        rasterize_mode: "classic" or "antialiased".
+        channel_chunk: has no effect.
+        distributed: must be False.
+        camera_model: "pinhole", "ortho" or "fisheye".
+        segmented: has no effect.
+        covars: [..., N, 3, 3] in place of quats and scales.
+        with_ut: must be False.
+        with_eval3d: must be False.
+        radial_coeffs: must be None.
+        tangential_coeffs: must be None.
+        thin_prism_coeffs: must be None.
+        ftheta_coeffs: must be None.
+        rolling_shutter: must be None or gsplat's GLOBAL.
+        viewmats_rs: must be None.
+
+    Returns:
+        Colors [..., C, H, W, D], with depths as one more channel ("RGB+D": blended, "RGB+ED": expected) or as the only
+        one ("D", "ED"); alphas [..., C, H, W, 1]; and a dictionary with gsplat's keys, of which those about
+        intersections are computed when they are first read.
+
+    Raises:
+        ValueError: for an argument that is not supported, by its name, and for shapes, dtypes or devices that do not
+            fit.
+    """
+    values = locals()
+    check_supported({name: values[name] for name in UNSUPPORTED}, rolling_shutter)
+    if render_mode not in RENDER_MODES:
+        raise ValueError(f"render_mode {render_mode!r} is none of {', '.join(RENDER_MODES)}")
+    if camera_model not in CAMERA_MODELS:
+        raise ValueError(f"camera_model {camera_model!r} is none of {', '.join(CAMERA_MODELS)}")
+    if covars is not None:
+        quats = scales = None
+    inputs = Inputs.flattened(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, sh_degree)
+    size = integer("width", width, 1, MAX_SIDE), integer("height", height, 1, MAX_SIDE)
+    culling = Culling(max(near_plane, 0.0), far_plane, radius_clip)
+    antialiased, has_depth, has_color = rasterize_mode == "antialiased", "D" in render_mode, "RGB" in render_mode
+    with oom_context(means.device, lambda: (means.shape[-2], *size)):
+        views = list(inputs.views())
+        projected = [
+            project_gaussians(
+                *(view.means, view.quats, view.scales, view.covars, view.opacities, view.viewmat, view.K, *size),
+                eps2d=eps2d,
+                culling=culling,
+                antialiased=antialiased,
+                camera_model=camera_model,
+            )
+            for view in views
+        ]
+        batch, cameras = tuple(means.shape[:-2]), viewmats.shape[-3]
+        splats = JoinedSplats.of(projected, packed, (*batch, cameras))
+        means2d = splats.means2d
+        if absgrad and means2d.requires_grad:
+            means2d.absgrad = torch.zeros_like(means2d)  # pyright: ignore[reportAttributeAccessIssue]
+        images, alphas = [], []
+        for place, view in enumerate(views):
+            mine = splats.of_view(place)
+            features = view.features(sh_degree, has_color, mine.gaussian_ids)
+            if has_depth:
+                features = torch.cat([features, mine.projected.depths[:, None]], 1)
+            store = _store(splats, mine.rows) if absgrad and means2d.requires_grad else None
+            image, transmittance = _render(mine.projected, features, *size, store)
+            if view.background is not None and has_color:
+                behind = view.background
+                behind = torch.cat([behind, behind.new_zeros(1)]) if has_depth else behind
+                image = image + transmittance[..., None] * behind
+            alpha = 1.0 - transmittance[..., None]
+            if "E" in render_mode:
+                expected = image[..., -1:] / alpha.clamp_min(1e-10)
+                image = torch.cat([image[..., :-1], expected], -1)
+            images.append(image)
+            alphas.append(alpha)
+    shape = *batch, cameras
+    meta = make_meta(splats, shape, size, tile_size)
+    return torch.stack(images).unflatten(0, shape), torch.stack(alphas).unflatten(0, shape), meta
+
+
+def _store(splats: JoinedSplats, rows: Any) -> Callable[[Tensor], None]:
+    """Return what writes a view's absolute gradients to its rows of means2d.absgrad."""
+    absgrad = splats.by_view(splats.means2d.absgrad)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def store(absolute: Tensor) -> None:
+        absgrad[rows] = absolute
+
+    return store
+
+
+def _render(
+    projected: ProjectedGaussians,
+    features: Tensor,
+    width: int,
+    height: int,
+    store: Callable[[Tensor], None] | None,
+) -> tuple[Tensor, Tensor]:
+    """Return image and transmittance; store: where to leave absolute gradients."""
+    options = RenderOptions(width, height)
+    if store is None:
+        rendering = render_projected(projected, features, options)
+        return rendering.image, rendering.transmittance
+    means2d, conics, depths, opacities, extents = projected
+    features = features.contiguous()
+    splats = Splats(
+        *(tensor.detach().contiguous() for tensor in (means2d, conics, opacities, features, depths, extents))
+    )
+    lists, packed = list_splats(splats, options)
+    image, transmittance = blend(means2d, conics, opacities, features, lists, packed, ALPHA_THRESHOLD)
+    return watch_absolute_gradients(image, transmittance, features, lists, packed, ALPHA_THRESHOLD, store)

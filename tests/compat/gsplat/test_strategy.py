@@ -1,0 +1,153 @@
+"""Strategies beside what their papers say, and trainings with them as gsplat's examples make them."""
+
+import math
+
+import pytest
+import torch
+
+from sehdr_warp.compat.gsplat import DefaultStrategy, MCMCStrategy, compute_relocation, rasterization
+from sehdr_warp.compat.gsplat.parameter_rows import change_rows, write_rows
+
+from .test_rendering import COUNT, scene
+
+
+def model(device="cpu", count=COUNT):
+    truth, place = scene(device, count)
+    photos = rasterization(*truth, *place)[0].detach()
+    generator = torch.Generator().manual_seed(1)
+    means = truth[0].detach() + 0.05 * torch.randn(count, 3, generator=generator).to(device)
+    values = {
+        "means": means,
+        "quats": truth[1].detach().clone(),
+        "scales": torch.full_like(means, -2.5),
+        "opacities": torch.zeros(count, device=device),
+        "colors": torch.full_like(means, 0.5),
+    }
+    params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in values.items()})
+    optimizers = {name: torch.optim.Adam([{"params": p, "lr": 0.01, "name": name}]) for name, p in params.items()}
+    return params, optimizers, place, photos
+
+
+STRATEGIES = {
+    "default": DefaultStrategy(refine_start_iter=10, refine_every=10, reset_every=1000, grow_grad2d=1e-5),
+    "absgrad": DefaultStrategy(
+        refine_start_iter=10, refine_every=10, reset_every=1000, grow_grad2d=2e-5, absgrad=True, revised_opacity=True,
+        refine_scale2d_stop_iter=20, prune_scale3d=1.0,
+    ),
+    "mcmc": MCMCStrategy(refine_start_iter=10, refine_every=10, cap_max=230),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("name", list(STRATEGIES))
+def test_a_training_as_gsplats_simple_trainer_makes_one(name, packed, device):
+    torch.manual_seed(0)
+    params, optimizers, place, photos = model(device)
+    strategy = STRATEGIES[name]
+    strategy.check_sanity(params, optimizers)
+    is_default = isinstance(strategy, DefaultStrategy)
+    state = strategy.initialize_state(scene_scale=1.0) if is_default else strategy.initialize_state()
+    losses, counts = [], []
+    for step in range(60):
+        colors, alphas, info = rasterization(
+            means=params["means"], quats=params["quats"], scales=torch.exp(params["scales"]),
+            opacities=torch.sigmoid(params["opacities"]), colors=params["colors"],
+            viewmats=place[0], Ks=place[1], width=place[2], height=place[3],
+            packed=packed, absgrad=is_default and strategy.absgrad, sparse_grad=False, rasterize_mode="classic",
+            distributed=False, camera_model="pinhole", with_ut=False, with_eval3d=False,
+        )  # fmt: skip
+        strategy.step_pre_backward(params=params, optimizers=optimizers, state=state, step=step, info=info)
+        loss = (colors - photos).abs().mean()
+        loss.backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        given = {"params": params, "optimizers": optimizers, "state": state, "step": step, "info": info}
+        if isinstance(strategy, DefaultStrategy):
+            strategy.step_post_backward(**given, packed=packed)
+        else:
+            strategy.step_post_backward(**given, lr=1e-6)
+        losses.append(float(loss.detach()))
+        counts.append(len(params["means"]))
+        assert all(len(value) == counts[-1] for value in params.values())
+        assert alphas.shape[-1] == 1
+    assert losses[-1] < 0.5 * losses[0]
+    assert counts[-1] != COUNT and (name != "mcmc" or counts[-1] == 230)
+
+
+def test_relocated_gaussians_look_as_the_one_did():
+    """Equation 9: n Gaussians one behind another have the opacity of the one, and its integral over a line."""
+    opacities, scales = torch.tensor([0.3, 0.9, 0.6]), torch.ones(3, 3)
+    ratios = torch.tensor([1, 2, 5])
+    shared, sizes = compute_relocation(opacities, scales, ratios)
+    torch.testing.assert_close(1 - (1 - shared) ** ratios, opacities)
+    assert float(sizes[0, 0]) == pytest.approx(1.0)
+    x = torch.linspace(-12, 12, 20001, dtype=torch.float64)
+    for opacity, own, size, ratio in zip(opacities, shared, sizes[:, 0], ratios, strict=True):
+        one = (opacity * torch.exp(-(x**2) / 2)).sum()
+        alpha = own.double() * torch.exp(-((x / size.double()) ** 2) / 2)
+        together = (1 - (1 - alpha) ** int(ratio)).sum()
+        assert float(together / one) == pytest.approx(1, rel=1e-4)
+
+
+def test_rows_change_with_their_optimizers():
+    params = {"means": torch.nn.Parameter(torch.arange(8.0).view(4, 2)), "fixed": torch.nn.Parameter(torch.ones(4))}
+    params["fixed"].requires_grad_(False)
+    optimizers = {"means": torch.optim.Adam([params["means"]])}
+    params["means"].square().sum().backward()
+    optimizers["means"].step()
+    moment = optimizers["means"].state[params["means"]]["exp_avg"].clone()
+    statistics = {"count": torch.arange(4.0), "scene_scale": 2.0}
+    kept = torch.tensor([True, False, True, True])
+    before = params["means"].detach().clone()
+    more = {"means": torch.full((2, 2), 9.0), "fixed": torch.zeros(2)}
+    change_rows(params, optimizers, statistics, kept, more, torch.tensor([0, 3]))
+    assert torch.equal(params["means"].detach(), torch.cat([before[kept], more["means"]]))
+    state = optimizers["means"].state[params["means"]]
+    assert torch.equal(state["exp_avg"], torch.cat([moment[kept], torch.zeros(2, 2)])) and int(state["step"]) == 1
+    assert optimizers["means"].param_groups[0]["params"] == [params["means"]] and not params["fixed"].requires_grad
+    assert statistics["count"].tolist() == [0, 2, 3, 0, 3] and statistics["scene_scale"] == 2.0
+    write_rows(params, optimizers, {"means": torch.zeros(5, 2)}, torch.tensor([0]))
+    assert bool((state["exp_avg"][0] == 0).all()) and bool((state["exp_avg"][1] != 0).any())
+
+
+def test_parts_of_a_split_lie_within_the_one_and_resets_lower_opacities():
+    torch.manual_seed(0)
+    params, optimizers, _, _ = model(count=1)
+    params["scales"].data[:] = torch.tensor([0.0, -3.0, -3.0])
+    strategy = DefaultStrategy(refine_every=1, refine_start_iter=0, reset_every=2, grow_scale3d=0.01, prune_scale3d=1e9)
+    state = strategy.initialize_state()
+    means2d = torch.zeros(1, 1, 2, requires_grad=True)
+    means2d.grad = torch.ones(1, 1, 2)
+    info = {
+        "means2d": means2d,
+        "radii": torch.ones(1, 1, 2, dtype=torch.int32),
+        "width": 10,
+        "height": 10,
+        "n_cameras": 1,
+    }
+    axis = params["quats"].detach()
+    strategy.step_post_backward(params, optimizers, state, 1, info)
+    assert len(params["means"]) == 2 and torch.equal(params["quats"].detach(), axis.repeat(2, 1))
+    torch.testing.assert_close(params["scales"].detach(), torch.tensor([[0.0, -3.0, -3.0]] * 2) - math.log(1.6))
+    info["radii"] = torch.ones(1, 2, 2, dtype=torch.int32)
+    info["means2d"] = torch.zeros(1, 2, 2, requires_grad=True)
+    info["means2d"].grad = torch.zeros(1, 2, 2)
+    strategy.step_post_backward(params, optimizers, state, 2, info)
+    torch.testing.assert_close(params["opacities"].detach().sigmoid(), torch.full((2,), 0.01))
+
+
+@pytest.mark.parametrize("strategy", [DefaultStrategy(), MCMCStrategy()])
+def test_parameters_that_do_not_fit_are_named(strategy):
+    params, optimizers, _, _ = model()
+    del optimizers["quats"]
+    with pytest.raises(ValueError, match="optimizers"):
+        strategy.check_sanity(params, optimizers)
+    params, optimizers, _, _ = model()
+    del params["scales"], optimizers["scales"]
+    with pytest.raises(ValueError, match="no parameter scales"):
+        strategy.check_sanity(params, optimizers)
+    params, optimizers, _, _ = model()
+    optimizers["means"].add_param_group({"params": [torch.nn.Parameter(torch.zeros(1))]})
+    with pytest.raises(ValueError, match="optimizer of means has 2 groups"):
+        strategy.check_sanity(params, optimizers)
