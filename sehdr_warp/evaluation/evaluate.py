@@ -219,7 +219,7 @@ class Evaluation:
             compared.append(("ldr", *pair))
         if truth is not None and (doubt := self.predictions.confidence(view)):
             self.ranking.add(doubt.confidence, hdr, truth, regions["well-exposed"], doubt.black, mask)
-        if truth is not None:
+        if truth is not None and view.camera.is_pinhole:
             true_light, light = (image.mean(2).cpu().numpy() for image in (truth, hdr * (scale or 1.0)))
             self.lights += light_regions(true_light, light, view.camera)
         for name in PROTOCOLS:

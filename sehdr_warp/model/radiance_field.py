@@ -16,6 +16,7 @@ from ..rasterizer.activations import opacities_with_penalty
 from ..response import Response
 from ..scene import Camera
 from ..scene.normalization import Normalization
+from ..scene.wide_camera import pixel_directions
 from .color_models import color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
@@ -31,6 +32,7 @@ class CameraTensors:
         world_to_camera: [4, 4].
         intrinsics: [4] fx, fy, cx, cy.
         position: [3] world coordinates.
+        directions: [H, W, 3] unit vectors along which the pixels look, world axes; None for a pinhole.
     """
 
     width: int
@@ -38,13 +40,21 @@ class CameraTensors:
     world_to_camera: Tensor
     intrinsics: Tensor
     position: Tensor
+    directions: Tensor | None = None
 
     @staticmethod
     def of(camera: Camera, device: torch.device | str) -> "CameraTensors":
         """Copy a camera to a device."""
         values = camera.world_to_camera, camera.intrinsics, camera.position
         tensors = (torch.tensor(value, dtype=torch.float32, device=device) for value in values)
-        return CameraTensors(camera.width, camera.height, *tensors)
+        directions = None
+        if not camera.is_pinhole:
+            # Pixels that show nothing do not count; they look along the axis.
+            along = np.nan_to_num(pixel_directions(camera)) @ camera.world_to_camera[:3, :3]
+            unseen = ~along.any(axis=2, keepdims=True)
+            along = np.where(unseen, camera.world_to_camera[2, :3], along)
+            directions = torch.tensor(along, dtype=torch.float32, device=device)
+        return CameraTensors(camera.width, camera.height, *tensors, directions)
 
 
 @dataclass(frozen=True)
@@ -220,10 +230,16 @@ class RadianceField(nn.Module):
 
     @torch.no_grad()
     def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:
-        """Render the HDR view of a camera, with depth as a fourth channel of the same rasterisation."""
+        """Render the HDR view of a camera, with depth as a fourth channel of the same rasterisation.
+
+        The depth of a camera that is not a pinhole is the distance from it.
+        """
         tensors = self.camera_tensors(camera)
         pose = tensors.world_to_camera
-        depth = self.gaussians.means @ pose[2, :3, None] + pose[2, 3]
+        if tensors.directions is None:
+            depth = self.gaussians.means @ pose[2, :3, None] + pose[2, 3]
+        else:
+            depth = (self.gaussians.means - tensors.position).norm(dim=1, keepdim=True)
         encoded, values = self.color_model.encoded, self._values(tensors.position, degree)
         colors = self.color_model.colors(values) if encoded else self._exposures(values)[1]
         rendering = self._rasterize(tensors, torch.cat([colors, depth], dim=1))
@@ -345,6 +361,8 @@ class RadianceField(nn.Module):
         """Rasterize features [N, C], with opacities [N] if the caller has already computed them."""
         gaussians = self.gaussians
         opacities = gaussians.opacities() if opacities is None else opacities
+        if camera.directions is not None:
+            return self._rasterize_wide(camera, camera.directions, features, opacities)
         return self.rasterizer(
             *(gaussians.means, gaussians.log_scales, gaussians.quaternions, opacities, features),
             *(camera.world_to_camera, camera.intrinsics, camera.width, camera.height),
@@ -352,6 +370,21 @@ class RadianceField(nn.Module):
             max_intersections=max_intersections,
             deterministic=self.deterministic,
         )
+
+    def _rasterize_wide(
+        self, camera: CameraTensors, directions: Tensor, features: Tensor, opacities: Tensor
+    ) -> Rendering:
+        """Rasterize features along a wide camera's directions; the result has no projected means."""
+        gaussians, focal = self.gaussians, float(camera.intrinsics[0])
+        image, transmittance = rasterize_directions(
+            *(gaussians.means, gaussians.log_scales, gaussians.quaternions, opacities, features),
+            *(camera.position, directions),
+            focal_length=focal,
+            pixel_angle=1 / focal,
+            antialiased=self.antialiased,
+        )
+        none = features.new_zeros(len(features), 2)
+        return Rendering(image, transmittance, none, none[:, 0], none, 0)
 
 
 def _unpremultiply(blended: Tensor, alpha: Tensor) -> Tensor:

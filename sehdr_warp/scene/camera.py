@@ -1,9 +1,13 @@
 """The pinhole camera that every part of the package shares."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+
+FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
+"""COLMAP's fisheye models that are radial."""
+PROJECTIONS = ("pinhole", "equirectangular", *FISHEYES)
 
 
 def limited_size(width: int, height: int, max_size: int | None) -> tuple[int, int]:
@@ -29,7 +33,7 @@ def look_at(position, target=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0)) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Camera:
-    """An undistorted pinhole camera in COLMAP's (OpenCV's) convention: +x right, +y down, +z into the scene.
+    """A camera in COLMAP's (OpenCV's) convention: +x right, +y down, +z into the scene. Almost all are pinholes.
 
     A world point X lands at pixel (fx x/z + cx, fy y/z + cy) with (x, y, z) = (world_to_camera @ [X, 1])[:3]; the
     centre of the top left pixel is at (0.5, 0.5).
@@ -42,6 +46,10 @@ class Camera:
         cx: column of the principal point in pixels.
         cy: row of the principal point in pixels.
         world_to_camera: [4, 4] float64, rigid.
+        projection: "pinhole"; "equirectangular", of the whole sphere with the camera's axis in the middle; or a fisheye
+            model of COLMAP, of a lens too wide for a pinhole. Others than pinholes look along the directions of
+            wide_camera.pixel_directions(), and fx is their pixels per radian at the axis.
+        distortion: the fisheye model's parameters behind the principal point.
 
     Raises:
         ValueError: if a size or focal length is not positive, a value is not finite or the pose is not rigid.
@@ -54,6 +62,8 @@ class Camera:
     cx: float
     cy: float
     world_to_camera: np.ndarray
+    projection: str = "pinhole"
+    distortion: tuple[float, ...] = ()
 
     def __post_init__(self):
         """Check the values and copy the pose."""
@@ -64,6 +74,10 @@ class Camera:
             raise ValueError(f"image size {self.width} x {self.height} is not positive")
         if not np.isfinite(self.intrinsics).all():
             raise ValueError(f"camera fx, fy, cx, cy = {self.intrinsics.tolist()} are not finite")
+        if self.projection not in PROJECTIONS:
+            raise ValueError(f"projection {self.projection!r:.40} is not one of {', '.join(PROJECTIONS)}")
+        if not np.isfinite(self.distortion).all():
+            raise ValueError("distortion is not finite")
         if self.fx <= 0 or self.fy <= 0:
             raise ValueError(f"focal lengths ({self.fx}, {self.fy}) are not positive")
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
@@ -73,6 +87,11 @@ class Camera:
             raise ValueError("the rotation of world_to_camera is not a proper rotation")
         if not np.allclose(pose[3], (0, 0, 0, 1)):
             raise ValueError("the last row of world_to_camera is not (0, 0, 0, 1)")
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether pixels are on a plane in front of the camera."""
+        return self.projection == "pinhole"
 
     @property
     def camera_to_world(self) -> np.ndarray:
@@ -95,7 +114,8 @@ class Camera:
     def resized(self, width: int, height: int) -> "Camera":
         """Return the same view at another size; principal point and focal lengths scale with each axis."""
         sx, sy = width / self.width, height / self.height
-        return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.world_to_camera)
+        scaled = {"fx": self.fx * sx, "fy": self.fy * sy, "cx": self.cx * sx, "cy": self.cy * sy}
+        return replace(self, width=width, height=height, **scaled)
 
     def within(self, max_size: int | None) -> "Camera":
         """Return the same view with at most max_size pixels on its longest side."""
@@ -104,7 +124,9 @@ class Camera:
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON, which from_dict reads back exactly."""
         names = ("width", "height", "fx", "fy", "cx", "cy")
-        return {name: getattr(self, name) for name in names} | {"world_to_camera": self.world_to_camera.tolist()}
+        values = {name: getattr(self, name) for name in names} | {"world_to_camera": self.world_to_camera.tolist()}
+        wide = {"projection": self.projection, "distortion": list(self.distortion)}
+        return values if self.projection == "pinhole" else values | wide
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "Camera":
@@ -116,4 +138,6 @@ class Camera:
         """
         width, height = (int(values[name]) for name in ("width", "height"))
         fx, fy, cx, cy = (float(values[name]) for name in ("fx", "fy", "cx", "cy"))
-        return Camera(width, height, fx, fy, cx, cy, np.array(values["world_to_camera"], dtype=np.float64))
+        pose = np.array(values["world_to_camera"], dtype=np.float64)
+        distortion = tuple(float(value) for value in values.get("distortion", ()))
+        return Camera(width, height, fx, fy, cx, cy, pose, str(values.get("projection", "pinhole")), distortion)

@@ -67,7 +67,7 @@ def _of_json(path: Path) -> list[tuple[str, Camera]]:
         return _listed(path, values["camera_path"], lambda e, i: (f"{i:04d}", _nerfstudio(e, i, values, path, back)))
     if "frames" in values:
         return [
-            (Path(name).stem, frame_lens(values, frame, None, path).pinhole(frame_pose(frame, path, name)))
+            (Path(name).stem, frame_lens(values, frame, None, path).camera(frame_pose(frame, path, name)))
             for name, frame in frames_of(values, path)
         ]
     raise InputError(path, "has none of cameras, camera_path and frames", "export cameras as the manual describes")
@@ -135,4 +135,4 @@ def _of_colmap(folder: Path) -> list[tuple[str, Camera]]:
     if source is None:
         raise InputError(folder, "holds no COLMAP model", "give cameras.bin or .txt and its kin, or a camera file")
     images = sorted(read_model(source).images, key=lambda image: natural_key(image.name))
-    return [(Path(image.name).stem, image.lens.pinhole(image.world_to_camera)) for image in images]
+    return [(Path(image.name).stem, image.lens.camera(image.world_to_camera)) for image in images]

@@ -7,14 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from .camera import Camera
+from .camera import FISHEYES, Camera
+from .wide_camera import WIDEST_PINHOLE, fisheye_angles
 
 # COLMAP's camera models by their number in binary files: name, number of parameters (src/colmap/sensor/models.h).
 CAMERA_MODELS = dict(enumerate((
     ("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8), ("OPENCV_FISHEYE", 8),
     ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5), ("THIN_PRISM_FISHEYE", 12),
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16), ("SIMPLE_DIVISION", 4), ("DIVISION", 5), ("SIMPLE_FISHEYE", 3), ("FISHEYE", 4),
-    ("EUCM", 6),
+    ("EUCM", 6), ("EQUIRECTANGULAR", 2),
 )))  # fmt: skip
 PARAMETER_COUNTS = dict(CAMERA_MODELS.values())
 
@@ -23,6 +24,8 @@ _ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEY
 # Models that are pinholes if every parameter after the principal point, if there is one, is zero.
 _NEUTRAL_AT_ZERO = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV",
                     "SIMPLE_DIVISION", "DIVISION"}  # fmt: skip
+_SPHERE = "EQUIRECTANGULAR"
+_SKEW = 0.01  # Part of its width by which a panorama may differ from twice its height
 _MAX_SIDE = 1 << 16
 _BAND_VALUES = 1 << 24  # Values that are averaged at one time, 64 MB
 
@@ -60,6 +63,9 @@ class Lens:
             problem = f"camera size {self.width} x {self.height} is not in 1..{_MAX_SIDE}"
         elif not np.isfinite(self.params).all():
             problem = f"camera parameters {self.params} are not finite"
+        elif self.model == _SPHERE and abs(self.width - 2 * self.height) > max(2.0, _SKEW * self.width):
+            problem = f"equirectangular photos are {self.width} x {self.height}, not twice as wide as high"
+            remedy = "export whole panoramas (360 x 180 degrees)"
         elif min(self.focal) <= 0:
             problem = f"focal lengths {self.focal} are not positive"
         if problem:
@@ -67,18 +73,40 @@ class Lens:
 
     @property
     def focal(self) -> tuple[float, float]:
-        """Focal lengths (fx, fy) in pixels."""
+        """Focal lengths (fx, fy) in pixels; of a panorama pixels per radian."""
+        if self.model == _SPHERE:
+            return (self.width / (2 * np.pi),) * 2
         return (self.params[0], self.params[0]) if self.model in _ONE_FOCAL else (self.params[0], self.params[1])
 
     @property
     def centre(self) -> tuple[float, float]:
         """Principal point (cx, cy) in pixels."""
+        if self.model == _SPHERE:
+            return self.width / 2, self.height / 2
         first = 1 if self.model in _ONE_FOCAL else 2
         return self.params[first], self.params[first + 1]
 
     @property
+    def projection(self) -> str:
+        """What the photos are used as, see Camera.projection: a fisheye lens keeps its own if it sees too much."""
+        if self.model == _SPHERE:
+            return "equirectangular"
+        if self.model not in FISHEYES:
+            return "pinhole"
+        (fx, _), (cx, _) = self.focal, self.centre
+        radii = np.array([cx, self.width - cx]) / fx
+        angle = float(np.degrees(fisheye_angles(self.model, self._distortion, radii).sum()))
+        return self.model if not angle <= WIDEST_PINHOLE else "pinhole"
+
+    @property
+    def _distortion(self) -> tuple[float, ...]:
+        return tuple(self.params[3 if self.model in _ONE_FOCAL else 4 :])
+
+    @property
     def is_pinhole(self) -> bool:
         """True if the photos need no undistortion."""
+        if self.projection != "pinhole":
+            return True
         first = 3 if self.model in _ONE_FOCAL else 4
         return self.model in _NEUTRAL_AT_ZERO and not any(self.params[first:])
 
@@ -86,15 +114,19 @@ class Lens:
         """Return the same lens for images of another size; distortion parameters do not depend on it."""
         sx, sy = width / self.width, height / self.height
         params = list(self.params)
-        if self.model in _ONE_FOCAL:
+        if self.model == _SPHERE:
+            params = [float(width), float(height)]
+        elif self.model in _ONE_FOCAL:
             params[0:3] = params[0] * (sx + sy) / 2, params[1] * sx, params[2] * sy
         else:
             params[0:4] = params[0] * sx, params[1] * sy, params[2] * sx, params[3] * sy
         return Lens(self.model, width, height, tuple(params), self.source)
 
-    def pinhole(self, world_to_camera: np.ndarray) -> Camera:
-        """Return the camera without its distortion parameters, at the same size."""
-        return Camera(self.width, self.height, *self.focal, *self.centre, world_to_camera)
+    def camera(self, world_to_camera: np.ndarray) -> Camera:
+        """Return the camera at a pose, at the photos' size; without distortion unless the lens is too wide for that."""
+        (fx, fy), (cx, cy), projection = self.focal, self.centre, self.projection
+        distortion = self._distortion if projection in FISHEYES else ()
+        return Camera(self.width, self.height, fx, fy, cx, cy, world_to_camera, projection, distortion)
 
 
 class Undistortion:

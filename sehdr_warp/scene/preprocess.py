@@ -23,6 +23,7 @@ from .names import unique_names
 from .photo_file import PhotoKeeper
 from .photos import photo_sizes, read_photo
 from .types import Scene, View, codes_of
+from .wide_camera import solid_angles
 
 if TYPE_CHECKING:
     from ..response import Response
@@ -131,7 +132,7 @@ class _Preprocessor:
 
     def view(self, record: ImageRecord, name: str) -> View:
         lens, oriented = (record.lens, False) if record.derived else fitted_lens(record)
-        working, undistortion, full = lens, None, lens.pinhole(record.world_to_camera)
+        working, undistortion, full = lens, None, lens.camera(record.world_to_camera)
         if not (lens.is_pinhole or record.derived):
             # Distortion is smooth: undistorting at twice the final size or more is exact to a fraction of a pixel.
             factor = 1 if self.max_size is None else max(lens.width, lens.height) // (2 * self.max_size)
@@ -156,7 +157,7 @@ class _Preprocessor:
         stored = None if record.mask is None else _fitted_mask(record.mask, lens, oriented)
         self.mask_shares[name] = None if stored is None else float(stored.mean())
         if record.derived and hdr is not None:  # Compute HDR-NeRF's photo from the truth at the final size.
-            mask = None if stored is None else warped(stored)
+            mask = _weighted(None if stored is None else warped(stored), camera)
             codes = codes_of(reinhard_gamma(hdr * time), 8)
             return View(name, codes, camera, time, split, mask, hdr, record.image)
         encoded = read_codes(record, oriented=oriented)
@@ -170,7 +171,7 @@ class _Preprocessor:
         if undistortion or alpha is not None or (camera.width, camera.height) != (lens.width, lens.height):
             codes, above = self._averaged(codes, alpha, above, warped)
         mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32) if masks else None
-        mask = None if mask is None or mask.min() >= 1 - 1e-6 else mask
+        mask = _weighted(None if mask is None or mask.min() >= 1 - 1e-6 else mask, camera)
         return View(
             name,
             codes,
@@ -216,6 +217,14 @@ class _Preprocessor:
             known = (averaged == 65535) & (clipped < _LEAST_CLIPPED)
             above = np.where(known, np.maximum(light / white, 1), 0).astype(np.float16) if known.any() else None
         return averaged, above
+
+
+def _weighted(mask: np.ndarray | None, camera: Camera) -> np.ndarray | None:
+    """Return the mask of a view; pixels of a panorama or a wide fisheye photo count by their solid angle."""
+    if camera.is_pinhole:
+        return mask
+    weights = solid_angles(camera)
+    return weights if mask is None else weights * mask
 
 
 def _shrunk(image: np.ndarray, to: Lens | Camera, values: Callable[[slice], np.ndarray] | None = None) -> np.ndarray:

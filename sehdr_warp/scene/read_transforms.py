@@ -183,6 +183,8 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
         if image is None:
             raise InputError(path, "states no image size", "add w and h")
         width, height = photo_sizes(image)[0]
+    if stated.get("camera_model") == "EQUIRECTANGULAR":
+        return Lens("EQUIRECTANGULAR", int(width), int(height), (width, height), path)
     fx, fy = focal("fl_x", "camera_angle_x", width), focal("fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
         raise InputError(path, "states no focal length", "add camera_angle_x (radians, below pi) or fl_x (pixels)")
@@ -193,7 +195,11 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
     if model == "OPENCV_FISHEYE" or stated.get("is_fisheye") is True:
         model, bent = "OPENCV_FISHEYE", (k1, k2, k3, k4)
     elif model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL"):
-        raise InputError(path, f"camera_model {model!r:.40} is not supported", "use OPENCV, OPENCV_FISHEYE or PINHOLE")
+        raise InputError(
+            path,
+            f"camera_model {model!r:.40} is not supported",
+            "use OPENCV, OPENCV_FISHEYE, PINHOLE or EQUIRECTANGULAR",
+        )
     elif k4:
         raise InputError(path, f"k4 = {k4} of a perspective camera is not supported", "undistort the images first")
     elif k3:

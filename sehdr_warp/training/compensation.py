@@ -104,10 +104,14 @@ class Compensation:
 
 
 def estimates_compensation(scene: Scene, config: Config, response: Response) -> bool:
-    """Return whether a training estimates a compensation: if allowed, and if it matches points and knows exposures."""
+    """Return whether a training estimates a compensation.
+
+    It does if that is allowed, if it matches points between pinhole photos, and if the response is known.
+    """
     option = config.model.exposure_compensation
     allowed = option in ("auto", "always") or (option == "unstated" and not scene.exposure_times_known)
-    return allowed and config.model.initial_density > 0 and not response.learnable
+    wide = any(not view.camera.is_pinhole for view in scene.train_views)
+    return allowed and not wide and config.model.initial_density > 0 and not response.learnable
 
 
 def estimate_compensation(scene: Scene, config: Config, response: Response, device: torch.device | str) -> Compensation:

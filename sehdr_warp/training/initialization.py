@@ -20,6 +20,7 @@ from ..runs.run import assemble_field
 from ..scene import Scene, View
 from ..scene.load import sample_photos, select_response_for
 from ..scene.normalization import Normalization, normalization_of
+from ..scene.wide_camera import perspective_views
 from ..splats import read_gaussians
 from .densification import FARTHEST, gaussian_budget
 from .matching import Matcher
@@ -83,6 +84,7 @@ def make_field(
     check_views(scene)
     normalization = normalization_of(scene)
     scene = normalization.scene(scene)
+    scene = replace(scene, views=perspective_views(scene.train_views))
     rng = np.random.default_rng(config.seed)
     if config.model.init_file:
         gaussians = start_gaussians(scene, config, response, rng, normalization)
@@ -190,7 +192,7 @@ def start_count(config: Config, pixels: int) -> int:
 
 def make_matcher(scene: Scene, response: Response, device: torch.device | str) -> Matcher:
     """Of the training views, with depths around those of the scene's points or of where the cameras look."""
-    views = scene.train_views
+    views = perspective_views(scene.train_views)
     points = scene.points[:: -(-len(scene.points) // MOST_DEPTHS) or 1]
     homogeneous = np.c_[points, np.ones(len(points))]
     depths = [homogeneous[pixels_of(points, view)[2]] @ view.camera.world_to_camera[2] for view in views]

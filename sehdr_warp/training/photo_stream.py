@@ -71,8 +71,8 @@ class PhotoStream:
         views, self._source = source.views, source
         first = source[0]
         kinds = {(v.camera.width, v.camera.height, source.truth and v.hdr is not None) for v in views}
-        if len(kinds) > 1:
-            raise ValueError("photos of several sizes, or only some with truth, have no common place")
+        if len(kinds) > 1 or first.camera.directions is not None:
+            raise ValueError("photos of several sizes, or only some with truth, or of panoramas have no common place")
         self._device = first.target.codes.device
         self._cuda = self._device.type == "cuda"
         masked = any(view.mask is not None for view in views)

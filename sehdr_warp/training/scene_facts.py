@@ -8,6 +8,7 @@ import numpy as np
 from ..scene import Scene, View, encoded_values
 from ..scene.exposure import are_camera_jpegs
 from ..scene.linear_photos import kind_of
+from ..scene.wide_camera import perspective_views
 from .initialization import focus_distance, pixels_of, points_on_rays
 
 PROBES = 2000  # Places at which overlap and visibility are measured
@@ -57,7 +58,7 @@ class SceneFacts:
 
 def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     """The facts of a scene with at least one training view; takes a second or so, draws its probes from a seed."""
-    views = scene.train_views
+    photos, views = scene.train_views, perspective_views(scene.train_views)
     rng = np.random.default_rng(seed)
     probes = drawn = points_on_rays(views, PROBES, focus_distance(views), rng)
     if len(scene.points) >= FEWEST_POINTS:
@@ -68,10 +69,10 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     clipped, black, mean, square, _ = map(float, figures.mean(0))
     gaze, ahead = _gaze(np.stack([view.camera.world_to_camera for view in views]))
     return SceneFacts(
-        photos=len(views),
-        pixels=sum(view.camera.width * view.camera.height for view in views),
-        from_camera=are_camera_jpegs([view.source for view in views]),
-        truths=sum(view.hdr is not None for view in views),
+        photos=len(photos),
+        pixels=sum(view.camera.width * view.camera.height for view in photos),
+        from_camera=are_camera_jpegs([view.source for view in photos]),
+        truths=sum(view.hdr is not None for view in photos),
         points=len(scene.points),
         seen=float(shown[shown > 0].mean()) if shown.any() else 0.0,
         overlap=max(float((count >= 2).mean()) for count in (shown, drawn)),

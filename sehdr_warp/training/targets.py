@@ -54,9 +54,9 @@ class ViewStack:
 
     @staticmethod
     def of(views: Sequence[TrainingView]) -> "ViewStack | None":
-        """Stack views; returns None if their sizes differ or only some have HDR truth."""
+        """Stack views; returns None if their sizes differ, one is not a pinhole or only some have HDR truth."""
         kinds = {(view.camera.width, view.camera.height, view.target.exposure_truth is None) for view in views}
-        if len(kinds) > 1:
+        if len(kinds) > 1 or any(view.camera.directions is not None for view in views):
             return None
         cameras, targets, times = zip(*((v.camera, v.target, v.exposure_time) for v in views), strict=True)
         masks, truths = [t.mask for t in targets], [t.exposure_truth for t in targets]

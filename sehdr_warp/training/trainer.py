@@ -33,6 +33,7 @@ from .photo_order import PhotoOrder
 from .photo_stream import PhotoStream, make_view_source
 from .ranks import Ranks
 from .targets import TrainingView, ViewStack, largest_truth, photo_source
+from .wide_views import has_wide_views
 
 CHECK_EVERY = 20  # Iterations between looks at what steps count on the device
 COMPARE_EVERY = 500  # Iterations between looks at whether all ranks still have the same Gaussians
@@ -72,6 +73,7 @@ class Trainer:
         self.densification = make_densification(config, self.extent, pixels, places)
         self._averaging = MovingAverage(config, self.densification.stop)
         self._views = scene.train_views
+        self._seeding = None if has_wide_views(scene, config) else self._births  # By pixels of pinhole photos
         self._matcher = matcher or cache(partial(make_matcher, scene, field.response, self.device))
         # Where light is compared, nothing needs the photo encoded.
         self._encoded = not compares_exposures(config.loss, field)
@@ -183,7 +185,7 @@ class Trainer:
         """Changes the Gaussians where the iteration is one for it: rank 0 does, for all; whether there are others or
         more now."""
         gaussians, strategy, ranks = self.field.gaussians, self.densification, self.ranks
-        given = self.iteration, gaussians, self.optimizer, self._generator, self._births
+        given = self.iteration, gaussians, self.optimizer, self._generator, self._seeding
         if ranks is None:
             changed = strategy.change(*given)
         elif not strategy.changes_at(self.iteration):

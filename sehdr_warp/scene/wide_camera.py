@@ -1,0 +1,150 @@
+"""Cameras that no pinhole stands for: panoramas of the whole sphere, and fisheye lenses wider than a plane can show.
+
+Their pixels look along directions. A panorama's pixels cover less and less of the sphere towards its poles, so each
+counts by its solid angle. What compares photos by pinhole cameras (matching points, structure from motion) sees views
+that are cut from them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from .camera import Camera
+from .types import View, codes_of
+
+FACE_ANGLE = 90.0
+"""Degrees that a view cut from a wide photo shows."""
+_LEAST_FILLED = 0.3  # Part of a cut view that its photo must show
+WIDEST_PINHOLE = 110.0
+"""Degrees: a fisheye lens that sees more keeps its own projection. Undistorted to a pinhole, its border would be lost
+or stretched."""
+
+
+def pixel_directions(camera: Camera) -> np.ndarray:
+    """Return [H, W, 3] float64 unit vectors along which pixels look, camera axes; NaN where the lens shows nothing."""
+    return _directions(camera.width, camera.height, camera.projection, tuple(camera.intrinsics), camera.distortion)
+
+
+@lru_cache(maxsize=4)
+def _directions(width: int, height: int, projection: str, intrinsics: tuple, distortion: tuple) -> np.ndarray:
+    columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    if projection == "equirectangular":
+        across, up = (columns / width - 0.5) * 2 * np.pi, (0.5 - rows / height) * np.pi
+        parts = np.sin(across) * np.cos(up), -np.sin(up), np.cos(across) * np.cos(up)
+        return np.stack(parts, axis=2)
+    fx, fy, cx, cy = intrinsics
+    if projection == "pinhole":
+        rays = np.stack([(columns - cx) / fx, (rows - cy) / fy, np.ones_like(rows)], axis=2)
+        return rays / np.linalg.norm(rays, axis=2, keepdims=True)
+    return _fisheye_directions(projection, (columns - cx) / fx, (rows - cy) / fy, distortion)
+
+
+def _fisheye_directions(projection: str, x: np.ndarray, y: np.ndarray, distortion: tuple) -> np.ndarray:
+    """Return the directions of normalized fisheye coordinates: theta_d (cos, sin) of a radial polynomial.
+
+    pycolmap returns x / z and y / z, which end at 90 degrees from the axis; a fisheye lens goes on.
+    """
+    radius = np.hypot(x, y)
+    angle = fisheye_angles(projection, distortion, radius)
+    scale = np.where(radius > 1e-12, np.sin(angle) / np.maximum(radius, 1e-12), 1.0)
+    return np.stack([x * scale, y * scale, np.cos(angle)], axis=2)
+
+
+def fisheye_angles(projection: str, distortion: tuple, radius: np.ndarray) -> np.ndarray:
+    """Return the angles from the axis, radians, that a fisheye lens shows at radii in focal lengths; NaN beyond."""
+    # By a table of theta_d(theta), which must rise: what lies behind its first maximum is not seen.
+    theta = np.linspace(0, np.pi, 8192)
+    bent = theta * np.polynomial.polynomial.polyval(theta**2, [1.0, *_radial_terms(projection, distortion)])
+    falling = np.flatnonzero(np.diff(bent) <= 0)
+    last = int(falling[0]) if len(falling) else len(theta) - 1
+    return np.interp(radius, bent[: last + 1], theta[: last + 1], right=np.nan)
+
+
+def _radial_terms(projection: str, distortion: tuple) -> tuple[float, ...]:
+    """Return the coefficients of theta^3, theta^5, ... of a fisheye model."""
+    counts = {"OPENCV_FISHEYE": 4, "SIMPLE_RADIAL_FISHEYE": 1, "RADIAL_FISHEYE": 2}
+    return tuple(distortion[: counts.get(projection, 0)])
+
+
+def solid_angles(camera: Camera) -> np.ndarray:
+    """Return [H, W] float32 solid angles of the pixels, 1 for the largest; 0 where the lens shows nothing."""
+    if camera.projection == "equirectangular":
+        rows = np.sin((np.arange(camera.height) + 0.5) / camera.height * np.pi)
+        return np.repeat(rows[:, None] / rows.max(), camera.width, 1).astype(np.float32)
+    directions = pixel_directions(camera)
+    across, down = np.gradient(directions, axis=1), np.gradient(directions, axis=0)
+    angles = np.nan_to_num(np.linalg.norm(np.cross(across, down), axis=2))
+    return (angles / max(float(angles.max()), 1e-12)).astype(np.float32)
+
+
+def pixels_of_directions(directions: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return [..., 2] row and column indices (the first pixel's center is 0) at which a camera shows directions
+    [..., 3] in its axes; NaN for what it does not show."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    if camera.projection == "equirectangular":
+        column = (np.arctan2(x, z) / (2 * np.pi) + 0.5) * camera.width - 0.5
+        row = (0.5 - np.arctan2(-y, np.hypot(x, z)) / np.pi) * camera.height - 0.5
+        return np.stack([row, column], axis=-1)
+    across = np.hypot(x, y)
+    theta = np.arctan2(across, z)
+    terms = _radial_terms(camera.projection, camera.distortion)
+    bent = theta * np.polynomial.polynomial.polyval(theta**2, [1.0, *terms])
+    scale = np.where(across > 1e-12, bent / np.maximum(across, 1e-12), 1.0)
+    column, row = camera.fx * x * scale + camera.cx - 0.5, camera.fy * y * scale + camera.cy - 0.5
+    inside = (column >= -0.5) & (column <= camera.width - 0.5) & (row >= -0.5) & (row <= camera.height - 0.5)
+    return np.where(inside[..., None], np.stack([row, column], axis=-1), np.nan)
+
+
+def perspective_views(views: Sequence[View], size: int | None = None) -> tuple[View, ...]:
+    """Return pinhole views for what needs them: pinholes as they are, others cut into faces of FACE_ANGLE degrees.
+
+    Args:
+        views: of any cameras.
+        size: of a face in pixels; by default that of the photo's resolution at its axis.
+    """
+    return tuple(face for view in views for face in ((view,) if view.camera.is_pinhole else faces_of(view, size)))
+
+
+def faces_of(view: View, size: int | None = None) -> list[View]:
+    """Return pinhole views cut from a wide view: forward, right, back, left, up and down, where it shows enough."""
+    from scipy.ndimage import map_coordinates
+
+    camera = view.camera
+    count = size or max(16, round(2 * camera.fx * np.tan(np.radians(FACE_ANGLE / 2))))
+    focal = count / 2 / np.tan(np.radians(FACE_ANGLE / 2))
+    image, faces = view.image, []
+    mask = None if view.mask is None else np.clip(view.mask / np.maximum(solid_angles(camera), 1e-6), 0, 1)
+    for number, turn in enumerate(face_rotations()):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn, 0
+        face = Camera(count, count, focal, focal, count / 2, count / 2, pose @ camera.world_to_camera)
+        # A face's axes are turn times the photo's.
+        places = pixels_of_directions(pixel_directions(face) @ turn, camera)
+        shown = np.isfinite(places).all(axis=2)
+        if shown.mean() < _LEAST_FILLED:
+            continue
+        wrap = camera.projection == "equirectangular"
+        stored = np.pad(image, ((0, 0), (1, 1), (0, 0)), mode="wrap") if wrap else image
+        rows, columns = np.where(shown[..., None], places, 0).transpose(2, 0, 1)
+        at = np.stack([rows, columns + wrap])
+        codes = np.stack([map_coordinates(stored[..., c], at, order=1, mode="nearest") for c in range(3)], axis=2)
+        counted = shown.astype(np.float32)
+        if mask is not None:
+            counted *= map_coordinates(mask, np.stack([rows, columns]), order=0, mode="nearest")
+        part = None if counted.min() >= 1 else counted
+        codes = codes_of(codes, 8 if view.codes.dtype == np.uint8 else 16)
+        name = f"{view.name}_{number}"
+        faces.append(replace(view, name=name, codes=codes, camera=face, mask=part, hdr=None, light_above_white=None))
+    return faces
+
+
+def face_rotations() -> np.ndarray:
+    """Return [6, 3, 3] rotations from the axes of a photo to those of its faces: front, right, back, left, up, down."""
+    turns = []
+    for yaw in np.radians([0, 90, 180, 270]):
+        c, s = np.cos(yaw), np.sin(yaw)
+        turns.append([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+    turns += [[[1, 0, 0], [0, 0, 1], [0, -1, 0]], [[1, 0, 0], [0, 0, -1], [0, 1, 0]]]
+    return np.rint(np.array(turns))

@@ -1,0 +1,138 @@
+"""Panoramas and wide fisheye lenses: where their pixels look, what they count, and how they are loaded."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.scene import load_scene
+from sehdr_warp.scene.camera import Camera
+from sehdr_warp.scene.lens import Lens
+from sehdr_warp.scene.types import View, codes_of
+from sehdr_warp.scene.wide_camera import (
+    faces_of,
+    perspective_views,
+    pixel_directions,
+    pixels_of_directions,
+    solid_angles,
+)
+
+WIDTH, HEIGHT = 128, 64
+FISHEYE = (40.0, 41.0, 64.0, 48.0, 0.02, -0.01, 0.003, 0.0)
+
+
+def panorama(pose=None):
+    return Lens("EQUIRECTANGULAR", WIDTH, HEIGHT, (WIDTH, HEIGHT), "test").camera(np.eye(4) if pose is None else pose)
+
+
+def fisheye():
+    return Lens("OPENCV_FISHEYE", 128, 96, FISHEYE, "test").camera(np.eye(4))
+
+
+def colored(camera):
+    """A view whose colors are the directions of its pixels, world axes."""
+    along = np.nan_to_num(pixel_directions(camera)) @ camera.world_to_camera[:3, :3]
+    return View("a", codes_of((along + 1) / 2, 16), camera, 1.0, "train", solid_angles(camera))
+
+
+@pytest.mark.parametrize("camera", [panorama(), fisheye()], ids=["panorama", "fisheye"])
+def test_pixels_and_directions_are_inverse(camera):
+    places = pixels_of_directions(pixel_directions(camera), camera)
+    shown = np.isfinite(places).all(2)
+    assert shown.mean() > 0.95
+    np.testing.assert_allclose(places[shown], np.stack(np.mgrid[: camera.height, : camera.width], 2)[shown], atol=1e-4)
+
+
+def test_directions_are_those_of_colmap():
+    pycolmap = pytest.importorskip("pycolmap")
+    for camera, params in ((panorama(), [WIDTH, HEIGHT]), (fisheye(), FISHEYE)):
+        model = "EQUIRECTANGULAR" if camera.projection == "equirectangular" else camera.projection
+        theirs = pycolmap.Camera(model=model, width=camera.width, height=camera.height, params=list(params))
+        column, row = np.meshgrid(np.arange(52, 76) + 0.5, np.arange(26, 38) + 0.5)
+        expected = theirs.cam_from_img(np.stack([column.ravel(), row.ravel()], 1))
+        ours = pixel_directions(camera)[26:38, 52:76].reshape(-1, 3)
+        np.testing.assert_allclose(ours[:, :2] / ours[:, 2:], expected, atol=1e-6)
+
+
+def test_solid_angles_add_up_to_the_sphere():
+    camera = panorama()
+    weights = solid_angles(camera)
+    assert weights.max() == pytest.approx(1) and weights[0, 0] < 0.05
+    # A pixel at the equator covers (2 pi / W)^2.
+    assert weights.sum() * (2 * np.pi / WIDTH) ** 2 == pytest.approx(4 * np.pi, rel=2e-3)
+
+
+@pytest.mark.parametrize("camera, count", [(panorama(), 6), (fisheye(), 1)], ids=["panorama", "fisheye"])
+def test_cut_views_show_the_same_directions(camera, count):
+    faces = faces_of(colored(camera))
+    assert len(faces) >= count and all(face.camera.is_pinhole for face in faces)
+    for face in faces:
+        along = pixel_directions(face.camera) @ face.camera.world_to_camera[:3, :3]
+        shown = np.ones(along.shape[:2], bool) if face.mask is None else face.mask > 0.99
+        assert np.abs(face.image - (along + 1) / 2)[shown].max() < 0.02, face.name
+
+
+def test_a_mask_of_a_panorama_reaches_its_cut_views():
+    view = colored(panorama())
+    masked = view.mask.copy()
+    masked[:, : WIDTH // 2] = 0
+    faces = {face.name: face for face in perspective_views([View("a", view.codes, view.camera, 1.0, "train", masked)])}
+    # The left half of the picture is what lies to the left of the camera's axis.
+    assert faces["a_1"].mask is None or faces["a_1"].mask.mean() > 0.95
+    assert faces["a_3"].mask.mean() < 0.05 and 0.4 < faces["a_0"].mask.mean() < 0.6
+
+
+def test_narrow_fisheye_photos_are_undistorted():
+    narrow = Lens("OPENCV_FISHEYE", 128, 96, (120.0, 120.0, *FISHEYE[2:]), "test")
+    assert narrow.projection == "pinhole" and not narrow.is_pinhole
+    assert fisheye().projection == "OPENCV_FISHEYE"
+
+
+def test_cameras_are_written_and_read():
+    for camera in (panorama(), fisheye()):
+        again = Camera.from_dict(json.loads(json.dumps(camera.to_dict())))
+        assert (again.projection, again.distortion) == (camera.projection, camera.distortion)
+    half = fisheye().resized(64, 48)
+    np.testing.assert_allclose(
+        pixel_directions(half)[10, 10], pixel_directions(fisheye())[20:22, 20:22].mean((0, 1)), atol=2e-3
+    )
+
+
+def write_set(folder, lens, size=(WIDTH, HEIGHT), mask=None):
+    frames = []
+    for i in range(4):
+        pixels = np.random.default_rng(i).integers(20, 230, (size[1], size[0], 3), np.uint8)
+        Image.fromarray(pixels).save(folder / f"{i}.png")
+        frames.append({"file_path": f"{i}.png", "transform_matrix": np.eye(4).tolist()})
+        if mask is not None:
+            Image.fromarray(mask).save(folder / f"mask_{i}.png")
+            frames[-1]["mask_path"] = f"mask_{i}.png"
+    (folder / "transforms.json").write_text(json.dumps({"w": size[0], "h": size[1], "frames": frames} | lens))
+    return folder
+
+
+def test_panoramas_of_nerfstudio_are_loaded_whole(tmp_path):
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[HEIGHT * 3 // 4 :] = 0  # The photographer
+    scene = load_scene(
+        write_set(tmp_path, {"camera_model": "EQUIRECTANGULAR"}, mask=mask), response="srgb", max_size=64
+    )
+    view = scene.views[0]
+    assert view.camera.projection == "equirectangular" and view.codes.shape == (32, 64, 3)
+    np.testing.assert_allclose(view.mask[:24], solid_angles(view.camera)[:24], atol=1e-6)
+    assert (view.mask[24:] == 0).all()
+
+
+def test_a_wide_fisheye_photo_is_loaded_whole(tmp_path):
+    names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4")
+    lens = dict(zip(names, FISHEYE, strict=True)) | {"camera_model": "OPENCV_FISHEYE"}
+    view = load_scene(write_set(tmp_path, lens, (128, 96)), response="srgb").views[0]
+    assert view.camera.projection == "OPENCV_FISHEYE" and view.codes.shape == (96, 128, 3)
+    assert view.codes.dtype == np.uint8 and view.mask.max() == pytest.approx(1)
+
+
+def test_panoramas_that_are_not_whole_are_refused(tmp_path):
+    with pytest.raises(InputError, match="equirectangular photos are 128 x 96, not twice as wide as high"):
+        load_scene(write_set(tmp_path, {"camera_model": "EQUIRECTANGULAR"}, (128, 96)))
