@@ -40,6 +40,7 @@ COMMANDS = {
         "compare": Command("evaluation.commands", "Compare", "run_compare"),
         "report": Command("output.commands", "Report", "run_report"),
         "envmap": Command("output.commands", "EnvironmentMap", "run_environment_map"),
+        "lights": Command("output.commands", "Lights", "run_lights"),
         "export": Command("output.commands", "Export", "run_export"),
         "convert": Command("output.commands", "Convert", "run_convert"),
     },

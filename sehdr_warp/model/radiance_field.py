@@ -4,7 +4,7 @@ Every color set that a step needs is a group of three channels of one rasterisat
 sorted and blended once.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -259,7 +259,7 @@ class RadianceField(nn.Module):
         pixel_angle: float,
         degree: int | None = None,
         beyond: float = 0.0,
-        dark: Tensor | None = None,
+        without: Sequence[Tensor] = (),
         shares: Tensor | None = None,
     ) -> Surroundings:
         """Render along unit directions from a position.
@@ -271,7 +271,7 @@ class RadianceField(nn.Module):
             pixel_angle: Radians, as in rasterize_directions().
             degree: Highest SH degree, by default all.
             beyond: Gaussians whose centers are nearer than this distance are left out; scene units.
-            dark: [N] bool, Gaussians that hide what is behind them and give no light.
+            without: indices [K] int64 of Gaussians that give no light, and hide what is behind them.
             shares: [N] in [0, 1], of each Gaussian's light, such as the clipped share.
         """
         gaussians = self.gaussians
@@ -279,8 +279,8 @@ class RadianceField(nn.Module):
         origin = torch.tensor(origin, dtype=torch.float32, device=gaussians.means.device)
         encoded, values = self.color_model.encoded, self._values(origin, degree)
         colors = self.color_model.colors(values) if encoded else self._exposures(values)[1]
-        if dark is not None:
-            colors = colors.masked_fill(dark[:, None], 0.0)
+        for index in without:
+            colors = colors.index_fill(0, index, 0.0)
         features = [colors, (gaussians.means - origin).norm(dim=1, keepdim=True)]
         if self.confidence is not None:
             features.append(self.confidence[:, None])
@@ -324,6 +324,15 @@ class RadianceField(nn.Module):
         features = values[:, None].expand(-1, 3).contiguous()
         rendering = self._rasterize(self.camera_tensors(camera), features)
         return _unpremultiply(rendering.image[..., 0], rendering.alpha).clamp(0, 1)
+
+    @torch.no_grad()
+    def radiance_towards(self, position: np.ndarray, *, degree: int | None = None) -> Tensor:
+        """Return the radiance [N, 3] of each Gaussian towards a point [3] in scene coordinates."""
+        place = torch.tensor(self.normalization.points(position), dtype=torch.float32)
+        values = self._values(place.to(self.gaussians.means.device), degree)
+        if self.color_model.encoded:
+            return self.response.decode(self.color_model.colors(values).clamp(0, 1)) / self.base_time
+        return self._exposures(values)[1] / self.base_time
 
     def weighted_sums(self, camera: CameraTensors, images: Tensor) -> Tensor:
         """Return [N, C]: for each Gaussian the sum over pixels of its blending weight times images [H, W, C].

@@ -228,6 +228,39 @@ class EnvironmentMap:
     """cpu or cuda:N; by default the first GPU if there is one."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Lights:
+    """List the lights that the photos clipped, with place, size, radiance and its deviation; and write them as lights.
+
+    A USD file holds a SphereLight or RectLight for each, and a DomeLight for everything else.
+    """
+
+    run: Positional[Path]
+    """Folder of a run."""
+    out: Path | None = None
+    """The file: .json, or .usda, with a map of the rest beside it. Without it the lights are only listed."""
+    axes: Literal["upright", "scene"] = "upright"
+    """upright: turned as render and export turn the scene; +Y is up. scene: the scene's own coordinates."""
+    up: str | None = None
+    """The scene's up direction in its own coordinates, if the photos do not show it: x,y,z, or an axis such as -y."""
+    overwrite: bool = False
+    """Replace files that exist."""
+    device: str | None = None
+    """cpu or cuda:N; by default the first GPU if there is one."""
+
+
+def run_lights(args: Lights) -> None:
+    """Run `sehdr-warp lights`."""
+    from .lights import lights_table, write_lights
+
+    run = open_run(args.run, args.device)
+    if args.out is None:
+        print(lights_table(run.find_lights()))
+        return
+    for path in write_lights(run, args.out, axes=args.axes, up=args.up, overwrite=args.overwrite):
+        print(path)
+
+
 def changed_flags(options: Any) -> list[str]:
     """Return the flags of a dataclass of options whose values are not the default."""
     names = [field.name for field in fields(options) if getattr(options, field.name) != field.default]

@@ -15,6 +15,7 @@ from ..model.confidence import Evidence, gather_evidence
 from ..model.exposure import exposure_times
 from ..model.fusion import NeuralExposureFusion
 from ..model.gaussians import PARAMETER_NAMES, Gaussians
+from ..model.lights import Light, find_lights
 from ..model.radiance_field import RadianceField, RenderedView, Surroundings
 from ..model.sensor_colors import rec709_of
 from ..response import Response
@@ -189,6 +190,27 @@ class Run(_Rendered):
             return None
         clipped = self.folder.read_clipped()
         return None if clipped is None else clipped.to(self.device)
+
+    def find_lights(self) -> list[Light]:
+        """Return the lights of the scene that the photos clipped, those that give most first.
+
+        Radiance is in linear Rec.709.
+
+        Raises:
+            SehdrError: if it was not measured what clipped.
+        """
+        clipped = self.clipped_share()
+        if clipped is None:
+            problem = "holds no record of what the photos clipped"
+            raise SehdrError(f"{self.path}: {problem}; lights are found in the folder of a run")
+        views = [(entry.camera, entry.exposure_time) for entry in self.cameras if entry.split == "train"]
+        lights = find_lights(self.model, clipped, views, degree=self.degree)
+        if self.color_matrix is None:
+            return lights
+        colors = [[light.radiance, light.lower_bound] for light in lights]
+        rec709 = self.in_rec709(torch.tensor(np.array(colors).reshape(-1, 2, 3), dtype=torch.float32)).numpy()
+        pairs = zip(lights, rec709, strict=True)
+        return [replace(light, radiance=pair[0], lower_bound=pair[1]) for light, pair in pairs]
 
     def metrics(self) -> list[dict]:
         """The evaluations made during training, as in metrics.jsonl."""

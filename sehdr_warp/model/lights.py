@@ -1,0 +1,199 @@
+"""Lights of a trained scene: groups of bright Gaussians that the photos clipped, as simple emitting shapes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..scene import Camera
+from .baking import sphere_directions
+from .radiance_field import RadianceField
+
+CLIPPED = 0.3  # Share of the photos' values that show a Gaussian, from which it can belong to a light
+BRIGHT = 0.7  # Times the photos' white, likewise
+LEAST_SEEN = 0.3  # Pixels of blending weight over all views, likewise
+REACH = 3.0  # Gaussians join one light if they are nearer than this many median standard deviations
+FLATNESS = 0.15  # Of the smallest to the middle variance, below which a light is a flat rectangle
+LEAST_SHARE = 5e-4  # Of the light at the middle of the cameras
+MOST_LIGHTS, MOST_VIEWS = 64, 24
+DIRECTIONS = 1 << 15  # In which the light at a point is measured
+
+
+@dataclass(frozen=True, eq=False)
+class LightShape:
+    """A rectangle or a sphere, in the scene's coordinates.
+
+    Attributes:
+        kind: "rect" or "sphere".
+        position: [3] middle.
+        axes: [3, 3] rows: along the width, along the height, and the direction that a rectangle emits to.
+        size: width and height of a rectangle; the diameter of a sphere, twice.
+    """
+
+    kind: str
+    position: np.ndarray
+    axes: np.ndarray
+    size: tuple[float, float]
+
+    def solid_angle(self, point: np.ndarray) -> float:
+        """Return the solid angle that a point sees of a light that is small for it; 0 from behind a rectangle."""
+        towards = point - self.position
+        distance = max(float(np.linalg.norm(towards)), 1e-12)
+        if self.kind == "sphere":
+            area = np.pi * (self.size[0] / 2) ** 2
+        else:
+            area = self.size[0] * self.size[1] * max(float(self.axes[2] @ towards) / distance, 0.0)
+        return min(float(area) / distance**2, 2 * np.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """One light of a scene.
+
+    Attributes:
+        shape: its place and size.
+        radiance: [3] in the field's colors; with the shape it gives the light that the training views show.
+        lower_bound: [3] radiance that the photos vouch for: their white, or less where the light has less of a color.
+        deviation: of log2 radiance, stops, from the confidence of its Gaussians; None if that was not measured.
+        share: of the light that reaches the middle of the training cameras.
+        members: [K] int64, its Gaussians.
+    """
+
+    shape: LightShape
+    radiance: np.ndarray
+    lower_bound: np.ndarray
+    deviation: float | None
+    share: float
+    members: Tensor
+
+
+@torch.no_grad()
+def find_lights(
+    field: RadianceField,
+    clipped: Tensor,
+    views: Sequence[tuple[Camera, float]],
+    *,
+    degree: int | None = None,
+) -> list[Light]:
+    """Return the lights of a scene, those that give most first.
+
+    Args:
+        field: a trained scene.
+        clipped: [N] in [0, 1], which share of the values that show a Gaussian was clipped.
+        views: training cameras in the scene's coordinates, with their exposure times in seconds.
+        degree: of the harmonics; by default all.
+    """
+    if not views:
+        return []
+    white = field.response.white / float(np.median([time for _, time in views]))
+    cameras = [camera for camera, _ in views]
+    middle = np.mean([camera.position for camera in cameras], axis=0)
+    cameras = cameras[:: -(-len(cameras) // MOST_VIEWS)]
+    sums = [_view_sums(field, camera, degree) for camera in cameras]
+    pixels, angles, flux = (sum(parts) for parts in zip(*sums, strict=True))
+    mean = flux / angles.clamp_min(1e-20)[:, None]
+    member = (clipped > CLIPPED) & (pixels > LEAST_SEEN) & (mean.amax(1) > BRIGHT * white)
+    members = member.nonzero()[:, 0]
+    if not len(members):
+        return []
+    gaussians = field.gaussians
+    places = field.normalization.scene_points(gaussians.means[members].cpu().numpy())
+    widths = gaussians.log_scales[members].exp().amax(1).cpu().numpy() * field.normalization.unit
+    weights = (pixels * mean.mean(1))[members].cpu().numpy()
+    confidence = None if field.confidence is None else field.confidence[members].cpu().numpy()
+    received = np.stack([part[2][members].cpu().numpy() for part in sums])
+    total = max(_light_at(field, middle, cameras, degree), 1e-30)
+    lights = []
+    for group in _groups(places, REACH * float(np.median(widths))):
+        shape = _shape(places[group], widths[group], weights[group], middle)
+        radiance = _radiance(shape, received[:, group].sum(1), cameras)
+        deviation = None
+        if confidence is not None:
+            stops = -np.log2(np.clip(confidence[group], 2.0**-8, 1))
+            deviation = float(np.average(stops, weights=weights[group]))
+        share = float(radiance.mean() * shape.solid_angle(middle)) / total
+        if share >= LEAST_SHARE:
+            bound = np.minimum(white, radiance)
+            index = members[torch.from_numpy(group).to(members.device)]
+            lights.append(Light(shape, radiance, bound, deviation, share, index))
+    return sorted(lights, key=lambda light: -light.share)[:MOST_LIGHTS]
+
+
+def _light_at(field: RadianceField, point: np.ndarray, cameras: Sequence[Camera], degree: int | None) -> float:
+    """Return the light that reaches a point: the mean of the channels' radiance, integrated over all directions."""
+    directions = torch.tensor(sphere_directions(DIRECTIONS), dtype=torch.float32).view(-1, 256, 3)
+    focal = float(np.median([np.sqrt(camera.fx * camera.fy) for camera in cameras]))
+    options = {"focal_length": focal, "pixel_angle": float(np.sqrt(4 * np.pi / DIRECTIONS)), "degree": degree}
+    seen = field.render_directions(point, directions.to(field.gaussians.means.device), **options)
+    return 4 * np.pi * float(seen.hdr.mean())
+
+
+def _view_sums(field: RadianceField, camera: Camera, degree: int | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what a camera receives of each Gaussian: pixels [N], their solid angle [N], and light times it [N, 3]."""
+    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    angle = (1 + x[None] ** 2 + y[:, None] ** 2) ** -1.5 / (camera.fx * camera.fy)
+    device = field.gaussians.means.device
+    angle = torch.tensor(angle, dtype=torch.float32, device=device)
+    # Sums of small angles stay numbers of about 1.
+    unit = float(angle.mean())
+    images = torch.stack([torch.ones_like(angle), angle / unit], 2)
+    sums = field.weighted_sums(field.camera_tensors(camera), images)
+    radiance = field.radiance_towards(camera.position, degree=degree)
+    return sums[:, 0], sums[:, 1] * unit, radiance * (sums[:, 1:] * unit)
+
+
+def _groups(places: np.ndarray, reach: float) -> list[np.ndarray]:
+    """Return the connected groups of points that are nearer to each other than `reach`, as indices."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    pairs = KDTree(places).query_pairs(reach, output_type="ndarray")
+    links = coo_matrix((np.ones(len(pairs)), pairs.T), (len(places), len(places)))
+    count, labels = connected_components(links, directed=False)
+    return [np.flatnonzero(labels == label) for label in range(count)]
+
+
+def _shape(places: np.ndarray, widths: np.ndarray, weights: np.ndarray, middle: np.ndarray) -> LightShape:
+    """Return the rectangle or sphere with the weighted mean and variances of Gaussians."""
+    weights = weights / weights.sum()
+    position = weights @ places
+    offsets = places - position
+    covariance = (offsets * weights[:, None]).T @ offsets
+    values, vectors = np.linalg.eigh(covariance)
+    # A Gaussian reaches beyond its center on the light's face, but not across a flat one.
+    spread = float(weights @ widths**2)
+    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1].T
+    flat = values[2] < FLATNESS * values[1]
+    if not flat:
+        diameter = 2 * float(np.sqrt(values.sum() + spread))
+        return LightShape("sphere", position, np.eye(3), (diameter, diameter))
+    normal = vectors[2] if vectors[2] @ (middle - position) >= 0 else -vectors[2]
+    axes = np.stack([vectors[0], np.cross(normal, vectors[0]), normal])
+    width, height = (float(np.sqrt(12 * (value + spread))) for value in values[:2])
+    return LightShape("rect", position, axes, (width, height))
+
+
+def _radiance(shape: LightShape, received: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the radiance [3] by which a shape gives cameras the light [V, 3] that they receive, by least squares.
+
+    Cameras that the light is only partly in the frame of are left out, if there are others.
+    """
+    angles = np.array([shape.solid_angle(camera.position) for camera in cameras])
+    whole = np.array([_in_frame(camera, shape) for camera in cameras]) & (angles > 0)
+    used = whole if whole.any() else angles > 0
+    if not used.any():
+        return np.zeros(3)
+    return angles[used] @ received[used] / (angles[used] @ angles[used])
+
+
+def _in_frame(camera: Camera, shape: LightShape) -> bool:
+    place = camera.world_to_camera[:3, :3] @ shape.position + camera.world_to_camera[:3, 3]
+    if place[2] <= 0:
+        return False
+    u, v = camera.fx * place[0] / place[2] + camera.cx, camera.fy * place[1] / place[2] + camera.cy
+    margin = max(shape.size) / 2 * max(camera.fx, camera.fy) / place[2]
+    return margin <= u <= camera.width - margin and margin <= v <= camera.height - margin

@@ -1,0 +1,179 @@
+"""The lights of a trained scene as JSON or as OpenUSD lights, with a map of everything else."""
+
+import json
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sehdr_warp.errors import SehdrError
+
+from ..files import atomic_path, check_absent
+from .environment_map import envmap, latlong
+from .exr import exr_header, rgb_channels, write_exr
+from .images import as_array
+from .render_views import provenance
+from .world_transform import WorldTransform, world_transform
+
+log = logging.getLogger(__name__)
+SUFFIXES = (".json", ".usda")
+MAP_SIZE = 1024  # Pixels across of the map of what is no light
+_STAGE = """#usda 1.0
+(
+    customLayerData = {{
+        string "sehdr:scene" = {scene}
+    }}
+    defaultPrim = "Lights"
+    metersPerUnit = 1
+    upAxis = "Y"
+)
+
+def Xform "Lights"
+{{
+{lights}
+}}
+"""
+_LIGHT = """    def {kind} "{name}"
+    {{
+        custom float3 sehdr:lowerBound = {bound}
+        custom float sehdr:shareOfLight = {share}
+{deviation}        color3f inputs:color = {color}
+        float inputs:intensity = {intensity}
+        bool inputs:normalize = 0
+{size}        matrix4d xformOp:transform = ( {rows} )
+        uniform token[] xformOpOrder = ["xformOp:transform"]
+    }}"""
+_DOME = """    def DomeLight "Rest"
+    {{
+        color3f inputs:color = (1, 1, 1)
+        float inputs:intensity = 1
+        asset inputs:texture:file = @./{file}@
+        token inputs:texture:format = "latlong"
+    }}"""
+
+
+def write_lights(
+    run: Any,
+    path: Path | str,
+    *,
+    axes: str = "upright",
+    up: str | None = None,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write the lights of a scene; return the files.
+
+    A light is a group of Gaussians that the photos clipped. With its size, its radiance gives the light that the
+    training views show. A USD file has a SphereLight or RectLight for each, and a DomeLight for everything else: a
+    map from the middle of the training cameras, `<stem>_rest.exr`, in which the lights are dark.
+
+    Args:
+        run: From load_run or train.
+        path: .json, or .usda.
+        axes: As in world_transform.
+        up: As in world_transform.
+        overwrite: Replace files that exist.
+
+    Raises:
+        SehdrError: For a suffix that is not known, or a scene that does not state what clipped.
+        InputError: If a file exists.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise SehdrError(f"{path}: lights are written as one of {', '.join(SUFFIXES)}; choose a suffix")
+    rest = path.with_name(f"{path.stem}_rest.exr")
+    files = [path] if suffix == ".json" else [path, rest]
+    for file in files:
+        check_absent(file, overwrite)
+    transform = world_transform(run, axes, up=up)
+    lights = run.find_lights()
+    if not lights:
+        log.warning(
+            "%s: nothing that the photos clipped gives light: no lights, all is in the map of the rest", run.path
+        )
+    rows = [_described(f"light_{index}", light, transform) for index, light in enumerate(lights)]
+    if suffix == ".usda":
+        _write_rest(run, rest, lights, transform, overwrite)
+        text = usd_lights(rows, run.scene_name, rest.name)
+    else:
+        facts = {**provenance(run), "units": "relative radiance, linear Rec.709", "axes": axes}
+        text = json.dumps({**facts, "lights": rows}, indent=1)
+    with atomic_path(path, overwrite) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return files
+
+
+def lights_table(lights: Sequence[Any]) -> str:
+    """Return lights as lines of text: shape, place, size, radiance, how sure it is, and share of the scene's light."""
+    lines = ["  share  shape   radiance  at least  stops   place, size"]
+    for light in lights:
+        size = " x ".join(f"{side:.3g}" for side in light.shape.size[: 2 if light.shape.kind == "rect" else 1])
+        place = ", ".join(f"{value:.3g}" for value in light.shape.position)
+        sure = "    -" if light.deviation is None else f"{light.deviation:5.2f}"
+        figures = f"{float(np.mean(light.radiance)):9.3g} {float(np.mean(light.lower_bound)):9.3g}"
+        lines.append(f"{100 * light.share:5.1f} %  {light.shape.kind:6} {figures}  {sure}   ({place}), {size}")
+    return "\n".join(lines)
+
+
+def usd_lights(rows: Sequence[dict], scene: str, rest: str) -> str:
+    """Return the text of a stage of the lights that _described() gives, and a dome of a map beside the file."""
+    lights = [_usd(row) for row in rows]
+    return _STAGE.format(scene=json.dumps(scene), lights="\n".join([*lights, _DOME.format(file=rest)]))
+
+
+def _described(name: str, light: Any, transform: WorldTransform) -> dict:
+    """Return a light as plain values, in the coordinates of the file."""
+    shape = light.shape
+    return {
+        "name": name,
+        "shape": shape.kind,
+        "position": transform.points(shape.position).tolist(),
+        "axes": (shape.axes @ transform.rotation.T).tolist(),
+        "size": [transform.scale * side for side in shape.size],
+        "radiance": np.asarray(light.radiance, float).tolist(),
+        "lower_bound": np.asarray(light.lower_bound, float).tolist(),
+        "deviation_stops": light.deviation,
+        "share_of_light": light.share,
+    }
+
+
+def _usd(row: dict) -> str:
+    radiance = np.maximum(row["radiance"], 0)
+    intensity = max(float(radiance.max()), 1e-12)
+    width, height = row["size"]
+    sphere = row["shape"] == "sphere"
+    size = {"radius": width / 2} if sphere else {"width": width, "height": height}
+    # USD's rectangles emit along -Z; matrices act on row vectors.
+    across, upward, normal = np.array(row["axes"])
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([-across, upward, -normal])
+    matrix[3, :3] = row["position"]
+    deviation = row["deviation_stops"]
+    return _LIGHT.format(
+        kind="SphereLight" if sphere else "RectLight",
+        name=row["name"],
+        bound=_tuple(row["lower_bound"]),
+        share=repr(float(row["share_of_light"])),
+        deviation="" if deviation is None else f"        custom float sehdr:deviationStops = {deviation!r}\n",
+        color=_tuple(radiance / intensity),
+        intensity=repr(intensity),
+        size="".join(f"        float inputs:{name} = {value!r}\n" for name, value in size.items()),
+        rows=", ".join(_tuple(line) for line in matrix),
+    )
+
+
+def _tuple(values) -> str:
+    return "(" + ", ".join(repr(float(value)) for value in values) + ")"
+
+
+def _write_rest(run: Any, path: Path, lights: Sequence[Any], transform: WorldTransform, overwrite: bool) -> None:
+    """Write the map of a scene from the middle of its training cameras, with the lights dark."""
+    cameras = [entry.camera for entry in run.cameras if entry.split == "train"]
+    middle = np.mean([camera.position for camera in cameras], axis=0)
+    options = {"focal_length": float(np.median([np.sqrt(c.fx * c.fy) for c in cameras]))}
+    options |= {"pixel_angle": 2 * np.pi / MAP_SIZE, "without": [light.members for light in lights]}
+    hdr = as_array(run.render_directions(middle, latlong(MAP_SIZE) @ transform.rotation, **options).hdr)
+    header = exr_header("rec709", 1.0, provenance=provenance(run)) | {"envmap": envmap("latlong")}
+    write_exr(path, rgb_channels(hdr), header=header, overwrite=overwrite)

@@ -1,0 +1,82 @@
+"""Lights found in Gaussians: place, size and radiance of shapes whose light is known."""
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.model.baking import field_of
+from sehdr_warp.model.lights import find_lights
+from sehdr_warp.scene import Camera, look_at
+from sehdr_warp.splats import GaussianArrays
+
+RADIANCE = np.array([40.0, 30.0, 20.0])
+
+
+def field(places, radiance, width):
+    """Opaque round Gaussians at places [N, 3] of one radiance."""
+    count = len(places)
+    harmonics = np.tile(np.float32(radiance) / 0.28209479, (count, 1))[:, None].astype(np.float32)
+    quaternions = np.tile(np.float32([1, 0, 0, 0]), (count, 1))
+    scales = np.full((count, 3), np.log(width), np.float32)
+    opacity = np.full(count, 6, np.float32)
+    return field_of(GaussianArrays(np.float32(places), scales, quaternions, opacity, harmonics, "linear", 1.0))
+
+
+def panel(width=1.2, height=0.6, step=0.04, at=(0.0, 0.0, 4.0)):
+    x, y = np.meshgrid(np.arange(-width / 2, width / 2, step), np.arange(-height / 2, height / 2, step))
+    return np.stack([x + at[0], y + at[1], np.full_like(x, at[2])], 2).reshape(-1, 3)
+
+
+def views(target=(0, 0, 4.0)):
+    """Cameras in front of the light, all of which see it whole, as finely as received()."""
+    positions = [(x, y, 0) for x in (-0.6, 0, 0.6) for y in (-0.3, 0.3)]
+    made = [look_at(position, target, up=(0, -1, 0)) for position in positions]
+    return [(Camera(256, 192, 240.0, 240.0, 128.0, 96.0, pose), 1.0) for pose in made]
+
+
+def received(scene):
+    """Light [3] that a camera at the origin receives: radiance times the solid angle of its pixels."""
+    camera = Camera(256, 256, 240.0, 240.0, 128.0, 128.0, look_at((0, 0, 0), (0, 0, 4), up=(0, -1, 0)))
+    x = (np.arange(256) + 0.5 - 128) / 240
+    angle = (1 + x**2 + x[:, None] ** 2) ** -1.5 / 240**2
+    return (scene.render(camera).hdr.numpy() * angle[..., None]).sum((0, 1))
+
+
+def test_a_panel_is_found_with_its_place_size_direction_and_light():
+    scene = field(panel(), RADIANCE, 0.03)
+    (light,) = find_lights(scene, torch.ones(scene.gaussians.count), views())
+    assert light.shape.kind == "rect" and light.shape.position == pytest.approx([0, 0, 4], abs=0.03)
+    assert light.shape.size == pytest.approx((1.25, 0.65), rel=0.1)  # Gaussians reach beyond their centers
+    assert light.shape.axes[2] == pytest.approx([0, 0, -1], abs=0.02)
+    # What counts is the light that a surface gets: radiance times solid angle.
+    assert light.radiance * light.shape.solid_angle(np.zeros(3)) == pytest.approx(received(scene), rel=0.06)
+    assert light.share == pytest.approx(1, abs=0.15) and len(light.members) == scene.gaussians.count
+    assert light.deviation is None and light.lower_bound == pytest.approx(np.ones(3), rel=0.01)
+
+
+def test_a_ball_is_a_sphere():
+    turns = np.random.default_rng(0).normal(size=(900, 3))
+    ball = 0.3 * turns / np.linalg.norm(turns, axis=1, keepdims=True) + [0.5, 0, 4]
+    scene = field(ball, RADIANCE, 0.03)
+    (light,) = find_lights(scene, torch.ones(900), views((0.5, 0, 4)))
+    assert light.shape.kind == "sphere" and light.shape.position == pytest.approx([0.5, 0, 3.9], abs=0.15)
+    seen = light.radiance * light.shape.solid_angle(np.zeros(3))
+    assert seen == pytest.approx(received(scene), rel=0.1)
+
+
+def test_lights_apart_are_two_and_what_is_dark_or_did_not_clip_is_none():
+    places = np.concatenate([panel(0.4, 0.4, at=(-0.7, 0, 4)), panel(0.4, 0.4, at=(0.7, 0, 4))])
+    scene, half = field(places, RADIANCE, 0.03), len(places) // 2
+    lights = find_lights(scene, torch.ones(len(places)), views())
+    assert sorted(light.shape.position[0] for light in lights) == pytest.approx([-0.7, 0.7], abs=0.03)
+    clipped = torch.cat([torch.ones(half), torch.zeros(half)])
+    assert len(find_lights(scene, clipped, views())) == 1
+    assert find_lights(field(places, [0.2, 0.2, 0.2], 0.03), torch.ones(len(places)), views()) == []
+    assert find_lights(scene, torch.ones(len(places)), []) == []
+
+
+def test_deviation_follows_the_confidence():
+    scene = field(panel(), RADIANCE, 0.03)
+    scene.confidence = torch.full((scene.gaussians.count,), 0.5)
+    (light,) = find_lights(scene, torch.ones(scene.gaussians.count), views())
+    assert light.deviation == pytest.approx(1.0)

@@ -1,0 +1,96 @@
+"""Files of lights: what they hold, read by OpenUSD, and that they light as the scene does."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.model.lights import Light, LightShape
+from sehdr_warp.output.lights import lights_table, write_lights
+from sehdr_warp.runs.run import Splats
+from sehdr_warp.scene.hdr_files import read_hdr
+
+from .helpers import Entry, camera
+from .test_environment_map import lamps
+
+PANEL = LightShape("rect", np.array([1.0, 0.5, 2.0]), np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), (0.4, 0.2))
+BALL = LightShape("sphere", np.array([0.0, 0.0, 3.0]), np.eye(3), (0.3, 0.3))
+LIGHTS = [
+    Light(PANEL, np.array([8.0, 4.0, 2.0]), np.ones(3), 0.7, 0.5, torch.tensor([0])),
+    Light(BALL, np.array([3.0, 3.0, 3.0]), np.ones(3), None, 0.2, torch.tensor([1, 2])),
+]
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """A scene of six lamps, of which three belong to two lights."""
+    from sehdr_warp.model.baking import field_of
+
+    cameras = tuple(Entry(str(i), "train", camera(position=(0.1 * i - 0.1, 0, 0), target=(0, 0, 9))) for i in range(3))
+    scene = Splats(tmp_path / "run", field_of(lamps()), cameras)
+    scene.find_lights = lambda: LIGHTS
+    return scene
+
+
+def test_json_has_every_figure(tmp_path, run):
+    assert write_lights(run, tmp_path / "lights.json", axes="scene") == [tmp_path / "lights.json"]
+    found = json.loads((tmp_path / "lights.json").read_text())
+    first, second = found["lights"]
+    assert first["position"] == [1.0, 0.5, 2.0] and first["size"] == [0.4, 0.2] and first["shape"] == "rect"
+    assert first["radiance"] == [8, 4, 2] and first["deviation_stops"] == 0.7 and second["deviation_stops"] is None
+    assert (first["share_of_light"], second["shape"]) == (0.5, "sphere") and "Rec.709" in found["units"]
+
+
+def test_usd_lights_stand_and_shine_as_the_scene_s(tmp_path, run):
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom, UsdLux
+
+    files = write_lights(run, tmp_path / "lights.usda", axes="scene")
+    assert files == [tmp_path / "lights.usda", tmp_path / "lights_rest.exr"]
+    stage = Usd.Stage.Open(str(files[0]))
+    panel = UsdLux.RectLight(stage.GetPrimAtPath("/Lights/light_0"))
+    ball = UsdLux.SphereLight(stage.GetPrimAtPath("/Lights/light_1"))
+    color = np.array(panel.GetColorAttr().Get()) * panel.GetIntensityAttr().Get()
+    assert color == pytest.approx([8, 4, 2]) and not panel.GetNormalizeAttr().Get()
+    assert (panel.GetWidthAttr().Get(), panel.GetHeightAttr().Get()) == pytest.approx((0.4, 0.2))
+    assert ball.GetRadiusAttr().Get() == pytest.approx(0.15)
+    matrix = np.array(UsdGeom.Xformable(panel).ComputeLocalToWorldTransform(0))
+    assert matrix[3, :3] == pytest.approx([1, 0.5, 2])
+    # USD's rectangles emit along -Z, and no light is mirrored.
+    assert np.array([0, 0, -1, 0]) @ matrix == pytest.approx([0, 0, -1, 0])
+    assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1)
+    dome = UsdLux.DomeLight(stage.GetPrimAtPath("/Lights/Rest"))
+    assert (
+        dome.GetTextureFileAttr().Get().path == "./lights_rest.exr" and dome.GetTextureFormatAttr().Get() == "latlong"
+    )
+
+
+def test_the_map_of_the_rest_lacks_the_lights_and_nothing_else(tmp_path, run):
+    write_lights(run, tmp_path / "lights.usda", axes="scene")
+    image = read_hdr(tmp_path / "lights_rest.exr")
+    run.find_lights = list
+    write_lights(run, tmp_path / "none.usda", axes="scene")
+    whole = read_hdr(tmp_path / "none_rest.exr")
+    from sehdr_warp.output.environment_map import latlong
+
+    directions = latlong(1024)
+    for index, axis in enumerate(np.concatenate([np.eye(3), -np.eye(3)])[[0, 3, 1, 4, 2, 5]]):
+        place = np.unravel_index(np.argmax(directions @ axis), directions.shape[:2])
+        expected = 0 if index < 3 else whole[place]
+        assert image[place] == pytest.approx(expected, abs=1e-3) and whole[place].max() > 1
+
+
+def test_the_table_names_place_size_and_doubt():
+    lines = lights_table(LIGHTS).splitlines()
+    assert "50.0 %" in lines[1] and "0.70" in lines[1] and "0.4 x 0.2" in lines[1] and "sphere" in lines[2]
+
+
+def test_what_cannot_be_written_is_refused(tmp_path, run):
+    with pytest.raises(SehdrError, match="choose a suffix"):
+        write_lights(run, tmp_path / "lights.txt")
+    (tmp_path / "lights_rest.exr").write_text("mine")
+    with pytest.raises(InputError, match="lights_rest.exr"):
+        write_lights(run, tmp_path / "lights.usda")
+    assert not (tmp_path / "lights.usda").exists()
