@@ -19,6 +19,7 @@ from .linear_photos import color_matrix, one_kind
 from .names import list_images, natural_key, sibling, view_and_exposure
 from .photos import photo_sizes
 from .sfm import reconstruct
+from .sfm_panorama import are_panoramas, reconstruct_panoramas
 from .stack import refuse_stack
 
 FEWEST_PHOTOS = 3  # A training needs at least as many
@@ -216,7 +217,7 @@ def read_photos(folder: Path, cache: Path | str | None = None) -> DataparserOutp
     if kind == "raw":
         color_matrix(photos)  # Refuse photos of several cameras before minutes of matching.
     refuse_stack(photos, folder)
-    found = reconstruct(photos, cache)
+    found = reconstruct_panoramas(photos, cache) if are_panoramas(photos) else reconstruct(photos, cache)
     images = sorted(found.model.images, key=lambda image: image.name)
     files = [photos[int(Path(image.name).stem)] for image in images]
     records = tuple(

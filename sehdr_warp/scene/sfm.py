@@ -33,12 +33,12 @@ _log = logging.getLogger("sehdr_warp.scene")
 
 # SIFT finds little more above this size, and extraction time grows with the area.
 MAX_SIDE = 1200
-_SEED = 0
+SEED = 0
 FEWEST_SHARED = 60  # Points of a photo with fewer shared ones place it badly; sound photos have hundreds
 MOST_ERROR = 1.0  # Pixels; sound sets have 0.2 to 0.8
 _VERSION = 3
 # Up to so many photos every pair is matched; in larger sets each photo is matched with its neighbors by name.
-_EXHAUSTIVE_LIMIT = 150
+EXHAUSTIVE_LIMIT = 150
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Reco
     Raises:
         InputError: if fewer than two photos can be placed.
     """
-    key = _key("photos", MAX_SIDE, _SEED, [(photo.name, file_digest(photo)) for photo in photos])
+    key = cache_key("photos", MAX_SIDE, SEED, [(photo.name, file_digest(photo)) for photo in photos])
 
     def solve(work: Path, result: Path) -> None:
         sizes, small = _write_photos(photos, work / "images")
@@ -100,13 +100,13 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Reco
             groups.setdefault((sizes[i], small[i], _device(photo)), []).append(i)
         for (_, (width, height), device), group in groups.items():
             params = (_focal_prior(device[-1], width, height), width / 2, height / 2, 0.0)
-            _extract(database, work / "images", [_name(i) for i in group], "SIMPLE_RADIAL", params)
+            _extract(database, work / "images", [image_name(i) for i in group], "SIMPLE_RADIAL", params)
         _match(database, len(photos))
         model = _map(database, work, len(photos), photos[0].parent)
         model.write_binary(result)
         (result / "sizes.json").write_text(json.dumps(sizes))
 
-    with _cached(cache, f"sfm-{key}", solve) as folder:
+    with cached_result(cache, f"sfm-{key}", solve) as folder:
         model = read_model(folder)
         sizes = json.loads((folder / "sizes.json").read_text())
         error, weak = _placement(folder)
@@ -118,7 +118,7 @@ def _placement(folder: Path) -> tuple[float, tuple[int, ...]]:
     """Return the mean reprojection error of a result of ours, and the indices of photos with few shared points."""
     import pycolmap
 
-    with _quiet():
+    with quiet_colmap():
         found = pycolmap.Reconstruction(str(folder))
         shared = {int(Path(found.images[i].name).stem): found.images[i].num_points3D for i in found.reg_image_ids()}
         error = float(found.compute_mean_reprojection_error())
@@ -126,7 +126,7 @@ def _placement(folder: Path) -> tuple[float, tuple[int, ...]]:
 
 
 @contextlib.contextmanager
-def _cached(cache: Path | str | None, name: str, solve: Callable[[Path, Path], None]) -> Iterator[Path]:
+def cached_result(cache: Path | str | None, name: str, solve: Callable[[Path, Path], None]) -> Iterator[Path]:
     """Provide the folder of a result: the cached one, or a new one that solve(work, result) fills.
 
     The user's cache is $SEHDR_CACHE, or sehdr-warp/ in $XDG_CACHE_HOME or ~/.cache. If it cannot be written, the result
@@ -166,11 +166,13 @@ def file_digest(path: Path) -> str:
         raise InputError(path, f"cannot be read ({error.strerror or error})", "check the file and its rights") from None
 
 
-def _key(*parts) -> str:
+def cache_key(*parts) -> str:
+    """Return a name for a result made of everything that it depends on; the parts go through JSON."""
     return hashlib.sha256(json.dumps([_VERSION, *parts]).encode()).hexdigest()[:16]
 
 
-def _name(index: int) -> str:
+def image_name(index: int) -> str:
+    """Return the name of a photo in what pycolmap reads."""
     return f"{index:05d}.png"
 
 
@@ -186,7 +188,7 @@ def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tup
         small.append(image.size)
         values = np.asarray(image)
         visible |= bool(((values > 2) & (values < 253)).mean() > 1e-3)
-        image.save(folder / _name(i), compress_level=1)
+        image.save(folder / image_name(i), compress_level=1)
     if not visible:
         problem = "the photos are all black or all white"
         raise InputError(photos[0].parent, problem, "expose them so that the scene shows")
@@ -227,7 +229,7 @@ def _extract(database: Path, images: Path, names: list[str], model: str, params)
         part = names[start : start + 8]
         if len(names) > 1:
             _log.info("finding features in photos %d to %d of %d", start + 1, start + len(part), len(names))
-        with _quiet():
+        with quiet_colmap():
             pycolmap.extract_features(
                 database, images, part, pycolmap.CameraMode.SINGLE, reader, device=pycolmap.Device.cpu
             )
@@ -240,10 +242,10 @@ def _match(database: Path, count: int) -> None:
     import pycolmap
 
     options = {"verification_options": pycolmap.TwoViewGeometryOptions(), "device": pycolmap.Device.cpu}
-    options["verification_options"].ransac.random_seed = _SEED
+    options["verification_options"].ransac.random_seed = SEED
     _log.info("matching features between %d photos", count)
-    with _quiet():
-        if count <= _EXHAUSTIVE_LIMIT:
+    with quiet_colmap():
+        if count <= EXHAUSTIVE_LIMIT:
             pycolmap.match_exhaustive(database, **options)
         else:
             pairing = pycolmap.SequentialPairingOptions(overlap=20, quadratic_overlap=True)
@@ -257,7 +259,7 @@ def _map(database: Path, work: Path, count: int, source: Path):
     best = None
     for patient in (False, True):
         options = pycolmap.IncrementalPipelineOptions(min_model_size=2)
-        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = _SEED
+        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
         if patient:
             options.min_num_matches = 10
             options.mapper.init_min_tri_angle = 4.0
@@ -271,7 +273,7 @@ def _map(database: Path, work: Path, count: int, source: Path):
 
         output = work / f"model{int(patient)}"
         output.mkdir()
-        with _quiet():
+        with quiet_colmap():
             models = pycolmap.incremental_mapping(
                 database, work / "images", output, options, next_image_callback=next_image
             )
@@ -286,7 +288,7 @@ def _map(database: Path, work: Path, count: int, source: Path):
 
 
 @contextlib.contextmanager
-def _quiet():
+def quiet_colmap():
     """Suppress pycolmap's log on the terminal except fatal errors."""
     import pycolmap
 

@@ -243,7 +243,7 @@ def test_a_damaged_result_of_structure_from_motion_is_made_again(tmp_path, caplo
         (result / "sizes.json").write_text("[]")
 
     for expected in (1, 1):
-        with sfm._cached(tmp_path, "sfm-key", solve) as place:
+        with sfm.cached_result(tmp_path, "sfm-key", solve) as place:
             assert len(solved) == expected
     file = place / ("cameras.bin" if damage != "no list" else LIST)
     if damage in ("missing", "no list"):
@@ -251,7 +251,7 @@ def test_a_damaged_result_of_structure_from_motion_is_made_again(tmp_path, caplo
     else:
         file.write_bytes({"empty": b"", "cut": b"cam", "pickle": b"\x80\x04."}[damage])
     for _ in range(2):
-        with sfm._cached(tmp_path, "sfm-key", solve) as place:
+        with sfm.cached_result(tmp_path, "sfm-key", solve) as place:
             assert len(solved) == 2 and (place / "cameras.bin").read_bytes() == b"cameras"
     assert caplog.text.count("is damaged and is made again") == 1
 

@@ -1,0 +1,174 @@
+"""Structure from motion of panoramas: through pinhole views cut from each, which COLMAP moves as one rigid rig."""
+
+import json
+import logging
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from ..errors import InputError
+from .colmap_model import ModelImage, SparseModel, read_points
+from .dataparser import PointCloud
+from .images import open_image
+from .lens import Lens
+from .linear_photos import kind_of
+from .photos import photo_sizes, read_photo
+from .preprocess import log_progress
+from .sfm import EXHAUSTIVE_LIMIT, SEED, Reconstruction, cache_key, cached_result, file_digest, image_name, quiet_colmap
+from .types import View, encoded_values
+from .wide_camera import FACE_ANGLE, face_rotations, faces_of
+
+_log = logging.getLogger("sehdr_warp.scene")
+
+_FACE_SIDE = 600  # Pixels of a cut view at most
+_SEAM = 3.0  # Times their usual difference, by which the outer columns of a panorama may differ
+_JUDGED = 5
+_SKEW = 2  # Pixels by which a panorama may differ from 2:1
+_PROJECTION = re.compile(rb"GPano:ProjectionType\s*(?:=\s*[\"']|>)\s*(\w+)")
+
+
+def are_panoramas(photos: Sequence[Path]) -> bool:
+    """Return whether bare photos are equirectangular panoramas.
+
+    They are if all are twice as wide as high, and some say so in their metadata (GPano), or their left and right ends
+    fit together.
+    """
+    for photo in photos:
+        width, height = photo_sizes(photo)[1]
+        if abs(width - 2 * height) > _SKEW:
+            return False
+    judged = photos[:: max(1, len(photos) // _JUDGED)][:_JUDGED]
+    stated = {kind for photo in judged if (kind := _stated_projection(photo))}
+    if stated:
+        return stated == {"equirectangular"}
+    return float(np.median([_seam(photo) for photo in judged])) < _SEAM
+
+
+def _stated_projection(photo: Path) -> str | None:
+    """Return the projection that a photo's XMP states, in lower case."""
+    if kind_of(photo) != "encoded":
+        return None
+    with open_image(photo) as image:
+        xmp = image.info.get("xmp", b"")
+    found = _PROJECTION.search(xmp if isinstance(xmp, bytes) else str(xmp).encode())
+    return found[1].decode().lower() if found else None
+
+
+def _seam(photo: Path) -> float:
+    """Return how much the outer columns of a photo differ, relative to neighboring columns within it."""
+    image = encoded_values(read_photo(photo, oriented=True).pixels)
+    inside = np.abs(np.diff(image[:, :: max(1, image.shape[1] // 64)], axis=1)).mean()
+    next_to = np.abs(np.diff(image, axis=1)).mean()
+    ends = np.abs(image[:, 0] - image[:, -1]).mean()
+    # In a picture that is flat everywhere the ends fit, too.
+    return float(ends / max(next_to, 1e-3)) if inside > 1e-3 else 0.0
+
+
+def reconstruct_panoramas(photos: Sequence[Path], cache: Path | str | None = None) -> Reconstruction:
+    """Find poses and points of equirectangular panoramas; arguments, result and errors as of reconstruct()."""
+    digests = [(photo.name, file_digest(photo)) for photo in photos]
+    key = cache_key("panoramas", _FACE_SIDE, FACE_ANGLE, SEED, digests)
+
+    def solve(work: Path, result: Path) -> None:
+        database = work / "database.db"
+        _write_faces(photos, work / "images")
+        _match_rigs(database, work / "images", len(photos))
+        model = _map_rigs(database, work, len(photos), photos[0].parent)
+        poses = {}
+        for number in model.reg_image_ids():
+            image = model.images[number]
+            face, _, name = image.name.partition("/")
+            if face == "face0":
+                poses[int(Path(name).stem)] = image.cam_from_world().matrix().tolist()
+        model.write_binary(result)
+        facts = {"poses": poses, "error": float(model.compute_mean_reprojection_error())}
+        (result / "panoramas.json").write_text(json.dumps(facts))
+
+    with cached_result(cache, f"sfm-{key}", solve) as folder:
+        facts = json.loads((folder / "panoramas.json").read_text())
+        cloud: PointCloud = read_points(folder)
+    images = []
+    for index, matrix in sorted(facts["poses"].items(), key=lambda item: int(item[0])):
+        width, height = photo_sizes(photos[int(index)])[1]
+        lens = Lens("EQUIRECTANGULAR", width, height, (float(width), float(height)), photos[int(index)])
+        images.append(ModelImage(image_name(int(index)), lens, np.vstack([matrix, [0, 0, 0, 1]])))
+    return Reconstruction(SparseModel(tuple(images), cloud), facts["error"], ())
+
+
+def _write_faces(photos: Sequence[Path], folder: Path) -> None:
+    """Write the cut views of each photo: face0/00000.png, face1/00000.png, ..."""
+    for number in range(len(face_rotations())):
+        (folder / f"face{number}").mkdir(parents=True)
+    for index, photo in log_progress("cutting panoramas", photos):
+        pixels = read_photo(photo, oriented=True).pixels
+        pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
+        height, width = pixels.shape[:2]
+        lens = Lens("EQUIRECTANGULAR", width, height, (float(width), float(height)), photo)
+        view = View("p", pixels, lens.camera(np.eye(4)), 1.0, "train")
+        for number, face in enumerate(faces_of(view, min(_FACE_SIDE, height))):
+            Image.fromarray(face.codes).save(folder / f"face{number}" / image_name(index), compress_level=1)
+
+
+def _match_rigs(database: Path, images: Path, count: int) -> None:
+    """Find and match features; views of one panorama are one frame of a rig and are not matched with each other."""
+    import pycolmap
+
+    side = Image.open(images / "face0" / image_name(0)).size[0]
+    focal = side / 2 / np.tan(np.radians(FACE_ANGLE / 2))
+    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_PINHOLE", camera_params=f"{focal},{side / 2},{side / 2}")
+    _log.info("finding features in the cut views of %d panoramas", count)
+    turns = face_rotations()
+    cameras = []
+    for number, turn in enumerate(turns):
+        from_rig = None if number == 0 else pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.zeros(3))
+        options = {"ref_sensor": number == 0, "image_prefix": f"face{number}/"}
+        cameras.append(pycolmap.RigConfigCamera(**options, **({} if from_rig is None else {"cam_from_rig": from_rig})))
+    matching = pycolmap.FeatureMatchingOptions(rig_verification=True, skip_image_pairs_in_same_frame=True)
+    options = {"verification_options": pycolmap.TwoViewGeometryOptions(), "device": pycolmap.Device.cpu}
+    options["verification_options"].ransac.random_seed = SEED
+    with quiet_colmap():
+        pycolmap.extract_features(
+            database, images, [], pycolmap.CameraMode.PER_FOLDER, reader, device=pycolmap.Device.cpu
+        )
+        with pycolmap.Database.open(database) as opened:
+            pycolmap.apply_rig_config([pycolmap.RigConfig(cameras=cameras)], opened)
+        _log.info("matching features between %d panoramas", count)
+        if count * len(turns) <= EXHAUSTIVE_LIMIT:
+            pycolmap.match_exhaustive(database, matching_options=matching, **options)
+        else:
+            pairing = pycolmap.SequentialPairingOptions(overlap=10, quadratic_overlap=True)
+            pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing, **options)
+
+
+def _map_rigs(database: Path, work: Path, count: int, source: Path):
+    """Return the reconstruction with the most panoramas; a second try has weaker conditions."""
+    import pycolmap
+
+    best = None
+    for patient in (False, True):
+        options = pycolmap.IncrementalPipelineOptions(min_model_size=2)
+        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
+        # The views are cut: their lens and their places in the rig are known.
+        for name in ("focal_length", "principal_point", "extra_params", "sensor_from_rig"):
+            setattr(options, f"ba_refine_{name}", False)
+        if patient:
+            options.min_num_matches = 10
+            options.mapper.init_min_tri_angle = 4.0
+            options.mapper.init_min_num_inliers = 50
+            options.mapper.abs_pose_min_num_inliers = 15
+        _log.info("placing %d panoramas", count)
+        output = work / f"model{int(patient)}"
+        output.mkdir()
+        with quiet_colmap():
+            models = pycolmap.incremental_mapping(database, work / "images", output, options)
+        candidates = [*([] if best is None else [best]), *models.values()]
+        best = max(candidates, key=lambda model: model.num_reg_frames(), default=None)
+        if best is not None and best.num_reg_frames() == count:
+            break
+    if best is None or best.num_reg_frames() < 2:
+        problem = f"none of the {count} panoramas could be placed by structure from motion"
+        raise InputError(source, problem, "take them closer together, or bring poses")
+    return best

@@ -1,0 +1,66 @@
+"""Bare panoramas: recognized, and placed by structure from motion."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sehdr_warp.scene import load_scene
+from sehdr_warp.scene.sfm_panorama import are_panoramas
+
+from .panorama_room import camera_at, light, walls
+
+pytest.importorskip("pycolmap")
+
+
+def photos(folder, count, width=512, options=None):
+    random, painted, cameras = np.random.default_rng(1), walls(), []
+    for i in range(count):
+        cameras.append(camera_at(random.uniform(-0.35, 0.35, 3), random.uniform(-1, 1), width))
+        codes = np.rint(255 * light(cameras[-1], painted) ** (1 / 2.2)).astype(np.uint8)
+        Image.fromarray(codes).save(folder / f"{i}.png", **(options or {}))
+    return cameras
+
+
+def test_panoramas_are_recognized_by_size_and_seam(tmp_path):
+    photos(tmp_path, 2, 128)
+    files = sorted(tmp_path.glob("*.png"))
+    assert are_panoramas(files)
+    image = np.asarray(Image.open(files[0]))
+    # Cut from a wider picture: twice as wide as high, and its ends have nothing to do with each other.
+    random = np.random.default_rng(0).integers(0, 255, (8, 5, 3), np.uint8)
+    cut = Image.fromarray(random).resize((128, 64), Image.Resampling.BICUBIC)
+    (tmp_path / "cut").mkdir()
+    for i in range(3):
+        cut.save(tmp_path / "cut" / f"{i}.png")
+    assert not are_panoramas(sorted((tmp_path / "cut").glob("*.png")))
+    Image.fromarray(image[:, :100]).save(tmp_path / "c.png")
+    assert not are_panoramas([*files, tmp_path / "c.png"])
+
+
+def test_stated_projections_win(tmp_path):
+    random = np.random.default_rng(0).integers(0, 255, (8, 5, 3), np.uint8)
+    cut = Image.fromarray(random).resize((128, 64), Image.Resampling.BICUBIC)
+    for kind, expected in (("equirectangular", True), ("cylindrical", False)):
+        text = f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><a GPano:ProjectionType="{kind}"/></x:xmpmeta>'
+        cut.save(tmp_path / f"{kind}.jpg", xmp=text.encode())
+        assert are_panoramas([tmp_path / f"{kind}.jpg"]) == expected
+
+
+def test_bare_panoramas_are_placed(tmp_path):
+    (tmp_path / "set").mkdir()
+    cameras = photos(tmp_path / "set", 6)
+    scene = load_scene(tmp_path / "set", response="srgb", cache=tmp_path / "cache", holdout=0, max_size=128)
+    assert len(scene.views) == 6 and len(scene.points) > 100
+    assert all(view.camera.projection == "equirectangular" for view in scene.views)
+    found = np.stack([view.camera.position for view in scene.views])
+    truth = np.stack([camera.position for camera in cameras])
+    # Equal up to a similarity (Umeyama 1991).
+    a, b = found - found.mean(0), truth - truth.mean(0)
+    u, values, vt = np.linalg.svd(b.T @ a)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ sign @ vt
+    scale = (values * sign.diagonal()).sum() / (a**2).sum()
+    assert np.abs(scale * a @ rotation.T - b).max() < 0.02
+    for view, camera in zip(scene.views, cameras, strict=True):
+        turn = view.camera.world_to_camera[:3, :3] @ rotation.T @ camera.world_to_camera[:3, :3].T
+        assert np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))) < 1
