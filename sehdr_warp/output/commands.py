@@ -293,9 +293,10 @@ def run_render(args: Render) -> None:
         raise UsageError(f"--count {args.count}: set for an orbit or interpolation; name one with --cameras")
     files, ramp, summary = [], _ramp(args.film.ev_ramp), ""
     if args.video is not None:
-        from .film import film_library
+        from .film import film_format, film_library
 
         film_library()
+        film_format(args.video)
         check_absent(args.video, args.overwrite)
     run = open_scene(args.run, args.device)
     path = {"cameras": args.cameras, "camera": args.camera, "count": args.count}

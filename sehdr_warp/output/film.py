@@ -5,6 +5,7 @@ grading.
 """
 
 import logging
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from sehdr_warp.errors import SehdrError
+from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.scene import Camera
 
 from ..console import format_seconds
@@ -70,6 +71,10 @@ LOGS = {
 }
 """Curve and primaries of each logarithm, as colour-science names them. H.273 has no code points for them."""
 _FASTSTART = (".mp4", ".mov", ".m4v")
+FORMATS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska", ".avi": "avi", ".ts": "mpegts"}
+"""FFmpeg's formats by suffix: those of one file. Others write further files beside it, whoever owns their names."""
+_SLOWEST, _FASTEST = 0.1, 1000.0
+"""Frames a second."""
 TRANSFERS |= dict.fromkeys(LOGS, Transfer("prores_ks", "yuv444p10le", {"profile": "4444"}, 2, 2, 1))
 
 
@@ -102,10 +107,12 @@ def write_film(
 
     Raises:
         SehdrError: Without PyAV (the extra `film`) or its encoder.
-        InputError: If `out` exists (unless overwrite).
+        InputError: If `out` exists (unless overwrite), or is not a film in one file by its suffix.
     """
     av, kind = film_library(), TRANSFERS[transfer]
-    out, first = Path(out), cameras[0]
+    out, first, container_format = Path(out), cameras[0], film_format(out)
+    if not _SLOWEST <= fps <= _FASTEST:
+        raise SehdrError(f"{fps} frames a second are not between {_SLOWEST} and {_FASTEST}")
     # Chroma of 4:2:0 covers two by two pixels.
     width, height = (max(2, side - side % 2) for side in (first.width, first.height))
     gain = run.base_time * display_gain(run.response)
@@ -116,7 +123,9 @@ def write_film(
     options = {"movflags": "faststart"} if out.suffix.lower() in _FASTSTART else {}
     with atomic_path(out, overwrite) as temporary:
         try:
-            with av.open(str(temporary), "w", options=options) as container:
+            # FFmpeg takes what stands before a colon for a protocol, and would connect to a URL.
+            name = f"file:{temporary.absolute()}"
+            with av.open(name, "w", format=container_format, options=options) as container:
                 stream = container.add_stream(kind.codec, rate=Fraction(fps).limit_denominator(1001))
                 stream.width, stream.height, stream.pix_fmt = width, height, kind.pixels
                 stream.options = kind.options
@@ -136,6 +145,20 @@ def write_film(
             remedy = f"choose {'.mov' if transfer in LOGS else '.mp4'} or another size"
             raise SehdrError(f"{out}: cannot be written as a film ({error}); {remedy}") from error
     return out
+
+
+def film_format(out: Path | str) -> str:
+    """Return FFmpeg's name of the format of a film.
+
+    Raises:
+        InputError: For a URL, and for a suffix that is not one of FORMATS.
+    """
+    if re.match(r"[a-z][a-z0-9+.-]+:/", str(out), re.IGNORECASE):
+        raise InputError(out, "is a URL", "name a file")
+    suffix = Path(out).suffix.lower()
+    if suffix not in FORMATS:
+        raise InputError(out, f"{suffix or 'no suffix'} is not the suffix of a film", f"use one of {' '.join(FORMATS)}")
+    return FORMATS[suffix]
 
 
 def encode(light: np.ndarray, transfer: str) -> np.ndarray:

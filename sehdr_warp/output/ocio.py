@@ -1,5 +1,6 @@
 """Previews as a production's OpenColorIO config shows them (the extra `ocio`)."""
 
+import os
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -8,11 +9,13 @@ from typing import Any
 import numpy as np
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.files import read_bytes
+from sehdr_warp.files import read_bytes, read_text
 
 from .colorspace import from_rec709
 
 _ROLE = "aces_interchange"
+_LARGEST = 256 << 20
+"""Bytes of a config, and of a LUT."""
 
 
 def ocio_view(config: str, view: str, gain: float = 1.0) -> Callable[[np.ndarray], np.ndarray]:
@@ -32,14 +35,12 @@ def ocio_view(config: str, view: str, gain: float = 1.0) -> Callable[[np.ndarray
         OCIO: Any = import_module("PyOpenColorIO")  # Its stubs lack what it loads from its library.
     except ImportError:
         raise SehdrError("--ocio needs OpenColorIO; run `pip install sehdr-warp[ocio]`") from None
-    if not config.startswith("ocio://"):
-        read_bytes(Path(config))
+    refused = (OCIO.Exception, OCIO.ExceptionMissingFile)
     try:
-        read = OCIO.Config.CreateFromFile(config)
+        read, files = _open_config(OCIO, config)
         read.validate()
-    except (OCIO.Exception, OCIO.ExceptionMissingFile) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(config, f"is no OpenColorIO config ({reason:.120})", "give a .ocio file") from None
+    except refused as error:
+        raise InputError(config, f"is no OpenColorIO config ({_line(error):.120})", "give a .ocio file") from None
     if not read.hasRole(_ROLE):
         raise InputError(config, f"has no role {_ROLE}, by which light enters", "take a config for OpenColorIO 2")
     display, _, name = view.rpartition("/")
@@ -50,7 +51,13 @@ def ocio_view(config: str, view: str, gain: float = 1.0) -> Callable[[np.ndarray
     ):
         if value not in known:
             raise InputError(config, f"has no {what} {value!r}", f"choose one of {', '.join(known)}")
-    processor = read.getProcessor(_ROLE, display, name, OCIO.TRANSFORM_DIR_FORWARD).getDefaultCPUProcessor()
+    try:
+        processor = read.getProcessor(_ROLE, display, name, OCIO.TRANSFORM_DIR_FORWARD).getDefaultCPUProcessor()
+    except refused as error:
+        if files is not None and files.refusal is not None:
+            raise files.refusal from None
+        problem = f"its view {name!r:.60} cannot be used ({_line(error):.160})"
+        raise InputError(config, problem, "check the config and its LUTs") from None
 
     def encode(radiance: np.ndarray) -> np.ndarray:
         pixels = np.ascontiguousarray(from_rec709(radiance, "aces2065-1") * gain, np.float32)
@@ -58,3 +65,47 @@ def ocio_view(config: str, view: str, gain: float = 1.0) -> Callable[[np.ndarray
         return np.clip(np.nan_to_num(pixels), 0, 1)
 
     return encode
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def _open_config(OCIO: Any, config: str) -> tuple[Any, Any]:
+    """Return a config, and what reads its LUTs; None for a built-in config and an archive, which hold theirs."""
+    if config.startswith("ocio://"):
+        return OCIO.Config.CreateFromFile(config), None
+    path = Path(config)
+    if path.suffix.lower() == ".ocioz":
+        read_bytes(path, _LARGEST)
+        return OCIO.Config.CreateFromFile(config), None
+    text = read_text(path, _LARGEST)
+
+    class Files(OCIO.PyConfigIOProxy):
+        """Reads the LUTs that a config names, by our bounded reader: its own waits for pipes and ends at no size."""
+
+        refusal: InputError | None = None
+
+        def getConfigData(self) -> str:
+            return text
+
+        def getFastLutFileHash(self, name: str) -> str:
+            """Return what identifies a file; empty if there is none."""
+            if not os.path.lexists(name):
+                return ""
+            try:
+                known.setdefault(name, list(read_bytes(Path(name), _LARGEST)))
+            except InputError as error:
+                # Of a name without content OpenColorIO would open the file itself.
+                self.refusal, known[name] = error, [0]
+            return name
+
+        def getLutData(self, name: str) -> list[int]:
+            return known[name]
+
+    known: dict[str, list[int]] = {}
+    files = Files()
+    OCIO.ClearAllCaches()  # It would take another file's content for that of the same name.
+    read = OCIO.Config.CreateFromConfigIOProxy(files)
+    read.setWorkingDir(str(path.absolute().parent))
+    return read, files

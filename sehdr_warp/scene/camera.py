@@ -8,6 +8,8 @@ import numpy as np
 FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
 """COLMAP's fisheye models that are radial."""
 PROJECTIONS = ("pinhole", "equirectangular", *FISHEYES)
+MAX_SIDE = 1 << 20
+"""Pixels of a side of an image that can be rendered."""
 
 
 def limited_size(width: int, height: int, max_size: int | None) -> tuple[int, int]:
@@ -72,6 +74,8 @@ class Camera:
         object.__setattr__(self, "world_to_camera", pose)
         if self.width < 1 or self.height < 1:
             raise ValueError(f"image size {self.width} x {self.height} is not positive")
+        if max(self.width, self.height) > MAX_SIDE:
+            raise ValueError(f"image size {self.width} x {self.height} is more than {MAX_SIDE} pixels on a side")
         if not np.isfinite(self.intrinsics).all():
             raise ValueError(f"camera fx, fy, cx, cy = {self.intrinsics.tolist()} are not finite")
         if self.projection not in PROJECTIONS:

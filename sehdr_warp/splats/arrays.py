@@ -15,6 +15,8 @@ log = logging.getLogger(__name__)
 HARMONIC_0 = 0.5 / math.sqrt(math.pi)
 """The harmonic of degree 0."""
 MAX_DEGREE = 3
+SHORTEST_TIME, LONGEST_TIME = 1e-12, 1e12
+"""Seconds that a base exposure time may have; beyond, radiance leaves the range of float32."""
 _NOT_FINITE = "it is not written; train again from an earlier checkpoint or with another seed"
 # A logit beyond this is an opacity of 0 or 1 in float32.
 _MOST_LOGIT = 20.0
@@ -112,7 +114,7 @@ class GaussianArrays:
         """
         if len(lengths := {len(getattr(self, name)) for name in _ARRAYS}) > 1:
             raise InputError(path, f"its arrays are of {sorted(lengths)} Gaussians", "export it again")
-        if not 0 < self.base_time < math.inf:
+        if not SHORTEST_TIME <= self.base_time <= LONGEST_TIME:
             problem = f"its base exposure time is {self.base_time} s"
             raise InputError(path, problem, "state a positive number of seconds")
         logits = np.clip(self.opacity_logits, -_MOST_LOGIT, _MOST_LOGIT)

@@ -150,5 +150,7 @@ def _accessor(described: dict, binary: bytes, index: int, columns: int) -> np.nd
         raise ValueError(f"accessor {index} is {accessor['type']}")
     row = np.dtype(kind).itemsize * columns
     offset, stride = view.get("byteOffset", 0) + accessor.get("byteOffset", 0), view.get("byteStride", row)
+    if type(stride) is not int or stride < row:  # Of 0, one element would stand for any number of them.
+        raise ValueError(f"a stride of {stride!r:.20} bytes is less than the {row} of an element")
     stored = np.ndarray((accessor["count"], columns), kind, binary, offset, (stride, row // columns))
     return np.maximum(stored.astype(np.float32) / one, -np.inf if one == 1 else -1)

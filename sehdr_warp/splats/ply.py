@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import atomic_path, plain_size
-from .arrays import GaussianArrays, degree_of, read_matrix
+from .arrays import LONGEST_TIME, SHORTEST_TIME, GaussianArrays, degree_of, read_matrix
 
 _DAMAGED = "copy or export the file again"
 _COLOR_MODELS = ("display", "log", "linear")
@@ -141,7 +141,9 @@ def _facts(comments: list[str], path: Path) -> _Facts:
         base_time = float(facts.get("base_exposure_time", 1.0))
     except ValueError:
         base_time = np.nan
-    if color_model not in _COLOR_MODELS or not 0 < base_time < np.inf:
+    if color_model not in _COLOR_MODELS or not SHORTEST_TIME <= base_time <= LONGEST_TIME:
         problem = f"its header states color model {color_model!r:.40} at {base_time} s"
-        raise InputError(path, problem, f"state one of {', '.join(_COLOR_MODELS)} and a positive time")
+        raise InputError(
+            path, problem, f"state one of {', '.join(_COLOR_MODELS)} and a time of {SHORTEST_TIME} to {LONGEST_TIME} s"
+        )
     return _Facts(color_model, base_time, read_matrix(facts.get("world_matrix"), path))

@@ -1,5 +1,7 @@
 """Previews through OpenColorIO, and its names of color spaces."""
 
+import os
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -53,3 +55,60 @@ def test_color_spaces_have_the_names_and_matrices_of_openexr(tmp_path):
         to = config.getProcessor(found["lin_rec709_scene"], found[space.interop_id]).getDefaultCPUProcessor()
         for light in np.eye(3):
             np.testing.assert_allclose(to.applyRGB(light.tolist()), from_rec709(light, space.name), atol=2e-5)
+
+
+def config_of(folder, transform):
+    """A config whose one view is a transform."""
+    folder.joinpath("own.ocio").write_text(f"""ocio_profile_version: 2
+search_path: luts:.
+strictparsing: true
+roles: {{default: raw, scene_linear: raw, aces_interchange: raw, cie_xyz_d65_interchange: raw}}
+file_rules:
+  - !<Rule> {{name: Default, colorspace: default}}
+displays:
+  D:
+    - !<View> {{name: V, colorspace: out}}
+colorspaces:
+  - !<ColorSpace>
+    name: raw
+  - !<ColorSpace>
+    name: out
+    from_scene_reference: {transform}
+""")
+    return str(folder / "own.ocio")
+
+
+def test_luts_beside_a_config_are_read(tmp_path, monkeypatch):
+    (tmp_path / "luts").mkdir()
+    rows = (f"{r / 2} {g / 4} {b / 8}" for b in (0, 1) for g in (0, 1) for r in (0, 1))
+    (tmp_path / "luts" / "a.cube").write_text("LUT_3D_SIZE 2\n" + "\n".join(rows) + "\n")
+    config = config_of(tmp_path, "!<FileTransform> {src: a.cube, interpolation: linear}")
+    monkeypatch.chdir(tmp_path)
+    light = np.full((1, 1, 3), 0.4)
+    expected = from_rec709(light, "aces2065-1") / [2, 4, 8]
+    for name in (config, "own.ocio"):
+        np.testing.assert_allclose(ocio_view(name, "V")(light), expected, atol=1e-5)
+    (tmp_path / "luts" / "a.cube").write_text("LUT_3D_SIZE 2\n" + "0.5 0.5 0.5\n" * 8)
+    np.testing.assert_allclose(ocio_view(config, "V")(light), 0.5, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "kind", ["missing", "damaged", "no lut", "cycle", "pipe", "device", "folder", "sparse", "empty"]
+)
+def test_luts_that_cannot_be_read_are_told_in_a_line(tmp_path, kind):
+    lut = tmp_path / "x.cube"
+    if kind == "pipe":
+        os.mkfifo(lut)
+    elif kind == "folder":
+        lut.mkdir()
+    elif kind != "missing":
+        lut.write_text("" if kind == "empty" else "LUT_3D_SIZE 2\n0 0 0\n")
+    if kind == "sparse":
+        os.truncate(lut, 4 << 30)
+    source = {"no lut": "/etc/passwd", "device": "/dev/zero"}.get(kind, "x.cube")
+    transform = f"!<FileTransform> {{src: {source}}}"
+    if kind == "cycle":
+        transform = "!<ColorSpaceTransform> {src: out, dst: raw}"
+    with pytest.raises(InputError) as error:
+        ocio_view(config_of(tmp_path, transform), "V")
+    assert "\n" not in str(error.value) and len(str(error.value)) < 900

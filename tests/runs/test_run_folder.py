@@ -211,7 +211,7 @@ def test_confidence_is_the_same_file_each_time(run):
     from sehdr_warp.model.confidence import Evidence
     from sehdr_warp.runs.run_writer import write_confidence
 
-    evidence, folder = Evidence(*torch.rand(3, 4)), RunFolder(run)
+    evidence, folder = Evidence(*torch.rand(4, 4)), RunFolder(run)
     contents = set()
     for _ in range(8):
         write_confidence(folder, evidence, "a" * 64)
