@@ -1,9 +1,9 @@
 """Memory: how much Warp holds beside torch's allocator, and one clear line when there is not enough."""
 
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 import warp as wp
@@ -15,18 +15,26 @@ try:
 except ImportError:  # Windows has no limits of this kind.
     resource = None
 
-REMEDY = "use fewer Gaussians (densification.cap_max) or a smaller image (--max-size)"
+REMEDY = "use fewer Gaussians or a smaller image"
+TRAINING_REMEDY = "use fewer Gaussians (densification.cap_max) or a smaller image (--max-size)"
 
 COMPILER_BYTES = 64 << 20  # Half of it is too little for a kernel of the CPU
 
 
 class OutOfMemory(SehdrError):
-    """Not enough memory; the message gives the sizes and how much was asked for."""
+    """Not enough memory; the message gives the sizes and how much was requested.
+
+    Attributes:
+        details: the message without the remedy.
+    """
+
+    def __init__(self, details: str, remedy: str = REMEDY) -> None:
+        super().__init__(f"{details}; {remedy}")
+        self.details = details
 
 
 def check_room_to_compile() -> None:
-    """Raises MemoryError where the address space is limited and nearly used up: the compiler of kernels would end this
-    process, without a word."""
+    """Raise MemoryError if the address space is limited and nearly used up: the compiler would end this process."""
     status = Path("/proc/self/statm")
     if resource is None or not status.exists():
         return
@@ -38,13 +46,15 @@ def check_room_to_compile() -> None:
 
 
 def warp_memory_bytes(device: torch.device) -> int:
-    """Bytes that Warp itself has allocated on a CUDA device at most so far (sorting's scratch); 0 on the CPU."""
+    """Return the most bytes that Warp itself has allocated on a CUDA device so far, as scratch; 0 on the CPU."""
     return wp.get_mempool_used_mem_high(wp.device_from_torch(device)) if device.type == "cuda" else 0
 
 
 def failed_allocation(error: BaseException) -> str | None:
-    """How much memory an error says could not be had, as text ("some memory" where it does not say how much); None if
-    the error is about something else."""
+    """Return how much memory an error says could not be allocated, as text; None if it is about something else.
+
+    If the error does not say how much, it is "some memory".
+    """
     text, kinds = str(error), (MemoryError, torch.OutOfMemoryError)
     says_so = re.search(r"can't allocate memory|[Ff]ailed to allocate|out of memory", text)
     if isinstance(error, OutOfMemory) or not (isinstance(error, kinds) or says_so):
@@ -59,16 +69,33 @@ def failed_allocation(error: BaseException) -> str | None:
     return f"{found[1]} {unit}"
 
 
-@contextmanager
-def oom_context(device: torch.device, sizes: Callable[[], tuple[int, ...]]) -> Iterator[None]:
-    """Makes allocations that fail within the block OutOfMemory errors. sizes: Gaussians, width, height and perhaps
-    channels by then."""
-    try:
-        yield
-    except (RuntimeError, MemoryError) as error:
-        asked = failed_allocation(error)
-        if asked is None:
-            raise
-        gaussians, width, height, *channels = sizes()
-        told = f"{gaussians} Gaussians, an image of {width} x {height}" + "".join(f", {n} channels" for n in channels)
-        raise OutOfMemory(f"out of memory on {device}: {asked} could not be allocated with {told}; {REMEDY}") from error
+class oom_context:
+    """Turn allocations that fail within the block into OutOfMemory errors that name the sizes.
+
+    Args:
+        device: of the work.
+        sizes: returns the number of Gaussians, width, height and, if known by then, channels.
+        remedy: what the user can do, also in place of the remedy of an OutOfMemory error from within.
+    """
+
+    __slots__ = ("_device", "_remedy", "_sizes")
+
+    def __init__(self, device: torch.device, sizes: Callable[[], tuple[int, ...]], remedy: str = REMEDY) -> None:
+        self._device, self._sizes, self._remedy = device, sizes, remedy
+
+    def __enter__(self) -> None:
+        """Enter the block."""
+
+    def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
+        """Raise OutOfMemory for an error about memory."""
+        if isinstance(error, OutOfMemory) and self._remedy not in str(error):
+            raise OutOfMemory(error.details, self._remedy) from error
+        if not isinstance(error, RuntimeError | MemoryError):
+            return
+        request = failed_allocation(error)
+        if request is None:
+            return
+        gaussians, width, height, *channels = self._sizes()
+        work = f"{gaussians} Gaussians, an image of {width} x {height}" + "".join(f", {n} channels" for n in channels)
+        details = f"out of memory on {self._device}: {request} could not be allocated with {work}"
+        raise OutOfMemory(details, self._remedy) from error

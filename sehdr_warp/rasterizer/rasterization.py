@@ -264,9 +264,7 @@ def render_projected(projected: ProjectedGaussians, features: Tensor, options: R
         features = torch.cat([features, depths[:, None]], 1)
     features = features.contiguous()
     # In place on memory that the projection's graph has saved: as data, so that it is no change of a saved tensor.
-    splats = Splats(
-        means2d.detach(), conics.detach(), opacities.detach(), features.detach(), depths.detach(), extents.data
-    )
+    splats = Splats(means2d, conics, opacities, features.detach(), depths, extents.data)
     repeated = None
     if options.max_intersections is None and not options.deterministic:
         differentiable = torch.is_grad_enabled() and (

@@ -22,8 +22,11 @@ HALF = torch.float16, torch.bfloat16
 _transforms_are_active = torch._C._are_functorch_transforms_active
 
 
-def _some_autocast() -> bool:
+def _autocast_of_a_device() -> bool:
     return torch.is_autocast_enabled("cuda") or torch.is_autocast_enabled("cpu")
+
+
+_some_autocast = getattr(torch._C, "_is_any_autocast_enabled", _autocast_of_a_device)
 
 
 def torch_operation(function: Callable[P, T]) -> Callable[P, T]:

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 
 from ..model.radiance_field import RadianceField
-from ..rasterizer.memory import oom_context
+from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..runs.checkpoint import Checkpoint
 from ..runs.config import Config
 from ..runs.run import field_from_checkpoint
@@ -53,7 +53,7 @@ def follow_leader(ranks: Ranks) -> Trainer:
 
     every = config.scaled(config.schedule.checkpoint_every)
     with (
-        oom_context(ranks.device, lambda: sizes_of(scene, trainer.field.gaussians.count)),
+        oom_context(ranks.device, lambda: sizes_of(scene, trainer.field.gaussians.count), TRAINING_REMEDY),
         torch_settings(config.deterministic),
         interruptible() as interrupted,
     ):

@@ -17,7 +17,7 @@ from ..errors import InputError, SehdrError
 from ..model.confidence import Evidence, gather_evidence
 from ..model.radiance_field import RenderedView
 from ..model.residual_regions import MAX_LISTED, find_residual_regions, regions_to_dict
-from ..rasterizer.memory import oom_context
+from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..response import Response
 from ..runs.checkpoint import first_not_finite
 from ..runs.config import Config
@@ -120,7 +120,7 @@ class Training:
         make_writer = summary_writer() if tensorboard else None
         config = as_config(config)
         self.seconds = 0.0
-        with oom_context(self.device, lambda: sizes_of(scene)):
+        with oom_context(self.device, lambda: sizes_of(scene), TRAINING_REMEDY):
             self.scene = scene
             resumed = self.folder.check(resume=resume, overwrite=overwrite)
             try:
@@ -180,7 +180,7 @@ class Training:
 
     def __iter__(self) -> Iterator[Step]:
         with (
-            oom_context(self.device, lambda: sizes_of(self.scene, self.trainer.field.gaussians.count)),
+            oom_context(self.device, lambda: sizes_of(self.scene, self.trainer.field.gaussians.count), TRAINING_REMEDY),
             torch_settings(self.config.deterministic),
             interruptible() as interrupted,
             ExitStack() as leaving,

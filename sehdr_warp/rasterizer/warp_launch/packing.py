@@ -25,7 +25,9 @@ class PackedLaunch:
     ) -> None:
         self.arguments = kernel.adj.args
         self.kinds = [argument.type for argument in self.arguments] * (1 + adjoint)
+        # The last launch's values; of tensors the dtype, beside their shapes if they were contiguous.
         self.packed: list[Any] = [...] * len(self.kinds)
+        self.shapes: list[Any] = [None] * len(self.kinds)
         count = len(self.arguments)
         initial = [
             type(kind.__ctype__())() if hasattr(kind, "__ctype__") else values[place % count]
@@ -70,13 +72,16 @@ class PackedLaunch:
         return structures
 
     def _pack(self, values: list) -> None:
-        arrays, packed = self.arrays, self.packed
+        """Pack what differs from the last launch: mostly addresses, since call sites repeat shapes."""
+        arrays, packed, shapes = self.arrays, self.packed, self.shapes
         for index, value in enumerate(values):
             if isinstance(value, Tensor):
-                array, layout = arrays[index], (value.shape, value.stride(), value.dtype)
-                if layout != packed[index]:
+                array, shape = arrays[index], value.shape
+                if shape != shapes[index] or value.dtype is not packed[index] or not value.is_contiguous():
                     write_layout(array, value, self.kinds[index])
-                    packed[index] = layout
+                    # Of a tensor that is not contiguous the shape does not tell the strides.
+                    shapes[index] = shape if value.is_contiguous() else None
+                    packed[index] = value.dtype
                 array.data = value.data_ptr()
             elif value is not packed[index] and (value is None or value != packed[index]):
                 if value is not None:
