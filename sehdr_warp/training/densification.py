@@ -27,7 +27,7 @@ SHORTEST_RESET = 300
 SPARE = 1.17  # Rows in multiples of the Gaussians: changes that add a twentieth each fill them in three
 MOST_GROWTH = 1.0  # A change adds at most as many as there are: each then shares with one other in the mean
 PAIRS = 1 << 24  # Of Gaussians and cameras whose distances are held at once
-NOISE_SIZES = 0.2
+NOISE_SIZES = 0.05
 """Position noise moves a Gaussian by at most this many of its standard deviations in a step (times a normal number)."""
 FARTHEST = 100.0
 """Position noise moves no Gaussian farther than this from the origin, in normalized units (1.1 camera radii)."""

@@ -89,7 +89,7 @@ def test_a_plan_decides_everything_once_with_figures(scene):
 @pytest.mark.parametrize(
     "name,change,field,few,many",
     [
-        ("iterations", {"photos": 200}, "schedule.iterations", 4000, 30_000),
+        ("iterations", {"photos": 200}, "schedule.iterations", 4000, 15_000),
         # Relocation's budget: 120 times the square root of 6144, and of 10^6.
         ("densification", {"pixels": 10**6}, "densification.cap_max", 9406, 120_000),
     ],
@@ -148,9 +148,9 @@ def test_a_cpu_gets_the_iterations_that_fit_into_minutes(facts, monkeypatch):
     config, rule = config_of(), RULES["iterations"]
     small, large = (replace(facts, photos=200, pixels=200 * side * side) for side in (32, 2000))
     some, few, all_of_them = rule(small, config, CPU), rule(large, config, CPU), rule(small, config, GPU)
-    assert all_of_them[0] == {"schedule.iterations": 30_000} and few[0] == {"schedule.iterations": 1000}
+    assert all_of_them[0] == {"schedule.iterations": 15_000} and few[0] == {"schedule.iterations": 1000}
     assert "--max-size" in few[2] and "58 min on a CPU" in few[2]
-    assert 1000 < some[0]["schedule.iterations"] <= 30_000
+    assert 1000 < some[0]["schedule.iterations"] <= 15_000
     assert cpu_step_seconds(large, config) > 50 * cpu_step_seconds(small, config)
 
 
