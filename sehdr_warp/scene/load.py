@@ -29,6 +29,8 @@ from .read_folders import (
     read_llff,
     read_photos,
 )
+from .read_opensfm import FILE as OPENSFM_FILE
+from .read_opensfm import read_opensfm
 from .read_transforms import read_hdr_nerf, read_transforms
 from .types import Scene
 from .video import is_video
@@ -252,6 +254,7 @@ def _read(folder: Path, cache: Path | str | None) -> DataparserOutputs:
         (beside, read_colmap),
         (has("transforms.json") or has("transforms_train.json"), read_transforms),
         (model is not None, read_colmap),
+        (has(OPENSFM_FILE), read_opensfm),
         (has("poses_bounds.npy"), read_llff),
     )
     reader = next((reader for fits, reader in readers if fits), None)

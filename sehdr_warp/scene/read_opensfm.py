@@ -1,0 +1,115 @@
+"""OpenSfM's reconstruction.json: cameras of all its projections, poses and points."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..files import contained, read_text
+from .dataparser import NO_POINTS, DataparserOutputs, ImageRecord, PointCloud
+from .lens import Lens
+from .names import natural_key
+
+FILE = "reconstruction.json"
+_REMEDY = "export it again with OpenSfM"
+_SPHERES = ("spherical", "equirectangular")
+
+
+def read_opensfm(folder: Path) -> DataparserOutputs:
+    """Parse a folder with `reconstruction.json` and `images/`: a record for each shot of the largest reconstruction.
+
+    Raises:
+        InputError: if the file is damaged, or none of its images is there.
+    """
+    path = folder / FILE
+    try:
+        models = json.loads(read_text(path))
+        model = max(models, key=lambda each: len(each["shots"]))
+        shots, cameras = dict(model["shots"]), dict(model["cameras"])
+    except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as error:
+        raise InputError(path, f"is not a list of reconstructions ({error!r:.60})", _REMEDY) from None
+    lenses = {name: _lens(values, path, name) for name, values in cameras.items()}
+    records, absent = [], []
+    for name in sorted(shots, key=natural_key):
+        image = contained(folder / "images", name, path)
+        if not image.is_file():
+            absent.append(name)
+            continue
+        lens = lenses.get(shots[name].get("camera")) if isinstance(shots[name], dict) else None
+        if lens is None:
+            raise InputError(path, f"shot {name!r:.90} has no camera of the file", _REMEDY)
+        records.append(ImageRecord(image.stem, image, lens, _pose(shots[name], path, name), oriented=True))
+    if not records:
+        raise InputError(folder / "images", f"none of the {len(shots)} images of {FILE} is here", "copy the whole set")
+    notes = []
+    if absent:
+        notes.append(f"{len(absent)} images of {FILE} are missing and were left out: {absent[0]!r:.90} ...")
+    if len(models) > 1:
+        rest = sum(len(each["shots"]) for each in models) - len(shots)
+        notes.append(
+            f"{FILE} holds {len(models)} reconstructions: the largest is used, {rest} images of others are not"
+        )
+    return DataparserOutputs("opensfm", tuple(records), cloud=_points(model, path), notes=tuple(notes))
+
+
+def _pose(shot: dict, path: Path, name: str) -> np.ndarray:
+    """Return [4, 4] world_to_camera of a shot's rotation vector and translation."""
+    from scipy.spatial.transform import Rotation
+
+    pose = np.eye(4)
+    try:
+        turn, move = (np.array(shot[key], np.float64).reshape(3) for key in ("rotation", "translation"))
+        if not (np.isfinite(turn).all() and np.isfinite(move).all()):
+            raise ValueError("not finite")
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(path, f"pose of {name!r:.90} cannot be used ({error!s:.40})", _REMEDY) from None
+    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec(turn).as_matrix(), move
+    return pose
+
+
+def _lens(values: Any, path: Path, name: str) -> Lens:
+    """Return a camera's lens. OpenSfM's lengths are parts of the longer side, its center is the picture's."""
+    try:
+        kind = str(values["projection_type"]).lower()
+        width, height = int(values["width"]), int(values["height"])
+        side = max(width, height)
+
+        def number(key: str, default: float = 0.0) -> float:
+            return float(values.get(key, default))
+
+        focal = number("focal", number("focal_x"))
+        fx, fy = number("focal_x", focal) * side, number("focal_y", focal) * side
+        cx, cy = width / 2 + number("c_x") * side, height / 2 + number("c_y") * side
+        k1, k2, k3, k4, p1, p2 = (number(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
+        raise InputError(path, f"camera {name!r:.60} cannot be used ({error!r:.60})", _REMEDY) from None
+    lenses = {
+        "perspective": ("RADIAL", (fx, cx, cy, k1, k2)),
+        "simple_radial": ("OPENCV", (fx, fy, cx, cy, k1, 0.0, 0.0, 0.0)),
+        "radial": ("OPENCV", (fx, fy, cx, cy, k1, k2, 0.0, 0.0)),
+        "brown": ("FULL_OPENCV", (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)),
+        "fisheye": ("RADIAL_FISHEYE", (fx, cx, cy, k1, k2)),
+        "fisheye_opencv": ("OPENCV_FISHEYE", (fx, fy, cx, cy, k1, k2, k3, k4)),
+    }
+    lenses |= dict.fromkeys(_SPHERES, ("EQUIRECTANGULAR", (float(width), float(height))))
+    if kind not in lenses:
+        problem = f"camera {name!r:.60} has projection_type {kind!r:.40}, which is not supported"
+        raise InputError(path, problem, f"use one of {', '.join(lenses)}")
+    model, params = lenses[kind]
+    return Lens(model, width, height, params, path)
+
+
+def _points(model: dict, path: Path) -> PointCloud:
+    points = model.get("points")
+    if not points:
+        return NO_POINTS
+    try:
+        places = np.array([point["coordinates"] for point in points.values()], np.float64).reshape(-1, 3)
+        colors = np.array([point.get("color", (128, 128, 128)) for point in points.values()]).reshape(-1, 3)
+        if not np.isfinite(places).all():
+            raise ValueError("not finite")
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(path, f"its points cannot be used ({error!r:.60})", _REMEDY) from None
+    return PointCloud(places, np.clip(colors.astype(np.float64) / 255, 0, 1).astype(np.float32))
