@@ -204,7 +204,7 @@ def _help() -> str:
         + f"""
 First try:  {PROGRAM} train embedded --out runs/first
 {PROGRAM} COMMAND --help explains a command. Every command takes -q (quiet),
---verbose, and --debug (where an error comes from). --version prints the version."""
+--verbose, and --debug (where an error comes from). There is also --version."""
     )
 
 

@@ -210,7 +210,6 @@ def test_fields_named_on_the_command_line_override_the_preset_and_stay(capsys):
         ("train embedded:rom --out r", "did you mean room?"),
         ("train embedded --out r --device cuda:77", "cuda:77"),
         ("train embedded --out r --device mps", "device mps: is neither"),
-        ("train --resume --out r", "nothing to resume"),
         ("config defualt", "did you mean default?"),
         ("render nowhere --out r", "nowhere"),
         ("compare nowhere --plot chart.pdf", "chart.pdf: the chart is a PNG file; name it chart.png"),

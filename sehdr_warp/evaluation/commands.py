@@ -51,9 +51,9 @@ class ResultOptions:
 class Evaluate:
     """Compare a trained scene, or a folder of EXR pictures, with held-out photos and HDR truth."""
 
-    folder: Annotated[Positional[Path], tyro.conf.arg(metavar="RUN|PICTURES")]
+    run: Annotated[Positional[Path], tyro.conf.arg(metavar="RUN|PICTURES")]
     """Folder of a run; or of EXR pictures of any origin, with --truth."""
-    run: RunOptions = RunOptions()
+    scene: RunOptions = RunOptions()
     pictures: PictureOptions = PictureOptions()
     result: ResultOptions = ResultOptions()
 
@@ -82,7 +82,7 @@ def run_evaluate(options: Evaluate) -> None:
     if options.pictures.truth is None:
         _refuse_unused(options.pictures, PictureOptions(), "needs --truth, the set to compare pictures with")
     else:
-        _refuse_unused(options.run, RunOptions(), "belongs to runs; pictures with --truth do not take it")
+        _refuse_unused(options.scene, RunOptions(), "belongs to runs; pictures with --truth do not take it")
     result = options.result
     file = None if result.json is None or str(result.json) == "-" else result.json
     if file is not None:
@@ -106,8 +106,8 @@ def _refuse_unused(group: Any, defaults: Any, problem: str) -> None:
 def _evaluate_run(options: Evaluate) -> dict[str, Any]:
     from .evaluate import evaluate
 
-    run = open_run(options.folder, options.run.device)
-    scene = load_run_photos_with_confidence(run, options.run.data)
+    run = open_run(options.run, options.scene.device)
+    scene = load_run_photos_with_confidence(run, options.scene.data)
     return evaluate(run, scene, lpips_weights=options.result.lpips)
 
 
@@ -117,14 +117,14 @@ def _evaluate_pictures(options: Evaluate, truth_path: str) -> dict[str, Any]:
     from .folder import evaluate_folder
 
     max_size = options.pictures.max_size
-    response = options.pictures.response or enclosing_run_response(options.folder)
+    response = options.pictures.response or enclosing_run_response(options.run)
     if response is None:
         dataset = parse_dataset(truth_path)
         resampled = dataset.alpha == "background" or not all(record.lens.is_pinhole for record in dataset.records)
         # Photos that are not resampled keep their codes, so every response finds the same regions clipped and dark.
         response = "auto" if resampled or max_size is not None else "srgb"
     truth = load_scene(truth_path, response=response, max_size=max_size)
-    return evaluate_folder(options.folder, truth, lpips_weights=options.result.lpips)
+    return evaluate_folder(options.run, truth, lpips_weights=options.result.lpips)
 
 
 def run_compare(options: Compare) -> None:
