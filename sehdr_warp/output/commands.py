@@ -154,12 +154,13 @@ class EditOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write the Gaussians as PLY, OpenUSD or glTF, for viewers and other tools, or as a page that shows them in HDR."""
+    """Write the Gaussians as a file for viewers and other tools, or as a page that shows them in HDR."""
 
     run: Positional[Path]
     """Folder of a run, or a file of Gaussians."""
     out: Path
-    """The file; its suffix decides: .ply, .glb (glTF), .usda, .usdc or .usdz (OpenUSD), .html (a page to send)."""
+    """The file; its suffix decides: .ply, .glb (glTF), .usda, .usdc or .usdz (OpenUSD), .html (a page to send), or the
+    small ones .sog, .spz and .compressed.ply."""
     world: WorldOptions = WorldOptions()
     edits: EditOptions = EditOptions()
     merge: tuple[Path, ...] = ()
@@ -175,10 +176,10 @@ class Export:
 
 @dataclass(frozen=True, kw_only=True)
 class Convert:
-    """Turn a file of Gaussians into one of another kind: PLY, OpenUSD or glTF."""
+    """Turn a file of Gaussians into one of another kind."""
 
     source: Positional[Path]
-    """The file: .ply, .glb, .usda, .usdc or .usdz."""
+    """The file: .ply, .glb, .usda, .usdc, .usdz, .sog, .spz or .compressed.ply."""
     out: Positional[Path]
     """The file to write; its suffix decides."""
     file: SplatFileOptions = SplatFileOptions()

@@ -175,7 +175,8 @@ def _log_file_loss(
     views = _judged(run)
     if not views:
         return
-    gaussians = read_gaussians(path).transformed(to_file.inverse().matrix)
+    # SPZ does not state the exposure time.
+    gaussians = replace(read_gaussians(path).transformed(to_file.inverse().matrix), base_time=time)
     if reference is None:
         picture, beside = _photographed(run, time), "the scene"
     else:

@@ -1,4 +1,4 @@
-"""Files of Gaussians, and Gaussians as plain arrays: PLY of 3D Gaussian Splatting, OpenUSD, glTF. The suffix decides.
+"""Files of Gaussians, and Gaussians as plain arrays: PLY, OpenUSD, glTF, SOG, SPZ and compressed PLY, by suffix.
 
 NumPy alone is loaded here; USD needs the extra `usd`.
 """
@@ -7,19 +7,22 @@ from pathlib import Path
 
 from ..errors import InputError
 from .arrays import GaussianArrays
+from .compressed_ply import SUFFIX as COMPRESSED_PLY
+from .compressed_ply import write_compressed_ply
 from .gltf import read_glb, write_glb
 from .ply import read_ply, write_ply
+from .sog import read_sog, write_sog
+from .spz import read_spz, write_spz
 from .usd import read_usd, write_usd
 
 USD_SUFFIXES = (".usda", ".usdc", ".usd", ".usdz")
-SUFFIXES = (".ply", *USD_SUFFIXES, ".glb")
+SUFFIXES = (".ply", *USD_SUFFIXES, ".glb", ".sog", ".spz", COMPRESSED_PLY)
 """Of the files that are read and written."""
-LOSSY_SUFFIXES: tuple[str, ...] = ()
+LOSSY_SUFFIXES = (".sog", ".spz", COMPRESSED_PLY)
+"""Of files that hold rounded numbers, a tenth to a fourth of the size."""
 _OTHER = {
     ".splat": "holds 8 bits and no harmonics",
     ".ksplat": "holds a viewer's own compression",
-    ".spz": "ends at 1.44 times white",
-    ".sog": "holds a viewer's own compression",
     ".gltf": "is glTF in pieces",
 }
 
@@ -30,7 +33,8 @@ def check_suffix(path: Path | str, *others: str) -> str:
     Raises:
         InputError: For a suffix that is neither read nor written.
     """
-    suffix = Path(path).suffix.lower()
+    name = Path(path).name.lower()
+    suffix = COMPRESSED_PLY if name.endswith(COMPRESSED_PLY) else Path(name).suffix
     if suffix not in (*SUFFIXES, *others):
         why = f"{suffix} is not read or written here: it {_OTHER[suffix]}" if suffix in _OTHER else "is no splat file"
         raise InputError(path, why, f"use one of {' '.join((*SUFFIXES, *others))}")
@@ -45,7 +49,7 @@ def path_is_lossy(path: Path | str) -> bool:
 def color_model_of(path: Path | str) -> str | None:
     """Return the one color model that a file of this suffix can hold; None if it can hold any (PLY)."""
     suffix = check_suffix(path)
-    return {".ply": None, ".glb": "display"}.get(suffix, "linear")
+    return None if suffix == ".ply" else "linear" if suffix in USD_SUFFIXES else "display"
 
 
 def read_gaussians(path: Path | str) -> GaussianArrays:
@@ -57,7 +61,8 @@ def read_gaussians(path: Path | str) -> GaussianArrays:
         InputError: If the file is missing, damaged, of another kind or holds no Gaussian.
     """
     suffix = check_suffix(path)
-    read = {".ply": read_ply, ".glb": read_glb}.get(suffix, read_usd)
+    readers = {".ply": read_ply, COMPRESSED_PLY: read_ply, ".glb": read_glb, ".sog": read_sog, ".spz": read_spz}
+    read = readers.get(suffix, read_usd)
     return read(Path(path)).checked(path)
 
 
@@ -74,7 +79,9 @@ def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: b
         problem = f"holds {held} colors, and these are {gaussians.color_model}"
         raise InputError(path, problem, "choose another suffix, or let export change the colors")
     gaussians.require_finite(path)
-    write = {".ply": write_ply, ".glb": write_glb}.get(suffix, write_usd)
+    writers = {".ply": write_ply, COMPRESSED_PLY: write_compressed_ply, ".glb": write_glb}
+    writers |= {".sog": write_sog, ".spz": write_spz}
+    write = writers.get(suffix, write_usd)
     write(Path(path), gaussians, overwrite)
 
 

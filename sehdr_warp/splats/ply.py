@@ -15,6 +15,7 @@ import numpy as np
 from ..errors import InputError
 from ..files import atomic_path, plain_size
 from .arrays import LONGEST_TIME, SHORTEST_TIME, GaussianArrays, degree_of, read_matrix
+from .compressed_ply import unpack_ply
 
 _DAMAGED = "copy or export the file again"
 _COLOR_MODELS = ("display", "log", "linear")
@@ -49,7 +50,10 @@ def write_ply(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
 
 
 def read_ply(path: Path) -> GaussianArrays:
-    """Read a file of the reference release, gsplat, nerfstudio or this package; other properties are ignored."""
+    """Read a file of the reference release, gsplat, nerfstudio or this package; other properties are ignored.
+
+    Compressed PLY is recognized by its properties, whatever the file's name.
+    """
     from plyfile import PlyData, PlyParseError
 
     _check_header(path)
@@ -57,6 +61,10 @@ def read_ply(path: Path) -> GaussianArrays:
         read = PlyData.read(str(path), mmap="r")
         vertex = read["vertex"]
         names = {each.name for each in vertex.properties}
+        if "packed_position" in names:
+            facts = _facts(read.comments, path)
+            color = {"color_model": "display", "base_time": facts.base_time, "world_matrix": facts.world_matrix}
+            return GaussianArrays(**unpack_ply(read, path), **color)
         missing = [name for group in _GROUPS for name in group.split() if name not in names]
         if missing:
             raise InputError(path, _without(missing, names), "export 3D Gaussians as an uncompressed PLY")
@@ -118,8 +126,6 @@ def _start(path: Path) -> bytes:
 
 
 def _without(missing: list[str], names: set[str]) -> str:
-    if "packed_position" in names:
-        return "is a compressed PLY (SuperSplat)"
     if "red" in names and len(missing) > 6:
         return "is a point cloud, not Gaussians"
     return f"has no {', '.join(missing[:4])}"

@@ -9,7 +9,7 @@ from sehdr_warp.output.commands import Export, run_export
 from sehdr_warp.output.export import export
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import load_cameras
-from sehdr_warp.splats import read_gaussians, write_gaussians
+from sehdr_warp.splats import LOSSY_SUFFIXES, read_gaussians, write_gaussians
 
 from ..splats.test_splat_files import gaussians
 from .helpers import Entry, camera
@@ -32,7 +32,7 @@ def test_suffix_and_kind_decide(tmp_path, run, logged):
 
 
 def test_a_wrong_suffix_is_told_all_that_export_writes(tmp_path):
-    with pytest.raises(InputError, match=r"scene: is no splat file; use one of \.ply .* \.glb \.html$"):
+    with pytest.raises(InputError, match=r"scene: is no splat file; use one of \.ply .* \.glb .* \.html$"):
         run_export(Export(run=tmp_path, out=tmp_path / "scene"))
     with pytest.raises(InputError, match=r"holds 8 bits .* \.html$"):
         run_export(Export(run=tmp_path, out=tmp_path / "scene.splat"))
@@ -84,3 +84,12 @@ def test_unusable_requests(tmp_path, run):
 def test_files_hold_one_color_model(tmp_path):
     with pytest.raises(InputError, match="holds display colors, and these are log"):
         write_gaussians(tmp_path / "a.glb", gaussians())
+
+
+@pytest.mark.parametrize("suffix", LOSSY_SUFFIXES)
+def test_what_a_small_file_loses_is_measured_on_the_file(tmp_path, run, logged, suffix):
+    export(run, tmp_path / f"a{suffix}", exposure_time=0.25)
+    [line] = [line for line in logged if line.startswith("compressed:")]
+    size = (tmp_path / f"a{suffix}").stat().st_size
+    assert "beside the scene (" in line and line.endswith(f"{size / 1e6:.2f} MB")
+    assert float(line.split()[1]) > 25

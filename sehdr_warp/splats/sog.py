@@ -1,0 +1,181 @@
+"""SOG (PlayCanvas), version 2: a ZIP of lossless WebP pictures and meta.json; display colors, about a tenth of a PLY.
+
+Positions are 16 bits of a logarithm, sizes and colors codes of 256 levels, higher harmonics entries of a palette. Axes
+are those of PLY. What this package adds stands under `sehdr` in meta.json.
+"""
+
+import io
+import json
+import math
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from .. import __version__
+from ..errors import InputError
+from ..files import atomic_path, read_bytes
+from .arrays import GaussianArrays, read_matrix
+from .packing import CODES, codebook, from_smallest_three, logits, morton_order, palette, smallest_three
+
+_LARGEST_PALETTE, _PER_ENTRY, _ACROSS = 1 << 14, 2, 64  # Entries; Gaussians for each; entries side by side
+_COEFFICIENTS = (0, 3, 8, 15)  # Of degrees 0 to 3, without the constant one
+_MOST_BYTES, _MOST_PIXELS = 1 << 30, 1 << 26
+_DAMAGED = "export it again"
+# What a damaged file makes of its numbers, names and pictures; RuntimeError includes encrypted entries.
+_FAULTS = (KeyError, IndexError, TypeError, ValueError, OSError, AttributeError, RuntimeError, OverflowError)
+
+
+def write_sog(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
+    """Write a .sog file; arguments as in write_gaussians."""
+    gaussians = gaussians.rows(morton_order(gaussians.means))
+    count, degree = gaussians.count, gaussians.degree
+    width = math.ceil(math.sqrt(count) / 4) * 4
+    height = math.ceil(count / width / 4) * 4
+    pictures: dict[str, np.ndarray] = {}
+
+    def picture(name: str, columns: np.ndarray) -> str:
+        texels = np.full((width * height, 4), 255, np.uint8)
+        texels[:count, : columns.shape[1]] = columns
+        texels[count:, :3] = 0
+        pictures[name] = texels.reshape(height, width, 4)
+        return name
+
+    spread = np.sign(gaussians.means) * np.log1p(np.abs(gaussians.means.astype(np.float64)))
+    low, high = spread.min(axis=0), spread.max(axis=0)
+    fixed = np.rint((spread - low) / np.maximum(high - low, 1e-12) * 65535).astype(np.uint16)
+    largest, others = smallest_three(gaussians.unit_quaternions.astype(np.float64))
+    turns = np.concatenate([np.rint((others / 2 + 0.5) * 255), 252 + largest[:, None]], axis=1)
+    scale_levels, scale_codes = codebook(gaussians.log_scales)
+    color_levels, color_codes = codebook(gaussians.harmonics[:, 0])
+    opacity = np.rint(gaussians.opacities * 255).astype(np.uint8)
+    meta: dict[str, Any] = {
+        "version": 2,
+        "asset": {"generator": f"sehdr-warp {__version__}"},
+        "count": count,
+        "antialias": False,
+        "means": {
+            "mins": low.tolist(),
+            "maxs": high.tolist(),
+            "files": [picture("means_l.webp", fixed & 255), picture("means_u.webp", fixed >> 8)],
+        },
+        "scales": {"codebook": scale_levels.tolist(), "files": [picture("scales.webp", scale_codes)]},
+        "quats": {"files": [picture("quats.webp", turns.astype(np.uint8))]},
+        "sh0": {
+            "codebook": color_levels.tolist(),
+            "files": [picture("sh0.webp", np.concatenate([color_codes, opacity[:, None]], axis=1))],
+        },
+        "sehdr": {"base_exposure_time": gaussians.base_time},
+    }
+    if gaussians.world_matrix is not None:
+        meta["sehdr"]["world_matrix"] = gaussians.world_matrix.tolist()
+    if degree:
+        entries = min(_LARGEST_PALETTE, max(count // _PER_ENTRY, min(count, _ACROSS)))
+        higher = gaussians.harmonics[:, 1:].reshape(count, -1)
+        centers, labels = palette(higher, entries)
+        levels, codes = codebook(centers)
+        rows = math.ceil(entries / _ACROSS)
+        texels = np.zeros((rows * _ACROSS, _COEFFICIENTS[degree], 4), np.uint8)
+        texels[..., 3] = 255
+        texels[:entries, :, :3] = codes.reshape(entries, -1, 3)
+        pictures["shN_centroids.webp"] = texels.reshape(rows, -1, 4)
+        columns = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1)
+        meta["shN"] = {
+            "count": entries,
+            "bands": degree,
+            "codebook": levels.tolist(),
+            "files": ["shN_centroids.webp", picture("shN_labels.webp", columns.astype(np.uint8))],
+        }
+    with atomic_path(path, overwrite) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        archive.writestr(_entry("meta.json"), json.dumps(meta))
+        for name, texels in pictures.items():
+            buffer = io.BytesIO()
+            Image.fromarray(texels, "RGBA").save(buffer, "WEBP", lossless=True, exact=True, quality=100, method=4)
+            archive.writestr(_entry(name), buffer.getvalue())
+
+
+def read_sog(path: Path) -> GaussianArrays:
+    """Read a .sog file of version 2."""
+    read_bytes(path)  # Refuses what is no plain file or too large
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
+                raise InputError(path, "unpacks to more than 1 GiB", _DAMAGED)
+            meta = json.loads(archive.read("meta.json"))
+            if meta.get("version") != 2:
+                problem = f"is SOG of version {meta.get('version', 1)!r:.20}"
+                raise InputError(path, problem, "version 2 is read; save it with a newer SplatTransform, or as PLY")
+            return _gaussians(archive, meta, path)
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        KeyError,
+        IndexError,
+        TypeError,
+        ValueError,
+        OSError,
+        AttributeError,
+    ) as error:
+        raise InputError(path, f"is damaged SOG ({error!r:.120})", _DAMAGED) from None
+    except (RecursionError, NotImplementedError, RuntimeError, OverflowError, Image.DecompressionBombError) as error:
+        raise InputError(path, f"is damaged SOG ({error!r:.120})", _DAMAGED) from None
+
+
+def _gaussians(archive: zipfile.ZipFile, meta: dict[str, Any], path: Path) -> GaussianArrays:
+    count = int(meta["count"])
+    if not 0 < count <= _MOST_PIXELS:
+        raise ValueError(f"count {count}")
+
+    def texels(part: str, index: int = 0) -> np.ndarray:
+        values = _picture(archive, meta[part]["files"][index]).reshape(-1, 4)
+        if len(values) < count:
+            raise ValueError(f"{part} has {len(values)} texels for {count} Gaussians")
+        return values[:count]
+
+    def levels(part: str) -> np.ndarray:
+        values = np.array(meta[part]["codebook"], np.float32)
+        if values.shape != (CODES,):
+            raise ValueError(f"the codebook of {part} has shape {values.shape}")
+        return values
+
+    low, high = (np.array(meta["means"][name], np.float64).reshape(3) for name in ("mins", "maxs"))
+    fixed = texels("means")[:, :3] + 256.0 * texels("means", 1)[:, :3]
+    spread = low + (high - low) * fixed / 65535
+    means = np.sign(spread) * np.expm1(np.abs(spread))
+    turns = texels("quats").astype(int)
+    if (turns[:, 3] < 252).any():
+        raise ValueError("a rotation has no largest component")
+    color, facts = texels("sh0"), meta.get("sehdr", {})
+    degree = int(meta["shN"]["bands"]) if "shN" in meta else 0
+    harmonics = np.zeros((count, _COEFFICIENTS[degree] + 1, 3), np.float32)
+    harmonics[:, 0] = levels("sh0")[color[:, :3]]
+    if degree:
+        columns = texels("shN", 1).astype(int)
+        entries = _picture(archive, meta["shN"]["files"][0])
+        entries = entries.reshape(len(entries) * _ACROSS, _COEFFICIENTS[degree], 4)[..., :3]
+        harmonics[:, 1:] = levels("shN")[entries[columns[:, 0] + 256 * columns[:, 1]]]
+    return GaussianArrays(
+        means=means.astype(np.float32),
+        log_scales=levels("scales")[texels("scales")[:, :3]],
+        quaternions=from_smallest_three(turns[:, 3] - 252, turns[:, :3] / 255 * 2 - 1),
+        opacity_logits=logits(color[:, 3] / 255),
+        harmonics=harmonics,
+        color_model="display",
+        base_time=float(facts.get("base_exposure_time", 1.0)),
+        world_matrix=read_matrix(facts.get("world_matrix"), path),
+    )
+
+
+def _picture(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    with Image.open(io.BytesIO(archive.read(name)), formats=["WEBP", "PNG"]) as image:
+        if image.width * image.height > _MOST_PIXELS:
+            raise ValueError(f"{name} has {image.width} x {image.height} pixels")
+        return np.asarray(image.convert("RGBA"))
+
+
+def _entry(name: str) -> zipfile.ZipInfo:
+    """Return an entry whose date is the same in every file; pictures are compressed already."""
+    return zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))

@@ -1,0 +1,170 @@
+import json
+import os
+import subprocess
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.splats import LOSSY_SUFFIXES, GaussianArrays, check_suffix, read_gaussians, write_gaussians
+from sehdr_warp.splats.packing import codebook, from_smallest_three, morton_order, palette, smallest_three
+
+from .test_npm_parsers import package
+from .test_splat_files import gaussians
+
+SHARED = Path(os.environ.get("SEHDR_SHARED", "../shared")) / "data" / "splats"
+
+
+def natural(count=600, degree=3, seed=0):
+    """Gaussians as trainings make them: small higher harmonics, sizes over two decades."""
+    random = np.random.default_rng(seed)
+    harmonics = random.normal(0, 0.08, (count, (degree + 1) ** 2, 3))
+    harmonics[:, 0] = random.uniform(-1.6, 1.6, (count, 3))
+    return GaussianArrays(
+        means=random.normal(0, 2, (count, 3)).astype(np.float32),
+        log_scales=random.uniform(-6, -1, (count, 3)).astype(np.float32),
+        quaternions=random.normal(size=(count, 4)).astype(np.float32),
+        opacity_logits=random.normal(0, 2, count).astype(np.float32),
+        harmonics=harmonics.astype(np.float32),
+        color_model="display",
+        base_time=0.25,
+    )
+
+
+def covariances(each):
+    w, x, y, z = each.unit_quaternions.astype(np.float64).T
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
+    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
+    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+    axes = np.stack(rows, 1).reshape(-1, 3, 3) * np.exp(each.log_scales)[:, None].astype(np.float64)
+    return axes @ axes.swapaxes(1, 2)
+
+
+def pairs(a, b):
+    """The index of the Gaussian of b at the place of each of a."""
+    from scipy.spatial import cKDTree
+
+    return cKDTree(b.means).query(a.means)[1]
+
+
+def assert_alike(given, read, *, harmonics=0.03):
+    index = pairs(given, read)
+    assert len(set(index.tolist())) == given.count == read.count
+    np.testing.assert_allclose(read.means[index], given.means, atol=2e-2)
+    np.testing.assert_allclose(read.opacities[index], given.opacities, atol=3e-3)
+    a, b = covariances(given), covariances(read)[index]
+    error = np.linalg.norm(a - b, axis=(1, 2)) / np.linalg.norm(a, axis=(1, 2))
+    assert np.median(error) < 0.08 and np.percentile(error, 99) < 0.3
+    np.testing.assert_allclose(read.harmonics[index][:, 0], given.harmonics[:, 0], atol=0.03)
+    if given.degree:
+        assert np.abs(read.harmonics[index][:, 1:] - given.harmonics[:, 1:]).mean() < harmonics
+
+
+@pytest.mark.parametrize("suffix", LOSSY_SUFFIXES)
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_what_is_written_is_read(tmp_path, suffix, degree):
+    given = natural(degree=degree)
+    path = tmp_path / f"a{suffix}"
+    write_gaussians(path, given)
+    read = read_gaussians(path)
+    assert (read.degree, read.color_model) == (degree, "display")
+    # The palette of SOG is small beside so few and so random Gaussians.
+    assert_alike(given, read, harmonics=0.06 if suffix == ".sog" else 0.03)
+    if suffix != ".spz":
+        assert read.base_time == 0.25
+    with pytest.raises(InputError, match="exists already"):
+        write_gaussians(path, given)
+    first = path.read_bytes()
+    write_gaussians(path, given, overwrite=True)
+    assert path.read_bytes() == first
+
+
+@pytest.mark.parametrize("suffix", [".sog", ".compressed.ply"])
+def test_the_transform_is_stored(tmp_path, suffix):
+    matrix = np.diag([2.0, 2.0, 2.0, 1.0])
+    write_gaussians(tmp_path / f"a{suffix}", natural().transformed(matrix))
+    np.testing.assert_allclose(read_gaussians(tmp_path / f"a{suffix}").world_matrix, matrix)
+
+
+@pytest.mark.parametrize("suffix", LOSSY_SUFFIXES)
+def test_splat_transform_reads_them(tmp_path, suffix):
+    tool = package("@playcanvas/splat-transform") / "bin" / "cli.mjs"
+    given = natural()
+    write_gaussians(tmp_path / f"a{suffix}", given)
+    subprocess.run(["node", tool, tmp_path / f"a{suffix}", tmp_path / "b.ply"], check=True, capture_output=True)
+    assert_alike(given, read_gaussians(tmp_path / "b.ply"), harmonics=0.06)
+
+
+def test_files_of_other_programs():
+    if not SHARED.is_dir():
+        pytest.skip("no shared data")
+    plain = read_gaussians(SHARED / "plush_dog_point_cloud_29999_clean.ply")
+    packed = read_gaussians(SHARED / "plush_dog_point_cloud_29999_clean.compressed.ply")
+    index = pairs(plain, packed)
+    np.testing.assert_allclose(packed.means[index], plain.means, atol=1e-3)
+    assert np.abs(packed.harmonics[index][:, 1:] - plain.harmonics[:, 1:]).mean() < 0.02
+    for name in ("raw", "v2", "v3"):
+        assert read_gaussians(SHARED / f"pc_minimal-{name}.spz").count == 4
+    with pytest.raises(InputError, match="SPZ of version 4; save it as version 2 or 3, or as PLY"):
+        read_gaussians(SHARED / "pc_minimal-v4.spz")
+
+
+def test_linear_colors_are_refused(tmp_path):
+    for suffix in LOSSY_SUFFIXES:
+        assert check_suffix(f"x{suffix.upper()}") == suffix
+        with pytest.raises(InputError, match="holds display colors, and these are linear"):
+            write_gaussians(tmp_path / f"a{suffix}", gaussians(color_model="linear"))
+
+
+def test_damage_and_other_versions_are_one_line(tmp_path):
+    given = natural(64)
+    for suffix in LOSSY_SUFFIXES:
+        whole = tmp_path / f"whole{suffix}"
+        write_gaussians(whole, given)
+        data = whole.read_bytes()
+        for length in (0, 3, 40, len(data) // 2, len(data) - 30):
+            cut = tmp_path / f"cut{suffix}"
+            cut.write_bytes(data[:length])
+            with pytest.raises(InputError) as refusal:
+                read_gaussians(cut)
+            assert len(str(refusal.value).splitlines()) == 1
+    old = tmp_path / "old.sog"
+    with zipfile.ZipFile(tmp_path / "whole.sog") as archive, zipfile.ZipFile(old, "w") as changed:
+        for name in archive.namelist():
+            text = archive.read(name)
+            if name == "meta.json":
+                text = json.dumps({key: value for key, value in json.loads(text).items() if key != "version"})
+            changed.writestr(name, text)
+    with pytest.raises(InputError, match="is SOG of version 1"):
+        read_gaussians(old)
+
+
+def test_neighbors_stay_neighbors():
+    points = np.random.default_rng(0).uniform(size=(4000, 3)).astype(np.float32)
+    points[0] = 1e6  # A stray changes nothing.
+    order = morton_order(points)
+    assert sorted(order.tolist()) == list(range(4000))
+    steps = np.linalg.norm(np.diff(points[order], axis=0), axis=1)
+    assert np.median(steps) < 0.1
+
+
+def test_codebooks_and_palettes_are_near():
+    random = np.random.default_rng(0)
+    values = np.concatenate([random.normal(size=5000), [40.0, -30.0]])
+    levels, codes = codebook(values)
+    assert (np.diff(levels) >= 0).all() and np.abs(levels[codes] - values).max() < 0.4
+    assert np.abs(levels[codes] - values).mean() < 0.02
+    rows = np.repeat(random.normal(size=(40, 9)), 50, axis=0) + random.normal(0, 0.01, (2000, 9))
+    centers, labels = palette(rows, 128)
+    assert np.abs(centers[labels] - rows).mean() < 0.02 and labels.max() < 128
+    few, same = palette(np.ones((5, 3)), 5)
+    np.testing.assert_allclose(few[same], 1)
+
+
+def test_three_components_make_a_quaternion():
+    turns = np.random.default_rng(0).normal(size=(100, 4))
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    back = from_smallest_three(*smallest_three(turns))
+    np.testing.assert_allclose(np.abs((back * turns).sum(axis=1)), 1, atol=1e-6)
