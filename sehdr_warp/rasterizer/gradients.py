@@ -16,16 +16,20 @@ def zero_gradients(tensors: Sequence[Tensor], needed: Sequence[bool], leaves: Se
     leaves: which tensors are leaves. On a GPU the gradients of leaves share one allocation, filled by one launch;
     others are freed soon, each by itself.
     """
-    zeros: dict[int, Tensor] = {}
     device = tensors[0].device
-    if device.type != "cpu":
-        together = [place for place, need in enumerate(needed) if need and leaves[place]]
-        zeros.update(zip(together, _zeros_together([tensors[place] for place in together]), strict=False))
-    with torch_threads(device):
-        for place, need in enumerate(needed):
-            if need and place not in zeros:
-                zeros[place] = torch.zeros_like(tensors[place], memory_format=torch.contiguous_format)
-    return [zeros.get(place) for place in range(len(tensors))]
+    if device.type == "cpu":
+        with torch_threads(device):
+            return [_zeros(tensor) if need else None for tensor, need in zip(tensors, needed, strict=True)]
+    together = [place for place, need in enumerate(needed) if need and leaves[place]]
+    zeros = dict(zip(together, _zeros_together([tensors[place] for place in together]), strict=False))
+    return [
+        zeros[place] if place in zeros else _zeros(tensors[place]) if need else None
+        for place, need in enumerate(needed)
+    ]
+
+
+def _zeros(like: Tensor) -> Tensor:
+    return torch.zeros_like(like, memory_format=torch.contiguous_format)
 
 
 def _zeros_together(tensors: list[Tensor]) -> list[Tensor]:

@@ -48,11 +48,13 @@ def assert_gone(function, gaussians, shared, place, value):
     image, found = gradients(function, [*bad, *shared])
     truth, expected = gradients(function, [*(tensor[others] for tensor in gaussians), *shared])
     torch.testing.assert_close(image, truth, rtol=1e-6, atol=1e-7)
+    # A GPU sums in any order.
+    rounding = 1e-4 if image.is_cuda and image.dtype == torch.float32 else 1e-7
     for gradient, true in zip(found[: len(bad)], expected, strict=False):
         assert bool((gradient[part] == 0).all())
-        torch.testing.assert_close(gradient[others], true, rtol=1e-5, atol=1e-7)
+        torch.testing.assert_close(gradient[others], true, rtol=1e-5, atol=rounding)
     for gradient, true in zip(found[len(bad) :], expected[len(bad) :], strict=True):
-        torch.testing.assert_close(gradient, true, rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(gradient, true, rtol=1e-5, atol=max(100 * rounding, 1e-5))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

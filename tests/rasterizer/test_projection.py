@@ -66,7 +66,9 @@ def test_a_retained_graph_gives_the_same_gradients_again(device):
     first = torch.autograd.grad(loss, leaves, retain_graph=True, allow_unused=True)
     second = torch.autograd.grad(loss, leaves, allow_unused=True)
     for one, other in zip(first, second, strict=True):
-        torch.testing.assert_close(one, other, rtol=0, atol=0)
+        assert (one is None) == (other is None)
+        if one is not None:  # A GPU sums the camera's gradient in any order.
+            torch.testing.assert_close(one, other, rtol=0, atol=1e-3 if one.is_cuda else 0)
     with pytest.raises(RuntimeError, match="second time"):
         loss.backward()
 

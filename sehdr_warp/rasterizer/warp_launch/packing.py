@@ -7,7 +7,7 @@ wp.launch().
 import ctypes
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
@@ -15,6 +15,14 @@ from torch import Tensor
 
 from . import threads
 from .loading import launch_object
+
+
+class _Layout(NamedTuple):
+    """A tensor's layout; strides are None if it is contiguous."""
+
+    shape: torch.Size
+    strides: tuple[int, ...] | None
+    dtype: torch.dtype
 
 
 class PackedLaunch:
@@ -25,9 +33,7 @@ class PackedLaunch:
     ) -> None:
         self.arguments = kernel.adj.args
         self.kinds = [argument.type for argument in self.arguments] * (1 + adjoint)
-        # The last launch's values; of tensors the dtype, beside their shapes if they were contiguous.
-        self.packed: list[Any] = [...] * len(self.kinds)
-        self.shapes: list[Any] = [None] * len(self.kinds)
+        self.packed: list[Any] = [...] * len(self.kinds)  # The last launch's values, and of tensors the layouts.
         count = len(self.arguments)
         initial = [
             type(kind.__ctype__())() if hasattr(kind, "__ctype__") else values[place % count]
@@ -73,15 +79,22 @@ class PackedLaunch:
 
     def _pack(self, values: list) -> None:
         """Pack what differs from the last launch: mostly addresses, since call sites repeat shapes."""
-        arrays, packed, shapes = self.arrays, self.packed, self.shapes
+        arrays, packed = self.arrays, self.packed
         for index, value in enumerate(values):
             if isinstance(value, Tensor):
-                array, shape = arrays[index], value.shape
-                if shape != shapes[index] or value.dtype is not packed[index] or not value.is_contiguous():
+                array = arrays[index]
+                # The shape of a contiguous tensor tells its strides.
+                strides = None if value.is_contiguous() else value.stride()
+                shape, dtype = value.shape, value.dtype
+                last = packed[index]
+                if (
+                    last.__class__ is not _Layout
+                    or shape != last.shape
+                    or strides != last.strides
+                    or dtype != last.dtype
+                ):
                     write_layout(array, value, self.kinds[index])
-                    # Of a tensor that is not contiguous the shape does not tell the strides.
-                    shapes[index] = shape if value.is_contiguous() else None
-                    packed[index] = value.dtype
+                    packed[index] = _Layout(shape, strides, dtype)
                 array.data = value.data_ptr()
             elif value is not packed[index] and (value is None or value != packed[index]):
                 if value is not None:
@@ -121,5 +134,4 @@ def write_layout(array: Any, tensor: Tensor, kind: wp.array) -> None:
     elif surplus < 0:
         shape, steps = [1, *shape], [size * tensor.numel(), *steps]
     array.ndim = kind.ndim
-    for axis, (length, step) in enumerate(zip(shape, steps, strict=True)):
-        array.shape[axis], array.strides[axis] = length, step
+    array.shape[: len(shape)], array.strides[: len(steps)] = shape, steps
