@@ -1,13 +1,23 @@
-"""The number of threads, and results that threads compute ahead."""
+"""The number of threads, results that threads compute ahead, and waits that signals can end."""
 
+import atexit
+import logging
 import os
+import signal
+import sys
+import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from typing import TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+WAITING_NOTICE = 5.0
+"""Seconds after which a wait is told."""
+_LOOK_EVERY = 0.1
 
 
 def thread_count() -> int:
@@ -43,3 +53,60 @@ def prefetch_map(function: Callable[[Item], Result], items: Iterable[Item], ahea
                 yield waiting.popleft().result()
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
+
+
+def run_interruptibly(function: Callable[[], Result], waiting: Callable[[], None] | None = None) -> Result:
+    """Return function() while signals stay in force, for native code that does not return to Python for long.
+
+    The main thread waits for another that runs it. If a signal ends the wait, the program must not outlast its main
+    thread, so its end does not wait for the native code.
+
+    Args:
+        function: What takes long.
+        waiting: Called once if it takes longer than WAITING_NOTICE seconds.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return function()
+    done: Future[Result] = Future()
+
+    def run() -> None:
+        try:
+            done.set_result(function())
+        except BaseException as error:  # noqa: BLE001 - It is raised where the result is waited for.
+            done.set_exception(error)
+
+    thread = threading.Thread(target=run, name="sehdr-warp waits", daemon=True)
+    thread.start()
+    started = time.monotonic()
+    try:
+        while thread.is_alive():
+            thread.join(_LOOK_EVERY)
+            if waiting is not None and time.monotonic() - started > WAITING_NOTICE:
+                waiting()
+                waiting = None
+    except BaseException as error:
+        code = error.code if isinstance(error, SystemExit) else 130 if isinstance(error, KeyboardInterrupt) else 1
+        atexit.register(_leave, thread, code if isinstance(code, int) else 1)
+        raise
+    return done.result()
+
+
+def _leave(thread: threading.Thread, code: int) -> None:
+    """End the process at once if a thread is in native code, which must not run while Python ends."""
+    if thread.is_alive():
+        with suppress(Exception):
+            logging.shutdown()
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(code)
+
+
+@contextmanager
+def signals_kept() -> Iterator[None]:
+    """Put the program's signal handlers back after an import whose library installs its own."""
+    yield
+    if threading.current_thread() is threading.main_thread():
+        for each in (signal.SIGINT, signal.SIGTERM):
+            handler = signal.getsignal(each)  # Python's own view, which the library did not change.
+            if handler is not None:
+                signal.signal(each, handler)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
+from ..parallel import signals_kept
 from .camera import FISHEYES, Camera
 from .wide_camera import WIDEST_PINHOLE, fisheye_angles
 
@@ -142,7 +143,8 @@ class Undistortion:
         Raises:
             InputError: if the distortion cannot be inverted.
         """
-        import pycolmap
+        with signals_kept():
+            import pycolmap
 
         described = f"distortion {lens.model} {lens.params}"
         try:

@@ -15,6 +15,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from ..caches import usable, user_cache
 from ..errors import InputError, SehdrError
 from ..files import atomic_folder
 from ..own_files import is_sealed
+from ..parallel import run_interruptibly, signals_kept
 from .colmap_model import SparseModel, read_model
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
 from .photos import read_photo
@@ -230,9 +232,8 @@ def _extract(database: Path, images: Path, names: list[str], model: str, params)
         if len(names) > 1:
             _log.info("finding features in photos %d to %d of %d", start + 1, start + len(part), len(names))
         with quiet_colmap():
-            pycolmap.extract_features(
-                database, images, part, pycolmap.CameraMode.SINGLE, reader, device=pycolmap.Device.cpu
-            )
+            options = (database, images, part, pycolmap.CameraMode.SINGLE, reader)
+            run_interruptibly(partial(pycolmap.extract_features, *options, device=pycolmap.Device.cpu))
         if start == 0:
             with pycolmap.Database.open(database) as opened:
                 reader.existing_camera_id = max(image.camera_id for image in opened.read_all_images())
@@ -246,10 +247,10 @@ def _match(database: Path, count: int) -> None:
     _log.info("matching features between %d photos", count)
     with quiet_colmap():
         if count <= EXHAUSTIVE_LIMIT:
-            pycolmap.match_exhaustive(database, **options)
+            run_interruptibly(partial(pycolmap.match_exhaustive, database, **options))
         else:
             pairing = pycolmap.SequentialPairingOptions(overlap=20, quadratic_overlap=True)
-            pycolmap.match_sequential(database, pairing_options=pairing, **options)
+            run_interruptibly(partial(pycolmap.match_sequential, database, pairing_options=pairing, **options))
 
 
 def _map(database: Path, work: Path, count: int, source: Path):
@@ -274,9 +275,8 @@ def _map(database: Path, work: Path, count: int, source: Path):
         output = work / f"model{int(patient)}"
         output.mkdir()
         with quiet_colmap():
-            models = pycolmap.incremental_mapping(
-                database, work / "images", output, options, next_image_callback=next_image
-            )
+            place = partial(pycolmap.incremental_mapping, database, work / "images", output, options)
+            models = run_interruptibly(partial(place, next_image_callback=next_image))
         candidates = [*([] if best is None else [best]), *models.values()]
         best = max(candidates, key=lambda model: model.num_reg_images(), default=None)
         if best is not None and best.num_reg_images() == count:
@@ -290,7 +290,8 @@ def _map(database: Path, work: Path, count: int, source: Path):
 @contextlib.contextmanager
 def quiet_colmap():
     """Suppress pycolmap's log on the terminal except fatal errors."""
-    import pycolmap
+    with signals_kept():  # Its log would end the process with a trace of its stack.
+        import pycolmap
 
     level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, int(pycolmap.logging.FATAL)
     try:

@@ -4,12 +4,14 @@ import json
 import logging
 import re
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from ..errors import InputError
+from ..parallel import run_interruptibly
 from .colmap_model import ModelImage, SparseModel, read_points
 from .dataparser import PointCloud
 from .images import open_image
@@ -130,17 +132,17 @@ def _match_rigs(database: Path, images: Path, count: int) -> None:
     options = {"verification_options": pycolmap.TwoViewGeometryOptions(), "device": pycolmap.Device.cpu}
     options["verification_options"].ransac.random_seed = SEED
     with quiet_colmap():
-        pycolmap.extract_features(
-            database, images, [], pycolmap.CameraMode.PER_FOLDER, reader, device=pycolmap.Device.cpu
-        )
+        arguments = (database, images, [], pycolmap.CameraMode.PER_FOLDER, reader)
+        run_interruptibly(partial(pycolmap.extract_features, *arguments, device=pycolmap.Device.cpu))
         with pycolmap.Database.open(database) as opened:
             pycolmap.apply_rig_config([pycolmap.RigConfig(cameras=cameras)], opened)
         _log.info("matching features between %d panoramas", count)
         if count * len(turns) <= EXHAUSTIVE_LIMIT:
-            pycolmap.match_exhaustive(database, matching_options=matching, **options)
+            run_interruptibly(partial(pycolmap.match_exhaustive, database, matching_options=matching, **options))
         else:
             pairing = pycolmap.SequentialPairingOptions(overlap=10, quadratic_overlap=True)
-            pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing, **options)
+            options |= {"matching_options": matching, "pairing_options": pairing}
+            run_interruptibly(partial(pycolmap.match_sequential, database, **options))
 
 
 def _map_rigs(database: Path, work: Path, count: int, source: Path):
@@ -163,7 +165,9 @@ def _map_rigs(database: Path, work: Path, count: int, source: Path):
         output = work / f"model{int(patient)}"
         output.mkdir()
         with quiet_colmap():
-            models = pycolmap.incremental_mapping(database, work / "images", output, options)
+            models = run_interruptibly(
+                partial(pycolmap.incremental_mapping, database, work / "images", output, options)
+            )
         candidates = [*([] if best is None else [best]), *models.values()]
         best = max(candidates, key=lambda model: model.num_reg_frames(), default=None)
         if best is not None and best.num_reg_frames() == count:

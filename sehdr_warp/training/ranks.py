@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import timedelta
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from ..errors import InputError, SehdrError, as_user_error
-from ..parallel import thread_count
+from ..parallel import run_interruptibly, thread_count
 from ..scene.photo_file import PhotoFile, can_share, open_shared
 
 log = logging.getLogger(__name__)
@@ -65,12 +66,16 @@ class Ranks:
             backend = "nccl" if self._cuda else "gloo"
             given: dict[str, Any] = {"device_id": self.device} if self._cuda else {}
             given |= {"store": self.store, "rank": self.rank, "world_size": self.count}
-            dist.init_process_group(backend, timeout=_EVER, **given)
+            begin = partial(dist.init_process_group, backend, timeout=_EVER, **given)
+            run_interruptibly(begin, self._tell_wait)
             # What hosts say to each other must not wait for their devices.
             self._hosts = dist.new_group(backend="gloo", timeout=_EVER) if self._cuda else dist.group.WORLD
         self._check_versions()
         self._watcher = threading.Thread(target=self._watch, name="sehdr-warp ranks", daemon=True)
         self._watcher.start()
+
+    def _tell_wait(self) -> None:
+        log.info("rank %d of %d waits for the others", self.rank, self.count)
 
     def agree(self, wanted: int) -> int:
         """The least that any rank wants of GO, WAIT and END. Rank 0 may take its time before it asks; the others
@@ -257,7 +262,8 @@ def joined(rank: int, count: int, device: torch.device) -> Iterator[Ranks]:
         torch.cuda.set_device(device)
     if rank:
         logging.getLogger("sehdr_warp").setLevel(logging.ERROR)
-    ranks = Ranks(_store(), rank, count, device)
+    store = run_interruptibly(_store, lambda: log.info("rank %d of %d waits for the others", rank, count))
+    ranks = Ranks(store, rank, count, device)
     try:
         ranks.meet()
         yield ranks
@@ -279,7 +285,16 @@ def _store() -> dist.Store:
         return dist.FileStore(path, int(os.environ["WORLD_SIZE"]) + 1)
     from torch.distributed.rendezvous import rendezvous
 
-    return next(rendezvous("env://", timeout=timedelta(minutes=5)))[0]
+    if missing := [name for name in ("MASTER_ADDR", "MASTER_PORT") if not os.environ.get(name)]:
+        problem = f"RANK and WORLD_SIZE are set, and {' and '.join(missing)} not"
+        raise SehdrError(f"{problem}: start with torchrun or --gpus, or unset RANK")
+    try:
+        return next(rendezvous("env://", timeout=timedelta(minutes=5)))[0]
+    except (RuntimeError, ValueError) as error:
+        place = f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
+        raise SehdrError(
+            f"no other ranks at {place} ({str(error).splitlines()[0]:.120}); start with torchrun"
+        ) from None
 
 
 def _end_soon(error: BaseException) -> None:
