@@ -24,6 +24,7 @@ from .sensor_colors import rec709_of
 
 # Smallest radiance whose logarithm is taken.
 DARKEST = 1e-12
+COARSE = 1e-3  # Of the median size of Gaussians: larger errors of float32 positions keep them in float64
 STEPS = 150
 RATES = {"harmonics_dc": 0.03, "harmonics_rest": 0.01, "opacity_logits": 0.3}
 # For a fit: more than three directions for each of the 16 coefficients of degree 3, and the sphere's whole weight
@@ -35,7 +36,11 @@ Colors = Callable[[np.ndarray], np.ndarray]
 
 
 def field_of(gaussians: GaussianArrays) -> RadianceField:
-    """Return the field that a file of Gaussians represents; its response is sRGB."""
+    """Return the field that Gaussians represent; its response is sRGB.
+
+    Positions in float64, which float32 would move, are taken relative to their mean.
+    """
+    center = gaussians.means.mean(0) if gaussians.means.dtype == np.float64 else np.zeros(3)
     harmonics = gaussians.harmonics.astype(np.float64)
     if gaussians.color_model == "log":
         harmonics[:, 0] += np.log(gaussians.base_time) / HARMONIC_0
@@ -44,10 +49,11 @@ def field_of(gaussians: GaussianArrays) -> RadianceField:
     harmonics = torch.from_numpy(harmonics.astype(np.float32))
     means, log_scales, quaternions, logits = (
         torch.from_numpy(np.array(values, np.float32))
-        for values in (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits)
+        for values in (gaussians.means - center, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits)
     )
     model = Gaussians(means, log_scales, quaternions, logits, harmonics[:, :1], harmonics[:, 1:])
     options = {"base_time": gaussians.base_time, "radiance": gaussians.color_model}
+    options["normalization"] = Normalization(center)
     return RadianceField(model, response_by_name("srgb"), **options).requires_grad_(False)
 
 
@@ -88,9 +94,16 @@ def to_scene(gaussians: GaussianArrays, normalization: Normalization) -> Gaussia
 
 
 def _transformed(gaussians: GaussianArrays, means: np.ndarray, log_scale: float) -> GaussianArrays:
-    """Return Gaussians at other means [N, 3], with sizes multiplied by exp(log_scale)."""
+    """Return Gaussians at other means [N, 3] float64, with sizes multiplied by exp(log_scale).
+
+    Positions stay float64 if float32 would move them by more than a thousandth of the median size, as in UTM
+    coordinates.
+    """
     sizes = gaussians.log_scales.astype(np.float64) + log_scale
-    return replace(gaussians, means=means.astype(np.float32), log_scales=sizes.astype(np.float32))
+    rounded = means.astype(np.float32)
+    moved = np.abs(rounded - means).max(initial=0.0)
+    coarse = len(means) > 0 and moved > COARSE * float(np.exp(np.median(sizes)))
+    return replace(gaussians, means=means if coarse else rounded, log_scales=sizes.astype(np.float32))
 
 
 def _in_colors(

@@ -3,7 +3,10 @@
 NumPy alone is loaded here; USD needs the extra `usd`.
 """
 
+import logging
 from pathlib import Path
+
+import numpy as np
 
 from ..errors import InputError
 from .arrays import GaussianArrays
@@ -15,6 +18,7 @@ from .sog import read_sog, write_sog
 from .spz import read_spz, write_spz
 from .usd import read_usd, write_usd
 
+log = logging.getLogger(__name__)
 USD_SUFFIXES = (".usda", ".usdc", ".usd", ".usdz")
 SUFFIXES = (".ply", *USD_SUFFIXES, ".glb", ".sog", ".spz", COMPRESSED_PLY)
 """Of the files that are read and written."""
@@ -79,6 +83,13 @@ def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: b
         problem = f"holds {held} colors, and these are {gaussians.color_model}"
         raise InputError(path, problem, "choose another suffix, or let export change the colors")
     gaussians.require_finite(path)
+    if gaussians.means.dtype == np.float64:
+        far = float(np.abs(gaussians.means).max())
+        log.warning(
+            "%s: positions up to %.4g are too large for the float32 of the file, which moves Gaussians; "
+            "without --axes scene they are relative to the scene",
+            *(Path(path).name, far),
+        )
     writers = {".ply": write_ply, COMPRESSED_PLY: write_compressed_ply, ".glb": write_glb}
     writers |= {".sog": write_sog, ".spz": write_spz}
     write = writers.get(suffix, write_usd)

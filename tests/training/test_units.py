@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.model.baking import gaussians_of
+from sehdr_warp.model.baking import field_of, gaussians_of
+from sehdr_warp.output.export import export
 from sehdr_warp.scene import Scene
+from sehdr_warp.splats import read_gaussians
 from sehdr_warp.training.train import train
 
 from .toy import load_unscaled, toy_scene
@@ -43,3 +45,18 @@ def test_unit_and_origin_do_not_matter(tmp_path, scale, shift):
     spread = np.abs(scale * ours.means + shift - theirs.means).max()
     assert spread < 1e-4 * scale + 1e-6 * np.abs(shift).max()
     np.testing.assert_allclose(theirs.log_scales, ours.log_scales + np.log(scale), atol=1e-3)
+
+
+def test_far_coordinates_are_exported_relative_to_the_scene(tmp_path, caplog):
+    scene = moved(toy_scene(), 1.0, np.array([500_000.0, 4_200_000.0, 100.0]))
+    run = train(scene, tmp_path / "run", CONFIG, device="cpu")
+    export(run, tmp_path / "upright.ply", kind="ldr")
+    assert "too large for the float32" not in caplog.text
+    assert np.abs(read_gaussians(tmp_path / "upright.ply").means).max() < 1000
+    # Gaussians in the coordinates of the set keep what float32 would lose.
+    gaussians = gaussians_of(run.model, "linear", np.zeros((0, 3)))
+    camera = scene.test_views[0].camera
+    shown = field_of(gaussians).render(camera).hdr
+    torch.testing.assert_close(shown, run.render(camera).hdr, rtol=0.1, atol=0.02)
+    export(run, tmp_path / "scene.ply", axes="scene", kind="ldr")
+    assert "too large for the float32" in caplog.text
