@@ -1,17 +1,24 @@
-"""How good the prior for clipped light is on panoramas: against white, a constant and a ridge regression."""
+"""How good the prior for clipped light is on panoramas: against white, a constant and a ridge regression.
 
+`python -m priors.judge PACK WEIGHTS --out FIGURES.json` judges weights of `priors.train --judge` again.
+"""
+
+import argparse
 import itertools
+import json
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from sehdr_warp.prior import load_prior
 from sehdr_warp.prior.network import LightNetwork, network_input
 
-from .panoramas import Pack
+from .panoramas import Pack, read_pack
 from .photos import Camera, Photos
 
-PHOTOS, BATCH, SIZE = 768, 32, 96
+PHOTOS, BATCH, SIZE = 384, 32, 96
 RIDGE = 10.0
 MU = 5000.0
 
@@ -60,6 +67,20 @@ def judge(
         figures["network"]["sample"] = np.round(points, 3).tolist()
         result[name] = figures
     return result
+
+
+def main() -> None:
+    """Judge weights and write the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("pack", type=Path)
+    parser.add_argument("weights", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    args = parser.parse_args()
+    pack, prior = read_pack(args.pack), load_prior(args.device, args.weights)
+    unseen, chosen = np.flatnonzero(pack.held_out), np.flatnonzero(~pack.held_out)
+    figures = judge(prior.network, prior.deviation_scale, pack, unseen, chosen, seed=2, device=args.device)
+    args.out.write_text(json.dumps(figures, indent=1))
 
 
 @torch.no_grad()
@@ -132,3 +153,7 @@ def _psnr(guess: np.ndarray, truth: np.ndarray, clipped: np.ndarray, exposure: n
     ours, true = (np.log1p(MU * np.minimum(np.exp2(v) / largest, 1)) / np.log1p(MU) for v in (guess, truth))
     error[clipped] = ours - true
     return float(-10 * np.log10(max((error**2).mean(), 1e-9)))
+
+
+if __name__ == "__main__":
+    main()

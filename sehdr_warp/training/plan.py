@@ -210,7 +210,7 @@ def _response(facts: SceneFacts, config: Config, device: torch.device) -> Choice
 def _light(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     if not (facts.unclipped and facts.truths == facts.photos and config.loss.ldr_weight):
         unneeded: dict[str, object] = (
-            {} if facts.clipped else {"loss.clipped_smoothness": 0.0, "loss.clipped_lift": 0.0}
+            {} if facts.clipped else dict.fromkeys(("loss.clipped_smoothness", "loss.clipped_estimate"), 0.0)
         )
         return unneeded, "as photos show it", f"{facts.clipped:.1%} of the pixels are a bound alone"
     fields: dict[str, object] = {"loss.ldr_weight": 0.0, "loss.hdr_weight": 1.0, "loss.form": "blend"}

@@ -9,6 +9,7 @@ from safetensors.torch import save_file
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.prior import LightPrior, coarse_size, combined_estimates, load_prior
+from sehdr_warp.prior.estimate import WEIGHTS
 from sehdr_warp.prior.network import LightNetwork
 
 
@@ -95,3 +96,29 @@ def test_estimates_do_not_depend_on_the_number_type_of_the_mask():
     exposure, clipped = photo()
     one = combined_estimates(exposure, clipped, small_prior(), torch.from_numpy(np.zeros((20, 30, 3), np.float16)), 0.2)
     assert torch.equal(one, combined_estimates(exposure, clipped, small_prior()))
+
+
+def lit(surround, radius, noise=0.05):
+    """A disk that clips before a surround of some exposure."""
+    y, x = torch.meshgrid(torch.arange(96), torch.arange(96), indexing="ij")
+    clipped = ((y - 40) ** 2 + (x - 50) ** 2 < radius**2)[..., None].expand(-1, -1, 3)
+    grain = torch.exp(noise * torch.randn(96, 96, 3, generator=torch.Generator().manual_seed(0)))
+    return torch.where(clipped, 1.0, (surround * grain).clamp_max(0.99)), clipped
+
+
+def test_the_weights_of_the_package_are_small_and_know_lamps_from_white_walls():
+    assert WEIGHTS.stat().st_size <= 2_000_000
+    prior = load_prior()
+
+    def stops(exposure, clipped):
+        return float(prior.estimate(exposure, clipped).mean[clipped].mean())
+
+    wall = stops(torch.ones(96, 96, 3), torch.ones(96, 96, 3, dtype=torch.bool))
+    lamp = stops(*lit(0.05, 4))
+    assert wall < 1 and lamp > wall + 1
+
+
+def test_deviations_of_the_package_are_wide_where_it_must_guess():
+    exposure, clipped = lit(0.05, 4)
+    estimate = load_prior().estimate(exposure, clipped)
+    assert float(estimate.deviation[clipped].mean()) > 0.3

@@ -48,3 +48,8 @@ def test_targets_carry_the_estimates():
     estimates = light_estimates(views, SRGB, LossConfig(light_prior=False), CPU)
     source = photo_source(views, 1.0, CPU, truth=False, light=SRGB, estimates=estimates)
     assert torch.equal(source[1].target.estimates, estimates[1])
+
+
+def test_the_prior_estimates_photos_that_clip_alone():
+    first, second = light_estimates([view(255), view(100)], SRGB, LossConfig(), CPU)
+    assert (first[..., 3:] > 0).all() and (first[..., :3] >= 0).all() and (second == 0).all()

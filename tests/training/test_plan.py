@@ -105,7 +105,7 @@ def test_decisions_follow_their_figures(facts, name, change, field, few, many):
 @pytest.mark.parametrize("clipped", [0.0, 1e-4])
 def test_clipped_light_is_left_out_where_none_is(facts, clipped):
     weights = RULES["light"](replace(facts, clipped=clipped), config_of(), GPU)[0]
-    assert weights == ({} if clipped else {"loss.clipped_smoothness": 0.0, "loss.clipped_lift": 0.0})
+    assert weights == ({} if clipped else {"loss.clipped_smoothness": 0.0, "loss.clipped_estimate": 0.0})
 
 
 @pytest.mark.parametrize("points,choice", [(0, "at most 9406"), (3000, "at most 9406"), (10_000, "without growth")])
