@@ -12,8 +12,8 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.runs.run_writer import RunWriter
 
-from .full_disk import full_disk
-from .refusals import call, refused
+from ..full_disk import full_disk
+from ..refusals import call, refused
 
 # ------------------------------------------------------------------------------------------------------------- runs
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "sehdr_warp"
 
 # What each room may import of the others: training -> runs -> model -> response -> rasterizer -> kernels, and below

@@ -19,7 +19,7 @@ from sehdr_warp import cli
 from sehdr_warp.arguments import flags, subcommands
 from sehdr_warp.runs.config_files import GONE, RENAMED, config_fields
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 GUIDE = [page for page in PAGES if page.parent.name == "docs"]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

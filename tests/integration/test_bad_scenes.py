@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from .make_scenes import write_blender, write_colmap
-from .refusals import call, error_line, train_refused
+from ..make_scenes import write_blender, write_colmap
+from ..refusals import call, error_line, train_refused
 
 
 @pytest.fixture

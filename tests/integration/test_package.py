@@ -16,7 +16,7 @@ import pytest
 
 import sehdr_warp
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_stub_and_lazy_names_agree():

@@ -1,0 +1,40 @@
+"""Where tests are: beside the rooms of the package, named after the modules that they test."""
+
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).resolve().parents[1]
+ROOT = TESTS.parent
+NOT_ROOMS = {"integration", "fuzz", "trial", "scenes_generator"}
+TOPICS = {
+    "benchmarks": {"bench"},
+    "compat/gsplat": {"against_gsplat"},
+    "output": {"pictures"},
+    "rasterizer": {"blend_blocks", "culling", "extremes", "properties", "rasterize"},
+    "response": {"responses"},
+    "scene": {"scene_colmap", "scene_images", "scene_load", "scene_transforms"},
+    "splats": {"npm_parsers", "splat_files"},
+    "training": {
+        "bad_input", "confidence", "deterministic", "divergence", "fields", "out_of_memory", "reserved_rows", "resume",
+        "rivals", "units",
+    },
+    "viewer": {"page", "scene_page"},
+}  # fmt: skip
+"""Tests of what several modules of a room do together. Prefer a module's name."""
+
+
+def home(room: str) -> Path:
+    """Return the folder of a room's modules."""
+    return ROOT / room if room in ("kernels", "benchmarks") else ROOT / "sehdr_warp" / room
+
+
+@pytest.mark.parametrize("test", sorted(TESTS.rglob("test_*.py")), ids=lambda path: str(path.relative_to(TESTS)))
+def test_a_test_has_the_name_of_its_module(test):
+    *room, _ = test.relative_to(TESTS).parts
+    name = test.stem.removeprefix("test_")
+    if (room and room[0] in NOT_ROOMS) or name in TOPICS.get("/".join(room), ()):
+        return
+    folder = home("/".join(room))
+    remedy = f"name it after a module, move it to tests/integration, or add {name!r} to TOPICS here"
+    assert [*folder.rglob(f"{name}.py")] or (folder / name).is_dir(), f"{folder} has no {name}.py: {remedy}"
