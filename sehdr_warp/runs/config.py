@@ -73,7 +73,7 @@ class ResponseConfig(_Table):
 
 
 class FusionConfig(_Table):
-    """Exposure brackets and their neural fusion (SeHDR, equations 6 to 9)."""
+    """Exposure brackets and their neural fusion (SeHDR, equations 6 to 12)."""
 
     enabled: bool = False
     """fuse exposure brackets into the HDR color; else the base color is the HDR color"""

@@ -108,7 +108,7 @@ def image_loss(prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str
         prediction: Rendered image.
         truth: Reference.
         mask: Weights in [0, 1]; SSIM sees masked pixels as equal.
-        form: "sum": L1 + weight (1 - SSIM) (SeHDR, equation 11); "blend": (1 - weight) L1 + weight (1 - SSIM) (3DGS).
+        form: "sum": L1 + weight (1 - SSIM) (SeHDR, equation 16); "blend": (1 - weight) L1 + weight (1 - SSIM) (3DGS).
         weight: Weight of SSIM.
     """
     distance_weight = _distance_weight(form, weight)
@@ -211,7 +211,7 @@ def extra_images(config: LossConfig, has_truth: bool) -> frozenset[str]:
 def data_loss(
     field: RadianceField, photo: TrainRender, target: Target, config: LossConfig, largest_truth: float = 1.0
 ) -> Tensor:
-    """Return L_LDR + beta L_linear (equation 13) + the HDR loss + the anchor, each if it has a weight."""
+    """Return L_LDR + beta L_linear (SeHDR, equation 20) + the HDR loss + the anchor, each if it has a weight."""
     loss = ldr_loss(photo, target, config) if config.ldr_weight > 0 else 0.0
     if config.ldr_weight not in (0, 1):
         loss = config.ldr_weight * loss
