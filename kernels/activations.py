@@ -1,5 +1,4 @@
-"""What a Gaussian's parameters become before it is drawn, exposures and opacities: one launch each way, where torch
-would make four and five of it."""
+"""Exposures and opacities of Gaussians from their parameters, one launch each way in place of torch's four and five."""
 
 from functools import cache
 
@@ -10,7 +9,7 @@ from .constants import FORWARD
 
 @cache
 def exposures_kernel(dtype):
-    """exposures = exp of values held within [-bound, bound]; one that is not a number stays so. Covers the numbers."""
+    """Return the kernel of exp(values), values clamped to [-bound, bound]; NaN stays NaN. Launched over the numbers."""
     real = dtype
 
     @wp.kernel(module="unique", module_options=FORWARD)
@@ -49,8 +48,11 @@ def exposures_adjoint_kernel(dtype):
 
 @cache
 def opacities_kernel(dtype):
-    """opacities: [N] sigmoids of the logits; shares: [T], what each of T threads has of `weight` times their mean.
-    live: [1], of how many it is the mean, those behind them having an opacity of 0; or None for all. Covers [0, T)."""
+    """Return the kernel of sigmoids and of the shares of `weight` times their mean, launched over T threads.
+
+    opacities: [N] sigmoids of the logits. shares: [T], each thread's part of the weighted mean. live: [1] number of
+    Gaussians that the mean counts, of which those behind have an opacity of 0; None for all.
+    """
     real = dtype
 
     @wp.kernel(module="unique", module_options=FORWARD)
@@ -75,8 +77,11 @@ def opacities_kernel(dtype):
 
 @cache
 def opacities_adjoint_kernel(dtype):
-    """logit_gradients [N] of opacity_gradients [N] and mean_gradient [1], by the opacities and by `weight` times their
-    mean; either may be None. live: as of opacities_kernel()."""
+    """Return the adjoint of opacities_kernel(), launched over N threads.
+
+    logit_gradients: [N] from opacity_gradients [N] and mean_gradient [1], either of which may be None. live: as of
+    opacities_kernel().
+    """
     real = dtype
 
     @wp.kernel(module="unique", module_options=FORWARD)

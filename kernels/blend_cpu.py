@@ -44,10 +44,10 @@ EXP_COEFFICIENTS = (
 
 @cache
 def row_functions(dtype, halvings: int):
-    """The type of a row, and on rows: broadcast, comparison with zero, exp; and the halves of a tile that a Gaussian
-    reaches. float64, the reference, uses the library's exponential.
+    """Return the type of a row of pixels and functions on rows: broadcast, step, exponential, reached halves of a tile.
 
-    halvings: the polynomial is taken at p / 2^halvings and squared as often, so that p may go down to -0.7 2^halvings.
+    float64, the reference, uses the library's exponential. halvings: the polynomial is evaluated at p / 2^halvings and
+    squared as often, so that p may go down to -0.7 * 2^halvings.
     """
     row, vec4, real = vector(LANES, dtype), vector(4, dtype), dtype
     lowest = -0.7 * 2.0**halvings
@@ -198,14 +198,15 @@ def forward_kernel(dtype, channels: int, halvings: int):
 
 @cache
 def backward_kernel(dtype, channels: int, halvings: int):
-    """The adjoint of forward_kernel, whose arguments it shares.
+    """Return the adjoint of forward_kernel(), whose arguments it shares.
 
-    unsorted: [M] each entry's row in intersection_gradients
-    last: as the forward left it; image_gradient: [H W, C]; left_over_gradient: [H W]
-    transmittance: as the forward left it, and used up
-    behind: scratch of [tiles, 32] rows; incoming: of [tiles, C, 32]; weights, slopes: of [tiles, 16]; sums: of
-        [tiles, C + 6]
-    intersection_gradients: [M, C + 6], in the order of unsorted: features, conic a b c, x, y, opacity
+    unsorted: [M] row of each intersection in intersection_gradients. last: as the forward kernel left it.
+    image_gradient: [H W, C]; left_over_gradient: [H W]. transmittance: as the forward kernel left it; it is
+    overwritten.
+
+    Scratch: behind [tiles, 32] rows, incoming [tiles, C, 32], weights and slopes [tiles, 16], sums [tiles, C + 6].
+
+    intersection_gradients: [M, C + 6] in the order of `unsorted`: features, conic a b c, x, y, opacity.
     """
     row, spread, step, exponential, halves = row_functions(dtype, halvings)
     real, vec4, size, lanes = dtype, vector(4, dtype), TILE_SIZE, LANES

@@ -38,13 +38,13 @@ def padded_channels(channels: int) -> int:
 
 @cache
 def pad_rows_kernel(dtype, channels: int):
-    """The kernel for one scalar type and features [N, channels]; covers the numbers of the rows."""
+    """Return pad_rows() for one scalar type and features [N, channels], launched over the numbers of the rows."""
     real = dtype
     columns = padded_channels(channels)
 
     @wp.kernel(module="unique", module_options=FORWARD)
     def pad_rows(first: int, features: wp.array2d(dtype=real), rows: wp.array2d(dtype=real)):
-        """rows [N, columns]: those of features, and zeros behind them."""
+        """Copy features to rows [N, columns] and fill the columns behind them with zeros."""
         i = first + wp.tid()
         row = i // wp.static(columns)
         column = i - row * wp.static(columns)
@@ -76,13 +76,16 @@ ROW = """
 
 @wp.func_native(BALLOT)
 def ballot(vote: bool, lane: int) -> wp.uint32:
-    """The lanes of the warp whose vote is true, on CUDA."""
+    """Return the lanes of the warp whose vote is true, on CUDA."""
 
 
 @cache
 def block_functions(dtype, cuda: bool) -> tuple:
-    """For one scalar type, votes(): a word with a bit for each lane whose vote is true; row(): a row of four numbers,
-    on CUDA by one access where numbers are float32."""
+    """Return votes() and row() for one scalar type.
+
+    votes() is a word with a bit for each lane whose vote is true; row() reads a row of four numbers, on CUDA by one
+    access if they are float32.
+    """
     vec4 = geometry(dtype).vec4
 
     if cuda:

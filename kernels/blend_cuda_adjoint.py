@@ -40,7 +40,7 @@ ADD_ROW = """
 
 @wp.func_native(ADD_ROW)
 def add_row(numbers: wp.array(dtype=wp.float32), i: int, a: float, b: float, c: float, d: float):
-    """Adds to four numbers, from number 4 i on, on CUDA; by one access where the GPU can."""
+    """Add to four numbers, from number 4 i on, on CUDA; by one access if the GPU can."""
 
 
 def adds_rows(dtype, ordered: bool, cuda: bool) -> bool:

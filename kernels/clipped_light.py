@@ -49,8 +49,10 @@ def _estimate_function(dtype):
         estimates: wp.array(dtype=wp.float16), rows: int, columns: int,
         y: int, x: int, channel: int, height: int, width: int,
     ):
-        """Return the expected logarithm and its precision at a value of an image [height, width, 3], from estimates
-        [rows, columns, 6] that cover the same picture; 0 and 0 without estimates."""
+        """Return the expected logarithm and its precision at a value of an image; 0 and 0 without estimates.
+
+        Estimates [rows, columns, 6] cover the same picture as the image [height, width, 3].
+        """
         expected = real(0.0)
         precision = real(0.0)
         if estimates:
@@ -64,7 +66,7 @@ def _estimate_function(dtype):
 
 @cache
 def clipped_logarithms_kernel(dtype, code):
-    """The kernel for one scalar type and one type of codes, wp.uint8 or wp.uint16."""
+    """Return the kernel for one scalar type and one type of codes, wp.uint8 or wp.uint16."""
     real = dtype
 
     @wp.kernel(module="unique", module_options=FORWARD)
@@ -73,8 +75,10 @@ def clipped_logarithms_kernel(dtype, code):
         image: wp.array(dtype=real), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64),
         mask: wp.array(dtype=real), white_code: int, white: real, logarithms: wp.array(dtype=real),
     ):
-        """Of image [H, W, 3], flat, beside photo index[0]: max(0, log(image / white)) where the code is `white_code`
-        and the mask [H W], if there is one, is not 0; NOT_CLIPPED elsewhere."""
+        """Write max(0, log(image / white)) for clipped values of a flat image [H, W, 3], and NOT_CLIPPED for others.
+
+        A value is clipped if its code in photo index[0] is `white_code` and the mask [H W], if there is one, is not 0.
+        """
         i = first + wp.tid()
         clipped = int(codes[wp.int32(index[0]), i]) == white_code
         if mask:
@@ -89,7 +93,7 @@ def clipped_logarithms_kernel(dtype, code):
 
 @cache
 def clipped_light_kernel(dtype):
-    """The kernel for one scalar type."""
+    """Return the kernel for one scalar type."""
     real = dtype
     terms_of, estimate_of = _terms_function(dtype), _estimate_function(dtype)
 
@@ -100,8 +104,11 @@ def clipped_light_kernel(dtype):
         smoothness: real, lift: real, hold: real, estimates: wp.array(dtype=wp.float16), rows: int, columns: int,
         terms: wp.array(dtype=real), slopes: wp.array(dtype=real),
     ):
-        """Add terms_of() each clipped value of image [H, W, 3], flat, with the values of its channel within REACH, to
-        terms [H W 3], and its derivative by the value to the slopes, which may be None."""
+        """Add terms_of() each clipped value, and its derivative.
+
+        image: [H, W, 3], flat. Neighbors are the values of the same channel within REACH. terms: [H W 3]. slopes:
+        derivatives by the values; may be None.
+        """
         i = first + wp.tid()
         v = logarithms[i]
         if v >= real(0.0):

@@ -10,9 +10,9 @@ from .geometry import vector
 
 @cache
 def code_residual_kernel(dtype, code, mu_law: bool):
-    """The kernel for one scalar type and one type of codes, wp.uint8 or wp.uint16.
+    """Return the kernel for one scalar type and one type of codes, wp.uint8 or wp.uint16.
 
-    mu_law: the image becomes gain log(1 + scale x); otherwise it is compared as it is.
+    mu_law: compare gain * log(1 + scale * image) in place of the image.
     """
     real = dtype
     vec3 = vector(3, dtype)
@@ -35,9 +35,12 @@ def code_residual_kernel(dtype, code, mu_law: bool):
         table: wp.array(dtype=vec3), scale: real, gain: real,
         seen: wp.array(dtype=real), slopes: wp.array(dtype=real), truth: wp.array(dtype=real),
     ):
-        """table: what each code is worth, the least and the most that it stands for. truth: what the codes of photo
-        index[0] are worth. seen: the truth, plus what the image is above the most, or less what it is below the least.
-        slopes: the derivatives of seen by image."""
+        """Compare an image with photo index[0] of a stack of codes.
+
+        table: radiance of each code, and the ends of the interval of radiances that map to it. truth: radiances of the
+        photo. seen: the truth plus the distance of the image from the interval. slopes: derivatives of seen by the
+        image.
+        """
         i = first + wp.tid()
         row = table[int(codes[wp.int32(index[0]), i])]
         value = image[i]

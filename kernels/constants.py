@@ -22,8 +22,11 @@ LOG_SCALE_MAX = 20.0
 
 
 def cpu_flags(depth: int = 6) -> str:
-    """Of Warp's compiler for the CPU: everything is inlined, and rows of numbers are found that many operations deep.
-    4 would cost the blend 30 %, 7 its adjoint 20 %, 8 SSIM 80 %. Kernels of different depths wait for each other."""
+    """Return flags of Warp's CPU compiler: everything is inlined, and vectors are found `depth` operations deep.
+
+    Depth 4 would cost the blend 30 %, 7 its adjoint 20 %, 8 SSIM 80 %. Kernels of different depths are compiled on
+    different threads' headers and wait for each other.
+    """
     inlined = "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
     return f"{inlined} -mllvm=-slp-recursion-max-depth={depth}"
 

@@ -34,7 +34,7 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         outputs: reals2d, exposedness: reals2d,
         channel: int, place: int, count: int, brackets: int,
     ) -> real:
-        """What softmax subtracts from the logits of one colour's brackets, so that its exponentials stay finite."""
+        """Return the largest logit of one color's brackets, which softmax subtracts to stay finite."""
         largest = outputs[channel, place] * exposedness[channel, place]
         for p in range(1, brackets):
             largest = wp.max(largest, outputs[channel, p * count + place] * exposedness[channel, p * count + place])
@@ -64,7 +64,7 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         brackets: int, scale: real,
         results: reals2d,
     ):
-        """scale times the mean of the encoded brackets, weighted by the softmax of outputs times exposedness."""
+        """Write scale times the mean of the encoded brackets, weighted by the softmax of outputs * exposedness."""
         place, channel = wp.tid()
         count = results.shape[0]
         largest = largest_logit(outputs, exposedness, channel, place, count, brackets)
@@ -105,7 +105,7 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         inner: reals3d, inner_bias: reals2d, outer: reals2d, points: int,
         by_inner: reals3d, by_inner_bias: reals2d, by_outer: reals2d, by_outer_bias: reals,
     ):
-        """Added to: the gradients by the perceptrons' weights, of `points` points a thread."""
+        """Add the gradients by the perceptrons' weights, of `points` points for each thread."""
         channel, chunk, unit = wp.tid()
         first_weight = inner[channel, 0, unit]
         second_weight = inner[channel, 1, unit]

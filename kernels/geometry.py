@@ -7,12 +7,12 @@ import warp as wp
 
 
 def vector(length: int, dtype):
-    """The Warp vector type of `length` components of `dtype`."""
+    """Return the Warp vector type with `length` components of `dtype`."""
     return wp.types.vector(length=length, dtype=dtype)
 
 
 def matrix(rows: int, columns: int, dtype):
-    """The Warp matrix type of `rows` x `columns` components of `dtype`."""
+    """Return the Warp matrix type with `rows` x `columns` components of `dtype`."""
     return wp.types.matrix(shape=(rows, columns), dtype=dtype)
 
 
@@ -49,8 +49,11 @@ def geometry(dtype) -> SimpleNamespace:
     def ellipse_meets_rectangle(
         x: real, y: real, a: real, b: real, c: real, level: real, left: real, top: real, width: real, height: real
     ) -> bool:
-        """Does the ellipse a dx^2 + 2 b dx dy + c dy^2 <= level around (x, y) touch the rectangle? The form is smallest
-        on one of the edges nearest to the centre. The small allowance keeps rounding from dropping a border pixel."""
+        """Return whether the ellipse a dx^2 + 2 b dx dy + c dy^2 <= level around (x, y) touches the rectangle.
+
+        The form is smallest on one of the edges nearest to the centre. A small allowance keeps rounding from dropping a
+        border pixel.
+        """
         x0 = left - x
         x1 = x0 + width
         y0 = top - y
@@ -65,7 +68,7 @@ def geometry(dtype) -> SimpleNamespace:
 
     @wp.func
     def splat_exponent(a: real, b: real, c: real, dx: real, dy: real) -> real:
-        """The logarithm of a 2D Gaussian's value at offset (dx, dy); never positive, also when rounding says so."""
+        """Return the logarithm of a 2D Gaussian's value at offset (dx, dy), at most 0 whatever the rounding."""
         return wp.min(real(-0.5) * (a * dx * dx + c * dy * dy) - b * dx * dy, real(0.0))
 
     return SimpleNamespace(

@@ -18,6 +18,7 @@ _weights4 = vector(4, wp.float32)
 
 @wp.func
 def cell_of(position: float, last_cell: int) -> int:
+    """Return the cell of a position, from 0 to last_cell; 0 for NaN."""
     cell = int(0)
     if position > 0.0:  # not for NaN
         cell = int(wp.min(position, float(last_cell)))
@@ -39,7 +40,7 @@ def node_weights(part: float) -> _weights4:
 
 @wp.func
 def weight_slopes(part: float) -> _weights4:
-    """Derivative of node_weights by part."""
+    """Return the derivatives of node_weights() by the part of the cell."""
     t = wp.min(part, 1.0)
     right_value = 6.0 * t * (1.0 - t)
     left_slope = 1.0 + t * (3.0 * t - 4.0)

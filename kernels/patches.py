@@ -26,8 +26,10 @@ def patch_functions(radius: int) -> SimpleNamespace:
 
     @wp.func
     def patch_of(index: int, width: int, channels: int):
-        """Of a thread's index: its block, its place there, and the top row, left pixel and first channel of its patch
-        of an image [H, width, channels]."""
+        """Return a thread's block, its place there, and the top row, left pixel and first channel of its patch.
+
+        The image is [H, width, channels].
+        """
         block = index // wp.static(BLOCK_DIM)
         across = (width + wp.static(COLUMNS - 1)) // wp.static(COLUMNS)
         groups = (channels + wp.static(CHANNELS - 1)) // wp.static(CHANNELS)
@@ -45,8 +47,10 @@ def patch_functions(radius: int) -> SimpleNamespace:
 
     @wp.func
     def value_of(thread: int, turn: int, top: int, left: int, channel: int):
-        """The value that a thread takes in one of TURNS: its row in the patch, and where its sums begin there, those of
-        what is k pixels behind being CHANNELS k behind; and its row, pixel and channel, which may be beyond the image.
+        """Return which value a thread takes in one of TURNS, and where it is.
+
+        First its row in the patch and where its sums begin there; those of what is k pixels behind are CHANNELS * k
+        behind. Then its row, pixel and channel, which may be beyond the image.
         """
         place = turn * wp.static(BLOCK_DIM) + thread
         row = place // wp.static(COLUMNS * CHANNELS)

@@ -26,6 +26,7 @@ _patch = wp.types.vector(length=SIDE * SIDE, dtype=wp.float32)
 
 @wp.func
 def color_at(photos: wp.array(dtype=wp.vec4ub), place: wp.int64) -> wp.vec4:
+    """Return the four codes of a pixel."""
     code = photos[place]
     return wp.vec4(float(code[0]), float(code[1]), float(code[2]), float(code[3]))
 
@@ -61,13 +62,14 @@ def in_pixels(lens: wp.vec4, place: wp.vec3) -> wp.vec3:
 
 @wp.func
 def is_inside(pixel: wp.vec3, nearest: float, right: float, bottom: float) -> bool:
+    """Return whether a projected pixel is beyond the nearest depth and inside of the image."""
     u, v = pixel[0] / pixel[2], pixel[1] / pixel[2]
     return pixel[2] > nearest and u >= 0.0 and v >= 0.0 and u < right and v < bottom
 
 
 @wp.func
 def in_order(costs: costs8, count: int, cost: float) -> costs8:
-    """The first `count` of costs, the best first, and one more in its place."""
+    """Return the first `count` costs with one more inserted, the best first."""
     result = costs
     rank = int(count)
     while rank > 0 and result[wp.max(rank - 1, 0)] > cost:
@@ -79,7 +81,7 @@ def in_order(costs: costs8, count: int, cost: float) -> costs8:
 
 @wp.func
 def better_half(costs: costs8, count: int) -> float:
-    """The mean of the better half, two at least, of `count` costs in order; 2 * LARGEST where they are fewer."""
+    """Return the mean of the better half, at least two, of `count` sorted costs; 2 * LARGEST if there are fewer."""
     result = 2.0 * LARGEST
     if count >= 2:
         half = wp.max(2, (count + 1) / 2)
@@ -97,12 +99,14 @@ def sweep(
     pixels: wp.array2d(dtype=wp.int32), depths: wp.array2d(dtype=wp.float32),
     costs: wp.array2d(dtype=wp.float32),
 ):
-    """costs[n, d]: of pixel n at depths[n, d], the mean of the better half of its neighbors' mean differences, in
-    [0, LARGEST]; 2 * LARGEST where fewer than two neighbors show it.
+    """Compute matching costs: costs[n, d] of pixel n at depths[n, d], in [0, LARGEST].
 
-    photos: all pixels, RGB and a code that is not read, one photo after another from offsets [V]; sizes: [V, 2] width
-    and height; intrinsics: fx, fy, cx, cy; neighbors: [V, K <= 8], -1 for none; between: [V, K] from a view's axes to
-    its neighbor's; pixels: [N, 3] view, column, row, at least RADIUS from the border; depths: [N, D] along the view's
+    A cost is the mean over the better half of the neighbors of the mean difference to them; 2 * LARGEST if fewer than
+    two neighbors show the place.
+
+    photos: all pixels, RGB and a code that is not read, one photo after another from offsets [V]. sizes: [V, 2] width
+    and height. intrinsics: fx, fy, cx, cy. neighbors: [V, K <= 8], -1 for none. between: [V, K] from a view's axes to
+    its neighbor's. pixels: [N, 3] view, column, row, at least RADIUS from the border. depths: [N, D] along the view's
     axis.
     """
     i = first + wp.tid()
@@ -211,8 +215,10 @@ def place_matches(
     pixels: wp.array2d(dtype=wp.int32), depths: wp.array(dtype=wp.float32),
     points: wp.array(dtype=wp.vec3), colors: wp.array(dtype=wp.vec3), footprints: wp.array(dtype=wp.float32),
 ):
-    """The points, in the world that poses [V] lead to, of pixels [N, 3] at depths [N]; their colors in [0, 1]; what a
-    pixel covers there. Photos as in sweep."""
+    """Compute world points, colors in [0, 1] and footprints of pixels [N, 3] at depths [N].
+
+    poses: [V] from the views' axes to the world's. A footprint is what a pixel covers there. Photos as in sweep().
+    """
     n = first + wp.tid()
     view, column, row = pixels[n, 0], pixels[n, 1], pixels[n, 2]
     lens, depth = intrinsics[view], depths[n]

@@ -30,13 +30,16 @@ _costs = wp.types.matrix(shape=(MOST_NEIGHBORS, LANES), dtype=wp.float32)
 
 @wp.func
 def channel_of(code: int, channel: int) -> float:
-    """Times 256^channel."""
+    """Return a channel of packed codes, times 256^channel."""
     return float(code & (255 << (8 * channel)))
 
 
 @wp.func
 def channels_of(codes: _codes, channel: int) -> _row:
-    """Times 256^channel: without a shift, which LLVM would follow by packing bytes."""
+    """Return a channel of eight packed codes, times 256^channel.
+
+    Without a shift, because LLVM would continue by packing bytes.
+    """
     masked = codes & _codes(255 << (8 * channel))
     result = _row()
     for lane in range(wp.static(LANES)):
@@ -55,6 +58,7 @@ def codes_at(photos: wp.array(dtype=wp.int32), offset: wp.int64, places: _row) -
 
 @wp.func
 def whole(x: _row) -> _row:
+    """Return the numbers of a row without their fractions."""
     result = _row()
     for lane in range(wp.static(LANES)):
         result[lane] = float(int(x[lane]))
@@ -63,6 +67,7 @@ def whole(x: _row) -> _row:
 
 @wp.func
 def mixed(a: _row, b: _row, share: _row) -> _row:
+    """Return a row between a (share 0) and b (share 1)."""
     return a + wp.cw_mul(b - a, share)
 
 
@@ -74,8 +79,10 @@ def sweep_rows(
     pixels: wp.array2d(dtype=wp.int32), depths: wp.array2d(dtype=wp.float32),
     costs: wp.array2d(dtype=wp.float32),
 ):
-    """The costs of plane_sweep.sweep; an index is one pixel and one row of depths, ceil(D / 8) to a pixel. photos: a
-    pixel's four codes in one number, red lowest."""
+    """Compute the costs of plane_sweep.sweep(); an index is one pixel and one row of depths, ceil(D / 8) for a pixel.
+
+    photos: the four codes of a pixel in one number, red lowest.
+    """
     i = first + wp.tid()
     count = depths.shape[1]
     rows = (count + wp.static(LANES - 1)) / wp.static(LANES)

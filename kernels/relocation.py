@@ -23,9 +23,11 @@ def share_opacities(
     copies: wp.array(dtype=wp.int32), sums: wp.array2d(dtype=wp.float64), least: float,
     logits: wp.array(dtype=wp.float32), log_scales: wp.array(dtype=_vec3),
 ):
-    """Makes each Gaussian with copies the n-th part of itself, n one more than they are but at most the rows of sums.
-    sums: row n - 1 times the powers of an opacity, from the first on, is the denominator of equation 9. least: opacity
-    that remains."""
+    """Give each Gaussian with copies the opacity and size that it and its copies have together (3DGS-MCMC, equation 9).
+
+    sums: row n - 1 times the powers of an opacity, from the first on, is the denominator for n = 1 + copies, at most
+    the number of rows. least: lowest opacity.
+    """
     i = first + wp.tid()
     if copies[i] > 0:
         parts = wp.min(copies[i] + 1, sums.shape[0])
@@ -49,8 +51,10 @@ def number_places(
     first: int,
     dead: wp.array(dtype=wp.bool), numbers: wp.array(dtype=wp.int64), places: wp.array(dtype=wp.int32),
 ):
-    """places: of the dead and then of the new rows behind them, from 0 on; -1 for the living. numbers: running count of
-    the dead. Covers the places."""
+    """Assign numbers from 0 to the places to fill: dead Gaussians and then new rows behind them; -1 for living ones.
+
+    numbers: running count of the dead. Launched over the places.
+    """
     i = first + wp.tid()
     count = dead.shape[0]
     place = int(-1)
@@ -67,8 +71,11 @@ def count_copies(
     chosen: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.float64), begin: wp.array(dtype=wp.int64),
     end: wp.array(dtype=wp.int64), copies: wp.array(dtype=wp.int32), changed: wp.array(dtype=wp.bool),
 ):
-    """Adds to copies, and marks in changed, what is chosen for the places from begin[0] to end[0]; nothing where the
-    total[0] of the weights it was drawn by is 0. Covers chosen, by one range: several may choose the same."""
+    """Count how often each row is chosen for the places from begin[0] to end[0], and mark those rows in changed.
+
+    Nothing is counted if total[0], the sum of the weights of the draw, is 0. Launched over `chosen` in one range,
+    because several may choose the same row.
+    """
     i = first + wp.tid()
     if total[0] > wp.float64(0.0) and wp.int64(i) < end[0] - begin[0]:
         source = int(chosen[i])
@@ -80,9 +87,10 @@ _rows = wp.array2d(dtype=wp.float32)
 
 
 @wp.func
-def copy_row(given: _rows, source: int, values: _rows, row: int):
+def copy_row(sources: _rows, source: int, values: _rows, row: int):
+    """Copy a row of sources to a row of values."""
     for column in range(values.shape[1]):
-        values[row, column] = given[source, column]
+        values[row, column] = sources[source, column]
 
 
 @wp.kernel(module="unique", module_options=FORWARD)
@@ -94,9 +102,11 @@ def copy_rows(
     values_a: _rows, values_b: _rows, values_c: _rows, values_d: _rows, values_e: _rows, values_f: _rows,
     changed: wp.array(dtype=wp.bool),
 ):
-    """Fills the rows whose place, less begin[0], is k from 0 on and below end[0] with row k of what is given, or with
-    chosen, not [0], with row chosen[k], but then not where total[0] is 0; they are marked in changed, if not [0]. given
-    may be values, where no row is both read and written. A thread for each row."""
+    """Fill rows whose place is begin[0] + k, below end[0], with source row k or, if `chosen` is not empty, chosen[k].
+
+    With `chosen` nothing is filled if total[0] is 0. Filled rows are marked in changed, if it is not empty. Sources may
+    be the values themselves if no row is both read and written. One thread for each row.
+    """
     row = first + wp.tid()
     place = wp.int64(places[row])
     if place < begin[0] or place >= end[0]:
@@ -118,6 +128,7 @@ def copy_rows(
 
 @wp.func
 def clear_row(values: _rows, row: int):
+    """Set a row of values to 0."""
     for column in range(values.shape[1]):
         values[row, column] = 0.0
 

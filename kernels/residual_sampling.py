@@ -9,7 +9,7 @@ from .constants import FORWARD
 
 @cache
 def error_weights_kernel(code):
-    """The kernel for one type of codes, wp.uint8 or wp.uint16. Covers the pixels."""
+    """Return error_weights() for one type of codes, wp.uint8 or wp.uint16, launched over the pixels."""
 
     @wp.kernel(module="unique", module_options=FORWARD)
     def error_weights(
@@ -17,8 +17,11 @@ def error_weights_kernel(code):
         shown: wp.array(dtype=wp.vec3), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64), white: float,
         mask: wp.array(dtype=wp.float32), least: float, weights: wp.array(dtype=wp.float64),
     ):
-        """The squares of the mean differences over the channels of encoded values [H W], held within [0, 1], and codes
-        of photo index[0], times the mask, if there is one; 0 where these are not above least."""
+        """Write the squared mean difference over channels between encoded values and the codes of photo index[0].
+
+        Encoded values [H W] are clamped to [0, 1]. Differences are multiplied by the mask, if there is one; those not
+        above `least` have weight 0.
+        """
         i = first + wp.tid()
         photo = wp.int32(index[0])
         color = shown[i]
@@ -39,9 +42,11 @@ def sampled_pixels(
     across: float, down: float, columns: int, rows: int, border: int,
     pixels: wp.array2d(dtype=wp.int32), meant: wp.array(dtype=wp.bool),
 ):
-    """Places in a photo `width` pixels wide as pixels (view, column, row) of the same photo, columns x rows large,
-    across and down times as large, held `border` from its edge; and whether they are meant: they were as far from it,
-    and the total of the weights that they were drawn by is above 0."""
+    """Convert places in a photo `width` pixels wide to pixels (view, column, row) of the same photo at another size.
+
+    The other size is columns x rows, across and down times as large. Pixels are clamped to `border` from its edge.
+    meant: whether a pixel was that far from the edge before and the total of the weights is above 0.
+    """
     k = first + wp.tid()
     place = wp.int32(places[k])
     row = place // width

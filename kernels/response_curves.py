@@ -12,7 +12,7 @@ NO_TONE, REINHARD, FILMIC, KNEE = 0, 1, 2, 3
 
 @cache
 def encode_kernel(dtype, tone: int):
-    """encode for one scalar type and one kind of tone curve: NO_TONE, REINHARD, FILMIC or KNEE."""
+    """Return encode() for one scalar type and one tone curve: NO_TONE, REINHARD, FILMIC or KNEE."""
     real = dtype
     vec4, vec5 = vector(4, dtype), vector(5, dtype)
 
@@ -23,8 +23,11 @@ def encode_kernel(dtype, tone: int):
         power_law: vec4, tone_numbers: vec5, clip: real, extension_slope: real,
         values: wp.array(dtype=real), slopes: wp.array(dtype=real),
     ):
-        """power_law: exponent, offset, slope and end of the toe; tone_numbers: Filmic's a, b, d, e, g or Knee's start
-        and softness; clip: the clip point, infinite for none; extension_slope: of the rise by log exposure beyond."""
+        """Encode exposures by a tone curve and a power law, with derivatives.
+
+        power_law: exponent, offset, slope and end of the toe. tone_numbers: Filmic's a, b, d, e, g or Knee's start and
+        softness. clip: clip point, infinite for none. extension_slope: slope by log exposure beyond it.
+        """
         i = first + wp.tid()
         exposure = exposures[i]
         x = wp.clamp(exposure, real(0.0), clip)

@@ -16,9 +16,12 @@ LARGEST = 4096
 
 
 class Work(ctypes.Structure):
-    """kernel, bounds, given, gradients: places of the compiled kernel, Warp's bounds of one dimension, the parameters,
-    and for an adjoint their gradients, else 0. size: of the parameters, bytes. ranges: place of [count + 1] int32, of
-    which each is where a range begins and the one before ends. next: the first range that nobody has."""
+    """Work that threads share: addresses of a compiled kernel, its bounds, parameters and ranges.
+
+    kernel, bounds, given, gradients: addresses of the compiled kernel, of Warp's bounds of one dimension, of the
+    parameters, and for an adjoint of their gradients, else 0. size: of the parameters, bytes. ranges: address of [count
+    + 1] int32, where ranges begin and where the last one ends. next: the first range that no thread has.
+    """
 
     _fields_ = (
         ("kernel", ctypes.c_void_p), ("bounds", ctypes.c_void_p), ("given", ctypes.c_void_p),
@@ -69,10 +72,11 @@ SHARE = f"""
 
 
 @wp.func_native(SHARE)
-def share(work: wp.uint64, fork: wp.uint64, threads: wp.int32): ...
+def share(work: wp.uint64, fork: wp.uint64, threads: wp.int32):
+    """Take part in the Work at an address; see SHARE."""
 
 
 @wp.kernel(module="unique", module_options=FORWARD)
 def share_ranges(work: wp.uint64, fork: wp.uint64, threads: wp.int32):
-    """Does what the Work at a place in memory tells. fork: of GOMP_parallel(), or 0."""
+    """Run the Work at an address. fork: address of GOMP_parallel(), or 0."""
     share(work, fork, threads)

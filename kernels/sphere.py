@@ -149,8 +149,10 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
         block_caps: wp.array(dtype=vec4), columns: int, rows: int, starts: wp.array(dtype=wp.int32),
         counts: wp.array(dtype=wp.int32), tiles: wp.array(dtype=wp.int32), gaussians: wp.array(dtype=wp.int32),
     ):
-        """counts: the tiles that each Gaussian touches. Where tiles and gaussians have room, an entry for each of them
-        from starts[place] on."""
+        """Count the tiles that each Gaussian touches and, if there is memory, list them.
+
+        Intersections of the Gaussian at `place` in the order are written from starts[place] on.
+        """
         place = first + wp.tid()
         gaussian = order[place]
         cap = caps[gaussian]
@@ -179,7 +181,7 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
         columns: int, width: int, height: int, alpha_threshold: real,
         image: wp.array(dtype=features_type), transmittance: wp.array(dtype=real), ends: wp.array(dtype=wp.int32),
     ):
-        """ends: one past the last entry that a pixel shows."""
+        """Blend each pixel's list front to back. ends: one past the last intersection that a pixel shows."""
         found = pixel_of(first + wp.tid(), columns)
         if found[1] < width and found[2] < height:
             pixel = found[2] * width + found[1]
@@ -219,8 +221,7 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
         transmittance: wp.array(dtype=real), ends: wp.array(dtype=wp.int32), places: wp.array(dtype=wp.int32),
         by_image: wp.array(dtype=features_type), by_transmittance: wp.array(dtype=real), rows: wp.array2d(dtype=real),
     ):
-        """rows: added to at places[entry]: gradients by the direction of the cap, across, along (3 each), the opacity,
-        and features."""
+        """Add gradients to rows[places[intersection]]: cap direction, across, along (3 each), opacity, features."""
         found = pixel_of(first + wp.tid(), columns)
         if found[1] < width and found[2] < height:
             pixel = found[2] * width + found[1]

@@ -30,15 +30,18 @@ C2 = 0.03**2
 
 
 def window() -> list[float]:
-    """The 2 RADIUS + 1 weights of the Gaussian window; they sum to one."""
+    """Return the 2 RADIUS + 1 weights of the Gaussian window, which sum to one."""
     weights = [exp(-((i - RADIUS) ** 2) / (2.0 * SIGMA**2)) for i in range(2 * RADIUS + 1)]
     return [weight / sum(weights) for weight in weights]
 
 
 @cache
 def comparison(dtype, lanes: int):
-    """Of windowed moments E[s], E[d], E[s^2], E[d^2], each `lanes` numbers of one scalar type: the SSIM and its
-    derivatives by E[s] and E[d] together, E[s^2] and E[d^2], as far as they follow `a`."""
+    """Return the function that computes SSIM from windowed moments E[s], E[d], E[s^2], E[d^2].
+
+    Each moment is `lanes` numbers of one scalar type. Its derivatives are by E[s] and E[d] together, E[s^2] and E[d^2],
+    as far as they depend on `a`.
+    """
     real, run = dtype, vector(lanes, dtype)
 
     @wp.func
@@ -69,14 +72,13 @@ def comparison(dtype, lanes: int):
 
 @cache
 def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
-    """The four passes for one scalar type (wp.float32 or wp.float64); images need W C >= lanes.
+    """Return the four passes for one scalar type (wp.float32 or wp.float64); images need W C >= lanes.
 
     blur_columns, then compare: the SSIM map and its derivatives by the four windowed moments, combined for `a`.
     blur_derivatives, then gradient: the adjoint of the blurs, applied to those derivatives.
 
-    A launch covers [0, rows * blocks) with blocks = ceil(W C / lanes).
-    distance: for a weighted sum of |a - b| and 1 - SSIM in place of the SSIM. With it alone weights are read, and
-    slopes, the derivatives of `a` by what is differentiated by, or None for 1.
+    A launch has rows * ceil(W C / lanes) threads. distance: compute a weighted sum of |a - b| and 1 - SSIM in place of
+    the SSIM. Only then weights are read, and slopes, the derivatives of `a` by the variable, or None for 1.
     """
     real, run = dtype, vector(lanes, dtype)
     taps, radius = wp.constant(2 * RADIUS + 1), wp.constant(RADIUS)
@@ -87,8 +89,10 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
 
     @wp.func
     def place_of(index: int, length: int):
-        """Row of a thread's run and its start there. The last run of a row overlaps the one before it and writes the
-        same values again."""
+        """Return the row of a thread's run and its start there.
+
+        The last run of a row overlaps the one before it and writes the same values again.
+        """
         blocks = (length + wp.static(lanes - 1)) // wp.static(lanes)
         return index // blocks, wp.min(index % blocks * wp.static(lanes), length - wp.static(lanes))
 

@@ -16,11 +16,10 @@ from .ssim import RADIUS, comparison
 
 @cache
 def ssim_patch_kernels(dtype, distance: bool = False) -> SimpleNamespace:
-    """For one scalar type (wp.float32 or wp.float64): compare and gradient, as those of ssim_kernels(), which do the
-    blurs too, over patches_of() x BLOCK_DIM threads.
+    """Return compare() and gradient() for one scalar type (wp.float32 or wp.float64), which also blur.
 
-    Images are [rows, W C], channel fastest; derivatives [3, rows, W C]. With a distance, compare leaves the sum of each
-    patch, [patches], in place of the map.
+    As those of ssim_kernels(), over patches_of() x BLOCK_DIM threads. Images are [rows, W C], channel fastest;
+    derivatives [3, rows, W C]. With a distance, compare() writes the sum of each patch, [patches], in place of the map.
     """
     real = dtype
     functions = patch_functions(RADIUS)
@@ -49,7 +48,7 @@ def ssim_patch_kernels(dtype, distance: bool = False) -> SimpleNamespace:
 
     @wp.func
     def values_around(image: wp.array2d(dtype=real), top: int, x: int, channel: int, channels: int) -> around:
-        """A column and what the window reaches above and below; zeros beyond the image."""
+        """Return a column and what the window reaches above and below; zeros beyond the image."""
         values = around()
         i = x * channels + channel
         inside = x >= 0 and i < image.shape[1] and channel < channels

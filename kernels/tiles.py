@@ -56,10 +56,13 @@ def tile_kernels(dtype) -> SimpleNamespace:
         channels: int, alpha_threshold: real, columns: int, rows: int,
         extents: vec2s, shapes: vec4s, ellipses: vec4s, counts: int64s,
     ):
-        """shapes: (x, y, opacity, half-height); ellipses: (conic a, b, c, level at which alpha meets the threshold);
-        counts: of the tiles that it touches, of columns x rows.
-        extents: changed to 0 for a Gaussian with a feature that is not finite: the CPU blend multiplies what a pixel
-        does not see by 0, and 0 times NaN would show beside it."""
+        """Pack 2D Gaussians and count the tiles, of columns x rows, that each one touches.
+
+        shapes: (x, y, opacity, half-height). ellipses: (conic a, b, c, level at which alpha meets the threshold).
+
+        extents: set to 0 for a Gaussian with a feature that is not finite, because the CPU blend multiplies what a
+        pixel does not show by 0, and 0 times NaN would be visible.
+        """
         i = first + wp.tid()
         for channel in range(channels):
             if not wp.isfinite(features[i, channel]):
@@ -90,7 +93,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
         first: int,
         depths: reals, extents: vec2s, keys: reals, places: wp.array(dtype=int),
     ):
-        """What sorts Gaussians nearest first, culled ones last, and their indices."""
+        """Write keys that sort Gaussians nearest first and culled ones last, and their indices."""
         i = first + wp.tid()
         key = depths[i]
         if not (extents[i][0] > real(0.0)):
@@ -110,11 +113,15 @@ def tile_kernels(dtype) -> SimpleNamespace:
             max_intersections: int,
             keys: wp.array(dtype=key), gaussians: ints, overflow: bools,
         ):
-            """ends: the running sum of the counts: Gaussian `place` fills the intersections before ends[place] and
-            `max_intersections`, with columns * rows, no tile at all, where there are fewer tiles than were counted. All
-            fill so what is left. overflow: [1], whether more were counted than there is room for; or None.
-            keys: tiles, of Gaussians in their order; or by_depth, of Gaussians as they come, tiles above DEPTH_BITS of
-            the depth, whose order is that of positive numbers. Without by_depth depths are None, with it the order."""
+            """Write the intersections of each Gaussian, which end at ends[place].
+
+            If fewer tiles are touched than were counted, or no Gaussian is left, the rest up to `max_intersections`
+            gets tile columns * rows, which is none. overflow: [1], whether more were counted than there is memory for;
+            or None.
+
+            keys: tiles, of Gaussians in their order; or if by_depth, of Gaussians by index, tiles above DEPTH_BITS of
+            the depth, whose bits order as positive numbers do. Without by_depth `depths` is None, with it `order`.
+            """
             place = first + wp.tid()
             i = place
             depth = key(0)
@@ -162,8 +169,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
         columns: int,
         rows: reals2d,
     ):
-        """rows[order[place]]: the sum of intersection_gradients [M, columns] over the intersections of Gaussian
-        `place`, in their order, which end at ends[place]."""
+        """Write rows[order[place]], the sum of Gaussian `place`'s rows of intersection_gradients [M, columns]."""
         place = first + wp.tid()
         begin = int(0)
         if place > 0:
@@ -195,8 +201,10 @@ def place_intersections(
     tiles: wp.array(dtype=wp.int32), given: wp.array(dtype=wp.int32), size: int, starts: wp.array2d(dtype=wp.int32),
     gaussians: wp.array(dtype=wp.int32), places: wp.array(dtype=wp.int32),
 ):
-    """Puts the Gaussians `given` by entry where starts[c, t], counted up, says, and the entry's own place beside it, if
-    there is room for any. Covers [0, chunks)."""
+    """Write Gaussians, and their places before, to starts[chunk, tile], counted up; launched over the chunks.
+
+    Places are written only if there is memory for them.
+    """
     chunk = first + wp.tid()
     for entry in range(chunk * size, wp.min((chunk + 1) * size, tiles.shape[0])):
         tile = tiles[entry]
@@ -209,12 +217,13 @@ def place_intersections(
 
 @cache
 def lists_kernel(dtype, key, shift: int):
-    """find_lists for sorted keys, wp.int32 or wp.int64, whose tile is above their lowest `shift` bits, and records of
-    one scalar type. Covers the intersections, of which there is one at least.
+    """Return find_lists() for sorted keys, wp.int32 or wp.int64, with tiles above the lowest `shift` bits.
 
-    ranges: [2 tiles], for each tile the first and one past the last of its intersections; corners: [intersections], bit
-    k where the ellipse touches corner k of the tile, CORNER pixels, or [0] where none are asked for. Unused
-    intersections carry a tile number beyond all: they belong to no list, and their corners are 0.
+    Packed Gaussians are of one scalar type. Launched over the intersections, of which there is at least one.
+
+    ranges: [2 tiles], for each tile the first and one past the last of its intersections. corners: [intersections], bit
+    k set if the ellipse touches corner k of the tile, CORNER pixels, or [0] if none are requested. Unused intersections
+    have a tile number beyond all: they belong to no list, and their corners are 0.
     """
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4

@@ -27,9 +27,12 @@ def judge_step(
     loss: wp.array(dtype=wp.float32), norms: wp.array(dtype=wp.float32), incomplete: wp.array(dtype=wp.bool),
     tally: wp.array(dtype=wp.int64), pairs: wp.array(dtype=wp.int64), verdict: wp.array(dtype=wp.float32),
 ):
-    """verdict: [2], 1 or 0 each: the step is to be skipped, as the loss or a gradient is not finite; it is not to be.
-    norms: [K] of the gradients; incomplete: [1], or [0] where nothing can be. tally: [3] or [0], counts steps that are
-    not finite, and with pairs, [1] or [0], the most of them and the steps that are incomplete. One thread."""
+    """Decide whether a step is skipped because its loss or a gradient is not finite; one thread.
+
+    verdict: [2], 1 or 0: skipped, not skipped. norms: [K] of the gradients. incomplete: [1], or [0] if no step can be.
+    tally: [3] or [0], counts steps that are not finite and, with pairs ([1] or [0]), holds the most intersections and
+    counts the incomplete steps.
+    """
     finite = wp.isfinite(loss[0])
     for i in range(norms.shape[0]):
         finite = finite and wp.isfinite(norms[i])
@@ -95,10 +98,12 @@ def update_by_adam(
     gradients_c: _floats, step_c: _floats, rate_c: _floats, parameters_c: _floats, means_c: _floats, squares_c: _floats,
     gradients_d: _floats, step_d: _floats, rate_d: _floats, parameters_d: _floats, means_d: _floats, squares_d: _floats,
 ):
-    """One step of every number of AT_ONCE parameters, in place; none where skipped[0] is not 0. Covers the longest.
-    step: [1], already counted up; rate: [1]; all of length 0 for a parameter that is not there. *_decay_log: log of the
-    decays; *_gain: 1 - decay, not as float32 would round it. means, squares: the moments. live, width_*: as counted()
-    takes them."""
+    """Update every number of AT_ONCE parameters by Adam, in place; none if skipped[0] is not 0.
+
+    Launched over the longest parameter. step: [1], already counted up; rate: [1]; all of length 0 for an absent
+    parameter. *_decay_log: logarithms of the decays; *_gain: 1 - decay, not as float32 would round it. means, squares:
+    the moments. live, width_*: as counted() takes them.
+    """
     i = first + wp.tid()
     if skipped[0] == 0.0:
         if i < counted(parameters_a, live, width_a):
@@ -169,10 +174,12 @@ def place_in_turn(k: int, turn: int, turns: int) -> int:
 
 @cache
 def harmonics_adam_kernel(count: int):
-    """update_by_adam of coefficients of harmonics, [3 N count], whose gradients nobody stored: they are as
-    harmonics.coefficient_adjoint_kernel() multiplies them out. TURN of them step after each other in `turns` turns.
-    Covers [0, stride): a thread takes NUMBERS, `stride` apart of those whose turn it is, and asks for the memory of all
-    before it waits for any."""
+    """Return update_by_adam() for coefficients of harmonics [3 N count] whose gradients are not stored.
+
+    They are computed as harmonics.coefficient_adjoint_kernel() does. Blocks of TURN coefficients are updated in `turns`
+    turns. Launched over `stride` threads: a thread takes NUMBERS coefficients, `stride` apart, and requests the memory
+    of all before it waits for any.
+    """
     numbers, whole_numbers = vector(NUMBERS, wp.float32), vector(NUMBERS, wp.int32)
 
     @wp.kernel(module="unique", module_options=FORWARD)
@@ -234,8 +241,10 @@ def add_gradient_statistics(
     half_width: float, half_height: float,
     gradient_sum: wp.array(dtype=wp.float32), seen: wp.array(dtype=wp.float32),
 ):
-    """Adds the lengths of the gradients by the projected centres, in units of half the image's sides, and 1, for each
-    Gaussian with a radius; nothing where usable[0] is 0."""
+    """Add, for each Gaussian with a radius, the length of its gradient by the projected centre, and 1.
+
+    Lengths are in units of half the image's sides. Nothing is added if usable[0] is 0.
+    """
     i = first + wp.tid()
     if radii[i] > 0.0 and usable[0] != 0.0:
         x = gradients[i][0] * half_width
@@ -261,7 +270,8 @@ def add_position_noise(
 
     Each axis moves at most most_sizes of the Gaussian's standard deviations (times a normal number). Nothing moves
     farther from the origin than most_distance, unless it is there already and comes nearer. Depends on seed and index
-    alone."""
+    alone.
+    """
     i = first + wp.tid()
     opacity = 1.0 / (1.0 + wp.exp(-opacity_logits[i]))
     above = SHARPNESS * (opacity - (1.0 - CENTRE))

@@ -16,8 +16,10 @@ MEAN_THREADS = 1 << 14
 
 
 def bounded_exponential(values: Tensor, bound: float) -> Tensor:
-    """The exponential of [N, C] values, float32 or float64, held within [-bound, bound], from where on the derivative
-    is 0; differentiable once. One that is not a number stays so."""
+    """Return exp of [N, C] values clamped to [-bound, bound], float32 or float64; NaN stays NaN.
+
+    Beyond the bounds the derivative is 0. Differentiable once.
+    """
     if values.device.type == "cuda":
         return _BoundedExponential.apply(values, bound)
     # clamp(), but for the derivative, which is one operation in place of four.
@@ -45,8 +47,10 @@ class _BoundedExponential(torch.autograd.Function):
 
 
 def opacities_with_penalty(logits: Tensor, weight: float, live: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """The sigmoids of [N] logits, float32 or float64, N >= 1, and `weight` times their mean, a scalar; differentiable
-    once. live: [1] int32 on the device, how many there are, where those behind them have a sigmoid of 0."""
+    """Return the sigmoids of [N] logits, N >= 1, and `weight` times their mean, a scalar; differentiable once.
+
+    live: [1] int32 on the device, how many the mean counts, if those behind them have a sigmoid of 0.
+    """
     if logits.device.type == "cuda":
         return _Opacities.apply(logits, weight, live)
     opacities = torch.sigmoid(logits)

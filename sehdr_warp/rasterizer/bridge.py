@@ -49,6 +49,7 @@ class Program:
     """
 
     def __init__(self, tensors: Sequence[Tensor], differentiable: bool) -> None:
+        """Take a program's arguments; differentiable: keep what its backward pass needs."""
         self.device = tensors[0].device
         self._differentiable, self._launches = differentiable, list[_Launch]()
         self._tensors: list[Tensor] = []

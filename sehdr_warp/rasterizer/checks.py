@@ -13,10 +13,13 @@ from torch import Tensor
 
 
 def check_tensors(**arguments: tuple[Any, tuple[int | str, ...]]) -> None:
-    """Raises TypeError for what is no torch tensor; ValueError for another shape, another type than float32 or float64,
-    or another type or device than the first's.
+    """Raise TypeError for an argument that is not a tensor, and ValueError for a wrong shape, dtype or device.
 
-    arguments: by name, the value and its shape, in which a letter is a size of the first tensor that has it.
+    dtypes are float32 or float64, the same as the first argument's, and so are devices.
+
+    Args:
+        **arguments: by name, the value and its shape, in which a letter stands for the size of the first tensor that
+            has it.
     """
     if _fit(arguments.values()):
         return
@@ -63,7 +66,7 @@ def _fit(arguments: Iterable[tuple[Any, tuple[int | str, ...]]]) -> bool:
 
 
 def integer(name: str, value: Any, least: int, most: int) -> int:
-    """The value as an int; TypeError for another kind of number, ValueError for one out of range."""
+    """Return the value as an int; raise TypeError for another kind of number, ValueError for one out of range."""
     try:
         number = operator.index(value)
     except TypeError:
@@ -74,7 +77,7 @@ def integer(name: str, value: Any, least: int, most: int) -> int:
 
 
 def check_opacities(opacities: Tensor) -> None:
-    """Raises ValueError for opacities on the CPU that are finite and outside of [0, 1]."""
+    """Raise ValueError for opacities on the CPU that are finite and outside of [0, 1]."""
     if opacities.device.type == "cpu" and opacities.numel():
         low, high = (float(value) for value in opacities.detach().aminmax())
         if -math.inf < low < -1e-6 or math.inf > high > 1 + 1e-6:

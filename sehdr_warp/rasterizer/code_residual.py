@@ -27,7 +27,7 @@ def code_tensor(codes: np.ndarray, device: torch.device | str) -> Tensor:
 
 
 def code_values(codes: Tensor) -> Tensor:
-    """Encoded values in [0, 1], float32, of code_tensor()'s codes."""
+    """Return the encoded values in [0, 1], float32, of code_tensor()'s codes."""
     found = codes.int() & 0xFFFF if codes.dtype == torch.int16 else codes
     # By a tensor: torch's division by a number on a GPU is a product with its reciprocal, which rounds differently.
     return found / torch.full((), float(WHITE[codes.dtype]), device=codes.device)
@@ -55,20 +55,27 @@ class CodeScale:
 
 
 def code_residual(image: Tensor, codes: Tensor, scale: CodeScale, index: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """What a photo can tell of an image, and what it tells, both [H, W, 3] in the domain of the scale.
+    """Return prediction and target of a photo loss, both [H, W, 3] in the domain of the scale.
 
-    The first equals the second where the code may stand for what is seen; elsewhere it is as far from it as what is
-    seen is from what the code may stand for. Differentiable once with respect to the image.
+    Within the interval of radiances that map to a pixel's code, prediction and target are equal (zero residual).
+    Outside, their difference is the distance to the nearest end of the interval. Differentiable once with respect to
+    the image.
 
-    image: [H, W, 3] float32 or float64. codes: code_tensor()'s of the photo, [H, W, 3], or of a stack of photos
-    [V, H, W, 3] that has it at index [1], int64. All on one device. Raises ValueError otherwise.
+    Args:
+        image: [H, W, 3] float32 or float64.
+        codes: code_tensor()'s of the photo, [H, W, 3], or of a stack of photos [V, H, W, 3].
+        scale: radiances of codes.
+        index: [1] int64, of the photo in a stack.
+
+    Raises:
+        ValueError: if shapes or dtypes do not fit.
     """
     check_codes(image, codes, scale, index)
     return _CodeResidual.apply(image, codes, scale, index)
 
 
 def check_codes(image: Tensor, codes: Tensor, scale: CodeScale, index: Tensor | None) -> None:
-    """Raises ValueError for what code_residual() does not take."""
+    """Raise ValueError for what code_residual() does not take."""
     shape = image.shape if index is None else (codes.shape[0], *image.shape)
     levels = WHITE.get(codes.dtype, 0) + 1
     if codes.shape != shape or (levels, 3) != scale.table.shape or scale.table.dtype != image.dtype:

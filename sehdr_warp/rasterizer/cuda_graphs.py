@@ -42,8 +42,10 @@ def _no_collection():
 
 
 def _one_thread():
-    """Run backward passes on this thread: torch's own frees a graph some time later, also in the middle of a
-    capture."""
+    """Run backward passes on this thread.
+
+    Torch's own thread frees a graph some time later, also in the middle of a capture.
+    """
     return torch.autograd.set_multithreading_enabled(False)
 
 
@@ -84,6 +86,7 @@ class CudaGraphRunner:
     """
 
     def __init__(self, device: torch.device | str, stream: torch.cuda.Stream | None = None) -> None:
+        """Make a runner with memory of its own and, by default, a stream of its own."""
         self.device = torch.device(device)
         if self.device.type != "cuda":
             raise ValueError(f"device {self.device} has no CUDA graphs; use a GPU, or call the function itself")

@@ -94,6 +94,6 @@ class _Fusion(torch.autograd.Function):
 
 
 def _flat(weights):
-    """inner [3, 2, H], inner_bias [3, H], outer [3, H] and outer_bias [3]: without the axes of length 1."""
+    """Return inner [3, 2, H], inner_bias [3, H], outer [3, H] and outer_bias [3]: without the axes of length 1."""
     inner, inner_bias, outer, outer_bias = weights
     return inner, inner_bias.view(3, -1), outer.view(3, -1), outer_bias.view(3)

@@ -61,12 +61,15 @@ def spherical_harmonics(
 
 @dataclass(frozen=True)
 class HarmonicsGradients:
-    """Gradients by the coefficients of harmonics as their factors, of which there are 3 numbers a Gaussian and view in
-    place of 48: the gradients by the values that views showed, and where these were seen from. The gradients are the
-    sums over the views.
+    """Gradients by coefficients of harmonics as their factors: 3 numbers for a Gaussian and view in place of 48.
 
-    by_values: [V, N, 3]; positions: [V, 3]; means: [N, 3], as the views saw them; world coordinates. degree: of the
-    evaluation.
+    The gradients are sums over the views.
+
+    Attributes:
+        by_values: [V, N, 3] gradients by the values of each view.
+        positions: [V, 3] of the views' cameras, world coordinates.
+        means: [N, 3] of the Gaussians when the views were rendered.
+        degree: of the evaluation.
     """
 
     by_values: Tensor
@@ -84,7 +87,7 @@ class HarmonicsGradients:
         return basis
 
     def by_coefficients(self, like: Tensor, start: int) -> Tensor:
-        """The gradients [N, K, 3], like a tensor of that shape, by the coefficients from number `start` on."""
+        """Return the gradients [N, K, 3], like a tensor of that shape, by the coefficients from number `start` on."""
         made = torch.empty_like(like)
         if made.numel():
             kernel = coefficient_adjoint_kernel(warp_scalar(made.dtype), made.shape[1])
@@ -93,8 +96,11 @@ class HarmonicsGradients:
 
 
 class _Evaluation(torch.autograd.Function):
-    """The adjoint is by hand: the generated one adds to zeros, number by number, which for 48 numbers a Gaussian takes
-    several times as long as to write them."""
+    """Harmonics with an adjoint written by hand.
+
+    The generated adjoint adds to zeros, number by number, which for 48 numbers a Gaussian takes several times as long
+    as writing them.
+    """
 
     @staticmethod
     def forward(ctx, degree, constant, rest, means, camera_position):
@@ -137,6 +143,8 @@ class _Evaluation(torch.autograd.Function):
 
 
 def writes_turns(device: torch.device) -> bool:
-    """Whether the forward pass on a device has a thread for each channel, which writes what the gradient by the means
-    needs."""
+    """Return whether the forward pass on a device has one thread for each channel.
+
+    That pass also writes what the gradient by the means needs.
+    """
     return device.type == "cuda"

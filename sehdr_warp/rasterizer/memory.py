@@ -29,6 +29,7 @@ class OutOfMemory(SehdrError):
     """
 
     def __init__(self, details: str, remedy: str = REMEDY) -> None:
+        """Compose the message; remedy says what to do."""
         super().__init__(f"{details}; {remedy}")
         self.details = details
 
@@ -81,6 +82,7 @@ class oom_context:
     __slots__ = ("_device", "_remedy", "_sizes")
 
     def __init__(self, device: torch.device, sizes: Callable[[], tuple[int, ...]], remedy: str = REMEDY) -> None:
+        """Make a context for one piece of work."""
         self._device, self._sizes, self._remedy = device, sizes, remedy
 
     def __enter__(self) -> None:

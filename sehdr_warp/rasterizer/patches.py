@@ -26,7 +26,7 @@ def new_terms(image: Tensor) -> Tensor:
 
 
 def total(terms: Tensor) -> Tensor:
-    """The sum of new_terms(), a scalar; on the CPU the same whatever the number of threads."""
+    """Return the sum of new_terms(), a scalar; on the CPU the same whatever the number of threads."""
     if terms.ndim == 1:
         return terms.sum()
     with torch_threads(terms.device):  # Each row is one thread's.

@@ -1,5 +1,8 @@
-"""A simulated image against a photo's codes: image_distance() of code_residual()'s two and clipped_light_energy(), in
-the fewest launches: one sum of all terms, and one gradient that each part goes on with."""
+"""The loss of a simulated image against a photo's codes, in the fewest launches.
+
+It joins image_distance() of code_residual()'s pair and clipped_light_energy(): one sum of all terms, and one gradient
+that each part continues.
+"""
 
 import torch
 from torch import Tensor
@@ -22,12 +25,14 @@ def photo_loss(
     clipped: ClippedWeights = ClippedWeights(),
     estimates: Tensor | None = None,
 ) -> Tensor:
-    """distance_weight mean |a - b| + dissimilarity_weight (1 - ssim(a, b)) of what code_residual(image, ...) gives, and
-    clipped_light_energy() of the image where it has a weight: a scalar, differentiable once with respect to the image.
+    """Return the photo loss of an image, a scalar, differentiable once with respect to it.
 
-    image: [H, W, 3] float32 or float64. codes, scale, index: as of code_residual(), with its errors. clipped:
-    weights of clipped_light_energy(), where the scale's white is the exposure that the photo shows as white. estimates:
-    as it takes them.
+    It is distance_weight mean |a - b| + dissimilarity_weight (1 - ssim(a, b)) of the pair from code_residual(image,
+    ...), plus clipped_light_energy() of the image if that has a weight.
+
+    image: [H, W, 3] float32 or float64. codes, scale, index: as of code_residual(), with its errors. clipped: weights
+    of clipped_light_energy(), for which scale.white is the exposure that the photo shows as white. estimates: as it
+    takes them.
     """
     check_codes(image, codes, scale, index)
     weights = distance_weight, dissimilarity_weight

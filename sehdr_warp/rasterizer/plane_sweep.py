@@ -52,8 +52,10 @@ class PhotoSet:
 
 @torch.no_grad()
 def matching_costs(photos: PhotoSet, pixels: Tensor, depths: Tensor) -> Tensor:
-    """[N, D] in [0, 0.25]: how unlike the photos are where pixels [N, 3] (view, column, row; int32) would be at depths
-    [N, D] (float32, along the axis); 0.5 where fewer than two neighbors show the place."""
+    """Return matching costs [N, D] in [0, 0.25] of pixels at depths; 0.5 if fewer than two neighbors show the place.
+
+    pixels: [N, 3] view, column, row; int32. depths: [N, D] float32, along the view's axis.
+    """
     costs = torch.empty(depths.shape, device=depths.device)
     others = photos.offsets, photos.sizes, photos.intrinsics, photos.neighbors, photos.between
     asked = pixels.contiguous(), depths.contiguous(), costs
@@ -81,8 +83,10 @@ def trusted_depths(
 
 @torch.no_grad()
 def matched_points(photos: PhotoSet, poses: Tensor, pixels: Tensor, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """What pixels [N, 3] show at depths [N]: points [N, 3], by poses [V, 4, 4] from the views' axes to the world's;
-    colors [N, 3] in [0, 1]; footprints [N], what a pixel covers there. All float32."""
+    """Return points [N, 3], colors [N, 3] in [0, 1] and footprints [N] of pixels [N, 3] at depths [N], all float32.
+
+    poses: [V, 4, 4] from the views' axes to the world's. A footprint is what a pixel covers there.
+    """
     points, colors = (depths.new_empty(len(depths), 3) for _ in range(2))
     footprints = torch.empty_like(depths)
     given = photos.codes, photos.offsets, photos.sizes, photos.intrinsics, poses, pixels.contiguous(), depths

@@ -1,5 +1,7 @@
-"""A training's kernels for the CPU, compiled while its photos are read: the compiler takes some ten seconds for
-them, once on each machine, and a second to find them in the cache."""
+"""Compile a training's CPU kernels while its photos are read.
+
+The compiler takes some ten seconds for them, once on each machine, and a second to find them in the cache.
+"""
 
 import importlib
 import logging
@@ -34,8 +36,10 @@ PATIENCE = 0.2  # Seconds that a block may end in with nothing begun, as one doe
 
 
 def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
-    """Those that take the compiler longest, about as they are asked for. channels: that are blended; None where that is
-    not known."""
+    """Return the kernels that take the compiler longest, about in the order of their first launches.
+
+    channels: that are blended; None if not known.
+    """
     real = wp.float32
     distance, lists = ssim.ssim_kernels(real, CPU_LANES, True), tiles.tile_kernels(real)
     kind = real, channels, halvings(ALPHA_THRESHOLD)
@@ -60,8 +64,11 @@ def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
 
 @contextmanager
 def precompiled(kernels: Sequence[Any], modules: Sequence[str] = ()) -> Iterator[None]:
-    """Imports modules and compiles kernels for the CPU, or finds them in the cache, on two threads beside this block,
-    which waits for one of them each at most, at its end. What fails is told to whoever needs it."""
+    """Import modules and compile CPU kernels, or load them from the cache, on two threads beside the block.
+
+    At its end the block waits for at most one of them on each thread. Failures are left to whoever needs the module or
+    kernel.
+    """
     over = threading.Event()
     fused = [kernel for kernel in kernels if uses_fused_multiply_add(kernel)]
 

@@ -1,5 +1,4 @@
-"""Pixels drawn where a picture does not explain its photo, on either device without waiting for it
-(kernels/unexplained.py)."""
+"""Sample pixels with a high residual, on either device without waiting for it (kernels/residual_sampling.py)."""
 
 import torch
 from torch import Tensor
@@ -22,11 +21,13 @@ def sample_residual_pixels(
     *,
     least: float,
 ) -> tuple[Tensor, Tensor]:
-    """Pixels drawn by the square of their error, where it is above least: [K, 3] int32 (view, column, row) of the photo
-    at another size (width, height), each BORDER from its edge; and [K] bool, whether each is meant.
+    """Sample pixels by the square of their error, if it is above `least`.
 
-    shown: [H, W, 3] encoded, float32; what is beyond [0, 1] counts as its end. codes, index: as of code_residual().
-    mask: [H, W, 1] float32, times which errors count. uniform: [K] float64 in [0, 1), which the draws are of.
+    Returns [K, 3] int32 (view, column, row) of the photo at another size (width, height), each BORDER from its edge,
+    and [K] bool, whether each is meant.
+
+    shown: [H, W, 3] encoded, float32, clamped to [0, 1]. codes, index: as of code_residual(). mask: [H, W, 1] float32,
+    by which errors are multiplied. uniform: [K] float64 in [0, 1), random numbers of the draws.
     """
     height, width, _ = shown.shape
     if index is None:

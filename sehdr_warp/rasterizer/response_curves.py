@@ -14,8 +14,14 @@ TONES = {"none": NO_TONE, "reinhard": REINHARD, "filmic": FILMIC, "knee": KNEE}
 
 @dataclass(frozen=True)
 class FormulaCurve:
-    """power_law: exponent, offset, slope and end of the toe, as response.analytic.PowerLaw holds them; tone:
-    the curve before it, a name in TONES, with its numbers; clip: the clip point, infinite for none."""
+    """A camera response that has a formula.
+
+    Attributes:
+        power_law: exponent, offset, slope and end of the toe, as response.analytic.PowerLaw holds them.
+        tone: the curve before it, a name in TONES.
+        tone_numbers: of the tone curve.
+        clip: the clip point, infinite for none.
+    """
 
     power_law: tuple[float, float, float, float]
     tone: str = "none"
@@ -25,8 +31,10 @@ class FormulaCurve:
 
 @torch.no_grad()
 def encode_with_slope(exposure: Tensor, curve: FormulaCurve, extension_slope: float) -> tuple[Tensor, Tensor]:
-    """The encoded values of exposures [...], float32 or float64, with extension_slope log(x / clip) added beyond the
-    clip point, and their derivatives by exposure: 0 below 0, NaN for NaN."""
+    """Return the encoded values of exposures [...] and their derivatives: 0 below 0, NaN for NaN.
+
+    Beyond the clip point extension_slope * log(x / clip) is added. float32 or float64.
+    """
     exposure = exposure.contiguous()
     values, slopes = torch.empty_like(exposure), torch.empty_like(exposure)
     scalar = warp_scalar(exposure.dtype)

@@ -194,8 +194,7 @@ class _Blend(torch.autograd.Function):
 
 
 def caps_of(directions: Tensor, side: int) -> Tensor:
-    """Return [blocks, 4], by rows: the mean direction of each block of side x side pixels and the largest angle to
-    it."""
+    """Return caps [blocks, 4], by rows: mean direction of each side x side pixels, and the largest angle to it."""
     height, width = directions.shape[:2]
     rows, columns = -(-height // side), -(-width // side)
     # What is missing at the end repeats the last pixels.

@@ -38,13 +38,15 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
 
 @torch_operation
 def ssim_map(a: Tensor, b: Tensor) -> Tensor:
-    """The [H, W, C] values whose mean is ssim(a, b); same arguments, same errors, differentiable as well."""
+    """Return the [H, W, C] values whose mean is ssim(a, b); same arguments, same errors, differentiable as well."""
     return _Similarity.apply(a, b, False)
 
 
 def image_distance(a: Tensor, b: Tensor, distance_weight: float, dissimilarity_weight: float) -> Tensor:
-    """distance_weight mean |a - b| + dissimilarity_weight (1 - ssim(a, b)), in one launch more than ssim() takes: a
-    scalar, differentiable once with respect to a. a, b: as for ssim(), with its errors."""
+    """Return distance_weight mean |a - b| + dissimilarity_weight (1 - ssim(a, b)), a scalar.
+
+    Takes one launch more than ssim(). Differentiable once with respect to a. a, b: as of ssim(), with its errors.
+    """
     return _Distance.apply(a, b, distance_weight, dissimilarity_weight)
 
 
@@ -71,8 +73,10 @@ def distance_terms(
     wanted: bool,
     slopes: Tensor | None = None,
 ) -> tuple[Tensor, Tensor | None]:
-    """What image_distance() of contiguous images is the total() of, and if wanted its derivatives by what `a` has the
-    slopes by, all [H, W, C], or by `a` itself."""
+    """Return the terms whose total() is image_distance() of contiguous images, and if wanted their derivatives.
+
+    Derivatives [H, W, C] are by the variable of which `a` has the slopes, or by `a` itself.
+    """
     weights = distance_weight / a.numel(), dissimilarity_weight / a.numel()
     terms, derivatives = _compare(a, b, weights)
     # Made at once: it takes a fifth of the memory of what it is made of.
@@ -113,8 +117,10 @@ def _check(a: Tensor, b: Tensor) -> None:
 
 
 def _compare(a: Tensor, b: Tensor, weights: tuple[float, float] | None = None) -> tuple[Tensor, Tensor]:
-    """The similarity [H, W, C] and its derivatives [3, H, W C] by the windowed moments. weights: of |a - b| and of the
-    dissimilarity, whose sum's terms then stand in the similarity's place."""
+    """Return the similarity [H, W, C] and its derivatives [3, H, W C] by the windowed moments.
+
+    weights: of |a - b| and of the dissimilarity; if given, the terms of their sum take the place of the similarity.
+    """
     values = torch.empty_like(a) if weights is None else patches.new_terms(a)
     derivatives = a.new_empty(3, a.shape[0], a.shape[1] * a.shape[2])
     if patches.in_patches(a.device):
@@ -183,7 +189,7 @@ class _Runs:
         return buffer
 
     def view(self, tensor: Tensor) -> Tensor:
-        """A contiguous image [H, W, C] or stack of rows [..., H, n] as overlapping runs."""
+        """Return a contiguous image [H, W, C] or stack of rows [..., H, n] as overlapping runs."""
         rows = tensor.shape[:1] if tensor.shape == self.like.shape else tensor.shape[:-1]
         length = tensor.numel() // rows.numel()
         strides = (length,) if len(rows) == 1 else (rows[1] * length, length)

@@ -22,11 +22,14 @@ def judge_step(
     tally: Tensor | None = None,
     pairs: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Two scalars, 1 or 0: whether a step is to be skipped, as the loss or a norm is not finite or `incomplete` is
-    true; whether it is to be made. loss: float32 scalar; norms: [K] float32; incomplete: bool scalar.
+    """Return two scalars, 1 or 0: whether a step is skipped, and whether it is made.
 
-    tally: [3] int64, is told: it counts steps that are not finite, and with pairs, an int64 scalar, the most of them
-    and the steps that are incomplete."""
+    It is skipped if the loss or a norm is not finite or `incomplete` is true. loss: float32 scalar; norms: [K] float32;
+    incomplete: bool scalar.
+
+    tally: [3] int64, counts steps that are not finite; with pairs, an int64 scalar, it also holds the most
+    intersections and counts the incomplete steps.
+    """
     verdict = norms.new_empty(2)
     if incomplete is None:
         incomplete = torch.empty(0, dtype=torch.bool, device=norms.device)
@@ -73,9 +76,17 @@ class _ByOne(torch.autograd.Function):
 
 
 class AdamStep(NamedTuple):
-    """What a step changes and what it takes: parameter, gradient, moments, contiguous float32 of one shape; float32 of
-    one element the number of this step, from 1, and the rate. A rate that is a number cannot change in a CUDA graph.
-    width: of a Gaussian's row, where adam_steps() is told how many of them count; else 0."""
+    """One parameter's step of Adam.
+
+    Attributes:
+        parameter: contiguous float32, as the next three of one shape.
+        gradient: by the parameter.
+        first_moment: changed in place.
+        second_moment: changed in place.
+        step: float32 of one element, the number of this step, from 1.
+        rate: float32 of one element, or a number, which cannot change in a CUDA graph.
+        width: numbers in a Gaussian's row if adam_steps() gets `live`; else 0.
+    """
 
     parameter: Tensor
     gradient: Tensor
@@ -95,12 +106,14 @@ def adam_steps(
     epsilon: float,
     live: Tensor | None = None,
 ) -> None:
-    """Changes parameters and moments in place, or nothing where `skipped`, float32 of one element, is 1: torch's step
-    on the CPU; on a GPU, where torch's leaves most of it idle, a kernel of the same numbers, several parameters at
-    once. All on one device, so that the call can be part of a CUDA graph. live: [1] int32, how many rows count; the
-    gradients of others are 0.
+    """Update parameters and moments by Adam in place; nothing if `skipped`, float32 of one element, is 1.
 
-    Raises ValueError for a tensor that is not contiguous float32 of the parameter's shape.
+    By torch on the CPU. On a GPU, most of which torch's update leaves idle, by a kernel of the same numbers, several
+    parameters at once. Nothing waits for the device, so the call can be part of a CUDA graph. live: [1] int32, how many
+    rows count; the gradients of others are 0.
+
+    Raises:
+        ValueError: if a tensor is not contiguous float32 of the parameter's shape.
     """
     for each in steps:
         shape = each.parameter.shape
@@ -151,9 +164,11 @@ def harmonics_adam_step(
     live: Tensor | None = None,
     turns: int = 1,
 ) -> None:
-    """adam_steps() of coefficients of harmonics [N, K, 3] from number `start` on, whose gradients are multiplied out
-    where they are used. turns: parts of the coefficients, which step in turn, one at each call; whose turn it is and
-    how many it had is told by `step`."""
+    """Do adam_steps() for coefficients of harmonics [N, K, 3] from number `start` on.
+
+    Their gradients are multiplied out as they are used. turns: parts of the coefficients that are updated in turn, one
+    at each call; `step` tells whose turn it is and how many it had.
+    """
     if not parameter.numel():
         return
     numbers = step, _rate(rate, skipped), skipped, _live(live, skipped), *_numbers(betas), epsilon
@@ -173,7 +188,7 @@ def _rate(rate: Tensor | float, like: Tensor) -> Tensor:
 
 
 def _numbers(betas: tuple[float, float]) -> tuple[float, ...]:
-    """What Adam's kernels know of the decays."""
+    """Return what Adam's kernels need of the decays: 1 - beta and log(beta) of each."""
     return *(1 - beta for beta in betas), *(math.log(beta) for beta in betas)
 
 
@@ -181,9 +196,11 @@ def _numbers(betas: tuple[float, float]) -> tuple[float, ...]:
 def add_gradient_statistics(
     gradients: Tensor, radii: Tensor, usable: Tensor, width: int, height: int, gradient_sum: Tensor, seen: Tensor
 ) -> None:
-    """Adds to gradient_sum [N] the lengths of gradients [N, 2] by the projected centres, in normalised screen units
-    (the screen is 2 wide), and to seen [N] 1, where radii [N] are above 0; nothing where the scalar usable is 0. width,
-    height: of the image in pixels. All float32 on one device."""
+    """Add the lengths of gradients [N, 2] by the projected centres to gradient_sum [N], and 1 to seen [N].
+
+    Lengths are in normalised screen units (the screen is 2 wide). Only Gaussians with radii [N] above 0 count, and
+    nothing is added if the scalar usable is 0. width, height: of the image in pixels. All float32 on one device.
+    """
     given = gradients.contiguous(), radii, usable, width / 2, height / 2
     launch(kernels.add_gradient_statistics, len(radii), *given, gradient_sum, seen)
 

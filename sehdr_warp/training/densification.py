@@ -15,7 +15,7 @@ from torch import Tensor
 from ..model.gaussians import PARAMETER_NAMES, Gaussians
 from ..model.reserved_rows import moments_of
 from ..rasterizer import Rendering
-from ..rasterizer.relocation import Drawn, clear_rows, copy_rows, count_copies, number_places, share_opacities
+from ..rasterizer.relocation import SampledRows, clear_rows, copy_rows, count_copies, number_places, share_opacities
 from ..rasterizer.training_step import add_gradient_statistics, add_position_noise
 from ..runs.config import Config
 
@@ -276,7 +276,7 @@ class Relocation(Densification):
         share_opacities(gaussians.opacity_logits.detach(), gaussians.log_scales.detach(), copies, least=least)
         values = list(gaussians.tensors().values())
         # In the authors' code the moved ones keep their Adam state, and only those that share lose it.
-        copy_rows(values, values, places, begin, end, drawn=drawn)
+        copy_rows(values, values, places, begin, end, samples=drawn)
 
 
 def make_densification(config: Config, extent: float, pixels: int, places: Tensor | None = None) -> Densification:
@@ -313,10 +313,10 @@ def _room(number: Tensor, most: int) -> int:
     return min(most, int(number)) if number.device.type == "cpu" else most
 
 
-def _draw(weights: Tensor, count: int, generator) -> Drawn:
+def _draw(weights: Tensor, count: int, generator) -> SampledRows:
     """Rows drawn in proportion to weights, with replacement; by bisection, for any number of weights."""
     steps = weights.double().cumsum(0)
     uniform = torch.rand(count, generator=generator, device=weights.device, dtype=torch.float64)
     # Not 0, which the first would be drawn by, whatever it weighs.
     uniform = uniform.clamp_min_(torch.finfo(torch.float64).tiny)
-    return Drawn(torch.searchsorted(steps, uniform * steps[-1]).clamp_max_(len(weights) - 1), steps[-1])
+    return SampledRows(torch.searchsorted(steps, uniform * steps[-1]).clamp_max_(len(weights) - 1), steps[-1])

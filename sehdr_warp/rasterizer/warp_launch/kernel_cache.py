@@ -27,7 +27,7 @@ _MODULE = re.compile(r"wp_.*_[0-9a-f]{7}")
 
 
 def select_folder() -> None:
-    """Gives Warp a cache that can be used; before wp.init()."""
+    """Give Warp a cache folder that can be written to; called before wp.init()."""
     stated = os.environ.get("WARP_CACHE_PATH")
     if wp.config.kernel_cache_dir or (stated is None and not sys.platform.startswith("linux")):
         return

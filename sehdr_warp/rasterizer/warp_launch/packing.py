@@ -31,6 +31,7 @@ class PackedLaunch:
     def __init__(
         self, kernel: Any, device: torch.device, block_dim: int | None, adjoint: bool, dim: Any, values: list
     ) -> None:
+        """Compile or load the kernel. dim and values are of the first launch."""
         self.arguments = kernel.adj.args
         self.kinds = [argument.type for argument in self.arguments] * (1 + adjoint)
         self.packed: list[Any] = [...] * len(self.kinds)  # The last launch's values, and of tensors the layouts.
